@@ -1,0 +1,3 @@
+//! Plain-slice kernels (rayon and SIMD) that serve every CPU backend.
+
+pub mod tensor;

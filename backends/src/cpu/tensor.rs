@@ -1,0 +1,88 @@
+//! The CPU backends' tensors as plain slices, so that one kernel serves Flex and NdArray alike.
+
+use burn::backend::flex::FlexTensor;
+use burn::backend::ndarray::NdArrayTensor;
+use burn::backend::tensor::{FloatTensor, IntTensor};
+use burn::backend::{Backend, Flex, NdArray};
+use burn::tensor::{DType, Shape, TensorData};
+use std::borrow::Cow;
+
+/// A backend whose tensors live in host memory.
+pub trait CpuBackend: Backend {
+    /// The elements, row-major; borrowed when the tensor is contiguous.
+    fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]>;
+    /// The integer elements, row-major.
+    fn ints(tensor: &IntTensor<Self>) -> Vec<i64>;
+    /// Changes the elements in place when nobody else holds them, in a copy otherwise.
+    fn update_floats(tensor: FloatTensor<Self>, change: impl FnOnce(&mut [f32])) -> FloatTensor<Self>;
+    /// A tensor that owns `values`, row-major; no copy.
+    fn from_floats(values: Vec<f32>, shape: impl Into<Shape>) -> FloatTensor<Self>;
+    /// An integer tensor that owns `values`, row-major; no copy.
+    fn from_ints(values: Vec<i64>, shape: impl Into<Shape>) -> IntTensor<Self>;
+}
+
+impl CpuBackend for Flex {
+    fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]> {
+        match tensor.as_slice::<f32>() {
+            Some(slice) => Cow::Borrowed(slice),
+            None => Cow::Owned(tensor.to_contiguous().storage::<f32>().to_vec()),
+        }
+    }
+    fn ints(tensor: &IntTensor<Self>) -> Vec<i64> {
+        let tensor = tensor.to_contiguous();
+        match tensor.dtype() {
+            DType::I32 => tensor.storage::<i32>().iter().map(|&v| i64::from(v)).collect(),
+            _ => tensor.storage::<i64>().to_vec(),
+        }
+    }
+    fn update_floats(mut tensor: FloatTensor<Self>, change: impl FnOnce(&mut [f32])) -> FloatTensor<Self> {
+        let len = tensor.layout().shape().num_elements();
+        let whole = tensor.is_contiguous() && tensor.layout().start_offset() == 0 && tensor.bytes().len() == 4 * len;
+        if !whole {
+            tensor = tensor.to_contiguous();
+        }
+        change(&mut tensor.storage_mut::<f32>()[..len]);
+        tensor
+    }
+    fn from_floats(values: Vec<f32>, shape: impl Into<Shape>) -> FloatTensor<Self> {
+        FlexTensor::from_data(TensorData::new(values, shape.into()))
+    }
+    fn from_ints(values: Vec<i64>, shape: impl Into<Shape>) -> IntTensor<Self> {
+        FlexTensor::from_data(TensorData::new(values, shape.into()))
+    }
+}
+
+impl CpuBackend for NdArray {
+    fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]> {
+        let NdArrayTensor::F32(storage) = tensor else { panic!("ndarray: expected float32, got {:?}", burn::backend::TensorMetadata::dtype(tensor)) };
+        let view = storage.view();
+        match view.to_slice() {
+            Some(slice) => Cow::Borrowed(slice),
+            None => Cow::Owned(view.iter().copied().collect()),
+        }
+    }
+    fn ints(tensor: &IntTensor<Self>) -> Vec<i64> {
+        match tensor {
+            NdArrayTensor::I64(storage) => storage.view().iter().copied().collect(),
+            NdArrayTensor::I32(storage) => storage.view().iter().map(|&v| i64::from(v)).collect(),
+            other => panic!("ndarray: expected integers, got {:?}", burn::backend::TensorMetadata::dtype(other)),
+        }
+    }
+    fn update_floats(tensor: FloatTensor<Self>, change: impl FnOnce(&mut [f32])) -> FloatTensor<Self> {
+        let NdArrayTensor::F32(storage) = tensor else { panic!("ndarray: expected float32") };
+        let mut array = storage.into_owned();
+        if !array.is_standard_layout() {
+            array = array.as_standard_layout().to_shared();
+        }
+        if let Some(slice) = array.as_slice_mut() {
+            change(slice);
+        }
+        NdArrayTensor::from(array)
+    }
+    fn from_floats(values: Vec<f32>, shape: impl Into<Shape>) -> FloatTensor<Self> {
+        NdArrayTensor::from_data(TensorData::new(values, shape.into()))
+    }
+    fn from_ints(values: Vec<i64>, shape: impl Into<Shape>) -> IntTensor<Self> {
+        NdArrayTensor::from_data(TensorData::new(values, shape.into()))
+    }
+}

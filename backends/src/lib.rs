@@ -1,0 +1,5 @@
+//! Operations burn lacks, per device, and the rasterizers made of them.
+
+pub mod cpu;
+pub mod ops;
+pub mod rasterizers;

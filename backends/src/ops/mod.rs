@@ -1,0 +1,1 @@
+//! The tensor operations burn lacks. Each is a `backend_extension` trait with an implementation per device and a hand-written backward.

@@ -1,0 +1,1 @@
+//! The rasterizers made of the operations.

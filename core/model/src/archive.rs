@@ -1,0 +1,1 @@
+//! The `.cc4d` archive.

@@ -1,0 +1,82 @@
+//! TOML configuration: strict parsing, overrides, layering.
+
+use crate::{Error, Result};
+use serde::de::DeserializeOwned;
+
+/// Parses a section into `T`. Unknown keys, wrong types and missing values name the section and the key.
+pub fn parse_section<T: DeserializeOwned>(object: &str, section: &toml::Table) -> Result<T> {
+    T::deserialize(toml::Value::Table(section.clone())).map_err(|e| Error::parameter(object, e.message().trim().to_string(), "`cc4dgs plugins NAME` and the presets show the known keys"))
+}
+
+/// Parses TOML text into a table; `object` names the file.
+pub fn parse_table(object: &str, text: &str) -> Result<toml::Table> {
+    text.parse::<toml::Table>().map_err(|e| Error::parameter(object, e.to_string().replace('\n', " ").trim().to_string(), "Correct the TOML"))
+}
+
+/// Lays `over` on `base`, table by table; values of `over` win.
+pub fn merge(base: &mut toml::Table, over: &toml::Table) {
+    for (key, value) in over {
+        match (base.get_mut(key), value) {
+            (Some(toml::Value::Table(inner)), toml::Value::Table(new)) => {
+                // Another plug-in's settings mean nothing to the new one.
+                let changes_kind = new.get("kind").is_some_and(|k| inner.get("kind") != Some(k));
+                if changes_kind {
+                    inner.clear();
+                }
+                merge(inner, new);
+            }
+            _ => {
+                base.insert(key.clone(), value.clone());
+            }
+        }
+    }
+}
+
+/// Applies one `--set a.b.c=value`. The value is read as TOML; bare words become strings.
+pub fn set(table: &mut toml::Table, assignment: &str) -> Result<()> {
+    let object = format!("--set {assignment}");
+    let Some((path, text)) = assignment.split_once('=') else {
+        return Err(Error::parameter(object, "no '=' found", "Write --set section.key=value"));
+    };
+    let text = text.trim();
+    let value = format!("v = {text}").parse::<toml::Table>().ok().and_then(|mut t| t.remove("v")).unwrap_or_else(|| toml::Value::String(text.to_string()));
+    let keys: Vec<&str> = path.trim().split('.').collect();
+    if keys.iter().any(|k| k.is_empty()) {
+        return Err(Error::parameter(object, "the key has an empty part", "Write --set section.key=value"));
+    }
+    let mut over = toml::Table::new();
+    over.insert(keys[keys.len() - 1].to_string(), value);
+    for key in keys[..keys.len() - 1].iter().rev() {
+        over = toml::Table::from_iter([(key.to_string(), toml::Value::Table(over))]);
+    }
+    merge(table, &over);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn set_reads_numbers_and_bare_words() {
+        let mut t = parse_table("test", "[deformer]\nkind = \"cdf\"\nlevels = 5\n[train]\niterations = 10").unwrap();
+        set(&mut t, "train.iterations=20").unwrap();
+        set(&mut t, "deformer.kind=none").unwrap();
+        assert_eq!(t["train"]["iterations"].as_integer(), Some(20));
+        assert_eq!(t["deformer"]["kind"].as_str(), Some("none"));
+        assert!(t["deformer"].get("levels").is_none(), "settings of another plug-in must go");
+        assert!(set(&mut t, "nonsense").is_err());
+    }
+
+    #[test]
+    fn unknown_keys_are_named() {
+        #[derive(serde::Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct S {
+            #[allow(dead_code)]
+            a: i32,
+        }
+        let e = parse_section::<S>("train", &parse_table("t", "a = 1\niteratons = 3").unwrap()).err().unwrap().to_string();
+        assert!(e.contains("iteratons") && e.contains("train"), "{e}");
+    }
+}

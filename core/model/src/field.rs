@@ -1,0 +1,127 @@
+//! The first seam: deformation fields.
+
+use crate::plugin::Plugin;
+use crate::{Offsets, Result, Seed};
+use burn::tensor::{Device, Tensor};
+use serde::{Deserialize, Serialize};
+
+/// What a field must know of its scene before its weights mean anything. Stored in checkpoints and archives.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FieldContext {
+    /// Lower corner of the box the field covers, world units.
+    pub box_min: [f32; 3],
+    /// Upper corner of the box the field covers, world units.
+    pub box_max: [f32; 3],
+    /// The number of frames of the sequence (sets temporal bandwidth).
+    pub frame_count: usize,
+    /// Spherical-harmonics degree of the Gaussians it will move.
+    pub sh_degree: usize,
+    /// The field's own node of the seed tree.
+    pub seed: Seed,
+}
+
+/// Which share of the stored bytes a parameter counts towards (the paper's Deform-Grid and Deform-Net).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Part {
+    /// Spatial encoding: tables, planes, or the decoders that replace them.
+    Grid,
+    /// Everything else.
+    Net,
+}
+
+/// One named weight array of a field. The optimizer replaces `value`; the field reads it at every call.
+#[derive(Clone, Debug)]
+pub struct Parameter {
+    /// Unique within the field.
+    pub name: String,
+    /// Which share of the bytes it counts towards.
+    pub part: Part,
+    /// The logical shape; `value` is flat.
+    pub shape: Vec<usize>,
+    /// The weights, flat [product of shape].
+    pub value: Tensor<1>,
+    /// Index into [`DeformationField::groups`].
+    pub group: usize,
+}
+
+/// How a set of parameters is optimised (Adam).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ParameterGroup {
+    /// For people and logs.
+    pub name: String,
+    /// Learning rate at the first step.
+    pub lr_start: f64,
+    /// Learning rate at the last step, reached log-linearly.
+    pub lr_end: f64,
+    /// Linear warm-up from zero over this share of the stage.
+    pub warmup: f64,
+    /// Whether the rates are multiplied by the extent of the cameras (as the Gaussians' positions are).
+    pub times_extent: bool,
+    /// Adam's epsilon.
+    pub epsilon: f64,
+    /// Gradient-norm clip over the whole group; 0 is off.
+    pub clip_norm: f64,
+}
+
+/// What a call cost, counted rather than timed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FieldWork {
+    /// Gaussians asked about.
+    pub gaussians: u64,
+    /// Corner queries before reuse.
+    pub vertices_queried: u64,
+    /// Vertices actually decoded.
+    pub vertices_decoded: u64,
+}
+
+/// Time-invariant features of M Gaussians and what they cost.
+#[derive(Clone, Debug)]
+pub struct SpatialFeatures {
+    /// Features [M, F].
+    pub values: Tensor<2>,
+    /// The work done for them.
+    pub work: FieldWork,
+}
+
+/// A deformation field: canonical Gaussians in, offsets at a time out (paper Section IV-B).
+///
+/// The time-invariant half is a call of its own so that playback can cache it; training recomputes it every step.
+pub trait DeformationField: Send {
+    /// Features of the canonical centres `means_world` [M,3]; no gradient flows to the centres.
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures>;
+    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F].
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
+    /// The weights, in a fixed order.
+    fn parameters(&self) -> Vec<&Parameter>;
+    /// The weights for the optimizer and for loading, in the same order.
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter>;
+    /// The optimizer groups that [`Parameter::group`] points into.
+    fn groups(&self) -> Vec<ParameterGroup>;
+    /// Whether playback may keep spatial features between frames.
+    fn caches_spatial(&self) -> bool {
+        true
+    }
+    /// Whether the field never moves anything, so that every stage may skip it.
+    fn is_static(&self) -> bool {
+        false
+    }
+    /// A regularisation term of the field's own, at `progress` in 0..1 of the main stage.
+    fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
+        Ok(None)
+    }
+    /// Bytes of the weights as float32, per part: (grid, net).
+    fn size_bytes(&self) -> (u64, u64) {
+        let sum = |part| self.parameters().iter().filter(|p| p.part == part).map(|p| 4 * p.shape.iter().product::<usize>() as u64).sum();
+        (sum(Part::Grid), sum(Part::Net))
+    }
+}
+
+/// A deformation field in the registry.
+pub struct FieldPlugin {
+    /// Facts for people, tables and checks.
+    pub info: Plugin,
+    /// Builds a fresh field. The table is the `[deformer]` section without `kind`; unknown keys are errors.
+    pub build: fn(&toml::Table, &FieldContext, &Device) -> Result<Box<dyn DeformationField>>,
+}
+inventory::collect!(FieldPlugin);

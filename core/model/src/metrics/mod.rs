@@ -1,0 +1,1 @@
+//! Image metrics, each with its protocol spelled out.

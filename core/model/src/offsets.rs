@@ -1,0 +1,69 @@
+//! What a deformation field returns, and the one function that applies it.
+
+use crate::Gaussians;
+use burn::tensor::{Int, Tensor};
+
+/// Time-dependent changes of M Gaussians (a row per Gaussian the field was asked about). Every head is optional.
+///
+/// Offsets are added to the raw parameters, before activation (paper Section IV-B, `facts` of Swift4D and 4DGS).
+#[derive(Clone, Debug, Default)]
+pub struct Offsets {
+    /// Change of the centres in world units [M,3].
+    pub means: Option<Tensor<2>>,
+    /// Change of the log-scales [M,3].
+    pub log_scales: Option<Tensor<2>>,
+    /// Change of the raw quaternions [M,4].
+    pub quaternions: Option<Tensor<2>>,
+    /// Change of the opacity logits [M].
+    pub opacity_logits: Option<Tensor<1>>,
+    /// Change of all spherical-harmonics coefficients, degree 0 first [M, (d+1)^2, 3].
+    pub sh: Option<Tensor<3>>,
+}
+
+impl Offsets {
+    /// Applies the offsets to the Gaussians `rows` [M]; `None` means that row i of the offsets belongs to Gaussian i.
+    /// Everything else is returned as it came.
+    pub fn apply(self, canonical: &Gaussians, rows: Option<&Tensor<1, Int>>) -> Gaussians {
+        let mut moved = canonical.clone();
+        moved.means = add(moved.means, self.means, rows);
+        moved.log_scales = add(moved.log_scales, self.log_scales, rows);
+        moved.quaternions = add(moved.quaternions, self.quaternions, rows);
+        moved.opacity_logits = add(moved.opacity_logits, self.opacity_logits, rows);
+        if let Some(sh) = self.sh {
+            let [m, k, _] = sh.dims();
+            let dc = sh.clone().slice([0..m, 0..1, 0..3]).reshape([m, 3]);
+            moved.sh_dc = add(moved.sh_dc, Some(dc), rows);
+            if k > 1 {
+                let rest = sh.slice([0..m, 1..k, 0..3]);
+                // A field may drive fewer degrees than the Gaussians store.
+                let stored = moved.sh_rest.dims()[1];
+                let rest = if stored > k - 1 {
+                    let padding = Tensor::zeros([m, stored - (k - 1), 3], &rest.device());
+                    Tensor::cat(vec![rest, padding], 1)
+                } else {
+                    rest.slice([0..m, 0..stored, 0..3])
+                };
+                moved.sh_rest = add(moved.sh_rest, Some(rest), rows);
+            }
+        }
+        moved
+    }
+    /// All heads side by side as one matrix [M, total width], for regularisers; `None` when every head is off.
+    pub fn concatenated(&self) -> Option<Tensor<2>> {
+        let mut parts: Vec<Tensor<2>> = Vec::new();
+        parts.extend(self.means.clone());
+        parts.extend(self.log_scales.clone());
+        parts.extend(self.quaternions.clone());
+        parts.extend(self.opacity_logits.clone().map(|o| o.unsqueeze_dim(1)));
+        parts.extend(self.sh.clone().map(|s| s.flatten(1, 2)));
+        if parts.is_empty() { None } else { Some(Tensor::cat(parts, 1)) }
+    }
+}
+
+fn add<const D: usize>(base: Tensor<D>, offset: Option<Tensor<D>>, rows: Option<&Tensor<1, Int>>) -> Tensor<D> {
+    match (offset, rows) {
+        (None, _) => base,
+        (Some(offset), None) => base + offset,
+        (Some(offset), Some(rows)) => base.select_assign(0, rows.clone(), offset, burn::tensor::IndexingUpdateOp::Add),
+    }
+}

@@ -1,0 +1,188 @@
+//! A scene: cameras, times, and lazily decoded 8-bit frames.
+
+use crate::{Camera, Error, Result};
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+
+/// Which side of the split a view is on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Split {
+    /// Seen in training.
+    Train,
+    /// Held out.
+    Test,
+}
+
+/// One picture of the scene: a camera at a time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct View {
+    /// Index into [`Scene::cameras`].
+    pub camera: usize,
+    /// Frame index, 0-based.
+    pub frame: usize,
+    /// Time in 0..1.
+    pub time_norm: f32,
+    /// Train or test.
+    pub split: Split,
+}
+
+/// An 8-bit picture, row-major, 3 (RGB) or 4 (RGBA, straight alpha) channels.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Image8 {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// 3 or 4.
+    pub channels: u32,
+    /// `width * height * channels` bytes.
+    pub data: Vec<u8>,
+}
+
+impl Image8 {
+    /// Linear planes [3,H,W] in 0..1, alpha composited over `background`.
+    pub fn to_planes(&self, background: [f32; 3]) -> Vec<f32> {
+        let pixels = (self.width * self.height) as usize;
+        let mut planes = vec![0.0f32; 3 * pixels];
+        let c = self.channels as usize;
+        for (i, px) in self.data.chunks_exact(c).enumerate() {
+            let a = if c == 4 { f32::from(px[3]) / 255.0 } else { 1.0 };
+            for k in 0..3 {
+                planes[k * pixels + i] = a * f32::from(px[k]) / 255.0 + (1.0 - a) * background[k];
+            }
+        }
+        planes
+    }
+    /// The RGB picture of planes [3,H,W]: clamped to 0..1, `value * 255 + 0.5` truncated (the protocol of published tables).
+    pub fn from_planes(planes: &[f32], width: u32, height: u32) -> Self {
+        let pixels = (width * height) as usize;
+        let mut data = vec![0u8; 3 * pixels];
+        for (i, px) in data.chunks_exact_mut(3).enumerate() {
+            for k in 0..3 {
+                px[k] = (planes[k * pixels + i].clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+            }
+        }
+        Self { width, height, channels: 3, data }
+    }
+}
+
+/// Initial points with colours, as structure from motion leaves them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PointCloud {
+    /// Positions in world units.
+    pub positions: Vec<[f32; 3]>,
+    /// Colours in 0..1.
+    pub colors: Vec<[f32; 3]>,
+}
+
+/// Decodes the picture of a view. Implementations read files or trace rays; they keep no cache of their own.
+pub trait FrameSource: Send + Sync {
+    /// The picture of `view`, already undistorted and at the size of its camera.
+    fn load(&self, view: usize) -> Result<Image8>;
+}
+
+/// A dynamic scene. Frames are decoded on demand and kept up to a byte cap.
+pub struct Scene {
+    /// A name for people.
+    pub name: String,
+    /// All cameras; a moving camera is one entry per pose.
+    pub cameras: Vec<Camera>,
+    /// All pictures, train and test.
+    pub views: Vec<View>,
+    /// Frames in the sequence (1 for a static scene).
+    pub frame_count: usize,
+    /// Points to start from, if the dataset has any.
+    pub points: Option<PointCloud>,
+    /// Where random points go when there are none: box corners in world units.
+    pub init_box: Option<([f32; 3], [f32; 3])>,
+    /// What the reader found odd and left out.
+    pub warnings: Vec<String>,
+    /// The background the dataset's pictures want (RGBA scenes), if it says.
+    pub background: Option<[f32; 3]>,
+    frames: FrameCache,
+}
+
+impl Scene {
+    /// A scene over `source`; frames are cached up to `cache_bytes`. Refuses a scene without training views, views that point nowhere, and bad cameras.
+    pub fn new(name: impl Into<String>, cameras: Vec<Camera>, views: Vec<View>, source: Arc<dyn FrameSource>, cache_bytes: u64) -> Result<Self> {
+        let name = name.into();
+        for camera in &cameras {
+            camera.validate()?;
+        }
+        if let Some(v) = views.iter().find(|v| v.camera >= cameras.len() || !v.time_norm.is_finite()) {
+            return Err(Error::data(name, format!("a view names camera {} of {} at time {}", v.camera, cameras.len(), v.time_norm), "Check the dataset's index files"));
+        }
+        if !views.iter().any(|v| v.split == Split::Train) {
+            return Err(Error::data(name, "there is no training view", "Check the path and that its pictures exist"));
+        }
+        let frame_count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
+        let frames = FrameCache { source, cap: cache_bytes, state: Mutex::default() };
+        Ok(Self { name, cameras, views, frame_count, points: None, init_box: None, warnings: Vec::new(), background: None, frames })
+    }
+    /// Indices of the views of `split`, in order.
+    pub fn split(&self, split: Split) -> Vec<usize> {
+        (0..self.views.len()).filter(|&i| self.views[i].split == split).collect()
+    }
+    /// The camera of a view.
+    pub fn camera(&self, view: usize) -> &Camera {
+        &self.cameras[self.views[view].camera]
+    }
+    /// The picture of a view, from the cache or decoded now.
+    pub fn frame(&self, view: usize) -> Result<Arc<Image8>> {
+        self.frames.get(view)
+    }
+    /// 1.1 x the largest distance of a training camera from their mean, the scale of position learning rates (Inria's `cameras_extent`).
+    pub fn extent(&self) -> f32 {
+        let centers: Vec<[f64; 3]> = self.split(Split::Train).iter().map(|&v| self.camera(v).center_world()).collect();
+        let n = centers.len().max(1) as f64;
+        let mean: [f64; 3] = std::array::from_fn(|k| centers.iter().map(|c| c[k]).sum::<f64>() / n);
+        let far = centers.iter().map(|c| (0..3).map(|k| (c[k] - mean[k]).powi(2)).sum::<f64>().sqrt()).fold(0.0, f64::max);
+        // A single camera has no spread; 1 keeps the learning rates meaningful.
+        if far > 1e-6 { (1.1 * far) as f32 } else { 1.0 }
+    }
+}
+
+struct FrameCache {
+    source: Arc<dyn FrameSource>,
+    cap: u64,
+    state: Mutex<CacheState>,
+}
+
+#[derive(Default)]
+struct CacheState {
+    frames: HashMap<usize, (Arc<Image8>, u64)>,
+    bytes: u64,
+    clock: u64,
+}
+
+impl FrameCache {
+    fn get(&self, view: usize) -> Result<Arc<Image8>> {
+        if let Ok(mut state) = self.state.lock() {
+            state.clock += 1;
+            let now = state.clock;
+            if let Some((image, used)) = state.frames.get_mut(&view) {
+                *used = now;
+                return Ok(image.clone());
+            }
+        }
+        // Decoded outside the lock, so that prefetching threads work side by side.
+        let image = Arc::new(self.source.load(view)?);
+        if let Ok(mut state) = self.state.lock() {
+            let size = image.data.len() as u64;
+            while state.bytes + size > self.cap {
+                let Some(oldest) = state.frames.iter().min_by_key(|(_, (_, used))| *used).map(|(&v, _)| v) else { break };
+                if let Some((old, _)) = state.frames.remove(&oldest) {
+                    state.bytes -= old.data.len() as u64;
+                }
+            }
+            if size <= self.cap && !state.frames.contains_key(&view) {
+                state.bytes += size;
+                let now = state.clock;
+                state.frames.insert(view, (image.clone(), now));
+            }
+        }
+        Ok(image)
+    }
+}

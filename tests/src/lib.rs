@@ -1,0 +1,1 @@
+//! cc4dgs-tests
