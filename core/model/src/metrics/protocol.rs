@@ -1,0 +1,147 @@
+//! A metric and everything its number depends on.
+
+use super::{Planes, SsimConvention, ms_ssim, psnr, ssim};
+use crate::{Error, Result, Split};
+use serde::{Deserialize, Serialize};
+
+/// Which formula.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MetricKind {
+    /// Peak signal-to-noise ratio in dB, MSE over all channels and pixels of a picture, mean over pictures.
+    Psnr,
+    /// Structural similarity.
+    Ssim,
+    /// Multi-scale structural similarity (pytorch-msssim, float64 window).
+    MsSsim,
+}
+
+/// What is done to pixel values before they are compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Rounding {
+    /// Both pictures are compared as they are.
+    Float,
+    /// Both are clamped to 0..1 and rounded to 256 levels, as if saved as PNG (the protocol of published tables).
+    EightBit,
+}
+
+/// The Gaussian window of SSIM and MS-SSIM, weights in float64.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Window {
+    /// Taps per axis.
+    pub taps: usize,
+    /// Standard deviation in pixels.
+    pub sigma: f64,
+}
+
+/// What a window sees beyond the border.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Padding {
+    /// Nothing: only windows inside the picture count.
+    Valid,
+    /// Zeros: every pixel is the centre of a window.
+    Zero,
+}
+
+/// Which pixels count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MaskRule {
+    /// All.
+    Whole,
+    /// Those set in a mask (for SSIM: windows centred on them).
+    Masked,
+}
+
+/// Which pictures of a scene were measured.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameSet {
+    /// The side of the split.
+    pub split: Split,
+    /// How many pictures the mean is over.
+    pub count: usize,
+    /// Every how many-th picture of the split was taken (1 is all).
+    pub stride: usize,
+}
+
+/// Everything a score depends on besides the pictures.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Protocol {
+    /// The formula.
+    pub metric: MetricKind,
+    /// The convention, where several are in use.
+    pub convention: Option<SsimConvention>,
+    /// The span from black to white.
+    pub data_range: f64,
+    /// Rounding before the comparison.
+    pub rounding: Rounding,
+    /// The window, for windowed metrics.
+    pub window: Option<Window>,
+    /// Its border rule.
+    pub padding: Option<Padding>,
+    /// Which pixels count.
+    pub mask: MaskRule,
+    /// Which pictures the mean is over, once known.
+    pub frames: Option<FrameSet>,
+}
+
+/// A metric whose number can be trusted because it carries its [`Protocol`]. Only its constructors make one, so the protocol is what is computed.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(transparent)]
+pub struct Metric {
+    protocol: Protocol,
+}
+
+impl Metric {
+    /// PSNR of data range 1.
+    pub fn psnr(rounding: Rounding) -> Self {
+        Self::new(MetricKind::Psnr, None, rounding, None, None)
+    }
+    /// SSIM of data range 1.
+    pub fn ssim(convention: SsimConvention, rounding: Rounding) -> Self {
+        Self::new(MetricKind::Ssim, Some(convention), rounding, Some(convention.window()), Some(convention.padding()))
+    }
+    /// MS-SSIM of data range 1.
+    pub fn ms_ssim(rounding: Rounding) -> Self {
+        Self::new(MetricKind::MsSsim, None, rounding, Some(SsimConvention::Skimage.window()), Some(Padding::Valid))
+    }
+    /// The same metric over masked pixels only.
+    pub fn masked(mut self) -> Self {
+        self.protocol.mask = MaskRule::Masked;
+        self
+    }
+    /// The same metric, recording which pictures its mean is over.
+    pub fn over(mut self, frames: FrameSet) -> Self {
+        self.protocol.frames = Some(frames);
+        self
+    }
+    /// What the score depends on.
+    pub fn protocol(&self) -> &Protocol {
+        &self.protocol
+    }
+    /// The score of `render` against `reference`, both planes [channels, height, width] in 0..1. A masked metric needs a mask [H,W], a whole one takes none.
+    pub fn score(&self, reference: &[f32], render: &[f32], shape: [usize; 3], mask: Option<&[bool]>) -> Result<f64> {
+        let [channels, height, width] = shape;
+        let planes = |values: &[f32]| match self.protocol.rounding {
+            Rounding::Float => Planes::from_f32(values, channels, height, width),
+            Rounding::EightBit => Planes::from_f32_rounded(values, channels, height, width),
+        };
+        if mask.is_some() != (self.protocol.mask == MaskRule::Masked) {
+            return Err(Error::parameter("metric mask", "the mask given and the protocol disagree", "Use Metric::masked() exactly when passing a mask"));
+        }
+        let (reference, render) = (planes(reference)?, planes(render)?);
+        match (self.protocol.metric, self.protocol.convention) {
+            (MetricKind::Psnr, _) => psnr(&reference, &render, mask),
+            (MetricKind::Ssim, convention) => ssim(&reference, &render, convention.unwrap_or(SsimConvention::Skimage), mask),
+            (MetricKind::MsSsim, _) if mask.is_some() => {
+                Err(Error::unsupported("MS-SSIM with a mask", "pooled scales have no agreed mask", "Use SSIM for masked pixels"))
+            }
+            (MetricKind::MsSsim, _) => ms_ssim(&reference, &render),
+        }
+    }
+    fn new(metric: MetricKind, convention: Option<SsimConvention>, rounding: Rounding, window: Option<Window>, padding: Option<Padding>) -> Self {
+        Self { protocol: Protocol { metric, convention, data_range: 1.0, rounding, window, padding, mask: MaskRule::Whole, frames: None } }
+    }
+}
