@@ -1,1 +1,16 @@
-//! cc4dgs-engine
+//! The engine: readers, initialisation, the three-stage trainer, checkpoints, playback, evaluation. It names no concrete plug-in.
+
+pub mod checkpoint;
+pub mod columns;
+pub mod config;
+pub mod data;
+pub mod densify;
+pub mod eval;
+pub mod init;
+pub mod knn;
+pub mod masks;
+pub mod model;
+pub mod pictures;
+pub mod play;
+pub mod schedule;
+pub mod train;

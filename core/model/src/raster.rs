@@ -29,6 +29,8 @@ pub enum ParameterSpace {
 }
 
 /// The colour of each Gaussian.
+// One value per render: boxing the larger variant would only cost an allocation.
+#[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug)]
 pub enum SplatColors {
     /// Spherical harmonics seen from the camera: max(0, SH(direction) + 0.5).

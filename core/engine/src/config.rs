@@ -1,0 +1,343 @@
+//! The configuration of a run: presets, files and overrides, read strictly.
+
+use crate::data::SceneOptions;
+use cc4dgs_core::{Error, Limits, Result, Rules, config, unknown_name};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Everything that decides a run. Written beside every result as `config.toml`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// Name of the preset it started from, for the record.
+    #[serde(default)]
+    pub preset: String,
+    /// Root of the seed tree.
+    #[serde(default)]
+    pub seed: u64,
+    /// Device name; see [`cc4dgs_core::parse_device`].
+    #[serde(default = "flex")]
+    pub device: String,
+    /// What readers may believe.
+    #[serde(default)]
+    pub limits: Limits,
+    /// How the scene is read.
+    #[serde(default)]
+    pub scene: SceneOptions,
+    /// How pictures are drawn.
+    #[serde(default)]
+    pub render: RenderConfig,
+    /// The rasterizer plug-in: `kind` and its settings.
+    #[serde(default = "tile")]
+    pub rasterizer: toml::Table,
+    /// The deformation field plug-in: `kind` and its settings.
+    #[serde(default = "cdf")]
+    pub deformer: toml::Table,
+    /// Where the first Gaussians come from.
+    #[serde(default)]
+    pub init: InitConfig,
+    /// The trainer.
+    #[serde(default)]
+    pub train: TrainConfig,
+}
+
+fn flex() -> String {
+    "flex".into()
+}
+fn tile() -> toml::Table {
+    toml::Table::from_iter([("kind".into(), "tile".into())])
+}
+fn cdf() -> toml::Table {
+    toml::Table::from_iter([("kind".into(), "cdf".into())])
+}
+
+/// How pictures are drawn, in training and afterwards.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RenderConfig {
+    /// Corner-case rules of projection and blending.
+    pub rules: Rules,
+    /// Mip-Splatting's 2D filter.
+    pub antialiased: bool,
+    /// Colour behind everything, RGB in 0..1.
+    pub background: [f32; 3],
+}
+
+impl Default for RenderConfig {
+    fn default() -> Self {
+        Self { rules: Rules::Gsplat099, antialiased: false, background: [1.0; 3] }
+    }
+}
+
+/// Where the first Gaussians come from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct InitConfig {
+    /// `auto` (the dataset's points, else photo-consistent ones if several cameras share a time, else random), `points`, `photo`, `random`.
+    pub source: String,
+    /// The most Gaussians to start with.
+    pub count: usize,
+    /// Opacity of a new Gaussian, 0..1.
+    pub opacity: f32,
+}
+
+impl Default for InitConfig {
+    fn default() -> Self {
+        Self { source: "auto".into(), count: 40_000, opacity: 0.1 }
+    }
+}
+
+/// The three-stage trainer (paper Section V; Swift4D's rules). Counts marked "reference" are iterations of the 28,000-iteration
+/// schedule and scale with [`TrainConfig::iterations`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// Iterations of all stages together: the one knob that scales every schedule.
+    pub iterations: usize,
+    /// Shares of coarse, score and main stage.
+    pub shares: [f64; 3],
+    /// Views per iteration.
+    pub batch: usize,
+    /// Frames the coarse stage sees: `first` or `all` (`all` where no time has several cameras).
+    pub coarse_frames: String,
+    /// Highest spherical-harmonics degree.
+    pub sh_degree: usize,
+    /// Reference iterations between two degrees.
+    pub sh_interval: usize,
+    /// Weight of L1; the rest goes to 1 - SSIM (the paper's lambda_c).
+    pub lambda_c: f32,
+    /// Smoothness weight at the end of its ramp (the paper's lambda_r); 0 is off.
+    pub lambda_r: f32,
+    /// Switch smoothness on only when flicker is measured.
+    pub smooth_auto: bool,
+    /// Flicker above which `smooth_auto` acts: rms second difference of the motion per frame over its rms amplitude.
+    pub flicker_threshold: f32,
+    /// Half-width of the smoothness perturbation, normalised units (the paper's delta).
+    pub smooth_delta: f32,
+    /// Dynamic-score threshold (the paper's zeta).
+    pub zeta: f32,
+    /// Temporal standard deviation over which a pixel counts as dynamic.
+    pub mask_threshold: f32,
+    /// `auto` (score where a camera has several frames, else all move), `score`, `all`, `none`.
+    pub dynamic: String,
+    /// Skip invisible Gaussians in Adam.
+    pub sparse_adam: bool,
+    /// Learning rates of the Gaussians.
+    pub lr: GaussianRates,
+    /// Adding and removing Gaussians.
+    pub densify: DensifyConfig,
+    /// Iterations between two log events.
+    pub log_every: usize,
+    /// Iterations between two checkpoints; 0 writes only the last one.
+    pub checkpoint_every: usize,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            iterations: 28_000,
+            shares: [5.0, 3.0, 20.0],
+            batch: 2,
+            coarse_frames: "first".into(),
+            sh_degree: 3,
+            sh_interval: 1000,
+            lambda_c: 0.8,
+            lambda_r: 0.05,
+            smooth_auto: true,
+            flicker_threshold: 0.5,
+            smooth_delta: 0.005,
+            zeta: 7.0,
+            mask_threshold: 0.02,
+            dynamic: "auto".into(),
+            sparse_adam: true,
+            lr: GaussianRates::default(),
+            densify: DensifyConfig::default(),
+            log_every: 10,
+            checkpoint_every: 5000,
+        }
+    }
+}
+
+/// Adam's learning rates per attribute (Inria's, as Swift4D uses them).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GaussianRates {
+    /// Positions at the first iteration of a stage, times the camera extent.
+    pub means: f64,
+    /// Positions at the last iteration of a stage, times the camera extent.
+    pub means_end: f64,
+    /// Log-scales.
+    pub log_scales: f64,
+    /// Quaternions.
+    pub quaternions: f64,
+    /// Opacity logits.
+    pub opacity: f64,
+    /// Degree-0 colour.
+    pub sh_dc: f64,
+    /// Higher colour coefficients.
+    pub sh_rest: f64,
+    /// Dynamic scores at the first iteration of their stage.
+    pub score: f64,
+    /// Attributes that plug-ins bring along.
+    pub extra: f64,
+}
+
+impl Default for GaussianRates {
+    fn default() -> Self {
+        Self { means: 1.6e-4, means_end: 1.6e-6, log_scales: 5e-3, quaternions: 1e-3, opacity: 0.05, sh_dc: 2.5e-3, sh_rest: 1.25e-4, score: 0.05, extra: 2.5e-3 }
+    }
+}
+
+/// Adding and removing Gaussians (Inria's rules, Swift4D's windows).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DensifyConfig {
+    /// Reference iteration of a stage at which it begins.
+    pub from: usize,
+    /// Reference iteration of the main stage at which it ends.
+    pub until: usize,
+    /// Reference iterations between two rounds.
+    pub every: usize,
+    /// Mean screen gradient (normalised device units) that asks for more Gaussians.
+    pub gradient: f32,
+    /// Share of the camera extent that separates clone from split.
+    pub dense_share: f32,
+    /// Gaussians fainter than this go.
+    pub min_opacity: f32,
+    /// Gaussians larger than this share of the extent go; 0 is off.
+    pub max_scale_share: f32,
+    /// Largest blending weight below which a Gaussian goes at a weight pruning.
+    pub min_weight: f32,
+    /// Reference iterations between two weight prunings; 0 is off.
+    pub weight_every: usize,
+    /// Reference iterations between two opacity resets of the coarse stage; 0 is off.
+    pub reset_every: usize,
+    /// No growth at or over this many.
+    pub max_gaussians: usize,
+}
+
+impl Default for DensifyConfig {
+    fn default() -> Self {
+        Self {
+            from: 500,
+            until: 10_000,
+            every: 100,
+            gradient: 2e-4,
+            dense_share: 0.01,
+            min_opacity: 0.005,
+            max_scale_share: 0.0,
+            min_weight: 0.02,
+            weight_every: 3000,
+            reset_every: 3000,
+            max_gaussians: 400_000,
+        }
+    }
+}
+
+/// The presets: name, summary, TOML.
+const PRESETS: [(&str, &str, &str); 7] = [
+    ("demo", "the built-in ray-traced scene, minutes on two cores", include_str!("../presets/demo.toml")),
+    ("n3dv", "Neural 3D Video, the paper's protocol", include_str!("../presets/n3dv.toml")),
+    ("technicolor", "Technicolor light field, the paper's protocol", include_str!("../presets/technicolor.toml")),
+    ("dnerf", "D-NeRF synthetic scenes at full protocol", include_str!("../presets/dnerf.toml")),
+    ("dnerf-cpu", "D-NeRF at 400x400 on two cores", include_str!("../presets/dnerf-cpu.toml")),
+    ("panoptic", "PanopticSports, all frames", include_str!("../presets/panoptic.toml")),
+    ("panoptic-cpu", "PanopticSports, 30 frames on two cores", include_str!("../presets/panoptic-cpu.toml")),
+];
+
+impl RunConfig {
+    /// Names and summaries of the presets.
+    pub fn presets() -> Vec<(&'static str, &'static str)> {
+        PRESETS.iter().map(|&(name, summary, _)| (name, summary)).collect()
+    }
+    /// Layers a preset, a TOML file and `key=value` overrides, in that order, and reads the result strictly.
+    pub fn resolve(preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
+        let mut table = toml::Table::new();
+        let from_file = match file {
+            Some(path) => {
+                let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+                config::parse_table(&path.display().to_string(), &text)?
+            }
+            None => toml::Table::new(),
+        };
+        let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
+        if let Some(name) = preset.map(str::to_string).or(named) {
+            let (_, _, text) = PRESETS.iter().find(|p| p.0 == name).ok_or_else(|| unknown_name("preset", &name, PRESETS.iter().map(|p| p.0)))?;
+            table = config::parse_table(&format!("preset {name}"), text)?;
+            table.insert("preset".into(), name.into());
+        }
+        config::merge(&mut table, &from_file);
+        for assignment in sets {
+            config::set(&mut table, assignment)?;
+        }
+        let resolved: Self = config::parse_section("configuration", &table)?;
+        resolved.validate()?;
+        Ok(resolved)
+    }
+    /// The configuration as TOML text; reading it back gives the same run.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string_pretty(self).map_err(|e| Error::parameter("configuration", e.to_string(), "Report this: every configuration should be printable"))
+    }
+    /// The colour behind everything: the scene's if it was set, else the renderer's.
+    pub fn background(&self) -> Result<[f32; 3]> {
+        self.scene.background.as_ref().map_or(Ok(self.render.background), |b| b.rgb())
+    }
+    fn validate(&self) -> Result<()> {
+        self.scene.validate()?;
+        let t = &self.train;
+        let bad = |key: &str, problem: String, remedy: &str| Err(Error::parameter(format!("train.{key}"), problem, remedy));
+        if t.iterations == 0 || t.iterations > 10_000_000 {
+            return bad("iterations", format!("{} is not in 1..10,000,000", t.iterations), "Choose the number of training iterations");
+        }
+        if t.batch == 0 || t.batch > 64 {
+            return bad("batch", format!("{} is not in 1..64", t.batch), "Choose the number of views per iteration");
+        }
+        if t.sh_degree > 4 {
+            return bad("sh_degree", format!("{} is over 4", t.sh_degree), "Choose a degree of 0 to 4");
+        }
+        if t.shares.iter().any(|s| !s.is_finite() || *s < 0.0) || t.shares.iter().sum::<f64>() <= 0.0 {
+            return bad("shares", format!("{:?} are not shares", t.shares), "Give three numbers of which one is positive");
+        }
+        if !(0.0..=1.0).contains(&t.lambda_c) {
+            return bad("lambda_c", format!("{} is not in 0..1", t.lambda_c), "It is the weight of L1 against 1 - SSIM");
+        }
+        one_of("train.coarse_frames", &t.coarse_frames, &["first", "all"])?;
+        one_of("train.dynamic", &t.dynamic, &["auto", "score", "all", "none"])?;
+        one_of("init.source", &self.init.source, &["auto", "points", "photo", "random"])?;
+        if self.render.background.iter().any(|c| !(0.0..=1.0).contains(c)) {
+            return Err(Error::parameter("render.background", format!("{:?} is not RGB in 0..1", self.render.background), "Give three numbers in 0..1"));
+        }
+        if !(self.init.opacity > 0.0 && self.init.opacity < 1.0) || self.init.count == 0 {
+            return Err(Error::parameter("init", format!("opacity {} count {}", self.init.opacity, self.init.count), "Opacity lies between 0 and 1, the count is positive"));
+        }
+        Ok(())
+    }
+}
+
+fn one_of(object: &str, value: &str, known: &[&str]) -> Result<()> {
+    if known.contains(&value) { Ok(()) } else { Err(unknown_name(object, value, known.iter().copied())) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_preset_parses_and_round_trips() {
+        for (name, _) in RunConfig::presets() {
+            let config = RunConfig::resolve(Some(name), None, &["train.iterations=7".into()]).unwrap();
+            assert_eq!(config.train.iterations, 7);
+            let text = config.to_toml().unwrap();
+            let again: RunConfig = config::parse_section("again", &text.parse().unwrap()).unwrap();
+            assert_eq!(again.to_toml().unwrap(), text);
+        }
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let e = RunConfig::resolve(Some("dnerf_cpu"), None, &[]).unwrap_err().to_string();
+        assert!(e.contains("dnerf-cpu"), "{e}");
+        let e = RunConfig::resolve(Some("demo"), None, &["train.iteratons=3".into()]).unwrap_err().to_string();
+        assert!(e.contains("iteratons"), "{e}");
+    }
+}

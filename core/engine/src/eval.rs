@@ -1,0 +1,178 @@
+//! Evaluation by the protocol of published tables: 8-bit pictures, metrics per image, then their means.
+
+use crate::model::{Model, ModelSize};
+use crate::play::{FrameTime, PlayWork, Player};
+use burn::tensor::Device;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::metrics::{self, Planes, SsimConvention, psnr, ssim};
+use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
+use serde::Serialize;
+
+/// Sizes in MB = 10^6 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct SizeMb {
+    /// Everything.
+    pub total: f64,
+    /// The field.
+    pub deform: f64,
+    /// The Gaussians.
+    pub point_cloud: f64,
+    /// Float32 size of the field's spatial encoding.
+    pub deform_grid_f32: f64,
+    /// Float32 size of the rest of the field.
+    pub deform_net_f32: f64,
+}
+
+impl From<ModelSize> for SizeMb {
+    fn from(s: ModelSize) -> Self {
+        let mb = |bytes: u64| bytes as f64 / 1e6;
+        Self { total: mb(s.total), deform: mb(s.deform), point_cloud: mb(s.point_cloud), deform_grid_f32: mb(s.deform_grid), deform_net_f32: mb(s.deform_net) }
+    }
+}
+
+/// Milliseconds per frame: the first frame (t = 0, spatial features computed) apart from the others.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct FrameMs {
+    /// Mean of a whole frame at t > 0.
+    pub mean: f64,
+    /// The field in the first frame.
+    pub field_first: f64,
+    /// The rasterizer in the first frame.
+    pub raster_first: f64,
+    /// The field, median of the other frames.
+    pub field: f64,
+    /// The rasterizer, median of the other frames.
+    pub raster: f64,
+}
+
+/// One picture's numbers.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ImageScore {
+    /// Index of the view in the scene.
+    pub view: usize,
+    /// The camera's name.
+    pub camera: String,
+    /// Frame index.
+    pub frame: usize,
+    /// Peak signal-to-noise ratio, 8-bit pictures, all pixels and channels.
+    pub psnr_db: f64,
+    /// Structural similarity, Inria's convention.
+    pub ssim: f64,
+    /// Milliseconds.
+    pub field_ms: f64,
+    /// Milliseconds.
+    pub raster_ms: f64,
+}
+
+/// The whole evaluation.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct EvalReport {
+    /// Scene name.
+    pub scene: String,
+    /// Which views.
+    pub split: Split,
+    /// Mean over images.
+    pub psnr_db: f64,
+    /// Mean over images, Inria's convention.
+    pub ssim: f64,
+    /// Mean over images, skimage's Gaussian convention.
+    pub ssim_skimage: f64,
+    /// Mean over images; absent where a picture is too small for five scales.
+    pub ms_ssim: Option<f64>,
+    /// Sizes.
+    pub size_mb: SizeMb,
+    /// Times.
+    pub frame_ms: FrameMs,
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Of which the field moves.
+    pub dynamic_gaussians: usize,
+    /// Work counted over all frames.
+    pub work: PlayWork,
+    /// What the numbers mean.
+    pub protocol: &'static str,
+    /// Per picture.
+    pub images: Vec<ImageScore>,
+}
+
+/// What [`evaluate`] hands to `on_image`: the view, the truth, the render, and their score.
+pub type OnImage<'a> = dyn FnMut(usize, &Image8, &Image8, &ImageScore) -> Result<()> + 'a;
+
+/// Renders every view of `split` (at most `max_views`, evenly spread; 0 is all) and scores it.
+pub fn evaluate(
+    model: &Model,
+    scene: &Scene,
+    split: Split,
+    max_views: usize,
+    registry: &Registry,
+    device: &Device,
+    events: &dyn EventSink,
+    on_image: &mut OnImage,
+) -> Result<EvalReport> {
+    let mut views = scene.split(split);
+    if max_views > 0 && views.len() > max_views {
+        views = (0..max_views).map(|i| views[i * views.len() / max_views]).collect();
+    }
+    if views.is_empty() {
+        return Err(cc4dgs_core::Error::parameter("--split", format!("{} has no view of split {split:?}", scene.name), "Evaluate the other split"));
+    }
+    let mut player = Player::new(model, registry, device)?;
+    let mut images = Vec::with_capacity(views.len());
+    let mut times: Vec<FrameTime> = Vec::with_capacity(views.len());
+    let (mut skimage, mut ms_ssim) = (0.0, Some(0.0));
+    for (done, &view) in views.iter().enumerate() {
+        let camera = scene.camera(view);
+        let (output, time) = player.render(camera, scene.views[view].time_norm)?;
+        let render = Image8::from_planes(&to_vec(output.image(), "render")?, camera.width, camera.height);
+        let frame = scene.frame(view)?;
+        // Both pictures are rounded to 8 bits before they are compared.
+        let truth = Image8::from_planes(&frame.to_planes(model.render.background), camera.width, camera.height);
+        let (a, b) = (Planes::from_image8(&truth)?, Planes::from_image8(&render)?);
+        skimage += ssim(&a, &b, SsimConvention::Skimage)?;
+        let multi_scale = metrics::ms_ssim(&a, &b).ok();
+        ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);
+        let score = ImageScore {
+            view,
+            camera: camera.name.clone(),
+            frame: scene.views[view].frame,
+            psnr_db: psnr(&a, &b)?,
+            ssim: ssim(&a, &b, SsimConvention::Inria)?,
+            field_ms: time.field_ms,
+            raster_ms: time.raster_ms,
+        };
+        on_image(view, &truth, &render, &score)?;
+        images.push(score);
+        times.push(time);
+        events.emit(&Event::Progress { task: "evaluate".into(), done: done as u64 + 1, total: views.len() as u64 });
+    }
+    let n = images.len() as f64;
+    let steady = if times.len() > 1 { &times[1..] } else { &times[..] };
+    let frame_ms = FrameMs {
+        mean: steady.iter().map(|t| t.field_ms + t.raster_ms).sum::<f64>() / steady.len() as f64,
+        field_first: times[0].field_ms,
+        raster_first: times[0].raster_ms,
+        field: median(steady.iter().map(|t| t.field_ms)),
+        raster: median(steady.iter().map(|t| t.raster_ms)),
+    };
+    Ok(EvalReport {
+        scene: scene.name.clone(),
+        split,
+        psnr_db: images.iter().map(|i| i.psnr_db).sum::<f64>() / n,
+        ssim: images.iter().map(|i| i.ssim).sum::<f64>() / n,
+        ssim_skimage: skimage / n,
+        ms_ssim: ms_ssim.map(|s| s / n),
+        size_mb: model.size.into(),
+        frame_ms,
+        gaussians: model.gaussians.len(),
+        dynamic_gaussians: player.moving(),
+        work: player.work,
+        protocol: "8-bit RGB pictures, range 255; PSNR over all pixels and channels; SSIM 11x11 Gaussian sigma 1.5, zero padding (Inria); means over images; times on the stated device, synchronised, first frame apart",
+        images,
+    })
+}
+
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_unstable_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}

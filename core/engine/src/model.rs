@@ -1,0 +1,218 @@
+//! A trained model: canonical Gaussians, the field that moves them, and how they want to be drawn.
+
+use crate::checkpoint;
+use crate::config::{RenderConfig, RunConfig};
+use crate::train::{CHECKPOINT, Moving};
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind, WeightArray, decode_weights, encode_weights};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{CodecContext, DeformationField, Error, EventSink, FieldContext, HostGaussians, Limits, Registry, Result, Seed, Stream, split_kind};
+use serde::Serialize;
+use std::io::Read;
+use std::path::Path;
+
+/// Name of the stream with the field's weights.
+const FIELD_STREAM: &str = "field.weights";
+
+/// A model, wherever it came from.
+pub struct Model {
+    /// The canonical Gaussians.
+    pub gaussians: HostGaussians,
+    /// The deformation field, absent from static models.
+    pub field: Option<ModelField>,
+    /// What may move.
+    pub moving: Moving,
+    /// How it wants to be drawn.
+    pub render: RenderConfig,
+    /// The `[rasterizer]` section.
+    pub rasterizer: toml::Table,
+    /// Frames in the sequence.
+    pub frame_count: usize,
+    /// Where it came from.
+    pub provenance: Provenance,
+    /// Bytes per share.
+    pub size: ModelSize,
+}
+
+/// A field with what is needed to build it again.
+pub struct ModelField {
+    /// The field.
+    pub field: Box<dyn DeformationField>,
+    /// Its `[deformer]` section.
+    pub section: toml::Table,
+    /// What it was built with.
+    pub context: FieldContext,
+}
+
+/// Sizes in bytes. For an archive these are bytes on disk, headers included in `total`; for a checkpoint the float32 size of what playback needs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct ModelSize {
+    /// Weights of the field: spatial encoding (the paper's Deform-Grid).
+    pub deform_grid: u64,
+    /// Weights of the field: everything else (the paper's Deform-Net).
+    pub deform_net: u64,
+    /// The field as stored.
+    pub deform: u64,
+    /// The Gaussians as stored.
+    pub point_cloud: u64,
+    /// Everything.
+    pub total: u64,
+}
+
+impl Model {
+    /// Loads a run's folder, a checkpoint file or a `.cc4d` archive; the first bytes decide which.
+    pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
+        let file = if path.is_dir() { path.join(CHECKPOINT) } else { path.to_path_buf() };
+        let mut head = [0u8; 8];
+        let read = std::fs::File::open(&file).and_then(|mut f| f.read(&mut head)).map_err(|e| Error::io(&file, e))?;
+        if read == 8 && head == MAGIC { Self::from_archive(&file, registry, device, limits, events) } else { Self::from_checkpoint(&file, registry, device, limits) }
+    }
+    fn from_checkpoint(path: &Path, registry: &Registry, device: &Device, limits: &Limits) -> Result<Self> {
+        let stored = checkpoint::load(path, registry, device, limits)?;
+        let config = stored.config().clone();
+        let (gaussians, moving, frame_count) = (stored.gaussians()?, stored.moving(), stored.frame_count());
+        let field = stored.into_field().map(|(field, section, context)| ModelField { field, section, context });
+        let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
+        let floats: usize = gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
+        let point_cloud = 4 * floats as u64;
+        let deform = deform_grid + deform_net;
+        Ok(Self {
+            gaussians,
+            field,
+            moving,
+            render: RenderConfig { background: config.background()?, ..config.render.clone() },
+            rasterizer: config.rasterizer.clone(),
+            frame_count,
+            provenance: provenance(&config)?,
+            size: ModelSize { deform_grid, deform_net, deform, point_cloud, total: deform + point_cloud },
+        })
+    }
+    fn from_archive(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
+        let archive = Archive::open(path, limits)?;
+        let object = path.display().to_string();
+        let manifest = archive.manifest().clone();
+        let spec = format!("{}:{}", manifest.codec.name, manifest.codec.profile);
+        let known = registry.codec(&manifest.codec.name)?.info.version;
+        check_version(&object, "codec", &manifest.codec.name, &manifest.codec.version, known)?;
+        let codec = registry.build_codec(&spec, &manifest.codec.settings)?;
+        let context = CodecContext { seed: codec_seed(manifest.provenance.seed), limits: *limits, events };
+        let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
+        gaussians.validate(&object, limits)?;
+        if gaussians.len() as u64 != manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
+            let problem = format!("the manifest says {} Gaussians of degree {}, the streams hold {} of degree {}", manifest.gaussian_count, manifest.sh_degree, gaussians.len(), gaussians.sh_degree);
+            return Err(Error::data(object, problem, "The archive is damaged; fetch it again"));
+        }
+        let field = match &manifest.deformer {
+            None => None,
+            Some(entry) => {
+                check_version(&object, "deformer", &entry.name, &entry.version, registry.deformer(&entry.name)?.info.version)?;
+                let mut section = entry.settings.clone();
+                section.insert("kind".into(), entry.name.clone().into());
+                let mut field = registry.build_deformer(&section, &entry.context, device)?;
+                let weights = decode_weights(&object, &archive.read_stream(FIELD_STREAM)?, limits)?;
+                load_weights(&object, field.as_mut(), weights, device)?;
+                Some(ModelField { field, section, context: entry.context.clone() })
+            }
+        };
+        let moving = match manifest.extra.get("moving") {
+            Some(value) => serde_json::from_value(value.clone()).map_err(|e| Error::data(&object, format!("moving: {e}"), "The archive is damaged; fetch it again"))?,
+            None => Moving::Scored { zeta: manifest.dynamic_threshold },
+        };
+        let mut rasterizer = manifest.rasterizer.settings.clone();
+        rasterizer.insert("kind".into(), manifest.rasterizer.name.clone().into());
+        let of_kind = |kind| archive.stream_sizes().iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();
+        let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
+        let size = ModelSize { deform_grid, deform_net, deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: archive.total_bytes()? };
+        Ok(Self {
+            gaussians,
+            field,
+            moving,
+            render: RenderConfig { rules: manifest.rasterizer.rules, antialiased: manifest.rasterizer.antialiased, background: manifest.background },
+            rasterizer,
+            frame_count: manifest.frame_count,
+            provenance: manifest.provenance.clone(),
+            size,
+        })
+    }
+    /// Writes a `.cc4d` archive with the codec `spec` (`name` or `name:profile`) and returns its size in bytes.
+    pub fn save_archive(&self, path: &Path, spec: &str, settings: &toml::Table, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
+        let codec = registry.build_codec(spec, settings)?;
+        let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
+        let context = CodecContext { seed: codec_seed(self.provenance.seed), limits: *limits, events };
+        let streams = codec.encode(&self.gaussians, &context)?;
+        // A field that moves nothing is not stored.
+        let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
+        let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
+        let deformer = match field {
+            None => None,
+            Some(f) => {
+                let (name, settings) = split_kind("deformer", &f.section)?;
+                let version = registry.deformer(&name)?.info.version.to_string();
+                Some(DeformerEntry { name, version, settings, context: f.context.clone() })
+            }
+        };
+        let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
+        let moving = if movable { self.moving } else { Moving::Nothing };
+        let axis = |k: usize, start: f32, pick: fn(f32, f32) -> f32| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
+        let corner = |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
+            std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k, start, pick) })
+        };
+        let manifest = Manifest {
+            codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
+            deformer,
+            rasterizer: RasterizerEntry { name: rasterizer, rules: self.render.rules, antialiased: self.render.antialiased, settings: rasterizer_settings },
+            frame_count: self.frame_count,
+            time_range: [0.0, 1.0],
+            box_world: [corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max)],
+            background: self.render.background,
+            sh_degree: self.gaussians.sh_degree,
+            dynamic_threshold: if let Moving::Scored { zeta } = moving { zeta } else { 0.0 },
+            gaussian_count: self.gaussians.len() as u64,
+            provenance: self.provenance.clone(),
+            extra: serde_json::Map::from_iter([(
+                "moving".to_string(),
+                serde_json::to_value(moving).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))?,
+            )]),
+            ..Default::default()
+        };
+        let mut writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams);
+        if let Some(f) = field {
+            writer = writer.add(StreamKind::Field, Stream { name: FIELD_STREAM.into(), bytes: encode_weights(&weights_of(f.field.as_ref())?)? });
+        }
+        writer.write_to(path)
+    }
+}
+
+fn codec_seed(root: u64) -> Seed {
+    Seed::root(root).child("codec")
+}
+
+fn check_version(object: &str, kind: &str, name: &str, stored: &str, known: &str) -> Result<()> {
+    if stored == known {
+        return Ok(());
+    }
+    Err(Error::unsupported(format!("{object}: {kind} {name}"), format!("version {stored} of its stored form"), format!("This program reads version {known}")))
+}
+
+fn weights_of(field: &dyn DeformationField) -> Result<Vec<WeightArray>> {
+    field.parameters().into_iter().map(|p| Ok(WeightArray { name: p.name.clone(), shape: p.shape.clone(), values: to_vec(p.value.clone(), &p.name)? })).collect()
+}
+
+fn load_weights(object: &str, field: &mut dyn DeformationField, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
+    let wanted: Vec<(String, Vec<usize>)> = field.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect();
+    let found: Vec<(String, Vec<usize>)> = weights.iter().map(|w| (w.name.clone(), w.shape.clone())).collect();
+    if wanted != found {
+        let odd = wanted.iter().zip(&found).find(|(a, b)| a != b).map_or_else(|| format!("{} arrays, {} expected", found.len(), wanted.len()), |(a, b)| format!("found {b:?}, expected {a:?}"));
+        return Err(Error::data(object, format!("field weights do not fit the field: {odd}"), "The archive is damaged or of another version of the deformer"));
+    }
+    for (parameter, array) in field.parameters_mut().into_iter().zip(weights) {
+        let len = array.values.len();
+        parameter.value = Tensor::from_data(TensorData::new(array.values, [len]), device);
+    }
+    Ok(())
+}
+
+fn provenance(config: &RunConfig) -> Result<Provenance> {
+    let table = config.to_toml()?.parse().unwrap_or_default();
+    Ok(Provenance { commit: option_env!("CC4DGS_COMMIT").unwrap_or_default().into(), seed: config.seed, device: config.device.clone(), config: table })
+}
