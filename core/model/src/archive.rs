@@ -1,1 +1,0 @@
-//! The `.cc4d` archive.

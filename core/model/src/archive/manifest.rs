@@ -1,0 +1,176 @@
+//! What an archive says of itself.
+
+use crate::raster::Rules;
+use crate::{Error, FieldContext, Limits, Result};
+use serde::{Deserialize, Serialize};
+
+/// The archive version this build writes and reads.
+pub const FORMAT_VERSION: u32 = 1;
+
+/// Which codec wrote the canonical streams.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CodecEntry {
+    /// Registry name.
+    pub name: String,
+    /// Profile, empty for the codec's default one.
+    pub profile: String,
+    /// The codec's own version ([`crate::Plugin::version`]).
+    pub version: String,
+    /// The settings it was built with.
+    pub settings: toml::Table,
+}
+
+/// Which deformation field the field streams belong to.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DeformerEntry {
+    /// Registry name.
+    pub name: String,
+    /// The field's own version.
+    pub version: String,
+    /// The settings it was built with, without `kind`.
+    pub settings: toml::Table,
+    /// What it was told of the scene.
+    pub context: FieldContext,
+}
+
+/// How the model wants to be drawn.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RasterizerEntry {
+    /// Registry name of the rasterizer used in training.
+    pub name: String,
+    /// The rules it was trained under.
+    pub rules: Rules,
+    /// Whether the antialiasing compensation was on.
+    pub antialiased: bool,
+    /// Its settings, without `kind`.
+    pub settings: toml::Table,
+}
+
+/// Where a model comes from. Nothing that changes between equal runs (no clock, no host name), so that equal runs write equal bytes.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Commit of the program, empty if unknown.
+    pub commit: String,
+    /// Root seed.
+    pub seed: u64,
+    /// Device name.
+    pub device: String,
+    /// The whole configuration of the run.
+    pub config: toml::Table,
+}
+
+/// The archive's manifest. Keys a reader does not know are ignored; additions of a writer go to `extra`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// [`FORMAT_VERSION`] of the writer.
+    pub format_version: u32,
+    /// The codec of the canonical streams.
+    pub codec: CodecEntry,
+    /// The deformation field; none for a static model.
+    pub deformer: Option<DeformerEntry>,
+    /// How to draw it.
+    pub rasterizer: RasterizerEntry,
+    /// Frames in the sequence, 1 for a static model.
+    pub frame_count: usize,
+    /// First and last normalised time.
+    pub time_range: [f32; 2],
+    /// Lower and upper corner of the model in world units.
+    pub box_world: [[f32; 3]; 2],
+    /// Background colour in 0..1 it was trained on.
+    pub background: [f32; 3],
+    /// Spherical-harmonics degree of the Gaussians.
+    pub sh_degree: usize,
+    /// A Gaussian is dynamic iff its score is above this (zeta of the paper).
+    pub dynamic_threshold: f32,
+    /// Gaussians in the canonical streams.
+    pub gaussian_count: u64,
+    /// Where it comes from.
+    pub provenance: Provenance,
+    /// Free for others.
+    #[serde(default)]
+    pub extra: serde_json::Map<String, serde_json::Value>,
+}
+
+impl Manifest {
+    /// The manifest as JSON. Refuses one that would not read back the same (numbers that are not finite).
+    pub fn to_json(&self) -> Result<Vec<u8>> {
+        let refuse = |problem: String| Error::parameter("archive manifest", problem, "Give finite numbers and plain TOML values");
+        let json = serde_json::to_vec(self).map_err(|e| refuse(e.to_string()))?;
+        let back: Self = serde_json::from_slice(&json).map_err(|e| refuse(format!("it would not read back: {e}")))?;
+        if &back == self { Ok(json) } else { Err(refuse("it would not read back unchanged".into())) }
+    }
+    /// Parses and checks JSON from outside; `object` names the file.
+    pub fn from_json(object: &str, json: &[u8], limits: &Limits) -> Result<Self> {
+        let object = format!("manifest of {object}");
+        check_depth(&object, json, limits.max_depth)?;
+        let manifest: Self = serde_json::from_slice(json).map_err(|e| damaged(&object, e.to_string()))?;
+        manifest.validate(&object, limits)?;
+        Ok(manifest)
+    }
+    fn validate(&self, object: &str, limits: &Limits) -> Result<()> {
+        if self.format_version != FORMAT_VERSION {
+            return Err(damaged(object, format!("format version {} differs from the file's version {FORMAT_VERSION}", self.format_version)));
+        }
+        limits.check_gaussians(object, self.gaussian_count)?;
+        if self.sh_degree > 4 {
+            return Err(damaged(object, format!("spherical-harmonics degree {} is over 4", self.sh_degree)));
+        }
+        if self.frame_count == 0 {
+            return Err(damaged(object, "frame_count is 0".into()));
+        }
+        let context = self.deformer.iter().flat_map(|d| d.context.box_min.iter().chain(&d.context.box_max));
+        let mut numbers = self.time_range.iter().chain(self.box_world.iter().flatten()).chain(&self.background).chain([&self.dynamic_threshold]).chain(context);
+        // A decimal beyond the range of f32 reads as infinity.
+        if let Some(v) = numbers.find(|v| !v.is_finite()) {
+            return Err(damaged(object, format!("a time, box, colour or threshold is {v}")));
+        }
+        Ok(())
+    }
+}
+
+fn damaged(object: &str, problem: String) -> Error {
+    Error::data(object, problem, "The file is damaged; fetch or write it again")
+}
+
+/// Refuses JSON nested deeper than `max_depth` before a recursive parser sees it.
+fn check_depth(object: &str, json: &[u8], max_depth: u32) -> Result<()> {
+    let (mut depth, mut in_string, mut escaped) = (0u32, false, false);
+    for &byte in json {
+        if in_string {
+            in_string = escaped || byte != b'"';
+            escaped = !escaped && byte == b'\\';
+            continue;
+        }
+        match byte {
+            b'"' => in_string = true,
+            b'{' | b'[' => {
+                depth += 1;
+                if depth > max_depth {
+                    return Err(Error::limit(object, u64::from(depth), u64::from(max_depth), "Raise limits.max_depth if the file is trusted"));
+                }
+            }
+            b'}' | b']' => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn depth_counts_brackets_outside_strings_only() {
+        assert!(check_depth("t", br#"{"a":"[[[[[\"[[[","b":[[1]]}"#, 3).is_ok());
+        assert!(check_depth("t", br#"{"a":[[[1]]]}"#, 3).is_err());
+        assert!(check_depth("t", br#"{"a":"\\","b":[[[1]]]}"#, 3).is_err());
+    }
+
+    #[test]
+    fn numbers_that_json_cannot_hold_are_refused() {
+        let sound = Manifest { format_version: FORMAT_VERSION, frame_count: 1, ..Default::default() };
+        assert!(sound.to_json().is_ok());
+        assert!(Manifest { dynamic_threshold: f32::NAN, ..sound }.to_json().is_err());
+    }
+}

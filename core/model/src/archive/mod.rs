@@ -1,0 +1,69 @@
+//! The `.cc4d` archive: one manifest and independent compressed streams.
+//!
+//! Layout (little-endian):
+//!
+//! ```text
+//!  0  magic      8 bytes   89 'C' 'C' '4' 'D' 0D 0A 1A
+//!  8  version    u32       1
+//! 12  header     u32       bytes of the header
+//! 16  checksum   u64       XXH3-64 of the header
+//! 24  header:    u32 + JSON manifest, u32 stream count, then per stream
+//!                u8 kind, u8 shuffle (0, 2 or 4), u8 encoding (0 stored, 1 Zstandard), u8 + name,
+//!                u64 decoded bytes, u64 stored bytes, u64 XXH3-64 of the stored bytes
+//!     streams, one after the other, in the order of the directory; nothing follows the last
+//! ```
+//!
+//! The directory is at the front and offsets follow from the stored lengths, so that one stream can be read alone and none can point
+//! outside the file. Kinds this version does not know are listed and skipped; versions it does not know are refused.
+
+mod bytes;
+mod manifest;
+mod packing;
+mod read;
+mod weights;
+mod write;
+
+pub use bytes::ByteReader;
+pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, Manifest, Provenance, RasterizerEntry};
+pub use packing::estimate_stored_len;
+pub use read::{Archive, StreamInfo};
+pub use weights::{WeightArray, decode_weights, encode_weights};
+pub use write::{ArchiveWriter, write_atomically};
+
+/// First bytes of every archive. The high bit, the line ends and the control character show transfers that mangled the file.
+pub const MAGIC: [u8; 8] = *b"\x89CC4D\r\n\x1a";
+
+/// Bytes before the header: magic, version, header length, header checksum.
+const PREFIX_BYTES: usize = 24;
+
+/// What a stream is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StreamKind {
+    /// Canonical Gaussians, written and read by the codec.
+    Canonical,
+    /// Weights of the deformation field.
+    Field,
+    /// Anything else a writer of this version added.
+    Meta,
+    /// A kind of a later writer; readers skip it.
+    Other(u8),
+}
+
+impl StreamKind {
+    fn code(self) -> u8 {
+        match self {
+            Self::Canonical => 0,
+            Self::Field => 1,
+            Self::Meta => 2,
+            Self::Other(code) => code,
+        }
+    }
+    fn from_code(code: u8) -> Self {
+        match code {
+            0 => Self::Canonical,
+            1 => Self::Field,
+            2 => Self::Meta,
+            other => Self::Other(other),
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! One stream's bytes, smaller: byte planes and Zstandard.
+
+use crate::{Error, Limits, Result};
+use std::io::Read;
+
+/// Zstandard's level for archives (paper Section IV-D names Zstandard; 19 is the highest level without long-window memory).
+const ZSTD_LEVEL: i32 = 19;
+/// The shuffle width is chosen on this many leading bytes of a stream: exact for short streams, cheap for long ones.
+const TRIAL_BYTES: usize = 1 << 20;
+/// Element sizes whose byte planes are tried.
+const SHUFFLES: [u8; 3] = [0, 2, 4];
+
+/// How the stored bytes of a stream are to be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Encoding {
+    Stored,
+    Zstd,
+}
+
+impl Encoding {
+    pub(super) fn code(self) -> u8 {
+        match self {
+            Self::Stored => 0,
+            Self::Zstd => 1,
+        }
+    }
+    pub(super) fn from_code(code: u8) -> Option<Self> {
+        match code {
+            0 => Some(Self::Stored),
+            1 => Some(Self::Zstd),
+            _ => None,
+        }
+    }
+}
+
+/// A stream as it is stored.
+pub(super) struct Packed {
+    pub(super) shuffle: u8,
+    pub(super) encoding: Encoding,
+    pub(super) bytes: Vec<u8>,
+}
+
+/// Packs `bytes` in the smallest form known.
+pub(super) fn pack(bytes: &[u8]) -> Result<Packed> {
+    let (shuffle, trial) = best_shuffle(bytes)?;
+    let compressed = if bytes.len() <= TRIAL_BYTES { trial } else { compress(&shuffled(bytes, shuffle))? };
+    if compressed.len() < bytes.len() {
+        Ok(Packed { shuffle, encoding: Encoding::Zstd, bytes: compressed })
+    } else {
+        Ok(Packed { shuffle: 0, encoding: Encoding::Stored, bytes: bytes.to_vec() })
+    }
+}
+
+/// About how many bytes a stream of these bytes takes in an archive (exact up to 1 MiB), for encoders that choose between forms.
+pub fn estimate_stored_len(bytes: &[u8]) -> Result<u64> {
+    let (_, trial) = best_shuffle(bytes)?;
+    let tried = bytes.len().clamp(1, TRIAL_BYTES) as f64;
+    Ok((trial.len() as f64 * (bytes.len() as f64 / tried)).min(bytes.len() as f64) as u64)
+}
+
+/// The width whose planes compress the leading bytes best (the plain order on a tie), and those bytes compressed.
+fn best_shuffle(bytes: &[u8]) -> Result<(u8, Vec<u8>)> {
+    let sample = &bytes[..bytes.len().min(TRIAL_BYTES)];
+    let mut best = (0, compress(sample)?);
+    for shuffle in SHUFFLES.into_iter().filter(|&s| s > 0 && sample.len() >= 2 * usize::from(s)) {
+        let trial = compress(&shuffled(sample, shuffle))?;
+        if trial.len() < best.1.len() {
+            best = (shuffle, trial);
+        }
+    }
+    Ok(best)
+}
+
+fn compress(bytes: &[u8]) -> Result<Vec<u8>> {
+    zstd::bulk::compress(bytes, ZSTD_LEVEL).map_err(|e| Error::backend("Zstandard", e.to_string(), "Free some memory and try again"))
+}
+
+/// Undoes [`pack`]: at most `decoded_len` bytes, which `limits` must allow; memory grows with the bytes that are really there.
+pub(super) fn unpack(object: &str, stored: Vec<u8>, encoding: Encoding, shuffle: u8, decoded_len: u64, limits: &Limits) -> Result<Vec<u8>> {
+    limits.check_bytes(object, decoded_len)?;
+    let damaged = |problem: String| Error::data(object, problem, "The file is damaged; fetch or write it again");
+    let planes = match encoding {
+        Encoding::Stored => stored,
+        Encoding::Zstd => {
+            let mut decoder = zstd::stream::read::Decoder::with_buffer(stored.as_slice()).map_err(|e| damaged(e.to_string()))?.single_frame();
+            // A frame may ask for no more window than its stream is long.
+            let window_log = (u64::BITS - decoded_len.leading_zeros() + 1).clamp(10, 31);
+            decoder.window_log_max(window_log).map_err(|e| damaged(e.to_string()))?;
+            let mut out = Vec::with_capacity(decoded_len.min(TRIAL_BYTES as u64) as usize);
+            decoder.by_ref().take(decoded_len.saturating_add(1)).read_to_end(&mut out).map_err(|e| damaged(format!("Zstandard says: {e}")))?;
+            let rest = decoder.finish();
+            if out.len() as u64 == decoded_len && !rest.is_empty() {
+                return Err(damaged(format!("{} bytes follow the Zstandard frame", rest.len())));
+            }
+            out
+        }
+    };
+    if planes.len() as u64 != decoded_len {
+        let seen = if planes.len() as u64 > decoded_len { "more".to_string() } else { planes.len().to_string() };
+        return Err(damaged(format!("{decoded_len} decoded bytes were declared, {seen} are there")));
+    }
+    Ok(unshuffled(planes, shuffle))
+}
+
+/// Byte planes of `width`-byte elements: all first bytes, all second bytes, ...; a last partial element follows as it is.
+fn shuffled(bytes: &[u8], width: u8) -> Vec<u8> {
+    let width = usize::from(width);
+    if width < 2 {
+        return bytes.to_vec();
+    }
+    let whole = bytes.len() - bytes.len() % width;
+    let mut out = Vec::with_capacity(bytes.len());
+    for plane in 0..width {
+        out.extend(bytes[..whole].iter().skip(plane).step_by(width));
+    }
+    out.extend_from_slice(&bytes[whole..]);
+    out
+}
+
+fn unshuffled(planes: Vec<u8>, width: u8) -> Vec<u8> {
+    let width = usize::from(width);
+    if width < 2 {
+        return planes;
+    }
+    let count = planes.len() / width;
+    let mut out = planes.clone();
+    for plane in 0..width {
+        for (i, &byte) in planes[plane * count..(plane + 1) * count].iter().enumerate() {
+            out[i * width + plane] = byte;
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn round_trip(bytes: &[u8]) -> Packed {
+        let packed = pack(bytes).unwrap();
+        let back = unpack("test", packed.bytes.clone(), packed.encoding, packed.shuffle, bytes.len() as u64, &Limits::default()).unwrap();
+        assert_eq!(back, bytes);
+        packed
+    }
+
+    #[test]
+    fn every_shape_of_stream_comes_back() {
+        for n in [0usize, 1, 3, 4, 5, 7, 8, 1000, 1001, 1002, 1003] {
+            round_trip(&(0..n).map(|i| (i * i % 251) as u8).collect::<Vec<_>>());
+        }
+        // Longer than the trial, so that the whole is packed by the choice made on its head.
+        let floats: Vec<u8> = (0..400_000).flat_map(|i| (1.0f32 + i as f32 * 1e-6).to_le_bytes()).collect();
+        let packed = round_trip(&floats);
+        assert_eq!(packed.shuffle, 4, "slowly varying floats belong in byte planes");
+    }
+
+    #[test]
+    fn noise_is_stored_as_it_is() {
+        let noise: Vec<u8> = (0u64..500).flat_map(|i| xxhash_rust::xxh3::xxh3_64(&i.to_le_bytes()).to_le_bytes()).collect();
+        assert_eq!(round_trip(&noise).encoding, Encoding::Stored);
+    }
+
+    #[test]
+    fn a_bomb_ends_at_its_declared_length() {
+        let bomb = compress(&vec![0u8; 50 << 20]).unwrap();
+        assert!(unpack("test", bomb.clone(), Encoding::Zstd, 0, 1000, &Limits::default()).is_err(), "its window alone is too large");
+        let e = unpack("test", compress(&[0u8; 1500]).unwrap(), Encoding::Zstd, 0, 1400, &Limits::default()).unwrap_err().to_string();
+        assert!(e.contains("1400 decoded bytes were declared, more are there"), "{e}");
+        let small = Limits { max_bytes: 1 << 20, ..Limits::default() };
+        let e = unpack("test", bomb, Encoding::Zstd, 0, 50 << 20, &small).unwrap_err().to_string();
+        assert!(e.contains("max_bytes"), "{e}");
+    }
+}

@@ -1,0 +1,191 @@
+//! Reading an archive: the front once, then any stream alone.
+
+use super::packing::{Encoding, unpack};
+use super::{ByteReader, FORMAT_VERSION, MAGIC, Manifest, PREFIX_BYTES, StreamKind};
+use crate::{Error, Limits, Result, Stream, registry};
+use rayon::prelude::*;
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
+use std::sync::Mutex;
+use xxhash_rust::xxh3::xxh3_64;
+
+/// One line of the directory.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StreamInfo {
+    /// The stream's name, unique in the archive.
+    pub name: String,
+    /// What it is for.
+    pub kind: StreamKind,
+    /// Bytes once decoded, as declared.
+    pub decoded_bytes: u64,
+    /// Bytes in the file.
+    pub stored_bytes: u64,
+}
+
+struct Entry {
+    info: StreamInfo,
+    shuffle: u8,
+    encoding: Encoding,
+    checksum: u64,
+    offset: u64,
+}
+
+enum Source {
+    File(Mutex<File>),
+    Memory(Vec<u8>),
+}
+
+impl Source {
+    fn len(&self, object: &str) -> Result<u64> {
+        match self {
+            Self::Memory(bytes) => Ok(bytes.len() as u64),
+            Self::File(file) => Ok(lock(file)?.metadata().map_err(|e| Error::io(object, e))?.len()),
+        }
+    }
+    /// `count` bytes from `offset`; the caller has checked both against the length.
+    fn read(&self, object: &str, offset: u64, count: u64) -> Result<Vec<u8>> {
+        let bytes = match self {
+            Self::Memory(bytes) => bytes.get(offset as usize..(offset + count) as usize).unwrap_or_default().to_vec(),
+            Self::File(file) => {
+                let mut file = lock(file)?;
+                file.seek(SeekFrom::Start(offset)).map_err(|e| Error::io(object, e))?;
+                let mut bytes = Vec::with_capacity(count as usize);
+                file.by_ref().take(count).read_to_end(&mut bytes).map_err(|e| Error::io(object, e))?;
+                bytes
+            }
+        };
+        if bytes.len() as u64 == count {
+            Ok(bytes)
+        } else {
+            Err(damaged(object, format!("{count} bytes expected at byte {offset}, {} are there", bytes.len())))
+        }
+    }
+}
+
+fn lock(file: &Mutex<File>) -> Result<std::sync::MutexGuard<'_, File>> {
+    file.lock().map_err(|_| Error::backend("archive", "a reader panicked before", "Open the archive again"))
+}
+
+fn damaged(object: &str, problem: String) -> Error {
+    Error::data(object, problem, "The file is damaged; fetch or write it again")
+}
+
+/// An open archive. The manifest and the directory are checked on opening, each stream when it is read.
+pub struct Archive {
+    object: String,
+    limits: Limits,
+    manifest: Manifest,
+    entries: Vec<Entry>,
+    source: Source,
+}
+
+impl Archive {
+    /// Opens the archive at `path` and reads its front. Nothing is allocated for what the file merely claims.
+    pub fn open(path: impl AsRef<Path>, limits: &Limits) -> Result<Self> {
+        let path = path.as_ref();
+        let file = File::open(path).map_err(|e| Error::io(path, e))?;
+        Self::from_source(path.display().to_string(), Source::File(Mutex::new(file)), limits)
+    }
+    /// Reads an archive in memory; `object` names it in errors.
+    pub fn from_bytes(object: impl Into<String>, bytes: Vec<u8>, limits: &Limits) -> Result<Self> {
+        Self::from_source(object.into(), Source::Memory(bytes), limits)
+    }
+    fn from_source(object: String, source: Source, limits: &Limits) -> Result<Self> {
+        let total = source.len(&object)?;
+        if total < PREFIX_BYTES as u64 {
+            return Err(damaged(&object, format!("{total} bytes are fewer than the {PREFIX_BYTES} an archive begins with")));
+        }
+        let prefix = source.read(&object, 0, PREFIX_BYTES as u64)?;
+        let mut reader = ByteReader::new(object.clone(), &prefix);
+        if reader.take(8)? != MAGIC {
+            return Err(Error::data(object, "it does not begin like a .cc4d archive", "Check the path; transfers in text mode also damage archives"));
+        }
+        let version = reader.u32()?;
+        if version != FORMAT_VERSION {
+            return Err(Error::unsupported(object, format!("archive version {version} is not {FORMAT_VERSION}"), "Use a release of cc4dgs that knows it"));
+        }
+        let (header_len, checksum) = (u64::from(reader.u32()?), reader.u64()?);
+        limits.check_bytes(&format!("header of {object}"), header_len)?;
+        if header_len > total - PREFIX_BYTES as u64 {
+            return Err(damaged(&object, format!("a header of {header_len} bytes is claimed in a file of {total}")));
+        }
+        let header = source.read(&object, PREFIX_BYTES as u64, header_len)?;
+        if xxh3_64(&header) != checksum {
+            return Err(damaged(&object, "the checksum of the header does not match".into()));
+        }
+        let mut reader = ByteReader::new(format!("header of {object}"), &header);
+        let manifest_len = reader.u32()? as usize;
+        let manifest = Manifest::from_json(&object, reader.take(manifest_len)?, limits)?;
+        let entries = read_directory(&mut reader, PREFIX_BYTES as u64 + header_len, total)?;
+        reader.finish()?;
+        Ok(Self { object, limits: *limits, manifest, entries, source })
+    }
+    /// What the archive says of itself.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+    /// The directory, in file order.
+    pub fn stream_sizes(&self) -> Vec<StreamInfo> {
+        self.entries.iter().map(|e| e.info.clone()).collect()
+    }
+    /// The size of the whole file in bytes.
+    pub fn total_bytes(&self) -> Result<u64> {
+        self.source.len(&self.object)
+    }
+    /// Reads, checks and decodes one stream.
+    pub fn read_stream(&self, name: &str) -> Result<Vec<u8>> {
+        match self.entries.iter().find(|e| e.info.name == name) {
+            Some(entry) => self.read_entry(entry),
+            None => Err(registry::unknown_name(&format!("{}: stream", self.object), name, self.entries.iter().map(|e| e.info.name.as_str()))),
+        }
+    }
+    /// Reads all streams of `kind`, in file order.
+    pub fn read_kind(&self, kind: StreamKind) -> Result<Vec<Stream>> {
+        let entries: Vec<&Entry> = self.entries.iter().filter(|e| e.info.kind == kind).collect();
+        entries.into_par_iter().map(|e| Ok(Stream { name: e.info.name.clone(), bytes: self.read_entry(e)? })).collect()
+    }
+    fn read_entry(&self, entry: &Entry) -> Result<Vec<u8>> {
+        let object = format!("stream '{}' of {}", entry.info.name, self.object);
+        self.limits.check_bytes(&object, entry.info.decoded_bytes)?;
+        self.limits.check_bytes(&object, entry.info.stored_bytes)?;
+        let stored = self.source.read(&object, entry.offset, entry.info.stored_bytes)?;
+        if xxh3_64(&stored) != entry.checksum {
+            return Err(damaged(&object, "its checksum does not match".into()));
+        }
+        unpack(&object, stored, entry.encoding, entry.shuffle, entry.info.decoded_bytes, &self.limits)
+    }
+}
+
+/// The directory; stored lengths must fill the file from `start` to `total` exactly.
+fn read_directory(reader: &mut ByteReader, start: u64, total: u64) -> Result<Vec<Entry>> {
+    let count = reader.u32()?;
+    // Grown entry by entry: the count is a claim, the bytes behind it are not.
+    let mut entries = Vec::new();
+    let (mut offset, mut names) = (start, BTreeSet::new());
+    for _ in 0..count {
+        let (kind, shuffle, encoding) = (StreamKind::from_code(reader.u8()?), reader.u8()?, reader.u8()?);
+        let name_len = usize::from(reader.u8()?);
+        let name = reader.name(name_len)?;
+        let (decoded_bytes, stored_bytes, checksum) = (reader.u64()?, reader.u64()?, reader.u64()?);
+        let Some(encoding) = Encoding::from_code(encoding).filter(|_| matches!(shuffle, 0 | 2 | 4)) else {
+            return Err(reader.error(format!("stream '{name}' has encoding {encoding} and shuffle {shuffle}, which version {FORMAT_VERSION} does not have")));
+        };
+        if encoding == Encoding::Stored && decoded_bytes != stored_bytes {
+            return Err(reader.error(format!("stream '{name}' is stored plainly in {stored_bytes} bytes but declares {decoded_bytes}")));
+        }
+        if stored_bytes > total - offset {
+            return Err(reader.error(format!("stream '{name}' claims {stored_bytes} bytes, {} are left", total - offset)));
+        }
+        if !names.insert(name.clone()) {
+            return Err(reader.error(format!("two streams are called '{name}'")));
+        }
+        entries.push(Entry { info: StreamInfo { name, kind, decoded_bytes, stored_bytes }, shuffle, encoding, checksum, offset });
+        offset += stored_bytes;
+    }
+    if offset != total {
+        return Err(reader.error(format!("{} bytes follow the last stream", total - offset)));
+    }
+    Ok(entries)
+}

@@ -1,0 +1,98 @@
+//! Writing an archive, deterministically and all or nothing.
+
+use super::packing::pack;
+use super::{FORMAT_VERSION, MAGIC, Manifest, StreamKind};
+use crate::{Error, Result, Stream};
+use rayon::prelude::*;
+use std::io::Write;
+use std::path::Path;
+use xxhash_rust::xxh3::xxh3_64;
+
+/// Collects a manifest and streams and writes them as one archive. Equal inputs give equal bytes.
+pub struct ArchiveWriter {
+    manifest: Manifest,
+    streams: Vec<(StreamKind, Stream)>,
+}
+
+impl ArchiveWriter {
+    /// An archive without streams; the manifest's format version is set to this build's.
+    pub fn new(manifest: Manifest) -> Self {
+        Self { manifest: Manifest { format_version: FORMAT_VERSION, ..manifest }, streams: Vec::new() }
+    }
+    /// Adds a stream. Names must be unique in the archive and 1 to 255 bytes long; [`ArchiveWriter::to_bytes`] checks them.
+    pub fn add(mut self, kind: StreamKind, stream: Stream) -> Self {
+        self.streams.push((kind, stream));
+        self
+    }
+    /// Adds several streams of one kind.
+    pub fn add_all(mut self, kind: StreamKind, streams: impl IntoIterator<Item = Stream>) -> Self {
+        self.streams.extend(streams.into_iter().map(|s| (kind, s)));
+        self
+    }
+    /// The archive in memory.
+    pub fn to_bytes(&self) -> Result<Vec<u8>> {
+        let refuse = |name: &str, problem: &str| Error::parameter(format!("archive stream '{name}'"), problem, "Rename the stream");
+        let mut names: Vec<&str> = self.streams.iter().map(|(_, s)| s.name.as_str()).collect();
+        names.sort_unstable();
+        if let Some(pair) = names.windows(2).find(|w| w[0] == w[1]) {
+            return Err(refuse(pair[0], "the name is taken"));
+        }
+        if let Some(name) = names.iter().find(|n| n.is_empty() || n.len() > 255 || n.chars().any(char::is_control)) {
+            return Err(refuse(name, "the name is empty, over 255 bytes or not printable"));
+        }
+        let packed = self.streams.par_iter().map(|(_, s)| pack(&s.bytes)).collect::<Result<Vec<_>>>()?;
+        let manifest = self.manifest.to_json()?;
+        let mut header = Vec::with_capacity(manifest.len() + 64 * packed.len());
+        header.extend((manifest.len() as u32).to_le_bytes());
+        header.extend(&manifest);
+        header.extend((packed.len() as u32).to_le_bytes());
+        for ((kind, stream), packed) in self.streams.iter().zip(&packed) {
+            header.extend([kind.code(), packed.shuffle, packed.encoding.code(), stream.name.len() as u8]);
+            header.extend(stream.name.as_bytes());
+            header.extend((stream.bytes.len() as u64).to_le_bytes());
+            header.extend((packed.bytes.len() as u64).to_le_bytes());
+            header.extend(xxh3_64(&packed.bytes).to_le_bytes());
+        }
+        let header_len = u32::try_from(header.len())
+            .map_err(|_| Error::limit("archive header", header.len() as u64, u64::from(u32::MAX), "Shorten the manifest's configuration and extras"))?;
+        let mut out = Vec::with_capacity(super::PREFIX_BYTES + header.len() + packed.iter().map(|p| p.bytes.len()).sum::<usize>());
+        out.extend(MAGIC);
+        out.extend(FORMAT_VERSION.to_le_bytes());
+        out.extend(header_len.to_le_bytes());
+        out.extend(xxh3_64(&header).to_le_bytes());
+        out.extend(header);
+        for packed in packed {
+            out.extend(packed.bytes);
+        }
+        Ok(out)
+    }
+    /// Writes the archive to `path` and returns its size in bytes. On any failure `path` is what it was before.
+    pub fn write_to(&self, path: impl AsRef<Path>) -> Result<u64> {
+        let bytes = self.to_bytes()?;
+        write_atomically(path, &bytes)?;
+        Ok(bytes.len() as u64)
+    }
+}
+
+/// Writes `bytes` to a temporary name in the folder of `path`, flushes them to the disk and renames. On any failure `path` is what it was before.
+pub fn write_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
+    let path = path.as_ref();
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".cc4dgs-").suffix(".part");
+    // Temporary files are private by default; the result should have the permissions any new file gets.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file = builder.tempfile_in(folder).map_err(|e| Error::io(folder, e))?;
+    file.write_all(bytes).map_err(|e| Error::io(path, e))?;
+    file.as_file().sync_all().map_err(|e| Error::io(path, e))?;
+    file.persist(path).map_err(|e| Error::io(path, e.error))?;
+    // The rename itself becomes durable with the folder; systems that cannot open a folder do without.
+    if let Ok(folder) = std::fs::File::open(folder) {
+        folder.sync_all().ok();
+    }
+    Ok(())
+}
