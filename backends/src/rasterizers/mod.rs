@@ -1,1 +1,5 @@
 //! The rasterizers made of the operations.
+
+pub mod reference;
+mod settings;
+pub mod tile;

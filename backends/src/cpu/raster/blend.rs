@@ -1,0 +1,244 @@
+//! Front-to-back blending of one tile's list, a row of the tile at a time.
+
+use super::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
+use super::parallel::{SharedMut, run_tasks};
+use super::scratch::{Entry, Workspace, set_len};
+use super::{RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
+use crate::cpu::simd::{Lanes, dispatch};
+use pulp::{Simd, WithSimd};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Sigma up to which the exponential is evaluated; alpha is far below 1/255 beyond.
+pub const SIGMA_MAX: f32 = 87.0;
+/// Planes of the output.
+const PLANES: usize = 5;
+
+/// Numbers per pixel of one tile, row-major.
+pub type TilePlane = [f32; TILE_PIXELS];
+
+/// Pixel centres of the columns of a tile at `origin_x`.
+#[inline(always)]
+pub fn column_centers(origin_x: usize) -> [f32; TILE] {
+    std::array::from_fn(|x| (origin_x + x) as f32 + 0.5)
+}
+
+/// Blends every tile into `planes` [5,H,W] and keeps what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
+pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, planes: &mut [f32]) -> u64 {
+    let tiles_x = settings.width.div_ceil(TILE);
+    let tiles = tiles_x * settings.height.div_ceil(TILE);
+    let buffers = &mut **workspace;
+    set_len(&mut buffers.tile_end, tiles);
+    set_len(&mut buffers.tile_stops, tiles);
+    set_len(&mut buffers.final_transmittance, tiles * TILE_PIXELS);
+    set_len(&mut buffers.stop_at, tiles * TILE_PIXELS);
+    if settings.max_weights {
+        set_len(&mut buffers.pair_weights, buffers.list.len());
+        buffers.pair_weights.fill(0.0);
+    }
+    let pixels = settings.width * settings.height;
+    let planes = SharedMut::new(planes);
+    let ends = SharedMut::new(&mut buffers.tile_end);
+    let stops = SharedMut::new(&mut buffers.tile_stops);
+    let transmittance = SharedMut::new(&mut buffers.final_transmittance);
+    let stop_at = SharedMut::new(&mut buffers.stop_at);
+    let weights = SharedMut::new(&mut buffers.pair_weights);
+    let (list, starts, ranked, order) = (&buffers.list, &buffers.tile_start, &buffers.ranked, &buffers.tile_order);
+    let evaluations = AtomicU64::new(0);
+    run_tasks(tiles, |position| {
+        let tile = order[position] as usize;
+        let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
+        let list = &list[starts[tile] as usize..starts[tile + 1] as usize];
+        // SAFETY: every tile has its own part of these.
+        let (transmittance, stop_at) =
+            unsafe { (transmittance.slice(tile * TILE_PIXELS, TILE_PIXELS), stop_at.slice(tile * TILE_PIXELS, TILE_PIXELS)) };
+        let mut state = TileState::new(origin, settings, stop_at);
+        if settings.max_weights {
+            dispatch(BlendTile::<true> { ranked, list, origin, rules, state: &mut state, weights });
+        } else {
+            dispatch(BlendTile::<false> { ranked, list, origin, rules, state: &mut state, weights });
+        }
+        evaluations.fetch_add(state.evaluations, Ordering::Relaxed);
+        // SAFETY: as above.
+        unsafe {
+            ends.slice(tile, 1)[0] = state.end;
+            stops.slice(tile, 1)[0] = u32::from(state.stops);
+        }
+        for (pixel, left) in transmittance.iter_mut().enumerate() {
+            // A running transmittance of NaN marks a stopped pixel.
+            let running = state.running[pixel];
+            *left = if running.is_nan() { state.stopped[pixel] } else { running };
+        }
+        let width = TILE.min(settings.width - origin[0]);
+        for row in 0..TILE.min(settings.height - origin[1]) {
+            let from = (origin[1] + row) * settings.width + origin[0];
+            for plane in 0..PLANES {
+                // SAFETY: pixels belong to one tile.
+                let out = unsafe { planes.slice(plane * pixels + from, width) };
+                for (x, value) in out.iter_mut().enumerate() {
+                    let pixel = row * TILE + x;
+                    *value = match plane {
+                        3 => 1.0 - transmittance[pixel],
+                        4 => state.sums[3][pixel],
+                        c => state.sums[c][pixel] + transmittance[pixel] * background[c],
+                    };
+                }
+            }
+        }
+    });
+    evaluations.into_inner()
+}
+
+/// The largest weight of each of `n` Gaussians over all its pairs.
+pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
+    let mut out = vec![0.0f32; n];
+    for (rank, splat) in workspace.ranked.iter().enumerate() {
+        let records = workspace.record_start[rank] as usize..workspace.record_start[rank + 1] as usize;
+        out[splat.index as usize] = workspace.pair_weights[records].iter().fold(0.0, |a, &b| a.max(b));
+    }
+    out
+}
+
+/// Running numbers of one tile.
+struct TileState<'a> {
+    /// Transmittance so far; NaN where the pixel has stopped or lies outside the image.
+    running: TilePlane,
+    /// Transmittance of stopped pixels.
+    stopped: TilePlane,
+    /// Red, green, blue, depth so far.
+    sums: [TilePlane; 4],
+    /// List position where a pixel stopped.
+    stop_at: &'a mut [u32],
+    /// Bits of rows with a running pixel.
+    alive: u32,
+    /// Whether `stop_at` holds.
+    stops: bool,
+    /// Entries looked at.
+    end: u32,
+    evaluations: u64,
+}
+
+impl<'a> TileState<'a> {
+    fn new(origin: [usize; 2], settings: &RasterSettings, stop_at: &'a mut [u32]) -> Self {
+        let (width, height) = (TILE.min(settings.width - origin[0]), TILE.min(settings.height - origin[1]));
+        let partial = width < TILE || height < TILE;
+        let mut state = Self {
+            running: [1.0; TILE_PIXELS],
+            stopped: [1.0; TILE_PIXELS],
+            sums: [[0.0; TILE_PIXELS]; 4],
+            stop_at,
+            alive: (1 << height) - 1,
+            stops: false,
+            end: 0,
+            evaluations: 0,
+        };
+        if partial {
+            state.start_stopping();
+            for pixel in 0..TILE_PIXELS {
+                if pixel % TILE >= width || pixel / TILE >= height {
+                    state.running[pixel] = f32::NAN;
+                    state.stop_at[pixel] = 0;
+                }
+            }
+        }
+        state
+    }
+    /// From here on `stop_at` is read.
+    #[cold]
+    fn start_stopping(&mut self) {
+        if !self.stops {
+            self.stops = true;
+            self.stop_at.fill(u32::MAX);
+        }
+    }
+    /// Stops the running pixels of `row` that the Gaussian at list position `i` would take to the stop value or below.
+    #[cold]
+    #[inline(never)]
+    fn stop_pixels(&mut self, row: usize, first: usize, stopping: &[f32], i: u32) {
+        self.start_stopping();
+        for (lane, &stops) in stopping.iter().enumerate() {
+            let pixel = row * TILE + first + lane;
+            if stops != 0.0 {
+                self.stopped[pixel] = self.running[pixel];
+                self.running[pixel] = f32::NAN;
+                self.stop_at[pixel] = i;
+            }
+        }
+        if self.running[row * TILE..(row + 1) * TILE].iter().all(|t| t.is_nan()) {
+            self.alive &= !(1 << row);
+        }
+    }
+}
+
+struct BlendTile<'k, 'a, const WEIGHTS: bool> {
+    ranked: &'k [ScreenSplat],
+    list: &'k [Entry],
+    origin: [usize; 2],
+    rules: &'k RuleConstants,
+    state: &'k mut TileState<'a>,
+    weights: SharedMut<'k, f32>,
+}
+
+impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
+    type Output = ();
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let Self { ranked, list, origin, rules, state, weights } = self;
+        let like = |v: f32| Lanes::<S>::splat(simd, v);
+        let columns = column_centers(origin[0]);
+        let origin_y = origin[1] as f32 + 0.5;
+        let (cap, least, stop, limit) = (like(rules.alpha_max), like(ALPHA_MIN), like(TRANSMITTANCE_STOP), like(SIGMA_MAX));
+        let one = like(1.0);
+        for (i, entry) in list.iter().enumerate() {
+            let splat = &ranked[entry.rank as usize];
+            let rows = entry.row_mask() & state.alive;
+            state.evaluations += u64::from(rows.count_ones()) * TILE as u64;
+            let [half_a, b, half_c] = splat.conic;
+            let a = like(half_a);
+            let opacity = like(splat.opacity);
+            let color = splat.color.map(like);
+            let depth = like(splat.depth);
+            let mut largest = like(0.0);
+            for block in 0..TILE / S::F32_LANES {
+                let first = block * S::F32_LANES;
+                let dx = Lanes::load(simd, &columns[first..]) - splat.center[0];
+                let mut left = rows;
+                while left != 0 {
+                    let row = left.trailing_zeros() as usize;
+                    left &= left - 1;
+                    let at = row * TILE + first;
+                    let dy = origin_y + row as f32 - splat.center[1];
+                    let sigma = a.fma(dx, like(b * dy)).fma(dx, like(half_c * dy * dy));
+                    let alpha = (opacity * sigma.exp_negated()).min(cap);
+                    let hit = sigma.bits_le(limit) & alpha.ge(least);
+                    let before = Lanes::load(simd, &state.running[at..]);
+                    let after = alpha.nfma(before, before);
+                    let drawn = hit & after.gt(stop);
+                    let weight = drawn.keep(alpha * before);
+                    for (sum, value) in state.sums.iter_mut().zip([color[0], color[1], color[2], depth]) {
+                        weight.fma(value, Lanes::load(simd, &sum[at..])).store(&mut sum[at..]);
+                    }
+                    drawn.select(after, before).store(&mut state.running[at..]);
+                    if WEIGHTS {
+                        largest = largest.max(weight);
+                    }
+                    // False for pixels that have stopped already: they hold NaN.
+                    let stopping = hit & after.le(stop);
+                    if stopping.any() {
+                        let mut flags = [0.0f32; TILE];
+                        stopping.keep(one).store(&mut flags);
+                        state.stop_pixels(row, first, &flags[..S::F32_LANES], i as u32);
+                    }
+                }
+            }
+            if WEIGHTS {
+                // SAFETY: a record belongs to one pair.
+                unsafe { weights.slice(entry.record as usize, 1)[0] = largest.largest() };
+            }
+            if state.alive == 0 {
+                state.end = i as u32 + 1;
+                return;
+            }
+        }
+        state.end = list.len() as u32;
+    }
+}

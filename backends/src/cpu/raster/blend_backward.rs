@@ -1,0 +1,196 @@
+//! Back-to-front derivative of blending, one tile at a time.
+//!
+//! With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i the part of the loss behind it,
+//! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = d loss / d
+//! sigma times powers of dx and dy; dx is constant per column, so its powers are applied once after the rows.
+
+use super::blend::{SIGMA_MAX, TilePlane, column_centers};
+use super::camera::{ALPHA_MIN, RuleConstants};
+use super::parallel::{SharedMut, run_tasks};
+use super::scratch::{Entry, Workspace, set_len};
+use super::{RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
+use crate::cpu::simd::{Lanes, dispatch};
+use pulp::{Simd, WithSimd};
+
+/// Fills the gradient records of all pairs from `upstream` [5,H,W].
+pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32]) {
+    let rules = RuleConstants::new(settings.rules);
+    let tiles_x = settings.width.div_ceil(TILE);
+    let buffers = &mut **workspace;
+    set_len(&mut buffers.records, buffers.list.len());
+    let records = SharedMut::new(&mut buffers.records);
+    let (list, starts, ranked, order) = (&buffers.list, &buffers.tile_start, &buffers.ranked, &buffers.tile_order);
+    let (ends, stops) = (&buffers.tile_end, &buffers.tile_stops);
+    let (transmittance, stop_at) = (&buffers.final_transmittance, &buffers.stop_at);
+    run_tasks(order.len(), |position| {
+        let tile = order[position] as usize;
+        let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
+        let list = &list[starts[tile] as usize..starts[tile + 1] as usize];
+        let pixels = tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS;
+        let mut state = TileGradient::new(origin, settings, background, upstream, &transmittance[pixels.clone()]);
+        let end = if state.live_rows == 0 { 0 } else { ends[tile] as usize };
+        for entry in &list[end..] {
+            // SAFETY: a record belongs to one pair, a pair to one tile.
+            unsafe { records.slice(entry.record as usize, 1)[0] = [0.0; RECORD] };
+        }
+        let kernel = BackTile { ranked, list: &list[..end], origin, rules: &rules, state: &mut state, stop_at: &stop_at[pixels], records };
+        match (stops[tile] != 0, kernel.state.depth_matters) {
+            (false, false) => dispatch(Flags::<false, false>(kernel)),
+            (false, true) => dispatch(Flags::<false, true>(kernel)),
+            (true, false) => dispatch(Flags::<true, false>(kernel)),
+            (true, true) => dispatch(Flags::<true, true>(kernel)),
+        }
+    });
+}
+
+/// Upstream gradients and running numbers of one tile.
+struct TileGradient {
+    /// Upstream of red, green, blue, depth.
+    upstream: [TilePlane; 4],
+    /// Transmittance behind the Gaussian at hand.
+    running: TilePlane,
+    /// The loss's part behind the Gaussian at hand.
+    behind: TilePlane,
+    /// Bits of rows with any upstream gradient.
+    live_rows: u32,
+    depth_matters: bool,
+}
+
+impl TileGradient {
+    fn new(origin: [usize; 2], settings: &RasterSettings, background: [f32; 3], upstream: &[f32], transmittance: &[f32]) -> Self {
+        let zero = [0.0; TILE_PIXELS];
+        let mut state = Self { upstream: [zero; 4], running: [1.0; TILE_PIXELS], behind: zero, live_rows: 0, depth_matters: false };
+        state.running.copy_from_slice(transmittance);
+        let (width, height) = (TILE.min(settings.width - origin[0]), TILE.min(settings.height - origin[1]));
+        let plane = settings.width * settings.height;
+        for row in 0..height {
+            let from = (origin[1] + row) * settings.width + origin[0];
+            let at = row * TILE;
+            for (k, source) in [0, 1, 2, 4].into_iter().enumerate() {
+                state.upstream[k][at..at + width].copy_from_slice(&upstream[source * plane + from..][..width]);
+            }
+            let alpha = &upstream[3 * plane + from..][..width];
+            let mut any = false;
+            for x in 0..width {
+                let g: [f32; 4] = std::array::from_fn(|k| state.upstream[k][at + x]);
+                state.depth_matters |= g[3] != 0.0;
+                any |= g.iter().any(|&v| v != 0.0) || alpha[x] != 0.0;
+                let shown = background[0] * g[0] + background[1] * g[1] + background[2] * g[2] - alpha[x];
+                state.behind[at + x] = state.running[at + x] * shown;
+            }
+            state.live_rows |= u32::from(any) << row;
+        }
+        state
+    }
+}
+
+struct BackTile<'k> {
+    ranked: &'k [ScreenSplat],
+    list: &'k [Entry],
+    origin: [usize; 2],
+    rules: &'k RuleConstants,
+    state: &'k mut TileGradient,
+    stop_at: &'k [u32],
+    records: SharedMut<'k, [f32; RECORD]>,
+}
+
+/// Whether pixels of the tile stopped early, and whether depth carries gradient.
+struct Flags<'k, const STOPS: bool, const DEPTH: bool>(BackTile<'k>);
+
+impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> {
+    type Output = ();
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let BackTile { ranked, list, origin, rules, state, stop_at, records } = self.0;
+        let stop_at: &[f32] = bytemuck::cast_slice(stop_at);
+        let like = |v: f32| Lanes::<S>::splat(simd, v);
+        let columns = column_centers(origin[0]);
+        let origin_y = origin[1] as f32 + 0.5;
+        let (cap, least, limit, one, zero) = (like(rules.alpha_max), like(ALPHA_MIN), like(SIGMA_MAX), like(1.0), like(0.0));
+        // Largest uncapped alpha whose gradient passes.
+        let passing = like(if rules.pass_capped { f32::MAX } else { rules.alpha_max });
+        for (i, entry) in list.iter().enumerate().rev() {
+            let splat = &ranked[entry.rank as usize];
+            let rows = entry.row_mask() & state.live_rows;
+            let [half_a, b, half_c] = splat.conic;
+            let a = like(half_a);
+            let opacity = like(splat.opacity);
+            let color = splat.color.map(like);
+            let depth = like(splat.depth);
+            let position = like(f32::from_bits(i as u32 + 1));
+            let mut record = [0.0f32; RECORD];
+            for block in 0..TILE / S::F32_LANES {
+                let first = block * S::F32_LANES;
+                let dx = Lanes::load(simd, &columns[first..]) - splat.center[0];
+                // Sums over rows of v, v dy, v dy^2, weight times upstream colour and depth.
+                let mut v_sum = zero;
+                let mut v_dy = zero;
+                let mut v_dy2 = zero;
+                let mut shown = [zero; 4];
+                let mut left = rows;
+                while left != 0 {
+                    let row = left.trailing_zeros() as usize;
+                    left &= left - 1;
+                    let at = row * TILE + first;
+                    let dy = origin_y + row as f32 - splat.center[1];
+                    let sigma = a.fma(dx, like(b * dy)).fma(dx, like(half_c * dy * dy));
+                    let full = opacity * sigma.exp_negated();
+                    let mut hit = sigma.bits_le(limit) & full.ge(least);
+                    if STOPS {
+                        // i < stop_at, on integers.
+                        hit = hit & position.bits_le(Lanes::load(simd, &stop_at[at..]));
+                        if !hit.any() {
+                            continue;
+                        }
+                    }
+                    let alpha = hit.keep(full.min(cap));
+                    let inverse = one / (one - alpha);
+                    let before = Lanes::load(simd, &state.running[at..]) * inverse;
+                    before.store(&mut state.running[at..]);
+                    let weight = alpha * before;
+                    let g: [Lanes<S>; 3] = std::array::from_fn(|c| Lanes::load(simd, &state.upstream[c][at..]));
+                    let mut q = color[0].fma(g[0], color[1].fma(g[1], color[2] * g[2]));
+                    if DEPTH {
+                        let g_depth = Lanes::load(simd, &state.upstream[3][at..]);
+                        q = depth.fma(g_depth, q);
+                        shown[3] = weight.fma(g_depth, shown[3]);
+                    }
+                    let behind = Lanes::load(simd, &state.behind[at..]);
+                    let d_alpha = before.fma(q, -(behind * inverse));
+                    weight.fma(q, behind).store(&mut state.behind[at..]);
+                    // d alpha / d sigma = -alpha, uncapped.
+                    let v = (hit & full.le(passing)).keep(full) * d_alpha;
+                    let dy = like(dy);
+                    let moment = v * dy;
+                    v_sum += v;
+                    v_dy += moment;
+                    v_dy2 = moment.fma(dy, v_dy2);
+                    for c in 0..3 {
+                        shown[c] = weight.fma(g[c], shown[c]);
+                    }
+                }
+                let v_dx = v_sum * dx;
+                let sums = [v_sum, v_dx, v_dx * dx, v_dy, v_dy * dx, v_dy2, shown[0], shown[1], shown[2]].map(Lanes::sum);
+                let [v, x, xx, y, xy, yy, red, green, blue] = sums;
+                // v was -d loss / d sigma: the signs turn here. dx is pixel minus centre.
+                let part = [
+                    2.0 * half_a * x + b * y,
+                    b * x + 2.0 * half_c * y,
+                    -0.5 * xx,
+                    -xy,
+                    -0.5 * yy,
+                    v / splat.opacity,
+                    red,
+                    green,
+                    blue,
+                    if DEPTH { shown[3].sum() } else { 0.0 },
+                ];
+                for (sum, value) in record.iter_mut().zip(part) {
+                    *sum += value;
+                }
+            }
+            // SAFETY: a record belongs to one pair.
+            unsafe { records.slice(entry.record as usize, 1)[0] = record };
+        }
+    }
+}

@@ -1,0 +1,233 @@
+//! EWA projection of Gaussians, a vector of them at a time, and its derivative.
+//!
+//! With M = R S (rotation times scales) the projected covariance is U U^T + blur, U = J W M being 2x3. The unblurred determinant is then
+//! |U0 x U1|^2 and the blurred one a sum of positive terms, so neither cancels for needles.
+
+use super::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION};
+use crate::cpu::simd::{Lanes, Mask};
+use pulp::Simd;
+
+/// Three numbers per Gaussian.
+pub type Vec3<S> = [Lanes<S>; 3];
+
+#[inline(always)]
+fn dot<S: Simd>(a: Vec3<S>, b: Vec3<S>) -> Lanes<S> {
+    a[0].fma(b[0], a[1].fma(b[1], a[2] * b[2]))
+}
+
+#[inline(always)]
+fn cross<S: Simd>(a: Vec3<S>, b: Vec3<S>) -> Vec3<S> {
+    std::array::from_fn(|k| {
+        let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+        a[j].nfma(b[i], a[i] * b[j])
+    })
+}
+
+/// A unit quaternion (w,x,y,z) as a rotation matrix, by rows.
+#[inline(always)]
+pub fn rotation<S: Simd>(q: [Lanes<S>; 4]) -> [Vec3<S>; 3] {
+    let [w, x, y, z] = q;
+    let one = w.like(1.0);
+    let two = w.like(2.0);
+    let diagonal = |a: Lanes<S>, b: Lanes<S>| two.nfma(a.fma(a, b * b), one);
+    [
+        [diagonal(y, z), two * x.fma(y, -(w * z)), two * x.fma(z, w * y)],
+        [two * x.fma(y, w * z), diagonal(x, z), two * y.fma(z, -(w * x))],
+        [two * x.fma(z, -(w * y)), two * y.fma(z, w * x), diagonal(x, y)],
+    ]
+}
+
+/// Gradient of a raw quaternion from that of the rotation matrix; `unit` is the normalised one and `inverse_norm` 1 / its former norm.
+#[inline(always)]
+pub fn rotation_backward<S: Simd>(unit: [Lanes<S>; 4], inverse_norm: Lanes<S>, d: [Vec3<S>; 3]) -> [Lanes<S>; 4] {
+    let [w, x, y, z] = unit;
+    let minus_two = w.like(-2.0);
+    let g = [
+        x * (d[2][1] - d[1][2]) + y * (d[0][2] - d[2][0]) + z * (d[1][0] - d[0][1]),
+        minus_two * x * (d[1][1] + d[2][2]) + y * (d[0][1] + d[1][0]) + z * (d[0][2] + d[2][0]) + w * (d[2][1] - d[1][2]),
+        x * (d[0][1] + d[1][0]) + minus_two * y * (d[0][0] + d[2][2]) + z * (d[1][2] + d[2][1]) + w * (d[0][2] - d[2][0]),
+        x * (d[0][2] + d[2][0]) + y * (d[1][2] + d[2][1]) + minus_two * z * (d[0][0] + d[1][1]) + w * (d[1][0] - d[0][1]),
+    ];
+    // The matrix is quadratic in the quaternion: a factor 2 in all; then the part along the quaternion is projected out.
+    let along = g[0].fma(w, g[1].fma(x, g[2].fma(y, g[3] * z)));
+    let factor = inverse_norm * 2.0;
+    std::array::from_fn(|k| unit[k].nfma(along, g[k]) * factor)
+}
+
+/// A projected vector of Gaussians with everything its derivative needs.
+pub struct Projection<S: Simd> {
+    /// Centre in camera axes, world units.
+    pub point: Vec3<S>,
+    /// Centre in the image, pixels.
+    pub center: [Lanes<S>; 2],
+    /// Covariance in square pixels with the blur: xx, xy, yy.
+    pub covariance: Vec3<S>,
+    /// Its determinant.
+    pub determinant: Lanes<S>,
+    /// (A,B,C) of sigma = (A dx^2 + C dy^2) / 2 + B dx dy.
+    pub conic: Vec3<S>,
+    /// sqrt(determinant before the blur / after), at least 0.005.
+    pub compensation: Lanes<S>,
+    /// Squared norm of the raw quaternion.
+    pub norm_squared: Lanes<S>,
+    unit: [Lanes<S>; 4],
+    inverse_norm: Lanes<S>,
+    rotation: [Vec3<S>; 3],
+    scales: Vec3<S>,
+    turned: [Vec3<S>; 3],
+    scaled: [Vec3<S>; 3],
+    rows: [Vec3<S>; 2],
+    raw_covariance: Vec3<S>,
+    raw_determinant: Lanes<S>,
+    inverse_depth: Lanes<S>,
+    ratio: [Lanes<S>; 2],
+    inside: [Mask<S>; 2],
+}
+
+/// Projects Gaussians of centres `mean`, raw quaternions `quaternion` and linear scales `scales`.
+#[inline(always)]
+pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [Lanes<S>; 4], scales: Vec3<S>) -> Projection<S> {
+    let like = |v: f32| mean[0].like(v);
+    let w: [Vec3<S>; 3] = camera.rotation.map(|row| row.map(like));
+    let point: Vec3<S> = std::array::from_fn(|i| w[i][0].fma(mean[0], w[i][1].fma(mean[1], w[i][2].fma(mean[2], like(camera.translation[i])))));
+    let inverse_depth = like(1.0) / point[2];
+    let [q0, q1, q2, q3] = quaternion;
+    let norm_squared = q0.fma(q0, q1.fma(q1, q2.fma(q2, q3 * q3)));
+    let inverse_norm = like(1.0) / norm_squared.sqrt();
+    let unit = quaternion.map(|v| v * inverse_norm);
+    let rotation = rotation(unit);
+    let turned: [Vec3<S>; 3] =
+        std::array::from_fn(|i| std::array::from_fn(|j| w[i][0].fma(rotation[0][j], w[i][1].fma(rotation[1][j], w[i][2] * rotation[2][j]))));
+    let scaled: [Vec3<S>; 3] = std::array::from_fn(|i| std::array::from_fn(|j| turned[i][j] * scales[j]));
+    let raw_ratio = [point[0] * inverse_depth, point[1] * inverse_depth];
+    let limits = camera.ratio_limits.map(|pair| pair.map(like));
+    let ratio: [Lanes<S>; 2] = std::array::from_fn(|k| raw_ratio[k].max(limits[k][0]).min(limits[k][1]));
+    let inside: [Mask<S>; 2] = std::array::from_fn(|k| raw_ratio[k].ge(limits[k][0]) & raw_ratio[k].le(limits[k][1]));
+    let rows: [Vec3<S>; 2] = std::array::from_fn(|k| {
+        let scale = inverse_depth * camera.focal[k];
+        // J's third column is -f x / z^2 = -(f / z) (x / z).
+        std::array::from_fn(|j| scale * ratio[k].nfma(scaled[2][j], scaled[k][j]))
+    });
+    let (xx, xy, yy) = (dot(rows[0], rows[0]), dot(rows[0], rows[1]), dot(rows[1], rows[1]));
+    let normal = cross(rows[0], rows[1]);
+    let raw_determinant = dot(normal, normal);
+    let determinant = raw_determinant + (xx + yy).fma(like(EPS_2D), like(EPS_2D * EPS_2D));
+    let inverse = like(1.0) / determinant;
+    let covariance = [xx + EPS_2D, xy, yy + EPS_2D];
+    Projection {
+        point,
+        center: std::array::from_fn(|k| raw_ratio[k].fma(like(camera.focal[k]), like(camera.principal[k]))),
+        covariance,
+        determinant,
+        conic: [covariance[2] * inverse, -(xy * inverse), covariance[0] * inverse],
+        compensation: (raw_determinant * inverse).max(like(MIN_COMPENSATION * MIN_COMPENSATION)).sqrt(),
+        norm_squared,
+        unit,
+        inverse_norm,
+        rotation,
+        scales,
+        turned,
+        scaled,
+        rows,
+        raw_covariance: [xx, xy, yy],
+        raw_determinant,
+        inverse_depth,
+        ratio,
+        inside,
+    }
+}
+
+/// What flows into a [`Projection`].
+pub struct ProjectionGradient<S: Simd> {
+    /// d loss / d centre in pixels.
+    pub center: [Lanes<S>; 2],
+    /// d loss / d (A,B,C).
+    pub conic: Vec3<S>,
+    /// d loss / d camera depth.
+    pub depth: Lanes<S>,
+    /// d loss / d compensation.
+    pub compensation: Lanes<S>,
+}
+
+/// What flows out of a [`Projection`].
+pub struct GeometryGradient<S: Simd> {
+    /// d loss / d centre in world units.
+    pub mean: Vec3<S>,
+    /// d loss / d raw quaternion.
+    pub quaternion: [Lanes<S>; 4],
+    /// d loss / d linear scale.
+    pub scales: Vec3<S>,
+    /// d loss / d camera rotation, by rows.
+    pub camera_rotation: [Vec3<S>; 3],
+    /// d loss / d camera translation.
+    pub camera_translation: Vec3<S>,
+}
+
+/// The derivative of [`project`].
+#[inline(always)]
+pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Projection<S>, g: &ProjectionGradient<S>) -> GeometryGradient<S> {
+    let like = |v: f32| mean[0].like(v);
+    let w: [Vec3<S>; 3] = camera.rotation.map(|row| row.map(like));
+    // The conic is the inverse of the covariance: d covariance = -K G K with G the symmetric gradient.
+    let [a, b, c] = p.conic;
+    let half = g.conic[1] * 0.5;
+    let left = [a.fma(g.conic[0], b * half), a.fma(half, b * g.conic[2]), b.fma(g.conic[0], c * half), b.fma(half, c * g.conic[2])];
+    let mut d_xx = -left[0].fma(a, left[1] * b);
+    // Half the gradient of the off-diagonal entry, which appears twice.
+    let d_xy = -left[0].fma(b, left[1] * c);
+    let mut d_yy = -left[2].fma(b, left[3] * c);
+    // Compensation^2 = raw determinant / determinant, where that is over its floor.
+    let inverse = like(1.0) / p.determinant;
+    let share = p.raw_determinant * inverse;
+    let alive = share.gt(like(MIN_COMPENSATION * MIN_COMPENSATION));
+    let d_share = alive.keep(g.compensation * 0.5 / p.compensation) * inverse;
+    let d_raw = d_share * (like(1.0) - share);
+    let d_trace = -(d_share * share * EPS_2D);
+    d_xx += d_trace;
+    d_yy += d_trace;
+    let [xx, xy, yy] = p.raw_covariance;
+    // raw determinant = xx yy - xy^2.
+    let m = [d_raw.fma(yy, d_xx), d_raw.nfma(xy, d_xy), d_raw.fma(xx, d_yy)];
+    let two = like(2.0);
+    let d_rows: [Vec3<S>; 2] = [
+        std::array::from_fn(|j| two * m[0].fma(p.rows[0][j], m[1] * p.rows[1][j])),
+        std::array::from_fn(|j| two * m[1].fma(p.rows[0][j], m[2] * p.rows[1][j])),
+    ];
+    // rows[k] = (f_k / z) (scaled[k] - ratio_k scaled[2]).
+    let scale: [Lanes<S>; 2] = std::array::from_fn(|k| p.inverse_depth * camera.focal[k]);
+    let mut d_point = [like(0.0), like(0.0), g.depth];
+    let mut d_scaled = [[like(0.0); 3]; 3];
+    for k in 0..2 {
+        d_scaled[k] = d_rows[k].map(|v| v * scale[k]);
+        let ratio = p.ratio[k];
+        for j in 0..3 {
+            d_scaled[2][j] = d_scaled[k][j].nfma(ratio, d_scaled[2][j]);
+        }
+        let d_ratio_row = -dot(d_scaled[k], p.scaled[2]);
+        // 1/z scales the whole row.
+        d_point[2] = (dot(d_rows[k], p.rows[k]) * p.inverse_depth).nfma(like(1.0), d_point[2]);
+        // The clamped ratio passes no gradient; the projected centre always does.
+        let d_ratio = g.center[k].fma(like(camera.focal[k]), p.inside[k].keep(d_ratio_row));
+        let step = d_ratio * p.inverse_depth;
+        d_point[k] = step;
+        let raw_ratio = p.point[k] * p.inverse_depth;
+        d_point[2] = step.nfma(raw_ratio, d_point[2]);
+    }
+    let mut d_scales = [like(0.0); 3];
+    let mut d_turned = [[like(0.0); 3]; 3];
+    for j in 0..3 {
+        d_scales[j] = d_scaled[0][j].fma(p.turned[0][j], d_scaled[1][j].fma(p.turned[1][j], d_scaled[2][j] * p.turned[2][j]));
+        for i in 0..3 {
+            d_turned[i][j] = d_scaled[i][j] * p.scales[j];
+        }
+    }
+    let d_rotation: [Vec3<S>; 3] =
+        std::array::from_fn(|i| std::array::from_fn(|j| w[0][i].fma(d_turned[0][j], w[1][i].fma(d_turned[1][j], w[2][i] * d_turned[2][j]))));
+    GeometryGradient {
+        mean: std::array::from_fn(|i| w[0][i].fma(d_point[0], w[1][i].fma(d_point[1], w[2][i] * d_point[2]))),
+        quaternion: rotation_backward(p.unit, p.inverse_norm, d_rotation),
+        scales: d_scales,
+        camera_rotation: std::array::from_fn(|i| std::array::from_fn(|j| d_point[i].fma(mean[j], dot(d_turned[i], p.rotation[j])))),
+        camera_translation: d_point,
+    }
+}

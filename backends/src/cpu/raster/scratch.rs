@@ -1,0 +1,172 @@
+//! The working memory of one render. It lives until the backward pass has used it, then returns to a pool, because faulting in fresh pages
+//! costs more than the kernels that fill them.
+
+use super::{RECORD, ScreenSplat};
+use std::sync::Mutex;
+
+/// Workspaces kept for reuse.
+const KEPT: usize = 4;
+/// Bytes a kept workspace may hold.
+const KEPT_BYTES: usize = 512 << 20;
+
+static POOL: Mutex<Vec<Buffers>> = Mutex::new(Vec::new());
+
+/// Where the footprint {sigma <= cutoff} of a Gaussian reaches, for cutting it by columns.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Footprint {
+    /// Half height in pixels.
+    pub half_height: f32,
+    /// Offset of the lowest point of the image (largest y) from the centre, along x, pixels.
+    pub x_of_bottom: f32,
+    /// Slope of the line of centres of the columns.
+    pub slope: f32,
+    /// Half height of a column over the half width of the ellipse left there.
+    pub aspect: f32,
+}
+
+/// A (Gaussian, tile) pair in the order of creation: by depth, then tile.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Pair {
+    /// Index of the tile, row-major.
+    pub tile: u32,
+    /// Position of the Gaussian in depth order.
+    pub rank: u32,
+    /// First row of the tile it reaches, and last row times 256.
+    pub rows: u32,
+}
+
+/// An entry of a tile's list.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Entry {
+    /// Position of the Gaussian in depth order.
+    pub rank: u32,
+    /// Where the gradient record of this pair goes.
+    pub record: u32,
+    /// First row of the tile it reaches, and last row times 256.
+    pub rows: u32,
+}
+
+impl Entry {
+    /// One bit per row of the tile.
+    #[inline(always)]
+    pub fn row_mask(self) -> u32 {
+        let (first, last) = (self.rows & 255, self.rows >> 8);
+        ((2u32 << last) - 1) & !((1u32 << first) - 1)
+    }
+}
+
+/// Buffers of one render.
+#[derive(Default)]
+pub struct Buffers {
+    /// Visible Gaussians by slot: those of a chunk of inputs lie side by side from the chunk's start.
+    pub slots: Vec<ScreenSplat>,
+    /// Footprints by slot.
+    pub footprints: Vec<Footprint>,
+    /// Visible Gaussians per chunk, and the tiles of their bounding boxes.
+    pub chunk_counts: Vec<(u32, u64)>,
+    /// (depth bits, slot) in depth order, and a buffer for sorting.
+    pub order: Vec<u64>,
+    /// The other half of the sort.
+    pub order_spare: Vec<u64>,
+    /// Visible Gaussians in depth order.
+    pub ranked: Vec<ScreenSplat>,
+    /// Position in depth order of every slot.
+    pub rank_of_slot: Vec<u32>,
+    /// First record of every rank, and the end.
+    pub record_start: Vec<u32>,
+    /// Pairs per binning task.
+    pub pairs: Vec<Vec<Pair>>,
+    /// Entries per binning task and tile.
+    pub histograms: Vec<u32>,
+    /// All tile lists, one after the other, front to back.
+    pub list: Vec<Entry>,
+    /// Start of every tile's list, and the end.
+    pub tile_start: Vec<u32>,
+    /// Tiles, longest list first.
+    pub tile_order: Vec<u32>,
+    /// How much of its list a tile needed before all its pixels had stopped.
+    pub tile_end: Vec<u32>,
+    /// Whether a pixel of the tile stopped early (or lies outside the image), so that `stop_at` holds.
+    pub tile_stops: Vec<u32>,
+    /// Transmittance left, per tile and pixel.
+    pub final_transmittance: Vec<f32>,
+    /// Position in the list where the pixel stopped, per tile and pixel.
+    pub stop_at: Vec<u32>,
+    /// Gradient records by pair.
+    pub records: Vec<[f32; RECORD]>,
+    /// Largest weight by pair, when asked for.
+    pub pair_weights: Vec<f32>,
+}
+
+impl Buffers {
+    fn bytes(&self) -> usize {
+        let pairs: usize = self.pairs.iter().map(|p| 12 * p.capacity()).sum();
+        48 * (self.slots.capacity() + self.ranked.capacity())
+            + 16 * (self.footprints.capacity() + self.order.capacity())
+            + 12 * self.list.capacity()
+            + 4 * RECORD * self.records.capacity()
+            + 8 * self.final_transmittance.capacity()
+            + pairs
+    }
+}
+
+/// [`Buffers`] on loan from the pool.
+#[derive(Default)]
+pub struct Workspace {
+    buffers: Buffers,
+}
+
+impl Workspace {
+    /// Takes a workspace whose contents are leftovers.
+    pub fn take() -> Self {
+        Self { buffers: POOL.lock().ok().and_then(|mut pool| pool.pop()).unwrap_or_default() }
+    }
+    /// The sum of the records of the Gaussian at `rank`, in the order of its tiles.
+    #[inline(always)]
+    pub fn summed_record(&self, rank: usize) -> [f32; RECORD] {
+        let mut sum = [0.0f32; RECORD];
+        for record in &self.records[self.record_start[rank] as usize..self.record_start[rank + 1] as usize] {
+            for (a, b) in sum.iter_mut().zip(record) {
+                *a += b;
+            }
+        }
+        sum
+    }
+}
+
+impl std::ops::Deref for Workspace {
+    type Target = Buffers;
+    #[inline(always)]
+    fn deref(&self) -> &Buffers {
+        &self.buffers
+    }
+}
+
+impl std::ops::DerefMut for Workspace {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut Buffers {
+        &mut self.buffers
+    }
+}
+
+impl std::fmt::Debug for Workspace {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Workspace({} visible, {} pairs)", self.ranked.len(), self.list.len())
+    }
+}
+
+impl Drop for Workspace {
+    fn drop(&mut self) {
+        if self.buffers.bytes() <= KEPT_BYTES
+            && let Ok(mut pool) = POOL.lock()
+            && pool.len() < KEPT
+        {
+            pool.push(std::mem::take(&mut self.buffers));
+        }
+    }
+}
+
+/// Makes `buffer` `len` long without touching what is there; new elements are `T::default()`.
+pub fn set_len<T: Clone + Default>(buffer: &mut Vec<T>, len: usize) {
+    buffer.resize(len, T::default());
+}

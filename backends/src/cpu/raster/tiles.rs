@@ -1,0 +1,198 @@
+//! Depth order and tile lists. Walking the Gaussians in depth order and appending to the lists keeps every list sorted, so only the
+//! Gaussians are sorted, not the pairs.
+
+use super::camera::RuleConstants;
+use super::parallel::{SharedMut, run_tasks};
+use super::project::CHUNK;
+use super::scratch::{Buffers, Entry, Footprint, Pair, Workspace, set_len};
+use super::{RasterSettings, ScreenSplat, TILE};
+
+/// Binning tasks. The lists do not depend on it.
+const TASKS: usize = 8;
+/// Bits of a digit of the radix sort.
+const DIGIT: u32 = 12;
+
+/// Fills `ranked`, the tile lists and the record positions from the slots.
+pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, radii: &[i64]) {
+    let buffers = &mut **workspace;
+    sort_by_depth(buffers);
+    let visible = buffers.order.len();
+    let tiles_x = settings.width.div_ceil(TILE);
+    let tiles = tiles_x * settings.height.div_ceil(TILE);
+    set_len(&mut buffers.ranked, visible);
+    set_len(&mut buffers.rank_of_slot, buffers.slots.len());
+    set_len(&mut buffers.record_start, visible + 1);
+    set_len(&mut buffers.histograms, TASKS * tiles);
+    buffers.pairs.resize_with(TASKS, Vec::new);
+    let per_task = visible.div_ceil(TASKS).max(1);
+    {
+        let pairs = SharedMut::new(&mut buffers.pairs);
+        let histograms = SharedMut::new(&mut buffers.histograms);
+        let ranked = SharedMut::new(&mut buffers.ranked);
+        let starts = SharedMut::new(&mut buffers.record_start);
+        let rank_of_slot = SharedMut::new(&mut buffers.rank_of_slot);
+        let (slots, footprints, order) = (&buffers.slots, &buffers.footprints, &buffers.order);
+        run_tasks(TASKS, |task| {
+            let first = (task * per_task).min(visible);
+            let len = per_task.min(visible - first);
+            // SAFETY: ranks, tasks and slots belong to one task each.
+            let (pairs, histogram, ranked, starts) =
+                unsafe { (&mut pairs.slice(task, 1)[0], histograms.slice(task * tiles, tiles), ranked.slice(first, len), starts.slice(first, len)) };
+            pairs.clear();
+            histogram.fill(0);
+            for (k, key) in order[first..first + len].iter().enumerate() {
+                let slot = *key as u32 as usize;
+                let splat = slots[slot];
+                ranked[k] = splat;
+                // SAFETY: a slot occurs once in the order.
+                unsafe { rank_of_slot.slice(slot, 1)[0] = (first + k) as u32 };
+                starts[k] = pairs.len() as u32;
+                let limits = if rules.square_tiles { square(&splat, radii[splat.index as usize], settings) } else { None };
+                cut_into_tiles(&splat, &footprints[slot], settings, limits, |tile, rows| {
+                    histogram[tile] += 1;
+                    pairs.push(Pair { tile: tile as u32, rank: (first + k) as u32, rows });
+                });
+            }
+        });
+    }
+    place_lists(buffers, tiles, per_task);
+}
+
+/// Sorts the visible slots by depth, ties by index.
+fn sort_by_depth(buffers: &mut Buffers) {
+    buffers.order.clear();
+    for (chunk, &(count, _)) in buffers.chunk_counts.iter().enumerate() {
+        let slots = chunk * CHUNK..chunk * CHUNK + count as usize;
+        // Depths are positive, so their bits order like the numbers. Slots come in order of index.
+        buffers.order.extend(slots.map(|slot| u64::from(buffers.slots[slot].depth.to_bits()) << 32 | slot as u64));
+    }
+    let keys = buffers.order.iter().map(|v| (v >> 32) as u32);
+    let (low, high) = keys.fold((u32::MAX, 0), |(low, high), key| (low.min(key), high.max(key)));
+    if high <= low {
+        return;
+    }
+    let bits = 32 - (high - low).leading_zeros();
+    let len = buffers.order.len();
+    set_len(&mut buffers.order_spare, len);
+    let mut counts = vec![0u32; 1 << DIGIT];
+    for pass in 0..bits.div_ceil(DIGIT) {
+        let digit = |v: u64| (((v >> 32) as u32 - low) >> (pass * DIGIT)) as usize & ((1 << DIGIT) - 1);
+        counts.fill(0);
+        for &v in &buffers.order {
+            counts[digit(v)] += 1;
+        }
+        let mut start = 0;
+        for count in &mut counts {
+            (*count, start) = (start, start + *count);
+        }
+        for &v in &buffers.order {
+            let place = &mut counts[digit(v)];
+            buffers.order_spare[*place as usize] = v;
+            *place += 1;
+        }
+        std::mem::swap(&mut buffers.order, &mut buffers.order_spare);
+    }
+}
+
+/// Tile rectangle of Inria's getRect: first and end per axis.
+fn square(splat: &ScreenSplat, radius: i64, settings: &RasterSettings) -> Option<[[usize; 2]; 2]> {
+    let radius = radius as f32;
+    let axis = |center: f32, size: usize| {
+        let tiles = size.div_ceil(TILE);
+        // Casting truncates towards zero and saturates, as in C but defined.
+        let first = ((center - radius) / TILE as f32) as i64;
+        let end = ((center + radius + (TILE - 1) as f32) / TILE as f32) as i64;
+        [first.clamp(0, tiles as i64) as usize, end.clamp(0, tiles as i64) as usize]
+    };
+    Some([axis(splat.center[0], settings.width), axis(splat.center[1], settings.height)])
+}
+
+/// Calls `found(tile, rows)` for every tile with a pixel centre inside the footprint; `rows` packs the first and the last row of the tile.
+#[inline(always)]
+fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettings, limits: Option<[[usize; 2]; 2]>, mut found: impl FnMut(usize, u32)) {
+    let [x, y] = splat.center;
+    let tiles_x = settings.width.div_ceil(TILE);
+    let first_column = (x - splat.half_width - 0.5).ceil().max(0.0) as usize;
+    let last_column = ((x + splat.half_width - 0.5).floor().max(0.0) as usize).min(settings.width - 1);
+    if first_column > last_column {
+        return;
+    }
+    let (mut first_tile, mut end_tile) = (first_column / TILE, last_column / TILE + 1);
+    if let Some([columns, _]) = limits {
+        (first_tile, end_tile) = (first_tile.max(columns[0]), end_tile.min(columns[1]));
+    }
+    for tile_x in first_tile..end_tile {
+        // The strip between the outermost pixel centres of the tile column, relative to the centre of the Gaussian.
+        let left = ((tile_x * TILE) as f32 + 0.5 - x).max(-splat.half_width);
+        let right = ((tile_x * TILE + TILE - 1) as f32 + 0.5 - x).min(splat.half_width);
+        let column = |dx: f32| foot.aspect * ((splat.half_width - dx) * (splat.half_width + dx)).max(0.0).sqrt();
+        let dx_bottom = foot.x_of_bottom.max(left).min(right);
+        let dx_top = (-foot.x_of_bottom).max(left).min(right);
+        let bottom = (foot.slope * dx_bottom + column(dx_bottom)).min(foot.half_height);
+        let top = (foot.slope * dx_top - column(dx_top)).max(-foot.half_height);
+        let first_row = (y + top - 0.5).ceil().max(0.0) as usize;
+        let last_row = (y + bottom - 0.5).floor();
+        if !(last_row >= 0.0) {
+            continue;
+        }
+        let last_row = (last_row as usize).min(settings.height - 1);
+        if first_row > last_row {
+            continue;
+        }
+        let (mut first, mut end) = (first_row / TILE, last_row / TILE + 1);
+        if let Some([_, rows]) = limits {
+            (first, end) = (first.max(rows[0]), end.min(rows[1]));
+        }
+        for tile_y in first..end {
+            let from = first_row.max(tile_y * TILE) - tile_y * TILE;
+            let to = last_row.min(tile_y * TILE + TILE - 1) - tile_y * TILE;
+            found(tile_y * tiles_x + tile_x, (from | to << 8) as u32);
+        }
+    }
+}
+
+/// Turns the pairs of the binning tasks into one list per tile.
+fn place_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
+    set_len(&mut buffers.tile_start, tiles + 1);
+    let mut position = 0u32;
+    for tile in 0..tiles {
+        buffers.tile_start[tile] = position;
+        for task in 0..TASKS {
+            let count = &mut buffers.histograms[task * tiles + tile];
+            (*count, position) = (position, position + *count);
+        }
+    }
+    buffers.tile_start[tiles] = position;
+    set_len(&mut buffers.list, position as usize);
+    let mut base = [0u32; TASKS + 1];
+    for task in 0..TASKS {
+        base[task + 1] = base[task] + buffers.pairs[task].len() as u32;
+    }
+    let visible = buffers.ranked.len();
+    {
+        let list = SharedMut::new(&mut buffers.list);
+        let histograms = SharedMut::new(&mut buffers.histograms);
+        let starts = SharedMut::new(&mut buffers.record_start);
+        let pairs = &buffers.pairs;
+        run_tasks(TASKS, |task| {
+            let first = (task * per_task).min(visible);
+            // SAFETY: a task's ranks and histogram are its own, and the histogram's places in the list are too.
+            let (next, starts) = unsafe { (histograms.slice(task * tiles, tiles), starts.slice(first, per_task.min(visible - first))) };
+            for start in starts {
+                *start += base[task];
+            }
+            for (k, pair) in pairs[task].iter().enumerate() {
+                let place = &mut next[pair.tile as usize];
+                // SAFETY: as above.
+                unsafe { list.slice(*place as usize, 1)[0] = Entry { rank: pair.rank, record: base[task] + k as u32, rows: pair.rows } };
+                *place += 1;
+            }
+        });
+    }
+    buffers.record_start[visible] = position;
+    buffers.tile_order.clear();
+    buffers.tile_order.extend(0..tiles as u32);
+    let starts = &buffers.tile_start;
+    let length = |&tile: &u32| starts[tile as usize + 1] - starts[tile as usize];
+    buffers.tile_order.sort_by_key(|tile| (std::cmp::Reverse(length(tile)), *tile));
+}

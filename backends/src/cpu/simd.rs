@@ -1,0 +1,344 @@
+//! Operators over [`pulp`]'s vectors, so that kernels read like arithmetic. Everything inlines to single instructions.
+//!
+//! A kernel is a struct that implements [`pulp::WithSimd`]; [`dispatch`] runs it with the widest instruction set of the machine.
+
+use pulp::Simd;
+use pulp::bytemuck::{bytes_of, pod_read_unaligned};
+use std::ops::{Add, AddAssign, BitAnd, BitOr, Div, Mul, Neg, Sub};
+
+/// Runs `kernel` with the best instruction set found at run time (AVX-512, AVX2, NEON, scalar).
+#[inline]
+pub fn dispatch<K: pulp::WithSimd>(kernel: K) -> K::Output {
+    pulp::Arch::new().dispatch(kernel)
+}
+
+/// Float32 lanes of the vectors that [`dispatch`] runs kernels with on this machine.
+pub fn lanes_in_use() -> usize {
+    struct Width;
+    impl pulp::WithSimd for Width {
+        type Output = usize;
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, _: S) -> usize {
+            S::F32_LANES
+        }
+    }
+    dispatch(Width)
+}
+
+/// A vector of float32.
+#[derive(Clone, Copy, Debug)]
+pub struct Lanes<S: Simd> {
+    simd: S,
+    raw: S::f32s,
+}
+
+/// One truth value per lane.
+#[derive(Clone, Copy, Debug)]
+pub struct Mask<S: Simd> {
+    simd: S,
+    raw: S::m32s,
+}
+
+macro_rules! binary {
+    ($trait:ident, $method:ident, $op:ident) => {
+        impl<S: Simd> $trait for Lanes<S> {
+            type Output = Self;
+            #[inline(always)]
+            fn $method(self, other: Self) -> Self {
+                Self { simd: self.simd, raw: self.simd.$op(self.raw, other.raw) }
+            }
+        }
+        impl<S: Simd> $trait<f32> for Lanes<S> {
+            type Output = Self;
+            #[inline(always)]
+            fn $method(self, other: f32) -> Self {
+                self.$method(Self::splat(self.simd, other))
+            }
+        }
+    };
+}
+binary!(Add, add, add_f32s);
+binary!(Sub, sub, sub_f32s);
+binary!(Mul, mul, mul_f32s);
+binary!(Div, div, div_f32s);
+
+impl<S: Simd> AddAssign for Lanes<S> {
+    #[inline(always)]
+    fn add_assign(&mut self, other: Self) {
+        *self = *self + other;
+    }
+}
+
+impl<S: Simd> Neg for Lanes<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Self { simd: self.simd, raw: self.simd.neg_f32s(self.raw) }
+    }
+}
+
+const LOG2_E: f32 = std::f32::consts::LOG2_E;
+/// log2(e) minus its float32 value.
+const LOG2_E_TAIL: f32 = 1.925_963_033_5e-8;
+/// Adding and subtracting 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits.
+const ROUND: f32 = 12_582_912.0;
+/// 2^f on [-1/2, 1/2] with value 1 at 0, largest relative error 9.2e-8 (fitted by iteratively reweighted least squares).
+const EXP2_5: [f32; 5] = [0.693_146_98, 0.240_222_42, 0.055_507_337, 0.009_671_513, 0.001_326_472_7];
+/// As [`EXP2_5`] with one term more, largest relative error 2e-9.
+const EXP2_6: [f32; 6] = [0.693_147_2, 0.240_226_48, 0.055_503_325, 0.009_618_437, 0.001_339_887_4, 0.000_153_533_61];
+
+impl<S: Simd> Lanes<S> {
+    /// Lanes per vector; divides 16 for every instruction set of [`pulp`].
+    pub const COUNT: usize = S::F32_LANES;
+
+    /// The same value in every lane.
+    #[inline(always)]
+    pub fn splat(simd: S, value: f32) -> Self {
+        Self { simd, raw: simd.splat_f32s(value) }
+    }
+    /// A value splat with the instruction set of `self`.
+    #[inline(always)]
+    pub fn like(self, value: f32) -> Self {
+        Self::splat(self.simd, value)
+    }
+    /// The first [`Lanes::COUNT`] values of `from`.
+    #[inline(always)]
+    pub fn load(simd: S, from: &[f32]) -> Self {
+        assert!(from.len() >= S::F32_LANES);
+        // SAFETY: the slice holds a whole vector, checked above; vectors are plain data.
+        Self { simd, raw: unsafe { from.as_ptr().cast::<S::f32s>().read_unaligned() } }
+    }
+    /// Writes the lanes to the start of `to`.
+    #[inline(always)]
+    pub fn store(self, to: &mut [f32]) {
+        assert!(to.len() >= S::F32_LANES);
+        // SAFETY: the slice holds a whole vector, checked above.
+        unsafe { to.as_mut_ptr().cast::<S::f32s>().write_unaligned(self.raw) }
+    }
+    /// The vector that starts at `from`.
+    ///
+    /// # Safety
+    /// `from` must point to [`Lanes::COUNT`] readable values.
+    #[inline(always)]
+    pub unsafe fn load_ptr(simd: S, from: *const f32) -> Self {
+        // SAFETY: the caller's promise.
+        Self { simd, raw: unsafe { from.cast::<S::f32s>().read_unaligned() } }
+    }
+    /// Writes the vector that starts at `to`.
+    ///
+    /// # Safety
+    /// `to` must point to [`Lanes::COUNT`] writable values.
+    #[inline(always)]
+    pub unsafe fn store_ptr(self, to: *mut f32) {
+        // SAFETY: the caller's promise.
+        unsafe { to.cast::<S::f32s>().write_unaligned(self.raw) }
+    }
+    /// self * factor + addend.
+    #[inline(always)]
+    pub fn fma(self, factor: Self, addend: Self) -> Self {
+        Self { simd: self.simd, raw: self.simd.mul_add_e_f32s(self.raw, factor.raw, addend.raw) }
+    }
+    /// addend - self * factor.
+    #[inline(always)]
+    pub fn nfma(self, factor: Self, addend: Self) -> Self {
+        Self { simd: self.simd, raw: self.simd.negate_mul_add_e_f32s(self.raw, factor.raw, addend.raw) }
+    }
+    /// The smaller value per lane.
+    #[inline(always)]
+    pub fn min(self, other: Self) -> Self {
+        Self { simd: self.simd, raw: self.simd.min_f32s(self.raw, other.raw) }
+    }
+    /// The larger value per lane.
+    #[inline(always)]
+    pub fn max(self, other: Self) -> Self {
+        Self { simd: self.simd, raw: self.simd.max_f32s(self.raw, other.raw) }
+    }
+    /// Square root per lane.
+    #[inline(always)]
+    pub fn sqrt(self) -> Self {
+        Self { simd: self.simd, raw: self.simd.sqrt_f32s(self.raw) }
+    }
+    /// self > other; false where either is NaN.
+    #[inline(always)]
+    pub fn gt(self, other: Self) -> Mask<S> {
+        Mask { simd: self.simd, raw: self.simd.greater_than_f32s(self.raw, other.raw) }
+    }
+    /// self >= other; false where either is NaN.
+    #[inline(always)]
+    pub fn ge(self, other: Self) -> Mask<S> {
+        Mask { simd: self.simd, raw: self.simd.greater_than_or_equal_f32s(self.raw, other.raw) }
+    }
+    /// self <= other; false where either is NaN.
+    #[inline(always)]
+    pub fn le(self, other: Self) -> Mask<S> {
+        Mask { simd: self.simd, raw: self.simd.less_than_or_equal_f32s(self.raw, other.raw) }
+    }
+    /// self < other; false where either is NaN.
+    #[inline(always)]
+    pub fn lt(self, other: Self) -> Mask<S> {
+        Mask { simd: self.simd, raw: self.simd.less_than_f32s(self.raw, other.raw) }
+    }
+    /// self == other; false where either is NaN.
+    #[inline(always)]
+    pub fn equal(self, other: Self) -> Mask<S> {
+        Mask { simd: self.simd, raw: self.simd.equal_f32s(self.raw, other.raw) }
+    }
+    /// Compares the bit patterns as unsigned integers: with a positive limit this is `0 <= self <= limit` and false for NaN, in one test.
+    #[inline(always)]
+    pub fn bits_le(self, limit: Self) -> Mask<S> {
+        let simd = self.simd;
+        Mask { simd, raw: simd.less_than_or_equal_u32s(simd.transmute_u32s_f32s(self.raw), simd.transmute_u32s_f32s(limit.raw)) }
+    }
+    /// The sum of the lanes, in a fixed order.
+    #[inline(always)]
+    pub fn sum(self) -> f32 {
+        self.simd.reduce_sum_f32s(self.raw)
+    }
+    /// The largest lane.
+    #[inline(always)]
+    pub fn largest(self) -> f32 {
+        self.simd.reduce_max_f32s(self.raw)
+    }
+    /// exp(-self) for 0 <= self <= 87; relative error under 2e-7 where the result is over 1/255, exactly 1 at 0, garbage outside the range.
+    #[inline(always)]
+    pub fn exp_negated(self) -> Self {
+        let scaled = self.like(-LOG2_E);
+        let rounded = self.fma(scaled, self.like(ROUND));
+        let n = rounded - ROUND;
+        let f = self.fma(scaled, -n);
+        let mut p = self.like(EXP2_5[4]);
+        for k in (0..4).rev() {
+            p = p.fma(f, self.like(EXP2_5[k]));
+        }
+        p.fma(f, self.like(1.0)).times_power_of_two(rounded)
+    }
+    /// exp(self), the argument clamped to -87..88; relative error about 1e-7. A NaN gives a finite value: test the input.
+    #[inline(always)]
+    pub fn exp(self) -> Self {
+        let x = self.max(self.like(-87.0)).min(self.like(88.0));
+        let rounded = x.fma(self.like(LOG2_E), self.like(ROUND));
+        let n = rounded - ROUND;
+        let f = x.fma(self.like(LOG2_E_TAIL), x.fma(self.like(LOG2_E), -n));
+        let mut p = self.like(EXP2_6[5]);
+        for k in (0..5).rev() {
+            p = p.fma(f, self.like(EXP2_6[k]));
+        }
+        p.fma(f, self.like(1.0)).times_power_of_two(rounded)
+    }
+    /// ln(self) for positive normal numbers, absolute error under 1e-4: good for bounds, not for values.
+    #[inline(always)]
+    pub fn ln_rough(self) -> Self {
+        let simd = self.simd;
+        let bits = simd.transmute_u32s_f32s(self.raw);
+        let of = |raw| Self { simd, raw: simd.transmute_f32s_u32s(raw) };
+        // The exponent, turned into a float by putting it in the low bits of 2^23; the mantissa, in 1..2.
+        let exponent = of(simd.or_u32s(simd.wrapping_dyn_shr_u32s(bits, simd.splat_u32s(23)), simd.splat_u32s(0x4b00_0000))) - (8_388_608.0 + 127.0);
+        let mantissa = of(simd.or_u32s(simd.and_u32s(bits, simd.splat_u32s(0x007f_ffff)), simd.splat_u32s(0x3f80_0000)));
+        // atanh series: ln m = ln sqrt(2) + 2 (s + s^3/3 + s^5/5) with s = (m - sqrt 2) / (m + sqrt 2), |s| < 0.172.
+        let root = std::f32::consts::SQRT_2;
+        let s = (mantissa - root) / (mantissa + root);
+        let s2 = s * s;
+        let series = s2.fma(s2.fma(self.like(0.4), self.like(2.0 / 3.0)), self.like(2.0)) * s;
+        exponent.fma(self.like(std::f32::consts::LN_2), series + 0.5 * std::f32::consts::LN_2)
+    }
+    /// Whether the value is neither infinite nor NaN.
+    #[inline(always)]
+    pub fn finite(self) -> Mask<S> {
+        let zero = self.like(0.0);
+        (self * zero).equal(zero)
+    }
+    /// Adds the integer in the low bits of `rounded` to the exponent.
+    #[inline(always)]
+    fn times_power_of_two(self, rounded: Self) -> Self {
+        let simd = self.simd;
+        let shifted = simd.wrapping_dyn_shl_u32s(simd.transmute_u32s_f32s(rounded.raw), simd.splat_u32s(23));
+        Self { simd, raw: simd.transmute_f32s_u32s(simd.add_u32s(simd.transmute_u32s_f32s(self.raw), shifted)) }
+    }
+}
+
+impl<S: Simd> Mask<S> {
+    /// `yes` where the mask is set, `no` elsewhere.
+    #[inline(always)]
+    pub fn select(self, yes: Lanes<S>, no: Lanes<S>) -> Lanes<S> {
+        Lanes { simd: self.simd, raw: self.simd.select_f32s(self.raw, yes.raw, no.raw) }
+    }
+    /// `yes` where the mask is set, zero elsewhere.
+    #[inline(always)]
+    pub fn keep(self, yes: Lanes<S>) -> Lanes<S> {
+        self.select(yes, Lanes::splat(self.simd, 0.0))
+    }
+    /// Whether any lane is set.
+    #[inline(always)]
+    pub fn any(self) -> bool {
+        let bytes = bytes_of(&self.raw);
+        match bytes.len() {
+            1 => bytes[0] != 0,
+            2 => u16::from_ne_bytes([bytes[0], bytes[1]]) != 0,
+            4 => pod_read_unaligned::<u32>(bytes) != 0,
+            _ => bytes.chunks_exact(8).map(pod_read_unaligned::<u64>).fold(0, |all, word| all | word) != 0,
+        }
+    }
+}
+
+impl<S: Simd> BitAnd for Mask<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn bitand(self, other: Self) -> Self {
+        Self { simd: self.simd, raw: self.simd.and_m32s(self.raw, other.raw) }
+    }
+}
+
+impl<S: Simd> BitOr for Mask<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn bitor(self, other: Self) -> Self {
+        Self { simd: self.simd, raw: self.simd.or_m32s(self.raw, other.raw) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Exponentials<'a>(&'a mut [f32], u8);
+    impl pulp::WithSimd for Exponentials<'_> {
+        type Output = ();
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) {
+            for chunk in self.0.chunks_exact_mut(16) {
+                for part in chunk.chunks_exact_mut(S::F32_LANES) {
+                    let x = Lanes::load(simd, part);
+                    let y = match self.1 {
+                        0 => x.exp(),
+                        1 => x.exp_negated(),
+                        _ => x.ln_rough(),
+                    };
+                    y.store(part);
+                }
+            }
+        }
+    }
+
+    fn worst(values: &[f32], results: &[f32], sign: f64) -> f64 {
+        values.iter().zip(results).map(|(&x, &y)| (f64::from(y) / (sign * f64::from(x)).exp() - 1.0).abs()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn exponentials_are_accurate() {
+        let blend: Vec<f32> = (0..16_000).map(|i| 6.0 * i as f32 / 16_000.0).collect();
+        let mut y = blend.clone();
+        dispatch(Exponentials(&mut y, 1));
+        assert_eq!(y[0], 1.0);
+        let error = worst(&blend, &y, -1.0);
+        assert!(error < 2.5e-7, "{error:e}");
+        let wide: Vec<f32> = (0..16_000).map(|i| -87.0 + 175.0 * i as f32 / 16_000.0).collect();
+        let mut y = wide.clone();
+        dispatch(Exponentials(&mut y, 0));
+        let error = worst(&wide, &y, 1.0);
+        assert!(error < 2.5e-7, "{error:e}");
+        let mut logs = y.clone();
+        dispatch(Exponentials(&mut logs, 2));
+        let error = wide.iter().zip(&logs).map(|(&x, &l)| (x.clamp(-87.0, 88.0) - l).abs()).fold(0.0, f32::max);
+        assert!(error < 1e-4, "{error:e}");
+    }
+}

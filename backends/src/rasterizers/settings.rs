@@ -1,0 +1,75 @@
+//! Inputs of a render, checked and brought to the form of the operation.
+
+use crate::cpu::raster::RasterSettings;
+use cc4dgs_core::{Camera, Error, RenderSettings, Result, SplatColors, Splats};
+
+/// Pixels of the largest image drawn.
+const MAX_PIXELS: u64 = 1 << 28;
+
+/// Refuses `table` if it holds anything: neither rasterizer has settings of its own.
+pub fn no_settings(name: &str, table: &toml::Table) -> Result<()> {
+    match table.keys().next() {
+        None => Ok(()),
+        Some(key) => Err(Error::parameter(format!("rasterizer.{key}"), format!("rasterizer '{name}' has no such setting"), "Remove the key")),
+    }
+}
+
+/// Checks shapes, camera and degree, and gathers the numbers of a render.
+pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RasterSettings> {
+    camera.validate()?;
+    let pixels = u64::from(camera.width) * u64::from(camera.height);
+    if pixels > MAX_PIXELS {
+        return Err(Error::limit(format!("image of camera {}", camera.name), pixels, MAX_PIXELS, "Render a smaller image"));
+    }
+    let [n, _] = splats.means.dims();
+    let shape = |name: &str, seen: &[usize], wanted: &[usize]| {
+        if seen == wanted {
+            return Ok(());
+        }
+        Err(Error::parameter(format!("splats.{name}"), format!("shape {seen:?} where {wanted:?} is needed"), "Give every attribute one row per Gaussian"))
+    };
+    shape("means", &splats.means.dims(), &[n, 3])?;
+    shape("scales", &splats.scales.dims(), &[n, 3])?;
+    shape("quaternions", &splats.quaternions.dims(), &[n, 4])?;
+    shape("opacities", &splats.opacities.dims(), &[n])?;
+    let sh_degree = match &splats.colors {
+        SplatColors::Direct(colors) => {
+            shape("colors", &colors.dims(), &[n, 3])?;
+            None
+        }
+        SplatColors::Sh { dc, rest, degree } => {
+            shape("colors.dc", &dc.dims(), &[n, 3])?;
+            let [rows, stored, channels] = rest.dims();
+            shape("colors.rest", &[rows, channels], &[n, 3])?;
+            let needed = (degree + 1) * (degree + 1) - 1;
+            if *degree > 4 || stored < needed {
+                let problem = format!("degree {degree} with {stored} coefficients per channel stored above degree 0");
+                return Err(Error::parameter("splats.colors", problem, "Use a degree of 0 to 4 that the coefficients cover"));
+            }
+            Some(*degree)
+        }
+    };
+    if let Some(probe) = &splats.screen_probe {
+        shape("screen_probe", &probe.dims(), &[n, 2])?;
+    }
+    if let Some(probe) = &splats.camera_probe {
+        shape("camera_probe", &probe.dims(), &[4, 4])?;
+    }
+    if let Some(background) = &settings.background {
+        shape("background", &background.dims(), &[3])?;
+    }
+    Ok(RasterSettings {
+        width: camera.width as usize,
+        height: camera.height as usize,
+        fx: camera.fx,
+        fy: camera.fy,
+        cx: camera.cx,
+        cy: camera.cy,
+        world_to_camera: camera.world_to_camera,
+        rules: settings.rules,
+        antialiased: settings.antialiased,
+        space: splats.space,
+        sh_degree,
+        max_weights: settings.max_weights,
+    })
+}
