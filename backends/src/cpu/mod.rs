@@ -1,3 +1,8 @@
 //! Plain-slice kernels (rayon and SIMD) that serve every CPU backend.
 
 pub mod tensor;
+pub mod adam;
+pub mod photometric;
+pub mod scratch;
+pub mod raster;
+pub mod simd;

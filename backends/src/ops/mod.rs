@@ -1,1 +1,5 @@
 //! The tensor operations burn lacks. Each is a `backend_extension` trait with an implementation per device and a hand-written backward.
+
+pub mod adam;
+pub mod photometric;
+pub mod rasterize;
