@@ -101,6 +101,8 @@ pub struct Scene {
     pub warnings: Vec<String>,
     /// The background the dataset's pictures want (RGBA scenes), if it says.
     pub background: Option<[f32; 3]>,
+    /// Foreground masks by view, where the dataset has them: white (first channel over 127) is foreground. Not cached.
+    pub foreground_masks: Option<Arc<dyn FrameSource>>,
     frames: FrameCache,
 }
 
@@ -119,7 +121,7 @@ impl Scene {
         }
         let frame_count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
         let frames = FrameCache { source, cap: cache_bytes, state: Mutex::default() };
-        Ok(Self { name, cameras, views, frame_count, points: None, init_box: None, warnings: Vec::new(), background: None, frames })
+        Ok(Self { name, cameras, views, frame_count, points: None, init_box: None, warnings: Vec::new(), background: None, foreground_masks: None, frames })
     }
     /// Indices of the views of `split`, in order.
     pub fn split(&self, split: Split) -> Vec<usize> {

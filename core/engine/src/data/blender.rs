@@ -1,0 +1,105 @@
+//! D-NeRF and Blender scenes: `transforms_train.json` and friends, RGBA pictures, times in 0..1.
+
+use super::distortion::Distortion;
+use super::files::{file_name, picture_size, read_json};
+use super::nerfstudio::picture_path;
+use super::pose::{from_opengl_camera_to_world, matrix4};
+use super::raw::{Picture, RawCamera, RawScene, RawView};
+use super::{Reader, SceneOptions};
+use cc4dgs_core::{Error, Limits, Result, Split};
+use serde::Deserialize;
+use std::path::Path;
+
+pub(crate) struct Blender;
+
+#[derive(Deserialize)]
+struct Transforms {
+    camera_angle_x: f64,
+    frames: Vec<Frame>,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    file_path: String,
+    time: Option<f64>,
+    transform_matrix: Vec<Vec<f64>>,
+}
+
+/// Half the side of the cube D-NeRF scenes are initialised in (Deformable-3DGS and 4DGS; facts 8.3).
+const INIT_HALF_WIDTH: f32 = 1.3;
+
+impl Reader for Blender {
+    fn name(&self) -> &'static str {
+        "blender"
+    }
+    fn looks_for(&self) -> &'static str {
+        "transforms_train.json (D-NeRF, NeRF synthetic)"
+    }
+    fn probe(&self, path: &Path) -> bool {
+        path.join("transforms_train.json").is_file()
+    }
+    fn open(&self, path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+        let mut scene = RawScene { name: file_name(path), ..Default::default() };
+        let mut times: Vec<Option<f64>> = Vec::new();
+        read_split(path, "train", Split::Train, limits, &mut scene, &mut times)?;
+        let test = format!("transforms_{}.json", options.test_split);
+        if path.join(&test).is_file() {
+            read_split(path, &options.test_split, Split::Test, limits, &mut scene, &mut times)?;
+        } else {
+            scene.warnings.push(format!("there is no {test}; nothing is held out"));
+        }
+        set_times(&mut scene, &times);
+        scene.init_box = Some(([-INIT_HALF_WIDTH; 3], [INIT_HALF_WIDTH; 3]));
+        // The published tables composite over white (4DGS, Swift4D); pictures without alpha are not touched by it.
+        scene.background = Some([1.0; 3]);
+        Ok(scene)
+    }
+}
+
+fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &mut RawScene, times: &mut Vec<Option<f64>>) -> Result<()> {
+    let file = folder.join(format!("transforms_{name}.json"));
+    let object = file.display().to_string();
+    let transforms: Transforms = read_json(&file, limits)?;
+    let angle = transforms.camera_angle_x;
+    if !(angle > 0.0 && angle < std::f64::consts::PI) {
+        return Err(Error::data(object, format!("camera_angle_x is {angle}, not an angle below pi"), "Write the horizontal field of view in radians"));
+    }
+    let paths: Vec<_> = transforms.frames.iter().map(|f| picture_path(folder, &f.file_path)).collect();
+    let Some(present) = paths.iter().find(|p| p.is_file()) else {
+        let first = paths.first().map(|p| p.display().to_string()).unwrap_or_else(|| "any".into());
+        return Err(Error::data(object, format!("none of its {} pictures exists ({first})", paths.len()), "Check that the pictures lie beside the JSON"));
+    };
+    let (w, h) = picture_size(present, limits)?;
+    let focal = 0.5 * f64::from(w) / (0.5 * angle).tan();
+    for (frame, path) in transforms.frames.iter().zip(paths) {
+        let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
+        let world_to_camera = matrix4(&frame.transform_matrix).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
+        if frame.time.is_some_and(|t| !t.is_finite() || t < 0.0) {
+            return Err(bad(format!("time {:?} is not a number from 0 up", frame.time)));
+        }
+        scene.cameras.push(RawCamera {
+            name: frame.file_path.trim_start_matches("./").to_string(),
+            size: [w, h],
+            focal: [focal; 2],
+            principal: [0.5 * f64::from(w), 0.5 * f64::from(h)],
+            distortion: Distortion::None,
+            world_to_camera,
+        });
+        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, picture: Picture::File { path, mask: None } });
+        times.push(frame.time);
+    }
+    Ok(())
+}
+
+/// The frame index is the rank of a view's time among all; times over 1 are divided by the largest.
+fn set_times(scene: &mut RawScene, times: &[Option<f64>]) {
+    let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
+    let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
+    distinct.sort_by(f64::total_cmp);
+    distinct.dedup();
+    for (view, time) in scene.views.iter_mut().zip(times) {
+        let t = time.unwrap_or(0.0);
+        view.frame = distinct.partition_point(|&d| d < t);
+        view.time = Some(t / largest);
+    }
+}

@@ -1,0 +1,174 @@
+//! COLMAP models, text or binary, with their sparse points. Static scenes; every eighth picture is held out.
+
+use super::distortion::Distortion;
+use super::files::{file_name, read_bytes, read_text};
+use super::nerfstudio::HOLD_OUT_EVERY;
+use super::pose::{Matrix4, from_quaternion};
+use super::raw::{Picture, RawCamera, RawScene, RawView};
+use super::{Reader, SceneOptions, colmap_binary, colmap_text};
+use cc4dgs_core::{Error, Limits, PointCloud, Result, Split};
+use glam::DVec3;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+pub(crate) struct Colmap;
+
+/// A camera record: model, size in pixels, parameters.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct ColmapCamera {
+    pub model: Model,
+    pub size: [u64; 2],
+    pub parameters: Vec<f64>,
+}
+
+/// A picture record.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct ColmapImage {
+    pub camera: u32,
+    pub name: String,
+    /// Quaternion (w,x,y,z), world to camera.
+    pub rotation: [f64; 4],
+    pub translation: [f64; 3],
+}
+
+/// The camera models this reader knows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Model {
+    SimplePinhole,
+    Pinhole,
+    SimpleRadial,
+    Radial,
+    OpenCv,
+    OpenCvFisheye,
+}
+
+impl Model {
+    const ALL: [(Model, &'static str, i32, usize); 6] = [
+        (Model::SimplePinhole, "SIMPLE_PINHOLE", 0, 3),
+        (Model::Pinhole, "PINHOLE", 1, 4),
+        (Model::SimpleRadial, "SIMPLE_RADIAL", 2, 4),
+        (Model::Radial, "RADIAL", 3, 5),
+        (Model::OpenCv, "OPENCV", 4, 8),
+        (Model::OpenCvFisheye, "OPENCV_FISHEYE", 5, 8),
+    ];
+    /// By COLMAP's number.
+    pub(crate) fn from_id(id: i32) -> Option<Self> {
+        Self::ALL.iter().find(|m| m.2 == id).map(|m| m.0)
+    }
+    /// By COLMAP's name.
+    pub(crate) fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.iter().find(|m| m.1 == name).map(|m| m.0)
+    }
+    /// How many numbers it has.
+    pub(crate) fn parameters(self) -> usize {
+        Self::ALL.iter().find(|m| m.0 == self).map_or(0, |m| m.3)
+    }
+    pub(crate) fn known() -> String {
+        Self::ALL.iter().map(|m| m.1).collect::<Vec<_>>().join(", ")
+    }
+}
+
+impl ColmapCamera {
+    /// Focal lengths, principal point, lens.
+    fn intrinsics(&self) -> ([f64; 2], [f64; 2], Distortion) {
+        let p = &self.parameters;
+        let brown = |k1: f64, k2: f64, p1: f64, p2: f64| Distortion::Brown { radial: [k1, k2, 0.0, 0.0], tangential: [p1, p2] };
+        match self.model {
+            Model::SimplePinhole => ([p[0]; 2], [p[1], p[2]], Distortion::None),
+            Model::Pinhole => ([p[0], p[1]], [p[2], p[3]], Distortion::None),
+            Model::SimpleRadial => ([p[0]; 2], [p[1], p[2]], brown(p[3], 0.0, 0.0, 0.0)),
+            Model::Radial => ([p[0]; 2], [p[1], p[2]], brown(p[3], p[4], 0.0, 0.0)),
+            Model::OpenCv => ([p[0], p[1]], [p[2], p[3]], brown(p[4], p[5], p[6], p[7])),
+            Model::OpenCvFisheye => ([p[0], p[1]], [p[2], p[3]], Distortion::Fisheye { radial: [p[4], p[5], p[6], p[7]] }),
+        }
+    }
+}
+
+/// The folder with `cameras.bin` or `cameras.txt`.
+fn model_folder(path: &Path) -> Option<PathBuf> {
+    let candidates = [path.join("sparse/0"), path.join("sparse"), path.join("colmap/sparse/0"), path.to_path_buf()];
+    candidates.into_iter().find(|f| ["bin", "txt"].iter().any(|e| f.join(format!("cameras.{e}")).is_file() && f.join(format!("images.{e}")).is_file()))
+}
+
+struct ColmapModel {
+    cameras: BTreeMap<u32, ColmapCamera>,
+    images: Vec<ColmapImage>,
+    points: PointCloud,
+}
+
+fn read_model(folder: &Path, limits: &Limits) -> Result<ColmapModel> {
+    let file = |stem: &str, extension: &str| folder.join(format!("{stem}.{extension}"));
+    let named = |path: &Path| path.display().to_string();
+    let (cameras, images, points);
+    if file("cameras", "bin").is_file() {
+        let (c, i, p) = (file("cameras", "bin"), file("images", "bin"), file("points3D", "bin"));
+        cameras = colmap_binary::cameras(&named(&c), &read_bytes(&c, limits)?)?;
+        images = colmap_binary::images(&named(&i), &read_bytes(&i, limits)?)?;
+        points = if p.is_file() { colmap_binary::points(&named(&p), &read_bytes(&p, limits)?, limits)? } else { PointCloud::default() };
+    } else {
+        let (c, i, p) = (file("cameras", "txt"), file("images", "txt"), file("points3D", "txt"));
+        cameras = colmap_text::cameras(&named(&c), &read_text(&c, limits)?)?;
+        images = colmap_text::images(&named(&i), &read_text(&i, limits)?)?;
+        points = if p.is_file() { colmap_text::points(&named(&p), &read_text(&p, limits)?, limits)? } else { PointCloud::default() };
+    }
+    Ok(ColmapModel { cameras, images, points })
+}
+
+impl Reader for Colmap {
+    fn name(&self) -> &'static str {
+        "colmap"
+    }
+    fn looks_for(&self) -> &'static str {
+        "sparse/0/cameras.bin or .txt, with images.* beside it and pictures in images/ (COLMAP)"
+    }
+    fn probe(&self, path: &Path) -> bool {
+        model_folder(path).is_some()
+    }
+    fn open(&self, path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+        let folder = model_folder(path)
+            .ok_or_else(|| Error::data(path.display().to_string(), "it holds no cameras.bin or cameras.txt", "Point to the folder above sparse/"))?;
+        let object = folder.display().to_string();
+        let ColmapModel { cameras, mut images, points } = read_model(&folder, limits)?;
+        images.sort_by(|a, b| a.name.cmp(&b.name));
+        let mut scene = RawScene { name: file_name(path), points: Some(points), ..Default::default() };
+        let pictures = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()].into_iter().find(|f| f.is_dir());
+        let pictures = pictures.unwrap_or_else(|| path.join("images"));
+        let hold_out = images.len() > 1;
+        for (index, image) in images.iter().enumerate() {
+            let bad = |problem: String| Error::data(format!("{object}: picture {}", image.name), problem, "Export the model again");
+            let camera = cameras.get(&image.camera).ok_or_else(|| bad(format!("its camera {} is not in the model", image.camera)))?;
+            let (focal, principal, distortion) = camera.intrinsics();
+            let size = camera.size.map(|v| u32::try_from(v).unwrap_or(u32::MAX));
+            limits.check_pixels(&format!("{object}: camera {}", image.camera), camera.size[0], camera.size[1])?;
+            let world_to_camera: Matrix4 = from_quaternion(image.rotation, image.translation).map_err(bad)?;
+            scene.cameras.push(RawCamera { name: image.name.clone(), size, focal, principal, distortion, world_to_camera });
+            let split = if hold_out && index % HOLD_OUT_EVERY == 0 { Split::Test } else { Split::Train };
+            let picture = Picture::File { path: pictures.join(&image.name), mask: None };
+            scene.views.push(RawView { camera: index, frame: 0, time: Some(0.0), split, picture });
+        }
+        Ok(scene)
+    }
+}
+
+/// The points of a COLMAP model beside another calibration, if both speak of the same world: every camera must have a picture of its name whose
+/// centre agrees to a thousandth of the rig.
+pub(crate) fn points_in_same_world(path: &Path, cameras: &[RawCamera], limits: &Limits) -> Result<Option<PointCloud>> {
+    let Some(folder) = model_folder(path) else { return Ok(None) };
+    let model = read_model(&folder, limits)?;
+    let centers: BTreeMap<&str, DVec3> = model
+        .images
+        .iter()
+        .filter_map(|i| {
+            let stem = Path::new(&i.name).file_stem()?.to_str()?;
+            Some((stem, center(&from_quaternion(i.rotation, i.translation).ok()?)))
+        })
+        .collect();
+    let own: Vec<DVec3> = cameras.iter().map(|c| center(&c.world_to_camera)).collect();
+    let spread = own.iter().flat_map(|a| own.iter().map(move |b| (*a - *b).length())).fold(0.0, f64::max);
+    let agree = cameras.iter().zip(&own).all(|(c, o)| centers.get(c.name.as_str()).is_some_and(|p| (*p - *o).length() <= 1e-3 * spread));
+    Ok((agree && spread > 0.0).then_some(model.points))
+}
+
+fn center(m: &Matrix4) -> DVec3 {
+    DVec3::from(std::array::from_fn::<f64, 3, _>(|j| -(0..3).map(|i| m[i][j] * m[i][3]).sum::<f64>()))
+}

@@ -1,0 +1,135 @@
+//! COLMAP's binary files. Every count is held against the bytes that are there before anything is allocated for it.
+
+use super::colmap::{ColmapCamera, ColmapImage, Model};
+use cc4dgs_core::{Error, Limits, PointCloud, Result};
+use std::collections::BTreeMap;
+
+/// Bytes read from front to back.
+struct Bytes<'a> {
+    object: &'a str,
+    rest: &'a [u8],
+    length: usize,
+}
+
+impl<'a> Bytes<'a> {
+    fn new(object: &'a str, bytes: &'a [u8]) -> Self {
+        Self { object, rest: bytes, length: bytes.len() }
+    }
+    fn bad(&self, problem: String) -> Error {
+        Error::data(self.object, problem, "The file is damaged or not a COLMAP model; export it again")
+    }
+    fn take(&mut self, n: u64) -> Result<&'a [u8]> {
+        match usize::try_from(n).ok().and_then(|n| self.rest.split_at_checked(n)) {
+            Some((head, tail)) => {
+                self.rest = tail;
+                Ok(head)
+            }
+            None => Err(self.bad(format!("at byte {}, {n} bytes are wanted and {} are left", self.length - self.rest.len(), self.rest.len()))),
+        }
+    }
+    fn array<const N: usize>(&mut self) -> Result<[u8; N]> {
+        let mut out = [0; N];
+        out.copy_from_slice(self.take(N as u64)?);
+        Ok(out)
+    }
+    fn u32(&mut self) -> Result<u32> {
+        Ok(u32::from_le_bytes(self.array()?))
+    }
+    fn u64(&mut self) -> Result<u64> {
+        Ok(u64::from_le_bytes(self.array()?))
+    }
+    fn floats<const N: usize>(&mut self) -> Result<[f64; N]> {
+        let mut out = [0.0; N];
+        for v in &mut out {
+            *v = f64::from_le_bytes(self.array()?);
+        }
+        Ok(out)
+    }
+    /// A count of records of at least `size` bytes each.
+    fn count(&mut self, what: &str, size: u64) -> Result<u64> {
+        let count = self.u64()?;
+        if count.checked_mul(size).is_none_or(|bytes| bytes > self.rest.len() as u64) {
+            return Err(self.bad(format!("it claims {count} {what}, {} bytes are left for them", self.rest.len())));
+        }
+        Ok(count)
+    }
+}
+
+/// `cameras.bin`.
+pub(crate) fn cameras(object: &str, bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>> {
+    let mut b = Bytes::new(object, bytes);
+    let mut cameras = BTreeMap::new();
+    for _ in 0..b.count("cameras", 24)? {
+        let id = b.u32()?;
+        let number = b.u32()? as i32;
+        let model = Model::from_id(number).ok_or_else(|| {
+            Error::unsupported(
+                format!("{object}: camera {id}"),
+                format!("camera model number {number}"),
+                format!("Undistort with COLMAP, or use one of {}", Model::known()),
+            )
+        })?;
+        let size = [b.u64()?, b.u64()?];
+        let mut parameters = Vec::with_capacity(model.parameters());
+        for _ in 0..model.parameters() {
+            parameters.push(b.floats::<1>()?[0]);
+        }
+        cameras.insert(id, ColmapCamera { model, size, parameters });
+    }
+    Ok(cameras)
+}
+
+/// `images.bin`; the two-dimensional points are passed over.
+pub(crate) fn images(object: &str, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
+    let mut b = Bytes::new(object, bytes);
+    let mut images = Vec::new();
+    for _ in 0..b.count("pictures", 73)? {
+        b.u32()?;
+        let rotation = b.floats()?;
+        let translation = b.floats()?;
+        let camera = b.u32()?;
+        let end = b.rest.iter().position(|&c| c == 0).ok_or_else(|| b.bad("a picture's name has no end".into()))?;
+        let name = String::from_utf8_lossy(b.take(end as u64)?).into_owned();
+        b.take(1)?;
+        let points = b.count("points in a picture", 24)?;
+        b.take(points * 24)?;
+        images.push(ColmapImage { camera, name, rotation, translation });
+    }
+    Ok(images)
+}
+
+/// `points3D.bin`; tracks are passed over.
+pub(crate) fn points(object: &str, bytes: &[u8], limits: &Limits) -> Result<PointCloud> {
+    let mut b = Bytes::new(object, bytes);
+    let count = b.count("points", 51)?;
+    limits.check_gaussians(object, count)?;
+    let mut cloud = PointCloud::default();
+    for i in 0..count {
+        b.u64()?;
+        let p = b.floats::<3>()?;
+        let rgb = b.array::<3>()?;
+        b.floats::<1>()?;
+        let track = b.count("track elements", 8)?;
+        b.take(track * 8)?;
+        let p = p.map(|v| v as f32);
+        if p.iter().any(|v| !v.is_finite()) {
+            return Err(b.bad(format!("point {i} is at {p:?}")));
+        }
+        cloud.positions.push(p);
+        cloud.colors.push(rgb.map(|c| f32::from(c) / 255.0));
+    }
+    Ok(cloud)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn claimed_counts_are_not_believed() {
+        let claim = u64::MAX.to_le_bytes();
+        assert!(cameras("t", &claim).is_err() && images("t", &claim).is_err() && points("t", &claim, &Limits::default()).is_err());
+        let claim = (u64::MAX / 51).to_le_bytes();
+        assert!(points("t", &claim, &Limits::default()).is_err());
+    }
+}

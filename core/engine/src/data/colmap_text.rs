@@ -1,0 +1,91 @@
+//! COLMAP's text files.
+
+use super::colmap::{ColmapCamera, ColmapImage, Model};
+use cc4dgs_core::{Error, Limits, PointCloud, Result};
+use std::collections::BTreeMap;
+use std::str::FromStr;
+
+fn bad(object: &str, number: usize, problem: impl std::fmt::Display) -> Error {
+    Error::data(format!("{object}: line {}", number + 1), problem.to_string(), "The file is damaged or not a COLMAP model; export it again")
+}
+
+/// The next word of a line as a value.
+fn next<T: FromStr>(words: &mut std::str::SplitWhitespace, object: &str, line: usize) -> Result<T> {
+    let word = words.next().ok_or_else(|| bad(object, line, "a value is missing"))?;
+    word.parse().map_err(|_| bad(object, line, format!("{word:?} is not the value expected there")))
+}
+
+fn floats<const N: usize>(words: &mut std::str::SplitWhitespace, object: &str, line: usize) -> Result<[f64; N]> {
+    let mut out = [0.0; N];
+    for v in &mut out {
+        *v = next(words, object, line)?;
+    }
+    Ok(out)
+}
+
+/// Lines that are not comments, with their numbers. Empty lines count: a picture without points has one.
+fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines().enumerate().filter(|(_, l)| !l.starts_with('#'))
+}
+
+/// `cameras.txt`: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[].
+pub(crate) fn cameras(object: &str, text: &str) -> Result<BTreeMap<u32, ColmapCamera>> {
+    let mut cameras = BTreeMap::new();
+    for (n, line) in lines(text).filter(|(_, l)| !l.trim().is_empty()) {
+        let mut words = line.split_whitespace();
+        let id = next(&mut words, object, n)?;
+        let name: String = next(&mut words, object, n)?;
+        let model = Model::from_name(&name).ok_or_else(|| {
+            Error::unsupported(
+                format!("{object}: line {}", n + 1),
+                format!("camera model {name}"),
+                format!("Undistort with COLMAP, or use one of {}", Model::known()),
+            )
+        })?;
+        let size = [next(&mut words, object, n)?, next(&mut words, object, n)?];
+        let parameters = (0..model.parameters()).map(|_| next(&mut words, object, n)).collect::<Result<_>>()?;
+        cameras.insert(id, ColmapCamera { model, size, parameters });
+    }
+    Ok(cameras)
+}
+
+/// `images.txt`: two lines a picture, IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME and its points.
+pub(crate) fn images(object: &str, text: &str) -> Result<Vec<ColmapImage>> {
+    let mut images = Vec::new();
+    let mut rows = lines(text);
+    while let Some((n, line)) = rows.next() {
+        if line.trim().is_empty() {
+            continue;
+        }
+        let mut words = line.split_whitespace();
+        next::<u32>(&mut words, object, n)?;
+        let rotation = floats(&mut words, object, n)?;
+        let translation = floats(&mut words, object, n)?;
+        let camera = next(&mut words, object, n)?;
+        let name = words.collect::<Vec<_>>().join(" ");
+        if name.is_empty() {
+            return Err(bad(object, n, "the picture has no name"));
+        }
+        images.push(ColmapImage { camera, name, rotation, translation });
+        rows.next();
+    }
+    Ok(images)
+}
+
+/// `points3D.txt`: POINT3D_ID X Y Z R G B ERROR TRACK[].
+pub(crate) fn points(object: &str, text: &str, limits: &Limits) -> Result<PointCloud> {
+    let mut cloud = PointCloud::default();
+    for (n, line) in lines(text).filter(|(_, l)| !l.trim().is_empty()) {
+        let mut words = line.split_whitespace();
+        next::<u64>(&mut words, object, n)?;
+        let p = floats::<3>(&mut words, object, n)?.map(|v| v as f32);
+        let rgb: [u8; 3] = [next(&mut words, object, n)?, next(&mut words, object, n)?, next(&mut words, object, n)?];
+        if p.iter().any(|v| !v.is_finite()) {
+            return Err(bad(object, n, format!("the point is at {p:?}")));
+        }
+        cloud.positions.push(p);
+        cloud.colors.push(rgb.map(|c| f32::from(c) / 255.0));
+        limits.check_gaussians(object, cloud.positions.len() as u64)?;
+    }
+    Ok(cloud)
+}

@@ -1,0 +1,149 @@
+//! Reading files that may be hostile: sizes are checked before anything is allocated for them.
+
+use cc4dgs_core::{Error, Image8, Limits, Result};
+use image::{DynamicImage, ImageReader};
+use serde::de::DeserializeOwned;
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read};
+use std::path::{Path, PathBuf};
+
+/// The whole of a regular file, refused over `limits.max_bytes`.
+pub(crate) fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
+    let object = path.display().to_string();
+    let meta = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
+    if !meta.is_file() {
+        // A pipe would make the reader wait for ever.
+        return Err(Error::data(object, "is not a regular file", "Point to a file"));
+    }
+    limits.check_bytes(&object, meta.len())?;
+    let mut bytes = Vec::with_capacity(meta.len() as usize);
+    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    file.take(limits.max_bytes).read_to_end(&mut bytes).map_err(|e| Error::io(path, e))?;
+    Ok(bytes)
+}
+
+/// The file as UTF-8 text.
+pub(crate) fn read_text(path: &Path, limits: &Limits) -> Result<String> {
+    String::from_utf8(read_bytes(path, limits)?)
+        .map_err(|e| Error::data(path.display().to_string(), format!("byte {} is not UTF-8 text", e.utf8_error().valid_up_to()), "Fetch the file again"))
+}
+
+/// The JSON document of a file.
+pub(crate) fn read_json<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T> {
+    let text = read_text(path, limits)?;
+    let object = path.display().to_string();
+    limits_depth(&text, &object, limits)?;
+    serde_json::from_str(&text).map_err(|e| Error::data(object, e.to_string(), "Correct the JSON"))
+}
+
+fn limits_depth(text: &str, object: &str, limits: &Limits) -> Result<()> {
+    let (mut depth, mut deepest, mut in_string, mut escaped) = (0u64, 0u64, false, false);
+    for b in text.bytes() {
+        if in_string {
+            (in_string, escaped) = (escaped || b != b'"', !escaped && b == b'\\');
+            continue;
+        }
+        match b {
+            b'"' => in_string = true,
+            b'[' | b'{' => {
+                depth += 1;
+                deepest = deepest.max(depth);
+            }
+            b']' | b'}' => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+    }
+    if deepest > u64::from(limits.max_depth) {
+        return Err(Error::limit(format!("{object}: nesting"), deepest, u64::from(limits.max_depth), "Raise limits.max_depth if the file is trusted"));
+    }
+    Ok(())
+}
+
+/// Sorted entries of a folder that satisfy `keep`.
+pub(crate) fn list(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
+        let path = entry.map_err(|e| Error::io(folder, e))?.path();
+        if keep(&path) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// Whether the extension is that of a picture this build decodes.
+pub(crate) fn is_picture(path: &Path) -> bool {
+    has_extension(path, &["png", "jpg", "jpeg"]) && path.is_file()
+}
+
+/// Whether the extension, in lower case, is one of `known`.
+pub(crate) fn has_extension(path: &Path, known: &[&str]) -> bool {
+    path.extension().and_then(|e| e.to_str()).is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()))
+}
+
+/// The last part of a path as text.
+pub(crate) fn file_name(path: &Path) -> String {
+    path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_else(|| path.display().to_string())
+}
+
+fn picture_error(path: &Path, e: impl std::fmt::Display) -> Error {
+    Error::data(path.display().to_string(), format!("not a readable picture: {e}"), "Fetch the file again, or remove it from the dataset")
+}
+
+/// Width and height from a picture's header.
+pub(crate) fn picture_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
+    let file = File::open(path).map_err(|e| Error::io(path, e))?;
+    let reader = ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(|e| Error::io(path, e))?;
+    let (w, h) = reader.into_dimensions().map_err(|e| picture_error(path, e))?;
+    limits.check_pixels(&path.display().to_string(), u64::from(w), u64::from(h))?;
+    Ok((w, h))
+}
+
+/// Decodes a PNG or JPEG of at most `limits.max_pixels` into 8-bit RGB or RGBA.
+pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
+    let bytes = read_bytes(path, limits)?;
+    if bytes.starts_with(&[0xff, 0xd8]) && jpeg_is_cut(&bytes) {
+        return Err(picture_error(path, "the JPEG ends before its end marker"));
+    }
+    let mut reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?;
+    let (w, h) =
+        ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?.into_dimensions().map_err(|e| picture_error(path, e))?;
+    limits.check_pixels(&path.display().to_string(), u64::from(w), u64::from(h))?;
+    let mut caps = image::Limits::default();
+    caps.max_alloc = Some(limits.max_bytes);
+    reader.limits(caps);
+    let decoded = reader.decode().map_err(|e| picture_error(path, e))?;
+    let (width, height) = (decoded.width(), decoded.height());
+    let (channels, data) = match decoded {
+        DynamicImage::ImageRgb8(i) => (3, i.into_raw()),
+        DynamicImage::ImageRgba8(i) => (4, i.into_raw()),
+        other if other.color().has_alpha() => (4, other.into_rgba8().into_raw()),
+        other => (3, other.into_rgb8().into_raw()),
+    };
+    if width == 0 || height == 0 {
+        return Err(picture_error(path, "it has no pixels"));
+    }
+    Ok(Image8 { width, height, channels, data })
+}
+
+/// A JPEG that lost its tail still decodes, with grey where data is missing; within entropy-coded data the end marker cannot occur by chance.
+fn jpeg_is_cut(bytes: &[u8]) -> bool {
+    let last = |marker: u8| bytes.windows(2).rposition(|w| w == [0xff, marker]);
+    match (last(0xda), last(0xd9)) {
+        (Some(scan), Some(end)) => end < scan,
+        _ => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn depth_ignores_brackets_in_strings() {
+        let limits = Limits { max_depth: 2, ..Default::default() };
+        assert!(limits_depth(r#"{"a": "[[[[\"[[[", "b": [1]}"#, "t", &limits).is_ok());
+        assert!(limits_depth("[[[1]]]", "t", &limits).is_err());
+    }
+}

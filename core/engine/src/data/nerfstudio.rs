@@ -1,0 +1,198 @@
+//! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Usually static.
+
+use super::distortion::Distortion;
+use super::files::{file_name, has_extension, picture_size, read_json};
+use super::pose::{from_opengl_camera_to_world, matrix4};
+use super::raw::{Picture, RawCamera, RawScene, RawView};
+use super::{Reader, SceneOptions};
+use cc4dgs_core::{Error, Limits, Result, Split};
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+
+pub(crate) struct Nerfstudio;
+
+/// Every how many pictures one is held out where the file names no split, as is usual for static scenes.
+pub(crate) const HOLD_OUT_EVERY: usize = 8;
+
+#[derive(Clone, Default, Deserialize)]
+struct Intrinsics {
+    camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    w: Option<f64>,
+    h: Option<f64>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    k4: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+    camera_model: Option<String>,
+    is_fisheye: Option<bool>,
+}
+
+#[derive(Deserialize)]
+struct Transforms {
+    #[serde(flatten)]
+    shared: Intrinsics,
+    frames: Vec<Frame>,
+    #[serde(default)]
+    train_filenames: Vec<String>,
+    #[serde(default)]
+    test_filenames: Vec<String>,
+    #[serde(default)]
+    val_filenames: Vec<String>,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    #[serde(flatten)]
+    own: Intrinsics,
+    file_path: String,
+    transform_matrix: Vec<Vec<f64>>,
+    time: Option<f64>,
+}
+
+impl Intrinsics {
+    /// Own values first, then the shared ones.
+    fn over(&self, shared: &Self) -> Self {
+        macro_rules! first {
+            ($($field:ident),*) => { Self { $($field: self.$field.clone().or_else(|| shared.$field.clone())),* } };
+        }
+        first!(camera_angle_x, camera_angle_y, fl_x, fl_y, cx, cy, w, h, k1, k2, k3, k4, p1, p2, camera_model, is_fisheye)
+    }
+    fn distortion(&self) -> Result<Distortion, String> {
+        let radial = [self.k1, self.k2, self.k3, self.k4].map(|k| k.unwrap_or(0.0));
+        let tangential = [self.p1.unwrap_or(0.0), self.p2.unwrap_or(0.0)];
+        match self.camera_model.as_deref().unwrap_or("OPENCV") {
+            "OPENCV_FISHEYE" => Ok(Distortion::Fisheye { radial }),
+            _ if self.is_fisheye == Some(true) => Ok(Distortion::Fisheye { radial }),
+            "OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE" => Ok(Distortion::Brown { radial, tangential }),
+            other => Err(format!("camera model {other:?} is not supported; known are OPENCV, PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV_FISHEYE")),
+        }
+    }
+    /// Focal lengths from pixels, or from the angles of view.
+    fn focal(&self, w: f64, h: f64) -> Result<[f64; 2], String> {
+        let from_angle = |size: f64, angle: f64| 0.5 * size / (0.5 * angle).tan();
+        let fx = self.fl_x.or_else(|| self.camera_angle_x.map(|a| from_angle(w, a))).or(self.fl_y);
+        let fx = fx.or_else(|| self.camera_angle_y.map(|a| from_angle(h, a))).ok_or("it has neither fl_x nor camera_angle_x")?;
+        Ok([fx, self.fl_y.or_else(|| self.camera_angle_y.map(|a| from_angle(h, a))).unwrap_or(fx)])
+    }
+}
+
+/// The file a JSON names, with the usual extensions tried where it names none.
+pub(crate) fn picture_path(folder: &Path, named: &str) -> PathBuf {
+    let path = folder.join(named);
+    if has_extension(&path, &["png", "jpg", "jpeg"]) || path.is_file() {
+        return path;
+    }
+    let with = |extension: &str| folder.join(format!("{named}.{extension}"));
+    ["png", "jpg", "jpeg"].iter().map(|e| with(e)).find(|p| p.is_file()).unwrap_or_else(|| with("png"))
+}
+
+impl Reader for Nerfstudio {
+    fn name(&self) -> &'static str {
+        "nerfstudio"
+    }
+    fn looks_for(&self) -> &'static str {
+        "transforms.json (nerfstudio, instant-ngp), or the path of such a file"
+    }
+    fn probe(&self, path: &Path) -> bool {
+        path.join("transforms.json").is_file() || (path.is_file() && has_extension(path, &["json"]))
+    }
+    fn open(&self, path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+        let file = if path.is_file() { path.to_path_buf() } else { path.join("transforms.json") };
+        let folder = file.parent().unwrap_or(Path::new("."));
+        let object = file.display().to_string();
+        let transforms: Transforms = read_json(&file, limits)?;
+        let mut scene = RawScene { name: file_name(path), ..Default::default() };
+        let mut frames: Vec<&Frame> = transforms.frames.iter().collect();
+        frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
+        let named_split = !transforms.train_filenames.is_empty() || !transforms.test_filenames.is_empty();
+        let mut missing = Vec::new();
+        let mut seen = 0;
+        let mut times = Vec::new();
+        for frame in frames {
+            let picture = picture_path(folder, &frame.file_path);
+            if !picture.is_file() {
+                missing.push(frame.file_path.clone());
+                continue;
+            }
+            let split = if named_split {
+                let held_out = transforms.test_filenames.contains(&frame.file_path);
+                let listed = held_out || transforms.train_filenames.is_empty() || transforms.train_filenames.contains(&frame.file_path);
+                if !listed && transforms.val_filenames.contains(&frame.file_path) {
+                    continue;
+                }
+                if held_out { Split::Test } else { Split::Train }
+            } else if seen % HOLD_OUT_EVERY == 0 && transforms.frames.len() > 1 {
+                Split::Test
+            } else {
+                Split::Train
+            };
+            seen += 1;
+            let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
+            scene.cameras.push(camera(frame, &transforms.shared, &picture, limits, &bad)?);
+            times.push(frame.time);
+            scene.views.push(RawView {
+                camera: scene.cameras.len() - 1,
+                frame: 0,
+                time: Some(0.0),
+                split,
+                picture: Picture::File { path: picture, mask: None },
+            });
+        }
+        if !missing.is_empty() {
+            let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
+            scene.warnings.push(format!(
+                "{} of {} pictures are missing and were skipped: {shown}{}",
+                missing.len(),
+                transforms.frames.len(),
+                if missing.len() > 3 { ", …" } else { "" }
+            ));
+        }
+        rank_times(&mut scene, &times, &object)?;
+        Ok(scene)
+    }
+}
+
+fn camera(frame: &Frame, shared: &Intrinsics, picture: &Path, limits: &Limits, bad: &dyn Fn(String) -> Error) -> Result<RawCamera> {
+    let intrinsics = frame.own.over(shared);
+    let (w, h) = match (intrinsics.w, intrinsics.h) {
+        (Some(w), Some(h)) if w >= 1.0 && h >= 1.0 && w <= 1e6 && h <= 1e6 => (w, h),
+        (None, None) => {
+            let (w, h) = picture_size(picture, limits)?;
+            (f64::from(w), f64::from(h))
+        }
+        (w, h) => return Err(bad(format!("picture size w {w:?}, h {h:?} is not a size"))),
+    };
+    let world_to_camera = matrix4(&frame.transform_matrix).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
+    Ok(RawCamera {
+        name: frame.file_path.trim_start_matches("./").to_string(),
+        size: [w as u32, h as u32],
+        focal: intrinsics.focal(w, h).map_err(bad)?,
+        principal: [intrinsics.cx.unwrap_or(0.5 * w), intrinsics.cy.unwrap_or(0.5 * h)],
+        distortion: intrinsics.distortion().map_err(bad)?,
+        world_to_camera,
+    })
+}
+
+/// Frames with times form a sequence by rank; times are divided by the largest if that is over 1.
+fn rank_times(scene: &mut RawScene, times: &[Option<f64>], object: &str) -> Result<()> {
+    if let Some(t) = times.iter().flatten().find(|t| !t.is_finite() || **t < 0.0) {
+        return Err(Error::data(object, format!("time {t} is not a number from 0 up"), "Correct the JSON"));
+    }
+    let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
+    let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
+    distinct.sort_by(f64::total_cmp);
+    distinct.dedup();
+    for (view, time) in scene.views.iter_mut().zip(times) {
+        let t = time.unwrap_or(0.0);
+        view.frame = distinct.partition_point(|&d| d < t);
+        view.time = Some(t / largest);
+    }
+    Ok(())
+}

@@ -1,0 +1,158 @@
+//! The `[scene]` section: how a dataset is opened.
+
+use cc4dgs_core::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// A background colour: a name or RGB in 0..1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Background {
+    /// `white`, `black` or `grey`.
+    Name(String),
+    /// Red, green, blue in 0..1.
+    Rgb([f32; 3]),
+}
+
+impl Background {
+    /// The colour as RGB in 0..1.
+    pub fn rgb(&self) -> Result<[f32; 3]> {
+        match self {
+            Self::Name(name) => match name.as_str() {
+                "white" => Ok([1.0; 3]),
+                "black" => Ok([0.0; 3]),
+                "grey" | "gray" => Ok([0.5; 3]),
+                other => Err(cc4dgs_core::unknown_name("scene.background", other, ["white", "black", "grey"].into_iter())),
+            },
+            Self::Rgb(c) if c.iter().all(|v| (0.0..=1.0).contains(v)) => Ok(*c),
+            Self::Rgb(c) => Err(Error::parameter("scene.background", format!("{c:?} is outside 0..1"), "Write three numbers between 0 and 1")),
+        }
+    }
+}
+
+/// A camera by its place or its name.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum CameraRef {
+    /// Index in the reader's order.
+    Index(usize),
+    /// Name as the dataset has it.
+    Name(String),
+}
+
+/// How a dataset is opened. All keys are optional.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SceneOptions {
+    /// Reader name, or `auto` to probe.
+    pub reader: String,
+    /// Target width in pixels; 0 keeps the native one, or the aspect if only the height is given.
+    pub width: u32,
+    /// Target height in pixels; 0 keeps the native one, or the aspect if only the width is given.
+    pub height: u32,
+    /// Divides the native size; excludes `width` and `height`.
+    pub downscale: f64,
+    /// First frame, number of frames (0: all that follow) and stride, by frame index of the dataset.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frames: Option<[usize; 3]>,
+    /// Background the pictures are composited over and the renders start from; the dataset's own if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub background: Option<Background>,
+    /// Memory for decoded frames, in megabytes (10^6 bytes).
+    pub cache_mb: u64,
+    /// Cameras to hold out, instead of the dataset's own split.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub test_cameras: Option<Vec<CameraRef>>,
+    /// At most this many training views, evenly spread; 0 for all.
+    pub max_views: usize,
+    /// Which `transforms_*.json` is the held-out one of Blender-style scenes (`val` is the usual choice for D-NeRF lego).
+    pub test_split: String,
+    /// The `ffmpeg` command used for video input; `ffprobe` is looked for beside it.
+    pub ffmpeg: String,
+    /// Where frames extracted from videos are kept; the system's temporary folder if absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub video_cache: Option<PathBuf>,
+}
+
+impl Default for SceneOptions {
+    fn default() -> Self {
+        Self {
+            reader: "auto".into(),
+            width: 0,
+            height: 0,
+            downscale: 1.0,
+            frames: None,
+            background: None,
+            cache_mb: 2000,
+            test_cameras: None,
+            max_views: 0,
+            test_split: "test".into(),
+            ffmpeg: "ffmpeg".into(),
+            video_cache: None,
+        }
+    }
+}
+
+impl SceneOptions {
+    /// Refuses contradictions and values without meaning.
+    pub fn validate(&self) -> Result<()> {
+        if !(self.downscale.is_finite() && self.downscale > 0.0) {
+            return Err(Error::parameter("scene.downscale", format!("{} is not a positive number", self.downscale), "Write 2 to halve the pictures"));
+        }
+        if self.downscale != 1.0 && (self.width > 0 || self.height > 0) {
+            return Err(Error::parameter("scene.downscale", "given together with scene.width or scene.height", "Keep one of them"));
+        }
+        if self.frames.is_some_and(|f| f[2] == 0) {
+            return Err(Error::parameter("scene.frames", "the stride is 0", "Write [start, count, stride] with a stride of 1 or more"));
+        }
+        if let Some(background) = &self.background {
+            background.rgb()?;
+        }
+        Ok(())
+    }
+    /// The size pictures of `native` pixels are brought to.
+    pub(crate) fn target_size(&self, native: (u32, u32)) -> (u32, u32) {
+        let (w, h) = (f64::from(native.0), f64::from(native.1));
+        let pixels = |v: f64| v.round().clamp(1.0, f64::from(u32::MAX)) as u32;
+        match (self.width, self.height) {
+            (0, 0) => (pixels(w / self.downscale), pixels(h / self.downscale)),
+            (width, 0) => (width, pixels(h * f64::from(width) / w)),
+            (0, height) => (pixels(w * f64::from(height) / h), height),
+            both => both,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_keep_the_aspect() {
+        let native = (800, 600);
+        let with = |width, height, downscale| SceneOptions { width, height, downscale, ..Default::default() }.target_size(native);
+        assert_eq!(with(0, 0, 1.0), (800, 600));
+        assert_eq!(with(400, 0, 1.0), (400, 300));
+        assert_eq!(with(0, 150, 1.0), (200, 150));
+        assert_eq!(with(100, 100, 1.0), (100, 100));
+        assert_eq!(with(0, 0, 2.0), (400, 300));
+    }
+
+    #[test]
+    fn contradictions_are_refused() {
+        assert!(SceneOptions { downscale: 2.0, width: 100, ..Default::default() }.validate().is_err());
+        assert!(SceneOptions { downscale: f64::NAN, ..Default::default() }.validate().is_err());
+        assert!(SceneOptions { frames: Some([0, 4, 0]), ..Default::default() }.validate().is_err());
+        assert!(SceneOptions { background: Some(Background::Rgb([0.0, 2.0, 0.0])), ..Default::default() }.validate().is_err());
+        assert!(SceneOptions::default().validate().is_ok());
+    }
+
+    #[test]
+    fn toml_forms_are_read_and_unknown_keys_refused() {
+        let read = |text: &str| cc4dgs_core::config::parse_table("t", text).and_then(|t| cc4dgs_core::config::parse_section::<SceneOptions>("scene", &t));
+        let options = read("background = \"black\"\nframes = [0, 30, 5]\ntest_cameras = [0, \"cam10\"]").unwrap();
+        assert_eq!(options.background.unwrap().rgb().unwrap(), [0.0; 3]);
+        assert_eq!(options.test_cameras.unwrap(), vec![CameraRef::Index(0), CameraRef::Name("cam10".into())]);
+        assert!(read("widht = 3").unwrap_err().to_string().contains("widht"));
+    }
+}

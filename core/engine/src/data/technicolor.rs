@@ -1,0 +1,108 @@
+//! Technicolor light-field videos as E-D3DGS uses them: a 4x4 rig, undistorted pictures, `cameras_parameters.txt`.
+
+use super::distortion::Distortion;
+use super::files::{file_name, is_picture, list, picture_size, read_text};
+use super::pose::from_quaternion;
+use super::raw::{Picture, RawCamera, RawScene, RawView};
+use super::{Reader, SceneOptions};
+use cc4dgs_core::{Error, Limits, Result, Split};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+pub(crate) struct Technicolor;
+
+/// First frame of the 50 each of the five scenes is evaluated on (facts 8.2).
+const FIRST_FRAMES: [(&str, u32); 5] = [("Birthday", 151), ("Fabien", 51), ("Painter", 100), ("Theater", 51), ("Train", 151)];
+const FRAMES: u32 = 50;
+/// The held-out view.
+const TEST_CAMERA: u32 = 10;
+
+impl Reader for Technicolor {
+    fn name(&self) -> &'static str {
+        "technicolor"
+    }
+    fn looks_for(&self) -> &'static str {
+        "cameras_parameters.txt and <Scene>_undist_<frame>_<camera>.png (Technicolor)"
+    }
+    fn probe(&self, path: &Path) -> bool {
+        path.join("cameras_parameters.txt").is_file()
+    }
+    fn open(&self, path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+        let file = path.join("cameras_parameters.txt");
+        let rows = read_parameters(&file, limits)?;
+        let mut pictures: BTreeMap<(u32, u32), PathBuf> = BTreeMap::new();
+        let mut scene_name = String::new();
+        for picture in list(path, is_picture)? {
+            if let Some((name, frame, camera)) = parse_name(&picture) {
+                scene_name = name;
+                pictures.insert((frame, camera), picture);
+            }
+        }
+        // "Trains" and "Train" are both in use.
+        let range = FIRST_FRAMES.iter().find(|(name, _)| scene_name.starts_with(name)).map(|&(_, first)| first..first + FRAMES);
+        if let Some(range) = range {
+            pictures.retain(|(frame, _), _| range.contains(frame));
+        }
+        let mut frames: Vec<u32> = pictures.keys().map(|k| k.0).collect();
+        frames.dedup();
+        let Some(first) = pictures.values().next() else {
+            return Err(Error::data(
+                path.display().to_string(),
+                "no picture named <Scene>_undist_<frame>_<camera>.png lies in its frame range",
+                "Check the path",
+            ));
+        };
+        let (w, h) = picture_size(first, limits)?;
+        let mut scene = RawScene { name: file_name(path), ..Default::default() };
+        for (index, row) in rows.iter().enumerate() {
+            let bad = |problem: String| Error::data(format!("{}: camera {index}", file.display()), problem, "Fetch the file again");
+            scene.cameras.push(RawCamera {
+                name: format!("cam{index:02}"),
+                size: [w, h],
+                focal: [row[0]; 2],
+                principal: [row[1], row[2]],
+                distortion: Distortion::None,
+                world_to_camera: from_quaternion([row[5], row[6], row[7], row[8]], [row[9], row[10], row[11]]).map_err(bad)?,
+            });
+        }
+        for ((frame, camera), path) in pictures {
+            if camera as usize >= rows.len() {
+                return Err(Error::data(
+                    file.display().to_string(),
+                    format!("it has {} cameras, {} is of camera {camera}", rows.len(), path.display()),
+                    "Fetch the file again",
+                ));
+            }
+            let split = if camera == TEST_CAMERA { Split::Test } else { Split::Train };
+            let frame = frames.partition_point(|&f| f < frame);
+            scene.views.push(RawView { camera: camera as usize, frame, time: None, split, picture: Picture::File { path, mask: None } });
+        }
+        Ok(scene)
+    }
+}
+
+/// `Birthday_undist_00151_03.png` to ("Birthday", 151, 3).
+fn parse_name(path: &Path) -> Option<(String, u32, u32)> {
+    let stem = path.file_stem()?.to_str()?;
+    let (name, rest) = stem.split_once("_undist_")?;
+    let (frame, camera) = rest.split_once('_')?;
+    Some((name.to_string(), frame.parse().ok()?, camera.parse().ok()?))
+}
+
+/// A header line, then 12 numbers a row: focal, cx, cy, two ignored, quaternion (w,x,y,z), translation; world to camera.
+fn read_parameters(file: &Path, limits: &Limits) -> Result<Vec<Vec<f64>>> {
+    let text = read_text(file, limits)?;
+    let mut rows = Vec::new();
+    for (number, line) in text.lines().enumerate().skip(1).filter(|(_, l)| !l.trim().is_empty()) {
+        let bad = |problem: String| Error::data(format!("{}: line {}", file.display(), number + 1), problem, "Fetch the file again");
+        let row: Vec<f64> = line.split_whitespace().map(|t| t.parse::<f64>().map_err(|_| bad(format!("{t:?} is not a number")))).collect::<Result<_>>()?;
+        if row.len() < 12 {
+            return Err(bad(format!("it has {} numbers, 12 are needed", row.len())));
+        }
+        rows.push(row);
+    }
+    if rows.is_empty() {
+        return Err(Error::data(file.display().to_string(), "it lists no camera", "Fetch the file again"));
+    }
+    Ok(rows)
+}

@@ -1,0 +1,281 @@
+//! Every format on a tiny scene: poses come back, splits and times follow the convention of the dataset.
+
+use crate::common::*;
+use cc4dgs_core::{Limits, Split};
+use cc4dgs_engine::data::{SceneOptions, open, readers};
+
+fn train_count(scene: &cc4dgs_core::Scene) -> (usize, usize) {
+    (scene.split(Split::Train).len(), scene.split(Split::Test).len())
+}
+
+#[test]
+fn dnerf() {
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = write_dnerf(dir.path(), 5, 2, 16);
+    let scene = load(dir.path()).unwrap();
+    assert_eq!(train_count(&scene), (5, 2));
+    assert_eq!(scene.frame_count, 5, "distinct times");
+    assert_eq!(scene.init_box, Some(([-1.3; 3], [1.3; 3])));
+    assert_eq!(scene.background, Some([1.0; 3]));
+    for (i, truth) in cameras.iter().enumerate().take(5) {
+        let view = scene.views.iter().position(|v| scene.cameras[v.camera].name == format!("train/r_{i:03}")).unwrap();
+        same_pose(scene.camera(view), truth);
+        assert!((scene.camera(view).fx - truth.fx).abs() < 1e-9);
+        assert!((f64::from(scene.views[view].time_norm) - i as f64 / 4.0).abs() < 1e-6);
+        assert_eq!(scene.frame(view).unwrap().data[..4], [10, 20, 30, 255]);
+    }
+}
+
+#[test]
+fn panoptic() {
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = write_panoptic(dir.path(), 4, 3);
+    let scene = load(dir.path()).unwrap();
+    assert_eq!(train_count(&scene), (12, 3));
+    assert_eq!((scene.cameras.len(), scene.frame_count), (5, 3), "a camera that stands is one camera");
+    for (view, v) in scene.views.iter().enumerate() {
+        let c: usize = scene.camera(view).name.parse().unwrap();
+        same_pose(scene.camera(view), &cameras[c]);
+        assert_eq!(scene.frame(view).unwrap().data[2], (10 * c + v.frame) as u8, "each view shows its own picture");
+        assert!((v.time_norm - v.frame as f32 / 3.0).abs() < 1e-6);
+    }
+    let (low, high) = scene.init_box.unwrap();
+    assert!((0..3).all(|k| low[k] < -2.0 && high[k] > 2.0), "{low:?} {high:?}");
+    assert!(scene.foreground_masks.is_none());
+}
+
+#[test]
+fn panoptic_masks_are_found() {
+    let dir = tempfile::tempdir().unwrap();
+    write_panoptic(dir.path(), 4, 2);
+    let mask = image::GrayImage::from_fn(16, 12, |x, _| image::Luma([if x < 8 { 255 } else { 0 }]));
+    std::fs::create_dir_all(dir.path().join("seg/1")).unwrap();
+    mask.save(dir.path().join("seg/1/000001.png")).unwrap();
+    let scene = load(dir.path()).unwrap();
+    let masks = scene.foreground_masks.clone().unwrap();
+    let at = |camera: &str, frame: usize| (0..scene.views.len()).find(|&v| scene.camera(v).name == camera && scene.views[v].frame == frame).unwrap();
+    let found = masks.load(at("1", 1)).unwrap();
+    assert_eq!((found.data[0], found.data[15 * 3]), (255, 0));
+    assert!(masks.load(at("1", 0)).is_err(), "a view without a mask says so");
+}
+
+#[test]
+fn llff_with_frame_folders() {
+    let dir = tempfile::tempdir().unwrap();
+    // Calibrated at twice the size of the frames, as N3DV is used.
+    let cameras = ring(3, 32, 24);
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[3, 17], &llff_rows(&cameras))).unwrap();
+    for c in 0..3 {
+        for t in 0..4 {
+            picture(&dir.path().join(format!("cam{c:02}/images/{t:04}.png")), 16, 12, (10 * c + t) as u8);
+        }
+    }
+    let scene = load(dir.path()).unwrap();
+    assert_eq!(train_count(&scene), (8, 4));
+    for (view, v) in scene.views.iter().enumerate() {
+        let camera = scene.camera(view);
+        same_pose(camera, &cameras[v.camera]);
+        assert_eq!((camera.width, camera.fx, camera.cx), (16, cameras[0].fx / 2.0, 8.0));
+        assert_eq!(v.split, if camera.name == "cam00" { Split::Test } else { Split::Train });
+        assert_eq!(v.time_norm, v.frame as f32 / 4.0);
+        assert_eq!(scene.frame(view).unwrap().data[2], (10 * v.camera + v.frame) as u8);
+    }
+}
+
+#[test]
+fn llff_refuses_a_camera_too_many() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[2, 17], &llff_rows(&ring(2, 16, 12)))).unwrap();
+    (0..3).for_each(|c| picture(&dir.path().join(format!("images/{c}.png")), 16, 12, 0));
+    let message = load(dir.path()).err().unwrap().to_string();
+    assert!(message.contains("2 rows") && message.contains("3 cameras"), "{message}");
+}
+
+/// A stand-in for ffmpeg that answers the two calls the reader makes, by copying frames prepared by the test.
+#[cfg(unix)]
+#[test]
+fn llff_with_videos() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().unwrap();
+    let tools = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[2, 17], &llff_rows(&ring(2, 16, 12)))).unwrap();
+    for c in 0..2u8 {
+        std::fs::write(dir.path().join(format!("cam{c:02}.mp4")), "not a video").unwrap();
+        (0..6u8).for_each(|t| picture(&tools.path().join(format!("cam{c:02}/{t}.png")), 16, 12, 10 * c + t));
+    }
+    let script = |name: &str, text: String| {
+        let path = tools.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+        path.to_string_lossy().into_owned()
+    };
+    script("ffprobe", "#!/bin/sh\necho 16,12,6\n".into());
+    // The last argument is the pattern; the frames the filter selects are 1, 3, 5.
+    let log = tools.path().join("log");
+    let body = "for last; do :; done\nout=$(dirname \"$last\")\ncam=$(echo \"$*\" | grep -o 'cam0[0-9]' | head -1)\n";
+    let copy = "i=1\nfor t in 1 3 5; do cp TOOLS/$cam/$t.png $out/$(printf %06d $i).png; i=$((i+1)); done\n".replace("TOOLS", &tools.path().to_string_lossy());
+    let ffmpeg = script("ffmpeg", format!("#!/bin/sh\necho \"$*\" >> {}\n{body}{copy}", log.display()));
+    let options = SceneOptions { ffmpeg, frames: Some([1, 3, 2]), video_cache: Some(tools.path().join("cache")), ..Default::default() };
+    let scene = open(dir.path(), &options, &Limits::default()).unwrap();
+    assert_eq!(scene.frame_count, 3);
+    assert!(!log.exists(), "nothing is decoded before a frame is wanted");
+    for (view, v) in scene.views.iter().enumerate() {
+        assert_eq!(scene.frame(view).unwrap().data[2] as usize, 10 * v.camera + 1 + 2 * v.frame);
+    }
+    let calls = std::fs::read_to_string(&log).unwrap();
+    assert_eq!(calls.lines().count(), 2, "each video is decoded once: {calls}");
+    assert!(calls.contains("between(n,1,5)*not(mod(n-1,2))") && calls.contains("scale=16:12"), "{calls}");
+    // A second scene finds the frames in the cache.
+    let again = open(dir.path(), &options, &Limits::default()).unwrap();
+    again.frame(0).unwrap();
+    assert_eq!(std::fs::read_to_string(&log).unwrap().lines().count(), 2);
+}
+
+#[test]
+fn videos_without_ffmpeg_say_what_to_do() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[1, 17], &llff_rows(&ring(1, 16, 12)))).unwrap();
+    std::fs::write(dir.path().join("cam00.mp4"), "x").unwrap();
+    let options = SceneOptions { ffmpeg: "/nonexistent/ffmpeg".into(), ..Default::default() };
+    let message = open(dir.path(), &options, &Limits::default()).err().unwrap().to_string();
+    assert!(message.contains("/nonexistent/ffprobe") && message.contains("Install ffmpeg"), "{message}");
+}
+
+#[test]
+fn technicolor() {
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = ring(12, 16, 12);
+    let mut text = "header line\n".to_string();
+    for camera in &cameras {
+        let (q, t) = quaternion(camera);
+        text += &format!("{} 8.5 5.25 0 0 {} {} {} {} {} {} {}\n", camera.fx, q[0], q[1], q[2], q[3], t[0], t[1], t[2]);
+    }
+    std::fs::write(dir.path().join("cameras_parameters.txt"), text).unwrap();
+    for frame in [99, 100, 101, 149, 150] {
+        (0..12u8).for_each(|c| picture(&dir.path().join(format!("Painter_undist_{frame:05}_{c:02}.png")), 16, 12, c));
+    }
+    let scene = load(dir.path()).unwrap();
+    // Frames 99 and 150 lie outside the 50 of Painter.
+    assert_eq!((scene.frame_count, train_count(&scene)), (3, (33, 3)));
+    for (view, v) in scene.views.iter().enumerate() {
+        let camera = scene.camera(view);
+        same_pose(camera, &cameras[v.camera]);
+        assert_eq!((camera.cx, camera.cy), (8.5, 5.25), "the principal point is honoured");
+        assert_eq!(v.split == Split::Test, camera.name == "cam10");
+        assert_eq!(scene.frame(view).unwrap().data[2] as usize, v.camera);
+    }
+}
+
+fn colmap_names() -> Vec<String> {
+    (0..9).map(|i| format!("im_{i:02}.png")).collect()
+}
+
+fn check_colmap(scene: &cc4dgs_core::Scene, cameras: &[cc4dgs_core::Camera]) {
+    assert_eq!(train_count(scene), (7, 2), "every eighth is held out");
+    for (view, v) in scene.views.iter().enumerate() {
+        same_pose(scene.camera(view), &cameras[v.camera]);
+        assert_eq!(scene.frame(view).unwrap().data[2] as usize, v.camera);
+    }
+    let points = scene.points.as_ref().unwrap();
+    assert_eq!(points.positions, vec![[0.0, -1.0, 2.0], [0.5, -1.0, 2.0]]);
+    assert_eq!(points.colors[0], [1.0, 128.0 / 255.0, 0.0]);
+}
+
+#[test]
+fn colmap_in_both_forms() {
+    let cameras = ring(9, 16, 12);
+    let names = colmap_names();
+    let dir = tempfile::tempdir().unwrap();
+    names.iter().enumerate().for_each(|(i, n)| picture(&dir.path().join("images").join(n), 16, 12, i as u8));
+    let model = dir.path().join("sparse/0");
+    std::fs::create_dir_all(&model).unwrap();
+    for (file, bytes) in ["cameras", "images", "points3D"].iter().zip(colmap_binary(&cameras, &names)) {
+        std::fs::write(model.join(format!("{file}.bin")), bytes).unwrap();
+    }
+    check_colmap(&load(dir.path()).unwrap(), &cameras);
+
+    ["cameras", "images", "points3D"].iter().for_each(|f| std::fs::remove_file(model.join(format!("{f}.bin"))).unwrap());
+    let (mut c, mut i) = ("# comment\n".to_string(), "# comment\n".to_string());
+    for (index, (camera, name)) in cameras.iter().zip(&names).enumerate() {
+        let (q, t) = quaternion(camera);
+        c += &format!("{index} PINHOLE 16 12 {} {} 8 6\n", camera.fx, camera.fy);
+        // One picture has points, the next has an empty line for none.
+        let points = if index % 2 == 0 { "1.0 2.0 -1" } else { "" };
+        i += &format!("{index} {} {} {} {} {} {} {} {index} {name}\n{points}\n", q[0], q[1], q[2], q[3], t[0], t[1], t[2]);
+    }
+    std::fs::write(model.join("cameras.txt"), c).unwrap();
+    std::fs::write(model.join("images.txt"), i).unwrap();
+    std::fs::write(model.join("points3D.txt"), "# c\n1 0 -1 2 255 128 0 0.1 1 0\n2 0.5 -1 2 255 128 0 0.1\n").unwrap();
+    check_colmap(&load(dir.path()).unwrap(), &cameras);
+}
+
+#[test]
+fn colmap_lenses_are_undone() {
+    for (model, parameters) in [
+        ("SIMPLE_PINHOLE", "60 32 24"),
+        ("SIMPLE_RADIAL", "60 32 24 -0.1"),
+        ("RADIAL", "60 32 24 -0.1 0.02"),
+        ("OPENCV", "60 61 32 24 -0.1 0.02 0.001 -0.001"),
+        ("OPENCV_FISHEYE", "60 61 32 24 0.01 0 0 0"),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("cameras.txt"), format!("1 {model} 64 48 {parameters}\n")).unwrap();
+        std::fs::write(dir.path().join("images.txt"), "1 1 0 0 0 0 0 0 1 a.png\n\n").unwrap();
+        picture(&dir.path().join("a.png"), 64, 48, 9);
+        let scene = load(dir.path()).unwrap();
+        let (camera, image) = (scene.camera(0), scene.frame(0).unwrap());
+        assert_eq!((camera.width, camera.height), (image.width, image.height), "{model}");
+        // The point on the optical axis keeps its colour: red and green are the source column and row.
+        let p = (camera.cy as usize * image.width as usize + camera.cx as usize) * 3;
+        assert!(image.data[p].abs_diff(32) <= 1 && image.data[p + 1].abs_diff(24) <= 1, "{model}: {:?}", &image.data[p..p + 3]);
+        assert_eq!(camera.fx, 60.0, "{model}");
+    }
+}
+
+#[test]
+fn nerfstudio_with_shared_and_own_intrinsics_and_gaps() {
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = ring(10, 32, 24);
+    let frames: Vec<_> = cameras
+        .iter()
+        .enumerate()
+        .map(|(i, c)| {
+            if i != 4 {
+                picture(&dir.path().join(format!("images/{i:04}.jpg")), 32, 24, 0);
+            }
+            let mut frame = serde_json::json!({"file_path": format!("images/{i:04}.jpg"), "transform_matrix": opengl_camera_to_world(c)});
+            if i == 5 {
+                frame["fl_x"] = 55.0.into();
+            }
+            frame
+        })
+        .collect();
+    let document = serde_json::json!({"fl_x": 50.0, "fl_y": 51.0, "cx": 16.5, "cy": 12.0, "w": 32.0, "h": 24.0, "aabb_scale": 4, "frames": frames});
+    std::fs::write(dir.path().join("transforms.json"), document.to_string()).unwrap();
+    let scene = load(dir.path()).unwrap();
+    assert_eq!(train_count(&scene), (7, 2));
+    assert!(scene.warnings.iter().any(|w| w.contains("1 of 10") && w.contains("images/0004.jpg")), "{:?}", scene.warnings);
+    let camera = |name: &str| scene.cameras.iter().find(|c| c.name == name).unwrap();
+    same_pose(camera("images/0005.jpg"), &cameras[5]);
+    assert_eq!((camera("images/0005.jpg").fx, camera("images/0006.jpg").fx, camera("images/0006.jpg").fy), (55.0, 50.0, 51.0));
+}
+
+#[test]
+fn the_right_reader_answers_or_all_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let message = load(dir.path()).err().unwrap().to_string();
+    for (name, looks_for) in readers() {
+        assert!(message.contains(name) && message.contains(looks_for), "{message}");
+    }
+    let missing = load(&dir.path().join("nothing")).err().unwrap();
+    assert_eq!(missing.exit_code(), 2, "{missing}");
+    // A folder with the marks of two formats goes to the more particular one, and scene.reader decides otherwise.
+    write_dnerf(dir.path(), 3, 1, 8);
+    std::fs::write(dir.path().join("transforms.json"), "{}").unwrap();
+    assert!(load(dir.path()).is_ok());
+    let forced = SceneOptions { reader: "nerfstudio".into(), ..Default::default() };
+    assert!(open(dir.path(), &forced, &Limits::default()).is_err());
+    let typo = SceneOptions { reader: "blendr".into(), ..Default::default() };
+    let message = open(dir.path(), &typo, &Limits::default()).err().unwrap().to_string();
+    assert!(message.contains("Did you mean blender"), "{message}");
+}

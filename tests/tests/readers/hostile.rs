@@ -1,0 +1,213 @@
+//! Bytes that lie: an error or a sound result, never a panic and never memory for a claim.
+
+use crate::common::*;
+use cc4dgs_core::{Limits, Result, Scene};
+use cc4dgs_engine::data::npy::read_npy;
+use proptest::prelude::*;
+use std::path::{Path, PathBuf};
+
+/// Small limits, so that a reader that believes a claim fails the test instead of the machine.
+fn limits() -> Limits {
+    Limits { max_bytes: 1 << 22, max_gaussians: 10_000, max_pixels: 1 << 20, max_depth: 64 }
+}
+
+fn open(path: &Path) -> Result<Scene> {
+    cc4dgs_engine::data::open(path, &options(), &limits())
+}
+
+/// Whatever opens must also be sound.
+fn check(result: Result<Scene>) {
+    match result {
+        Ok(scene) => {
+            scene.cameras.iter().for_each(|c| c.validate().unwrap());
+            assert!(scene.views.iter().all(|v| (0.0..=1.0).contains(&v.time_norm)));
+            if let Some((low, high)) = scene.init_box {
+                assert!(low.iter().chain(&high).all(|v| v.is_finite()));
+            }
+            assert!(scene.points.iter().flat_map(|p| &p.positions).flatten().all(|v| v.is_finite()));
+            if let Ok(image) = scene.frame(0) {
+                assert_eq!((image.width, image.height), (scene.camera(0).width, scene.camera(0).height));
+            }
+        }
+        Err(e) => {
+            let message = e.to_string();
+            assert!(message.len() > 20, "{message}");
+        }
+    }
+}
+
+/// Changes of a file: (place, new byte) and a cut.
+fn damage() -> impl Strategy<Value = (Vec<(prop::sample::Index, u8)>, Option<prop::sample::Index>)> {
+    (prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..6), prop::option::weighted(0.3, any::<prop::sample::Index>()))
+}
+
+fn apply(bytes: &[u8], (changes, cut): &(Vec<(prop::sample::Index, u8)>, Option<prop::sample::Index>)) -> Vec<u8> {
+    let mut out = bytes.to_vec();
+    for (place, value) in changes {
+        let i = place.index(out.len());
+        out[i] = *value;
+    }
+    if let Some(cut) = cut {
+        out.truncate(cut.index(bytes.len()));
+    }
+    out
+}
+
+/// A dataset written once; each case damages one of its files and puts it back.
+struct Victim {
+    root: tempfile::TempDir,
+    file: PathBuf,
+    bytes: Vec<u8>,
+}
+
+impl Victim {
+    fn new(write: impl Fn(&Path), file: &str) -> Self {
+        let root = tempfile::tempdir().unwrap();
+        write(root.path());
+        let file = root.path().join(file);
+        let bytes = std::fs::read(&file).unwrap();
+        open(root.path()).unwrap();
+        Self { root, file, bytes }
+    }
+    fn try_bytes(&self, bytes: &[u8]) {
+        std::fs::write(&self.file, bytes).unwrap();
+        check(open(self.root.path()));
+    }
+}
+
+fn write_colmap(root: &Path) {
+    let cameras = ring(3, 16, 12);
+    let names: Vec<String> = (0..3).map(|i| format!("{i}.png")).collect();
+    names.iter().for_each(|n| picture(&root.join("images").join(n), 16, 12, 0));
+    std::fs::create_dir_all(root.join("sparse/0")).unwrap();
+    for (file, bytes) in ["cameras", "images", "points3D"].iter().zip(colmap_binary(&cameras, &names)) {
+        std::fs::write(root.join(format!("sparse/0/{file}.bin")), bytes).unwrap();
+    }
+}
+
+fn write_llff(root: &Path) {
+    std::fs::write(root.join("poses_bounds.npy"), npy(&[3, 17], &llff_rows(&ring(3, 16, 12)))).unwrap();
+    (0..3).for_each(|c| picture(&root.join(format!("images/{c}.png")), 16, 12, 0));
+}
+
+fn dnerf(root: &Path) {
+    write_dnerf(root, 3, 1, 8);
+}
+
+fn panoptic(root: &Path) {
+    write_panoptic(root, 2, 2);
+}
+
+#[test]
+fn every_cut_of_every_index_file_is_survived() {
+    let victims = [
+        Victim::new(write_colmap, "sparse/0/cameras.bin"),
+        Victim::new(write_colmap, "sparse/0/images.bin"),
+        Victim::new(write_colmap, "sparse/0/points3D.bin"),
+        Victim::new(write_llff, "poses_bounds.npy"),
+        Victim::new(dnerf, "transforms_train.json"),
+    ];
+    for victim in &victims {
+        let step = (victim.bytes.len() / 150).max(1);
+        for keep in (0..victim.bytes.len()).step_by(step) {
+            std::fs::write(&victim.file, &victim.bytes[..keep]).unwrap();
+            assert!(open(victim.root.path()).is_err(), "{} cut to {keep} of {}", victim.file.display(), victim.bytes.len());
+        }
+    }
+}
+
+#[test]
+fn counts_and_sizes_that_lie_are_refused() {
+    let victim = Victim::new(write_colmap, "sparse/0/points3D.bin");
+    for count in [3, 1000, u64::from(u32::MAX), u64::MAX / 51, u64::MAX] {
+        let mut bytes = victim.bytes.clone();
+        bytes[..8].copy_from_slice(&count.to_le_bytes());
+        std::fs::write(&victim.file, bytes).unwrap();
+        let message = open(victim.root.path()).err().unwrap().to_string();
+        assert!(message.contains("points3D.bin"), "{message}");
+    }
+    let victim = Victim::new(write_colmap, "sparse/0/cameras.bin");
+    for (place, value) in [(16, u64::MAX), (24, 1 << 40), (16, 0)] {
+        let mut bytes = victim.bytes.clone();
+        bytes[place..place + 8].copy_from_slice(&value.to_le_bytes());
+        std::fs::write(&victim.file, bytes).unwrap();
+        assert!(open(victim.root.path()).is_err(), "camera size {value}");
+    }
+}
+
+#[test]
+fn hostile_documents_are_refused() {
+    let deep = format!("{}{}", "[".repeat(100_000), "]".repeat(100_000));
+    let not_finite = r#"{"camera_angle_x": 1e999, "frames": []}"#;
+    for text in
+        ["", "{", "[]", "null", "{\"frames\": 3}", not_finite, "{\"camera_angle_x\": -1, \"frames\": []}", "{\"camera_angle_x\": 1, \"frames\": []}", &deep]
+    {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("transforms_train.json"), text).unwrap();
+        assert!(open(dir.path()).is_err(), "{:.40}", text);
+        std::fs::rename(dir.path().join("transforms_train.json"), dir.path().join("transforms.json")).unwrap();
+        assert!(open(dir.path()).is_err(), "{:.40}", text);
+        std::fs::rename(dir.path().join("transforms.json"), dir.path().join("train_meta.json")).unwrap();
+        assert!(open(dir.path()).is_err(), "{:.40}", text);
+    }
+}
+
+/// Files others sent in: each must be refused by the reader its folder is for.
+#[test]
+fn the_corpus_is_refused() {
+    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("bad/scenes");
+    let mut seen = 0;
+    for entry in std::fs::read_dir(&corpus).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            let error = open(&path).err().unwrap_or_else(|| panic!("{} was opened", path.display()));
+            assert!(matches!(error.exit_code(), 2..=4), "{}: {error}", path.display());
+            seen += 1;
+        }
+    }
+    assert!(seen >= 6, "{seen} scenes in {}", corpus.display());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn damaged_npy(damage in damage()) {
+        let bytes = npy(&[3, 17], &llff_rows(&ring(3, 16, 12)));
+        if let Ok(array) = read_npy("t", &apply(&bytes, &damage), &limits()) {
+            prop_assert_eq!(array.shape.iter().product::<usize>(), array.values.len());
+        }
+    }
+
+    #[test]
+    fn any_bytes_as_npy(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+        let mut framed = b"\x93NUMPY\x01\x00".to_vec();
+        framed.extend(((bytes.len() / 2) as u16).to_le_bytes());
+        framed.extend(&bytes);
+        let _ = read_npy("t", &framed, &limits());
+        let _ = read_npy("t", &bytes, &limits());
+    }
+}
+
+macro_rules! damaged {
+    ($($name:ident: $write:expr, $file:expr;)*) => { $(
+        #[test]
+        fn $name() {
+            let victim = Victim::new($write, $file);
+            let config = ProptestConfig { cases: 150, failure_persistence: None, ..ProptestConfig::default() };
+            proptest!(config, |(damage in damage())| {
+                victim.try_bytes(&apply(&victim.bytes, &damage));
+            });
+        }
+    )* };
+}
+
+damaged! {
+    damaged_colmap_cameras: write_colmap, "sparse/0/cameras.bin";
+    damaged_colmap_images: write_colmap, "sparse/0/images.bin";
+    damaged_colmap_points: write_colmap, "sparse/0/points3D.bin";
+    damaged_poses_bounds: write_llff, "poses_bounds.npy";
+    damaged_transforms: dnerf, "transforms_train.json";
+    damaged_meta: panoptic, "train_meta.json";
+    damaged_picture: dnerf, "train/r_000.png";
+}

@@ -1,0 +1,95 @@
+//! The options all readers share: frames, held-out cameras, sizes, missing and misfit pictures.
+
+use crate::common::*;
+use cc4dgs_core::{Limits, Split};
+use cc4dgs_engine::data::{Background, CameraRef, SceneOptions, open};
+
+#[test]
+fn frames_are_chosen_and_renumbered() {
+    let dir = tempfile::tempdir().unwrap();
+    write_panoptic(dir.path(), 4, 9);
+    let options = SceneOptions { frames: Some([1, 3, 2]), ..Default::default() };
+    let scene = open(dir.path(), &options, &Limits::default()).unwrap();
+    assert_eq!(scene.frame_count, 3);
+    for (view, v) in scene.views.iter().enumerate() {
+        let c: usize = scene.camera(view).name.parse().unwrap();
+        assert_eq!(scene.frame(view).unwrap().data[2] as usize, 10 * c + 1 + 2 * v.frame);
+        assert!((v.time_norm - v.frame as f32 / 3.0).abs() < 1e-6);
+    }
+    let none = SceneOptions { frames: Some([50, 3, 1]), ..Default::default() };
+    let message = open(dir.path(), &none, &Limits::default()).err().unwrap().to_string();
+    assert!(message.contains("9 frames"), "{message}");
+    let many = SceneOptions { frames: Some([7, usize::MAX, usize::MAX]), ..Default::default() };
+    assert_eq!(open(dir.path(), &many, &Limits::default()).unwrap().frame_count, 1);
+}
+
+#[test]
+fn held_out_cameras_and_caps() {
+    let dir = tempfile::tempdir().unwrap();
+    write_panoptic(dir.path(), 4, 2);
+    let options = SceneOptions { test_cameras: Some(vec![CameraRef::Index(0), CameraRef::Name("2".into())]), max_views: 3, ..Default::default() };
+    let scene = open(dir.path(), &options, &Limits::default()).unwrap();
+    let test: Vec<&str> = scene.split(Split::Test).iter().map(|&v| scene.camera(v).name.as_str()).collect();
+    assert_eq!(test, ["0", "2", "0", "2"]);
+    assert_eq!(scene.split(Split::Train).len(), 3);
+    let wrong = SceneOptions { test_cameras: Some(vec![CameraRef::Name("cam7".into())]), ..Default::default() };
+    assert!(open(dir.path(), &wrong, &Limits::default()).err().unwrap().to_string().contains("cam7"));
+    let all = SceneOptions { test_cameras: Some((0..5).map(CameraRef::Index).collect()), ..Default::default() };
+    assert!(open(dir.path(), &all, &Limits::default()).err().unwrap().to_string().contains("no training picture"));
+}
+
+#[test]
+fn sizes_follow_the_options() {
+    let dir = tempfile::tempdir().unwrap();
+    write_dnerf(dir.path(), 2, 1, 16);
+    let options = SceneOptions { width: 8, background: Some(Background::Name("black".into())), ..Default::default() };
+    let scene = open(dir.path(), &options, &Limits::default()).unwrap();
+    let (camera, image) = (scene.camera(0), scene.frame(0).unwrap());
+    assert_eq!((camera.width, camera.height, image.width, image.height), (8, 8, 8, 8));
+    let native = load(dir.path()).unwrap();
+    assert!((camera.fx * 2.0 - native.camera(0).fx).abs() < 1e-9 && camera.cx == 4.0);
+    assert_eq!(scene.background, Some([0.0; 3]));
+    let small = Limits { max_pixels: 100, ..Default::default() };
+    assert_eq!(open(dir.path(), &options, &small).err().unwrap().exit_code(), 4, "16x16 is over 100 pixels");
+}
+
+#[test]
+fn missing_pictures_are_skipped_and_named() {
+    let dir = tempfile::tempdir().unwrap();
+    write_dnerf(dir.path(), 4, 1, 8);
+    std::fs::remove_file(dir.path().join("train/r_002.png")).unwrap();
+    let scene = load(dir.path()).unwrap();
+    assert_eq!(scene.split(Split::Train).len(), 3);
+    assert!(scene.warnings.iter().any(|w| w.contains("r_002.png")), "{:?}", scene.warnings);
+    std::fs::remove_dir_all(dir.path().join("train")).unwrap();
+    assert!(load(dir.path()).err().unwrap().to_string().contains("none of its 4 pictures"));
+}
+
+#[test]
+fn misfit_and_broken_pictures_are_errors_that_name_them() {
+    let dir = tempfile::tempdir().unwrap();
+    write_panoptic(dir.path(), 2, 2);
+    picture(&dir.path().join("ims/0/000001.png"), 10, 10, 0);
+    let scene = load(dir.path()).unwrap();
+    let view = (0..scene.views.len()).find(|&v| scene.camera(v).name == "0" && scene.views[v].frame == 1).unwrap();
+    let message = scene.frame(view).err().unwrap().to_string();
+    assert!(message.contains("000001.png") && message.contains("10x10") && message.contains("16x12"), "{message}");
+
+    let jpeg = dir.path().join("a.jpg");
+    image::RgbImage::from_fn(64, 64, |x, y| image::Rgb([(x * y) as u8, x as u8, y as u8])).save(&jpeg).unwrap();
+    let bytes = std::fs::read(&jpeg).unwrap();
+    let read = |bytes: &[u8]| {
+        std::fs::write(&jpeg, bytes).unwrap();
+        cc4dgs_engine::data::read_png_or_jpeg(&jpeg, &Limits::default())
+    };
+    assert!(read(&bytes).is_ok());
+    for keep in [0, 1, 3, bytes.len() / 2, bytes.len() - 3] {
+        assert!(read(&bytes[..keep]).is_err(), "a JPEG cut to {keep} of {} bytes", bytes.len());
+    }
+    // A PNG header that claims a gigantic picture.
+    let png = dir.path().join("ims/0/000000.png");
+    let mut bytes = std::fs::read(&png).unwrap();
+    bytes[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff]);
+    std::fs::write(&png, bytes).unwrap();
+    assert!(load(dir.path()).is_err());
+}
