@@ -95,5 +95,12 @@ fn n3dv_sample() {
     assert_eq!(scene.frame(0).unwrap().data.len(), 676 * 507 * 3);
     // The COLMAP model in the folder is of another world, with other pictures, and must not be taken.
     assert!(scene.points.is_none());
-    assert!(scene.init_box.is_some());
+    let (low, high) = scene.init_box.unwrap();
+    assert!((0..3).all(|k| low[k] < high[k]), "{low:?} {high:?}");
+    // Four cameras are few, but enough for points; they lie in front of the held-out camera.
+    let cloud = photo_points(&scene, 10_000, Seed::root(0)).unwrap();
+    let held_out = scene.camera(scene.split(Split::Test)[0]);
+    let ahead = cloud.positions.iter().filter(|p| project(held_out, p.map(f64::from)).2 > 0.0).count();
+    eprintln!("{} points, {ahead} ahead of the held-out camera", cloud.positions.len());
+    assert!(cloud.positions.len() > 2000 && ahead * 100 > cloud.positions.len() * 95);
 }

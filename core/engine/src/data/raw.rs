@@ -12,6 +12,9 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+/// How far from the origin a camera may be, in world units: squares of distances must stay within f32.
+const FARTHEST: f64 = 1e12;
+
 /// A calibrated camera with its lens, at the size its calibration is for.
 #[derive(Clone, Debug)]
 pub(crate) struct RawCamera {
@@ -234,11 +237,8 @@ impl RawScene {
             scene.foreground_masks = Some(source);
         }
         scene.points = self.points.filter(|p| !p.positions.is_empty());
-        scene.init_box = match (&scene.points, self.init_box) {
-            (_, Some(given)) => Some(given),
-            (None, None) => Some(camera_box(&scene)),
-            _ => None,
-        };
+        let usable = |b: &([f32; 3], [f32; 3])| (0..3).all(|k| b.0[k] < b.1[k] && b.0[k].is_finite() && b.1[k].is_finite());
+        scene.init_box = self.init_box.filter(usable).or_else(|| scene.points.is_none().then(|| camera_box(&scene)));
         scene.background = options.background.as_ref().map(|b| b.rgb()).transpose()?.or(self.background);
         scene.warnings = dedupe(self.warnings);
         Ok(scene)
@@ -279,6 +279,9 @@ fn plan_camera(camera: &RawCamera, native: [u32; 2], options: &SceneOptions, lim
         world_to_camera: camera.world_to_camera,
     };
     pinhole.validate()?;
+    if pinhole.center_world().iter().any(|v| v.abs() > FARTHEST) {
+        return Err(Error::data(object, format!("its centre {:?} is over {FARTHEST:e} units away", pinhole.center_world()), "Check the dataset's calibration file"));
+    }
     let undistort = if camera.distortion.is_identity() {
         None
     } else {
