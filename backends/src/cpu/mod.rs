@@ -2,7 +2,9 @@
 
 pub mod tensor;
 pub mod adam;
+pub mod mlp;
 pub mod photometric;
 pub mod scratch;
+pub mod vertex;
 pub mod raster;
 pub mod simd;

@@ -1,5 +1,6 @@
 //! The tensor operations burn lacks. Each is a `backend_extension` trait with an implementation per device and a hand-written backward.
 
 pub mod adam;
+pub mod field;
 pub mod photometric;
 pub mod rasterize;

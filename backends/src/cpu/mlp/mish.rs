@@ -1,0 +1,195 @@
+//! The hash-feature decoder's network: (Linear, LayerNorm, Mish) for each hidden layer, then Linear (paper Section IV-B).
+//!
+//! Weights are one flat array. Per hidden layer: W [in, out] row-major (y = x W + b), b [out], LayerNorm gain [out], shift [out]; then W and b
+//! of the output layer. Rows are processed in blocks of a fixed, padded size, so that the result of a row does not depend on which rows
+//! it is computed with.
+
+use super::activation::{affine_mish_backward, affine_mish_rows, normalize_rows};
+use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, transposed};
+use super::{blocks_per_run, sum_in_order};
+use crate::cpu::scratch::{Scratch, scratch};
+use pulp::Arch;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Rows per block.
+pub const BLOCK: usize = 128;
+
+/// Layer widths: input, hidden layers, output.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MishShape {
+    /// Input width.
+    pub input: usize,
+    /// Widths of the hidden layers.
+    pub hidden: Vec<usize>,
+    /// Output width.
+    pub output: usize,
+}
+
+/// Where the arrays of one layer lie in the flat weights.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MishLayer {
+    /// Input width.
+    pub input: usize,
+    /// Output width.
+    pub output: usize,
+    /// W [input, output].
+    pub weight: Range<usize>,
+    /// b [output].
+    pub bias: Range<usize>,
+    /// LayerNorm gain [output]; `None` for the output layer, which has no norm and no activation.
+    pub gain: Option<Range<usize>>,
+    /// LayerNorm shift [output].
+    pub shift: Option<Range<usize>>,
+}
+
+impl MishShape {
+    /// The layers in order.
+    pub fn layers(&self) -> Vec<MishLayer> {
+        let mut at = 0;
+        let mut take = |n: usize| {
+            at += n;
+            at - n..at
+        };
+        let widths: Vec<usize> = self.hidden.iter().copied().chain([self.output]).collect();
+        let mut input = self.input;
+        let mut layers = Vec::with_capacity(widths.len());
+        for (i, &output) in widths.iter().enumerate() {
+            let hidden = i < self.hidden.len();
+            let (weight, bias) = (take(input * output), take(output));
+            let gain = hidden.then(|| take(output));
+            let shift = hidden.then(|| take(output));
+            layers.push(MishLayer { input, output, weight, bias, gain, shift });
+            input = output;
+        }
+        layers
+    }
+    /// The number of weights.
+    pub fn parameter_count(&self) -> usize {
+        self.layers().last().map_or(0, |l| l.bias.end)
+    }
+    fn widest(&self) -> usize {
+        self.hidden.iter().copied().chain([self.input, self.output]).max().unwrap_or(0)
+    }
+}
+
+/// Writes the input rows of a block: the first row's index and the rows to fill.
+pub type RowSource<'a> = dyn Fn(usize, &mut [f32]) + Sync + 'a;
+
+/// The activations of one block.
+struct Block {
+    input: Scratch,
+    /// Per hidden layer: normalised values, inverse deviations, activations.
+    hidden: Vec<(Scratch, Scratch, Scratch)>,
+    output: Scratch,
+    work: Scratch,
+}
+
+impl Block {
+    fn new(shape: &MishShape) -> Self {
+        let hidden = shape.hidden.iter().map(|&h| (scratch(BLOCK * h), scratch(BLOCK), scratch(BLOCK * h))).collect();
+        Self { input: scratch(BLOCK * shape.input), hidden, output: scratch(BLOCK * shape.output), work: scratch(shape.widest()) }
+    }
+    /// Fills the input with `count` rows and zeros, and computes everything.
+    fn forward(&mut self, layers: &[MishLayer], weights: &[f32], rows: &RowSource, first: usize, count: usize) {
+        let width = layers[0].input;
+        rows(first, &mut self.input[..count * width]);
+        self.input[count * width..].fill(0.0);
+        let arch = Arch::new();
+        let mut input: &[f32] = &self.input;
+        let mut hidden = self.hidden.iter_mut();
+        for layer in layers {
+            let (w, b) = (&weights[layer.weight.clone()], &weights[layer.bias.clone()]);
+            let size = (BLOCK, layer.input, layer.output);
+            match (&layer.gain, &layer.shift, hidden.next()) {
+                (Some(gain), Some(shift), Some((normalized, inverse_std, activated))) => {
+                    fill_rows(normalized, b);
+                    matmul(normalized, input, w, size, true);
+                    arch.dispatch(|| {
+                        normalize_rows(normalized, layer.output, inverse_std, &mut self.work);
+                        affine_mish_rows(activated, normalized, &weights[gain.clone()], &weights[shift.clone()]);
+                    });
+                    input = activated;
+                }
+                _ => {
+                    fill_rows(&mut self.output, b);
+                    matmul(&mut self.output, input, w, size, true);
+                }
+            }
+        }
+    }
+}
+
+/// The outputs [rows, output] of the network for `count` rows.
+pub fn forward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource) -> Vec<f32> {
+    let layers = shape.layers();
+    let mut out = vec![0.0f32; count * shape.output];
+    if out.is_empty() {
+        return out;
+    }
+    out.par_chunks_mut(BLOCK * shape.output).enumerate().for_each(|(i, out)| {
+        let mut block = Block::new(shape);
+        block.forward(&layers, weights, rows, i * BLOCK, out.len() / shape.output);
+        out.copy_from_slice(&block.output[..out.len()]);
+    });
+    out
+}
+
+/// The gradient of the weights given `grad` [rows, output], and, if `input_grad` [rows, input] is given, the gradient of the inputs.
+/// Activations are computed again rather than kept: at these widths that is cheaper than writing them out and reading them back.
+pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource, grad: &[f32], input_grad: Option<&mut [f32]>) -> Vec<f32> {
+    let layers = shape.layers();
+    if count == 0 {
+        return vec![0.0; shape.parameter_count()];
+    }
+    let back: Vec<Vec<f32>> = layers.iter().map(|l| transposed(&weights[l.weight.clone()], (l.input, l.output))).collect();
+    let run = blocks_per_run(count.div_ceil(BLOCK)) * BLOCK;
+    let wants_input = input_grad.is_some();
+    let mut unused = vec![0.0; if wants_input { 0 } else { count.div_ceil(run) }];
+    let (sink, sink_run) = match input_grad {
+        Some(sink) => (sink, run * shape.input),
+        None => (unused.as_mut_slice(), 1),
+    };
+    let job = |(i, (grad, sink)): (usize, (&[f32], &mut [f32]))| {
+        let mut total = vec![0.0f32; shape.parameter_count()];
+        let mut block = Block::new(shape);
+        let mut g = [scratch(BLOCK * shape.widest()), scratch(BLOCK * shape.widest())];
+        for (b, grad) in grad.chunks(BLOCK * shape.output).enumerate() {
+            let count = grad.len() / shape.output;
+            block.forward(&layers, weights, rows, i * run + b * BLOCK, count);
+            g[0][..grad.len()].copy_from_slice(grad);
+            g[0][grad.len()..BLOCK * shape.output].fill(0.0);
+            block_backward(&layers, weights, &back, &mut block, &mut g, &mut total, wants_input);
+            if wants_input {
+                let from = b * BLOCK * shape.input;
+                sink[from..from + count * shape.input].copy_from_slice(&g[0][..count * shape.input]);
+            }
+        }
+        total
+    };
+    let parts = grad.par_chunks(run * shape.output).zip(sink.par_chunks_mut(sink_run)).enumerate().map(job).collect();
+    sum_in_order(parts)
+}
+
+/// `g[0]` holds the gradient of the block's output and ends as that of its input (if wanted); `total` is added to.
+fn block_backward(layers: &[MishLayer], weights: &[f32], back: &[Vec<f32>], block: &mut Block, g: &mut [Scratch; 2], total: &mut [f32], wants_input: bool) {
+    let arch = Arch::new();
+    for (i, layer) in layers.iter().enumerate().rev() {
+        let len = BLOCK * layer.output;
+        if let (Some(gain), Some(shift)) = (&layer.gain, &layer.shift) {
+            let (normalized, inverse_std, _) = &block.hidden[i];
+            let affine = (&weights[gain.clone()], &weights[shift.clone()]);
+            // Gain and shift are neighbours in the flat array.
+            let (grad_gain, grad_shift) = total[gain.start..shift.end].split_at_mut(layer.output);
+            arch.dispatch(|| affine_mish_backward(&mut g[0][..len], normalized, inverse_std, affine, (grad_gain, grad_shift), &mut block.work));
+        }
+        let input: &[f32] = if i == 0 { &block.input } else { &block.hidden[i - 1].2 };
+        add_transposed_matmul(&mut total[layer.weight.clone()], input, &g[0], (BLOCK, layer.input, layer.output));
+        arch.dispatch(|| add_column_sums(&mut total[layer.bias.clone()], &g[0][..len]));
+        if i > 0 || wants_input {
+            let [from, to] = g;
+            matmul(to, from, &back[i], (BLOCK, layer.output, layer.input), false);
+            g.swap(0, 1);
+        }
+    }
+}

@@ -1,0 +1,225 @@
+//! A trunk of Linear + ReLU layers that feeds any number of heads, each Linear (ReLU, Linear)* with no activation at its end
+//! (paper Section IV-B: the deformation network). A plain network is a trunk without heads or one head without a trunk.
+//!
+//! Weights are one flat array: per layer W [in, out] row-major (y = x W + b), then b [out]; the trunk first, then head by head.
+//! The outputs are one flat array too, head after head, each [rows, width]; without heads, the trunk's output.
+
+use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, transposed};
+use super::{blocks_per_run, sum_in_order};
+use crate::cpu::scratch::{Scratch, scratch};
+use pulp::Arch;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Rows per block.
+pub const BLOCK: usize = 128;
+
+/// Layer widths of trunk and heads.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ReluShape {
+    /// Input width.
+    pub input: usize,
+    /// Output widths of the trunk's layers; each ends in a ReLU.
+    pub trunk: Vec<usize>,
+    /// Per head, the output widths of its layers; all but the last end in a ReLU.
+    pub heads: Vec<Vec<usize>>,
+}
+
+/// One layer: its place in the tree and in the flat weights.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Layer {
+    /// The layer whose output it reads; `None` is the network's input.
+    parent: Option<usize>,
+    input: usize,
+    output: usize,
+    weight: Range<usize>,
+    bias: Range<usize>,
+    relu: bool,
+    /// Which output it writes, if any.
+    slot: Option<usize>,
+}
+
+impl ReluShape {
+    /// A chain of Linear + ReLU layers ending in a Linear layer, if `widths` is input, hidden…, output.
+    pub fn chain(widths: &[usize]) -> Self {
+        match widths {
+            [input, rest @ ..] => Self { input: *input, trunk: Vec::new(), heads: vec![rest.to_vec()] },
+            [] => Self::default(),
+        }
+    }
+    fn layers(&self) -> Vec<Layer> {
+        let mut layers: Vec<Layer> = Vec::new();
+        let mut at = 0;
+        let mut push = |parent: Option<usize>, input: usize, output: usize, relu: bool, slot: Option<usize>| {
+            let weight = at..at + input * output;
+            let bias = weight.end..weight.end + output;
+            at = bias.end;
+            layers.push(Layer { parent, input, output, weight, bias, relu, slot });
+            layers.len() - 1
+        };
+        let (mut parent, mut width) = (None, self.input);
+        for (i, &output) in self.trunk.iter().enumerate() {
+            let last = self.heads.is_empty() && i + 1 == self.trunk.len();
+            parent = Some(push(parent, width, output, true, last.then_some(0)));
+            width = output;
+        }
+        for (slot, head) in self.heads.iter().enumerate() {
+            let (mut parent, mut width) = (parent, width);
+            for (i, &output) in head.iter().enumerate() {
+                let last = i + 1 == head.len();
+                parent = Some(push(parent, width, output, !last, last.then_some(slot)));
+                width = output;
+            }
+        }
+        layers
+    }
+    /// The number of weights.
+    pub fn parameter_count(&self) -> usize {
+        self.layers().last().map_or(0, |l| l.bias.end)
+    }
+    /// The widths of the outputs, in order.
+    pub fn output_widths(&self) -> Vec<usize> {
+        if self.heads.is_empty() { self.trunk.last().copied().into_iter().collect() } else { self.heads.iter().filter_map(|h| h.last().copied()).collect() }
+    }
+    /// Whether every layer has a width and every head a layer.
+    pub fn is_sound(&self) -> bool {
+        let widths = self.trunk.iter().chain(self.heads.iter().flatten());
+        self.input > 0 && widths.clone().count() > 0 && widths.clone().all(|&w| w > 0) && self.heads.iter().all(|h| !h.is_empty())
+    }
+}
+
+#[inline(always)]
+fn relu(values: &mut [f32]) {
+    for v in values {
+        *v = if *v > 0.0 { *v } else { 0.0 };
+    }
+}
+
+#[inline(always)]
+fn relu_backward(grad: &mut [f32], output: &[f32]) {
+    for (g, o) in grad.iter_mut().zip(output) {
+        *g = if *o > 0.0 { *g } else { 0.0 };
+    }
+}
+
+/// The outputs of all layers for one block of `x` [count, input].
+fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, outputs: &mut [Scratch]) {
+    let arch = Arch::new();
+    for (i, layer) in layers.iter().enumerate() {
+        let (before, rest) = outputs.split_at_mut(i);
+        let out = &mut rest[0][..count * layer.output];
+        let input: &[f32] = layer.parent.map_or(x, |p| &before[p]);
+        fill_rows(out, &weights[layer.bias.clone()]);
+        matmul(out, input, &weights[layer.weight.clone()], (count, layer.input, layer.output), true);
+        if layer.relu {
+            arch.dispatch(|| relu(out));
+        }
+    }
+}
+
+/// The flat outputs for `x` [rows, input].
+pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
+    let layers = shape.layers();
+    let count = x.len() / shape.input.max(1);
+    let widths = shape.output_widths();
+    let mut out = vec![0.0f32; count * widths.iter().sum::<usize>()];
+    if out.is_empty() {
+        return out;
+    }
+    // Per block, its part of every output.
+    let mut parts: Vec<Vec<&mut [f32]>> = (0..count.div_ceil(BLOCK)).map(|_| Vec::with_capacity(widths.len())).collect();
+    let mut rest = out.as_mut_slice();
+    for &width in &widths {
+        let (head, tail) = rest.split_at_mut(count * width);
+        rest = tail;
+        for (part, rows) in parts.iter_mut().zip(head.chunks_mut(BLOCK * width)) {
+            part.push(rows);
+        }
+    }
+    parts.into_par_iter().zip(x.par_chunks(BLOCK * shape.input)).for_each(|(mut outs, x)| {
+        let count = x.len() / shape.input;
+        let mut outputs: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
+        block_forward(&layers, weights, x, count, &mut outputs);
+        for (layer, output) in layers.iter().zip(&outputs) {
+            if let Some(slot) = layer.slot {
+                outs[slot].copy_from_slice(&output[..count * layer.output]);
+            }
+        }
+    });
+    out
+}
+
+/// The gradients `(x [rows, input], weights)` given that of the flat outputs; the first is empty unless `wants_input`.
+/// Activations are computed again rather than kept.
+pub fn backward(shape: &ReluShape, weights: &[f32], x: &[f32], grad: &[f32], wants_input: bool) -> (Vec<f32>, Vec<f32>) {
+    let layers = shape.layers();
+    let count = x.len() / shape.input.max(1);
+    let mut grad_x = vec![0.0f32; if wants_input { x.len() } else { 0 }];
+    if count == 0 {
+        return (grad_x, vec![0.0; shape.parameter_count()]);
+    }
+    let back: Vec<Vec<f32>> = layers.iter().map(|l| transposed(&weights[l.weight.clone()], (l.input, l.output))).collect();
+    let run = blocks_per_run(count.div_ceil(BLOCK)) * BLOCK;
+    let mut unused = vec![0.0; if wants_input { 0 } else { count.div_ceil(run) }];
+    let (sink, sink_run) = if wants_input { (grad_x.as_mut_slice(), run * shape.input) } else { (unused.as_mut_slice(), 1) };
+    let job = |(i, (x, sink)): (usize, (&[f32], &mut [f32]))| {
+        let mut total = vec![0.0f32; shape.parameter_count()];
+        let mut outputs: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
+        let mut grads: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
+        for (b, x) in x.chunks(BLOCK * shape.input).enumerate() {
+            let rows = x.len() / shape.input;
+            block_forward(&layers, weights, x, rows, &mut outputs);
+            let first = i * run + b * BLOCK;
+            load_output_grads(&layers, &mut grads, grad, count, first, rows);
+            let sink = if wants_input { &mut sink[b * BLOCK * shape.input..][..x.len()] } else { &mut sink[..0] };
+            block_backward(&layers, &back, x, rows, &outputs, &mut grads, &mut total, sink);
+        }
+        total
+    };
+    let parts = x.par_chunks(run * shape.input).zip(sink.par_chunks_mut(sink_run)).enumerate().map(job).collect();
+    (grad_x, sum_in_order(parts))
+}
+
+/// Sets the gradient of every layer's output: the given one where the layer is an output, zero elsewhere.
+fn load_output_grads(layers: &[Layer], grads: &mut [Scratch], grad: &[f32], count: usize, first: usize, rows: usize) {
+    let mut at = 0;
+    for (layer, own) in layers.iter().zip(grads) {
+        let own = &mut own[..rows * layer.output];
+        if layer.slot.is_some() {
+            own.copy_from_slice(&grad[at + first * layer.output..][..own.len()]);
+            at += count * layer.output;
+        } else {
+            own.fill(0.0);
+        }
+    }
+}
+
+fn block_backward(
+    layers: &[Layer],
+    back: &[Vec<f32>],
+    x: &[f32],
+    rows: usize,
+    outputs: &[Scratch],
+    grads: &mut [Scratch],
+    total: &mut [f32],
+    grad_x: &mut [f32],
+) {
+    let arch = Arch::new();
+    for (i, layer) in layers.iter().enumerate().rev() {
+        let (before, rest) = grads.split_at_mut(i);
+        let own = &mut rest[0][..rows * layer.output];
+        if layer.relu {
+            arch.dispatch(|| relu_backward(own, &outputs[i]));
+        }
+        let input: &[f32] = layer.parent.map_or(x, |p| &outputs[p]);
+        add_transposed_matmul(&mut total[layer.weight.clone()], input, own, (rows, layer.input, layer.output));
+        arch.dispatch(|| add_column_sums(&mut total[layer.bias.clone()], own));
+        let target: &mut [f32] = match layer.parent {
+            Some(p) => &mut before[p][..rows * layer.input],
+            None if grad_x.is_empty() => continue,
+            None => &mut *grad_x,
+        };
+        // Layers are visited in one order, so sums over heads are fixed too.
+        matmul(target, own, &back[i], (rows, layer.output, layer.input), true);
+    }
+}

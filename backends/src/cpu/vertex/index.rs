@@ -1,0 +1,145 @@
+//! Which grid vertices surround each point, and which of them are the same (paper Sections IV-B and IV-C, vertex reuse).
+
+use rayon::prelude::*;
+
+/// The most cells per axis; (cells + 1)^3 keys then fit in 32 bits.
+pub const MAX_RESOLUTION: u32 = 1600;
+
+/// The corners of all points on one level.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Corners {
+    /// The vertices to decode [U], each (x, y, z) in 0..=resolution; sorted and distinct with reuse, one per corner without.
+    pub vertices: Vec<[u32; 3]>,
+    /// Per point and corner, the index of its vertex [8 M].
+    pub corners: Vec<u32>,
+    /// Per point and corner, its trilinear weight [8 M].
+    pub weights: Vec<f32>,
+    /// All (point, corner) slots grouped by vertex, ascending within each [8 M].
+    pub slots: Vec<u32>,
+    /// Where the slots of each vertex start [U + 1].
+    pub starts: Vec<u32>,
+}
+
+/// Places `points` [M, 3] on a grid of `resolution` cells per axis over the box. Points outside are moved to its nearest face, NaN to its
+/// lower face. Corner c of a cell lies at offsets (c & 1, c >> 1 & 1, c >> 2).
+pub fn corners(points: &[f32], box_min: [f32; 3], box_max: [f32; 3], resolution: u32, reuse: bool) -> Corners {
+    let resolution = resolution.clamp(1, MAX_RESOLUTION);
+    let m = points.len() / 3;
+    let side = u64::from(resolution) + 1;
+    let mut keys = vec![0u32; 8 * m];
+    let mut weights = vec![0.0f32; 8 * m];
+    let scale: [f32; 3] = std::array::from_fn(|d| if box_max[d] > box_min[d] { resolution as f32 / (box_max[d] - box_min[d]) } else { 0.0 });
+    keys.par_chunks_mut(8 << 10).zip(weights.par_chunks_mut(8 << 10)).zip(points.par_chunks(3 << 10)).for_each(|((keys, weights), points)| {
+        for ((keys, weights), point) in keys.chunks_exact_mut(8).zip(weights.chunks_exact_mut(8)).zip(points.chunks_exact(3)) {
+            let mut cell = [0u32; 3];
+            let mut part = [0.0f32; 3];
+            for d in 0..3 {
+                // `max` turns NaN into 0.
+                let at = ((point[d] - box_min[d]) * scale[d]).max(0.0).min(resolution as f32);
+                cell[d] = (at as u32).min(resolution - 1);
+                part[d] = at - cell[d] as f32;
+            }
+            for c in 0..8usize {
+                let offset = [c & 1, c >> 1 & 1, c >> 2];
+                let vertex: [u64; 3] = std::array::from_fn(|d| u64::from(cell[d]) + offset[d] as u64);
+                keys[c] = ((vertex[2] * side + vertex[1]) * side + vertex[0]) as u32;
+                weights[c] = (0..3).map(|d| if offset[d] == 1 { part[d] } else { 1.0 - part[d] }).product();
+            }
+        }
+    });
+    let vertex = |key: u32| {
+        let (key, side) = (u64::from(key), side);
+        [(key % side) as u32, (key / side % side) as u32, (key / (side * side)) as u32]
+    };
+    if !reuse {
+        let identity: Vec<u32> = (0..8 * m as u32).collect();
+        let starts = (0..=8 * m as u32).collect();
+        return Corners { vertices: keys.into_par_iter().map(vertex).collect(), corners: identity.clone(), weights, slots: identity, starts };
+    }
+    let slots = sort_slots(&keys, side * side * side);
+    let mut corners = vec![0u32; 8 * m];
+    let (mut vertices, mut starts) = (Vec::new(), Vec::new());
+    let mut previous = None;
+    for (i, &slot) in slots.iter().enumerate() {
+        let key = keys[slot as usize];
+        if previous != Some(key) {
+            previous = Some(key);
+            starts.push(i as u32);
+            vertices.push(vertex(key));
+        }
+        corners[slot as usize] = vertices.len() as u32 - 1;
+    }
+    starts.push(slots.len() as u32);
+    Corners { vertices, corners, weights, slots, starts }
+}
+
+/// The slots ordered by key, equal keys in slot order: a radix sort over as many 11-bit digits as `bound` needs.
+fn sort_slots(keys: &[u32], bound: u64) -> Vec<u32> {
+    const BITS: u32 = 11;
+    let mut slots: Vec<u32> = (0..keys.len() as u32).collect();
+    let mut other = vec![0u32; keys.len()];
+    let mut shift = 0;
+    while bound.saturating_sub(1) >> shift > 0 {
+        let digit = |slot: u32| (keys[slot as usize] >> shift) as usize & ((1 << BITS) - 1);
+        let mut starts = vec![0u32; (1 << BITS) + 1];
+        for &slot in &slots {
+            starts[digit(slot) + 1] += 1;
+        }
+        for i in 0..1 << BITS {
+            starts[i + 1] += starts[i];
+        }
+        for &slot in &slots {
+            let place = &mut starts[digit(slot)];
+            other[*place as usize] = slot;
+            *place += 1;
+        }
+        std::mem::swap(&mut slots, &mut other);
+        shift += BITS;
+    }
+    slots
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn points(n: usize) -> Vec<f32> {
+        (0..3 * n).map(|i| ((i * 7919 % 1009) as f32 / 1009.0 - 0.1) * 1.3).collect()
+    }
+
+    #[test]
+    fn corners_surround_the_point_and_weights_reproduce_it() {
+        for (resolution, reuse) in [(1, true), (16, true), (256, true), (1600, true), (16, false)] {
+            let p = points(300);
+            let c = corners(&p, [0.0; 3], [1.0; 3], resolution, reuse);
+            for i in 0..300 {
+                for d in 0..3 {
+                    let sum: f32 = (0..8).map(|k| c.weights[8 * i + k] * c.vertices[c.corners[8 * i + k] as usize][d] as f32).sum();
+                    let want = p[3 * i + d].clamp(0.0, 1.0) * resolution as f32;
+                    assert!((sum - want).abs() <= 1e-5 * resolution as f32, "point {i} axis {d}: {sum} instead of {want}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn reuse_keeps_each_vertex_once_and_lists_its_slots() {
+        let c = corners(&points(500), [0.0; 3], [1.0; 3], 16, true);
+        let mut seen = c.vertices.clone();
+        seen.sort_unstable_by_key(|v| (v[2], v[1], v[0]));
+        seen.dedup();
+        assert_eq!(seen, c.vertices);
+        for u in 0..c.vertices.len() {
+            let slots = &c.slots[c.starts[u] as usize..c.starts[u + 1] as usize];
+            assert!(!slots.is_empty() && slots.is_sorted() && slots.iter().all(|&s| c.corners[s as usize] == u as u32));
+        }
+    }
+
+    #[test]
+    fn degenerate_input_is_defined() {
+        let c = corners(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 0.5, 2.0, -3.0], [0.0; 3], [1.0, 1.0, 0.0], 8, true);
+        assert!(c.weights.iter().all(|w| (0.0..=1.0).contains(w)));
+        assert!(c.vertices.iter().flatten().all(|&v| v <= 8));
+        assert_eq!(corners(&[], [0.0; 3], [1.0; 3], 8, true).vertices.len(), 0);
+    }
+}

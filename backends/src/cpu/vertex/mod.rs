@@ -1,0 +1,5 @@
+//! Voxel-grid vertices: which ones surround a point, their hash signatures, and interpolation between them (paper Section IV-B).
+
+pub mod hash;
+pub mod index;
+pub mod interpolate;

@@ -1,0 +1,349 @@
+//! Operations of computational deformation fields: grid corners, hash-feature decoders, interpolation and the deformation network.
+
+use crate::cpu::mlp::{mish, relu};
+use crate::cpu::tensor::CpuBackend;
+use crate::cpu::vertex::{index, interpolate};
+use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::tensor::{FloatTensor, IntTensor};
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::tensor::{Int, Tensor};
+use cc4dgs_core::{Error, Result};
+use std::sync::Arc;
+
+pub use crate::cpu::mlp::mish::MishShape;
+pub use crate::cpu::mlp::relu::ReluShape;
+pub use crate::cpu::vertex::hash::LevelHash;
+pub use crate::cpu::vertex::index::MAX_RESOLUTION;
+
+/// Where a level's grid lies.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GridBox {
+    /// Lower corner, world units.
+    pub min: [f32; 3],
+    /// Upper corner, world units.
+    pub max: [f32; 3],
+    /// Cells per axis.
+    pub resolution: u32,
+}
+
+/// One level's decoder: hash functions and layer widths (the input width is the number of functions).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Decoder {
+    /// The hash functions.
+    pub hash: LevelHash,
+    /// The network behind them.
+    pub shape: MishShape,
+}
+
+/// What one device computes.
+pub trait FieldKernels: Backend {
+    /// The gradient of the decoder's weights.
+    fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// The gradient [U, F] of the features.
+    fn trilinear_backward(grad: FloatTensor<Self>, weights: FloatTensor<Self>, slots: IntTensor<Self>, starts: IntTensor<Self>) -> FloatTensor<Self>;
+    /// The gradients of input (when wanted) and weights.
+    fn network_backward(
+        x: FloatTensor<Self>,
+        weights: FloatTensor<Self>,
+        shape: Arc<ReluShape>,
+        grad: FloatTensor<Self>,
+        wants_input: bool,
+    ) -> (Option<FloatTensor<Self>>, FloatTensor<Self>);
+}
+
+/// The differentiable operations of this module per device.
+#[backend_extension(Flex, NdArray, Autodiff)]
+pub trait FieldOps: Backend {
+    /// Features [U, F] of vertices [U, 3]; differentiable in the weights.
+    fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self>;
+    /// Interpolated features [M, F]; differentiable in the features.
+    fn trilinear(
+        features: FloatTensor<Self>,
+        corners: IntTensor<Self>,
+        weights: FloatTensor<Self>,
+        slots: IntTensor<Self>,
+        starts: IntTensor<Self>,
+    ) -> FloatTensor<Self>;
+    /// Flat outputs of the network for x [M, in]; differentiable in both.
+    fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self>;
+}
+
+/// Finding corners has no gradient: the paper's field is not differentiated with respect to the canonical centres.
+#[backend_extension(Flex, NdArray)]
+pub trait CornerOps: Backend {
+    /// `(vertices [U,3], corners [8M], weights [8M], slots [8M], starts [U+1])`, see [`VoxelCorners`].
+    #[allow(clippy::type_complexity, reason = "the dispatch macro must see the tuple of tensors")]
+    fn voxel_corners(
+        points: FloatTensor<Self>,
+        grid: GridBox,
+        reuse: bool,
+    ) -> (IntTensor<Self>, IntTensor<Self>, FloatTensor<Self>, IntTensor<Self>, IntTensor<Self>);
+}
+
+fn unsigned<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<u32> {
+    B::ints(tensor).into_iter().map(|v| v as u32).collect()
+}
+
+fn signed(values: &[u32]) -> Vec<i64> {
+    values.iter().map(|&v| i64::from(v)).collect()
+}
+
+fn triples<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<[u32; 3]> {
+    B::ints(tensor).chunks_exact(3).map(|v| [v[0] as u32, v[1] as u32, v[2] as u32]).collect()
+}
+
+impl<B: CpuBackend> FieldKernels for B {
+    fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        let vertices = triples::<B>(&vertices);
+        let width = decoder.hash.len().max(1);
+        let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
+        let out = mish::backward(&decoder.shape, &B::floats(&weights), vertices.len(), &rows, &B::floats(&grad), None);
+        B::from_floats(out, weights.shape())
+    }
+    fn trilinear_backward(grad: FloatTensor<Self>, weights: FloatTensor<Self>, slots: IntTensor<Self>, starts: IntTensor<Self>) -> FloatTensor<Self> {
+        let f = grad.shape()[1];
+        let starts = unsigned::<B>(&starts);
+        let out = interpolate::backward(&B::floats(&grad), f, &B::floats(&weights), &unsigned::<B>(&slots), &starts);
+        B::from_floats(out, [starts.len().saturating_sub(1), f])
+    }
+    fn network_backward(
+        x: FloatTensor<Self>,
+        weights: FloatTensor<Self>,
+        shape: Arc<ReluShape>,
+        grad: FloatTensor<Self>,
+        wants_input: bool,
+    ) -> (Option<FloatTensor<Self>>, FloatTensor<Self>) {
+        let (grad_x, grad_weights) = relu::backward(&shape, &B::floats(&weights), &B::floats(&x), &B::floats(&grad), wants_input);
+        (wants_input.then(|| B::from_floats(grad_x, x.shape())), B::from_floats(grad_weights, weights.shape()))
+    }
+}
+
+macro_rules! on_cpu {
+    ($backend:ty) => {
+        impl FieldOps for $backend {
+            fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
+                let vertices = triples::<Self>(&vertices);
+                let width = decoder.hash.len().max(1);
+                let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
+                let out = mish::forward(&decoder.shape, &Self::floats(&weights), vertices.len(), &rows);
+                Self::from_floats(out, [vertices.len(), decoder.shape.output])
+            }
+            fn trilinear(
+                features: FloatTensor<Self>,
+                corners: IntTensor<Self>,
+                weights: FloatTensor<Self>,
+                _slots: IntTensor<Self>,
+                _starts: IntTensor<Self>,
+            ) -> FloatTensor<Self> {
+                let f = features.shape()[1];
+                let corners = unsigned::<Self>(&corners);
+                let out = interpolate::forward(&Self::floats(&features), f, &corners, &Self::floats(&weights));
+                Self::from_floats(out, [corners.len() / 8, f])
+            }
+            fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
+                let out = relu::forward(&shape, &Self::floats(&weights), &Self::floats(&x));
+                let len = out.len();
+                Self::from_floats(out, [len])
+            }
+        }
+        impl CornerOps for $backend {
+            fn voxel_corners(
+                points: FloatTensor<Self>,
+                grid: GridBox,
+                reuse: bool,
+            ) -> (IntTensor<Self>, IntTensor<Self>, FloatTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
+                let found = index::corners(&Self::floats(&points), grid.min, grid.max, grid.resolution, reuse);
+                let (count, slots) = (found.vertices.len(), found.corners.len());
+                (
+                    Self::from_ints(signed(found.vertices.as_flattened()), [count, 3]),
+                    Self::from_ints(signed(&found.corners), [slots]),
+                    Self::from_floats(found.weights, [slots]),
+                    Self::from_ints(signed(&found.slots), [slots]),
+                    Self::from_ints(signed(&found.starts), [count + 1]),
+                )
+            }
+        }
+    };
+}
+on_cpu!(Flex);
+on_cpu!(NdArray);
+
+#[derive(Debug)]
+struct Decode;
+
+impl<B: FieldKernels> Backward<B, 1> for Decode {
+    type State = (FloatTensor<B>, IntTensor<B>, Arc<Decoder>);
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let [parent] = ops.parents;
+        let grad = grads.consume::<B>(&ops.node);
+        let (weights, vertices, decoder) = ops.state;
+        if let Some(parent) = parent {
+            grads.register::<B>(parent.id, B::decode_backward(weights, vertices, decoder, grad));
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Interpolate;
+
+impl<B: FieldKernels> Backward<B, 1> for Interpolate {
+    type State = (FloatTensor<B>, IntTensor<B>, IntTensor<B>);
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let [parent] = ops.parents;
+        let grad = grads.consume::<B>(&ops.node);
+        let (weights, slots, starts) = ops.state;
+        if let Some(parent) = parent {
+            grads.register::<B>(parent.id, B::trilinear_backward(grad, weights, slots, starts));
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Network;
+
+impl<B: FieldKernels> Backward<B, 2> for Network {
+    type State = (FloatTensor<B>, FloatTensor<B>, Arc<ReluShape>);
+
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let [input, parameters] = ops.parents;
+        let grad = grads.consume::<B>(&ops.node);
+        let (x, weights, shape) = ops.state;
+        let (grad_x, grad_weights) = B::network_backward(x, weights, shape, grad, input.is_some());
+        if let (Some(input), Some(grad_x)) = (input, grad_x) {
+            grads.register::<B>(input.id, grad_x);
+        }
+        if let Some(parameters) = parameters {
+            grads.register::<B>(parameters.id, grad_weights);
+        }
+    }
+}
+
+impl<B: FieldKernels + FieldOps, C: CheckpointStrategy> FieldOps for Autodiff<B, C> {
+    fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
+        let (weights, node) = weights.into_parts();
+        match Decode.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let out = B::decode(weights.clone(), vertices.clone(), decoder.clone());
+                prep.finish((weights, vertices, decoder), out)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::decode(weights, vertices, decoder)),
+        }
+    }
+    fn trilinear(
+        features: FloatTensor<Self>,
+        corners: IntTensor<Self>,
+        weights: FloatTensor<Self>,
+        slots: IntTensor<Self>,
+        starts: IntTensor<Self>,
+    ) -> FloatTensor<Self> {
+        let (features, node) = features.into_parts();
+        let weights = weights.into_primitive();
+        match Interpolate.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let out = B::trilinear(features, corners, weights.clone(), slots.clone(), starts.clone());
+                prep.finish((weights, slots, starts), out)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::trilinear(features, corners, weights, slots, starts)),
+        }
+    }
+    fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
+        let (x, input) = x.into_parts();
+        let (weights, parameters) = weights.into_parts();
+        match Network.prepare::<C>([input, parameters]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let out = B::network(x.clone(), weights.clone(), shape.clone());
+                prep.finish((x, weights, shape), out)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::network(x, weights, shape)),
+        }
+    }
+}
+
+/// The grid corners of M points on one level.
+#[derive(Clone, Debug)]
+pub struct VoxelCorners {
+    /// Vertices to decode [U,3], integer coordinates in 0..=resolution.
+    pub vertices: Tensor<2, Int>,
+    /// Per point and corner, the row of its vertex [8M].
+    pub corners: Tensor<1, Int>,
+    /// Per point and corner, its trilinear weight [8M].
+    pub weights: Tensor<1>,
+    /// The (point, corner) slots grouped by vertex [8M].
+    pub slots: Tensor<1, Int>,
+    /// Where each vertex's slots start [U+1].
+    pub starts: Tensor<1, Int>,
+}
+
+impl VoxelCorners {
+    /// Finds the corners of `points` [M,3], world units. Points outside the box are moved to its nearest face. With `reuse`, corners at one
+    /// place share a vertex (paper Section IV-C); without, every corner has its own. No gradient flows to the points.
+    pub fn find(points: Tensor<2>, grid: GridBox, reuse: bool) -> Result<Self> {
+        let [m, width] = points.dims();
+        if width != 3 || m == 0 {
+            return Err(Error::parameter("voxel corners", format!("points have shape [{m},{width}]"), "Give at least one point with three coordinates"));
+        }
+        if !(1..=MAX_RESOLUTION).contains(&grid.resolution) {
+            return Err(Error::parameter("grid resolution", format!("{} cells per axis", grid.resolution), format!("Choose 1 to {MAX_RESOLUTION}")));
+        }
+        let (vertices, corners, weights, slots, starts) = <Dispatch as CornerOps>::voxel_corners(points.inner().into_dispatch(), grid, reuse);
+        Ok(Self {
+            vertices: Tensor::from_dispatch(vertices),
+            corners: Tensor::from_dispatch(corners),
+            weights: Tensor::from_dispatch(weights),
+            slots: Tensor::from_dispatch(slots),
+            starts: Tensor::from_dispatch(starts),
+        })
+    }
+    /// Features [U,F] of the vertices: hash signature, then the decoder's network. `weights` is flat in the order of [`crate::cpu::mlp::mish`];
+    /// the gradient goes to it alone.
+    pub fn decode(&self, weights: Tensor<1>, decoder: &Arc<Decoder>) -> Result<Tensor<2>> {
+        check_weights("decoder", weights.dims()[0], decoder.shape.parameter_count())?;
+        if decoder.hash.len() != decoder.shape.input {
+            return Err(Error::parameter("decoder", format!("{} hash functions feed {} inputs", decoder.hash.len(), decoder.shape.input), "Make them equal"));
+        }
+        Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::decode(weights.into_dispatch(), self.vertices.clone().into_dispatch(), decoder.clone())))
+    }
+    /// Trilinear interpolation of vertex `features` [U,F] at the points [M,F].
+    pub fn interpolate(&self, features: Tensor<2>) -> Result<Tensor<2>> {
+        let ([u, _], [vertices, _]) = (features.dims(), self.vertices.dims());
+        if u != vertices {
+            return Err(Error::parameter("interpolation", format!("{u} feature rows for {vertices} vertices"), "Decode the vertices of the same level"));
+        }
+        let [corners, slots, starts] = [&self.corners, &self.slots, &self.starts].map(|t| t.clone().into_dispatch());
+        Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::trilinear(features.into_dispatch(), corners, self.weights.clone().into_dispatch(), slots, starts)))
+    }
+}
+
+/// Runs a trunk-and-heads ReLU network over `x` [M,in]; one output [M,width] per head (or the trunk's). `weights` is flat in the order of
+/// [`crate::cpu::mlp::relu`].
+pub fn mlp_relu(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Result<Vec<Tensor<2>>> {
+    let [m, width] = x.dims();
+    if !shape.is_sound() || width != shape.input || m == 0 {
+        return Err(Error::parameter("network", format!("input [{m},{width}] for layers {shape:?}"), "Give at least one row and widths that fit"));
+    }
+    check_weights("network", weights.dims()[0], shape.parameter_count())?;
+    let flat: Tensor<1> = Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone()));
+    let widths = shape.output_widths();
+    if let [only] = widths.as_slice() {
+        return Ok(vec![flat.reshape([m, *only])]);
+    }
+    let mut at = 0;
+    Ok(widths
+        .iter()
+        .map(|&width| {
+            at += m * width;
+            flat.clone().narrow(0, at - m * width, m * width).reshape([m, width])
+        })
+        .collect())
+}
+
+fn check_weights(object: &str, got: usize, want: usize) -> Result<()> {
+    if got == want {
+        return Ok(());
+    }
+    Err(Error::parameter(object, format!("{got} weights, the layers need {want}"), "Load weights of the same configuration"))
+}
