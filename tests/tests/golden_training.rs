@@ -1,0 +1,306 @@
+//! Loss, optimizer and network kernels against the reference numbers of `golden/` on every CPU device.
+
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use cc4dgs_backends::cpu::mlp::{activation, mish};
+use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
+use cc4dgs_backends::ops::photometric::{bce_with_logits_loss, photometric_loss};
+use std::collections::HashMap;
+use std::path::PathBuf;
+
+/// Arrays of a float64 fixture by name, with shapes.
+type Fixture = HashMap<String, (Vec<usize>, Vec<f64>)>;
+
+fn golden(name: &str) -> Fixture {
+    let folder = std::env::var("CC4DGS_GOLDEN").map_or_else(|_| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden"), PathBuf::from);
+    let path = folder.join(format!("{name}.f64.safetensors"));
+    let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let file = safetensors::SafeTensors::deserialize(&bytes).expect("a safetensors file");
+    let array = |view: &safetensors::tensor::TensorView| view.data().chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().expect("8 bytes"))).collect();
+    file.tensors().iter().map(|(name, view)| (name.clone(), (view.shape().to_vec(), array(view)))).collect()
+}
+
+fn f32s(fixture: &Fixture, name: &str) -> Vec<f32> {
+    fixture[name].1.iter().map(|&v| v as f32).collect()
+}
+
+/// Relative L2 distance.
+fn distance(got: &[f32], want: &[f64]) -> f64 {
+    assert_eq!(got.len(), want.len());
+    let difference: f64 = got.iter().zip(want).map(|(g, w)| (f64::from(*g) - w).powi(2)).sum();
+    (difference / want.iter().map(|w| w * w).sum::<f64>().max(1e-300)).sqrt()
+}
+
+fn check(what: &str, got: &[f32], want: &[f64], tolerance: f64) {
+    let d = distance(got, want);
+    assert!(d < tolerance, "{what}: relative L2 distance {d:.3e}, allowed {tolerance:.1e}");
+}
+
+fn devices() -> [(&'static str, Device); 2] {
+    [("flex", Device::flex()), ("ndarray", Device::ndarray())]
+}
+
+fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
+    t.into_data().try_to_vec::<f32>().expect("float32")
+}
+
+/// [H, W, C] of a fixture to planes [C, H, W].
+fn planes(fixture: &Fixture, name: &str) -> ([usize; 3], Vec<f64>) {
+    let (shape, data) = &fixture[name];
+    let (h, w, c) = (shape[0], shape[1], shape[2]);
+    ([c, h, w], (0..c * h * w).map(|i| data[(i % (h * w)) * c + i / (h * w)]).collect())
+}
+
+fn to_f32(values: &[f64]) -> Vec<f32> {
+    values.iter().map(|&v| v as f32).collect()
+}
+
+#[test]
+fn golden_ssim_loss() {
+    let fixture = golden("ssim_loss");
+    let (shape, render) = planes(&fixture, "in.render");
+    let (_, target) = planes(&fixture, "in.target");
+    for (name, device) in devices() {
+        for (lambda_c, loss_key, grad_key) in [(0.8, "out.loss", "grad.loss.render"), (0.0, "out.ssim", "grad.ssim.render")] {
+            // Two more planes, as a rasterizer's output has them.
+            let mut five = to_f32(&render);
+            five.resize(5 * shape[1] * shape[2], 0.25);
+            let planes5 = Tensor::<3>::from_data(TensorData::new(five, [5, shape[1], shape[2]]), &device.clone().autodiff()).require_grad();
+            let target = Tensor::<3>::from_data(TensorData::new(to_f32(&target), shape), &device);
+            let out = photometric_loss(planes5.clone(), target, lambda_c).expect("a loss");
+            let numbers = out.numbers().expect("terms");
+            let grads = out.loss.clone().backward();
+            let grad = values(planes5.grad(&grads).expect("a gradient"));
+            let loss = f64::from(values(out.loss)[0]);
+            // With lambda_c = 0 the loss is 1 - SSIM, and its gradient the negative one.
+            let (want, sign) = if lambda_c == 0.0 { (1.0 - fixture[loss_key].1[0], -1.0) } else { (fixture[loss_key].1[0], 1.0) };
+            assert!((loss - want).abs() < 1e-5, "{name}: loss {loss} instead of {want}");
+            assert!((f64::from(numbers.l1) - fixture["out.l1"].1[0]).abs() < 1e-6);
+            assert!((f64::from(numbers.ssim) - fixture["out.ssim"].1[0]).abs() < 2e-5);
+            let mse = render.iter().zip(&target_of(&fixture)).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / render.len() as f64;
+            assert!((f64::from(numbers.mse) / mse - 1.0).abs() < 1e-5, "{name}: mse {} instead of {mse}", numbers.mse);
+            let want: Vec<f64> = planes(&fixture, grad_key).1.iter().map(|g| sign * g).collect();
+            check(&format!("{name} {grad_key}"), &grad[..render.len()], &want, 2e-4);
+            assert!(grad[render.len()..].iter().all(|g| *g == 0.0), "{name}: planes that are not read have a gradient");
+        }
+    }
+}
+
+fn target_of(fixture: &Fixture) -> Vec<f64> {
+    planes(fixture, "in.target").1
+}
+
+#[test]
+fn golden_adam() {
+    let fixture = golden("adam");
+    for (name, device) in devices() {
+        for (variant, beta2, epsilon) in [("const", 0.999, 1e-15), ("sched", 0.999, 1e-15), ("eps8", 0.99, 1e-8)] {
+            let n = fixture["in.p0"].1.len();
+            let vector = |v: &[f64]| Tensor::<1>::from_data(TensorData::new(to_f32(v), [n]), &device);
+            let (mut p, mut m, mut v) = (vector(&fixture["in.p0"].1), Tensor::<1>::zeros([n], &device), Tensor::<1>::zeros([n], &device));
+            let (mut all_p, mut all_m, mut all_v) = (Vec::new(), Vec::new(), Vec::new());
+            for step in 0..50 {
+                let lr = if variant == "sched" { fixture["in.lr_schedule"].1[step] } else { 0.009999999776482582 };
+                let grad = vector(&fixture["in.grads"].1[step * n..(step + 1) * n]);
+                let settings = AdamSettings { lr, beta1: 0.9, beta2, epsilon, step: step as u64 + 1, visible: None };
+                let out = adam_step(p, m, v, grad, &settings).expect("a step");
+                (p, m, v) = (out.param, out.m, out.v);
+                all_p.extend(values(p.clone()));
+                all_m.extend(values(m.clone()));
+                all_v.extend(values(v.clone()));
+            }
+            let worst = all_p.iter().zip(&fixture[&format!("{variant}.out.params")].1).map(|(g, w)| (f64::from(*g) - w).abs()).fold(0.0, f64::max);
+            assert!(worst < 5e-6, "{name} {variant}: parameters off by {worst:.2e}");
+            check(&format!("{name} {variant} m"), &all_m, &fixture[&format!("{variant}.out.exp_avg")].1, 1e-6);
+            check(&format!("{name} {variant} v"), &all_v, &fixture[&format!("{variant}.out.exp_avg_sq")].1, 4e-6);
+        }
+    }
+}
+
+#[test]
+fn adam_leaves_invisible_and_broken_rows_alone() {
+    for (name, device) in devices() {
+        // Enough rows for several tasks of the kernel, odd width.
+        let (rows, width) = (9_001, 5);
+        let count = rows * width;
+        let wave = |k: f32| (0..count).map(|i| (i as f32 * k).sin()).collect::<Vec<f32>>();
+        let matrix = |v: Vec<f32>| Tensor::<2>::from_data(TensorData::new(v, [rows, width]), &device);
+        let (p0, m0, v0) = (wave(0.3), wave(0.7), wave(0.9).iter().map(|v| v * v).collect::<Vec<_>>());
+        let mut g = wave(1.1);
+        let visible: Vec<i64> = (0..rows as i64).map(|i| if i % 3 == 0 { 0 } else { i }).collect();
+        let broken = [7usize, 4_444, 9_000];
+        g[broken[0] * width] = f32::NAN;
+        g[broken[1] * width + 4] = f32::INFINITY;
+        g[broken[2] * width + 2] = f32::NEG_INFINITY;
+        let mut settings = AdamSettings::new(0.01, 3);
+        settings.visible = Some(Tensor::<1, Int>::from_data(TensorData::new(visible.clone(), [rows]), &device));
+        let out = adam_step(matrix(p0.clone()), matrix(m0.clone()), matrix(v0.clone()), matrix(g.clone()), &settings).expect("a step");
+        // Row 9000 is a multiple of 3, so it was not wanted and does not count.
+        assert_eq!(out.skipped_rows.into_data().iter::<i64>().collect::<Vec<_>>(), [2], "{name}");
+        let (p, m, v) = (values(out.param), values(out.m), values(out.v));
+        for row in 0..rows {
+            for i in row * width..(row + 1) * width {
+                if visible[row] == 0 || broken.contains(&row) {
+                    assert_eq!((p[i], m[i], v[i]), (p0[i], m0[i], v0[i]), "{name}: row {row} moved");
+                } else {
+                    let (m1, v1) = (0.9 * f64::from(m0[i]) + 0.1 * f64::from(g[i]), 0.999 * f64::from(v0[i]) + 0.001 * f64::from(g[i]).powi(2));
+                    let step = 0.01 / (1.0 - 0.9f64.powi(3)) * m1 / (v1.sqrt() / (1.0 - 0.999f64.powi(3)).sqrt() + 1e-15);
+                    assert!((f64::from(p[i]) - (f64::from(p0[i]) - step)).abs() < 1e-6 * (1.0 + step.abs()), "{name}: row {row}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn golden_nn_activations() {
+    let fixture = golden("nn");
+    let (x, w) = (f32s(&fixture, "mish.in.x"), &fixture["mish.in.weights"].1);
+    let out: Vec<f32> = x.iter().map(|&x| activation::mish(x)).collect();
+    check("mish", &out, &fixture["mish.out"].1, 1e-6);
+    let grad: Vec<f32> = x.iter().zip(w).map(|(&x, &w)| activation::mish_derivative(x) * w as f32).collect();
+    check("mish gradient", &grad, &fixture["mish.grad.x"].1, 1e-6);
+
+    let n = 16;
+    let mut normalized = f32s(&fixture, "layernorm.in.x");
+    let (gain, shift) = (f32s(&fixture, "layernorm.in.weight"), f32s(&fixture, "layernorm.in.bias"));
+    let (mut inverse, mut work) = (vec![0.0; 7], vec![0.0; n]);
+    activation::normalize_rows(&mut normalized, n, &mut inverse, &mut work);
+    let out: Vec<f32> = normalized.iter().enumerate().map(|(i, v)| v * gain[i % n] + shift[i % n]).collect();
+    check("layernorm", &out, &fixture["layernorm.out"].1, 3e-5);
+    let mut grad = f32s(&fixture, "layernorm.in.weights_loss");
+    let (mut grad_gain, mut grad_shift) = (vec![0.0; n], vec![0.0; n]);
+    activation::layer_norm_backward(&mut grad, &normalized, &inverse, &gain, (&mut grad_gain, &mut grad_shift), &mut work);
+    check("layernorm x", &grad, &fixture["layernorm.grad.x"].1, 2e-6);
+    check("layernorm gain", &grad_gain, &fixture["layernorm.grad.weight"].1, 5e-5);
+    check("layernorm shift", &grad_shift, &fixture["layernorm.grad.bias"].1, 2e-6);
+}
+
+#[test]
+fn golden_nn_mlp() {
+    let fixture = golden("nn");
+    let shape = mish::MishShape { input: 11, hidden: vec![16, 16], output: 5 };
+    // The fixture keeps W as [out, in]; the kernel as [in, out].
+    let transposed = |name: &str| {
+        let (shape, data) = &fixture[name];
+        let (out, input) = (shape[0], shape[1]);
+        (0..out * input).map(|i| data[(i % out) * input + i / out]).collect::<Vec<f64>>()
+    };
+    let flat = |prefix: &str| -> Vec<f64> {
+        let plain = |name: String| fixture[&name].1.clone();
+        let hidden = |l: usize| {
+            let (weight, bias) = (transposed(&format!("{prefix}.lin{l}.weight")), plain(format!("{prefix}.lin{l}.bias")));
+            [weight, bias, plain(format!("{prefix}.ln{l}.weight")), plain(format!("{prefix}.ln{l}.bias"))].concat()
+        };
+        [hidden(0), hidden(1), transposed(&format!("{prefix}.lin2.weight")), plain(format!("{prefix}.lin2.bias"))].concat()
+    };
+    let weights = to_f32(&flat("mlp.in"));
+    assert_eq!(weights.len(), shape.parameter_count());
+    let x = f32s(&fixture, "mlp.in.x");
+    let rows = |first: usize, out: &mut [f32]| out.copy_from_slice(&x[first * 11..][..out.len()]);
+    check("mlp", &mish::forward(&shape, &weights, 7, &rows), &fixture["mlp.out"].1, 2e-6);
+    let mut grad_x = vec![0.0; 77];
+    let grad = mish::backward(&shape, &weights, 7, &rows, &f32s(&fixture, "mlp.in.weights_loss"), Some(&mut grad_x));
+    check("mlp x", &grad_x, &fixture["mlp.grad.x"].1, 3e-6);
+    for (layer, name) in shape.layers().iter().zip(["lin0", "lin1", "lin2"]) {
+        check(name, &grad[layer.weight.clone()], &transposed(&format!("mlp.grad.{name}.weight")), 3e-6);
+        check(name, &grad[layer.bias.clone()], &fixture[&format!("mlp.grad.{name}.bias")].1, 3e-6);
+    }
+    check("whole", &grad, &flat("mlp.grad"), 3e-6);
+}
+
+/// The loss by its definition in float64, each window summed in two dimensions.
+fn plain_loss(x: &[f64], y: &[f64], (c, h, w): (usize, usize, usize), lambda_c: f64) -> f64 {
+    let weight = |d: isize| (-(d * d) as f64 / 4.5).exp();
+    let norm: f64 = (-5..=5).map(weight).sum();
+    let (mut ssim, mut l1) = (0.0, 0.0);
+    for ch in 0..c {
+        for i in 0..h as isize {
+            for j in 0..w as isize {
+                let mut m = [0.0f64; 5];
+                for di in -5..=5isize {
+                    for dj in -5..=5isize {
+                        let (r, q) = (i + di, j + dj);
+                        if r >= 0 && q >= 0 && r < h as isize && q < w as isize {
+                            let at = (ch * h + r as usize) * w + q as usize;
+                            let g = weight(di) * weight(dj) / (norm * norm);
+                            let (a, b) = (x[at], y[at]);
+                            for (m, v) in m.iter_mut().zip([a, b, a * a, b * b, a * b]) {
+                                *m += g * v;
+                            }
+                        }
+                    }
+                }
+                let (sx, sy, sxy) = (m[2] - m[0] * m[0], m[3] - m[1] * m[1], m[4] - m[0] * m[1]);
+                ssim += (2.0 * m[0] * m[1] + 1e-4) * (2.0 * sxy + 9e-4) / ((m[0] * m[0] + m[1] * m[1] + 1e-4) * (sx + sy + 9e-4));
+                let at = (ch * h + i as usize) * w + j as usize;
+                l1 += (x[at] - y[at]).abs();
+            }
+        }
+    }
+    let n = (c * h * w) as f64;
+    lambda_c * l1 / n + (1.0 - lambda_c) * (1.0 - ssim / n)
+}
+
+#[test]
+fn photometric_loss_matches_its_definition_at_awkward_sizes() {
+    for (h, w) in [(1, 1), (3, 130), (17, 64), (23, 5)] {
+        let n = 3 * h * w;
+        let x: Vec<f64> = (0..n).map(|i| f64::from((0.5 + 0.4 * (i as f64 * 0.37).sin()) as f32)).collect();
+        let y: Vec<f64> = (0..n).map(|i| f64::from((0.5 + 0.4 * (i as f64 * 0.31 + 1.0).cos()) as f32)).collect();
+        for (name, device) in devices() {
+            let planes = Tensor::<3>::from_data(TensorData::new(to_f32(&x), [3, h, w]), &device.clone().autodiff()).require_grad();
+            let target = Tensor::<3>::from_data(TensorData::new(to_f32(&y), [3, h, w]), &device);
+            let out = photometric_loss(planes.clone(), target.clone(), 0.6).expect("a loss");
+            let untracked = photometric_loss(planes.clone().inner(), target, 0.6).expect("a loss");
+            // A factor on the way back must arrive at the pixels.
+            let grads = (out.loss.clone() * 3.0).backward();
+            let grad = values(planes.grad(&grads).expect("a gradient"));
+            let loss = values(out.loss)[0];
+            assert_eq!(loss, values(untracked.loss)[0], "tracking must not change the value");
+            let want = plain_loss(&x, &y, (3, h, w), 0.6);
+            assert!((f64::from(loss) - want).abs() < 5e-6, "{name} {h}x{w}: {loss} instead of {want}");
+            for at in [0, n / 3, n / 2, n - 1] {
+                let mut moved = [x.clone(), x.clone()];
+                moved[0][at] += 1e-5;
+                moved[1][at] -= 1e-5;
+                let slope = 3.0 * (plain_loss(&moved[0], &y, (3, h, w), 0.6) - plain_loss(&moved[1], &y, (3, h, w), 0.6)) / 2e-5;
+                assert!((f64::from(grad[at]) - slope).abs() < 2e-3 * slope.abs() + 1e-6, "{name} {h}x{w} pixel {at}: {} instead of {slope}", grad[at]);
+            }
+        }
+    }
+}
+
+#[test]
+fn cross_entropy_is_stable_and_its_gradient_right() {
+    for (name, device) in devices() {
+        let logits = [-200.0f32, -3.0, -0.5, 0.0, 0.5, 4.0, 200.0, 7.0];
+        let mask = [0.0f32, 1.0, 0.0, 1.0, 0.25, 1.0, 0.0, 1.0];
+        let planes = Tensor::<3>::from_data(TensorData::new([logits, [9.0; 8]].concat(), [2, 2, 4]), &device.clone().autodiff()).require_grad();
+        let loss = bce_with_logits_loss(planes.clone(), Tensor::<2>::from_data(TensorData::new(mask.to_vec(), [2, 4]), &device)).expect("a loss");
+        let grads = loss.clone().backward();
+        let grad = values(planes.grad(&grads).expect("a gradient"));
+        let plain = |x: f64, z: f64| x.max(0.0) - x * z + (-x.abs()).exp().ln_1p();
+        let want: f64 = logits.iter().zip(&mask).map(|(&x, &z)| plain(f64::from(x), f64::from(z))).sum::<f64>() / 8.0;
+        assert!((f64::from(values(loss)[0]) / want - 1.0).abs() < 1e-6, "{name}");
+        for i in 0..8 {
+            let slope = (1.0 / (1.0 + (-f64::from(logits[i])).exp()) - f64::from(mask[i])) / 8.0;
+            assert!((f64::from(grad[i]) - slope).abs() < 1e-7, "{name} logit {i}");
+        }
+        assert!(grad[8..].iter().all(|g| *g == 0.0));
+    }
+}
+
+#[test]
+fn losses_and_steps_refuse_what_does_not_fit() {
+    let device = Device::flex();
+    let image = |c, h, w| Tensor::<3>::zeros([c, h, w], &device);
+    assert!(photometric_loss(image(2, 4, 4), image(3, 4, 4), 0.8).is_err());
+    assert!(photometric_loss(image(3, 4, 4), image(3, 4, 5), 0.8).is_err());
+    assert!(photometric_loss(image(3, 4, 4), image(3, 4, 4), f32::NAN).is_err());
+    assert!(bce_with_logits_loss(image(1, 4, 4), Tensor::zeros([4, 3], &device)).is_err());
+    let v = |n| Tensor::<1>::zeros([n], &device);
+    assert!(adam_step(v(3), v(3), v(2), v(3), &AdamSettings::new(0.1, 1)).is_err());
+    assert!(adam_step(v(3), v(3), v(3), v(3), &AdamSettings::new(0.1, 0)).is_err());
+    let empty = adam_step(v(0), v(0), v(0), v(0), &AdamSettings::new(0.1, 1)).expect("no rows are fine");
+    assert_eq!(empty.param.dims(), [0]);
+}
