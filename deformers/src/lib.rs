@@ -1,1 +1,4 @@
-//! cc4dgs-deformers
+//! Deformation fields. Each registers itself; link this crate and name one in the configuration.
+
+pub mod cdf;
+pub mod none;

@@ -1,0 +1,235 @@
+//! The computational deformation field (paper Section IV-B): features of grid vertices are computed from hash signatures by small
+//! decoders instead of being stored, interpolated at the Gaussians, modulated by time, and turned into offsets.
+//!
+//! Everything that does not depend on time is in `spatial`: its output is the hidden state W_s f_voxel + b_s, not f_voxel, so that a cache
+//! saves the spatial layer as well. What time does to that state is the same for all Gaussians and affine, so `deform` folds it into the
+//! first trunk layer: h (gamma ⊙ T) + (beta T + b) in place of (gamma ⊙ h + beta) T + b.
+
+mod config;
+mod time;
+mod weights;
+
+pub use config::{Capacity, CdfConfig, Fusion, Head, SCHEMA, Sizes, TimeEncoding};
+
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::field::{Decoder, GridBox, LevelHash, ReluShape, VoxelCorners, mlp_relu};
+use cc4dgs_core::{
+    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
+    config as toml_config, inventory,
+};
+use std::sync::Arc;
+
+/// Parameter groups by index.
+const GRID: usize = 0;
+const NET: usize = 1;
+
+/// The field: settings, settled sizes, weights.
+pub struct Cdf {
+    config: CdfConfig,
+    sizes: Sizes,
+    box_min: [f32; 3],
+    box_max: [f32; 3],
+    decoders: Vec<Arc<Decoder>>,
+    spatial: Arc<ReluShape>,
+    time: Arc<ReluShape>,
+    film: Option<Arc<ReluShape>>,
+    network: Arc<ReluShape>,
+    sh_degree: usize,
+    /// Decoders by level, spatial layer, time network, FiLM generator (if any), trunk, heads.
+    parameters: Vec<Parameter>,
+}
+
+impl Cdf {
+    /// A fresh field for the scene of `context`, weights on `device`.
+    pub fn new(config: CdfConfig, context: &FieldContext, device: &Device) -> Result<Self> {
+        let sizes = config.sizes(context)?;
+        let seed = context.seed;
+        let mut parameters = Vec::new();
+        let mut add = |name: String, part: Part, values: Vec<f32>| {
+            let count = values.len();
+            let group = if part == Part::Grid { GRID } else { NET };
+            parameters.push(Parameter { name, part, shape: vec![count], value: Tensor::from_data(TensorData::new(values, [count]), device), group });
+        };
+        let mut decoders = Vec::new();
+        for level in 0..sizes.resolutions.len() {
+            let level_seed = seed.child("level").index(level as u64);
+            add(format!("grid.level{level}"), Part::Grid, weights::decoder(level_seed.child("weights"), &sizes.decoder));
+            let hash = LevelHash::new(level_seed.child("hash"), config.hashes, config.modulus);
+            decoders.push(Arc::new(Decoder { hash, shape: sizes.decoder.clone() }));
+        }
+        let width = sizes.width;
+        add("net.spatial".into(), Part::Net, weights::linear(seed.child("spatial"), sizes.spatial_inputs(), width));
+        add("net.time".into(), Part::Net, weights::chain(seed.child("time"), &weights::widths(&sizes.time)));
+        if let Some(film) = &sizes.film {
+            add("net.film".into(), Part::Net, weights::film(seed.child("film"), film, width));
+        }
+        let trunk: Vec<usize> = std::iter::once(width).chain(sizes.network.trunk.iter().copied()).collect();
+        add("net.trunk".into(), Part::Net, weights::chain(seed.child("trunk"), &trunk));
+        for head in &config.heads {
+            let values = weights::head(seed.child(head.name()), width, head.width(context.sh_degree));
+            add(format!("net.head.{}", head.name()), Part::Net, values);
+        }
+        Ok(Self {
+            box_min: context.box_min,
+            box_max: context.box_max,
+            decoders,
+            spatial: Arc::new(ReluShape::chain(&[sizes.voxel_features(), width])),
+            time: Arc::new(sizes.time.clone()),
+            film: sizes.film.clone().map(Arc::new),
+            network: Arc::new(sizes.network.clone()),
+            sh_degree: context.sh_degree,
+            parameters,
+            config,
+            sizes,
+        })
+    }
+
+    /// The settled sizes.
+    pub fn sizes(&self) -> &Sizes {
+        &self.sizes
+    }
+
+    /// The weights of the parameter after the decoders, by place.
+    fn net(&self, place: usize) -> Tensor<1> {
+        self.parameters[self.decoders.len() + place].value.clone()
+    }
+
+    /// f_voxel [M, levels * features] and what it cost.
+    fn voxel_features(&self, means_world: Tensor<2>) -> Result<(Tensor<2>, FieldWork)> {
+        let [m, _] = means_world.dims();
+        let mut work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        let mut levels = Vec::with_capacity(self.decoders.len());
+        for (level, decoder) in self.decoders.iter().enumerate() {
+            let grid = GridBox { min: self.box_min, max: self.box_max, resolution: self.sizes.resolutions[level] };
+            let corners = VoxelCorners::find(means_world.clone(), grid, self.config.vertex_reuse)?;
+            work.vertices_queried += 8 * m as u64;
+            work.vertices_decoded += corners.vertices.dims()[0] as u64;
+            let features = corners.decode(self.parameters[level].value.clone(), decoder)?;
+            levels.push(corners.interpolate(features)?);
+        }
+        Ok((Tensor::cat(levels, 1), work))
+    }
+
+    /// The trunk's weights at a time, modulation folded into its first layer.
+    fn modulated_trunk(&self, time_norm: f32) -> Result<Tensor<1>> {
+        let w = self.sizes.width;
+        let trunk = self.net(if self.film.is_some() { 3 } else { 2 });
+        let len = trunk.dims()[0];
+        let matrix = trunk.clone().narrow(0, 0, w * w).reshape([w, w]);
+        let bias = trunk.clone().narrow(0, w * w, w).reshape([1, w]);
+        let rest = trunk.narrow(0, w * (w + 1), len - w * (w + 1));
+        let encoding = time::encode(time_norm, self.sizes.time_bands);
+        let inputs = encoding.len();
+        let encoding = Tensor::<2>::from_data(TensorData::new(encoding, [1, inputs]), &matrix.device());
+        let f_time = single(mlp_relu(encoding, self.net(1), &self.time)?)?;
+        let (matrix, shift) = match &self.film {
+            Some(film) => {
+                let modulation = single(mlp_relu(f_time, self.net(2), film)?)?;
+                let scale = modulation.clone().narrow(1, 0, w).reshape([w, 1]);
+                let shift = modulation.narrow(1, w, w).matmul(matrix.clone());
+                (matrix * scale, shift)
+            }
+            None => {
+                let from_time = self.net(0).narrow(0, self.sizes.voxel_features() * w, w * w).reshape([w, w]);
+                let shift = f_time.matmul(from_time).matmul(matrix.clone());
+                (matrix, shift)
+            }
+        };
+        Ok(Tensor::cat(vec![matrix.reshape([w * w]), (bias + shift).reshape([w]), rest], 0))
+    }
+}
+
+fn single(outputs: Vec<Tensor<2>>) -> Result<Tensor<2>> {
+    outputs.into_iter().next().ok_or_else(|| Error::backend("deformer cdf", "a network returned no output", "Report this as a defect"))
+}
+
+impl DeformationField for Cdf {
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let [m, _] = means_world.dims();
+        if m == 0 {
+            return Ok(SpatialFeatures { values: Tensor::zeros([0, self.sizes.width], &means_world.inner().device()), work: FieldWork::default() });
+        }
+        let (voxel, work) = self.voxel_features(means_world)?;
+        let (rows, w) = (self.sizes.voxel_features(), self.sizes.width);
+        let layer = self.net(0);
+        let layer = if self.film.is_some() {
+            layer
+        } else {
+            // The rows that read the time features belong to `deform`.
+            let end = layer.dims()[0];
+            Tensor::cat(vec![layer.clone().narrow(0, 0, rows * w), layer.narrow(0, end - w, w)], 0)
+        };
+        Ok(SpatialFeatures { values: single(mlp_relu(voxel, layer, &self.spatial)?)?, work })
+    }
+
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        if !time_norm.is_finite() {
+            return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
+        }
+        let [m, _] = features.dims();
+        let outputs = if m == 0 {
+            let device = features.device();
+            self.network.output_widths().into_iter().map(|w| Tensor::zeros([0, w], &device)).collect()
+        } else {
+            let first_head = self.parameters.len() - self.config.heads.len();
+            let heads = self.parameters[first_head..].iter().map(|p| p.value.clone());
+            let weights = std::iter::once(self.modulated_trunk(time_norm)?).chain(heads).collect();
+            mlp_relu(features, Tensor::cat(weights, 0), &self.network)?
+        };
+        let mut offsets = Offsets::default();
+        for (head, out) in self.config.heads.iter().zip(outputs) {
+            match head {
+                Head::Means => offsets.means = Some(out),
+                Head::LogScales => offsets.log_scales = Some(out),
+                Head::Quaternions => offsets.quaternions = Some(out),
+                Head::Opacity => offsets.opacity_logits = Some(out.reshape([m])),
+                Head::Sh => offsets.sh = Some(out.reshape([m, (self.sh_degree + 1).pow(2), 3])),
+            }
+        }
+        Ok(offsets)
+    }
+
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+
+    fn groups(&self) -> Vec<ParameterGroup> {
+        let group = |name: &str| ParameterGroup {
+            name: name.into(),
+            lr_start: self.config.lr_start,
+            lr_end: self.config.lr_end,
+            warmup: self.config.warmup,
+            times_extent: false,
+            epsilon: 1e-15,
+            clip_norm: self.config.clip_norm,
+        };
+        vec![group("cdf grid"), group("cdf net")]
+    }
+
+    fn caches_spatial(&self) -> bool {
+        self.config.cache
+    }
+}
+
+fn build(settings: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+    let config: CdfConfig = toml_config::parse_section("deformer cdf", settings)?;
+    Ok(Box::new(Cdf::new(config, context, device)?))
+}
+
+inventory::submit! {
+    FieldPlugin {
+        info: Plugin {
+            name: "cdf",
+            version: "1",
+            summary: "computational deformation field: hash signatures, decoders per grid level, FiLM, trunk and five heads",
+            paper: "CC-4DGS, Section IV-B",
+            schema: SCHEMA,
+            capabilities: &["differentiable", "vertex-reuse", "cached-spatial", "fusion=film,concat"],
+        },
+        build,
+    }
+}

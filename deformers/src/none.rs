@@ -1,0 +1,55 @@
+//! No deformation: a static scene, and the base line of every dynamic one.
+
+use burn::tensor::{Device, Tensor};
+use cc4dgs_core::{
+    DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config, inventory,
+};
+use serde::Deserialize;
+
+struct NoDeformation;
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoSettings {}
+
+impl DeformationField for NoDeformation {
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let [m, _] = means_world.dims();
+        let work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        Ok(SpatialFeatures { values: Tensor::zeros([m, 1], &means_world.inner().device()), work })
+    }
+    fn deform(&self, _features: Tensor<2>, _time_norm: f32) -> Result<Offsets> {
+        Ok(Offsets::default())
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        Vec::new()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        Vec::new()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        Vec::new()
+    }
+    fn is_static(&self) -> bool {
+        true
+    }
+}
+
+fn build(settings: &toml::Table, _context: &FieldContext, _device: &Device) -> Result<Box<dyn DeformationField>> {
+    config::parse_section::<NoSettings>("deformer none", settings)?;
+    Ok(Box::new(NoDeformation))
+}
+
+inventory::submit! {
+    FieldPlugin {
+        info: Plugin {
+            name: "none",
+            version: "1",
+            summary: "no deformation: a static scene",
+            paper: "Kerbl et al. 2023 (3DGS)",
+            schema: "# no settings\n",
+            capabilities: &["static-only"],
+        },
+        build,
+    }
+}

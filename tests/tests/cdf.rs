@@ -1,0 +1,345 @@
+//! The computational deformation field: sizes, start, switches, and its outputs and gradients against the paper's formulas written in
+//! burn primitives.
+
+use burn::tensor::activation::{mish, relu};
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use cc4dgs_backends::ops::field::{GridBox, LevelHash, MishShape, VoxelCorners};
+use cc4dgs_core::{DeformationField, FieldContext, Offsets, Registry, Seed};
+use cc4dgs_deformers::cdf::{Cdf, CdfConfig};
+use rand::{Rng, SeedableRng};
+
+fn context(frames: usize) -> FieldContext {
+    FieldContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.5, 2.0], frame_count: frames, sh_degree: 3, seed: Seed::root(11).child("field") }
+}
+
+fn config(text: &str) -> CdfConfig {
+    cc4dgs_core::config::parse_section("deformer cdf", &cc4dgs_core::config::parse_table("test", text).expect("TOML")).expect("settings")
+}
+
+/// Small enough for exact comparison, every part present.
+const TINY: &str = "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = [20, 12]\nfeatures = 6\nwidth = 16\n";
+
+fn field(text: &str, device: &Device) -> Cdf {
+    Cdf::new(config(text), &context(300), device).expect("a field")
+}
+
+fn devices() -> [(&'static str, Device); 2] {
+    [("flex", Device::flex()), ("ndarray", Device::ndarray())]
+}
+
+fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
+    t.into_data().try_to_vec::<f32>().expect("float32")
+}
+
+fn matrix(data: Vec<f32>, width: usize, device: &Device) -> Tensor<2> {
+    let rows = data.len() / width;
+    Tensor::from_data(TensorData::new(data, [rows, width]), device)
+}
+
+/// Centres clustered so that vertices are shared, a few of them outside the box.
+fn centres(n: usize) -> Vec<f32> {
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+    (0..3 * n).map(|i| if i % 3 == 2 { random.random_range(-0.1..2.1) } else { random.random_range(-1.1f32..1.1) }).collect()
+}
+
+/// Replaces every weight by a random one of the same order, so that no head is zero.
+fn shake(field: &mut dyn DeformationField, device: &Device) {
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+    for p in field.parameters_mut() {
+        let moved: Vec<f32> = values(p.value.clone()).iter().map(|v| v + random.random_range(-0.15f32..0.15)).collect();
+        let n = moved.len();
+        let value = Tensor::<1>::from_data(TensorData::new(moved, [n]), device);
+        p.value = if value.is_autodiff() { value.require_grad() } else { value };
+    }
+}
+
+fn evaluate(field: &dyn DeformationField, points: &[f32], time: f32, device: &Device) -> (Vec<f32>, Offsets) {
+    let spatial = field.spatial(matrix(points.to_vec(), 3, device)).expect("features").values;
+    let offsets = field.deform(spatial.clone(), time).expect("offsets");
+    (values(spatial), offsets)
+}
+
+fn distance(got: &[f32], want: &[f32]) -> f64 {
+    assert_eq!(got.len(), want.len());
+    let difference: f64 = got.iter().zip(want).map(|(g, w)| f64::from(g - w).powi(2)).sum();
+    (difference / want.iter().map(|w| f64::from(*w).powi(2)).sum::<f64>().max(1e-30)).sqrt()
+}
+
+#[test]
+fn sizes_are_those_of_the_paper() {
+    let device = Device::flex();
+    let count = |text: &str| {
+        let (grid, net) = field(text, &device).size_bytes();
+        (grid / 4, net / 4)
+    };
+    assert_eq!(count(""), (188_320, 278_203));
+    assert_eq!(count("fusion = \"concat\""), (188_320, 245_051));
+    assert_eq!(count("capacity = \"mid\""), (125_920, 162_587));
+    assert_eq!(count("capacity = \"small\""), (54_848, 71_547));
+    assert_eq!(count("levels = 4").0, 4 * 37_664);
+    // One switch, one share: each head is a layer of its own width and its output layer.
+    assert_eq!(count("heads = [\"means\"]").1, 278_203 - 4 * 16_512 - (3 + 4 + 1 + 48) * 129);
+    // Raw time drops 16 inputs of the time network.
+    assert_eq!(count("time_encoding = \"raw\"").1, 278_203 - 16 * 128);
+    let (grid, net) = field("", &device).size_bytes();
+    assert_eq!((format!("{:.3}", grid as f64 / 1e6), format!("{:.3}", net as f64 / 1e6)), ("0.753".into(), "1.113".into()));
+}
+
+#[test]
+fn a_fresh_field_moves_nothing() {
+    for (name, device) in devices() {
+        for text in ["capacity = \"small\"", "capacity = \"small\"\nfusion = \"concat\""] {
+            let (spatial, offsets) = evaluate(&field(text, &device), &centres(40), 0.37, &device);
+            assert!(spatial.iter().any(|v| v.abs() > 1e-3), "{name}: features are dead");
+            assert_eq!(offsets.means.as_ref().map(|t| t.dims()), Some([40, 3]));
+            assert_eq!(offsets.opacity_logits.as_ref().map(|t| t.dims()), Some([40]));
+            assert_eq!(offsets.sh.as_ref().map(|t| t.dims()), Some([40, 16, 3]));
+            assert!(values(offsets.concatenated().expect("heads")).iter().all(|v| *v == 0.0), "{name} {text}");
+        }
+    }
+}
+
+#[test]
+fn vertex_reuse_changes_the_work_and_not_one_bit() {
+    for (name, device) in devices() {
+        let (mut with, mut without) = (field(TINY, &device), field(&format!("{TINY}vertex_reuse = false\ncache = false"), &device));
+        shake(&mut with, &device);
+        shake(&mut without, &device);
+        let points = centres(777);
+        let work = |f: &Cdf| f.spatial(matrix(points.clone(), 3, &device)).expect("features").work;
+        let (less, more) = (work(&with), work(&without));
+        assert_eq!((more.gaussians, more.vertices_queried, more.vertices_decoded), (777, 3 * 8 * 777, 3 * 8 * 777));
+        assert_eq!(less.vertices_queried, more.vertices_queried);
+        assert!(less.vertices_decoded < more.vertices_decoded / 2, "{less:?}");
+        assert!(with.caches_spatial() && !without.caches_spatial());
+        for time in [0.0, 0.61] {
+            let ((a, x), (b, y)) = (evaluate(&with, &points, time, &device), evaluate(&without, &points, time, &device));
+            assert_eq!(a, b, "{name}: features differ");
+            assert_eq!(values(x.concatenated().expect("heads")), values(y.concatenated().expect("heads")), "{name}: offsets differ");
+        }
+    }
+}
+
+/// The same field by the paper's formulas: no folding, no fused kernels.
+struct Plain<'a> {
+    field: &'a Cdf,
+    device: Device,
+}
+
+impl Plain<'_> {
+    fn weight(&self, name: &str) -> Tensor<1> {
+        self.field.parameters().into_iter().find(|p| p.name == name).unwrap_or_else(|| panic!("no weight {name}")).value.clone()
+    }
+    /// Consecutive Linear layers of `widths` out of a flat array from `at`.
+    fn linear(&self, x: Tensor<2>, weights: &Tensor<1>, at: &mut usize, (input, output): (usize, usize)) -> Tensor<2> {
+        let w = weights.clone().narrow(0, *at, input * output).reshape([input, output]);
+        let b = weights.clone().narrow(0, *at + input * output, output).reshape([1, output]);
+        *at += (input + 1) * output;
+        x.matmul(w) + b
+    }
+    fn decoder(&self, x: Tensor<2>, weights: &Tensor<1>, shape: &MishShape) -> Tensor<2> {
+        let (mut x, mut at, mut input) = (x, 0, shape.input);
+        for &h in &shape.hidden {
+            x = self.linear(x, weights, &mut at, (input, h));
+            let centred = x.clone() - x.mean_dim(1);
+            let deviation = (centred.clone().powi_scalar(2).mean_dim(1) + 1e-5).sqrt();
+            let [gain, shift] = [0, h].map(|offset| weights.clone().narrow(0, at + offset, h).reshape([1, h]));
+            at += 2 * h;
+            x = mish(centred / deviation * gain + shift);
+            input = h;
+        }
+        self.linear(x, weights, &mut at, (input, shape.output))
+    }
+    fn chain(&self, mut x: Tensor<2>, weights: &Tensor<1>, widths: &[usize], last_relu: bool) -> Tensor<2> {
+        let mut at = 0;
+        for (i, pair) in widths.windows(2).enumerate() {
+            x = self.linear(x, weights, &mut at, (pair[0], pair[1]));
+            if last_relu || i + 2 < widths.len() {
+                x = relu(x);
+            }
+        }
+        x
+    }
+    fn offsets(&self, points: &[f32], time: f32) -> Tensor<2> {
+        let (sizes, scene) = (self.field.sizes(), context(300));
+        let inner = self.device.clone().inner();
+        let mut levels = Vec::new();
+        for (level, &resolution) in sizes.resolutions.iter().enumerate() {
+            let grid = GridBox { min: scene.box_min, max: scene.box_max, resolution };
+            let c = VoxelCorners::find(matrix(points.to_vec(), 3, &inner), grid, true).expect("corners");
+            let vertices: Vec<[u32; 3]> =
+                c.vertices.into_data().iter::<i64>().collect::<Vec<_>>().chunks_exact(3).map(|v| [v[0] as u32, v[1] as u32, v[2] as u32]).collect();
+            let hash = LevelHash::new(scene.seed.child("level").index(level as u64).child("hash"), sizes.decoder.input, 1_000_000);
+            let mut signatures = vec![0.0; vertices.len() * sizes.decoder.input];
+            hash.signatures(&vertices, &mut signatures);
+            let features = self.decoder(matrix(signatures, sizes.decoder.input, &self.device), &self.weight(&format!("grid.level{level}")), &sizes.decoder);
+            let m = points.len() / 3;
+            let gathered = features.select(0, Tensor::<1, Int>::from_data(c.corners.into_data(), &self.device));
+            let weights = Tensor::<1>::from_data(c.weights.into_data(), &self.device).reshape([8 * m, 1]);
+            levels.push((gathered * weights).reshape([m, 8, sizes.decoder.output]).sum_dim(1).reshape([m, sizes.decoder.output]));
+        }
+        let (voxel, w) = (Tensor::cat(levels, 1), sizes.width);
+        let bands = (0..8).flat_map(|l| [f64::sin, f64::cos].map(|f| f(std::f64::consts::TAU * f64::from(1 << l) * f64::from(time)) as f32));
+        let encoding = matrix(std::iter::once(time).chain(bands).collect(), 17, &self.device);
+        let f_time = self.chain(encoding, &self.weight("net.time"), &[17, w, w, w, w], false);
+        let fused = if sizes.film.is_some() {
+            let h = self.chain(voxel, &self.weight("net.spatial"), &[sizes.voxel_features(), w], false);
+            let modulation = self.chain(f_time, &self.weight("net.film"), &[w, w, 2 * w], false);
+            h * modulation.clone().narrow(1, 0, w) + modulation.narrow(1, w, w)
+        } else {
+            let m = voxel.dims()[0];
+            let both = Tensor::cat(vec![voxel, f_time.repeat_dim(0, m)], 1);
+            self.chain(both, &self.weight("net.spatial"), &[sizes.spatial_inputs(), w], false)
+        };
+        let hidden = self.chain(fused, &self.weight("net.trunk"), &[w; 5], true);
+        let heads = [("means", 3), ("log_scales", 3), ("quaternions", 4), ("opacity", 1), ("sh", 48)];
+        Tensor::cat(heads.map(|(name, out)| self.chain(hidden.clone(), &self.weight(&format!("net.head.{name}")), &[w, w, out], false)).to_vec(), 1)
+    }
+}
+
+#[test]
+fn outputs_and_all_gradients_match_the_formulas() {
+    for (name, device) in devices() {
+        for fusion in ["film", "concat"] {
+            let device = device.clone().autodiff();
+            let mut field = field(&format!("{TINY}fusion = \"{fusion}\""), &device);
+            shake(&mut field, &device);
+            let points = centres(300);
+            let (_, offsets) = evaluate(&field, &points, 0.43, &device);
+            let fast = offsets.concatenated().expect("heads");
+            let plain = Plain { field: &field, device: device.clone() }.offsets(&points, 0.43);
+            let d = distance(&values(fast.clone()), &values(plain.clone()));
+            assert!(d < 1e-5, "{name} {fusion}: outputs differ by {d:.2e}");
+            let wave: Vec<f32> = (0..300 * 59).map(|i| (i as f32 * 0.7).sin()).collect();
+            let wave = matrix(wave, 59, &device);
+            let (got, want) = ((fast * wave.clone()).sum().backward(), (plain * wave).sum().backward());
+            for p in field.parameters() {
+                let gradient = |g| values(p.value.grad(g).unwrap_or_else(|| panic!("{name} {fusion}: no gradient at {}", p.name)));
+                let (got, want) = (gradient(&got), gradient(&want));
+                assert!(want.iter().any(|v| v.abs() > 1e-6), "{} has no gradient to compare", p.name);
+                let d = distance(&got, &want);
+                assert!(d < 1e-4, "{name} {fusion}: gradient of {} differs by {d:.2e}", p.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn gradients_match_finite_differences() {
+    for (name, device) in devices() {
+        let device = device.clone().autodiff();
+        let mut field = field(TINY, &device);
+        shake(&mut field, &device);
+        let points = centres(60);
+        let wave: Vec<f32> = (0..60 * 59).map(|i| 1.0 + 0.5 * (i as f32 * 0.7).sin()).collect();
+        let loss = |field: &Cdf| {
+            let out = values(evaluate(field, &points, 0.43, &device).1.concatenated().expect("heads"));
+            out.iter().zip(&wave).map(|(o, w)| f64::from(*o) * f64::from(*w)).sum::<f64>()
+        };
+        let out = evaluate(&field, &points, 0.43, &device).1.concatenated().expect("heads");
+        let grads = (out * matrix(wave.clone(), 59, &device)).sum().backward();
+        // Along its own gradient the loss changes most, which drowns rounding; the short step crosses few kinks of ReLU.
+        for place in 0..field.parameters().len() {
+            let (gradient, start) = {
+                let p = field.parameters()[place];
+                (values(p.value.grad(&grads).expect("a gradient")), values(p.value.clone()))
+            };
+            let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+            let mut ends = [0.0; 2];
+            for (end, step) in ends.iter_mut().zip([5e-4, -5e-4]) {
+                let moved: Vec<f32> = start.iter().zip(&gradient).map(|(s, g)| s + (step * f64::from(*g) / norm) as f32).collect();
+                let n = moved.len();
+                field.parameters_mut()[place].value = Tensor::<1>::from_data(TensorData::new(moved, [n]), &device);
+                *end = loss(&field);
+            }
+            let n = start.len();
+            field.parameters_mut()[place].value = Tensor::<1>::from_data(TensorData::new(start, [n]), &device);
+            let slope = (ends[0] - ends[1]) / 1e-3;
+            assert!((slope / norm - 1.0).abs() < 0.03, "{name} {}: slope {slope} where the gradient says {norm}", field.parameters()[place].name);
+        }
+    }
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+        pool.install(|| {
+            let device = Device::flex().autodiff();
+            let mut field = field(TINY, &device);
+            shake(&mut field, &device);
+            let out = evaluate(&field, &centres(5000), 0.2, &device).1.concatenated().expect("heads");
+            let grads = out.clone().powi_scalar(2).sum().backward();
+            let gradients: Vec<Vec<f32>> = field.parameters().iter().map(|p| values(p.value.grad(&grads).expect("a gradient"))).collect();
+            (values(out), gradients)
+        })
+    };
+    assert!(run(1) == run(3), "one and three threads disagree");
+}
+
+#[test]
+fn points_outside_the_box_take_the_face() {
+    let device = Device::flex();
+    let mut field = field(TINY, &device);
+    shake(&mut field, &device);
+    let outside = [5.0, 0.1, 1.0, -9.0, -9.0, -9.0, 0.3, 0.2, 2.5];
+    let face = [1.0, 0.1, 1.0, -1.0, -0.5, 0.0, 0.3, 0.2, 2.0];
+    assert_eq!(evaluate(&field, &outside, 0.0, &device).0, evaluate(&field, &face, 0.0, &device).0);
+}
+
+#[test]
+fn seeds_decide_the_weights() {
+    let device = Device::flex();
+    let all = |seed: u64| {
+        let field = Cdf::new(config(TINY), &FieldContext { seed: Seed::root(seed), ..context(300) }, &device).expect("a field");
+        field.parameters().iter().map(|p| values(p.value.clone())).collect::<Vec<_>>()
+    };
+    assert_eq!(all(1), all(1));
+    assert!(all(1) != all(2));
+}
+
+#[test]
+fn odd_requests_get_answers() {
+    let device = Device::flex();
+    let small = field(TINY, &device);
+    let none = small.spatial(Tensor::zeros([0, 3], &device)).expect("no points are fine");
+    assert_eq!(none.values.dims(), [0, 16]);
+    assert_eq!(small.deform(none.values, 0.5).expect("no rows are fine").means.map(|t| t.dims()), Some([0, 3]));
+    let one = small.spatial(Tensor::from_floats([[f32::NAN, f32::INFINITY, 0.0]], &device)).expect("a defined result").values;
+    assert!(values(one.clone()).iter().all(|v| v.is_finite()));
+    assert!(small.deform(one.clone(), f32::NAN).is_err());
+    assert!(small.deform(one.repeat_dim(1, 2), 0.5).is_err(), "features of another width");
+    for text in [
+        "levels = 0",
+        "levels = 99",
+        "resolutions = [0]",
+        "resolutions = [99999]",
+        "levels = 2\nresolutions = [4]",
+        "heads = []",
+        "width = 0",
+        "modulus = 1",
+        "heads = [\"sh\", \"sh\"]",
+        "hidden = [0]",
+        "lr_start = nan",
+        "hashes = 100000",
+    ] {
+        let e = Cdf::new(config(text), &context(300), &device).err().unwrap_or_else(|| panic!("'{text}' was accepted"));
+        assert!(e.to_string().contains("deformer"), "{e}");
+    }
+    let registry = Registry::collect().expect("a registry");
+    let section = |kind: &str, settings: &str| {
+        let table = cc4dgs_core::config::parse_table("test", &format!("kind = \"{kind}\"\n{settings}")).expect("TOML");
+        registry.build_deformer(&table, &context(10), &device)
+    };
+    let message = section("cdf", "levls = 3").err().expect("unknown keys are refused").to_string();
+    assert!(message.contains("levls"), "{message}");
+    assert!(section("none", "levls = 3").is_err());
+    assert!(section("none", "").expect("none").is_static());
+    assert_eq!(section("cdf", "").expect("cdf").size_bytes().0, 753_280);
+    // The schema shown to users is the default configuration.
+    let schema = registry.deformer("cdf").expect("cdf").info.schema;
+    let shown = Cdf::new(config(schema), &context(300), &device).expect("the schema's settings");
+    assert_eq!(shown.sizes(), field("", &device).sizes());
+    let commented: String = schema.lines().map(|l| l.strip_prefix("# ").unwrap_or(l)).collect::<Vec<_>>().join("\n");
+    assert_eq!(Cdf::new(config(&commented), &context(300), &device).expect("the schema's settings").sizes(), shown.sizes());
+}
