@@ -128,7 +128,8 @@ impl GaussianSet {
         for (column, gradient) in self.columns.iter_mut().zip(gradients) {
             let Some(gradient) = gradient else { continue };
             let settings = AdamSettings { visible: visible.cloned(), ..AdamSettings::new(rate(&column.name), self.step) };
-            let empty = || Tensor::<2>::empty([0, 0], &column.value.device());
+            let device = column.value.device();
+            let empty = || Tensor::<2>::empty([0, 0], &device);
             // Moving the tensors out keeps them uniquely held, so that the step happens in place.
             let value = std::mem::replace(&mut column.value, empty());
             let first = std::mem::replace(&mut column.first_moment, empty());
@@ -145,11 +146,15 @@ pub fn host_gaussians(sh_degree: usize, columns: impl Iterator<Item = Result<(St
     let mut host = HostGaussians { sh_degree, ..Default::default() };
     for column in columns {
         let (name, width, values) = column?;
-        match host.columns_mut().into_iter().find(|(n, _, _)| *n == name) {
-            Some((_, _, slot)) => *slot = values,
-            None => {
-                host.extra.insert(name, ExtraAttribute { width, values });
+        if CORE_COLUMNS.contains(&name.as_str()) {
+            for (known, _, slot) in host.columns_mut() {
+                if known == name {
+                    *slot = values;
+                    break;
+                }
             }
+        } else {
+            host.extra.insert(name, ExtraAttribute { width, values });
         }
     }
     Ok(host)

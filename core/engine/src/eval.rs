@@ -128,15 +128,15 @@ pub fn evaluate(
         // Both pictures are rounded to 8 bits before they are compared.
         let truth = Image8::from_planes(&frame.to_planes(model.render.background), camera.width, camera.height);
         let (a, b) = (Planes::from_image8(&truth)?, Planes::from_image8(&render)?);
-        skimage += ssim(&a, &b, SsimConvention::Skimage)?;
+        skimage += ssim(&a, &b, SsimConvention::Skimage, None)?;
         let multi_scale = metrics::ms_ssim(&a, &b).ok();
         ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);
         let score = ImageScore {
             view,
             camera: camera.name.clone(),
             frame: scene.views[view].frame,
-            psnr_db: psnr(&a, &b)?,
-            ssim: ssim(&a, &b, SsimConvention::Inria)?,
+            psnr_db: psnr(&a, &b, None)?,
+            ssim: ssim(&a, &b, SsimConvention::Inria, None)?,
             field_ms: time.field_ms,
             raster_ms: time.raster_ms,
         };

@@ -51,8 +51,8 @@ impl FieldOptimizer {
             }
         }
         for ((parameter, moments), gradient) in self.field.parameters_mut().into_iter().zip(&mut self.moments).zip(gradient_of) {
-            let empty = || Tensor::<1>::empty([0], &moments[0].device());
-            let value = std::mem::replace(&mut parameter.value, empty()).inner();
+            let device = moments[0].device();
+            let value = std::mem::replace(&mut parameter.value, Tensor::empty([0], &device)).inner();
             let Some(gradient) = gradient else {
                 parameter.value = value;
                 continue;
@@ -61,7 +61,7 @@ impl FieldOptimizer {
             let warm = if group.warmup > 0.0 { (progress / group.warmup).min(1.0) } else { 1.0 };
             let lr = log_linear(group.lr_start, group.lr_end, progress) * warm * if group.times_extent { extent } else { 1.0 };
             let settings = AdamSettings { epsilon: group.epsilon, ..AdamSettings::new(lr, step) };
-            let [first, second] = std::array::from_fn(|k| std::mem::replace(&mut moments[k], Tensor::empty([0], &value.device())));
+            let [first, second] = std::array::from_fn(|k| std::mem::replace(&mut moments[k], Tensor::empty([0], &device)));
             let stepped = adam_step(value, first, second, gradient, &settings)?;
             parameter.value = stepped.param;
             *moments = [stepped.m, stepped.v];

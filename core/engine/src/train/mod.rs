@@ -8,7 +8,7 @@ mod state;
 mod step;
 
 pub use field_optimizer::FieldOptimizer;
-pub use state::{Moving, TrainState};
+pub use state::{Moving, Rows, TrainState};
 
 use crate::checkpoint;
 use crate::config::RunConfig;
