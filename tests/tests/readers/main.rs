@@ -3,6 +3,7 @@
 
 mod common;
 mod formats;
+mod golden;
 mod hostile;
 mod procedural;
 mod real;

@@ -48,7 +48,7 @@ impl Reader for Blender {
         } else {
             scene.warnings.push(format!("there is no {test}; nothing is held out"));
         }
-        set_times(&mut scene, &times);
+        scene.rank_times(&times, &path.display().to_string())?;
         scene.init_box = Some(([-INIT_HALF_WIDTH; 3], [INIT_HALF_WIDTH; 3]));
         // The published tables composite over white (4DGS, Swift4D); pictures without alpha are not touched by it.
         scene.background = Some([1.0; 3]);
@@ -74,9 +74,6 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
     for (frame, path) in transforms.frames.iter().zip(paths) {
         let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
         let world_to_camera = matrix4(&frame.transform_matrix).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
-        if frame.time.is_some_and(|t| !t.is_finite() || t < 0.0) {
-            return Err(bad(format!("time {:?} is not a number from 0 up", frame.time)));
-        }
         scene.cameras.push(RawCamera {
             name: frame.file_path.trim_start_matches("./").to_string(),
             size: [w, h],
@@ -89,17 +86,4 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
         times.push(frame.time);
     }
     Ok(())
-}
-
-/// The frame index is the rank of a view's time among all; times over 1 are divided by the largest.
-fn set_times(scene: &mut RawScene, times: &[Option<f64>]) {
-    let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
-    let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
-    distinct.sort_by(f64::total_cmp);
-    distinct.dedup();
-    for (view, time) in scene.views.iter_mut().zip(times) {
-        let t = time.unwrap_or(0.0);
-        view.frame = distinct.partition_point(|&d| d < t);
-        view.time = Some(t / largest);
-    }
 }

@@ -154,7 +154,7 @@ impl Reader for Nerfstudio {
                 if missing.len() > 3 { ", …" } else { "" }
             ));
         }
-        rank_times(&mut scene, &times, &object)?;
+        scene.rank_times(&times, &object)?;
         Ok(scene)
     }
 }
@@ -178,21 +178,4 @@ fn camera(frame: &Frame, shared: &Intrinsics, picture: &Path, limits: &Limits, b
         distortion: intrinsics.distortion().map_err(bad)?,
         world_to_camera,
     })
-}
-
-/// Frames with times form a sequence by rank; times are divided by the largest if that is over 1.
-fn rank_times(scene: &mut RawScene, times: &[Option<f64>], object: &str) -> Result<()> {
-    if let Some(t) = times.iter().flatten().find(|t| !t.is_finite() || **t < 0.0) {
-        return Err(Error::data(object, format!("time {t} is not a number from 0 up"), "Correct the JSON"));
-    }
-    let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
-    let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
-    distinct.sort_by(f64::total_cmp);
-    distinct.dedup();
-    for (view, time) in scene.views.iter_mut().zip(times) {
-        let t = time.unwrap_or(0.0);
-        view.frame = distinct.partition_point(|&d| d < t);
-        view.time = Some(t / largest);
-    }
-    Ok(())
 }

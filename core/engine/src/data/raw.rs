@@ -104,6 +104,24 @@ impl RawScene {
             .collect())
     }
 
+    /// Sets frame and time of each view from the dataset's times, one per view: the frame is the rank among the distinct times; times over 1 are
+    /// divided by the largest.
+    pub(crate) fn rank_times(&mut self, times: &[Option<f64>], object: &str) -> Result<()> {
+        if let Some(t) = times.iter().flatten().find(|t| !t.is_finite() || **t < 0.0) {
+            return Err(Error::data(object, format!("time {t} is not a number from 0 up"), "Correct the JSON"));
+        }
+        let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
+        let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
+        distinct.sort_by(f64::total_cmp);
+        distinct.dedup();
+        for (view, time) in self.views.iter_mut().zip(times) {
+            let t = time.unwrap_or(0.0);
+            view.frame = distinct.partition_point(|&d| d < t);
+            view.time = Some(t / largest);
+        }
+        Ok(())
+    }
+
     fn choose_frames(&mut self, options: &SceneOptions) -> Result<()> {
         let Some([start, count, stride]) = options.frames else { return Ok(()) };
         let available = self.views.iter().map(|v| v.frame + 1).max().unwrap_or(0);
@@ -280,7 +298,11 @@ fn plan_camera(camera: &RawCamera, native: [u32; 2], options: &SceneOptions, lim
     };
     pinhole.validate()?;
     if pinhole.center_world().iter().any(|v| v.abs() > FARTHEST) {
-        return Err(Error::data(object, format!("its centre {:?} is over {FARTHEST:e} units away", pinhole.center_world()), "Check the dataset's calibration file"));
+        return Err(Error::data(
+            object,
+            format!("its centre {:?} is over {FARTHEST:e} units away", pinhole.center_world()),
+            "Check the dataset's calibration file",
+        ));
     }
     let undistort = if camera.distortion.is_identity() {
         None
