@@ -1,5 +1,6 @@
 //! Operations burn lacks, per device, and the rasterizers made of them.
 
+pub mod bench;
 pub mod cpu;
 pub mod ops;
 pub mod rasterizers;

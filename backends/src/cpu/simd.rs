@@ -79,13 +79,13 @@ impl<S: Simd> Neg for Lanes<S> {
 
 const LOG2_E: f32 = std::f32::consts::LOG2_E;
 /// log2(e) minus its float32 value.
-const LOG2_E_TAIL: f32 = 1.925_963_033_5e-8;
+const LOG2_E_TAIL: f32 = 1.925_963e-8;
 /// Adding and subtracting 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits.
 const ROUND: f32 = 12_582_912.0;
 /// 2^f on [-1/2, 1/2] with value 1 at 0, largest relative error 9.2e-8 (fitted by iteratively reweighted least squares).
-const EXP2_5: [f32; 5] = [0.693_146_98, 0.240_222_42, 0.055_507_337, 0.009_671_513, 0.001_326_472_7];
+const EXP2_5: [f32; 5] = [0.693_147, 0.240_222_42, 0.055_507_337, 0.009_671_513, 0.001_326_472_7];
 /// As [`EXP2_5`] with one term more, largest relative error 2e-9.
-const EXP2_6: [f32; 6] = [0.693_147_2, 0.240_226_48, 0.055_503_325, 0.009_618_437, 0.001_339_887_4, 0.000_153_533_61];
+const EXP2_6: [f32; 6] = [std::f32::consts::LN_2, 0.240_226_48, 0.055_503_325, 0.009_618_437, 0.001_339_887_4, 0.000_153_533_6];
 
 impl<S: Simd> Lanes<S> {
     /// Lanes per vector; divides 16 for every instruction set of [`pulp`].

@@ -2,6 +2,8 @@
 
 use crate::cpu::raster::{self, GradientRequest, SplatArrays, Workspace};
 use crate::cpu::tensor::CpuBackend;
+use crate::rasterizers::reference::blend::Item;
+use crate::rasterizers::reference::{self, ReferenceInput};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
@@ -14,6 +16,16 @@ use std::fmt;
 use std::sync::{Arc, Mutex};
 
 pub use crate::cpu::raster::RasterSettings;
+
+/// Which implementation of a device draws.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Method {
+    /// Tiles.
+    #[default]
+    Tiles,
+    /// The float64 reference, on the host.
+    Reference,
+}
 
 /// What a device keeps between the forward and the backward pass. Only the device that made it can read it.
 #[derive(Clone)]
@@ -69,6 +81,7 @@ pub trait RasterOps: Backend {
         camera_probe: FloatTensor<Self>,
         background: FloatTensor<Self>,
         settings: RasterSettings,
+        method: Method,
     ) -> Rasterized<Self>;
 }
 
@@ -95,7 +108,7 @@ fn background_of<B: CpuBackend>(tensor: &FloatTensor<B>) -> [f32; 3] {
     std::array::from_fn(|k| values.get(k).copied().unwrap_or(0.0))
 }
 
-fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSettings) -> Rasterized<B> {
+fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSettings, method: Method) -> Rasterized<B> {
     let [means, scales, quaternions, opacities, colors, sh_rest] = std::array::from_fn(|k| B::floats(&inputs[k]));
     let splats = SplatArrays {
         means: &means,
@@ -106,6 +119,9 @@ fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSet
         sh_rest: &sh_rest,
         background: background_of::<B>(&inputs[6]),
     };
+    if method == Method::Reference {
+        return reference_forward::<B>(&splats, settings);
+    }
     match raster::forward(&splats, settings) {
         Ok(out) => {
             let weights = out.max_weights.len();
@@ -126,6 +142,41 @@ fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSet
             too_many_pairs: Some(pairs),
             saved: Saved::new(()),
         },
+    }
+}
+
+fn narrow(values: Vec<f64>) -> Vec<f32> {
+    values.into_iter().map(|v| v as f32).collect()
+}
+
+fn reference_forward<B: CpuBackend>(splats: &SplatArrays, settings: &RasterSettings) -> Rasterized<B> {
+    let out = reference::forward(&ReferenceInput::widen(splats), settings);
+    let n = splats.len();
+    let weights = if settings.max_weights { narrow(out.max_weights) } else { Vec::new() };
+    let weights_len = weights.len();
+    Rasterized {
+        planes: B::from_floats(narrow(out.planes), [5, settings.height, settings.width]),
+        radii: B::from_ints(out.radii, [n]),
+        max_weights: B::from_floats(weights, [weights_len]),
+        work: RenderWork { visible: out.items.len() as u64, tile_pairs: 0, pixel_pairs: out.pairs },
+        too_many_pairs: None,
+        saved: Saved::new(out.items),
+    }
+}
+
+fn reference_backward(splats: &SplatArrays, settings: &RasterSettings, items: &[Item], upstream: &[f32]) -> raster::Gradients {
+    let upstream: Vec<f64> = upstream.iter().map(|&v| f64::from(v)).collect();
+    let g = reference::backward(&ReferenceInput::widen(splats), settings, items, &upstream);
+    raster::Gradients {
+        means: narrow(g.means),
+        scales: narrow(g.scales),
+        quaternions: narrow(g.quaternions),
+        opacities: narrow(g.opacities),
+        colors: narrow(g.colors),
+        sh_rest: narrow(g.sh_rest),
+        screen: narrow(g.screen),
+        camera: narrow(g.camera),
+        background: narrow(g.background),
     }
 }
 
@@ -160,10 +211,17 @@ impl<B: CpuBackend> RasterBackward for B {
             camera: w_camera,
             background: w_background,
         };
-        let Some(workspace) = saved.get::<Mutex<Workspace>>() else { return std::array::from_fn(|_| None) };
-        // A panic of an earlier backward pass leaves leftovers at worst, and every buffer is written before it is read.
-        let mut workspace = workspace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let g = raster::backward(&splats, settings, &mut workspace, &B::floats(&upstream), &request);
+        let upstream = B::floats(&upstream);
+        let g = if let Some(items) = saved.get::<Vec<Item>>() {
+            reference_backward(&splats, settings, items, &upstream)
+        } else if let Some(workspace) = saved.get::<Mutex<Workspace>>() {
+            // A panic of an earlier backward pass leaves leftovers at worst, and every buffer is written before it is read.
+            let mut workspace = workspace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+            raster::backward(&splats, settings, &mut workspace, &upstream, &request)
+        } else {
+            // Nothing was drawn (too many pairs), so nothing flows back.
+            return std::array::from_fn(|_| None);
+        };
         let n = splats.len();
         let [s_means, s_scales, s_quaternions, s_opacities, s_colors, s_rest, s_background] = shapes;
         let values = [g.means, g.scales, g.quaternions, g.opacities, g.colors, g.sh_rest, g.screen, g.camera, g.background];
@@ -187,8 +245,9 @@ macro_rules! on_cpu {
                 _camera_probe: FloatTensor<Self>,
                 background: FloatTensor<Self>,
                 settings: RasterSettings,
+                method: Method,
             ) -> Rasterized<Self> {
-                rasterize_on_cpu::<Self>(&[means, scales, quaternions, opacities, colors, sh_rest, background], &settings)
+                rasterize_on_cpu::<Self>(&[means, scales, quaternions, opacities, colors, sh_rest, background], &settings, method)
             }
         }
     };
@@ -231,6 +290,7 @@ impl<B: RasterOps + RasterBackward, C: CheckpointStrategy> RasterOps for Autodif
         camera_probe: FloatTensor<Self>,
         background: FloatTensor<Self>,
         settings: RasterSettings,
+        method: Method,
     ) -> Rasterized<Self> {
         let (means, n0) = means.into_parts();
         let (scales, n1) = scales.into_parts();
@@ -244,7 +304,7 @@ impl<B: RasterOps + RasterBackward, C: CheckpointStrategy> RasterOps for Autodif
         let inputs = [means, scales, quaternions, opacities, colors, sh_rest, background];
         let [means, scales, quaternions, opacities, colors, sh_rest, background] = inputs.clone();
         let prep = RasterNode.prepare::<C>([n0, n1, n2, n3, n4, n5, n6, n7, n8]).compute_bound().stateful();
-        let out = B::rasterize(means, scales, quaternions, opacities, colors, sh_rest, screen_probe, camera_probe, background, settings.clone());
+        let out = B::rasterize(means, scales, quaternions, opacities, colors, sh_rest, screen_probe, camera_probe, background, settings.clone(), method);
         let Rasterized { planes, radii, max_weights, work, too_many_pairs, saved } = out;
         let planes = match prep {
             OpsKind::Tracked(prep) => prep.finish((inputs, settings, saved.clone()), planes),
@@ -285,7 +345,7 @@ fn check_device(device: &Device) -> Result<()> {
 }
 
 /// Renders; shapes must agree with `settings` (the rasterizer plug-ins check them).
-pub fn rasterize(inputs: RasterInputs, settings: RasterSettings) -> Result<RenderOutput> {
+pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method) -> Result<RenderOutput> {
     let device = inputs.means.device();
     check_device(&device)?;
     // A stand-in for what is absent; never read.
@@ -302,6 +362,7 @@ pub fn rasterize(inputs: RasterInputs, settings: RasterSettings) -> Result<Rende
         inputs.camera_probe.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
         inputs.background.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
         settings,
+        method,
     );
     if let Some(pairs) = out.too_many_pairs {
         return Err(Error::limit(

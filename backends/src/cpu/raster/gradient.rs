@@ -114,7 +114,7 @@ pub fn gradients(splats: &SplatArrays, settings: &RasterSettings, workspace: &Wo
             let first = chunk * CHUNK;
             let len = CHUNK.min(n - first);
             // SAFETY: every task has a chunk of its own.
-            let (out, camera_sums) = unsafe { (shared.each_ref().map(|column| rows(column, first, len)), parts.slice(chunk, usize::from(request.camera))) };
+            let (out, camera_sums) = unsafe { (shared.each_ref().map(|column| rows(column, first, len)), parts.slice(if request.camera { chunk } else { 0 }, usize::from(request.camera))) };
             let count = workspace.chunk_counts[chunk].0 as usize;
             let sums = dispatch(GradientChunk { splats, settings, camera: &camera, workspace, first, count, request, out });
             if let Some(part) = camera_sums.first_mut() {

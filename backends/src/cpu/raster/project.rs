@@ -4,7 +4,7 @@ use super::camera::{ALPHA_MIN, CameraConstants, FAR, RuleConstants};
 use super::geometry::{Vec3, project};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Footprint, Workspace, set_len};
-use super::{MAX_TILE_PAIRS, RasterSettings, ScreenSplat, SplatArrays, TILE, TooManyPairs, sh};
+use super::{MAX_TILE_PAIRS, RasterSettings, ScreenSplat, SplatArrays, TILE, TooManyPairs, sh, tiles};
 use crate::cpu::simd::{Lanes, dispatch};
 use cc4dgs_core::ParameterSpace;
 use pulp::{Simd, WithSimd};
@@ -187,6 +187,9 @@ impl ProjectChunk<'_> {
     fn emit(&mut self, offset: usize, v: &[f32; 13]) {
         // Inria keeps integer radii below 2^31; so do we.
         let radius = v[12].ceil().min(1e9) as i64;
+        if self.rules.square_tiles && tiles::square([v[0], v[1]], radius, self.settings).iter().any(|axis| axis[0] >= axis[1]) {
+            return;
+        }
         let span = |center: f32, half: f32, size: usize| {
             let first = ((center - half - 0.5).ceil().max(0.0) as usize).min(size - 1) / TILE;
             let last = ((center + half - 0.5).floor().max(0.0) as usize).min(size - 1) / TILE;

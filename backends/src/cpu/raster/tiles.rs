@@ -47,7 +47,7 @@ pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: 
                 // SAFETY: a slot occurs once in the order.
                 unsafe { rank_of_slot.slice(slot, 1)[0] = (first + k) as u32 };
                 starts[k] = pairs.len() as u32;
-                let limits = if rules.square_tiles { square(&splat, radii[splat.index as usize], settings) } else { None };
+                let limits = rules.square_tiles.then(|| square(splat.center, radii[splat.index as usize], settings));
                 cut_into_tiles(&splat, &footprints[slot], settings, limits, |tile, rows| {
                     histogram[tile] += 1;
                     pairs.push(Pair { tile: tile as u32, rank: (first + k) as u32, rows });
@@ -94,17 +94,19 @@ fn sort_by_depth(buffers: &mut Buffers) {
     }
 }
 
-/// Tile rectangle of Inria's getRect: first and end per axis.
-fn square(splat: &ScreenSplat, radius: i64, settings: &RasterSettings) -> Option<[[usize; 2]; 2]> {
+/// Tile rectangle of Inria's getRect: first and end per axis. Empty if the square misses the image.
+pub fn square(center: [f32; 2], radius: i64, settings: &RasterSettings) -> [[usize; 2]; 2] {
     let radius = radius as f32;
     let axis = |center: f32, size: usize| {
         let tiles = size.div_ceil(TILE);
+        // Inria counts pixels from their centres: column 0 is at 0, not at 0.5.
+        let center = center - 0.5;
         // Casting truncates towards zero and saturates, as in C but defined.
         let first = ((center - radius) / TILE as f32) as i64;
         let end = ((center + radius + (TILE - 1) as f32) / TILE as f32) as i64;
         [first.clamp(0, tiles as i64) as usize, end.clamp(0, tiles as i64) as usize]
     };
-    Some([axis(splat.center[0], settings.width), axis(splat.center[1], settings.height)])
+    [axis(center[0], settings.width), axis(center[1], settings.height)]
 }
 
 /// Calls `found(tile, rows)` for every tile with a pixel centre inside the footprint; `rows` packs the first and the last row of the tile.
@@ -132,7 +134,7 @@ fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettin
         let top = (foot.slope * dx_top - column(dx_top)).max(-foot.half_height);
         let first_row = (y + top - 0.5).ceil().max(0.0) as usize;
         let last_row = (y + bottom - 0.5).floor();
-        if !(last_row >= 0.0) {
+        if last_row < 0.0 || last_row.is_nan() {
             continue;
         }
         let last_row = (last_row as usize).min(settings.height - 1);

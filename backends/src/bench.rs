@@ -1,0 +1,283 @@
+//! Seeded workloads for timing a training step: random points in a box, seen from outside.
+
+use crate::cpu::simd::{Lanes, dispatch};
+use crate::ops::adam::{AdamSettings, adam_step};
+use crate::ops::photometric::photometric_loss;
+use crate::rasterizers::tile::TileRasterizer;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Camera, Gaussians, HostGaussians, Rasterizer, RenderSettings, Result, Seed, Splats};
+use pulp::{Simd, WithSimd};
+use std::time::Instant;
+
+/// Half the side of the box of points, world units.
+const HALF_BOX: f32 = 2.5;
+/// Distance of the camera from the centre of the box, world units.
+const CAMERA_DISTANCE: f64 = 7.0;
+/// Horizontal angle of view in radians (60 degrees).
+const ANGLE_OF_VIEW: f64 = std::f64::consts::FRAC_PI_3;
+/// Opacity of every point.
+const OPACITY: f32 = 0.1;
+/// Spherical-harmonics degree.
+const DEGREE: usize = 3;
+/// Share of L1 in the loss.
+const LAMBDA: f32 = 0.8;
+/// Learning rate; small, so that the scene stays what it is while it is timed.
+const LEARNING_RATE: f64 = 1e-6;
+/// Float32 operations per (Gaussian, pixel) evaluation, counted in the source of both blending kernels: 32 forwards, 48 backwards.
+pub const OPERATIONS_PER_PAIR: f64 = 80.0;
+
+/// Size of one case.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct StepCase {
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Gaussians.
+    pub gaussians: usize,
+}
+
+/// The cases that published CPU timings exist for.
+pub const STANDARD_CASES: [StepCase; 3] = [
+    StepCase { width: 134, height: 239, gaussians: 10_000 },
+    StepCase { width: 269, height: 479, gaussians: 10_000 },
+    StepCase { width: 134, height: 239, gaussians: 50_000 },
+];
+
+/// What a case took.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct StepTiming {
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Whole step (project, rasterize, loss, backward, Adam), median in milliseconds.
+    pub median_ms: f64,
+    /// Whole step, fastest, milliseconds.
+    pub min_ms: f64,
+    /// (Gaussian, pixel) evaluations of the forward pass.
+    pub pixel_pairs: u64,
+    /// (Gaussian, tile) pairs.
+    pub tile_pairs: u64,
+    /// Render, median, milliseconds.
+    pub forward_ms: f64,
+    /// Backward pass of loss and render, median, milliseconds.
+    pub backward_ms: f64,
+    /// L1 and SSIM with their gradient, median, milliseconds.
+    pub loss_ms: f64,
+    /// Adam on all parameters, median, milliseconds.
+    pub adam_ms: f64,
+    /// Evaluated pairs per second of the whole step.
+    pub pairs_per_s: f64,
+    /// [`OPERATIONS_PER_PAIR`] times `pairs_per_s` over the multiply-add rate measured on all threads (0..1).
+    pub peak_share: f64,
+}
+
+/// Uniform numbers in -1..1, the `k`-th of a named stream.
+fn uniform(seed: Seed, k: u64) -> f32 {
+    // 24 bits: every value is exact.
+    (seed.index(k).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+}
+
+/// Random Gaussians in the box; standard deviations are the root of the mean squared distance to three neighbours.
+pub fn random_gaussians(count: usize, seed: Seed) -> HostGaussians {
+    let stream = |name: &str, len: usize, scale: f32| -> Vec<f32> {
+        let seed = seed.child(name);
+        (0..len as u64).map(|k| scale * uniform(seed, k)).collect()
+    };
+    let means = stream("means", 3 * count, HALF_BOX);
+    let log_scales = neighbour_distances(&means).into_iter().flat_map(|d| [d.max(1e-4).ln(); 3]).collect();
+    HostGaussians {
+        sh_degree: DEGREE,
+        log_scales,
+        quaternions: stream("quaternions", 4 * count, 1.0),
+        opacity_logits: vec![(OPACITY / (1.0 - OPACITY)).ln(); count],
+        sh_dc: stream("sh_dc", 3 * count, 1.5),
+        sh_rest: stream("sh_rest", 3 * cc4dgs_core::gaussians::sh_rest_len(DEGREE) * count, 0.1),
+        dynamic_scores: vec![0.0; count],
+        means,
+        extra: Default::default(),
+    }
+}
+
+/// Root of the mean squared distance of every point to its three nearest others, by a grid of about one point per cell.
+fn neighbour_distances(means: &[f32]) -> Vec<f32> {
+    let n = means.len() / 3;
+    let side = ((n as f64).cbrt().ceil() as usize).max(1);
+    let cell_size = 2.0 * HALF_BOX / side as f32;
+    let cell = |v: f32| (((v + HALF_BOX) / cell_size) as usize).min(side - 1);
+    let cell_of = |i: usize| [cell(means[3 * i]), cell(means[3 * i + 1]), cell(means[3 * i + 2])];
+    let mut members = vec![Vec::new(); side * side * side];
+    for i in 0..n {
+        let [x, y, z] = cell_of(i);
+        members[(x * side + y) * side + z].push(i);
+    }
+    let nearest = |i: usize| {
+        let home = cell_of(i);
+        let mut ring = 1;
+        loop {
+            let range = |k: usize| home[k].saturating_sub(ring)..(home[k] + ring + 1).min(side);
+            let cells = range(0).flat_map(|x| range(1).flat_map(move |y| range(2).map(move |z| (x * side + y) * side + z)));
+            let mut squared: Vec<f32> = cells
+                .flat_map(|c| &members[c])
+                .filter(|&&j| j != i)
+                .map(|&j| (0..3).map(|k| (means[3 * i + k] - means[3 * j + k]).powi(2)).sum())
+                .collect();
+            squared.sort_by(f32::total_cmp);
+            // Anything nearer than the ring is wide has been seen.
+            let certain = squared.len() >= 3 && squared[2].sqrt() <= ring as f32 * cell_size;
+            if certain || ring >= side {
+                let found = squared.len().clamp(1, 3);
+                return (squared.iter().take(3).sum::<f32>() / found as f32).sqrt();
+            }
+            ring += 1;
+        }
+    };
+    (0..n).map(nearest).collect()
+}
+
+/// The camera of the cases.
+pub fn step_camera(case: &StepCase) -> Camera {
+    Camera::look_at("bench", (case.width, case.height), ANGLE_OF_VIEW, [0.0, 0.0, -CAMERA_DISTANCE], [0.0; 3], [0.0, -1.0, 0.0])
+}
+
+/// A parameter with its Adam moments.
+struct Trained<const D: usize> {
+    value: Option<Tensor<D>>,
+    m: Option<Tensor<D>>,
+    v: Option<Tensor<D>>,
+}
+
+impl<const D: usize> Trained<D> {
+    fn new(value: Tensor<D>) -> Self {
+        Self { m: Some(value.zeros_like()), v: Some(value.zeros_like()), value: Some(value) }
+    }
+    fn step(&mut self, grad: Option<Tensor<D>>, settings: &AdamSettings) -> Result<()> {
+        if let (Some(value), Some(m), Some(v), Some(grad)) = (self.value.take(), self.m.take(), self.v.take(), grad) {
+            let moved = adam_step(value, m, v, grad, settings)?;
+            (self.value, self.m, self.v) = (Some(moved.param), Some(moved.m), Some(moved.v));
+        }
+        Ok(())
+    }
+    /// The value as a leaf of a new graph.
+    fn leaf(&self, device: &Device) -> Option<Tensor<D>> {
+        self.value.clone().map(|value| if device.is_autodiff() { Tensor::from_inner(value).require_grad() } else { value })
+    }
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// Times `repetitions` whole training steps of `case` on `device` after a few that are not counted.
+pub fn time_step(case: &StepCase, device: &Device, seed: Seed, repetitions: usize) -> Result<StepTiming> {
+    let tracked = device.clone().autodiff();
+    let start = Gaussians::from_host(&random_gaussians(case.gaussians, seed.child("gaussians")), device);
+    let camera = step_camera(case);
+    let pixels = 3 * case.width as usize * case.height as usize;
+    let target_seed = seed.child("target");
+    let target: Vec<f32> = (0..pixels as u64).map(|k| 0.5 + 0.5 * uniform(target_seed, k)).collect();
+    let target = Tensor::<3>::from_data(TensorData::new(target, [3, case.height as usize, case.width as usize]), &tracked);
+    let mut matrices = [start.means, start.log_scales, start.quaternions, start.sh_dc].map(Trained::new);
+    let mut opacities = Trained::new(start.opacity_logits);
+    let mut rest = Trained::new(start.sh_rest);
+    const WARM_UP: usize = 3;
+    let mut times: [Vec<f64>; 5] = Default::default();
+    let mut work = cc4dgs_core::RenderWork::default();
+    for step in 0..repetitions.max(1) + WARM_UP {
+        let begin = Instant::now();
+        let leaves = matrices.each_ref().map(|p| p.leaf(&tracked));
+        let (opacity_leaf, rest_leaf) = (opacities.leaf(&tracked), rest.leaf(&tracked));
+        let ([Some(means), Some(scales), Some(quaternions), Some(dc)], Some(opacity), Some(higher)) = (leaves, opacity_leaf, rest_leaf) else { break };
+        let splats = Splats {
+            means: means.clone(),
+            scales: scales.clone(),
+            quaternions: quaternions.clone(),
+            opacities: opacity.clone(),
+            colors: cc4dgs_core::SplatColors::Sh { dc: dc.clone(), rest: higher.clone(), degree: DEGREE },
+            space: cc4dgs_core::ParameterSpace::Raw,
+            screen_probe: Some(Tensor::zeros([case.gaussians, 2], &tracked).require_grad()),
+            camera_probe: None,
+        };
+        let out = TileRasterizer.render(&splats, &camera, &RenderSettings::default())?;
+        work = out.stats.work;
+        let rendered = Instant::now();
+        let loss = photometric_loss(out.planes, target.clone(), LAMBDA)?;
+        let judged = Instant::now();
+        let mut grads = loss.loss.backward();
+        let d_matrices = [&means, &scales, &quaternions, &dc].map(|p| p.grad_remove(&mut grads));
+        let (d_opacity, d_rest) = (opacity.grad_remove(&mut grads), higher.grad_remove(&mut grads));
+        drop((splats, means, scales, quaternions, dc, opacity, higher, loss.terms, grads));
+        let derived = Instant::now();
+        let settings = AdamSettings { visible: Some(out.stats.radii.clone()), ..AdamSettings::new(LEARNING_RATE, step as u64 + 1) };
+        for (parameter, grad) in matrices.iter_mut().zip(d_matrices) {
+            parameter.step(grad, &settings)?;
+        }
+        opacities.step(d_opacity, &settings)?;
+        rest.step(d_rest, &settings)?;
+        // Reading one number back makes sure that nothing is still queued on devices that run behind.
+        if let Some(value) = &opacities.value {
+            to_vec(value.clone().narrow(0, 0, 1.min(case.gaussians)), "opacities")?;
+        }
+        let done = Instant::now();
+        if step >= WARM_UP {
+            let spans = [(begin, done), (begin, rendered), (rendered, judged), (judged, derived), (derived, done)];
+            for (list, (from, to)) in times.iter_mut().zip(spans) {
+                list.push((to - from).as_secs_f64() * 1e3);
+            }
+        }
+    }
+    let [mut whole, mut forward, mut loss, mut backward, mut adam] = times;
+    let median_ms = median(&mut whole);
+    let pairs_per_s = if median_ms > 0.0 { work.pixel_pairs as f64 / (median_ms * 1e-3) } else { 0.0 };
+    Ok(StepTiming {
+        width: case.width,
+        height: case.height,
+        gaussians: case.gaussians,
+        median_ms,
+        min_ms: whole.first().copied().unwrap_or(0.0),
+        pixel_pairs: work.pixel_pairs,
+        tile_pairs: work.tile_pairs,
+        forward_ms: median(&mut forward),
+        backward_ms: median(&mut backward),
+        loss_ms: median(&mut loss),
+        adam_ms: median(&mut adam),
+        pairs_per_s,
+        peak_share: pairs_per_s * OPERATIONS_PER_PAIR / peak_operations_per_s(),
+    })
+}
+
+/// Float32 operations per second that all threads reach together with nothing but multiply-adds in registers (best of several runs).
+pub fn peak_operations_per_s() -> f64 {
+    /// Independent chains: enough to hide the latency of the multiply-add units.
+    const CHAINS: usize = 12;
+    const ROUNDS: usize = 200_000;
+    struct Chains;
+    impl WithSimd for Chains {
+        type Output = (f32, usize);
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) -> (f32, usize) {
+            // Opaque to the optimiser, and bounded: x -> 0.5 x + 0.25.
+            let half = Lanes::splat(simd, std::hint::black_box(0.5));
+            let quarter = Lanes::splat(simd, std::hint::black_box(0.25));
+            let mut chains: [Lanes<S>; CHAINS] = std::array::from_fn(|k| Lanes::splat(simd, k as f32));
+            for _ in 0..ROUNDS {
+                for chain in &mut chains {
+                    *chain = chain.fma(half, quarter);
+                }
+            }
+            (chains.iter().map(|c| c.sum()).sum(), S::F32_LANES)
+        }
+    }
+    let mut best: f64 = 1.0;
+    for _ in 0..5 {
+        let begin = Instant::now();
+        let lanes: usize = rayon::broadcast(|_| std::hint::black_box(dispatch(Chains)).1).into_iter().sum();
+        best = best.max((2 * CHAINS * ROUNDS * lanes) as f64 / begin.elapsed().as_secs_f64());
+    }
+    best
+}

@@ -1,1 +1,0 @@
-//! The rasterizer `reference`.

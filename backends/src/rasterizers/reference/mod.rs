@@ -1,0 +1,237 @@
+//! The rasterizer `reference`: slow, obvious, float64. It is the oracle of `tile` and shares no arithmetic with it: geometry is
+//! differentiated by carrying derivatives along ([`real::Dual`]), blending pixel by pixel over the whole list.
+
+// Formulas with indices read as in the papers.
+#![allow(clippy::needless_range_loop)]
+
+pub mod blend;
+pub mod gaussian;
+pub mod harmonics;
+pub mod real;
+
+use super::settings::{no_settings, raster_settings};
+use super::tile::raster_inputs;
+use crate::cpu::raster::RasterSettings;
+use crate::ops::rasterize::{Method, rasterize};
+use blend::{Item, SCREEN};
+use cc4dgs_core::{Camera, Plugin, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, Splats, inventory};
+use gaussian::{Gaussian, Projected};
+use real::{Dual, Real};
+
+/// The arrays of N Gaussians in float64, row-major, as in [`crate::cpu::raster::SplatArrays`].
+#[derive(Clone, Debug, Default)]
+pub struct ReferenceInput {
+    /// [N,3]
+    pub means: Vec<f64>,
+    /// [N,3]
+    pub scales: Vec<f64>,
+    /// [N,4]
+    pub quaternions: Vec<f64>,
+    /// [N]
+    pub opacities: Vec<f64>,
+    /// [N,3]
+    pub colors: Vec<f64>,
+    /// [N,K,3]
+    pub sh_rest: Vec<f64>,
+    /// Colour behind everything.
+    pub background: [f64; 3],
+}
+
+/// What a forward pass returns.
+#[derive(Clone, Debug)]
+pub struct ReferenceOutput {
+    /// Red, green, blue, alpha, depth [5,H,W].
+    pub planes: Vec<f64>,
+    /// Screen radius, the larger of the two axes; 0 where culled [N].
+    pub radii: Vec<i64>,
+    /// Largest blending weight [N].
+    pub max_weights: Vec<f64>,
+    /// Visible Gaussians, front to back.
+    pub items: Vec<Item>,
+    /// Contributing (Gaussian, pixel) pairs.
+    pub pairs: u64,
+}
+
+/// Gradients of everything.
+#[derive(Clone, Debug)]
+pub struct ReferenceGradients {
+    /// [N,3]
+    pub means: Vec<f64>,
+    /// [N,3]
+    pub scales: Vec<f64>,
+    /// [N,4]
+    pub quaternions: Vec<f64>,
+    /// [N]
+    pub opacities: Vec<f64>,
+    /// [N,3]
+    pub colors: Vec<f64>,
+    /// [N,K,3]
+    pub sh_rest: Vec<f64>,
+    /// [N,2]
+    pub screen: Vec<f64>,
+    /// [4,4]
+    pub camera: Vec<f64>,
+    /// [3]
+    pub background: Vec<f64>,
+    /// Of the screen quantities, by item: centre, conic, opacity, colour, depth.
+    pub items: Vec<[f64; SCREEN]>,
+}
+
+fn three(values: &[f64], i: usize) -> [f64; 3] {
+    std::array::from_fn(|k| values[3 * i + k])
+}
+
+impl ReferenceInput {
+    /// Float32 arrays, widened.
+    pub fn widen(splats: &crate::cpu::raster::SplatArrays) -> Self {
+        let wide = |values: &[f32]| values.iter().map(|&v| f64::from(v)).collect();
+        Self {
+            means: wide(splats.means),
+            scales: wide(splats.scales),
+            quaternions: wide(splats.quaternions),
+            opacities: wide(splats.opacities),
+            colors: wide(splats.colors),
+            sh_rest: wide(splats.sh_rest),
+            background: splats.background.map(f64::from),
+        }
+    }
+    fn gaussian<T: Real>(&self, i: usize, settings: &RasterSettings, number: impl Fn(f64, usize) -> T) -> Gaussian<T> {
+        let mean = three(&self.means, i);
+        let scales = three(&self.scales, i);
+        Gaussian {
+            mean: std::array::from_fn(|k| number(mean[k], k)),
+            scales: std::array::from_fn(|k| number(scales[k], 3 + k)),
+            quaternion: std::array::from_fn(|k| number(self.quaternions[4 * i + k], 6 + k)),
+            opacity: number(self.opacities[i], 10),
+            view: std::array::from_fn(|r| std::array::from_fn(|c| number(settings.world_to_camera[r][c], 11 + 4 * r + c))),
+        }
+    }
+    /// The coefficients of Gaussian `i` for basis function `k`.
+    fn coefficient(&self, i: usize, k: usize) -> [f64; 3] {
+        if k == 0 {
+            return three(&self.colors, i);
+        }
+        let width = self.sh_rest.len() / self.opacities.len();
+        std::array::from_fn(|c| self.sh_rest[i * width + 3 * (k - 1) + c])
+    }
+    /// Colour before the clamp at zero.
+    fn color<T: Real>(&self, i: usize, degree: Option<usize>, direction: [T; 3]) -> [T; 3] {
+        let Some(degree) = degree else { return three(&self.colors, i).map(T::constant) };
+        let mut sum = [T::constant(0.5); 3];
+        for (k, value) in harmonics::basis(degree, direction).into_iter().enumerate() {
+            let coefficient = self.coefficient(i, k);
+            for c in 0..3 {
+                sum[c] = sum[c] + value * T::constant(coefficient[c]);
+            }
+        }
+        sum
+    }
+}
+
+/// Variables of one Gaussian: mean, scales, quaternion, opacity, view matrix.
+const VARIABLES: usize = 27;
+
+/// Renders.
+pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOutput {
+    let n = input.opacities.len();
+    let mut radii = vec![0i64; n];
+    let mut items = Vec::new();
+    for i in 0..n {
+        let p: Projected<f64> = gaussian::project(&input.gaussian(i, settings, |v, _| v), settings);
+        let Some((radius, tiles)) = gaussian::extent(&p, settings) else { continue };
+        let color = input.color(i, settings.sh_degree, p.direction);
+        let color = if settings.sh_degree.is_some() { color.map(|c| if c < 0.0 { 0.0 } else { c }) } else { color };
+        if color.iter().any(|c| !c.is_finite()) {
+            continue;
+        }
+        radii[i] = radius[0].max(radius[1]).min(1e9) as i64;
+        let numbers = [p.center[0], p.center[1], p.conic[0], p.conic[1], p.conic[2], p.opacity, color[0], color[1], color[2], p.depth];
+        items.push(Item { index: i, numbers, tiles });
+    }
+    // By depth as float32; equal depths stay in order of index.
+    items.sort_by(|a, b| (a.numbers[9] as f32).total_cmp(&(b.numbers[9] as f32)));
+    let picture = blend::blend(&items, settings, input.background);
+    let mut max_weights = vec![0.0; n];
+    for (item, weight) in items.iter().zip(&picture.max_weights) {
+        max_weights[item.index] = *weight;
+    }
+    ReferenceOutput { planes: picture.planes, radii, max_weights, items, pairs: picture.pairs }
+}
+
+/// Gradients for `upstream` [5,H,W] at the visible `items` of the forward pass.
+pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item], upstream: &[f64]) -> ReferenceGradients {
+    let n = input.opacities.len();
+    let (d_items, d_background) = blend::blend_backward(items, settings, input.background, upstream);
+    let mut out = ReferenceGradients {
+        means: vec![0.0; 3 * n],
+        scales: vec![0.0; 3 * n],
+        quaternions: vec![0.0; 4 * n],
+        opacities: vec![0.0; n],
+        colors: vec![0.0; 3 * n],
+        sh_rest: vec![0.0; input.sh_rest.len()],
+        screen: vec![0.0; 2 * n],
+        camera: vec![0.0; 16],
+        background: d_background.to_vec(),
+        items: Vec::new(),
+    };
+    for (item, g) in items.iter().zip(&d_items) {
+        let i = item.index;
+        let p = gaussian::project(&input.gaussian(i, settings, Dual::<VARIABLES>::variable), settings);
+        let color = input.color(i, settings.sh_degree, p.direction);
+        let mut d = [0.0; VARIABLES];
+        let mut add = |quantity: Dual<VARIABLES>, g: f64| (0..VARIABLES).for_each(|v| d[v] += g * quantity.slope[v]);
+        for (quantity, g) in [p.center[0], p.center[1], p.conic[0], p.conic[1], p.conic[2], p.opacity].into_iter().zip(g) {
+            add(quantity, *g);
+        }
+        add(p.depth, g[9]);
+        let d_color: [f64; 3] = std::array::from_fn(|c| if settings.sh_degree.is_some() && color[c].value < 0.0 { 0.0 } else { g[6 + c] });
+        for c in 0..3 {
+            add(color[c], d_color[c]);
+        }
+        out.means[3 * i..3 * i + 3].copy_from_slice(&d[0..3]);
+        out.scales[3 * i..3 * i + 3].copy_from_slice(&d[3..6]);
+        out.quaternions[4 * i..4 * i + 4].copy_from_slice(&d[6..10]);
+        out.opacities[i] = d[10];
+        for k in 0..16 {
+            out.camera[k] += d[11 + k];
+        }
+        out.screen[2 * i..2 * i + 2].copy_from_slice(&g[0..2]);
+        let values = settings.sh_degree.map_or(vec![1.0], |degree| harmonics::basis(degree, p.direction.map(|v| v.value)));
+        let width = input.sh_rest.len() / n;
+        for (k, value) in values.into_iter().enumerate() {
+            let to = if k == 0 { &mut out.colors[3 * i..3 * i + 3] } else { &mut out.sh_rest[i * width + 3 * (k - 1)..][..3] };
+            for c in 0..3 {
+                to[c] = value * d_color[c];
+            }
+        }
+    }
+    out.items = d_items;
+    out
+}
+
+/// Draws with [`forward`] and [`backward`]; the time grows with pixels times Gaussians.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct ReferenceRasterizer;
+
+impl Rasterizer for ReferenceRasterizer {
+    fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput> {
+        rasterize(raster_inputs(splats, settings), raster_settings(splats, camera, settings)?, Method::Reference)
+    }
+}
+
+inventory::submit! {
+    RasterizerPlugin {
+        info: Plugin {
+            name: "reference",
+            version: "1",
+            summary: "Every pixel over every Gaussian in float64; slow, the oracle of the tests",
+            paper: "Kerbl et al. 2023 (3DGS); Ye et al. 2024 (gsplat)",
+            schema: "",
+            capabilities: &["differentiable", "antialiased", "max-weights", "rules=gsplat099,gsplat0999,inria"],
+        },
+        build: |table| {
+            no_settings("reference", table)?;
+            Ok(Box::new(ReferenceRasterizer))
+        },
+    }
+}

@@ -1,0 +1,191 @@
+//! Reads the golden fixtures of the rasterizer.
+#![allow(dead_code)] // Each test program uses its own part.
+
+use cc4dgs_backends::cpu::raster::RasterSettings;
+use cc4dgs_core::{ParameterSpace, Rules};
+use safetensors::{Dtype, SafeTensors};
+use std::path::{Path, PathBuf};
+
+/// The folder of fixtures: `CC4DGS_GOLDEN`, or the committed ones.
+pub fn folder() -> PathBuf {
+    let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden");
+    std::env::var_os("CC4DGS_GOLDEN").map_or(committed, PathBuf::from)
+}
+
+/// Arrays of one file.
+pub struct Fixture {
+    name: String,
+    bytes: Vec<u8>,
+}
+
+impl Fixture {
+    /// `name`.f64.safetensors in the folder.
+    pub fn open(name: &str) -> Self {
+        let path = folder().join(format!("{name}.f64.safetensors"));
+        let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        Self { name: name.to_string(), bytes }
+    }
+    /// Shape of an array.
+    pub fn shape(&self, key: &str) -> Vec<usize> {
+        self.tensors().tensor(key).unwrap_or_else(|e| panic!("{} {key}: {e}", self.name)).shape().to_vec()
+    }
+    /// Values of an array, whatever its type.
+    pub fn get(&self, key: &str) -> Vec<f64> {
+        let file = self.tensors();
+        let view = file.tensor(key).unwrap_or_else(|e| panic!("{} {key}: {e}", self.name));
+        let data = view.data();
+        match view.dtype() {
+            Dtype::F64 => data.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect(),
+            Dtype::I32 => data.chunks_exact(4).map(|b| f64::from(i32::from_le_bytes(b.try_into().unwrap()))).collect(),
+            Dtype::U8 => data.iter().map(|&b| f64::from(b)).collect(),
+            other => panic!("{} {key}: unexpected type {other:?}", self.name),
+        }
+    }
+    /// The same in float32.
+    pub fn narrow(&self, key: &str) -> Vec<f32> {
+        narrow(&self.get(key))
+    }
+    fn tensors(&self) -> SafeTensors<'_> {
+        SafeTensors::deserialize(&self.bytes).unwrap_or_else(|e| panic!("{}: {e}", self.name))
+    }
+}
+
+/// Float32 of float64 values.
+pub fn narrow(values: &[f64]) -> Vec<f32> {
+    values.iter().map(|&v| v as f32).collect()
+}
+
+/// Float64 of float32 values.
+pub fn widen(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&v| f64::from(v)).collect()
+}
+
+/// |a - b| / |b| in the Euclidean norm; |a| where b is zero.
+pub fn relative_l2(a: &[f64], b: &[f64]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let norm = b.iter().map(|v| v * v).sum::<f64>().sqrt();
+    let difference = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+    if norm > 0.0 { difference / norm } else { difference }
+}
+
+/// The largest absolute difference.
+pub fn largest_difference(a: &[f64], b: &[f64]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| if a.is_nan() || b.is_nan() { f64::INFINITY } else { (a - b).abs() }).fold(0.0, f64::max)
+}
+
+/// A 4x4 from 16 row-major values.
+pub fn matrix(values: &[f64]) -> [[f64; 4]; 4] {
+    std::array::from_fn(|i| std::array::from_fn(|j| values[4 * i + j]))
+}
+
+/// Settings of a camera with intrinsics `k` (3x3) and activated parameters.
+pub fn settings(width: usize, height: usize, k: &[f64], view: &[f64]) -> RasterSettings {
+    RasterSettings {
+        width,
+        height,
+        fx: k[0],
+        fy: k[4],
+        cx: k[2],
+        cy: k[5],
+        world_to_camera: matrix(view),
+        rules: Rules::Gsplat099,
+        antialiased: false,
+        space: ParameterSpace::Activated,
+        sh_degree: None,
+        max_weights: false,
+    }
+}
+
+/// One golden scene under one rule set.
+pub struct Scene {
+    /// `raster_<scene>.<variant>`.
+    pub name: String,
+    /// Inputs.
+    pub inputs: Fixture,
+    /// Results.
+    pub results: Fixture,
+    /// Sizes, camera, rules.
+    pub settings: RasterSettings,
+    /// Whether float32 loses digits here (needles).
+    pub ill_conditioned: bool,
+}
+
+/// Every scene and variant in the folder.
+pub fn scenes() -> Vec<Scene> {
+    let mut names: Vec<String> = std::fs::read_dir(folder())
+        .unwrap_or_else(|e| panic!("{}: {e}", folder().display()))
+        .filter_map(|entry| entry.unwrap().file_name().to_str()?.strip_suffix(".f64.safetensors").map(str::to_string))
+        .filter(|name| name.starts_with("raster_") && !name.ends_with(".inputs"))
+        .collect();
+    names.sort();
+    names.iter().map(|name| Scene::open(name)).collect()
+}
+
+impl Scene {
+    /// Opens `raster_<scene>.<variant>`.
+    pub fn open(name: &str) -> Self {
+        let (scene, variant) = name.split_once('.').unwrap();
+        let inputs = Fixture::open(&format!("{scene}.inputs"));
+        let facts = std::fs::read_to_string(folder().join(format!("{scene}.inputs.json"))).unwrap();
+        let facts: serde_json::Value = serde_json::from_str(&facts).unwrap();
+        let number = |key: &str| facts[key].as_u64().unwrap() as usize;
+        let mut settings = settings(number("W"), number("H"), &inputs.get("in.K"), &inputs.get("in.viewmat"));
+        settings.sh_degree = Some(number("sh_degree"));
+        settings.antialiased = facts["antialiased"].as_bool().unwrap();
+        settings.rules = match variant {
+            "gsplat099" => Rules::Gsplat099,
+            "gsplat0999" => Rules::Gsplat0999,
+            "inria" => Rules::Inria,
+            other => panic!("unknown variant {other}"),
+        };
+        Self { name: name.to_string(), results: Fixture::open(name), inputs, settings, ill_conditioned: scene.contains("needles") }
+    }
+    /// Degree-0 coefficients [N,3] and the others [N,K,3].
+    pub fn coefficients(&self) -> (Vec<f64>, Vec<f64>) {
+        split_coefficients(&self.inputs.get("in.sh"), self.inputs.shape("in.sh")[1])
+    }
+    /// Weights of the loss as planes [5,H,W].
+    pub fn upstream(&self) -> Vec<f64> {
+        let mut planes = to_planes(&self.inputs.get("in.weights_image"));
+        planes.extend(self.inputs.get("in.weights_alpha"));
+        planes.extend(vec![0.0; self.settings.width * self.settings.height]);
+        planes
+    }
+    /// Reference planes [5,H,W].
+    pub fn planes(&self) -> Vec<f64> {
+        let mut planes = to_planes(&self.results.get("out.image"));
+        planes.extend(self.results.get("out.alpha"));
+        planes.extend(self.results.get("out.depth_acc"));
+        planes
+    }
+    /// Largest difference over robust pixels: of the colour and alpha planes, of depth over its largest value, and over all pixels.
+    pub fn image_errors(&self, planes: &[f64]) -> (f64, f64, f64) {
+        let golden = self.planes();
+        let robust = self.inputs.get("robust_pixel");
+        let pixels = robust.len();
+        let mut errors = (0.0f64, 0.0f64, 0.0f64);
+        let deepest = golden[4 * pixels..].iter().fold(1.0f64, |a, &b| a.max(b));
+        for (i, (a, b)) in planes.iter().zip(&golden).enumerate() {
+            let difference = if a.is_nan() { f64::INFINITY } else { (a - b).abs() };
+            match (robust[i % pixels] > 0.0, i < 4 * pixels) {
+                (true, true) => errors.0 = errors.0.max(difference),
+                (true, false) => errors.1 = errors.1.max(difference / deepest),
+                (false, true) => errors.2 = errors.2.max(difference),
+                (false, false) => {}
+            }
+        }
+        errors
+    }
+}
+
+/// Degree-0 coefficients and the rest of [N,count,3].
+pub fn split_coefficients(all: &[f64], count: usize) -> (Vec<f64>, Vec<f64>) {
+    let rows = all.chunks_exact(3 * count);
+    (rows.clone().flat_map(|row| row[..3].to_vec()).collect(), rows.flat_map(|row| row[3..].to_vec()).collect())
+}
+
+/// [H,W,3] to [3,H,W].
+pub fn to_planes(image: &[f64]) -> Vec<f64> {
+    (0..3).flat_map(|c| image.iter().skip(c).step_by(3).copied()).collect()
+}
