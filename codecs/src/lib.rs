@@ -1,1 +1,14 @@
-//! cc4dgs-codecs
+//! Attribute codecs: Gaussians to bytes and back.
+//!
+//! * `raw`: float32, nothing lost; the base line of every size table.
+//! * `cca`: the compression of canonical attributes of CC-4DGS (paper Section IV-D).
+//!
+//! Both register themselves; link this crate and ask the [`cc4dgs_core::Registry`].
+
+pub mod cca;
+mod column;
+pub mod kmeans;
+pub mod morton;
+pub mod mulaw;
+mod raw;
+mod streams;

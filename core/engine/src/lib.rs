@@ -12,5 +12,6 @@ pub mod masks;
 pub mod model;
 pub mod pictures;
 pub mod play;
+pub mod ply;
 pub mod schedule;
 pub mod train;

@@ -1,0 +1,110 @@
+//! `cca`: compression of canonical attributes (paper Section IV-D; open numbers from the fact sheet, section 10 rows 35 to 46).
+//!
+//! Three paths. Positions and degree-0 colours stay float32. Log-scales, opacity logits and quaternions are quantised per component, dynamic
+//! scores after mu-law companding. The higher colour coefficients pass through a conditional autoencoder whose latents are quantised; what it
+//! misses is matched with a k-means codebook. The autoencoder is trained on the very Gaussians it encodes, its decoder travels with them.
+//!
+//! Departures from the plainest reading of the paper, all of them lossless or better:
+//! * Gaussians are stored in Morton order of their positions; their order carries no meaning and neighbours compress together.
+//! * Quaternions are split into a unit part, whose sign is kept, and a norm, because deformation offsets are added before normalisation and
+//!   so both matter. A model with unit quaternions pays nothing for the norms.
+//! * Quantisers keep outliers exactly instead of clamping them (see `column`).
+//! * Coefficients go without autoencoder, at 16 bits each, where that takes fewer bytes (few Gaussians, low degrees) or where the
+//!   autoencoder would lose more than [`AttributeCodec::losses`] declares.
+
+mod appearance;
+mod geometry;
+mod network;
+mod principal;
+mod profile;
+mod train;
+
+use crate::morton;
+use crate::streams::{META, Shape, StreamSet, from_planes, to_planes};
+use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
+pub use profile::{Profile, Settings};
+
+/// Version of the stored form.
+const VERSION: u8 = 1;
+/// The stream of outliers of all quantised columns.
+const ESCAPES: &str = "escapes";
+
+/// The codec with its profile and settings.
+#[derive(Clone, Debug)]
+pub struct Cca {
+    profile: Profile,
+    settings: Settings,
+}
+
+impl AttributeCodec for Cca {
+    fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        gaussians.validate("Gaussians to encode", &context.limits)?;
+        let sorted = gaussians.select(&morton::order(&gaussians.means));
+        let mut meta = vec![VERSION];
+        Shape::of(&sorted).write(&mut meta)?;
+        let mut escapes = Vec::new();
+        let mut streams =
+            vec![Stream { name: "means".into(), bytes: to_planes(&sorted.means, 3) }, Stream { name: "sh_dc".into(), bytes: to_planes(&sorted.sh_dc, 3) }];
+        // What the decoder will know when it meets the colours.
+        let (geometry, known) = geometry::encode(&sorted, &self.profile, &mut meta, &mut escapes);
+        streams.extend(geometry);
+        streams.extend(appearance::encode(&sorted, &known, &self.profile, &self.settings, context, &mut meta, &mut escapes)?);
+        streams.extend(Shape::extra_streams(&sorted));
+        streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
+        streams.insert(0, Stream { name: META.into(), bytes: meta });
+        Ok(streams)
+    }
+
+    fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        let set = StreamSet::new("cca", streams);
+        let mut meta = set.reader(META)?;
+        let version = meta.u8()?;
+        if version != VERSION {
+            return Err(Error::unsupported("cca streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
+        }
+        let shape = Shape::read(&mut meta, &context.limits)?;
+        let mut escapes = set.reader(ESCAPES)?;
+        let mut out = HostGaussians {
+            sh_degree: shape.sh_degree,
+            means: from_planes(set.reader("means")?, shape.count, 3)?,
+            sh_dc: from_planes(set.reader("sh_dc")?, shape.count, 3)?,
+            ..Default::default()
+        };
+        geometry::decode(&set, shape.count, &mut meta, &mut escapes, &mut out)?;
+        out.sh_rest = appearance::decode(&set, &out, shape.count, &mut meta, &mut escapes)?;
+        shape.read_extra(&set, &mut out)?;
+        meta.finish()?;
+        escapes.finish()?;
+        out.validate("decoded Gaussians", &context.limits)?;
+        Ok(out)
+    }
+
+    fn losses(&self) -> Vec<DeclaredLoss> {
+        let of = |attribute: &str, relative_rms| DeclaredLoss { attribute: attribute.into(), relative_rms };
+        vec![
+            of("log_scales", self.profile.scalar_loss),
+            of("opacity_logits", self.profile.scalar_loss),
+            of("quaternions", self.profile.scalar_loss),
+            of("dynamic_scores", self.profile.dynamic_loss),
+            of("sh_rest", self.profile.appearance_loss),
+        ]
+    }
+}
+
+fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+    Ok(Box::new(Cca { profile: Profile::named(profile)?, settings: Settings::parse(settings)? }))
+}
+
+inventory::submit! {
+    CodecPlugin {
+        info: Plugin {
+            name: "cca",
+            version: "1",
+            summary: "conditional autoencoder and residual codebook for colours, selective quantisation for the rest",
+            paper: "CC-4DGS, Section IV-D",
+            schema: profile::SCHEMA,
+            capabilities: &["lossy", "reorders", "profiles=default,mid,low"],
+        },
+        build,
+    }
+}

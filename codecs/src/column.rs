@@ -1,0 +1,293 @@
+//! One column of numbers as few bits: constant, uniform, mu-law or exact.
+//!
+//! Uniform quantisers span percentiles of the values, a little widened; the few values beyond are kept exactly in a list of escapes, so that
+//! an outlier neither widens the steps of the others nor is clamped itself. An encoder that misses the loss it may cause takes more bits.
+
+use crate::mulaw;
+use cc4dgs_core::Result;
+use cc4dgs_core::archive::ByteReader;
+
+/// How the codes of a column become numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Form {
+    /// The same number everywhere; no codes.
+    Constant(f32),
+    /// `2^bits` even steps from `low` to `high`.
+    Uniform { low: f32, high: f32, bits: u8 },
+    /// Signed mu-law codes of value / `peak`.
+    MuLaw { peak: f32, bits: u8 },
+    /// float32.
+    Exact,
+}
+
+/// A column as it is stored.
+pub(crate) struct Column {
+    pub(crate) form: Form,
+    pub(crate) codes: Vec<u8>,
+    /// Values that the codes do not reach: (row, value), rows ascending.
+    pub(crate) escapes: Vec<(u32, f32)>,
+}
+
+/// The form to try first and the loss that is allowed (root-mean-square error over standard deviation).
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Target {
+    pub(crate) bits: u8,
+    pub(crate) mu_law: bool,
+    pub(crate) loss: f64,
+    /// Share of the values at either end that may be escapes.
+    pub(crate) tail: f64,
+}
+
+/// Encodes `values` (all finite) in the first form within the allowed loss: the wanted one, 16 uniform bits, exact.
+pub(crate) fn encode(values: &[f32], target: Target) -> Column {
+    let first = values.first().copied().unwrap_or(0.0);
+    if values.iter().all(|&v| v == first) {
+        return Column { form: Form::Constant(first), codes: Vec::new(), escapes: Vec::new() };
+    }
+    let wanted = if target.mu_law {
+        Form::MuLaw { peak: values.iter().fold(0.0, |a, v| a.max(v.abs())), bits: target.bits }
+    } else {
+        uniform(values, target.bits, target.tail)
+    };
+    for form in [wanted, uniform(values, 16, target.tail)] {
+        let column = quantise(values, form);
+        let decoded = dequantise(&column, values.len());
+        if relative_rms(values, &decoded) <= target.loss && central_loss(values, &decoded) <= target.loss {
+            return column;
+        }
+    }
+    quantise(values, Form::Exact)
+}
+
+/// A uniform quantiser between the `tail` and 1 - `tail` quantiles, widened by a tenth but never beyond the extremes.
+fn uniform(values: &[f32], bits: u8, tail: f64) -> Form {
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let last = sorted.len() - 1;
+    // Even few values may hold an outlier or two.
+    let cut = ((tail * sorted.len() as f64) as usize).max(2.min(sorted.len() / 8));
+    let (inner_low, inner_high) = (f64::from(sorted[cut]), f64::from(sorted[last - cut]));
+    let margin = 0.1 * (inner_high - inner_low);
+    let low = (inner_low - margin).max(f64::from(sorted[0])) as f32;
+    let high = (inner_high + margin).min(f64::from(sorted[last])) as f32;
+    Form::Uniform { low, high, bits }
+}
+
+fn quantise(values: &[f32], form: Form) -> Column {
+    let mut column = Column { form, codes: Vec::new(), escapes: Vec::new() };
+    match form {
+        Form::Constant(_) => {}
+        Form::Exact => column.codes.extend(values.iter().flat_map(|v| v.to_le_bytes())),
+        Form::Uniform { low, high, bits } => {
+            let levels = f64::from((1u32 << bits) - 1);
+            let width = f64::from(high) - f64::from(low);
+            let scale = if width > 0.0 { levels / width } else { 0.0 };
+            for (i, &v) in values.iter().enumerate() {
+                if v < low || v > high {
+                    column.escapes.push((i as u32, v));
+                }
+                push_code(&mut column.codes, ((f64::from(v) - f64::from(low)) * scale).round().clamp(0.0, levels) as u16, bits);
+            }
+        }
+        Form::MuLaw { peak, bits } => {
+            let zero = mulaw::peak_code(bits);
+            for &v in values {
+                push_code(&mut column.codes, (mulaw::encode(f64::from(v) / f64::from(peak), bits) + zero) as u16, bits);
+            }
+        }
+    }
+    column
+}
+
+fn push_code(codes: &mut Vec<u8>, code: u16, bits: u8) {
+    if bits > 8 { codes.extend(code.to_le_bytes()) } else { codes.push(code as u8) }
+}
+
+/// What [`read`] will make of a column.
+pub(crate) fn dequantise(column: &Column, count: usize) -> Vec<f32> {
+    // The codes were written just now, so they cannot be short.
+    let mut reader = ByteReader::new("column", &column.codes);
+    read(&mut reader, column.form, count, &column.escapes).unwrap_or_default()
+}
+
+impl Form {
+    /// Appends the form to a meta stream.
+    pub(crate) fn write(&self, out: &mut Vec<u8>) {
+        match *self {
+            Self::Constant(value) => {
+                out.push(0);
+                out.extend(value.to_le_bytes());
+            }
+            Self::Uniform { low, high, bits } => {
+                out.extend([1, bits]);
+                out.extend(low.to_le_bytes());
+                out.extend(high.to_le_bytes());
+            }
+            Self::MuLaw { peak, bits } => {
+                out.extend([2, bits]);
+                out.extend(peak.to_le_bytes());
+            }
+            Self::Exact => out.push(3),
+        }
+    }
+    /// Reads a form; every number in it is checked.
+    pub(crate) fn read(reader: &mut ByteReader) -> Result<Self> {
+        let kind = reader.u8()?;
+        let form = match kind {
+            0 => Self::Constant(reader.f32()?),
+            1 => {
+                let bits = reader.u8()?;
+                Self::Uniform { low: reader.f32()?, high: reader.f32()?, bits }
+            }
+            2 => {
+                let bits = reader.u8()?;
+                Self::MuLaw { peak: reader.f32()?, bits }
+            }
+            3 => Self::Exact,
+            _ => return Err(reader.error(format!("a column has the unknown form {kind}"))),
+        };
+        match form {
+            Self::Uniform { low, high, bits } if !(2..=16).contains(&bits) || low > high => {
+                Err(reader.error(format!("a quantiser of {bits} bits from {low} to {high} is impossible")))
+            }
+            Self::MuLaw { peak, bits } if !(2..=16).contains(&bits) || peak <= 0.0 => {
+                Err(reader.error(format!("a mu-law quantiser of {bits} bits up to {peak} is impossible")))
+            }
+            form => Ok(form),
+        }
+    }
+    /// The form's own step between neighbouring values, relative to its span.
+    fn bytes_per_code(&self) -> usize {
+        match *self {
+            Self::Constant(_) => 0,
+            Self::Uniform { bits, .. } | Self::MuLaw { bits, .. } => 1 + usize::from(bits > 8),
+            Self::Exact => 4,
+        }
+    }
+}
+
+/// Decodes `count` values of `form` from `reader`. Both sides of the codec call this, so both see the same bits.
+pub(crate) fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &[(u32, f32)]) -> Result<Vec<f32>> {
+    if let Form::Exact = form {
+        return reader.f32s(count);
+    }
+    let width = form.bytes_per_code();
+    let bytes = reader.take(count.saturating_mul(width))?;
+    let codes = |bits: u8| -> Result<Vec<u16>> {
+        let codes: Vec<u16> =
+            if width == 2 { bytes.chunks_exact(2).map(|c| u16::from_le_bytes([c[0], c[1]])).collect() } else { bytes.iter().map(|&b| u16::from(b)).collect() };
+        match codes.iter().find(|&&c| u32::from(c) >= 1 << bits) {
+            Some(c) => Err(reader.error(format!("code {c} does not fit {bits} bits"))),
+            None => Ok(codes),
+        }
+    };
+    let mut values: Vec<f32> = match form {
+        Form::Constant(value) => vec![value; count],
+        Form::Uniform { low, high, bits } => {
+            let (low, levels) = (f64::from(low), f64::from((1u32 << bits) - 1));
+            let step = (f64::from(high) - low) / levels;
+            codes(bits)?.into_iter().map(|c| (low + f64::from(c) * step) as f32).map(|v| v.min(high)).collect()
+        }
+        Form::MuLaw { peak, bits } => {
+            let zero = mulaw::peak_code(bits);
+            // 2^bits values at most: a table spares most of the exponentials.
+            let table: Vec<f32> =
+                (0..1i32 << bits).map(|c| (f64::from(peak) * mulaw::decode((c - zero).min(zero), bits)) as f32).map(|v| v.clamp(-peak, peak)).collect();
+            codes(bits)?.into_iter().map(|c| table[usize::from(c)]).collect()
+        }
+        Form::Exact => Vec::new(),
+    };
+    for &(row, value) in escapes {
+        match values.get_mut(row as usize) {
+            Some(v) => *v = value,
+            None => return Err(reader.error(format!("an escape names row {row} of {count}"))),
+        }
+    }
+    Ok(values)
+}
+
+/// Appends an escape list to the escape stream: u32 count, rows, values.
+pub(crate) fn write_escapes(escapes: &[(u32, f32)], out: &mut Vec<u8>) {
+    out.extend((escapes.len() as u32).to_le_bytes());
+    escapes.iter().for_each(|(row, _)| out.extend(row.to_le_bytes()));
+    escapes.iter().for_each(|(_, value)| out.extend(value.to_le_bytes()));
+}
+
+/// Reads what [`write_escapes`] wrote.
+pub(crate) fn read_escapes(reader: &mut ByteReader) -> Result<Vec<(u32, f32)>> {
+    let count = reader.u32()? as usize;
+    let rows: Vec<u32> = reader.take(count.saturating_mul(4))?.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect();
+    let values = reader.f32s(count)?;
+    Ok(rows.into_iter().zip(values).collect())
+}
+
+/// Root-mean-square error over the standard deviation of the values; 0 when nothing differs, NaN when something is not finite.
+pub(crate) fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
+    let n = values.len().max(1) as f64;
+    let error: f64 = values.iter().zip(decoded).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>() / n;
+    if error == 0.0 && values.len() == decoded.len() {
+        return 0.0;
+    }
+    let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
+    let variance = values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n;
+    if values.len() == decoded.len() { (error / variance).sqrt() } else { f64::NAN }
+}
+
+/// [`relative_rms`] of the values between the 5th and the 95th percentile. Far values that make the deviation large must not hide that the
+/// others lost their differences.
+fn central_loss(values: &[f32], decoded: &[f32]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let cut = sorted.len() / 20;
+    let (low, high) = (sorted[cut], sorted[sorted.len() - 1 - cut]);
+    let (inner, inner_decoded): (Vec<f32>, Vec<f32>) = values.iter().zip(decoded).filter(|(v, _)| (low..=high).contains(*v)).unzip();
+    relative_rms(&inner, &inner_decoded)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TARGET: Target = Target { bits: 8, mu_law: false, loss: 0.05, tail: 5e-4 };
+
+    fn wave(n: usize) -> Vec<f32> {
+        (0..n).map(|i| (i as f32 * 0.37).sin()).collect()
+    }
+
+    #[test]
+    fn an_outlier_is_kept_and_does_not_widen_the_steps() {
+        let mut values = wave(10_000);
+        values[77] = 1e30;
+        let column = encode(&values, TARGET);
+        assert!(matches!(column.form, Form::Uniform { bits: 8, high, .. } if high < 2.0), "{:?}", column.form);
+        let decoded = dequantise(&column, values.len());
+        assert_eq!(decoded[77], 1e30);
+        assert!(values.iter().zip(&decoded).all(|(a, b)| (a - b).abs() <= 1.1 / 255.0));
+    }
+
+    #[test]
+    fn a_column_that_would_lose_too_much_takes_more_bits() {
+        assert_eq!(encode(&wave(1000), Target { loss: 1e-7, ..TARGET }).form, Form::Exact);
+        assert!(matches!(encode(&wave(1000), Target { loss: 1e-3, ..TARGET }).form, Form::Uniform { bits: 16, .. }));
+        assert!(matches!(encode(&wave(1000), TARGET).form, Form::Uniform { bits: 8, .. }));
+    }
+
+    #[test]
+    fn outliers_too_many_to_escape_do_not_swallow_the_rest() {
+        // Two in a hundred at 10^4: over the whole deviation 8 bits look harmless, yet 0 to 6 would all become 0.
+        let values: Vec<f32> = (0..1000).map(|i| if i % 50 == 0 { 1e4 } else { (i % 7) as f32 }).collect();
+        let decoded = dequantise(&encode(&values, TARGET), values.len());
+        assert!(values.iter().zip(&decoded).all(|(a, b)| (a - b).abs() < 0.2));
+    }
+
+    #[test]
+    fn degenerate_columns_are_exact() {
+        for values in [vec![], vec![4.5f32], vec![-1e-40f32; 9], vec![0.0; 5]] {
+            let column = encode(&values, TARGET);
+            assert!(column.codes.is_empty());
+            assert_eq!(dequantise(&column, values.len()), values);
+        }
+        let extremes = vec![f32::MAX, f32::MIN, 0.0, 1.0];
+        assert!(dequantise(&encode(&extremes, TARGET), 4).iter().all(|v| v.is_finite()));
+    }
+}

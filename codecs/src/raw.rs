@@ -1,0 +1,70 @@
+//! `raw`: every attribute as float32, bit-exact and in order.
+
+use crate::streams::{META, Shape, StreamSet, from_planes, to_planes};
+use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
+use serde::Deserialize;
+
+/// Version of the stored form.
+const VERSION: u8 = 1;
+
+struct Raw;
+
+impl AttributeCodec for Raw {
+    fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        gaussians.validate("Gaussians to encode", &context.limits)?;
+        let mut meta = vec![VERSION];
+        Shape::of(gaussians).write(&mut meta)?;
+        let mut streams = vec![Stream { name: META.into(), bytes: meta }];
+        streams.extend(gaussians.columns().into_iter().map(|(name, width, values)| Stream { name: name.into(), bytes: to_planes(values, width) }));
+        streams.extend(Shape::extra_streams(gaussians));
+        Ok(streams)
+    }
+
+    fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        let set = StreamSet::new("raw", streams);
+        let mut meta = set.reader(META)?;
+        let version = meta.u8()?;
+        if version != VERSION {
+            return Err(Error::unsupported("raw streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
+        }
+        let shape = Shape::read(&mut meta, &context.limits)?;
+        meta.finish()?;
+        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+        for (name, width, values) in out.columns_mut() {
+            *values = from_planes(set.reader(name)?, shape.count, width)?;
+        }
+        shape.read_extra(&set, &mut out)?;
+        out.validate("decoded Gaussians", &context.limits)?;
+        Ok(out)
+    }
+
+    fn losses(&self) -> Vec<DeclaredLoss> {
+        Vec::new()
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Settings {}
+
+fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+    if !matches!(profile, "" | "default") {
+        return Err(unknown_name("profile of codec raw", profile, ["default"].into_iter()));
+    }
+    let Settings {} = config::parse_section("codec raw", settings)?;
+    Ok(Box::new(Raw))
+}
+
+inventory::submit! {
+    CodecPlugin {
+        info: Plugin {
+            name: "raw",
+            version: "1",
+            summary: "float32, bit-exact",
+            paper: "the uncompressed base line",
+            schema: "# no settings\n",
+            capabilities: &["lossless", "profiles=default"],
+        },
+        build,
+    }
+}

@@ -1,0 +1,123 @@
+//! What the codecs' streams have in common.
+
+use cc4dgs_core::archive::ByteReader;
+use cc4dgs_core::gaussians::sh_rest_len;
+use cc4dgs_core::{Error, ExtraAttribute, HostGaussians, Limits, Result, Stream};
+
+/// The stream that says what the others hold.
+pub(crate) const META: &str = "meta";
+
+/// The streams handed to a decoder, by name.
+pub(crate) struct StreamSet<'a> {
+    codec: &'static str,
+    streams: &'a [Stream],
+}
+
+impl<'a> StreamSet<'a> {
+    pub(crate) fn new(codec: &'static str, streams: &'a [Stream]) -> Self {
+        Self { codec, streams }
+    }
+    /// A reader over the stream `name`.
+    pub(crate) fn reader(&self, name: &str) -> Result<ByteReader<'a>> {
+        match self.streams.iter().find(|s| s.name == name) {
+            Some(stream) => Ok(ByteReader::new(format!("{} stream '{name}'", self.codec), &stream.bytes)),
+            None => Err(Error::data(format!("{} stream '{name}'", self.codec), "it is missing", "The file is damaged or another codec wrote it")),
+        }
+    }
+}
+
+/// Number of Gaussians, degree and plug-in attributes: the part of the meta stream both codecs share.
+pub(crate) struct Shape {
+    pub(crate) count: usize,
+    pub(crate) sh_degree: usize,
+    pub(crate) extra: Vec<(String, usize)>,
+}
+
+impl Shape {
+    pub(crate) fn of(gaussians: &HostGaussians) -> Self {
+        Self { count: gaussians.len(), sh_degree: gaussians.sh_degree, extra: gaussians.extra.iter().map(|(n, a)| (n.clone(), a.width)).collect() }
+    }
+    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<()> {
+        out.extend((self.count as u64).to_le_bytes());
+        out.push(self.sh_degree as u8);
+        out.extend((self.extra.len() as u16).to_le_bytes());
+        for (name, width) in &self.extra {
+            // The archive names a stream after the attribute, in at most 255 bytes.
+            if name.is_empty()
+                || name.len() > 240
+                || name.chars().any(char::is_control)
+                || *width == 0
+                || *width > MAX_EXTRA_WIDTH
+                || self.extra.len() > MAX_EXTRA
+            {
+                return Err(Error::parameter(
+                    format!("attribute '{name}'"),
+                    format!("a name of {} bytes, a width of {width} or {} attributes cannot be stored", name.len(), self.extra.len()),
+                    format!("Use printable names up to 240 bytes, widths from 1 to {MAX_EXTRA_WIDTH} and at most {MAX_EXTRA} attributes"),
+                ));
+            }
+            out.push(name.len() as u8);
+            out.extend(name.as_bytes());
+            out.extend((*width as u32).to_le_bytes());
+        }
+        Ok(())
+    }
+    /// Reads and checks what the file claims against `limits`, before anything is allocated for it.
+    pub(crate) fn read(reader: &mut ByteReader, limits: &Limits) -> Result<Self> {
+        let count = reader.u64()?;
+        limits.check_gaussians("encoded Gaussians", count)?;
+        let sh_degree = usize::from(reader.u8()?);
+        if sh_degree > 4 {
+            return Err(reader.error(format!("spherical-harmonics degree {sh_degree} is over 4")));
+        }
+        let attributes = usize::from(reader.u16()?);
+        if attributes > MAX_EXTRA {
+            return Err(reader.error(format!("{attributes} extra attributes are over {MAX_EXTRA}")));
+        }
+        let mut extra = Vec::new();
+        let mut floats = 15 + 3 * sh_rest_len(sh_degree) as u64;
+        for _ in 0..attributes {
+            let name_len = usize::from(reader.u8()?);
+            let name = reader.name(name_len)?;
+            let width = reader.u32()? as usize;
+            if width == 0 || width > MAX_EXTRA_WIDTH || extra.iter().any(|(n, _)| *n == name) {
+                return Err(reader.error(format!("attribute '{name}' of width {width} is impossible or there twice")));
+            }
+            floats += width as u64;
+            extra.push((name, width));
+        }
+        limits.check_bytes("decoded Gaussians", count.saturating_mul(4 * floats))?;
+        Ok(Self { count: count as usize, sh_degree, extra })
+    }
+    /// Streams of the plug-in attributes, exact.
+    pub(crate) fn extra_streams(gaussians: &HostGaussians) -> impl Iterator<Item = Stream> {
+        gaussians.extra.iter().map(|(name, a)| Stream { name: format!("extra.{name}"), bytes: to_planes(&a.values, a.width) })
+    }
+    /// Reads the plug-in attributes back.
+    pub(crate) fn read_extra(&self, set: &StreamSet, gaussians: &mut HostGaussians) -> Result<()> {
+        for (name, width) in &self.extra {
+            let values = from_planes(set.reader(&format!("extra.{name}"))?, self.count, *width)?;
+            gaussians.extra.insert(name.clone(), ExtraAttribute { width: *width, values });
+        }
+        Ok(())
+    }
+}
+
+const MAX_EXTRA: usize = 256;
+const MAX_EXTRA_WIDTH: usize = 4096;
+
+/// Rows [N, width] as float32 columns, one after the other: neighbours in a stream then have alike bytes.
+pub(crate) fn to_planes(rows: &[f32], width: usize) -> Vec<u8> {
+    (0..width).flat_map(|c| rows.iter().skip(c).step_by(width)).flat_map(|v| v.to_le_bytes()).collect()
+}
+
+/// Undoes [`to_planes`]; the stream must hold `count * width` finite floats and nothing else.
+pub(crate) fn from_planes(mut reader: ByteReader, count: usize, width: usize) -> Result<Vec<f32>> {
+    let planes = reader.f32s(count.saturating_mul(width))?;
+    reader.finish()?;
+    let mut rows = vec![0.0; planes.len()];
+    for (c, plane) in planes.chunks_exact(count.max(1)).enumerate() {
+        plane.iter().enumerate().for_each(|(i, &v)| rows[i * width + c] = v);
+    }
+    Ok(rows)
+}
