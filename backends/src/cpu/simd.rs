@@ -25,6 +25,20 @@ pub fn lanes_in_use() -> usize {
     dispatch(Width)
 }
 
+/// `[f(0), f(1), …]`, inlined as [`std::array::from_fn`] is not: a closure that stays a function of its own is compiled without the
+/// instruction set of the kernel around it. Write `each(#[inline(always)] |k| …)`.
+#[inline(always)]
+pub fn each<T: Copy, const N: usize>(mut f: impl FnMut(usize) -> T) -> [T; N] {
+    const { assert!(N > 0) };
+    let mut out = [f(0); N];
+    let mut k = 1;
+    while k < N {
+        out[k] = f(k);
+        k += 1;
+    }
+    out
+}
+
 /// A vector of float32.
 #[derive(Clone, Copy, Debug)]
 pub struct Lanes<S: Simd> {

@@ -195,8 +195,7 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
             let [half_a, b, half_c] = splat.conic;
             let a = like(half_a);
             let opacity = like(splat.opacity);
-            let color = splat.color.map(like);
-            let depth = like(splat.depth);
+            let shown = [like(splat.color[0]), like(splat.color[1]), like(splat.color[2]), like(splat.depth)];
             let mut largest = like(0.0);
             for block in 0..TILE / S::F32_LANES {
                 let first = block * S::F32_LANES;
@@ -214,8 +213,9 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
                     let after = alpha.nfma(before, before);
                     let drawn = hit & after.gt(stop);
                     let weight = drawn.keep(alpha * before);
-                    for (sum, value) in state.sums.iter_mut().zip([color[0], color[1], color[2], depth]) {
-                        weight.fma(value, Lanes::load(simd, &sum[at..])).store(&mut sum[at..]);
+                    for plane in 0..PLANES - 1 {
+                        let sum = &mut state.sums[plane][at..];
+                        weight.fma(shown[plane], Lanes::load(simd, sum)).store(sum);
                     }
                     drawn.select(after, before).store(&mut state.running[at..]);
                     if WEIGHTS {

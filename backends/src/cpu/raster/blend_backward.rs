@@ -9,7 +9,7 @@ use super::camera::{ALPHA_MIN, RuleConstants};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
 use super::{RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
-use crate::cpu::simd::{Lanes, dispatch};
+use crate::cpu::simd::{Lanes, dispatch, each};
 use pulp::{Simd, WithSimd};
 
 /// Fills the gradient records of all pairs from `upstream` [5,H,W].
@@ -72,7 +72,7 @@ impl TileGradient {
             let alpha = &upstream[3 * plane + from..][..width];
             let mut any = false;
             for x in 0..width {
-                let g: [f32; 4] = std::array::from_fn(|k| state.upstream[k][at + x]);
+                let g: [f32; 4] = each(#[inline(always)] |k| state.upstream[k][at + x]);
                 state.depth_matters |= g[3] != 0.0;
                 any |= g.iter().any(|&v| v != 0.0) || alpha[x] != 0.0;
                 let shown = background[0] * g[0] + background[1] * g[1] + background[2] * g[2] - alpha[x];
@@ -115,7 +115,7 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
             let [half_a, b, half_c] = splat.conic;
             let a = like(half_a);
             let opacity = like(splat.opacity);
-            let color = splat.color.map(like);
+            let color: [Lanes<S>; 3] = each(#[inline(always)] |c| like(splat.color[c]));
             let depth = like(splat.depth);
             let position = like(f32::from_bits(i as u32 + 1));
             let mut record = [0.0f32; RECORD];
@@ -148,7 +148,7 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                     let before = Lanes::load(simd, &state.running[at..]) * inverse;
                     before.store(&mut state.running[at..]);
                     let weight = alpha * before;
-                    let g: [Lanes<S>; 3] = std::array::from_fn(|c| Lanes::load(simd, &state.upstream[c][at..]));
+                    let g: [Lanes<S>; 3] = each(#[inline(always)] |c| Lanes::load(simd, &state.upstream[c][at..]));
                     let mut q = color[0].fma(g[0], color[1].fma(g[1], color[2] * g[2]));
                     if DEPTH {
                         let g_depth = Lanes::load(simd, &state.upstream[3][at..]);
@@ -170,8 +170,8 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                     }
                 }
                 let v_dx = v_sum * dx;
-                let sums = [v_sum, v_dx, v_dx * dx, v_dy, v_dy * dx, v_dy2, shown[0], shown[1], shown[2]].map(Lanes::sum);
-                let [v, x, xx, y, xy, yy, red, green, blue] = sums;
+                let (v, x, xx) = (v_sum.sum(), v_dx.sum(), (v_dx * dx).sum());
+                let (y, xy, yy) = (v_dy.sum(), (v_dy * dx).sum(), v_dy2.sum());
                 // v was -d loss / d sigma: the signs turn here. dx is pixel minus centre.
                 let part = [
                     2.0 * half_a * x + b * y,
@@ -180,9 +180,9 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                     -xy,
                     -0.5 * yy,
                     v / splat.opacity,
-                    red,
-                    green,
-                    blue,
+                    shown[0].sum(),
+                    shown[1].sum(),
+                    shown[2].sum(),
                     if DEPTH { shown[3].sum() } else { 0.0 },
                 ];
                 for (sum, value) in record.iter_mut().zip(part) {

@@ -6,7 +6,7 @@ use super::parallel::{SharedMut, run_tasks};
 use super::project::{CHUNK, Stage, WIDEST, activate, stage_coefficients, stage_inputs, view_direction};
 use super::scratch::Workspace;
 use super::{RECORD, RasterSettings, SplatArrays, TILE, TILE_PIXELS, sh};
-use crate::cpu::simd::{Lanes, dispatch};
+use crate::cpu::simd::{Lanes, dispatch, each};
 use cc4dgs_core::ParameterSpace;
 use pulp::{Simd, WithSimd};
 use std::mem::MaybeUninit;
@@ -204,11 +204,11 @@ impl WithSimd for GradientChunk<'_> {
             self.group(simd, &indices[..here], &stage, &screen, &mut camera_sums);
             start += S::F32_LANES;
         }
-        let sums = camera_sums.map(|lanes| f64::from(lanes.sum()));
+        let sums: [f64; CAMERA_ROWS] = each(#[inline(always)] |k| f64::from(camera_sums[k].sum()));
         CameraSums {
-            rotation: std::array::from_fn(|k| sums[k]),
-            translation: std::array::from_fn(|k| sums[9 + k]),
-            center: std::array::from_fn(|k| sums[12 + k]),
+            rotation: each(#[inline(always)] |k| sums[k]),
+            translation: each(#[inline(always)] |k| sums[9 + k]),
+            center: each(#[inline(always)] |k| sums[12 + k]),
         }
     }
 }
@@ -217,8 +217,8 @@ impl GradientChunk<'_> {
     /// The Gaussians `indices`, staged in columns.
     #[inline(always)]
     fn group<S: Simd>(&mut self, simd: S, indices: &[usize], stage: &Stage<11>, screen: &Stage<SCREEN_ROWS>, camera_sums: &mut [Lanes<S>; CAMERA_ROWS]) {
-        let inputs: [Lanes<S>; 11] = std::array::from_fn(|i| Lanes::load(simd, &stage[i]));
-        let g: [Lanes<S>; RECORD] = std::array::from_fn(|i| Lanes::load(simd, &screen[i]));
+        let inputs: [Lanes<S>; 11] = each(#[inline(always)] |i| Lanes::load(simd, &stage[i]));
+        let g: [Lanes<S>; RECORD] = each(#[inline(always)] |i| Lanes::load(simd, &screen[i]));
         let mean: Vec3<S> = [inputs[0], inputs[1], inputs[2]];
         let space = self.settings.space;
         let (scales, opacity) = activate(space, [inputs[3], inputs[4], inputs[5]], inputs[10]);
@@ -234,7 +234,7 @@ impl GradientChunk<'_> {
                 d.scales[k] = d.scales[k] * scales[k];
             }
         }
-        let color: Vec3<S> = std::array::from_fn(|c| g[6 + c] * Lanes::load(simd, &screen[RECORD + c]));
+        let color: Vec3<S> = each(#[inline(always)] |c| g[6 + c] * Lanes::load(simd, &screen[RECORD + c]));
         let mut d_colors = color;
         if let Some(degree) = self.settings.sh_degree {
             let (d_dc, d_offset) = self.harmonics(simd, degree, indices, mean, color);
@@ -290,7 +290,7 @@ impl GradientChunk<'_> {
             }
             for (lane, index) in indices.iter().enumerate() {
                 let row = &mut self.out[5][(index - self.first) * width..][..3 * (count - 1)];
-                let rgb: [f32; 3] = std::array::from_fn(|c| color_columns[c][lane]);
+                let rgb: [f32; 3] = each(#[inline(always)] |c| color_columns[c][lane]);
                 for (k, coefficient) in row.chunks_exact_mut(3).enumerate() {
                     let value = basis_columns[k + 1][lane];
                     for c in 0..3 {
@@ -299,7 +299,7 @@ impl GradientChunk<'_> {
                 }
             }
         }
-        (color.map(|c| c * values[0]), offset)
+        (each(#[inline(always)] |c| color[c] * values[0]), offset)
     }
     /// Writes columns to the rows of the Gaussians `indices` of output `which`, if that is wanted.
     #[inline(always)]

@@ -5,7 +5,7 @@ use super::geometry::{Vec3, project};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Footprint, Workspace, set_len};
 use super::{MAX_TILE_PAIRS, RasterSettings, ScreenSplat, SplatArrays, TILE, TooManyPairs, sh, tiles};
-use crate::cpu::simd::{Lanes, dispatch};
+use crate::cpu::simd::{Lanes, dispatch, each};
 use cc4dgs_core::ParameterSpace;
 use pulp::{Simd, WithSimd};
 
@@ -92,7 +92,7 @@ pub fn activate<S: Simd>(space: ParameterSpace, scales: Vec3<S>, opacity: Lanes<
     match space {
         ParameterSpace::Raw => {
             let one = opacity.like(1.0);
-            (scales.map(Lanes::exp), one / (one + (-opacity).exp()))
+            (each(#[inline(always)] |k| scales[k].exp()), one / (one + (-opacity).exp()))
         }
         ParameterSpace::Activated => (scales, opacity),
     }
@@ -101,10 +101,10 @@ pub fn activate<S: Simd>(space: ParameterSpace, scales: Vec3<S>, opacity: Lanes<
 /// Direction from the camera centre to `mean`, and one over the distance.
 #[inline(always)]
 pub fn view_direction<S: Simd>(camera: &CameraConstants, mean: Vec3<S>) -> (Vec3<S>, Lanes<S>) {
-    let offset: Vec3<S> = std::array::from_fn(|k| mean[k] - camera.center[k]);
+    let offset: Vec3<S> = each(#[inline(always)] |k| mean[k] - camera.center[k]);
     let squared = offset[0].fma(offset[0], offset[1].fma(offset[1], offset[2] * offset[2]));
     let inverse = offset[0].like(1.0) / squared.sqrt();
-    (offset.map(|v| v * inverse), inverse)
+    (each(#[inline(always)] |k| offset[k] * inverse), inverse)
 }
 
 struct Project<'k, 'a>(&'k mut ProjectChunk<'a>);
@@ -123,7 +123,7 @@ impl WithSimd for Project<'_, '_> {
         while start < len {
             let here = S::F32_LANES.min(len - start);
             stage_inputs::<S>(k.splats, |lane| k.first + start + lane.min(here - 1), &mut stage);
-            let inputs: [Lanes<S>; 11] = std::array::from_fn(|i| Lanes::load(simd, &stage[i]));
+            let inputs: [Lanes<S>; 11] = each(#[inline(always)] |i| Lanes::load(simd, &stage[i]));
             let mean: Vec3<S> = [inputs[0], inputs[1], inputs[2]];
             let (scales, opacity) = activate(k.settings.space, [inputs[3], inputs[4], inputs[5]], inputs[10]);
             let p = project(k.camera, mean, [inputs[6], inputs[7], inputs[8], inputs[9]], scales);
@@ -139,7 +139,10 @@ impl WithSimd for Project<'_, '_> {
                 xx.max(yy).sqrt() * 3.33
             };
             let zero = like(0.0);
-            let finite = inputs.iter().fold(zero, |sum, &v| v.fma(zero, sum)) + p.determinant * zero + half_width * zero + half_height * zero;
+            let mut finite = (p.determinant + half_width + half_height) * zero;
+            for input in inputs {
+                finite = input.fma(zero, finite);
+            }
             let visible = finite.equal(zero)
                 & p.point[2].gt(like(k.rules.near))
                 & p.point[2].lt(like(FAR))
@@ -172,7 +175,7 @@ impl WithSimd for Project<'_, '_> {
                 }
                 for lane in 0..here {
                     if out[13][lane] != 0.0 {
-                        k.emit(start + lane, &std::array::from_fn(|row| out[row][lane]));
+                        k.emit(start + lane, &each(#[inline(always)] |row| out[row][lane]));
                     }
                 }
             }
@@ -235,7 +238,7 @@ impl WithSimd for Color<'_, '_> {
         let Some(degree) = k.settings.sh_degree else {
             for slot in 0..k.count {
                 let i = k.slots[slot].index as usize;
-                k.finish(slot, &mut kept, std::array::from_fn(|c| k.splats.colors[3 * i + c]));
+                k.finish(slot, &mut kept, each(#[inline(always)] |c| k.splats.colors[3 * i + c]));
             }
             k.count = kept;
             return;
@@ -247,7 +250,7 @@ impl WithSimd for Color<'_, '_> {
         while start < k.count {
             let here = S::F32_LANES.min(k.count - start);
             stage_coefficients::<S>(k.splats, degree, |lane| k.slots[start + lane.min(here - 1)].index as usize, &mut stage);
-            let mean: Vec3<S> = std::array::from_fn(|c| Lanes::load(simd, &stage[c]));
+            let mean: Vec3<S> = each(#[inline(always)] |c| Lanes::load(simd, &stage[c]));
             let (direction, _) = view_direction(k.camera, mean);
             sh::basis(degree, direction, &mut values);
             for c in 0..3 {
@@ -259,7 +262,7 @@ impl WithSimd for Color<'_, '_> {
                 sum.lt(Lanes::splat(simd, 0.0)).select(Lanes::splat(simd, 0.0), sum).store(&mut colors[c]);
             }
             for lane in 0..here {
-                k.finish(start + lane, &mut kept, std::array::from_fn(|c| colors[c][lane]));
+                k.finish(start + lane, &mut kept, each(#[inline(always)] |c| colors[c][lane]));
             }
             start += S::F32_LANES;
         }

@@ -1,7 +1,7 @@
 //! Real spherical harmonics of degree 0 to 4 and their derivative, a vector of directions at a time (signs as in Inria's 3DGS).
 
 use super::geometry::Vec3;
-use crate::cpu::simd::Lanes;
+use crate::cpu::simd::{Lanes, each};
 use pulp::Simd;
 
 /// Coefficients of degree 4, the largest known.
@@ -70,7 +70,7 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
     if degree < 2 {
         return g;
     }
-    let h2: [Lanes<S>; 5] = std::array::from_fn(|k| h[4 + k] * C2[k]);
+    let h2: [Lanes<S>; 5] = each(#[inline(always)] |k| h[4 + k] * C2[k]);
     g[0] = h2[0].fma(y, h2[2].fma(x * -2.0, h2[3].fma(z, h2[4].fma(x * 2.0, g[0]))));
     g[1] = h2[0].fma(x, h2[1].fma(z, h2[2].fma(y * -2.0, h2[4].fma(y * -2.0, g[1]))));
     g[2] = h2[1].fma(y, h2[2].fma(z * 4.0, h2[3].fma(x, g[2])));
@@ -78,7 +78,7 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
         return g;
     }
     let (xx, yy, zz, xy, yz, xz) = (x * x, y * y, z * z, x * y, y * z, x * z);
-    let h3: [Lanes<S>; 7] = std::array::from_fn(|k| h[9 + k] * C3[k]);
+    let h3: [Lanes<S>; 7] = each(#[inline(always)] |k| h[9 + k] * C3[k]);
     let side = zz * 4.0 - xx - yy;
     g[0] = h3[0].fma(xy * 6.0, h3[1].fma(yz, h3[2].fma(xy * -2.0, h3[3].fma(xz * -6.0, g[0]))));
     g[0] = h3[4].fma(side - xx * 2.0, h3[5].fma(xz * 2.0, h3[6].fma((xx - yy) * 3.0, g[0])));
@@ -89,7 +89,7 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
     if degree < 4 {
         return g;
     }
-    let h4: [Lanes<S>; 9] = std::array::from_fn(|k| h[16 + k] * C4[k]);
+    let h4: [Lanes<S>; 9] = each(#[inline(always)] |k| h[16 + k] * C4[k]);
     let s = zz * 7.0;
     let (s1, s3) = (s - 1.0, s - 3.0);
     g[0] = h4[0].fma(y * (xx * 3.0 - yy), h4[1].fma(xy * z * 6.0, h4[2].fma(y * s1, g[0])));
@@ -106,5 +106,5 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
 #[inline(always)]
 pub fn normalize_backward<S: Simd>(direction: Vec3<S>, inverse_length: Lanes<S>, g: Vec3<S>) -> Vec3<S> {
     let along = direction[0].fma(g[0], direction[1].fma(g[1], direction[2] * g[2]));
-    std::array::from_fn(|k| direction[k].nfma(along, g[k]) * inverse_length)
+    each(#[inline(always)] |k| direction[k].nfma(along, g[k]) * inverse_length)
 }
