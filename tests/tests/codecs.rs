@@ -19,7 +19,9 @@ fn codecs() -> Vec<(String, Box<dyn AttributeCodec>)> {
         let profiles = plugin.capabilities.iter().find_map(|c| c.strip_prefix("profiles=")).unwrap_or("");
         for profile in profiles.split(',') {
             let spec = format!("{}:{profile}", plugin.name);
-            out.push((spec.clone(), registry.build_codec(&spec, &toml::Table::new()).unwrap()));
+            // A codec that trains is told to be quick about it.
+            let quick = if plugin.schema.contains("sample_budget") { "sample_budget = 20000".parse().unwrap() } else { toml::Table::new() };
+            out.push((spec.clone(), registry.build_codec(&spec, &quick).unwrap()));
         }
     }
     assert!(out.len() >= 4, "raw and three profiles of cca");
@@ -262,6 +264,43 @@ fn hostile_autoencoder_streams_never_panic() {
                 if let Ok(g) = codec.decode(&bad, &context()) {
                     g.validate("decoded", &Limits::default()).unwrap();
                 }
+            }
+        }
+    }
+}
+
+/// Bytes per stream of a trained model at full effort. `cargo test --release -p cc4dgs-tests --test codecs -- --ignored --nocapture`
+#[test]
+#[ignore = "takes a minute; prints a report"]
+fn report_bytes_of_a_trained_model() {
+    let data = std::env::var_os("CC4DGS_DATA").map_or_else(|| std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), Into::into);
+    let path = data.join("playbot_31k/lod3_decoded_3dgs.ply");
+    let trained = path.exists().then(|| cc4dgs_engine::ply::read(&path, &Limits::default()).unwrap());
+    if trained.is_none() {
+        println!("{} is absent", path.display());
+    }
+    for (name, g) in [("trained", trained), ("synthetic", Some(scene(50_000, 3, 20)))].into_iter().filter_map(|(n, g)| Some((n, g?))) {
+        for spec in ["raw", "cca:default", "cca:mid", "cca:low"] {
+            let codec = Registry::collect().unwrap().build_codec(spec, &toml::Table::new()).unwrap();
+            let start = std::time::Instant::now();
+            let (original, decoded, streams) = round_trip(spec, codec.as_ref(), &g);
+            let seconds = start.elapsed().as_secs_f64();
+            let manifest = cc4dgs_core::archive::Manifest { frame_count: 1, gaussian_count: g.len() as u64, ..Default::default() };
+            let start = std::time::Instant::now();
+            let bytes = cc4dgs_core::archive::ArchiveWriter::new(manifest).add_all(cc4dgs_core::archive::StreamKind::Canonical, streams).to_bytes().unwrap();
+            let archive = cc4dgs_core::archive::Archive::from_bytes("t", bytes, &Limits::default()).unwrap();
+            let per = |b: u64| b as f64 / g.len() as f64;
+            println!(
+                "{name} {spec}: {} Gaussians, {:.2} B each, coded and decoded in {seconds:.1} s, packed in {:.1} s",
+                g.len(),
+                per(archive.total_bytes().unwrap()),
+                start.elapsed().as_secs_f64()
+            );
+            for s in archive.stream_sizes() {
+                println!("    {:<20} {:>9} B {:>9} B stored {:>7.3} B/G", s.name, s.decoded_bytes, s.stored_bytes, per(s.stored_bytes));
+            }
+            for ((column, _, before), (_, _, after)) in original.columns().into_iter().zip(decoded.columns()) {
+                println!("    {column:<20} relative rms {:.2e}", relative_rms(before, after));
             }
         }
     }

@@ -75,7 +75,8 @@ fn golden_mulaw_codes_and_values() {
             let clear = (before[i] - before[i].round()).abs() > 1e-6;
             assert!(!clear || precode.floor() as i32 == codes[i], "{name} {}: code {} against {}", x[i], precode.floor(), codes[i]);
             let value = mulaw::expand(f64::from(codes[i]) / mu * 2.0 - 1.0, mu);
-            assert!((value - decoded[i]).abs() < 1e-9, "{name} code {}: {value} against {}", codes[i], decoded[i]);
+            // torchaudio decodes in float32.
+            assert!((value - decoded[i]).abs() < 1e-6, "{name} code {}: {value} against {}", codes[i], decoded[i]);
         }
     }
     // The codec's own: mu = 255, signed 16-bit codes, halves away from zero.
