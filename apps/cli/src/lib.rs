@@ -1,1 +1,54 @@
-//! cc4dgs
+//! cc4dgs: train a dynamic scene from calibrated pictures, store it in a few megabytes, play it back.
+//!
+//! This crate is the facade: it re-exports the parts of the framework and holds the `cc4dgs` command as [`run`]. A program that links further
+//! plug-in crates is three lines long:
+//!
+//! ```no_run
+//! use cc4dgs as _; // and: use my_deformer as _;
+//! fn main() -> std::process::ExitCode {
+//!     cc4dgs::run(std::env::args_os())
+//! }
+//! ```
+
+mod args;
+mod commands;
+mod interrupt;
+mod listeners;
+mod model_source;
+mod orbit;
+mod output;
+
+pub use cc4dgs_backends as backends;
+pub use cc4dgs_codecs as codecs;
+pub use cc4dgs_core as core;
+pub use cc4dgs_deformers as deformers;
+pub use cc4dgs_engine as engine;
+
+use clap::Parser;
+use std::ffi::OsString;
+use std::process::ExitCode;
+
+/// Runs the `cc4dgs` command on `args` (the program's name first) and returns its exit code: 0 done, 2 user error, 3 data error, 4 out of memory or
+/// over a limit, 5 back end, 130 interruption. Every plug-in linked into the program takes part.
+pub fn run<I, T>(args: I) -> ExitCode
+where
+    I: IntoIterator<Item = T>,
+    T: Into<OsString> + Clone,
+{
+    let cli = match args::Cli::try_parse_from(args) {
+        Ok(cli) => cli,
+        Err(error) => {
+            // Help and version are asked for, not errors; clap knows which stream each belongs on.
+            error.print().ok();
+            return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2));
+        }
+    };
+    let output = output::Output::new(cli.json.clone(), cli.quiet);
+    match commands::dispatch(&cli, &output) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            output.failure(&error);
+            ExitCode::from(error.exit_code())
+        }
+    }
+}

@@ -1,0 +1,325 @@
+//! The command line.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use std::path::PathBuf;
+
+const EXIT_CODES: &str =
+    "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 back end, 130 interrupted. Sizes are in MB = 10^6 bytes.";
+
+/// Dynamic Gaussian splatting: train, compress, play back.
+#[derive(Debug, Parser)]
+#[command(name = "cc4dgs", version, about, after_help = EXIT_CODES, subcommand_precedence_over_arg = true, arg_required_else_help = true)]
+pub struct Cli {
+    /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE.
+    #[arg(long, global = true, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
+    pub json: Option<PathBuf>,
+    /// Say nothing but results and errors.
+    #[arg(long, short, global = true)]
+    pub quiet: bool,
+    /// Threads to compute with; 0 takes all of the machine. Results do not depend on it.
+    #[arg(long, global = true, value_name = "N", default_value_t = 0)]
+    pub threads: usize,
+    /// Raise or lower what readers believe of a file, such as max_gaussians=50000000; may be given several times.
+    #[arg(long = "limit", global = true, value_name = "NAME=VALUE")]
+    pub limits: Vec<String>,
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Train the built-in scene, compress it, evaluate both and draw a contact sheet: the whole chain in minutes.
+    Demo(Demo),
+    /// Train a scene. Leaves DIR/checkpoint, DIR/config.toml and DIR/events.jsonl.
+    Train(Train),
+    /// Store a trained model as a .cc4d archive.
+    Compress(Compress),
+    /// Write the canonical Gaussians of an archive as a PLY file.
+    Decompress(Decompress),
+    /// Render a model to PNG frames, and to a video if asked.
+    Render(Render),
+    /// Measure a model against the pictures of a scene.
+    Eval(Eval),
+    /// Say what a checkpoint, an archive, a PLY file or a scene holds.
+    Info(Info),
+    /// List the plug-ins, or show one with its settings.
+    Plugins(Plugins),
+    /// Check this machine: processor, threads, devices, ffmpeg, and a picture drawn by two rasterizers.
+    Doctor(Doctor),
+    /// Measure speed.
+    Bench(Bench),
+}
+
+#[derive(Debug, Args)]
+pub struct Demo {
+    /// Folder for everything the demo makes.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Override a setting, such as train.iterations=500; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME")]
+    pub device: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub struct Train {
+    /// A dataset, or `procedural` for the built-in scene. The format is found out.
+    #[arg(long, value_name = "PATH")]
+    pub scene: PathBuf,
+    /// Settings to start from; see `cc4dgs plugins`.
+    #[arg(long, value_name = "NAME")]
+    pub preset: Option<String>,
+    /// A TOML file laid over the preset.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Override a setting, such as train.iterations=5000; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Device to compute on: auto, flex, ndarray.
+    #[arg(long, value_name = "NAME")]
+    pub device: Option<String>,
+    /// The run's folder.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Go on from DIR/checkpoint; the result is the same as without the interruption. Settings default to DIR/config.toml.
+    #[arg(long)]
+    pub resume: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct Compress {
+    /// A run's folder or a checkpoint.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// Codec, with its profile after a colon.
+    #[arg(long, value_name = "NAME[:PROFILE]", default_value = "cca:default")]
+    pub codec: String,
+    /// Override a setting of the codec; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// The archive to write.
+    #[arg(long, value_name = "F.cc4d")]
+    pub out: PathBuf,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+}
+
+#[derive(Debug, Args)]
+pub struct Decompress {
+    /// An archive, or a run's folder.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The PLY file to write (3DGS layout).
+    #[arg(long, value_name = "F.ply")]
+    pub out: PathBuf,
+    /// Leave the dynamic scores out, for viewers that insist on the 62 floats of static 3DGS.
+    #[arg(long)]
+    pub no_dynamic: bool,
+    /// The Gaussians as deformed at this time (0 to 1) instead of the canonical ones.
+    #[arg(long, value_name = "T")]
+    pub time: Option<f32>,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+}
+
+#[derive(Debug, Args)]
+pub struct Render {
+    /// A run's folder, a checkpoint or an archive.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// Folder for the frames, frame_00000.png and on.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Take the cameras and times of this dataset instead of an orbit around the model.
+    #[arg(long, value_name = "PATH")]
+    pub scene: Option<PathBuf>,
+    /// Which side of the dataset's split.
+    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
+    pub split: SplitArg,
+    /// Scene options over those the model was trained with, such as scene.width=800; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Frames to render: of the orbit (default 60), or at most so many of the dataset, evenly spread.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: Option<u32>,
+    /// Picture size in pixels; for datasets the default is their own.
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    pub size: Option<(u32, u32)>,
+    /// Full turns of the orbit while time runs from 0 to 1.
+    #[arg(long, value_name = "TURNS", default_value_t = 1.0)]
+    pub turns: f64,
+    /// The axis of the world that points up, for the orbit.
+    #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]
+    pub up: UpArg,
+    /// Also make a video of the frames with the ffmpeg command.
+    #[arg(long, value_name = "F.mp4")]
+    pub mp4: Option<PathBuf>,
+    /// Frames per second of the video.
+    #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=240))]
+    pub fps: u32,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+}
+
+#[derive(Debug, Args)]
+pub struct Eval {
+    /// A run's folder, a checkpoint or an archive.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The dataset to measure against.
+    #[arg(long, value_name = "PATH")]
+    pub scene: PathBuf,
+    /// Which side of the split.
+    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
+    pub split: SplitArg,
+    /// Scene options over those the model was trained with, such as scene.width=800; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Measure at most so many pictures, evenly spread; 0 measures all.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub max_views: usize,
+    /// The contact sheet: ground truth, render and error. Without it, it lies beside the JSON file or, for a run, in its folder.
+    #[arg(long, value_name = "F.png")]
+    pub sheet: Option<PathBuf>,
+    /// Rows of the contact sheet, evenly spread over the pictures; 0 draws none.
+    #[arg(long, value_name = "N", default_value_t = 6)]
+    pub sheet_rows: usize,
+    /// Also write every render as a PNG file into this folder.
+    #[arg(long, value_name = "DIR")]
+    pub renders: Option<PathBuf>,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+}
+
+#[derive(Debug, Args)]
+pub struct Info {
+    /// A run's folder, a checkpoint, an archive, a PLY file or a dataset.
+    #[arg(value_name = "PATH")]
+    pub path: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub struct Plugins {
+    /// Show this plug-in with its settings.
+    #[arg(value_name = "NAME")]
+    pub name: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub struct Doctor {}
+
+#[derive(Debug, Args)]
+pub struct Bench {
+    #[command(subcommand)]
+    pub what: BenchWhat,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum BenchWhat {
+    /// A whole static training step: project, rasterize, L1 and SSIM, backward, Adam.
+    Step(BenchStep),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchStep {
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Steps measured per case, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeats: u32,
+    /// Root of the seed tree the scenes are drawn from.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+}
+
+/// The two sides of a split.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SplitArg {
+    /// Pictures seen in training.
+    Train,
+    /// Pictures held out.
+    Test,
+}
+
+impl From<SplitArg> for cc4dgs_core::Split {
+    fn from(split: SplitArg) -> Self {
+        match split {
+            SplitArg::Train => Self::Train,
+            SplitArg::Test => Self::Test,
+        }
+    }
+}
+
+/// A signed axis of the world.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum UpArg {
+    X,
+    Y,
+    Z,
+    #[value(name = "-x")]
+    MinusX,
+    #[value(name = "-y")]
+    MinusY,
+    #[value(name = "-z")]
+    MinusZ,
+}
+
+impl From<UpArg> for [f64; 3] {
+    fn from(up: UpArg) -> Self {
+        match up {
+            UpArg::X => [1.0, 0.0, 0.0],
+            UpArg::Y => [0.0, 1.0, 0.0],
+            UpArg::Z => [0.0, 0.0, 1.0],
+            UpArg::MinusX => [-1.0, 0.0, 0.0],
+            UpArg::MinusY => [0.0, -1.0, 0.0],
+            UpArg::MinusZ => [0.0, 0.0, -1.0],
+        }
+    }
+}
+
+/// Reads `800x600`.
+fn parse_size(text: &str) -> Result<(u32, u32), String> {
+    let parts = text.split_once(['x', 'X']).and_then(|(w, h)| Some((w.trim().parse().ok()?, h.trim().parse().ok()?)));
+    match parts {
+        Some((w, h)) if (1..=16384).contains(&w) && (1..=16384).contains(&h) => Ok((w, h)),
+        _ => Err("write WIDTHxHEIGHT in pixels, each from 1 to 16384, such as 800x600".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn json_takes_a_file_or_none_in_every_place() {
+        let json = |args: &[&str]| Cli::try_parse_from(args).unwrap().json.map(|p| p.display().to_string());
+        assert_eq!(json(&["cc4dgs", "plugins", "--json"]).as_deref(), Some("-"));
+        assert_eq!(json(&["cc4dgs", "--json", "plugins"]).as_deref(), Some("-"));
+        assert_eq!(json(&["cc4dgs", "demo", "--out", "d", "--json"]).as_deref(), Some("-"));
+        assert_eq!(json(&["cc4dgs", "demo", "--json", "--out", "d"]).as_deref(), Some("-"));
+        assert_eq!(json(&["cc4dgs", "eval", "D", "--scene", "P", "--split", "test", "--json", "F.json"]).as_deref(), Some("F.json"));
+        assert_eq!(json(&["cc4dgs", "bench", "step", "--device", "flex", "--json", "F.json"]).as_deref(), Some("F.json"));
+        assert_eq!(json(&["cc4dgs", "doctor"]), None);
+    }
+
+    #[test]
+    fn sizes_are_read_strictly() {
+        assert_eq!(parse_size("800x600"), Ok((800, 600)));
+        for bad in ["800", "0x5", "5x", "-1x4", "99999x4", "4x4x4"] {
+            assert!(parse_size(bad).is_err(), "{bad}");
+        }
+    }
+}

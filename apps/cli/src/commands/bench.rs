@@ -1,0 +1,65 @@
+//! `cc4dgs bench`.
+
+use super::Context;
+use crate::args::BenchStep;
+use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, time_step};
+use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device};
+use serde::Serialize;
+
+#[derive(Serialize)]
+struct StepReport<'a> {
+    version: &'static str,
+    device: &'a str,
+    threads: usize,
+    cpu_features: Vec<&'static str>,
+    seed: u64,
+    repeats: u32,
+    /// What `peak_share` counts per (Gaussian, pixel) pair.
+    operations_per_pair: f64,
+    cases: Vec<StepTiming>,
+}
+
+/// Times the standard cases of a whole training step.
+pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
+    let device = parse_device(&args.device)?;
+    let events = context.listeners(None)?;
+    let seed = Seed::root(args.seed).child("bench");
+    let mut cases = Vec::with_capacity(STANDARD_CASES.len());
+    for (done, case) in STANDARD_CASES.iter().enumerate() {
+        cases.push(time_step(case, &device, seed, args.repeats as usize)?);
+        events.emit(&Event::Progress { task: "bench".into(), done: done as u64 + 1, total: STANDARD_CASES.len() as u64 });
+    }
+    let report = StepReport {
+        version: env!("CARGO_PKG_VERSION"),
+        device: &args.device,
+        threads: rayon::current_num_threads(),
+        cpu_features: super::doctor::cpu_features(),
+        seed: args.seed,
+        repeats: args.repeats,
+        operations_per_pair: OPERATIONS_PER_PAIR,
+        cases,
+    };
+    context.output.result(&report, || text(&report))
+}
+
+fn text(report: &StepReport) -> String {
+    let mut lines = vec![format!("training step on {}, {} threads, {} repeats", report.device, report.threads, report.repeats)];
+    lines.push("  picture  Gaussians  median ms   min ms  (render    loss  backward   Adam)   pairs/s  of peak".into());
+    lines.extend(report.cases.iter().map(|c| {
+        format!(
+            "{:>4}x{:<4} {:>9} {:>10.2} {:>8.2}  {:>7.2} {:>7.2} {:>9.2} {:>6.2}  {:>8.2e}  {:>6.1}%",
+            c.width,
+            c.height,
+            c.gaussians,
+            c.median_ms,
+            c.min_ms,
+            c.forward_ms,
+            c.loss_ms,
+            c.backward_ms,
+            c.adam_ms,
+            c.pairs_per_s,
+            100.0 * c.peak_share
+        )
+    }));
+    lines.join("\n")
+}

@@ -1,0 +1,103 @@
+//! `cc4dgs compress`.
+
+use super::{Context, create_parent, megabytes};
+use crate::args::Compress;
+use crate::model_source::load_model;
+use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
+use cc4dgs_core::{Event, EventSink, Result, config};
+use cc4dgs_engine::eval::SizeMb;
+use cc4dgs_engine::model::{Model, ModelSize};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// What compression came to.
+#[derive(Serialize)]
+pub struct CompressReport {
+    pub archive: PathBuf,
+    pub codec: String,
+    pub gaussians: usize,
+    pub bytes: u64,
+    pub size_mb: SizeMb,
+    /// Float32 size of what the archive stands for, over the archive's.
+    pub ratio: f64,
+    pub seconds: f64,
+    pub streams: Vec<StreamSize>,
+}
+
+/// One stream of an archive.
+#[derive(Serialize)]
+pub struct StreamSize {
+    pub name: String,
+    /// `canonical`, `field`, `meta` or `other`.
+    pub kind: &'static str,
+    pub decoded_bytes: u64,
+    pub stored_bytes: u64,
+}
+
+impl From<StreamInfo> for StreamSize {
+    fn from(info: StreamInfo) -> Self {
+        let kind = match info.kind {
+            StreamKind::Canonical => "canonical",
+            StreamKind::Field => "field",
+            StreamKind::Meta => "meta",
+            StreamKind::Other(_) => "other",
+        };
+        Self { name: info.name, kind, decoded_bytes: info.decoded_bytes, stored_bytes: info.stored_bytes }
+    }
+}
+
+pub fn run(context: &Context, args: &Compress) -> Result<()> {
+    let events = context.listeners(None)?;
+    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let mut settings = toml::Table::new();
+    for assignment in &args.sets {
+        config::set(&mut settings, assignment)?;
+    }
+    let report = compress(context, &loaded.model, &args.codec, &settings, &args.out, &events)?;
+    context.output.result(&report, || text(&report))
+}
+
+/// Writes `model` to the archive `out` and reads its directory back.
+pub fn compress(context: &Context, model: &Model, codec: &str, settings: &toml::Table, out: &Path, events: &dyn EventSink) -> Result<CompressReport> {
+    let began = Instant::now();
+    create_parent(out)?;
+    let bytes = model.save_archive(out, codec, settings, &context.registry, &context.limits, events)?;
+    events.emit(&Event::Saved { path: out.display().to_string(), bytes });
+    let seconds = began.elapsed().as_secs_f64();
+    let stored = Archive::open(out, &context.limits)?.stream_sizes();
+    let of_kind = |kind| stored.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum();
+    let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.size };
+    Ok(CompressReport {
+        archive: out.to_path_buf(),
+        codec: codec.to_string(),
+        gaussians: model.gaussians.len(),
+        bytes,
+        size_mb: size.into(),
+        ratio: model.size.total as f64 / bytes.max(1) as f64,
+        seconds,
+        streams: stored.into_iter().map(StreamSize::from).collect(),
+    })
+}
+
+/// The report for people.
+pub fn text(report: &CompressReport) -> String {
+    let mut lines = vec![format!(
+        "{}: {:.4} MB (deform {:.4} MB, point cloud {:.4} MB), {} Gaussians, {:.1}x smaller than float32, {} in {:.1} s",
+        report.archive.display(),
+        report.size_mb.total,
+        report.size_mb.deform,
+        report.size_mb.point_cloud,
+        report.gaussians,
+        report.ratio,
+        report.codec,
+        report.seconds
+    )];
+    lines.extend(report.streams.iter().map(stream_line));
+    lines.join("\n")
+}
+
+/// One stream for people.
+pub fn stream_line(stream: &StreamSize) -> String {
+    format!("  {:<28} {:>12.6} MB stored, {:>12.6} MB decoded", stream.name, megabytes(stream.stored_bytes), megabytes(stream.decoded_bytes))
+}

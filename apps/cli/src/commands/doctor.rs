@@ -1,0 +1,165 @@
+//! `cc4dgs doctor`: what this machine offers, and whether pictures come out right on it.
+
+use super::{Context, video};
+use burn::tensor::Device;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, parse_device};
+use serde::Serialize;
+
+/// The rasterizer that is slow, obvious, and right.
+const ORACLE: &str = "reference";
+/// Half a level of an 8-bit picture: what float32 may cost. Two correct rasterizers differ by more only where a Gaussian is just at the cut-off.
+const TOLERANCE: f32 = 0.5 / 255.0;
+
+#[derive(Serialize)]
+struct Report {
+    version: &'static str,
+    os: &'static str,
+    architecture: &'static str,
+    cpu_features: Vec<&'static str>,
+    threads: usize,
+    devices: Vec<DeviceReport>,
+    auto: &'static str,
+    auto_reason: &'static str,
+    ffmpeg: Option<String>,
+    self_check: Vec<Check>,
+    healthy: bool,
+}
+
+#[derive(Serialize)]
+struct DeviceReport {
+    name: &'static str,
+    available: bool,
+    note: String,
+}
+
+#[derive(Serialize)]
+struct Check {
+    device: &'static str,
+    rasterizer: String,
+    /// Largest difference of a pixel from the reference, 0..1.
+    max_difference: Option<f32>,
+    problem: Option<String>,
+}
+
+pub fn run(context: &Context) -> Result<()> {
+    let mut devices = Vec::new();
+    let mut self_check = Vec::new();
+    for name in DEVICE_NAMES.into_iter().filter(|n| *n != "auto") {
+        let device = parse_device(name);
+        if let Ok(device) = &device {
+            self_check.extend(check_device(context, name, device));
+        }
+        let note = device.as_ref().err().map_or_else(|| "computes on the processor".to_string(), Error::to_string);
+        devices.push(DeviceReport { name, available: device.is_ok(), note });
+    }
+    let taken = parse_device("auto")?;
+    let auto = DEVICE_NAMES.into_iter().filter(|n| *n != "auto").find(|n| parse_device(n).is_ok_and(|d| d == taken)).unwrap_or("an unnamed device");
+    let healthy = !self_check.is_empty() && self_check.iter().all(|c| c.problem.is_none());
+    let report = Report {
+        version: env!("CARGO_PKG_VERSION"),
+        os: std::env::consts::OS,
+        architecture: std::env::consts::ARCH,
+        cpu_features: cpu_features(),
+        threads: rayon::current_num_threads(),
+        devices,
+        auto,
+        auto_reason: "this build has no GPU operations yet, and flex is the CPU device burn recommends",
+        ffmpeg: video::ffmpeg_version().ok(),
+        self_check,
+        healthy,
+    };
+    context.output.result(&report, || text(&report))?;
+    if healthy { Ok(()) } else { Err(Error::backend("self-check", "a rasterizer disagrees with the reference or fails", "Report this with the output above")) }
+}
+
+fn text(r: &Report) -> String {
+    let mut lines = vec![
+        format!("cc4dgs {} on {} {}, {} threads", r.version, r.os, r.architecture, r.threads),
+        format!("processor: {}", if r.cpu_features.is_empty() { "no vector extension known here".to_string() } else { r.cpu_features.join(" ") }),
+    ];
+    lines.extend(r.devices.iter().map(|d| format!("device {:<8} {:<4} {}", d.name, if d.available { "yes" } else { "no" }, d.note)));
+    lines.push(format!("device auto     takes {}: {}", r.auto, r.auto_reason));
+    lines.push(format!("ffmpeg: {}", r.ffmpeg.as_deref().unwrap_or("not found (needed only for videos)")));
+    lines.extend(r.self_check.iter().map(|c| {
+        let result = match (&c.problem, c.max_difference) {
+            (Some(problem), _) => format!("FAILED: {problem}"),
+            (None, difference) => format!("ok, within {:.1e} of the reference", difference.unwrap_or_default()),
+        };
+        format!("self-check {} on {}: {result}", c.rasterizer, c.device)
+    }));
+    lines.join("\n")
+}
+
+/// Draws one picture with every rasterizer and compares it with the reference's.
+fn check_device(context: &Context, device_name: &'static str, device: &Device) -> Vec<Check> {
+    let names = context.registry.plugins().into_iter().filter(|(kind, p)| *kind == "rasterizer" && p.name != ORACLE).map(|(_, p)| p.name);
+    names
+        .map(|name| {
+            let difference = draw(context, ORACLE, device).and_then(|truth| {
+                let picture = draw(context, name, device)?;
+                // A value that is not a number must fail: `max` would drop it.
+                Ok(truth.iter().zip(&picture).map(|(a, b)| (a - b).abs()).fold(0.0f32, |m, d| if d <= m { m } else { d }))
+            });
+            let problem = match &difference {
+                Ok(d) if *d <= TOLERANCE => None,
+                Ok(d) => Some(format!("a pixel differs by {d} from the reference, {TOLERANCE} is allowed")),
+                Err(e) => Some(e.to_string()),
+            };
+            Check { device: device_name, rasterizer: name.to_string(), max_difference: difference.ok().filter(|d| d.is_finite()), problem }
+        })
+        .collect()
+}
+
+fn draw(context: &Context, rasterizer: &str, device: &Device) -> Result<Vec<f32>> {
+    let section = toml::Table::from_iter([("kind".to_string(), toml::Value::from(rasterizer))]);
+    let camera = Camera::look_at("doctor", (96, 64), 0.9, [0.4, -3.0, 0.8], [0.0; 3], [0.0, 0.0, 1.0]);
+    let gaussians = Gaussians::from_host(&spiral(), device);
+    let output = context.registry.build_rasterizer(&section)?.render(&Splats::from_gaussians(&gaussians, 1), &camera, &RenderSettings::default())?;
+    to_vec(output.image(), "self-check picture")
+}
+
+/// Coloured Gaussians on a spiral around a ball: every size, direction and opacity occurs, and no random number is needed.
+fn spiral() -> HostGaussians {
+    let mut g = HostGaussians { sh_degree: 1, ..Default::default() };
+    let count = 120;
+    for i in 0..count {
+        let t = (i as f32 + 0.5) / count as f32;
+        let (z, turn) = (1.0 - 2.0 * t, 2.399_963 * i as f32);
+        let r = (1.0 - z * z).sqrt();
+        g.means.extend([r * turn.cos(), r * turn.sin(), z]);
+        g.log_scales.extend([-3.5 + 1.5 * t, -2.6, -3.0 - t]);
+        g.quaternions.extend([1.0, turn.sin(), t, turn.cos()]);
+        g.opacity_logits.push(-1.0 + 4.0 * t);
+        g.sh_dc.extend([turn.sin(), turn.cos(), 1.0 - 2.0 * t]);
+        g.sh_rest.extend((0..9).map(|k| 0.2 * (turn + k as f32).sin()));
+        g.dynamic_scores.push(0.0);
+    }
+    g
+}
+
+/// Vector extensions of the processor that kernels may choose from.
+#[cfg(target_arch = "x86_64")]
+pub fn cpu_features() -> Vec<&'static str> {
+    let known = [
+        ("sse4.2", std::arch::is_x86_feature_detected!("sse4.2")),
+        ("avx", std::arch::is_x86_feature_detected!("avx")),
+        ("avx2", std::arch::is_x86_feature_detected!("avx2")),
+        ("fma", std::arch::is_x86_feature_detected!("fma")),
+        ("avx512f", std::arch::is_x86_feature_detected!("avx512f")),
+        ("avx512bw", std::arch::is_x86_feature_detected!("avx512bw")),
+        ("avx512dq", std::arch::is_x86_feature_detected!("avx512dq")),
+        ("avx512vl", std::arch::is_x86_feature_detected!("avx512vl")),
+    ];
+    known.into_iter().filter(|(_, present)| *present).map(|(name, _)| name).collect()
+}
+
+#[cfg(target_arch = "aarch64")]
+pub fn cpu_features() -> Vec<&'static str> {
+    if std::arch::is_aarch64_feature_detected!("neon") { vec!["neon"] } else { Vec::new() }
+}
+
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+pub fn cpu_features() -> Vec<&'static str> {
+    Vec::new()
+}

@@ -1,0 +1,156 @@
+//! `cc4dgs eval`.
+
+use super::{Context, evenly};
+use crate::args::Eval;
+use crate::interrupt;
+use crate::model_source::{Loaded, load_model, open_scene};
+use cc4dgs_core::{Event, EventSink, Limits, Result, Scene, Split};
+use cc4dgs_engine::eval::{EvalReport, evaluate};
+use cc4dgs_engine::pictures::{Comparison, SheetOptions, comparison_sheet, write_png};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// An evaluation with what it was made from.
+#[derive(Serialize)]
+pub struct FullReport {
+    pub model: PathBuf,
+    pub device: String,
+    /// Wall seconds of the whole evaluation.
+    pub seconds: f64,
+    /// The contact sheet, if one was drawn.
+    pub sheet: Option<PathBuf>,
+    #[serde(flatten)]
+    pub eval: EvalReport,
+    pub provenance: Provenance,
+}
+
+/// Where the model came from.
+#[derive(Serialize)]
+pub struct Provenance {
+    pub version: &'static str,
+    pub commit: String,
+    pub seed: u64,
+    pub trained_on: String,
+    pub limits: Limits,
+    pub config: toml::Table,
+}
+
+/// What to draw besides the numbers.
+#[derive(Default)]
+pub struct Pictures {
+    pub sheet: Option<PathBuf>,
+    pub sheet_rows: usize,
+    pub renders: Option<PathBuf>,
+}
+
+pub fn run(context: &Context, args: &Eval) -> Result<()> {
+    let events = context.listeners(None)?;
+    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let scene = open_scene(&args.scene, &loaded.model, &args.sets, &context.limits)?;
+    let split = args.split.into();
+    let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.model, split, context.output.json_file()));
+    let pictures = Pictures { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };
+    let report = measure(context, &args.model, &loaded, &scene, split, args.max_views, &pictures, &events)?;
+    context.output.result(&report, || text(&report))
+}
+
+/// Beside the JSON file if there is one, else in the run's folder, else beside the archive.
+fn default_sheet(model: &Path, split: Split, json_file: Option<&Path>) -> PathBuf {
+    let side = match split {
+        Split::Train => "train",
+        Split::Test => "test",
+    };
+    match json_file {
+        Some(file) => file.with_extension("png"),
+        None if model.is_dir() => model.join(format!("eval-{side}.png")),
+        None => model.with_extension(format!("{side}.png")),
+    }
+}
+
+/// Measures and draws.
+pub fn measure(
+    context: &Context,
+    model_path: &Path,
+    loaded: &Loaded,
+    scene: &Scene,
+    split: Split,
+    max_views: usize,
+    pictures: &Pictures,
+    events: &dyn EventSink,
+) -> Result<FullReport> {
+    let began = Instant::now();
+    let stop = interrupt::stop_flag()?;
+    let model = &loaded.model;
+    events.emit(&Event::RunStarted { command: "eval".into(), device: loaded.device_name.clone(), seed: model.provenance.seed });
+    for message in &scene.warnings {
+        events.emit(&Event::Warning { object: scene.name.clone(), message: message.clone() });
+    }
+    let in_split = scene.split(split).len();
+    let measured = if max_views == 0 { in_split } else { max_views.min(in_split) };
+    let mut rows = if pictures.sheet.is_some() { evenly(measured, pictures.sheet_rows) } else { Vec::new() };
+    rows.reverse();
+    let mut comparisons = Vec::with_capacity(rows.len());
+    let mut index = 0;
+    let report = evaluate(model, scene, split, max_views, &context.registry, &loaded.device, events, &mut |view, truth, render, score| {
+        interrupt::check(stop, "evaluation; nothing was written but finished renders")?;
+        if rows.last() == Some(&index) {
+            rows.pop();
+            let caption =
+                format!("{} frame {} t {:.3}  PSNR {:.2} dB  SSIM {:.4}", score.camera, score.frame, scene.views[view].time_norm, score.psnr_db, score.ssim);
+            comparisons.push(Comparison { caption, reference: truth.clone(), render: render.clone() });
+        }
+        if let Some(folder) = &pictures.renders {
+            write_png(&folder.join(format!("{index:05}.png")), render)?;
+        }
+        index += 1;
+        Ok(())
+    })?;
+    if let Some(path) = &pictures.sheet {
+        let title = format!("{}: PSNR {:.2} dB  SSIM {:.4}  {:.3} MB", report.scene, report.psnr_db, report.ssim, report.size_mb.total);
+        write_png(path, &comparison_sheet(&comparisons, &SheetOptions { title, ..Default::default() })?)?;
+    }
+    for (counter, done, skipped) in [
+        ("Gaussians deformed", report.work.deformed, report.work.static_skipped),
+        ("spatial passes of the field", report.work.frames - report.work.spatial_cached, report.work.spatial_cached),
+        ("vertices decoded", report.work.spatial.vertices_decoded, report.work.spatial.vertices_queried - report.work.spatial.vertices_decoded),
+    ] {
+        events.emit(&Event::Work { stage: "eval".into(), counter: counter.into(), done, skipped });
+    }
+    let provenance = &model.provenance;
+    Ok(FullReport {
+        model: model_path.to_path_buf(),
+        device: loaded.device_name.clone(),
+        seconds: began.elapsed().as_secs_f64(),
+        sheet: pictures.sheet.clone(),
+        eval: report,
+        provenance: Provenance {
+            version: env!("CARGO_PKG_VERSION"),
+            commit: provenance.commit.clone(),
+            seed: provenance.seed,
+            trained_on: provenance.device.clone(),
+            limits: context.limits,
+            config: provenance.config.clone(),
+        },
+    })
+}
+
+/// The report for people.
+pub fn text(report: &FullReport) -> String {
+    let e = &report.eval;
+    let ms_ssim = e.ms_ssim.map_or_else(|| "too small".to_string(), |v| format!("{v:.4}"));
+    let mut lines = vec![
+        format!("{} on {} ({} pictures)", report.model.display(), e.scene, e.images.len()),
+        format!("  PSNR {:.3} dB   SSIM {:.4} (Inria) {:.4} (skimage)   MS-SSIM {ms_ssim}", e.psnr_db, e.ssim, e.ssim_skimage),
+        format!("  size {:.4} MB: deform {:.4} MB, point cloud {:.4} MB", e.size_mb.total, e.size_mb.deform, e.size_mb.point_cloud),
+        format!("  {} Gaussians, {} of them dynamic", e.gaussians, e.dynamic_gaussians),
+        format!(
+            "  frame {:.2} ms: field {:.2} + rasterizer {:.2}; first frame: field {:.2} + rasterizer {:.2}",
+            e.frame_ms.mean, e.frame_ms.field, e.frame_ms.raster, e.frame_ms.field_first, e.frame_ms.raster_first
+        ),
+    ];
+    if let Some(path) = &report.sheet {
+        lines.push(format!("  contact sheet {}", path.display()));
+    }
+    lines.join("\n")
+}

@@ -1,0 +1,133 @@
+//! `cc4dgs info`.
+
+use super::compress::StreamSize;
+use super::{Context, megabytes};
+use crate::args::Info;
+use cc4dgs_core::archive::{Archive, MAGIC};
+use cc4dgs_core::{Error, HostGaussians, Result, Silent, Split, parse_device};
+use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_engine::model::Model;
+use cc4dgs_engine::ply;
+use cc4dgs_engine::train::CHECKPOINT;
+use serde_json::{Value, json};
+use std::io::Read;
+use std::path::Path;
+
+pub fn run(context: &Context, args: &Info) -> Result<()> {
+    let value = describe(context, &args.path)?;
+    context.output.result(&value, || {
+        let mut lines = Vec::new();
+        flatten("", &value, &mut lines);
+        lines.join("\n")
+    })
+}
+
+fn describe(context: &Context, path: &Path) -> Result<Value> {
+    if path.is_dir() && path.join(CHECKPOINT).is_file() {
+        return checkpoint(context, path);
+    }
+    if path.is_file() {
+        let mut head = Vec::new();
+        std::fs::File::open(path).and_then(|f| f.take(8).read_to_end(&mut head)).map_err(|e| Error::io(path, e))?;
+        if head == MAGIC {
+            return archive(context, path);
+        }
+        if head.starts_with(b"ply") {
+            return Ok(json!({ "kind": "ply", "path": path, "gaussians": gaussians(&ply::read(path, &context.limits)?)? }));
+        }
+        // A checkpoint is a safetensors file: a length of eight bytes, of which the upper ones are zero.
+        if head.len() == 8 && head[4..] == [0; 4] {
+            return checkpoint(context, path);
+        }
+    }
+    scene(context, path)
+}
+
+/// An archive's directory and manifest; no stream is decoded.
+fn archive(context: &Context, path: &Path) -> Result<Value> {
+    let archive = Archive::open(path, &context.limits)?;
+    let manifest = plain(archive.manifest())?;
+    let streams: Vec<StreamSize> = archive.stream_sizes().into_iter().map(StreamSize::from).collect();
+    Ok(json!({ "kind": "archive", "path": path, "size_mb": megabytes(archive.total_bytes()?), "streams": streams, "manifest": manifest }))
+}
+
+fn checkpoint(context: &Context, path: &Path) -> Result<Value> {
+    let model = Model::load(path, &context.registry, &parse_device("auto")?, &context.limits, &Silent)?;
+    let moving = model.moving.rows(&model.gaussians.dynamic_scores).map_or(model.gaussians.len(), |rows| rows.len());
+    let size: cc4dgs_engine::eval::SizeMb = model.size.into();
+    let field = match &model.field {
+        Some(f) => json!({ "settings": plain(&f.section)?, "context": plain(&f.context)? }),
+        None => Value::Null,
+    };
+    Ok(json!({
+        "kind": "checkpoint",
+        "path": path,
+        "size_mb": size,
+        "gaussians": gaussians(&model.gaussians)?,
+        "dynamic_gaussians": moving,
+        "moving": plain(&model.moving)?,
+        "frame_count": model.frame_count,
+        "deformer": field,
+        "rasterizer": plain(&model.rasterizer)?,
+        "render": plain(&model.render)?,
+        "provenance": plain(&model.provenance)?,
+    }))
+}
+
+fn gaussians(host: &HostGaussians) -> Result<Value> {
+    let range = |k: usize| {
+        let axis = host.means.iter().skip(k).step_by(3);
+        (!host.is_empty()).then(|| [axis.clone().copied().fold(f32::INFINITY, f32::min), axis.copied().fold(f32::NEG_INFINITY, f32::max)])
+    };
+    let extra: Vec<_> = host.extra.iter().map(|(name, a)| json!({ "name": name, "width": a.width })).collect();
+    let [x, y, z] = [plain(&range(0))?, plain(&range(1))?, plain(&range(2))?];
+    Ok(json!({ "count": host.len(), "sh_degree": host.sh_degree, "x": x, "y": y, "z": z, "extra": extra }))
+}
+
+fn scene(context: &Context, path: &Path) -> Result<Value> {
+    let scene = data::open(path, &SceneOptions::default(), &context.limits)?;
+    let sizes: std::collections::BTreeSet<(u32, u32)> = scene.cameras.iter().map(|c| (c.width, c.height)).collect();
+    let sizes: Vec<String> = sizes.into_iter().map(|(w, h)| format!("{w}x{h}")).collect();
+    Ok(json!({
+        "kind": "scene",
+        "path": path,
+        "name": scene.name,
+        "cameras": scene.cameras.len(),
+        "frames": scene.frame_count,
+        "train_views": scene.split(Split::Train).len(),
+        "test_views": scene.split(Split::Test).len(),
+        "picture_sizes": sizes,
+        "camera_extent": plain(&scene.extent())?,
+        "initial_points": scene.points.as_ref().map(|p| p.positions.len()),
+        "init_box": plain(&scene.init_box)?,
+        "background": plain(&scene.background)?,
+        "warnings": scene.warnings,
+    }))
+}
+
+/// The JSON form through text, so that a float32 of 0.1 reads 0.1 and not its nearest float64.
+fn plain(value: &impl serde::Serialize) -> Result<Value> {
+    serde_json::to_string(value)
+        .and_then(|text| serde_json::from_str(&text))
+        .map_err(|e| Error::backend("JSON", e.to_string(), "Report this: every fact should have a JSON form"))
+}
+
+/// One `key: value` line per leaf; lists of objects line by line.
+fn flatten(prefix: &str, value: &Value, lines: &mut Vec<String>) {
+    match value {
+        Value::Object(map) => {
+            for (key, inner) in map {
+                let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+                flatten(&name, inner, lines);
+            }
+        }
+        Value::Array(items) if items.iter().any(Value::is_object) => {
+            for (i, inner) in items.iter().enumerate() {
+                lines.push(format!("{prefix}[{i}]: {inner}"));
+            }
+        }
+        Value::String(text) => lines.push(format!("{prefix}: {text}")),
+        Value::Null => {}
+        other => lines.push(format!("{prefix}: {other}")),
+    }
+}

@@ -1,0 +1,111 @@
+//! The commands.
+
+mod bench;
+mod compress;
+mod decompress;
+mod demo;
+mod doctor;
+mod eval;
+mod info;
+mod plugins;
+mod render;
+mod train;
+mod video;
+
+use crate::args::{BenchWhat, Cli, Command};
+use crate::listeners::{JsonLines, Progress};
+use crate::output::Output;
+use cc4dgs_core::{Error, EventSink, Fanout, Limits, Registry, Result, config};
+use std::path::Path;
+
+/// What every command is handed.
+pub struct Context<'a> {
+    pub registry: Registry,
+    pub output: &'a Output,
+    pub limits: Limits,
+    /// The `--limit` options as they came.
+    pub limit_options: &'a [String],
+}
+
+impl Context<'_> {
+    /// The listeners of a command: progress unless `--quiet`, and a log if `log` names a file.
+    pub fn listeners(&self, log: Option<(&Path, bool)>) -> Result<Fanout> {
+        let mut sinks: Vec<Box<dyn EventSink>> = Vec::new();
+        if !self.output.quiet() {
+            sinks.push(Box::new(Progress::new()));
+        }
+        if let Some((path, append)) = log {
+            sinks.push(Box::new(JsonLines::open(path, append)?));
+        }
+        Ok(Fanout(sinks))
+    }
+}
+
+/// Runs the command that was asked for.
+pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
+    if cli.threads > 0 {
+        // Where the pool already runs (a program calling `run` twice), it stays as it is: results do not depend on it.
+        rayon::ThreadPoolBuilder::new().num_threads(cli.threads.min(1024)).build_global().ok();
+    }
+    let context = Context { registry: Registry::collect()?, output, limits: limits(&cli.limits)?, limit_options: &cli.limits };
+    match &cli.command {
+        Command::Demo(args) => demo::run(&context, args),
+        Command::Train(args) => train::run(&context, args),
+        Command::Compress(args) => compress::run(&context, args),
+        Command::Decompress(args) => decompress::run(&context, args),
+        Command::Render(args) => render::run(&context, args),
+        Command::Eval(args) => eval::run(&context, args),
+        Command::Info(args) => info::run(&context, args),
+        Command::Plugins(args) => plugins::run(&context, args),
+        Command::Doctor(_) => doctor::run(&context),
+        Command::Bench(args) => match &args.what {
+            BenchWhat::Step(args) => bench::step(&context, args),
+        },
+    }
+}
+
+fn limits(options: &[String]) -> Result<Limits> {
+    let mut table = toml::Table::new();
+    for option in options {
+        config::set(&mut table, option)?;
+    }
+    config::parse_section("--limit", &table)
+}
+
+/// Creates the folder a file will be written to, before any long work that would be lost without it.
+pub fn create_parent(path: &Path) -> Result<()> {
+    match path.parent().filter(|p| !p.as_os_str().is_empty()) {
+        Some(folder) => std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e)),
+        None => Ok(()),
+    }
+}
+
+/// `bytes` as MB = 10^6 bytes.
+pub fn megabytes(bytes: u64) -> f64 {
+    bytes as f64 / 1e6
+}
+
+/// `wanted` of 0..`len`, evenly spread from the first on; all of them if there are fewer.
+pub fn evenly(len: usize, wanted: usize) -> Vec<usize> {
+    if wanted >= len { (0..len).collect() } else { (0..wanted).map(|i| i * len / wanted).collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_are_read_strictly() {
+        assert_eq!(limits(&["max_gaussians=7".into()]).unwrap(), Limits { max_gaussians: 7, ..Limits::default() });
+        for bad in ["max_gausians=7", "max_bytes=-1", "max_bytes"] {
+            assert!(limits(&[bad.into()]).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn evenly_covers_without_repeating() {
+        assert_eq!(evenly(10, 3), [0, 3, 6]);
+        assert_eq!(evenly(2, 5), [0, 1]);
+        assert_eq!(evenly(5, 0), [0usize; 0]);
+    }
+}

@@ -1,0 +1,103 @@
+//! `cc4dgs render`.
+
+use super::{Context, create_parent, evenly, video};
+use crate::args::Render;
+use crate::interrupt;
+use crate::model_source::{load_model, open_scene};
+use crate::orbit::orbit;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Camera, Error, Event, EventSink, Image8, Result};
+use cc4dgs_engine::pictures::write_png;
+use cc4dgs_engine::play::Player;
+use serde::Serialize;
+use std::path::PathBuf;
+
+const ORBIT_FRAMES: usize = 60;
+const ORBIT_SIZE: (u32, u32) = (800, 600);
+
+#[derive(Serialize)]
+struct RenderReport {
+    model: PathBuf,
+    device: String,
+    folder: PathBuf,
+    frames: usize,
+    mp4: Option<PathBuf>,
+    /// Means over all frames but the first, which computes what the others reuse.
+    frame_ms: Timing,
+}
+
+#[derive(Serialize)]
+struct Timing {
+    field: f64,
+    raster: f64,
+}
+
+pub fn run(context: &Context, args: &Render) -> Result<()> {
+    if args.mp4.is_some() {
+        // Before any frame: an hour of rendering should not end in a missing program.
+        video::ffmpeg_version()?;
+    }
+    let stop = interrupt::stop_flag()?;
+    let events = context.listeners(None)?;
+    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let shots = shots(context, args, &loaded.model)?;
+    std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
+    let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?;
+    let mut times = Vec::with_capacity(shots.len());
+    for (index, (camera, time_norm)) in shots.iter().enumerate() {
+        interrupt::check(stop, &format!("after {index} of {} frames in {}", shots.len(), args.out.display()))?;
+        let (output, time) = player.render(camera, *time_norm)?;
+        let picture = Image8::from_planes(&to_vec(output.image(), "render")?, camera.width, camera.height);
+        write_png(&args.out.join(format!("frame_{index:05}.png")), &picture)?;
+        times.push(time);
+        events.emit(&Event::Progress { task: "render".into(), done: index as u64 + 1, total: shots.len() as u64 });
+    }
+    if let Some(path) = &args.mp4 {
+        create_parent(path)?;
+        video::encode(&args.out, shots.len(), args.fps, path)?;
+    }
+    let steady = if times.len() > 1 { &times[1..] } else { &times[..] };
+    let mean = |pick: fn(&cc4dgs_engine::play::FrameTime) -> f64| steady.iter().map(pick).sum::<f64>() / steady.len() as f64;
+    let report = RenderReport {
+        model: args.model.clone(),
+        device: loaded.device_name.clone(),
+        folder: args.out.clone(),
+        frames: shots.len(),
+        mp4: args.mp4.clone(),
+        frame_ms: Timing { field: mean(|t| t.field_ms), raster: mean(|t| t.raster_ms) },
+    };
+    context.output.result(&report, || {
+        let video = args.mp4.as_ref().map_or_else(String::new, |p| format!(" and {}", p.display()));
+        format!(
+            "{} frames in {}{video}; field {:.2} + rasterizer {:.2} ms per frame",
+            report.frames,
+            args.out.display(),
+            report.frame_ms.field,
+            report.frame_ms.raster
+        )
+    })
+}
+
+/// Cameras and times to render.
+fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) -> Result<Vec<(Camera, f32)>> {
+    let Some(path) = &args.scene else {
+        if !args.sets.is_empty() {
+            return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));
+        }
+        let frames = args.frames.map_or(ORBIT_FRAMES, |n| n as usize);
+        let cameras = orbit(&model.gaussians, args.size.unwrap_or(ORBIT_SIZE), frames, args.turns, args.up.into())?;
+        let time = |i: usize| if frames > 1 { i as f32 / (frames - 1) as f32 } else { 0.0 };
+        return Ok(cameras.into_iter().enumerate().map(|(i, camera)| (camera, time(i))).collect());
+    };
+    let scene = open_scene(path, model, &args.sets, &context.limits)?;
+    let views = scene.split(args.split.into());
+    if views.is_empty() {
+        return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));
+    }
+    let wanted = args.frames.map_or(views.len(), |n| n as usize);
+    let shot = |i: usize| {
+        let camera = scene.camera(views[i]);
+        (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[views[i]].time_norm)
+    };
+    Ok(evenly(views.len(), wanted).into_iter().map(shot).collect())
+}

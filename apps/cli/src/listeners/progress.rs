@@ -1,0 +1,102 @@
+//! What people see of a run, on standard error: a bar on a terminal, an occasional line elsewhere.
+
+use cc4dgs_core::{Event, EventSink};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::{IsTerminal, Write};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+/// Between two lines of progress where there is no terminal.
+const LINE_INTERVAL: Duration = Duration::from_secs(15);
+
+/// Shows stage, position, ETA, PSNR and the number of Gaussians.
+pub struct Progress {
+    terminal: bool,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    /// The bar on show and what it is about.
+    bar: Option<(String, ProgressBar)>,
+    last_line: Option<Instant>,
+}
+
+impl Progress {
+    pub fn new() -> Self {
+        Self { terminal: std::io::stderr().is_terminal(), state: Mutex::default() }
+    }
+}
+
+impl State {
+    fn say(&self, line: &str) {
+        match &self.bar {
+            Some((_, bar)) if !bar.is_hidden() => bar.println(line),
+            // Without a standard error nobody reads progress.
+            _ => _ = writeln!(std::io::stderr(), "{line}"),
+        }
+    }
+    /// The bar about `task`, made anew when the task changes.
+    fn bar(&mut self, task: &str, total: u64, terminal: bool) -> &ProgressBar {
+        if self.bar.as_ref().is_none_or(|(name, _)| name != task) {
+            self.clear();
+            let target = if terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+            let bar = ProgressBar::with_draw_target(Some(total), target);
+            if let Ok(style) = ProgressStyle::with_template("{prefix:>9} [{bar:30}] {pos}/{len} {elapsed_precise} eta {eta_precise} {msg}") {
+                bar.set_style(style.progress_chars("=> "));
+            }
+            bar.set_prefix(task.to_string());
+            self.last_line = None;
+            self.bar = Some((task.to_string(), bar));
+        }
+        let (_, bar) = self.bar.get_or_insert_with(|| (task.to_string(), ProgressBar::hidden()));
+        bar.set_length(total);
+        bar
+    }
+    fn clear(&mut self) {
+        if let Some((_, bar)) = self.bar.take() {
+            bar.finish_and_clear();
+        }
+    }
+    fn advance(&mut self, task: &str, done: u64, total: u64, message: String, terminal: bool) {
+        let bar = self.bar(task, total, terminal);
+        bar.set_position(done);
+        let eta = bar.eta();
+        bar.set_message(message.clone());
+        let due = self.last_line.is_none_or(|at| at.elapsed() >= LINE_INTERVAL);
+        if !terminal && due {
+            self.last_line = Some(Instant::now());
+            self.say(&format!("{task} {done}/{total} eta {}s {message}", eta.as_secs()));
+        }
+        if done >= total {
+            self.clear();
+        }
+    }
+}
+
+impl EventSink for Progress {
+    fn emit(&self, event: &Event) {
+        let Ok(mut state) = self.state.lock() else { return };
+        match event {
+            Event::RunStarted { command, device, seed } => state.say(&format!("{command} on {device}, seed {seed}")),
+            Event::Warning { object, message } => state.say(&format!("warning: {object}: {message}")),
+            Event::StageStarted { stage, iterations, gaussians } => {
+                state.say(&format!("stage {stage}: {iterations} iterations from {gaussians} Gaussians"));
+                state.bar(stage, *iterations as u64, self.terminal);
+            }
+            Event::Iteration { stage, iteration, of, loss, psnr_db, gaussians, ms } => {
+                let message = format!("PSNR {psnr_db:.2} dB loss {loss:.4} N {gaussians} {ms:.0} ms");
+                state.advance(stage, *iteration as u64, *of as u64, message, self.terminal);
+            }
+            Event::Progress { task, done, total } => state.advance(task, *done, *total, String::new(), self.terminal),
+            Event::StageFinished { stage, seconds, gaussians } => {
+                state.clear();
+                state.say(&format!("stage {stage} done in {seconds:.1} s, {gaussians} Gaussians"));
+            }
+            Event::Work { stage, counter, done, skipped } => state.say(&format!("{stage}: {counter}: {done} done, {skipped} skipped")),
+            Event::Saved { path, bytes } => state.say(&format!("wrote {path} ({:.3} MB)", *bytes as f64 / 1e6)),
+            // Densification shows in the number of Gaussians; the log has the rest.
+            _ => {}
+        }
+    }
+}

@@ -1,0 +1,211 @@
+//! The command as its users meet it: a process, files, exit codes.
+#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
+
+use serde_json::Value;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+fn cc4dgs() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cc4dgs"));
+    command.stdin(Stdio::null());
+    command
+}
+
+fn run(args: &[&str]) -> Output {
+    cc4dgs().args(args).output().expect("the program starts")
+}
+
+fn succeed(args: &[&str]) -> Output {
+    let output = run(args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    output
+}
+
+fn json_of(args: &[&str]) -> Value {
+    serde_json::from_slice(&succeed(args).stdout).expect("standard output is JSON")
+}
+
+/// Runs a command that must fail with `code`; returns what it said.
+fn fail(args: &[&str], code: i32) -> String {
+    let output = run(args);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {said}");
+    assert!(said.contains("error"), "{args:?}: {said}");
+    said
+}
+
+fn read_json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// The smallest scene and the shortest training that goes through every stage.
+fn train_args<'a>(out: &'a str, iterations: &'a str) -> Vec<&'a str> {
+    vec![
+        "train",
+        "--scene",
+        "procedural:tiny",
+        "--preset",
+        "demo",
+        "--set",
+        iterations,
+        "--set",
+        "train.checkpoint_every=0",
+        "--device",
+        "flex",
+        "--out",
+        out,
+        "-q",
+    ]
+}
+
+#[test]
+fn plugins_are_listed_with_four_facts_each() {
+    let list = json_of(&["plugins", "--json"]);
+    let list = list.as_array().unwrap();
+    for (kind, name) in [("deformer", "cdf"), ("deformer", "none"), ("codec", "raw"), ("codec", "cca"), ("rasterizer", "tile"), ("rasterizer", "reference")] {
+        assert!(list.iter().any(|p| p["kind"] == kind && p["name"] == name), "{kind} {name} is missing");
+    }
+    for plugin in list {
+        let keys: Vec<&String> = plugin.as_object().unwrap().keys().collect();
+        assert_eq!(keys, ["kind", "name", "summary", "version"]);
+        assert!(plugin.as_object().unwrap().values().all(|v| v.as_str().is_some_and(|s| !s.is_empty())), "{plugin}");
+    }
+    let cdf = json_of(&["plugins", "cdf", "--json"]);
+    assert!(cdf[0]["schema"].as_str().unwrap().contains("capacity"), "{cdf}");
+    assert!(fail(&["plugins", "cfd"], 2).contains("cdf"));
+}
+
+#[test]
+fn mistakes_end_with_their_own_exit_code() {
+    let folder = tempfile::tempdir().unwrap();
+    let (out, broken) = (folder.path().join("out"), folder.path().join("broken.cc4d"));
+    fail(&["trian"], 2);
+    fail(&["eval"], 2);
+    fail(&["render", "x", "--out", "y", "--size", "0x3"], 2);
+    assert!(fail(&["train", "--scene", "procedural", "--preset", "dnerf-gpu", "--out", text(&out)], 2).contains("dnerf-cpu"));
+    assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--set", "train.iteratons=3", "--out", text(&out)], 2).contains("iteratons"));
+    assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--device", "fleks", "--out", text(&out)], 2).contains("flex"));
+    fail(&["train", "--scene", text(&folder.path().join("nowhere")), "--out", text(&out)], 2);
+    assert!(!out.exists(), "a refused command leaves nothing behind");
+    std::fs::write(&broken, b"\x89CC4D\r\n\x1a and then nothing that makes sense, for more than a header's length").unwrap();
+    fail(&["info", text(&broken)], 3);
+    fail(&["eval", text(&broken), "--scene", "procedural:tiny"], 3);
+    fail(&["decompress", text(&folder.path().join("missing.cc4d")), "--out", text(&out)], 3);
+    fail(&["--limit", "max_gausians=3", "doctor"], 2);
+    let output = run(&["info", text(&broken), "--json"]);
+    let object: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((output.status.code(), &object["error"]["exit_code"]), (Some(3), &Value::from(3)));
+}
+
+#[test]
+fn a_scene_goes_through_the_whole_chain() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (dir, archive, ply) = (at("run"), at("model.cc4d"), at("model.ply"));
+    succeed(&train_args(text(&dir), "train.iterations=120"));
+    for name in ["checkpoint", "config.toml", "events.jsonl"] {
+        assert!(dir.join(name).is_file(), "{name}");
+    }
+    let log = std::fs::read_to_string(dir.join("events.jsonl")).unwrap();
+    let events: Vec<Value> = log.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    assert_eq!(events[0]["event"], "run-started");
+    assert!(events.iter().any(|e| e["event"] == "stage-started" && e["stage"] == "main"), "{log}");
+
+    succeed(&["compress", text(&dir), "--codec", "cca:default", "--out", text(&archive), "-q"]);
+    let (json, sheet) = (at("eval.json"), at("eval.png"));
+    succeed(&["eval", text(&archive), "--scene", "procedural:tiny", "--split", "test", "-q", "--json", text(&json)]);
+    let report = read_json(&json);
+    let number = |pointer: &str| report.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("{pointer} in {report}"));
+    assert!(number("/psnr_db") > 10.0 && number("/ssim") > 0.1 && number("/ssim") <= 1.0, "{report}");
+    let on_disk = std::fs::metadata(&archive).unwrap().len() as f64;
+    assert!((number("/size_mb/total") * 1e6 - on_disk).abs() < 0.5, "MB are 10^6 bytes on disk");
+    assert!(number("/size_mb/point_cloud") > 0.0 && number("/size_mb/deform") >= 0.0);
+    assert!(number("/size_mb/point_cloud") + number("/size_mb/deform") <= number("/size_mb/total"));
+    assert!(number("/frame_ms/mean") > 0.0);
+    assert_eq!(report["images"].as_array().unwrap().len(), 4);
+    assert!(image::open(&sheet).unwrap().width() > 3 * 40);
+
+    // The checkpoint evaluates too, and its float32 form is the larger one.
+    let plain = json_of(&["eval", text(&dir), "--scene", "procedural:tiny", "-q", "--sheet-rows", "0", "--json"]);
+    assert!(plain["size_mb"]["total"].as_f64().unwrap() > number("/size_mb/total"));
+    assert!((plain["psnr_db"].as_f64().unwrap() - number("/psnr_db")).abs() < 0.5);
+
+    succeed(&["decompress", text(&archive), "--out", text(&ply), "-q"]);
+    let (model, cloud) = (json_of(&["info", text(&archive), "--json"]), json_of(&["info", text(&ply), "--json"]));
+    assert_eq!((&model["kind"], &cloud["kind"]), (&Value::from("archive"), &Value::from("ply")));
+    assert_eq!(model["manifest"]["gaussian_count"], cloud["gaussians"]["count"]);
+    assert_eq!(json_of(&["info", text(&dir), "--json"])["gaussians"]["count"], cloud["gaussians"]["count"]);
+
+    let frames = at("frames");
+    let report = json_of(&["render", text(&archive), "--out", text(&frames), "--frames", "3", "--size", "48x36", "-q", "--json"]);
+    assert_eq!(report["frames"], 3);
+    for i in 0..3 {
+        let picture = image::open(frames.join(format!("frame_{i:05}.png"))).unwrap();
+        assert_eq!((picture.width(), picture.height()), (48, 36));
+    }
+    succeed(&["render", text(&archive), "--out", text(&at("views")), "--scene", "procedural:tiny", "--frames", "2", "-q"]);
+    assert_eq!(std::fs::read_dir(at("views")).unwrap().count(), 2);
+    let output = cc4dgs().args(["render", text(&archive), "--out", text(&at("v")), "--mp4", text(&at("v.mp4"))]).env("PATH", "").output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("ffmpeg") && !at("v").exists());
+    // A limit below the model's size is its own kind of failure.
+    fail(&["--limit", "max_gaussians=5", "decompress", text(&archive), "--out", text(&at("no.ply")), "-q"], 4);
+    assert!(!at("no.ply").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_run_resumes_to_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, parts) = (folder.path().join("whole"), folder.path().join("parts"));
+    let iterations = "train.iterations=400";
+    succeed(&train_args(text(&whole), iterations));
+
+    let log = parts.join("events.jsonl");
+    let mut child = cc4dgs().args(train_args(text(&parts), iterations)).stderr(Stdio::piped()).spawn().unwrap();
+    let began = Instant::now();
+    while !std::fs::read_to_string(&log).is_ok_and(|l| l.contains("\"iteration\"")) && child.try_wait().unwrap().is_none() {
+        assert!(began.elapsed() < Duration::from_secs(120), "no iteration within two minutes");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_ne!(std::fs::read(parts.join("checkpoint")).unwrap(), std::fs::read(whole.join("checkpoint")).unwrap());
+
+    let lines = std::fs::read_to_string(&log).unwrap().lines().count();
+    succeed(&["train", "--scene", "procedural:tiny", "--resume", "--out", text(&parts), "-q"]);
+    assert!(std::fs::read_to_string(&log).unwrap().lines().count() > lines, "the log goes on where it ended");
+    let same = std::fs::read(parts.join("checkpoint")).unwrap() == std::fs::read(whole.join("checkpoint")).unwrap();
+    assert!(same, "interruption changed the result");
+}
+
+#[test]
+fn the_doctor_finds_the_rasterizers_right() {
+    let report = json_of(&["doctor", "--json"]);
+    assert_eq!(report["healthy"], true, "{report}");
+    let checks = report["self_check"].as_array().unwrap();
+    for device in ["flex", "ndarray"] {
+        assert!(checks.iter().any(|c| c["device"] == device && c["rasterizer"] == "tile"), "{report}");
+    }
+}
+
+#[test]
+fn the_step_benchmark_reports_its_cases() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bench.json");
+    succeed(&["bench", "step", "--device", "flex", "--repeats", "1", "--json", text(&file), "-q"]);
+    let report = read_json(&file);
+    let cases = report["cases"].as_array().unwrap();
+    assert!(!cases.is_empty());
+    for case in cases {
+        for key in ["width", "height", "gaussians", "median_ms", "pairs_per_s"] {
+            assert!(case[key].as_f64().is_some_and(|v| v > 0.0), "{key} in {case}");
+        }
+    }
+}
