@@ -90,7 +90,8 @@ fn decoder_times(n: usize, device: &Device) -> cc4dgs_core::Result<()> {
 
 fn main() -> cc4dgs_core::Result<()> {
     let n = std::env::args().nth(1).and_then(|n| n.parse().ok()).unwrap_or(5_000);
-    for (name, device) in [("flex", Device::flex()), ("ndarray", Device::ndarray())] {
+    for name in ["flex", "ndarray"] {
+        let device = cc4dgs_core::parse_device(name)?;
         println!("[{name}]");
         for capacity in ["default", "small"] {
             field_times(n, capacity, &device)?;

@@ -1,11 +1,15 @@
 //! Adam in one sweep over parameters, moments and gradients (Kingma and Ba 2015, as PyTorch computes it).
 
-use pulp::Arch;
+use crate::cpu::scratch::scratch;
+use crate::cpu::simd::{Lanes, dispatch};
+use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Elements per task; rows are never split.
 const CHUNK: usize = 16 << 10;
+/// From this width on, runs of wanted rows are updated one after the other; narrower rows are masked element by element.
+const WIDE_ROW: usize = 16;
 
 /// The scalars of one step, bias corrections folded in.
 #[derive(Clone, Copy, Debug)]
@@ -32,79 +36,119 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
     if param.is_empty() || width == 0 {
         return 0;
     }
-    let arch = Arch::new();
     let rows_per_chunk = (CHUNK / width).max(1);
     let chunk = rows_per_chunk * width;
     let skipped = AtomicU64::new(0);
     let chunks = param.par_chunks_mut(chunk).zip(m.par_chunks_mut(chunk)).zip(v.par_chunks_mut(chunk)).zip(grad.par_chunks(chunk));
     chunks.enumerate().for_each(|(i, (((p, m), v), g))| {
-        let count = p.len() / width;
-        let visible = rows.map(|rows| &rows[i * rows_per_chunk..][..count]);
-        let finite = arch.dispatch(|| all_finite(g));
+        let visible = rows.map(|rows| &rows[i * rows_per_chunk..][..p.len() / width]);
+        let finite = dispatch(AllFinite(g));
         if finite && visible.is_none_or(|rows| rows.iter().all(|&r| r)) {
-            arch.dispatch(|| update(p, m, v, g, scalars));
-            return;
+            return dispatch(Update { p, m, v, g, keep: None, scalars });
         }
         let mut bad = 0;
-        let keep: Vec<bool> = (0..count)
-            .map(|row| {
-                let wanted = visible.is_none_or(|rows| rows[row]);
-                let row_finite = finite || g[row * width..][..width].iter().all(|v| v.is_finite());
-                bad += u64::from(wanted && !row_finite);
-                wanted && row_finite
-            })
-            .collect();
-        skipped.fetch_add(bad, Ordering::Relaxed);
-        // Spread over the elements, so that the arithmetic below stays free of branches.
-        let mut mask = vec![0u32; p.len()];
-        for (mask, &keep) in mask.chunks_exact_mut(width).zip(&keep) {
-            mask.fill(if keep { u32::MAX } else { 0 });
+        let mut wanted = |row: usize| {
+            let visible = visible.is_none_or(|rows| rows[row]);
+            let row_finite = finite || g[row * width..][..width].iter().all(|v| v.is_finite());
+            bad += u64::from(visible && !row_finite);
+            visible && row_finite
+        };
+        if width >= WIDE_ROW {
+            let mut start = 0;
+            for row in 0..=p.len() / width {
+                if row < p.len() / width && wanted(row) {
+                    continue;
+                }
+                let run = start * width..row * width;
+                dispatch(Update { p: &mut p[run.clone()], m: &mut m[run.clone()], v: &mut v[run.clone()], g: &g[run], keep: None, scalars });
+                start = row + 1;
+            }
+        } else {
+            let mut keep = scratch(p.len());
+            for (row, keep) in keep.chunks_exact_mut(width).enumerate() {
+                keep.fill(f32::from(u8::from(wanted(row))));
+            }
+            dispatch(Update { p, m, v, g, keep: Some(&keep), scalars });
         }
-        arch.dispatch(|| update_masked(p, m, v, g, &mask, scalars));
+        skipped.fetch_add(bad, Ordering::Relaxed);
     });
     skipped.into_inner()
 }
 
 /// x * 0 is 0 for finite numbers and NaN for all others.
-#[inline(always)]
-fn all_finite(values: &[f32]) -> bool {
-    let mut lanes = [0.0f32; 64];
-    let chunks = values.chunks_exact(64);
-    let rest = chunks.remainder().iter().all(|v| v.is_finite());
-    for chunk in chunks {
-        for (lane, v) in lanes.iter_mut().zip(chunk) {
-            *lane += v * 0.0;
+struct AllFinite<'a>(&'a [f32]);
+
+impl WithSimd for AllFinite<'_> {
+    type Output = bool;
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> bool {
+        let chunks = self.0.chunks_exact(Lanes::<S>::COUNT);
+        let rest = chunks.remainder().iter().all(|v| v.is_finite());
+        let mut zeros = Lanes::splat(simd, 0.0);
+        for chunk in chunks {
+            zeros = Lanes::load(simd, chunk).fma(zeros.like(0.0), zeros);
+        }
+        rest && zeros.sum() == 0.0
+    }
+}
+
+/// The update of a run of elements; where `keep` is 0, nothing changes.
+struct Update<'a> {
+    p: &'a mut [f32],
+    m: &'a mut [f32],
+    v: &'a mut [f32],
+    g: &'a [f32],
+    keep: Option<&'a [f32]>,
+    scalars: &'a AdamScalars,
+}
+
+impl WithSimd for Update<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let lanes = Lanes::<S>::COUNT;
+        let whole = self.p.len() / lanes * lanes;
+        for at in (0..whole).step_by(lanes) {
+            let keep = self.keep.map(|keep| &keep[at..]);
+            advance(simd, &mut self.p[at..], &mut self.m[at..], &mut self.v[at..], &self.g[at..], keep, self.scalars);
+        }
+        // The rest goes through a vector of its own, so that an element's arithmetic does not depend on its place.
+        let rest = self.p.len() - whole;
+        if rest > 0 {
+            let mut padded = [[0.0f32; MAX_LANES]; 5];
+            let rows = [&*self.p, &*self.m, &*self.v, self.g, self.keep.unwrap_or(&[])];
+            for (row, padded) in rows.iter().zip(&mut padded) {
+                if let Some(tail) = row.get(whole..) {
+                    padded[..tail.len()].copy_from_slice(tail);
+                }
+            }
+            let [p, m, v, g, keep] = &mut padded;
+            advance(simd, p, m, v, g, self.keep.map(|_| keep.as_slice()), self.scalars);
+            self.p[whole..].copy_from_slice(&p[..rest]);
+            self.m[whole..].copy_from_slice(&m[..rest]);
+            self.v[whole..].copy_from_slice(&v[..rest]);
         }
     }
-    rest && lanes.iter().all(|l| *l == 0.0)
 }
 
-#[inline(always)]
-fn advance(p: f32, m: f32, v: f32, g: f32, s: &AdamScalars) -> (f32, f32, f32) {
-    let m = s.beta1 * m + s.one_minus_beta1 * g;
-    let v = s.beta2 * v + s.one_minus_beta2 * g * g;
-    let p = p - s.step_size * m / (v.sqrt() * s.inverse_sqrt_correction + s.epsilon);
-    (p, m, v)
-}
+/// At least the lanes of every instruction set.
+const MAX_LANES: usize = 16;
 
+/// One vector.
 #[inline(always)]
-fn update(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32], s: &AdamScalars) {
-    let n = p.len();
-    let (m, v, g) = (&mut m[..n], &mut v[..n], &g[..n]);
-    for i in 0..n {
-        (p[i], m[i], v[i]) = advance(p[i], m[i], v[i], g[i], s);
-    }
-}
-
-#[inline(always)]
-fn update_masked(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32], mask: &[u32], s: &AdamScalars) {
-    let n = p.len();
-    let (m, v, g, mask) = (&mut m[..n], &mut v[..n], &g[..n], &mask[..n]);
-    for i in 0..n {
-        let (p1, m1, v1) = advance(p[i], m[i], v[i], g[i], s);
-        let keep = mask[i] != 0;
-        p[i] = if keep { p1 } else { p[i] };
-        m[i] = if keep { m1 } else { m[i] };
-        v[i] = if keep { v1 } else { v[i] };
-    }
+fn advance<S: Simd>(simd: S, p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32], keep: Option<&[f32]>, s: &AdamScalars) {
+    let (p0, m0, v0, g) = (Lanes::load(simd, p), Lanes::load(simd, m), Lanes::load(simd, v), Lanes::load(simd, g));
+    let m1 = m0 * s.beta1 + g * s.one_minus_beta1;
+    let v1 = v0 * s.beta2 + g * g * s.one_minus_beta2;
+    let p1 = p0 - m1 * s.step_size / (v1.sqrt() * s.inverse_sqrt_correction + s.epsilon);
+    let (p1, m1, v1) = match keep {
+        Some(keep) => {
+            let keep = Lanes::load(simd, keep).gt(p0.like(0.0));
+            (keep.select(p1, p0), keep.select(m1, m0), keep.select(v1, v0))
+        }
+        None => (p1, m1, v1),
+    };
+    p1.store(p);
+    m1.store(m);
+    v1.store(v);
 }

@@ -1,10 +1,10 @@
 //! Plain-slice kernels (rayon and SIMD) that serve every CPU backend.
 
-pub mod tensor;
 pub mod adam;
 pub mod mlp;
 pub mod photometric;
-pub mod scratch;
-pub mod vertex;
 pub mod raster;
+pub mod scratch;
 pub mod simd;
+pub mod tensor;
+pub mod vertex;

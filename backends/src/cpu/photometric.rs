@@ -6,14 +6,15 @@
 //! adjoint of the blur is the blur.
 
 use crate::cpu::scratch::scratch;
-use pulp::Arch;
+use crate::cpu::simd::{Lanes, dispatch};
+use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
 const RADIUS: usize = 5;
 const C1: f32 = 1e-4;
 const C2: f32 = 9e-4;
-/// Rows of a field are padded to this many columns, so that vector loops have no remainder.
-const LANES: usize = 64;
+/// Rows of a field are padded to a multiple of this many columns, so that vector loops have no remainder.
+const PADDING: usize = 16;
 /// Rows per task: enough work to be worth a task, few enough to balance two threads on a small image.
 const ROWS: usize = 8;
 
@@ -35,40 +36,46 @@ fn half_window() -> [f32; RADIUS + 1] {
     std::array::from_fn(|i| (weight(i) / sum) as f32)
 }
 
-/// One output row or run: the symmetric 11-tap sum of `taps`, all of one length.
+/// One output row or run: the symmetric 11-tap sum of `taps`. `out` holds whole vectors.
 #[inline(always)]
-fn blur(out: &mut [f32], taps: [&[f32]; 11], g: &[f32; 6]) {
+fn blur<S: Simd>(simd: S, out: &mut [f32], taps: [&[f32]; 11], g: &[f32; 6]) {
     let n = out.len();
-    let t = taps.map(|tap| &tap[..n]);
-    for i in 0..n {
-        let mut sum = g[5] * t[5][i];
-        sum += g[4] * (t[4][i] + t[6][i]);
-        sum += g[3] * (t[3][i] + t[7][i]);
-        sum += g[2] * (t[2][i] + t[8][i]);
-        sum += g[1] * (t[1][i] + t[9][i]);
-        sum += g[0] * (t[0][i] + t[10][i]);
-        out[i] = sum;
+    assert!(n.is_multiple_of(Lanes::<S>::COUNT) && taps.iter().all(|tap| tap.len() >= n), "blur: rows are not padded");
+    // Written out: array `map` does not inline into code of a wider instruction set.
+    let [g0, g1, g2, g3, g4, g5] = [
+        Lanes::splat(simd, g[0]),
+        Lanes::splat(simd, g[1]),
+        Lanes::splat(simd, g[2]),
+        Lanes::splat(simd, g[3]),
+        Lanes::splat(simd, g[4]),
+        Lanes::splat(simd, g[5]),
+    ];
+    let mut at = 0;
+    while at < n {
+        // SAFETY: `at` + COUNT is at most n, and every tap holds n values, checked above.
+        let pair = |a: usize, b: usize| unsafe { Lanes::load_ptr(simd, taps[a].as_ptr().add(at)) + Lanes::load_ptr(simd, taps[b].as_ptr().add(at)) };
+        // SAFETY: as above.
+        let centre = unsafe { Lanes::load_ptr(simd, taps[5].as_ptr().add(at)) };
+        let even = pair(4, 6).fma(g4, centre * g5);
+        let odd = pair(2, 8).fma(g2, pair(3, 7) * g3);
+        let ends = pair(0, 10).fma(g0, pair(1, 9) * g1);
+        (even + odd + ends).store(&mut out[at..]);
+        at += Lanes::<S>::COUNT;
     }
 }
 
 /// Horizontal blur of a row that carries [`RADIUS`] zeros on each side of its `out.len()` columns.
 #[inline(always)]
-fn blur_padded(out: &mut [f32], padded: &[f32], g: &[f32; 6]) {
-    blur(out, std::array::from_fn(|k| &padded[k..]), g);
+fn blur_padded<S: Simd>(simd: S, out: &mut [f32], padded: &[f32], g: &[f32; 6]) {
+    let p = padded;
+    blur(simd, out, [p, &p[1..], &p[2..], &p[3..], &p[4..], &p[5..], &p[6..], &p[7..], &p[8..], &p[9..], &p[10..]], g);
 }
 
-/// Sum in a fixed order that vectorises; float64 at the end, because a plane has many rows.
+/// Copies `row` to the start of `to` and clears the rest.
 #[inline(always)]
-fn sum(values: &[f32]) -> f64 {
-    let mut lanes = [0.0f32; 16];
-    let chunks = values.chunks_exact(16);
-    let rest: f32 = chunks.remainder().iter().sum();
-    for chunk in chunks {
-        for (lane, v) in lanes.iter_mut().zip(chunk) {
-            *lane += v;
-        }
-    }
-    lanes.iter().map(|&l| f64::from(l)).sum::<f64>() + f64::from(rest)
+fn copy_padded(to: &mut [f32], row: &[f32]) {
+    to[..row.len()].copy_from_slice(row);
+    to[row.len()..].fill(0.0);
 }
 
 /// The loss terms of `image` against `target`, both planar [channels, height, width]. With `gradient` [channels, height, width],
@@ -78,179 +85,234 @@ pub fn photometric(
     target: &[f32],
     (channels, height, width): (usize, usize, usize),
     lambda_c: f32,
-    gradient: Option<&mut [f32]>,
+    mut gradient: Option<&mut [f32]>,
 ) -> PhotometricTerms {
-    let rows = channels * height;
-    if rows * width == 0 {
+    let pixels = height * width;
+    if channels * pixels == 0 {
         return PhotometricTerms::default();
     }
-    let g = half_window();
-    let stride = width.next_multiple_of(LANES);
-    let arch = Arch::new();
+    let count = (channels * pixels) as f64;
+    let scale = (1.0 / count) as f32;
+    let scales = (lambda_c * scale, -(1.0 - lambda_c) * scale);
+    let mut total = [0.0f64; 3];
+    // Channel by channel, so that the fields of one stay in cache between the sweeps.
+    for channel in 0..channels {
+        let plane = channel * pixels..(channel + 1) * pixels;
+        let gradient = gradient.as_deref_mut().map(|gradient| &mut gradient[plane.clone()]);
+        for terms in one_channel(&image[plane.clone()], &target[plane], width, scales, gradient) {
+            for (total, term) in total.iter_mut().zip(terms) {
+                *total += term;
+            }
+        }
+    }
+    PhotometricTerms { l1: total[0] / count, ssim: total[1] / count, mse: total[2] / count }
+}
 
+/// Row sums of |x - y|, SSIM and (x - y)^2 of one plane, and its gradient.
+fn one_channel(image: &[f32], target: &[f32], width: usize, (l1_scale, ssim_scale): (f32, f32), gradient: Option<&mut [f32]>) -> Vec<[f64; 3]> {
+    let rows = image.len() / width;
+    let g = half_window();
+    let stride = width.next_multiple_of(PADDING);
     let mut blurred = scratch(rows * 4 * stride);
     let mut row_terms = vec![[0.0f64; 3]; rows];
     blurred.par_chunks_mut(ROWS * 4 * stride).zip(row_terms.par_chunks_mut(ROWS)).enumerate().for_each(|(task, (fields, terms))| {
-        let mut padded = scratch(4 * (stride + 2 * RADIUS) + 2 * width);
+        let mut padded = scratch(4 * (stride + 2 * RADIUS));
         for (i, (fields, terms)) in fields.chunks_exact_mut(4 * stride).zip(terms).enumerate() {
             let at = (task * ROWS + i) * width;
-            let (x, y) = (&image[at..at + width], &target[at..at + width]);
-            arch.dispatch(|| first_row(x, y, fields, terms, &mut padded, &g));
+            dispatch(FirstRow { x: &image[at..at + width], y: &target[at..at + width], fields, terms, padded: &mut padded, g: &g });
         }
     });
 
     let zeros = vec![0.0f32; 4 * stride];
     let with_gradient = gradient.is_some();
-    let mut derivatives = scratch(if with_gradient { rows * 3 * stride } else { 0 });
-    // Without a gradient the second sweep writes no field; chunks of one float keep the zip below alive.
-    let mut none = scratch(if with_gradient { 0 } else { rows });
-    let (sink, width_out) = if with_gradient { (&mut *derivatives, 3 * stride) } else { (&mut *none, 1) };
-    sink.par_chunks_mut(ROWS * width_out).zip(row_terms.par_chunks_mut(ROWS)).enumerate().for_each(|(task, (out, terms))| {
+    // Without a gradient the second sweep writes no field; a float per row keeps the zip below alive.
+    let width_out = if with_gradient { 3 * stride } else { 1 };
+    let mut derivatives = scratch(rows * width_out);
+    derivatives.par_chunks_mut(ROWS * width_out).zip(row_terms.par_chunks_mut(ROWS)).enumerate().for_each(|(task, (out, terms))| {
         let mut work = scratch(4 * stride + stride + 3 * (stride + 2 * RADIUS));
         for (i, (out, terms)) in out.chunks_exact_mut(width_out).zip(terms).enumerate() {
-            let taps = neighbours(task * ROWS + i, height, &blurred, 4 * stride, &zeros);
-            let out = with_gradient.then_some(out);
-            arch.dispatch(|| second_row(taps, width, out, terms, &mut work, &g));
+            let taps = neighbours(task * ROWS + i, &blurred, 4 * stride, &zeros);
+            dispatch(SecondRow { taps, width, out: with_gradient.then_some(out), terms, work: &mut work, g: &g });
         }
     });
 
     if let Some(gradient) = gradient {
-        let scale = 1.0 / (rows * width) as f32;
-        let (l1_scale, ssim_scale) = (lambda_c * scale, -(1.0 - lambda_c) * scale);
-        gradient[..rows * width].par_chunks_mut(ROWS * width).enumerate().for_each(|(task, out)| {
-            let mut work = scratch(3 * stride);
+        gradient.par_chunks_mut(ROWS * width).enumerate().for_each(|(task, out)| {
+            let mut work = scratch(6 * stride);
             for (i, out) in out.chunks_exact_mut(width).enumerate() {
                 let row = task * ROWS + i;
-                let taps = neighbours(row, height, &derivatives, 3 * stride, &zeros);
+                let taps = neighbours(row, &derivatives, 3 * stride, &zeros);
                 let (x, y) = (&image[row * width..][..width], &target[row * width..][..width]);
-                arch.dispatch(|| third_row(taps, x, y, out, &mut work, (l1_scale, ssim_scale), &g));
+                dispatch(ThirdRow { taps, x, y, out, work: &mut work, l1_scale, ssim_scale, g: &g });
             }
         });
     }
-
-    let total = row_terms.iter().fold([0.0f64; 3], |a, t| [a[0] + t[0], a[1] + t[1], a[2] + t[2]]);
-    let count = (rows * width) as f64;
-    PhotometricTerms { l1: total[0] / count, ssim: total[1] / count, mse: total[2] / count }
+    row_terms
 }
 
-/// The rows `row - 5 ..= row + 5` of the same channel; zeros beyond its edges.
-fn neighbours<'a>(row: usize, height: usize, fields: &'a [f32], row_len: usize, zeros: &'a [f32]) -> [&'a [f32]; 11] {
-    let in_channel = row % height;
+/// The rows `row - 5 ..= row + 5`; zeros beyond the image.
+fn neighbours<'a>(row: usize, fields: &'a [f32], row_len: usize, zeros: &'a [f32]) -> [&'a [f32]; 11] {
+    let rows = fields.len() / row_len;
     std::array::from_fn(|k| {
-        let inside = in_channel + k >= RADIUS && in_channel + k - RADIUS < height;
+        let inside = row + k >= RADIUS && row + k - RADIUS < rows;
         if inside { &fields[(row + k - RADIUS) * row_len..][..row_len] } else { &zeros[..row_len] }
     })
 }
 
 /// Horizontal blur of x, y, x^2 + y^2 and xy; row sums of |x - y| and (x - y)^2.
-#[inline(always)]
-fn first_row(x: &[f32], y: &[f32], fields: &mut [f32], terms: &mut [f64; 3], work: &mut [f32], g: &[f32; 6]) {
-    let width = x.len();
-    let stride = fields.len() / 4;
-    let padded_len = stride + 2 * RADIUS;
-    let (padded, differences) = work.split_at_mut(4 * padded_len);
-    for row in padded.chunks_exact_mut(padded_len) {
-        row[..RADIUS].fill(0.0);
-        row[RADIUS + width..].fill(0.0);
-    }
-    let mut rows = padded.chunks_exact_mut(padded_len);
-    if let (Some(px), Some(py), Some(ps), Some(pp)) = (rows.next(), rows.next(), rows.next(), rows.next()) {
-        let inner = RADIUS..RADIUS + width;
-        let (px, py, ps, pp) = (&mut px[inner.clone()], &mut py[inner.clone()], &mut ps[inner.clone()], &mut pp[inner]);
-        let (absolute, squared) = differences.split_at_mut(width);
-        let squared = &mut squared[..width];
-        let y = &y[..width];
-        for i in 0..width {
-            px[i] = x[i];
-            py[i] = y[i];
-            ps[i] = x[i] * x[i] + y[i] * y[i];
-            pp[i] = x[i] * y[i];
-            let d = x[i] - y[i];
-            absolute[i] = d.abs();
-            squared[i] = d * d;
+struct FirstRow<'a> {
+    x: &'a [f32],
+    y: &'a [f32],
+    /// Four blurred rows.
+    fields: &'a mut [f32],
+    terms: &'a mut [f64; 3],
+    /// Four rows with [`RADIUS`] more columns on each side.
+    padded: &'a mut [f32],
+    g: &'a [f32; 6],
+}
+
+impl WithSimd for FirstRow<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let stride = self.fields.len() / 4;
+        let padded_len = stride + 2 * RADIUS;
+        let (px, rest) = self.padded.split_at_mut(padded_len);
+        let (py, rest) = rest.split_at_mut(padded_len);
+        let (squares, products) = rest.split_at_mut(padded_len);
+        for row in [&mut *px, py, squares, products] {
+            row[..RADIUS].fill(0.0);
+            row[RADIUS + stride..].fill(0.0);
         }
-        terms[0] = sum(absolute);
-        terms[2] = sum(squared);
-    }
-    for (out, padded) in fields.chunks_exact_mut(stride).zip(padded.chunks_exact(padded_len)) {
-        blur_padded(out, padded, g);
+        copy_padded(&mut px[RADIUS..RADIUS + stride], self.x);
+        copy_padded(&mut py[RADIUS..RADIUS + stride], self.y);
+        let (mut absolute, mut squared) = (Lanes::splat(simd, 0.0), Lanes::splat(simd, 0.0));
+        for at in (RADIUS..RADIUS + stride).step_by(Lanes::<S>::COUNT) {
+            let (x, y) = (Lanes::load(simd, &px[at..]), Lanes::load(simd, &py[at..]));
+            x.fma(x, y * y).store(&mut squares[at..]);
+            (x * y).store(&mut products[at..]);
+            let d = x - y;
+            absolute += d.max(-d);
+            squared = d.fma(d, squared);
+        }
+        // A NaN must reach the loss, and `max` may drop it; the square keeps it.
+        let squared = squared.sum();
+        self.terms[0] = if squared.is_nan() { f64::NAN } else { f64::from(absolute.sum()) };
+        self.terms[2] = f64::from(squared);
+        let (out_x, rest) = self.fields.split_at_mut(stride);
+        let (out_y, rest) = rest.split_at_mut(stride);
+        let (out_squares, out_products) = rest.split_at_mut(stride);
+        blur_padded(simd, out_x, px, self.g);
+        blur_padded(simd, out_y, py, self.g);
+        blur_padded(simd, out_squares, squares, self.g);
+        blur_padded(simd, out_products, products, self.g);
     }
 }
 
 /// Vertical blur, the SSIM of the row and, if asked for, the horizontally blurred derivatives of SSIM with respect to
 /// E[x], E[x^2] and E[xy].
-#[inline(always)]
-fn second_row(taps: [&[f32]; 11], width: usize, out: Option<&mut [f32]>, terms: &mut [f64; 3], work: &mut [f32], g: &[f32; 6]) {
-    let stride = taps[0].len() / 4;
-    let (moments, work) = work.split_at_mut(4 * stride);
-    blur(moments, taps, g);
-    let (map, padded) = work.split_at_mut(stride);
-    let map = &mut map[..width];
-    let (mu_x, moments) = moments.split_at(stride);
-    let (mu_y, moments) = moments.split_at(stride);
-    let (squares, products) = moments.split_at(stride);
-    let (mu_x, mu_y, squares, products) = (&mu_x[..width], &mu_y[..width], &squares[..width], &products[..width]);
-    let Some(out) = out else {
-        for i in 0..width {
-            map[i] = similarity(mu_x[i], mu_y[i], squares[i], products[i]).0;
+struct SecondRow<'a> {
+    taps: [&'a [f32]; 11],
+    width: usize,
+    /// Three rows of blurred derivatives.
+    out: Option<&'a mut [f32]>,
+    terms: &'a mut [f64; 3],
+    /// Four rows of moments, one of similarities, three with [`RADIUS`] more columns on each side.
+    work: &'a mut [f32],
+    g: &'a [f32; 6],
+}
+
+impl WithSimd for SecondRow<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let stride = self.taps[0].len() / 4;
+        let padded_len = stride + 2 * RADIUS;
+        let (moments, work) = self.work.split_at_mut(4 * stride);
+        blur(simd, moments, self.taps, self.g);
+        let (map, padded) = work.split_at_mut(stride);
+        let (d_mu, rest) = padded.split_at_mut(padded_len);
+        let (d_square, d_product) = rest.split_at_mut(padded_len);
+        for at in (0..stride).step_by(Lanes::<S>::COUNT) {
+            let (mu_x, mu_y) = (Lanes::load(simd, &moments[at..]), Lanes::load(simd, &moments[stride + at..]));
+            let (squares, products) = (Lanes::load(simd, &moments[2 * stride + at..]), Lanes::load(simd, &moments[3 * stride + at..]));
+            let (s, [a, b, c]) = similarity(mu_x, mu_y, squares, products);
+            s.store(&mut map[at..]);
+            a.store(&mut d_mu[RADIUS + at..]);
+            b.store(&mut d_square[RADIUS + at..]);
+            c.store(&mut d_product[RADIUS + at..]);
         }
-        terms[1] = sum(map);
-        return;
-    };
-    let padded_len = stride + 2 * RADIUS;
-    for row in padded.chunks_exact_mut(padded_len) {
-        row[..RADIUS].fill(0.0);
-        row[RADIUS + width..].fill(0.0);
-    }
-    let (d_mu, rest) = padded.split_at_mut(padded_len);
-    let (d_square, d_product) = rest.split_at_mut(padded_len);
-    {
-        let inner = RADIUS..RADIUS + width;
-        let (d_mu, d_square, d_product) = (&mut d_mu[inner.clone()], &mut d_square[inner.clone()], &mut d_product[inner]);
-        for i in 0..width {
-            let (s, [a, b, c]) = similarity(mu_x[i], mu_y[i], squares[i], products[i]);
-            map[i] = s;
-            d_mu[i] = a;
-            d_square[i] = b;
-            d_product[i] = c;
+        // The blur runs over into the padding, where there is no image.
+        map[self.width..].fill(0.0);
+        let mut total = Lanes::splat(simd, 0.0);
+        for at in (0..stride).step_by(Lanes::<S>::COUNT) {
+            total += Lanes::load(simd, &map[at..]);
         }
+        self.terms[1] = f64::from(total.sum());
+        let Some(out) = self.out else { return };
+        for row in [&mut *d_mu, d_square, d_product] {
+            row[..RADIUS].fill(0.0);
+            row[RADIUS + self.width..].fill(0.0);
+        }
+        let (out_mu, rest) = out.split_at_mut(stride);
+        let (out_square, out_product) = rest.split_at_mut(stride);
+        blur_padded(simd, out_mu, d_mu, self.g);
+        blur_padded(simd, out_square, d_square, self.g);
+        blur_padded(simd, out_product, d_product, self.g);
     }
-    terms[1] = sum(map);
-    let (out_mu, rest) = out.split_at_mut(stride);
-    let (out_square, out_product) = rest.split_at_mut(stride);
-    blur_padded(out_mu, d_mu, g);
-    blur_padded(out_square, d_square, g);
-    blur_padded(out_product, d_product, g);
 }
 
 /// SSIM from the local moments E[x], E[y], E[x^2 + y^2], E[xy], and its derivatives with respect to E[x], E[x^2], E[xy].
 #[inline(always)]
-fn similarity(mu_x: f32, mu_y: f32, squares: f32, products: f32) -> (f32, [f32; 3]) {
+fn similarity<S: Simd>(mu_x: Lanes<S>, mu_y: Lanes<S>, squares: Lanes<S>, products: Lanes<S>) -> (Lanes<S>, [Lanes<S>; 3]) {
     let mu_product = mu_x * mu_y;
     let mu_squares = mu_x * mu_x + mu_y * mu_y;
-    let a = 2.0 * mu_product + C1;
-    let b = 2.0 * (products - mu_product) + C2;
+    let a = mu_product * 2.0 + C1;
+    let b = (products - mu_product) * 2.0 + C2;
     let c = mu_squares + C1;
     let d = squares - mu_squares + C2;
-    let inverse = 1.0 / (c * d);
+    let inverse = a.like(1.0) / (c * d);
     let s = a * b * inverse;
     let (inverse_c, inverse_d) = (d * inverse, c * inverse);
-    let d_mu = 2.0 * (mu_y * (b - a) * inverse + mu_x * s * (inverse_d - inverse_c));
-    (s, [d_mu, -s * inverse_d, 2.0 * a * inverse])
+    let d_mu = (mu_y * (b - a) * inverse + mu_x * s * (inverse_d - inverse_c)) * 2.0;
+    (s, [d_mu, -(s * inverse_d), a * inverse * 2.0])
 }
 
 /// Vertical blur of the derivative fields and the gradient of the row.
-#[inline(always)]
-fn third_row(taps: [&[f32]; 11], x: &[f32], y: &[f32], out: &mut [f32], work: &mut [f32], (l1_scale, ssim_scale): (f32, f32), g: &[f32; 6]) {
-    blur(work, taps, g);
-    let stride = work.len() / 3;
-    let width = out.len();
-    let (d_mu, d_square, d_product) = (&work[..width], &work[stride..][..width], &work[2 * stride..][..width]);
-    let (x, y) = (&x[..width], &y[..width]);
-    for i in 0..width {
-        let difference = x[i] - y[i];
-        let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
-        out[i] = l1_scale * sign + ssim_scale * (d_mu[i] + 2.0 * x[i] * d_square[i] + y[i] * d_product[i]);
+struct ThirdRow<'a> {
+    taps: [&'a [f32]; 11],
+    x: &'a [f32],
+    y: &'a [f32],
+    out: &'a mut [f32],
+    /// Three rows of derivatives, then x, y and the gradient, padded.
+    work: &'a mut [f32],
+    l1_scale: f32,
+    ssim_scale: f32,
+    g: &'a [f32; 6],
+}
+
+impl WithSimd for ThirdRow<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let stride = self.work.len() / 6;
+        let (fields, rest) = self.work.split_at_mut(3 * stride);
+        blur(simd, fields, self.taps, self.g);
+        let (x_row, rest) = rest.split_at_mut(stride);
+        let (y_row, gradient) = rest.split_at_mut(stride);
+        copy_padded(x_row, self.x);
+        copy_padded(y_row, self.y);
+        let zero = Lanes::splat(simd, 0.0);
+        let (up, down) = (Lanes::splat(simd, self.l1_scale), Lanes::splat(simd, -self.l1_scale));
+        for at in (0..stride).step_by(Lanes::<S>::COUNT) {
+            let (d_mu, d_square, d_product) =
+                (Lanes::load(simd, &fields[at..]), Lanes::load(simd, &fields[stride + at..]), Lanes::load(simd, &fields[2 * stride + at..]));
+            let (x, y) = (Lanes::load(simd, &x_row[at..]), Lanes::load(simd, &y_row[at..]));
+            let sign = x.gt(y).select(up, x.lt(y).select(down, zero));
+            let ssim = (x * 2.0).fma(d_square, y.fma(d_product, d_mu));
+            (ssim * self.ssim_scale + sign).store(&mut gradient[at..]);
+        }
+        self.out.copy_from_slice(&gradient[..self.out.len()]);
     }
 }
 

@@ -71,9 +71,9 @@ impl LevelHash {
         let scale = 2.0 / (self.modulus - 1) as f32;
         let modulus = u64::from(self.modulus);
         for i in 0..n {
-            // Each product is below 2^62 and is folded once, so the sum stays far below 2^64.
-            let sum = fold(u64::from(ax[i]) * u64::from(x)) + fold(u64::from(ay[i]) * u64::from(y)) + fold(u64::from(az[i]) * u64::from(z)) + u64::from(b[i]);
-            let sum = fold(sum);
+            // Each product is below 2^62, so their sum fits; two folds bring it to P or little more.
+            let sum = u64::from(ax[i]) * u64::from(x) + u64::from(ay[i]) * u64::from(y) + u64::from(az[i]) * u64::from(z) + u64::from(b[i]);
+            let sum = fold(fold(sum));
             let residue = if sum >= P { sum - P } else { sum };
             // The multiplied quotient is the true one or one less.
             let remainder = residue - ((residue * self.reciprocal) >> 32) * modulus;
