@@ -156,7 +156,7 @@ impl Form {
             form => Ok(form),
         }
     }
-    /// The form's own step between neighbouring values, relative to its span.
+    /// Bytes of one value in the code stream.
     fn bytes_per_code(&self) -> usize {
         match *self {
             Self::Constant(_) => 0,
@@ -190,10 +190,15 @@ pub(crate) fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &
         }
         Form::MuLaw { peak, bits } => {
             let zero = mulaw::peak_code(bits);
-            // 2^bits values at most: a table spares most of the exponentials.
-            let table: Vec<f32> =
-                (0..1i32 << bits).map(|c| (f64::from(peak) * mulaw::decode((c - zero).min(zero), bits)) as f32).map(|v| v.clamp(-peak, peak)).collect();
-            codes(bits)?.into_iter().map(|c| table[usize::from(c)]).collect()
+            let value = |c: u16| ((f64::from(peak) * mulaw::decode((i32::from(c) - zero).min(zero), bits)) as f32).clamp(-peak, peak);
+            let codes = codes(bits)?;
+            if count > 1 << bits {
+                // More values than codes: a table spares most of the exponentials.
+                let table: Vec<f32> = (0..=u16::MAX >> (16 - bits)).map(value).collect();
+                codes.into_iter().map(|c| table[usize::from(c)]).collect()
+            } else {
+                codes.into_iter().map(value).collect()
+            }
         }
         Form::Exact => Vec::new(),
     };
