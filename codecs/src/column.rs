@@ -40,9 +40,8 @@ pub(crate) struct Target {
 
 /// Encodes `values` (all finite) in the first form within the allowed loss: the wanted one, 16 uniform bits, exact.
 pub(crate) fn encode(values: &[f32], target: Target) -> Column {
-    let first = values.first().copied().unwrap_or(0.0);
-    if values.iter().all(|&v| v == first) {
-        return Column { form: Form::Constant(first), codes: Vec::new(), escapes: Vec::new() };
+    if let Some(column) = constant(values) {
+        return column;
     }
     let wanted = if target.mu_law {
         Form::MuLaw { peak: values.iter().fold(0.0, |a, v| a.max(v.abs())), bits: target.bits }
@@ -57,6 +56,16 @@ pub(crate) fn encode(values: &[f32], target: Target) -> Column {
         }
     }
     quantise(values, Form::Exact)
+}
+
+/// Encodes `values` without loss.
+pub(crate) fn encode_exact(values: &[f32]) -> Column {
+    constant(values).unwrap_or_else(|| quantise(values, Form::Exact))
+}
+
+fn constant(values: &[f32]) -> Option<Column> {
+    let first = values.first().copied().unwrap_or(0.0);
+    values.iter().all(|&v| v == first).then(|| Column { form: Form::Constant(first), codes: Vec::new(), escapes: Vec::new() })
 }
 
 /// A uniform quantiser between the `tail` and 1 - `tail` quantiles, widened by a tenth but never beyond the extremes.

@@ -45,15 +45,11 @@ pub(super) fn encode(
     if width == 0 {
         return Ok(Vec::new());
     }
-    let target = Target { bits: 16, mu_law: false, loss: profile.appearance_loss, tail: 5e-4 };
-    let columns: Vec<Column> = split(&gaussians.sh_rest, width).par_iter().map(|c| column::encode(c, target)).collect();
-    let mut direct = Form::new(DIRECT);
-    let codes = store(&columns, &mut direct.meta, &mut direct.escapes);
-    direct.streams.push(Stream { name: DIRECT_CODES.into(), bytes: codes });
+    let (quantised, exact) = (direct(&gaussians.sh_rest, width, Some(profile.appearance_loss))?, direct(&gaussians.sh_rest, width, None)?);
+    // Colours that were quantised before may compress better as they are.
+    let (direct_len, mut best) = if exact.0 < quantised.0 { exact } else { quantised };
     // Decoder and codebook alone may outweigh a few coefficients or many that are all alike.
     let fixed = 2 * decoder_len(width) + 4 * width * profile.codebook.min(gaussians.len());
-    let mut best = direct;
-    let direct_len = best.stored_len()?;
     if direct_len > fixed as u64
         && let Some((coded, loss)) = autoencode(gaussians, known, profile, settings, context)?
         && coded.stored_len()? < direct_len
@@ -65,7 +61,7 @@ pub(super) fn encode(
             context.events.emit(&Event::Warning {
                 object: "codec cca".into(),
                 message: format!(
-                    "the autoencoder would lose {loss:.2} of the colours' deviation, over {}; they are stored at 16 bits each",
+                    "the autoencoder would lose {loss:.2} of the colours' deviation, over {}; they are stored without it",
                     profile.appearance_loss
                 ),
             });
@@ -74,6 +70,19 @@ pub(super) fn encode(
     meta.extend(best.meta);
     escapes.extend(best.escapes);
     Ok(best.streams)
+}
+
+/// The columns at 16 bits (within the loss, if one is given) or exact, and about how many bytes they take.
+fn direct(rows: &[f32], width: usize, loss: Option<f64>) -> Result<(u64, Form)> {
+    let encode = |c: &Vec<f32>| match loss {
+        Some(loss) => column::encode(c, Target { bits: 16, mu_law: false, loss, tail: 5e-4 }),
+        None => column::encode_exact(c),
+    };
+    let columns: Vec<Column> = split(rows, width).par_iter().map(encode).collect();
+    let mut form = Form::new(DIRECT);
+    let codes = store(&columns, &mut form.meta, &mut form.escapes);
+    form.streams.push(Stream { name: DIRECT_CODES.into(), bytes: codes });
+    Ok((form.stored_len()?, form))
 }
 
 /// One way to store the coefficients.

@@ -9,7 +9,7 @@
 //! * Quaternions are split into a unit part, whose sign is kept, and a norm, because deformation offsets are added before normalisation and
 //!   so both matter. A model with unit quaternions pays nothing for the norms.
 //! * Quantisers keep outliers exactly instead of clamping them (see `column`).
-//! * Coefficients go without autoencoder, at 16 bits each, where that takes fewer bytes (few Gaussians, low degrees) or where the
+//! * Coefficients go without autoencoder, at 16 bits each or exactly, where that takes fewer bytes (few Gaussians, low degrees) or where the
 //!   autoencoder would lose more than [`AttributeCodec::losses`] declares.
 
 mod appearance;
