@@ -64,6 +64,9 @@ fn the_eight_bit_protocol_equals_measuring_saved_pictures() {
     let got = metric.score(&a, &b, [3, height, width], None).unwrap();
     assert_eq!(got, psnr(&saved(&a), &saved(&b), None).unwrap());
     assert_ne!(got, Metric::psnr(Rounding::Float).score(&a, &b, [3, height, width], None).unwrap());
+    let image = |planes: &[f32]| cc4dgs_core::Image8::from_planes(planes, width as u32, height as u32);
+    assert_eq!(metric.score_images(&image(&a), &image(&b)).unwrap(), got);
+    assert!(metric.masked().score_images(&image(&a), &image(&b)).is_err());
     let metric = Metric::ssim(SsimConvention::Inria, Rounding::EightBit);
     assert_eq!(metric.score(&a, &b, [3, height, width], None).unwrap(), ssim(&saved(&a), &saved(&b), SsimConvention::Inria, None).unwrap());
 }

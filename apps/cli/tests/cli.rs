@@ -90,9 +90,11 @@ fn mistakes_end_with_their_own_exit_code() {
     assert!(fail(&["train", "--scene", "procedural", "--preset", "dnerf-gpu", "--out", text(&out)], 2).contains("dnerf-cpu"));
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--set", "train.iteratons=3", "--out", text(&out)], 2).contains("iteratons"));
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--device", "fleks", "--out", text(&out)], 2).contains("flex"));
+    let unknown = "deformer.capasity=small";
+    assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--set", unknown, "--out", text(&out)], 2).contains("capasity"));
     fail(&["train", "--scene", text(&folder.path().join("nowhere")), "--out", text(&out)], 2);
     assert!(!out.exists(), "a refused command leaves nothing behind");
-    std::fs::write(&broken, b"\x89CC4D\r\n\x1a and then nothing that makes sense, for more than a header's length").unwrap();
+    std::fs::write(&broken, b"\x89CC4D\r\n\x1a\x01\0\0\0\x10\0\0\0 and then nothing that makes sense as a header").unwrap();
     fail(&["info", text(&broken)], 3);
     fail(&["eval", text(&broken), "--scene", "procedural:tiny"], 3);
     fail(&["decompress", text(&folder.path().join("missing.cc4d")), "--out", text(&out)], 3);
@@ -107,7 +109,7 @@ fn a_scene_goes_through_the_whole_chain() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let (dir, archive, ply) = (at("run"), at("model.cc4d"), at("model.ply"));
-    succeed(&train_args(text(&dir), "train.iterations=120"));
+    succeed(&train_args(text(&dir), "train.iterations=500"));
     for name in ["checkpoint", "config.toml", "events.jsonl"] {
         assert!(dir.join(name).is_file(), "{name}");
     }
@@ -121,10 +123,10 @@ fn a_scene_goes_through_the_whole_chain() {
     succeed(&["eval", text(&archive), "--scene", "procedural:tiny", "--split", "test", "-q", "--json", text(&json)]);
     let report = read_json(&json);
     let number = |pointer: &str| report.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("{pointer} in {report}"));
-    assert!(number("/psnr_db") > 10.0 && number("/ssim") > 0.1 && number("/ssim") <= 1.0, "{report}");
+    assert!(number("/psnr_db") > 12.0 && number("/ssim") > 0.2 && number("/ssim") <= 1.0, "{report}");
     let on_disk = std::fs::metadata(&archive).unwrap().len() as f64;
     assert!((number("/size_mb/total") * 1e6 - on_disk).abs() < 0.5, "MB are 10^6 bytes on disk");
-    assert!(number("/size_mb/point_cloud") > 0.0 && number("/size_mb/deform") >= 0.0);
+    assert!(number("/size_mb/point_cloud") > 0.0 && number("/size_mb/deform") > 0.0);
     assert!(number("/size_mb/point_cloud") + number("/size_mb/deform") <= number("/size_mb/total"));
     assert!(number("/frame_ms/mean") > 0.0);
     assert_eq!(report["images"].as_array().unwrap().len(), 4);

@@ -4,9 +4,10 @@ use crate::model::{Model, ModelSize};
 use crate::play::{FrameTime, PlayWork, Player};
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::metrics::{self, Planes, SsimConvention, psnr, ssim};
+use cc4dgs_core::metrics::{FrameSet, Metric, Rounding, SsimConvention};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
 use serde::Serialize;
+use std::collections::BTreeMap;
 
 /// Sizes in MB = 10^6 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -91,6 +92,8 @@ pub struct EvalReport {
     pub work: PlayWork,
     /// What the numbers mean.
     pub protocol: &'static str,
+    /// The protocol of each mean by its key.
+    pub metrics: BTreeMap<&'static str, Metric>,
     /// Per picture.
     pub images: Vec<ImageScore>,
 }
@@ -110,6 +113,7 @@ pub fn evaluate(
     on_image: &mut OnImage,
 ) -> Result<EvalReport> {
     let mut views = scene.split(split);
+    let in_split = views.len();
     if max_views > 0 && views.len() > max_views {
         views = (0..max_views).map(|i| views[i * views.len() / max_views]).collect();
     }
@@ -120,6 +124,12 @@ pub fn evaluate(
     let mut images = Vec::with_capacity(views.len());
     let mut times: Vec<FrameTime> = Vec::with_capacity(views.len());
     let (mut skimage, mut ms_ssim) = (0.0, Some(0.0));
+    let frames = FrameSet { split, count: views.len(), of: in_split };
+    let metric = |m: Metric| m.over(frames.clone());
+    let psnr_metric = metric(Metric::psnr(Rounding::EightBit));
+    let ssim_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit));
+    let skimage_metric = metric(Metric::ssim(SsimConvention::Skimage, Rounding::EightBit));
+    let ms_ssim_metric = metric(Metric::ms_ssim(Rounding::EightBit));
     for (done, &view) in views.iter().enumerate() {
         let camera = scene.camera(view);
         let (output, time) = player.render(camera, scene.views[view].time_norm)?;
@@ -127,16 +137,15 @@ pub fn evaluate(
         let frame = scene.frame(view)?;
         // Both pictures are rounded to 8 bits before they are compared.
         let truth = Image8::from_planes(&frame.to_planes(model.render.background), camera.width, camera.height);
-        let (a, b) = (Planes::from_image8(&truth)?, Planes::from_image8(&render)?);
-        skimage += ssim(&a, &b, SsimConvention::Skimage, None)?;
-        let multi_scale = metrics::ms_ssim(&a, &b).ok();
+        skimage += skimage_metric.score_images(&truth, &render)?;
+        let multi_scale = ms_ssim_metric.score_images(&truth, &render).ok();
         ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);
         let score = ImageScore {
             view,
             camera: camera.name.clone(),
             frame: scene.views[view].frame,
-            psnr_db: psnr(&a, &b, None)?,
-            ssim: ssim(&a, &b, SsimConvention::Inria, None)?,
+            psnr_db: psnr_metric.score_images(&truth, &render)?,
+            ssim: ssim_metric.score_images(&truth, &render)?,
             field_ms: time.field_ms,
             raster_ms: time.raster_ms,
         };
@@ -167,6 +176,7 @@ pub fn evaluate(
         dynamic_gaussians: player.moving(),
         work: player.work,
         protocol: "8-bit RGB pictures, range 255; PSNR over all pixels and channels; SSIM 11x11 Gaussian sigma 1.5, zero padding (Inria); means over images; times on the stated device, synchronised, first frame apart",
+        metrics: BTreeMap::from([("psnr_db", psnr_metric), ("ssim", ssim_metric), ("ssim_skimage", skimage_metric), ("ms_ssim", ms_ssim_metric)]),
         images,
     })
 }

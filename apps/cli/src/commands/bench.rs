@@ -2,6 +2,7 @@
 
 use super::Context;
 use crate::args::BenchStep;
+use crate::model_source::resolved_device;
 use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, time_step};
 use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device};
 use serde::Serialize;
@@ -31,7 +32,7 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
     }
     let report = StepReport {
         version: env!("CARGO_PKG_VERSION"),
-        device: &args.device,
+        device: resolved_device(&args.device)?,
         threads: rayon::current_num_threads(),
         cpu_features: super::doctor::cpu_features(),
         seed: args.seed,

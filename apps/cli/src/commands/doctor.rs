@@ -1,6 +1,7 @@
 //! `cc4dgs doctor`: what this machine offers, and whether pictures come out right on it.
 
 use super::{Context, video};
+use crate::model_source::resolved_device;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, parse_device};
@@ -53,8 +54,6 @@ pub fn run(context: &Context) -> Result<()> {
         let note = device.as_ref().err().map_or_else(|| "computes on the processor".to_string(), Error::to_string);
         devices.push(DeviceReport { name, available: device.is_ok(), note });
     }
-    let taken = parse_device("auto")?;
-    let auto = DEVICE_NAMES.into_iter().filter(|n| *n != "auto").find(|n| parse_device(n).is_ok_and(|d| d == taken)).unwrap_or("an unnamed device");
     let healthy = !self_check.is_empty() && self_check.iter().all(|c| c.problem.is_none());
     let report = Report {
         version: env!("CARGO_PKG_VERSION"),
@@ -63,7 +62,7 @@ pub fn run(context: &Context) -> Result<()> {
         cpu_features: cpu_features(),
         threads: rayon::current_num_threads(),
         devices,
-        auto,
+        auto: resolved_device("auto")?,
         auto_reason: "this build has no GPU operations yet, and flex is the CPU device burn recommends",
         ffmpeg: video::ffmpeg_version().ok(),
         self_check,

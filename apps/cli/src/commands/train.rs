@@ -3,7 +3,7 @@
 use super::Context;
 use crate::args::Train;
 use crate::interrupt;
-use cc4dgs_core::{Result, Scene};
+use cc4dgs_core::{FieldContext, Result, Scene, Seed, parse_device};
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::data;
 use cc4dgs_engine::train::{CONFIG, TrainJob, TrainReport, train};
@@ -50,11 +50,23 @@ pub fn resolve(context: &Context, preset: Option<&str>, file: Option<&Path>, set
 /// Trains the scene at `scene_path` into the folder `out`; returns the scene's name and the report.
 pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out: &Path, resume: bool) -> Result<(String, TrainReport)> {
     let stop = interrupt::stop_flag()?;
+    check_plugins(context, config)?;
     let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &config.limits)?);
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;
     let job = TrainJob { config, scene: scene.clone(), out: out.to_path_buf(), resume, registry: &context.registry, events: &events, stop };
     Ok((scene.name.clone(), train(&job)?))
+}
+
+/// Builds every plug-in of the configuration once and drops it: a mistake in the deformer's settings should not wait for the main stage, nor leave
+/// a folder behind.
+fn check_plugins(context: &Context, config: &RunConfig) -> Result<()> {
+    let device = parse_device(&config.device)?;
+    context.registry.build_rasterizer(&config.rasterizer)?;
+    let seed = Seed::root(config.seed).child("check");
+    let field = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: config.train.sh_degree, seed };
+    context.registry.build_deformer(&config.deformer, &field, &device)?;
+    Ok(())
 }
 
 /// The report for people.

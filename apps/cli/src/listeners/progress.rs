@@ -46,7 +46,8 @@ impl State {
                 bar.set_style(style.progress_chars("=> "));
             }
             bar.set_prefix(task.to_string());
-            self.last_line = None;
+            // Short tasks need no line of their own where there is no bar to watch.
+            self.last_line = Some(Instant::now());
             self.bar = Some((task.to_string(), bar));
         }
         let (_, bar) = self.bar.get_or_insert_with(|| (task.to_string(), ProgressBar::hidden()));

@@ -1,7 +1,7 @@
 //! A metric and everything its number depends on.
 
 use super::{Planes, SsimConvention, ms_ssim, psnr, ssim};
-use crate::{Error, Result, Split};
+use crate::{Error, Image8, Result, Split};
 use serde::{Deserialize, Serialize};
 
 /// Which formula.
@@ -60,10 +60,10 @@ pub enum MaskRule {
 pub struct FrameSet {
     /// The side of the split.
     pub split: Split,
-    /// How many pictures the mean is over.
+    /// How many pictures the mean is over, evenly spread.
     pub count: usize,
-    /// Every how many-th picture of the split was taken (1 is all).
-    pub stride: usize,
+    /// How many the split has.
+    pub of: usize,
 }
 
 /// Everything a score depends on besides the pictures.
@@ -131,14 +131,23 @@ impl Metric {
         if mask.is_some() != (self.protocol.mask == MaskRule::Masked) {
             return Err(Error::parameter("metric mask", "the mask given and the protocol disagree", "Use Metric::masked() exactly when passing a mask"));
         }
-        let (reference, render) = (planes(reference)?, planes(render)?);
+        self.compute(&planes(reference)?, &planes(render)?, mask)
+    }
+    /// The score of two 8-bit pictures, which are rounded already; alpha channels are left out. Refuses masked metrics.
+    pub fn score_images(&self, reference: &Image8, render: &Image8) -> Result<f64> {
+        if self.protocol.mask == MaskRule::Masked {
+            return Err(Error::parameter("metric mask", "a masked metric needs a mask", "Use Metric::score"));
+        }
+        self.compute(&Planes::from_image8(reference)?, &Planes::from_image8(render)?, None)
+    }
+    fn compute(&self, reference: &Planes, render: &Planes, mask: Option<&[bool]>) -> Result<f64> {
         match (self.protocol.metric, self.protocol.convention) {
-            (MetricKind::Psnr, _) => psnr(&reference, &render, mask),
-            (MetricKind::Ssim, convention) => ssim(&reference, &render, convention.unwrap_or(SsimConvention::Skimage), mask),
+            (MetricKind::Psnr, _) => psnr(reference, render, mask),
+            (MetricKind::Ssim, convention) => ssim(reference, render, convention.unwrap_or(SsimConvention::Skimage), mask),
             (MetricKind::MsSsim, _) if mask.is_some() => {
                 Err(Error::unsupported("MS-SSIM with a mask", "pooled scales have no agreed mask", "Use SSIM for masked pixels"))
             }
-            (MetricKind::MsSsim, _) => ms_ssim(&reference, &render),
+            (MetricKind::MsSsim, _) => ms_ssim(reference, render),
         }
     }
     fn new(metric: MetricKind, convention: Option<SsimConvention>, rounding: Rounding, window: Option<Window>, padding: Option<Padding>) -> Self {
