@@ -121,11 +121,8 @@ fn neighbour_distances(means: &[f32]) -> Vec<f32> {
         loop {
             let range = |k: usize| home[k].saturating_sub(ring)..(home[k] + ring + 1).min(side);
             let cells = range(0).flat_map(|x| range(1).flat_map(move |y| range(2).map(move |z| (x * side + y) * side + z)));
-            let mut squared: Vec<f32> = cells
-                .flat_map(|c| &members[c])
-                .filter(|&&j| j != i)
-                .map(|&j| (0..3).map(|k| (means[3 * i + k] - means[3 * j + k]).powi(2)).sum())
-                .collect();
+            let mut squared: Vec<f32> =
+                cells.flat_map(|c| &members[c]).filter(|&&j| j != i).map(|&j| (0..3).map(|k| (means[3 * i + k] - means[3 * j + k]).powi(2)).sum()).collect();
             squared.sort_by(f32::total_cmp);
             // Anything nearer than the ring is wide has been seen.
             let certain = squared.len() >= 3 && squared[2].sqrt() <= ring as f32 * cell_size;

@@ -39,6 +39,18 @@ pub fn each<T: Copy, const N: usize>(mut f: impl FnMut(usize) -> T) -> [T; N] {
     out
 }
 
+/// Asks for `from[index]` before it is needed, where the processor can be asked.
+#[inline(always)]
+pub fn prefetch<T>(from: &[T], index: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if index < from.len() {
+        // SAFETY: prefetching has no effect on memory, and the address is inside the slice.
+        unsafe { std::arch::x86_64::_mm_prefetch::<{ std::arch::x86_64::_MM_HINT_T0 }>(from.as_ptr().add(index).cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (from, index);
+}
+
 /// A vector of float32.
 #[derive(Clone, Copy, Debug)]
 pub struct Lanes<S: Simd> {
@@ -97,6 +109,7 @@ const LOG2_E_TAIL: f32 = 1.925_963e-8;
 /// Adding and subtracting 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits.
 const ROUND: f32 = 12_582_912.0;
 /// 2^f on [-1/2, 1/2] with value 1 at 0, largest relative error 9.2e-8 (fitted by iteratively reweighted least squares).
+#[allow(clippy::approx_constant)] // A fitted coefficient near ln 2, not ln 2.
 const EXP2_5: [f32; 5] = [0.693_147, 0.240_222_42, 0.055_507_337, 0.009_671_513, 0.001_326_472_7];
 /// As [`EXP2_5`] with one term more, largest relative error 2e-9.
 const EXP2_6: [f32; 6] = [std::f32::consts::LN_2, 0.240_226_48, 0.055_503_325, 0.009_618_437, 0.001_339_887_4, 0.000_153_533_6];
@@ -212,6 +225,22 @@ impl<S: Simd> Lanes<S> {
     #[inline(always)]
     pub fn largest(self) -> f32 {
         self.simd.reduce_max_f32s(self.raw)
+    }
+    /// 1 / self for normal numbers, relative error about 1e-7.
+    #[inline(always)]
+    pub fn reciprocal(self) -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if const { size_of::<S::f32s>() == 64 && size_of::<S::m32s>() == 2 } {
+            use std::arch::x86_64::{__m512, _mm512_rcp14_ps};
+            // SAFETY: 16 lanes with bit masks exist only where the dispatcher found AVX-512F, and then the vector is an __m512.
+            let rough = unsafe {
+                let rough: __m512 = _mm512_rcp14_ps(std::mem::transmute_copy(&self.raw));
+                Self { simd: self.simd, raw: std::mem::transmute_copy(&rough) }
+            };
+            // One Newton step doubles the 14 bits.
+            return rough.fma(self.nfma(rough, self.like(1.0)), rough);
+        }
+        self.like(1.0) / self
     }
     /// exp(-self) for 0 <= self <= 87; relative error under 2e-7 where the result is over 1/255, exactly 1 at 0, garbage outside the range.
     #[inline(always)]

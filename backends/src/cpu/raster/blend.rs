@@ -4,12 +4,14 @@ use super::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
 use super::{RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
-use crate::cpu::simd::{Lanes, dispatch};
+use crate::cpu::simd::{Lanes, dispatch, prefetch};
 use pulp::{Simd, WithSimd};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Sigma up to which the exponential is evaluated; alpha is far below 1/255 beyond.
 pub const SIGMA_MAX: f32 = 87.0;
+/// How many list entries ahead Gaussians are asked for.
+pub const AHEAD: usize = 6;
 /// Planes of the output.
 const PLANES: usize = 5;
 
@@ -47,10 +49,12 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
     run_tasks(tiles, |position| {
         let tile = order[position] as usize;
         let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
-        let list = &list[starts[tile] as usize..starts[tile + 1] as usize];
+        let places = starts[tile] as usize..starts[tile + 1] as usize;
+        // SAFETY: a place in the list belongs to one tile.
+        let weights: &mut [f32] = if settings.max_weights { unsafe { weights.slice(places.start, places.len()) } } else { &mut [] };
+        let list = &list[places];
         // SAFETY: every tile has its own part of these.
-        let (transmittance, stop_at) =
-            unsafe { (transmittance.slice(tile * TILE_PIXELS, TILE_PIXELS), stop_at.slice(tile * TILE_PIXELS, TILE_PIXELS)) };
+        let (transmittance, stop_at) = unsafe { (transmittance.slice(tile * TILE_PIXELS, TILE_PIXELS), stop_at.slice(tile * TILE_PIXELS, TILE_PIXELS)) };
         let mut state = TileState::new(origin, settings, stop_at);
         if settings.max_weights {
             dispatch(BlendTile::<true> { ranked, list, origin, rules, state: &mut state, weights });
@@ -92,8 +96,9 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
 pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
     let mut out = vec![0.0f32; n];
     for (rank, splat) in workspace.ranked.iter().enumerate() {
-        let records = workspace.record_start[rank] as usize..workspace.record_start[rank + 1] as usize;
-        out[splat.index as usize] = workspace.pair_weights[records].iter().fold(0.0, |a, &b| a.max(b));
+        let pairs = workspace.pair_start[rank] as usize..workspace.pair_start[rank + 1] as usize;
+        let weights = workspace.place_of_pair[pairs].iter().map(|&place| workspace.pair_weights[place as usize]);
+        out[splat.index as usize] = weights.fold(0.0, f32::max);
     }
     out
 }
@@ -175,7 +180,7 @@ struct BlendTile<'k, 'a, const WEIGHTS: bool> {
     origin: [usize; 2],
     rules: &'k RuleConstants,
     state: &'k mut TileState<'a>,
-    weights: SharedMut<'k, f32>,
+    weights: &'k mut [f32],
 }
 
 impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
@@ -189,6 +194,9 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
         let (cap, least, stop, limit) = (like(rules.alpha_max), like(ALPHA_MIN), like(TRANSMITTANCE_STOP), like(SIGMA_MAX));
         let one = like(1.0);
         for (i, entry) in list.iter().enumerate() {
+            if let Some(ahead) = list.get(i + AHEAD) {
+                prefetch(ranked, ahead.rank as usize);
+            }
             let splat = &ranked[entry.rank as usize];
             let rows = entry.row_mask() & state.alive;
             state.evaluations += u64::from(rows.count_ones()) * TILE as u64;
@@ -231,8 +239,7 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
                 }
             }
             if WEIGHTS {
-                // SAFETY: a record belongs to one pair.
-                unsafe { weights.slice(entry.record as usize, 1)[0] = largest.largest() };
+                weights[i] = largest.largest();
             }
             if state.alive == 0 {
                 state.end = i as u32 + 1;

@@ -4,12 +4,12 @@
 //! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = d loss / d
 //! sigma times powers of dx and dy; dx is constant per column, so its powers are applied once after the rows.
 
-use super::blend::{SIGMA_MAX, TilePlane, column_centers};
+use super::blend::{AHEAD, SIGMA_MAX, TilePlane, column_centers};
 use super::camera::{ALPHA_MIN, RuleConstants};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
 use super::{RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
-use crate::cpu::simd::{Lanes, dispatch, each};
+use crate::cpu::simd::{Lanes, dispatch, each, prefetch};
 use pulp::{Simd, WithSimd};
 
 /// Fills the gradient records of all pairs from `upstream` [5,H,W].
@@ -25,14 +25,14 @@ pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, works
     run_tasks(order.len(), |position| {
         let tile = order[position] as usize;
         let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
-        let list = &list[starts[tile] as usize..starts[tile + 1] as usize];
+        let places = starts[tile] as usize..starts[tile + 1] as usize;
+        // SAFETY: a place in the list belongs to one tile.
+        let records = unsafe { records.slice(places.start, places.len()) };
+        let list = &list[places];
         let pixels = tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS;
         let mut state = TileGradient::new(origin, settings, background, upstream, &transmittance[pixels.clone()]);
         let end = if state.live_rows == 0 { 0 } else { ends[tile] as usize };
-        for entry in &list[end..] {
-            // SAFETY: a record belongs to one pair, a pair to one tile.
-            unsafe { records.slice(entry.record as usize, 1)[0] = [0.0; RECORD] };
-        }
+        records[end..].fill([0.0; RECORD]);
         let kernel = BackTile { ranked, list: &list[..end], origin, rules: &rules, state: &mut state, stop_at: &stop_at[pixels], records };
         match (stops[tile] != 0, kernel.state.depth_matters) {
             (false, false) => dispatch(Flags::<false, false>(kernel)),
@@ -72,7 +72,10 @@ impl TileGradient {
             let alpha = &upstream[3 * plane + from..][..width];
             let mut any = false;
             for x in 0..width {
-                let g: [f32; 4] = each(#[inline(always)] |k| state.upstream[k][at + x]);
+                let g: [f32; 4] = each(
+                    #[inline(always)]
+                    |k| state.upstream[k][at + x],
+                );
                 state.depth_matters |= g[3] != 0.0;
                 any |= g.iter().any(|&v| v != 0.0) || alpha[x] != 0.0;
                 let shown = background[0] * g[0] + background[1] * g[1] + background[2] * g[2] - alpha[x];
@@ -91,7 +94,7 @@ struct BackTile<'k> {
     rules: &'k RuleConstants,
     state: &'k mut TileGradient,
     stop_at: &'k [u32],
-    records: SharedMut<'k, [f32; RECORD]>,
+    records: &'k mut [[f32; RECORD]],
 }
 
 /// Whether pixels of the tile stopped early, and whether depth carries gradient.
@@ -110,12 +113,18 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
         // Largest uncapped alpha whose gradient passes.
         let passing = like(if rules.pass_capped { f32::MAX } else { rules.alpha_max });
         for (i, entry) in list.iter().enumerate().rev() {
+            if i >= AHEAD {
+                prefetch(ranked, list[i - AHEAD].rank as usize);
+            }
             let splat = &ranked[entry.rank as usize];
             let rows = entry.row_mask() & state.live_rows;
             let [half_a, b, half_c] = splat.conic;
             let a = like(half_a);
             let opacity = like(splat.opacity);
-            let color: [Lanes<S>; 3] = each(#[inline(always)] |c| like(splat.color[c]));
+            let color: [Lanes<S>; 3] = each(
+                #[inline(always)]
+                |c| like(splat.color[c]),
+            );
             let depth = like(splat.depth);
             let position = like(f32::from_bits(i as u32 + 1));
             let mut record = [0.0f32; RECORD];
@@ -144,11 +153,14 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                         }
                     }
                     let alpha = hit.keep(full.min(cap));
-                    let inverse = one / (one - alpha);
+                    let inverse = (one - alpha).reciprocal();
                     let before = Lanes::load(simd, &state.running[at..]) * inverse;
                     before.store(&mut state.running[at..]);
                     let weight = alpha * before;
-                    let g: [Lanes<S>; 3] = each(#[inline(always)] |c| Lanes::load(simd, &state.upstream[c][at..]));
+                    let g: [Lanes<S>; 3] = each(
+                        #[inline(always)]
+                        |c| Lanes::load(simd, &state.upstream[c][at..]),
+                    );
                     let mut q = color[0].fma(g[0], color[1].fma(g[1], color[2] * g[2]));
                     if DEPTH {
                         let g_depth = Lanes::load(simd, &state.upstream[3][at..]);
@@ -189,8 +201,7 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                     *sum += value;
                 }
             }
-            // SAFETY: a record belongs to one pair.
-            unsafe { records.slice(entry.record as usize, 1)[0] = record };
+            records[i] = record;
         }
     }
 }

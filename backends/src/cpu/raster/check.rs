@@ -17,7 +17,10 @@ fn columns<S: Simd, const WIDTH: usize>(simd: S, from: &[f32], start: usize, her
             stage[k][lane] = from[i * WIDTH + k];
         }
     }
-    each(#[inline(always)] |k| Lanes::load(simd, &stage[k]))
+    each(
+        #[inline(always)]
+        |k| Lanes::load(simd, &stage[k]),
+    )
 }
 
 /// Writes `values` to rows `start..start + here` of `to`.
@@ -105,10 +108,25 @@ pub fn rotations(quaternions: &[f32], upstream: &[f32]) -> (Vec<f32>, Vec<f32>) 
                 let inverse = Lanes::splat(simd, 1.0) / raw.iter().fold(Lanes::splat(simd, 0.0), |sum, v| v.fma(*v, sum)).sqrt();
                 let unit = raw.map(|v| v * inverse);
                 let r = rotation(unit);
-                let flat: [Lanes<S>; 9] = each(#[inline(always)] |k| r[k / 3][k % 3]);
+                let flat: [Lanes<S>; 9] = each(
+                    #[inline(always)]
+                    |k| r[k / 3][k % 3],
+                );
                 write(&flat, &mut out.0, start, here);
                 let g: [Lanes<S>; 9] = columns(simd, self.1, start, here);
-                let d = rotation_backward(unit, inverse, each(#[inline(always)] |i| each(#[inline(always)] |j| g[3 * i + j])));
+                let d = rotation_backward(
+                    unit,
+                    inverse,
+                    each(
+                        #[inline(always)]
+                        |i| {
+                            each(
+                                #[inline(always)]
+                                |j| g[3 * i + j],
+                            )
+                        },
+                    ),
+                );
                 write(&d, &mut out.1, start, here);
             }
             out

@@ -17,10 +17,13 @@ fn dot<S: Simd>(a: Vec3<S>, b: Vec3<S>) -> Lanes<S> {
 
 #[inline(always)]
 fn cross<S: Simd>(a: Vec3<S>, b: Vec3<S>) -> Vec3<S> {
-    each(#[inline(always)] |k| {
-        let (i, j) = ((k + 1) % 3, (k + 2) % 3);
-        a[j].nfma(b[i], a[i] * b[j])
-    })
+    each(
+        #[inline(always)]
+        |k| {
+            let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+            a[j].nfma(b[i], a[i] * b[j])
+        },
+    )
 }
 
 /// A unit quaternion (w,x,y,z) as a rotation matrix, by rows.
@@ -51,7 +54,10 @@ pub fn rotation_backward<S: Simd>(unit: [Lanes<S>; 4], inverse_norm: Lanes<S>, d
     // The matrix is quadratic in the quaternion: a factor 2 in all; then the part along the quaternion is projected out.
     let along = g[0].fma(w, g[1].fma(x, g[2].fma(y, g[3] * z)));
     let factor = inverse_norm * 2.0;
-    each(#[inline(always)] |k| unit[k].nfma(along, g[k]) * factor)
+    each(
+        #[inline(always)]
+        |k| unit[k].nfma(along, g[k]) * factor,
+    )
 }
 
 /// A projected vector of Gaussians with everything its derivative needs.
@@ -88,26 +94,75 @@ pub struct Projection<S: Simd> {
 #[inline(always)]
 pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [Lanes<S>; 4], scales: Vec3<S>) -> Projection<S> {
     let like = |v: f32| mean[0].like(v);
-    let w: [Vec3<S>; 3] = each(#[inline(always)] |i| each(#[inline(always)] |j| like(camera.rotation[i][j])));
-    let point: Vec3<S> = each(#[inline(always)] |i| w[i][0].fma(mean[0], w[i][1].fma(mean[1], w[i][2].fma(mean[2], like(camera.translation[i])))));
+    let w: [Vec3<S>; 3] = each(
+        #[inline(always)]
+        |i| {
+            each(
+                #[inline(always)]
+                |j| like(camera.rotation[i][j]),
+            )
+        },
+    );
+    let point: Vec3<S> = each(
+        #[inline(always)]
+        |i| w[i][0].fma(mean[0], w[i][1].fma(mean[1], w[i][2].fma(mean[2], like(camera.translation[i])))),
+    );
     let inverse_depth = like(1.0) / point[2];
     let [q0, q1, q2, q3] = quaternion;
     let norm_squared = q0.fma(q0, q1.fma(q1, q2.fma(q2, q3 * q3)));
     let inverse_norm = like(1.0) / norm_squared.sqrt();
-    let unit: [Lanes<S>; 4] = each(#[inline(always)] |k| quaternion[k] * inverse_norm);
+    let unit: [Lanes<S>; 4] = each(
+        #[inline(always)]
+        |k| quaternion[k] * inverse_norm,
+    );
     let rotation = rotation(unit);
-    let turned: [Vec3<S>; 3] =
-        each(#[inline(always)] |i| each(#[inline(always)] |j| w[i][0].fma(rotation[0][j], w[i][1].fma(rotation[1][j], w[i][2] * rotation[2][j]))));
-    let scaled: [Vec3<S>; 3] = each(#[inline(always)] |i| each(#[inline(always)] |j| turned[i][j] * scales[j]));
+    let turned: [Vec3<S>; 3] = each(
+        #[inline(always)]
+        |i| {
+            each(
+                #[inline(always)]
+                |j| w[i][0].fma(rotation[0][j], w[i][1].fma(rotation[1][j], w[i][2] * rotation[2][j])),
+            )
+        },
+    );
+    let scaled: [Vec3<S>; 3] = each(
+        #[inline(always)]
+        |i| {
+            each(
+                #[inline(always)]
+                |j| turned[i][j] * scales[j],
+            )
+        },
+    );
     let raw_ratio = [point[0] * inverse_depth, point[1] * inverse_depth];
-    let limits: [[Lanes<S>; 2]; 2] = each(#[inline(always)] |i| each(#[inline(always)] |j| like(camera.ratio_limits[i][j])));
-    let ratio: [Lanes<S>; 2] = each(#[inline(always)] |k| raw_ratio[k].max(limits[k][0]).min(limits[k][1]));
-    let inside: [Mask<S>; 2] = each(#[inline(always)] |k| raw_ratio[k].ge(limits[k][0]) & raw_ratio[k].le(limits[k][1]));
-    let rows: [Vec3<S>; 2] = each(#[inline(always)] |k| {
-        let scale = inverse_depth * camera.focal[k];
-        // J's third column is -f x / z^2 = -(f / z) (x / z).
-        each(#[inline(always)] |j| scale * ratio[k].nfma(scaled[2][j], scaled[k][j]))
-    });
+    let limits: [[Lanes<S>; 2]; 2] = each(
+        #[inline(always)]
+        |i| {
+            each(
+                #[inline(always)]
+                |j| like(camera.ratio_limits[i][j]),
+            )
+        },
+    );
+    let ratio: [Lanes<S>; 2] = each(
+        #[inline(always)]
+        |k| raw_ratio[k].max(limits[k][0]).min(limits[k][1]),
+    );
+    let inside: [Mask<S>; 2] = each(
+        #[inline(always)]
+        |k| raw_ratio[k].ge(limits[k][0]) & raw_ratio[k].le(limits[k][1]),
+    );
+    let rows: [Vec3<S>; 2] = each(
+        #[inline(always)]
+        |k| {
+            let scale = inverse_depth * camera.focal[k];
+            // J's third column is -f x / z^2 = -(f / z) (x / z).
+            each(
+                #[inline(always)]
+                |j| scale * ratio[k].nfma(scaled[2][j], scaled[k][j]),
+            )
+        },
+    );
     let (xx, xy, yy) = (dot(rows[0], rows[0]), dot(rows[0], rows[1]), dot(rows[1], rows[1]));
     let normal = cross(rows[0], rows[1]);
     let raw_determinant = dot(normal, normal);
@@ -116,7 +171,10 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
     let covariance = [xx + EPS_2D, xy, yy + EPS_2D];
     Projection {
         point,
-        center: each(#[inline(always)] |k| raw_ratio[k].fma(like(camera.focal[k]), like(camera.principal[k]))),
+        center: each(
+            #[inline(always)]
+            |k| raw_ratio[k].fma(like(camera.focal[k]), like(camera.principal[k])),
+        ),
         covariance,
         determinant,
         conic: [covariance[2] * inverse, -(xy * inverse), covariance[0] * inverse],
@@ -167,7 +225,15 @@ pub struct GeometryGradient<S: Simd> {
 #[inline(always)]
 pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Projection<S>, g: &ProjectionGradient<S>) -> GeometryGradient<S> {
     let like = |v: f32| mean[0].like(v);
-    let w: [Vec3<S>; 3] = each(#[inline(always)] |i| each(#[inline(always)] |j| like(camera.rotation[i][j])));
+    let w: [Vec3<S>; 3] = each(
+        #[inline(always)]
+        |i| {
+            each(
+                #[inline(always)]
+                |j| like(camera.rotation[i][j]),
+            )
+        },
+    );
     // The conic is the inverse of the covariance: d covariance = -K G K with G the symmetric gradient.
     let [a, b, c] = p.conic;
     let half = g.conic[1] * 0.5;
@@ -190,15 +256,27 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
     let m = [d_raw.fma(yy, d_xx), d_raw.nfma(xy, d_xy), d_raw.fma(xx, d_yy)];
     let two = like(2.0);
     let d_rows: [Vec3<S>; 2] = [
-        each(#[inline(always)] |j| two * m[0].fma(p.rows[0][j], m[1] * p.rows[1][j])),
-        each(#[inline(always)] |j| two * m[1].fma(p.rows[0][j], m[2] * p.rows[1][j])),
+        each(
+            #[inline(always)]
+            |j| two * m[0].fma(p.rows[0][j], m[1] * p.rows[1][j]),
+        ),
+        each(
+            #[inline(always)]
+            |j| two * m[1].fma(p.rows[0][j], m[2] * p.rows[1][j]),
+        ),
     ];
     // rows[k] = (f_k / z) (scaled[k] - ratio_k scaled[2]).
-    let scale: [Lanes<S>; 2] = each(#[inline(always)] |k| p.inverse_depth * camera.focal[k]);
+    let scale: [Lanes<S>; 2] = each(
+        #[inline(always)]
+        |k| p.inverse_depth * camera.focal[k],
+    );
     let mut d_point = [like(0.0), like(0.0), g.depth];
     let mut d_scaled = [[like(0.0); 3]; 3];
     for k in 0..2 {
-        d_scaled[k] = each(#[inline(always)] |j| d_rows[k][j] * scale[k]);
+        d_scaled[k] = each(
+            #[inline(always)]
+            |j| d_rows[k][j] * scale[k],
+        );
         let ratio = p.ratio[k];
         for j in 0..3 {
             d_scaled[2][j] = d_scaled[k][j].nfma(ratio, d_scaled[2][j]);
@@ -221,13 +299,31 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
             d_turned[i][j] = d_scaled[i][j] * p.scales[j];
         }
     }
-    let d_rotation: [Vec3<S>; 3] =
-        each(#[inline(always)] |i| each(#[inline(always)] |j| w[0][i].fma(d_turned[0][j], w[1][i].fma(d_turned[1][j], w[2][i] * d_turned[2][j]))));
+    let d_rotation: [Vec3<S>; 3] = each(
+        #[inline(always)]
+        |i| {
+            each(
+                #[inline(always)]
+                |j| w[0][i].fma(d_turned[0][j], w[1][i].fma(d_turned[1][j], w[2][i] * d_turned[2][j])),
+            )
+        },
+    );
     GeometryGradient {
-        mean: each(#[inline(always)] |i| w[0][i].fma(d_point[0], w[1][i].fma(d_point[1], w[2][i] * d_point[2]))),
+        mean: each(
+            #[inline(always)]
+            |i| w[0][i].fma(d_point[0], w[1][i].fma(d_point[1], w[2][i] * d_point[2])),
+        ),
         quaternion: rotation_backward(p.unit, p.inverse_norm, d_rotation),
         scales: d_scales,
-        camera_rotation: each(#[inline(always)] |i| each(#[inline(always)] |j| d_point[i].fma(mean[j], dot(d_turned[i], p.rotation[j])))),
+        camera_rotation: each(
+            #[inline(always)]
+            |i| {
+                each(
+                    #[inline(always)]
+                    |j| d_point[i].fma(mean[j], dot(d_turned[i], p.rotation[j])),
+                )
+            },
+        ),
         camera_translation: d_point,
     }
 }

@@ -114,7 +114,9 @@ pub fn gradients(splats: &SplatArrays, settings: &RasterSettings, workspace: &Wo
             let first = chunk * CHUNK;
             let len = CHUNK.min(n - first);
             // SAFETY: every task has a chunk of its own.
-            let (out, camera_sums) = unsafe { (shared.each_ref().map(|column| rows(column, first, len)), parts.slice(if request.camera { chunk } else { 0 }, usize::from(request.camera))) };
+            let (out, camera_sums) = unsafe {
+                (shared.each_ref().map(|column| rows(column, first, len)), parts.slice(if request.camera { chunk } else { 0 }, usize::from(request.camera)))
+            };
             let count = workspace.chunk_counts[chunk].0 as usize;
             let sums = dispatch(GradientChunk { splats, settings, camera: &camera, workspace, first, count, request, out });
             if let Some(part) = camera_sums.first_mut() {
@@ -188,10 +190,9 @@ impl WithSimd for GradientChunk<'_> {
             for lane in 0..S::F32_LANES {
                 // Lanes without a Gaussian repeat the last one with no gradient.
                 let slot = self.first + start + lane.min(here - 1);
-                let rank = self.workspace.rank_of_slot[slot] as usize;
-                let splat = &self.workspace.ranked[rank];
+                let splat = &self.workspace.slots[slot];
                 indices[lane] = splat.index as usize;
-                let record = if lane < here { self.workspace.summed_record(rank) } else { [0.0; RECORD] };
+                let record = if lane < here { self.workspace.summed_record(self.workspace.rank_of_slot[slot] as usize) } else { [0.0; RECORD] };
                 for (row, value) in screen.iter_mut().zip(record) {
                     row[lane] = value;
                 }
@@ -200,15 +201,31 @@ impl WithSimd for GradientChunk<'_> {
                     screen[RECORD + c][lane] = if clamps && splat.color[c] <= 0.0 { 0.0 } else { 1.0 };
                 }
             }
+            // The records of the next group lie all over the lists: ask for them now.
+            for slot in start + here..self.count.min(start + here + S::F32_LANES) {
+                self.workspace.prefetch_records(self.workspace.rank_of_slot[self.first + slot] as usize);
+            }
             stage_inputs::<S>(self.splats, |lane| indices[lane], &mut stage);
             self.group(simd, &indices[..here], &stage, &screen, &mut camera_sums);
             start += S::F32_LANES;
         }
-        let sums: [f64; CAMERA_ROWS] = each(#[inline(always)] |k| f64::from(camera_sums[k].sum()));
+        let sums: [f64; CAMERA_ROWS] = each(
+            #[inline(always)]
+            |k| f64::from(camera_sums[k].sum()),
+        );
         CameraSums {
-            rotation: each(#[inline(always)] |k| sums[k]),
-            translation: each(#[inline(always)] |k| sums[9 + k]),
-            center: each(#[inline(always)] |k| sums[12 + k]),
+            rotation: each(
+                #[inline(always)]
+                |k| sums[k],
+            ),
+            translation: each(
+                #[inline(always)]
+                |k| sums[9 + k],
+            ),
+            center: each(
+                #[inline(always)]
+                |k| sums[12 + k],
+            ),
         }
     }
 }
@@ -217,8 +234,14 @@ impl GradientChunk<'_> {
     /// The Gaussians `indices`, staged in columns.
     #[inline(always)]
     fn group<S: Simd>(&mut self, simd: S, indices: &[usize], stage: &Stage<11>, screen: &Stage<SCREEN_ROWS>, camera_sums: &mut [Lanes<S>; CAMERA_ROWS]) {
-        let inputs: [Lanes<S>; 11] = each(#[inline(always)] |i| Lanes::load(simd, &stage[i]));
-        let g: [Lanes<S>; RECORD] = each(#[inline(always)] |i| Lanes::load(simd, &screen[i]));
+        let inputs: [Lanes<S>; 11] = each(
+            #[inline(always)]
+            |i| Lanes::load(simd, &stage[i]),
+        );
+        let g: [Lanes<S>; RECORD] = each(
+            #[inline(always)]
+            |i| Lanes::load(simd, &screen[i]),
+        );
         let mean: Vec3<S> = [inputs[0], inputs[1], inputs[2]];
         let space = self.settings.space;
         let (scales, opacity) = activate(space, [inputs[3], inputs[4], inputs[5]], inputs[10]);
@@ -234,7 +257,10 @@ impl GradientChunk<'_> {
                 d.scales[k] = d.scales[k] * scales[k];
             }
         }
-        let color: Vec3<S> = each(#[inline(always)] |c| g[6 + c] * Lanes::load(simd, &screen[RECORD + c]));
+        let color: Vec3<S> = each(
+            #[inline(always)]
+            |c| g[6 + c] * Lanes::load(simd, &screen[RECORD + c]),
+        );
         let mut d_colors = color;
         if let Some(degree) = self.settings.sh_degree {
             let (d_dc, d_offset) = self.harmonics(simd, degree, indices, mean, color);
@@ -270,7 +296,7 @@ impl GradientChunk<'_> {
         let mut offset = [zero; 3];
         if degree > 0 && (self.request.means || self.request.camera) {
             let mut stage: Stage<{ 3 + 3 * sh::MAX_BASIS }> = [[0.0; WIDEST]; 3 + 3 * sh::MAX_BASIS];
-            stage_coefficients::<S>(self.splats, degree, |lane| indices[lane.min(indices.len() - 1)], &mut stage);
+            stage_coefficients(self.splats, degree, indices, &mut stage);
             let mut shown = [zero; sh::MAX_BASIS];
             for k in 1..count {
                 let coefficient = |c: usize| Lanes::load(simd, &stage[3 + 3 * k + c]);
@@ -290,7 +316,10 @@ impl GradientChunk<'_> {
             }
             for (lane, index) in indices.iter().enumerate() {
                 let row = &mut self.out[5][(index - self.first) * width..][..3 * (count - 1)];
-                let rgb: [f32; 3] = each(#[inline(always)] |c| color_columns[c][lane]);
+                let rgb: [f32; 3] = each(
+                    #[inline(always)]
+                    |c| color_columns[c][lane],
+                );
                 for (k, coefficient) in row.chunks_exact_mut(3).enumerate() {
                     let value = basis_columns[k + 1][lane];
                     for c in 0..3 {
@@ -299,7 +328,13 @@ impl GradientChunk<'_> {
                 }
             }
         }
-        (each(#[inline(always)] |c| color[c] * values[0]), offset)
+        (
+            each(
+                #[inline(always)]
+                |c| color[c] * values[0],
+            ),
+            offset,
+        )
     }
     /// Writes columns to the rows of the Gaussians `indices` of output `which`, if that is wanted.
     #[inline(always)]

@@ -98,8 +98,9 @@ impl SplatArrays<'_> {
 }
 
 /// A visible Gaussian, ready to be blended.
-#[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
+// One cache line each: blending jumps through the array.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(C, align(64))]
 pub struct ScreenSplat {
     /// Centre in pixels.
     pub center: [f32; 2],

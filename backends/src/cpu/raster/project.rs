@@ -92,7 +92,13 @@ pub fn activate<S: Simd>(space: ParameterSpace, scales: Vec3<S>, opacity: Lanes<
     match space {
         ParameterSpace::Raw => {
             let one = opacity.like(1.0);
-            (each(#[inline(always)] |k| scales[k].exp()), one / (one + (-opacity).exp()))
+            (
+                each(
+                    #[inline(always)]
+                    |k| scales[k].exp(),
+                ),
+                one / (one + (-opacity).exp()),
+            )
         }
         ParameterSpace::Activated => (scales, opacity),
     }
@@ -101,10 +107,19 @@ pub fn activate<S: Simd>(space: ParameterSpace, scales: Vec3<S>, opacity: Lanes<
 /// Direction from the camera centre to `mean`, and one over the distance.
 #[inline(always)]
 pub fn view_direction<S: Simd>(camera: &CameraConstants, mean: Vec3<S>) -> (Vec3<S>, Lanes<S>) {
-    let offset: Vec3<S> = each(#[inline(always)] |k| mean[k] - camera.center[k]);
+    let offset: Vec3<S> = each(
+        #[inline(always)]
+        |k| mean[k] - camera.center[k],
+    );
     let squared = offset[0].fma(offset[0], offset[1].fma(offset[1], offset[2] * offset[2]));
     let inverse = offset[0].like(1.0) / squared.sqrt();
-    (each(#[inline(always)] |k| offset[k] * inverse), inverse)
+    (
+        each(
+            #[inline(always)]
+            |k| offset[k] * inverse,
+        ),
+        inverse,
+    )
 }
 
 struct Project<'k, 'a>(&'k mut ProjectChunk<'a>);
@@ -123,7 +138,10 @@ impl WithSimd for Project<'_, '_> {
         while start < len {
             let here = S::F32_LANES.min(len - start);
             stage_inputs::<S>(k.splats, |lane| k.first + start + lane.min(here - 1), &mut stage);
-            let inputs: [Lanes<S>; 11] = each(#[inline(always)] |i| Lanes::load(simd, &stage[i]));
+            let inputs: [Lanes<S>; 11] = each(
+                #[inline(always)]
+                |i| Lanes::load(simd, &stage[i]),
+            );
             let mean: Vec3<S> = [inputs[0], inputs[1], inputs[2]];
             let (scales, opacity) = activate(k.settings.space, [inputs[3], inputs[4], inputs[5]], inputs[10]);
             let p = project(k.camera, mean, [inputs[6], inputs[7], inputs[8], inputs[9]], scales);
@@ -175,7 +193,13 @@ impl WithSimd for Project<'_, '_> {
                 }
                 for lane in 0..here {
                     if out[13][lane] != 0.0 {
-                        k.emit(start + lane, &each(#[inline(always)] |row| out[row][lane]));
+                        k.emit(
+                            start + lane,
+                            &each(
+                                #[inline(always)]
+                                |row| out[row][lane],
+                            ),
+                        );
                     }
                 }
             }
@@ -212,10 +236,15 @@ impl ProjectChunk<'_> {
         self.footprints[self.count] = Footprint { half_height: v[8], x_of_bottom: v[9], slope: v[10], aspect: v[11] };
         self.count += 1;
     }
-    /// Sets the colour of a slot and moves it to `kept`, or culls it if the colour is not finite.
+    /// Sets the colour of a slot and moves it to `kept`, or culls it if the colour, before its clamp at zero, is not finite.
     #[inline(always)]
     fn finish(&mut self, slot: usize, kept: &mut usize, color: [f32; 3]) {
-        let splat = ScreenSplat { color, ..self.slots[slot] };
+        let clamps = self.settings.sh_degree.is_some();
+        let shown = each(
+            #[inline(always)]
+            |c| if clamps { color[c].max(0.0) } else { color[c] },
+        );
+        let splat = ScreenSplat { color: shown, ..self.slots[slot] };
         // False for NaN as well.
         if color.iter().all(|c| c.abs() < COLOR_LIMIT) {
             self.slots[*kept] = splat;
@@ -238,19 +267,33 @@ impl WithSimd for Color<'_, '_> {
         let Some(degree) = k.settings.sh_degree else {
             for slot in 0..k.count {
                 let i = k.slots[slot].index as usize;
-                k.finish(slot, &mut kept, each(#[inline(always)] |c| k.splats.colors[3 * i + c]));
+                k.finish(
+                    slot,
+                    &mut kept,
+                    each(
+                        #[inline(always)]
+                        |c| k.splats.colors[3 * i + c],
+                    ),
+                );
             }
             k.count = kept;
             return;
         };
         let mut stage: Stage<{ 3 + 3 * sh::MAX_BASIS }> = [[0.0; WIDEST]; 3 + 3 * sh::MAX_BASIS];
+        let mut indices = [0usize; WIDEST];
         let mut colors: Stage<3> = [[0.0; WIDEST]; 3];
         let mut values = [Lanes::splat(simd, 0.0); sh::MAX_BASIS];
         let mut start = 0;
         while start < k.count {
             let here = S::F32_LANES.min(k.count - start);
-            stage_coefficients::<S>(k.splats, degree, |lane| k.slots[start + lane.min(here - 1)].index as usize, &mut stage);
-            let mean: Vec3<S> = each(#[inline(always)] |c| Lanes::load(simd, &stage[c]));
+            for lane in 0..S::F32_LANES {
+                indices[lane] = k.slots[start + lane.min(here - 1)].index as usize;
+            }
+            stage_coefficients(k.splats, degree, &indices[..S::F32_LANES], &mut stage);
+            let mean: Vec3<S> = each(
+                #[inline(always)]
+                |c| Lanes::load(simd, &stage[c]),
+            );
             let (direction, _) = view_direction(k.camera, mean);
             sh::basis(degree, direction, &mut values);
             for c in 0..3 {
@@ -258,11 +301,17 @@ impl WithSimd for Color<'_, '_> {
                 for (j, value) in values[..(degree + 1) * (degree + 1)].iter().enumerate() {
                     sum = value.fma(Lanes::load(simd, &stage[3 + 3 * j + c]), sum);
                 }
-                // Written so that a NaN stays one: it must be seen below.
-                sum.lt(Lanes::splat(simd, 0.0)).select(Lanes::splat(simd, 0.0), sum).store(&mut colors[c]);
+                sum.store(&mut colors[c]);
             }
             for lane in 0..here {
-                k.finish(start + lane, &mut kept, each(#[inline(always)] |c| colors[c][lane]));
+                k.finish(
+                    start + lane,
+                    &mut kept,
+                    each(
+                        #[inline(always)]
+                        |c| colors[c][lane],
+                    ),
+                );
             }
             start += S::F32_LANES;
         }
@@ -270,18 +319,14 @@ impl WithSimd for Color<'_, '_> {
     }
 }
 
-/// Means in rows 0-2, then the coefficients up to `degree`, in columns.
-#[inline(always)]
-pub fn stage_coefficients<S: Simd>(
-    splats: &SplatArrays,
-    degree: usize,
-    index_of_lane: impl Fn(usize) -> usize,
-    stage: &mut Stage<{ 3 + 3 * sh::MAX_BASIS }>,
-) {
+/// Means of the Gaussians `indices` in rows 0-2, then the coefficients up to `degree`, one column each.
+///
+/// Never inlined: inside a kernel the compiler turns the transposition into scatter instructions, which are slower than plain stores.
+#[inline(never)]
+pub fn stage_coefficients(splats: &SplatArrays, degree: usize, indices: &[usize], stage: &mut Stage<{ 3 + 3 * sh::MAX_BASIS }>) {
     let width = splats.rest_width();
     let needed = 3 * ((degree + 1) * (degree + 1) - 1);
-    for lane in 0..S::F32_LANES {
-        let i = index_of_lane(lane);
+    for (lane, &i) in indices.iter().enumerate().take(WIDEST) {
         for c in 0..3 {
             stage[c][lane] = splats.means[3 * i + c];
             stage[3 + c][lane] = splats.colors[3 * i + c];

@@ -2,6 +2,7 @@
 //! costs more than the kernels that fill them.
 
 use super::{RECORD, ScreenSplat};
+use crate::cpu::simd::prefetch;
 use std::sync::Mutex;
 
 /// Workspaces kept for reuse.
@@ -40,8 +41,6 @@ pub struct Pair {
 pub struct Entry {
     /// Position of the Gaussian in depth order.
     pub rank: u32,
-    /// Where the gradient record of this pair goes.
-    pub record: u32,
     /// First row of the tile it reaches, and last row times 256.
     pub rows: u32,
 }
@@ -72,8 +71,10 @@ pub struct Buffers {
     pub ranked: Vec<ScreenSplat>,
     /// Position in depth order of every slot.
     pub rank_of_slot: Vec<u32>,
-    /// First record of every rank, and the end.
-    pub record_start: Vec<u32>,
+    /// First pair of every rank, and the end.
+    pub pair_start: Vec<u32>,
+    /// Position in `list` of every pair.
+    pub place_of_pair: Vec<u32>,
     /// Pairs per binning task.
     pub pairs: Vec<Vec<Pair>>,
     /// Entries per binning task and tile.
@@ -92,16 +93,16 @@ pub struct Buffers {
     pub final_transmittance: Vec<f32>,
     /// Position in the list where the pixel stopped, per tile and pixel.
     pub stop_at: Vec<u32>,
-    /// Gradient records by pair.
+    /// Gradient records by position in `list`.
     pub records: Vec<[f32; RECORD]>,
-    /// Largest weight by pair, when asked for.
+    /// Largest weight by position in `list`, when asked for.
     pub pair_weights: Vec<f32>,
 }
 
 impl Buffers {
     fn bytes(&self) -> usize {
         let pairs: usize = self.pairs.iter().map(|p| 12 * p.capacity()).sum();
-        48 * (self.slots.capacity() + self.ranked.capacity())
+        64 * (self.slots.capacity() + self.ranked.capacity())
             + 16 * (self.footprints.capacity() + self.order.capacity())
             + 12 * self.list.capacity()
             + 4 * RECORD * self.records.capacity()
@@ -121,12 +122,19 @@ impl Workspace {
     pub fn take() -> Self {
         Self { buffers: POOL.lock().ok().and_then(|mut pool| pool.pop()).unwrap_or_default() }
     }
+    /// Asks for the records that [`Workspace::summed_record`] will read.
+    #[inline(always)]
+    pub fn prefetch_records(&self, rank: usize) {
+        for &place in &self.place_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            prefetch(&self.records, place as usize);
+        }
+    }
     /// The sum of the records of the Gaussian at `rank`, in the order of its tiles.
     #[inline(always)]
     pub fn summed_record(&self, rank: usize) -> [f32; RECORD] {
         let mut sum = [0.0f32; RECORD];
-        for record in &self.records[self.record_start[rank] as usize..self.record_start[rank + 1] as usize] {
-            for (a, b) in sum.iter_mut().zip(record) {
+        for &place in &self.place_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            for (a, b) in sum.iter_mut().zip(&self.records[place as usize]) {
                 *a += b;
             }
         }

@@ -10,8 +10,7 @@ const C0: f32 = 0.282_094_79;
 const C1: f32 = 0.488_602_51;
 const C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_2];
 const C3: [f32; 7] = [-0.590_043_6, 2.890_611_4, -0.457_045_8, 0.373_176_34, -0.457_045_8, 1.445_305_7, -0.590_043_6];
-const C4: [f32; 9] =
-    [2.503_342_9, -1.770_130_8, 0.946_174_7, -0.669_046_5, 0.105_785_55, -0.669_046_5, 0.473_087_35, -1.770_130_8, 0.625_835_7];
+const C4: [f32; 9] = [2.503_342_9, -1.770_130_8, 0.946_174_7, -0.669_046_5, 0.105_785_55, -0.669_046_5, 0.473_087_35, -1.770_130_8, 0.625_835_7];
 
 /// Fills the first (degree + 1)^2 basis values at the unit direction `d`.
 #[inline(always)]
@@ -70,7 +69,10 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
     if degree < 2 {
         return g;
     }
-    let h2: [Lanes<S>; 5] = each(#[inline(always)] |k| h[4 + k] * C2[k]);
+    let h2: [Lanes<S>; 5] = each(
+        #[inline(always)]
+        |k| h[4 + k] * C2[k],
+    );
     g[0] = h2[0].fma(y, h2[2].fma(x * -2.0, h2[3].fma(z, h2[4].fma(x * 2.0, g[0]))));
     g[1] = h2[0].fma(x, h2[1].fma(z, h2[2].fma(y * -2.0, h2[4].fma(y * -2.0, g[1]))));
     g[2] = h2[1].fma(y, h2[2].fma(z * 4.0, h2[3].fma(x, g[2])));
@@ -78,7 +80,10 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
         return g;
     }
     let (xx, yy, zz, xy, yz, xz) = (x * x, y * y, z * z, x * y, y * z, x * z);
-    let h3: [Lanes<S>; 7] = each(#[inline(always)] |k| h[9 + k] * C3[k]);
+    let h3: [Lanes<S>; 7] = each(
+        #[inline(always)]
+        |k| h[9 + k] * C3[k],
+    );
     let side = zz * 4.0 - xx - yy;
     g[0] = h3[0].fma(xy * 6.0, h3[1].fma(yz, h3[2].fma(xy * -2.0, h3[3].fma(xz * -6.0, g[0]))));
     g[0] = h3[4].fma(side - xx * 2.0, h3[5].fma(xz * 2.0, h3[6].fma((xx - yy) * 3.0, g[0])));
@@ -89,7 +94,10 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
     if degree < 4 {
         return g;
     }
-    let h4: [Lanes<S>; 9] = each(#[inline(always)] |k| h[16 + k] * C4[k]);
+    let h4: [Lanes<S>; 9] = each(
+        #[inline(always)]
+        |k| h[16 + k] * C4[k],
+    );
     let s = zz * 7.0;
     let (s1, s3) = (s - 1.0, s - 3.0);
     g[0] = h4[0].fma(y * (xx * 3.0 - yy), h4[1].fma(xy * z * 6.0, h4[2].fma(y * s1, g[0])));
@@ -106,5 +114,8 @@ pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BAS
 #[inline(always)]
 pub fn normalize_backward<S: Simd>(direction: Vec3<S>, inverse_length: Lanes<S>, g: Vec3<S>) -> Vec3<S> {
     let along = direction[0].fma(g[0], direction[1].fma(g[1], direction[2] * g[2]));
-    each(#[inline(always)] |k| direction[k].nfma(along, g[k]) * inverse_length)
+    each(
+        #[inline(always)]
+        |k| direction[k].nfma(along, g[k]) * inverse_length,
+    )
 }

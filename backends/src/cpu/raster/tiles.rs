@@ -6,9 +6,13 @@ use super::parallel::{SharedMut, run_tasks};
 use super::project::CHUNK;
 use super::scratch::{Buffers, Entry, Footprint, Pair, Workspace, set_len};
 use super::{RasterSettings, ScreenSplat, TILE};
+use crate::cpu::simd::{dispatch, prefetch};
+use pulp::{Simd, WithSimd};
 
 /// Binning tasks. The lists do not depend on it.
 const TASKS: usize = 8;
+/// How far ahead data is asked for.
+const AHEAD: usize = 8;
 /// Bits of a digit of the radix sort.
 const DIGIT: u32 = 12;
 
@@ -21,7 +25,7 @@ pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: 
     let tiles = tiles_x * settings.height.div_ceil(TILE);
     set_len(&mut buffers.ranked, visible);
     set_len(&mut buffers.rank_of_slot, buffers.slots.len());
-    set_len(&mut buffers.record_start, visible + 1);
+    set_len(&mut buffers.pair_start, visible + 1);
     set_len(&mut buffers.histograms, TASKS * tiles);
     buffers.pairs.resize_with(TASKS, Vec::new);
     let per_task = visible.div_ceil(TASKS).max(1);
@@ -29,33 +33,84 @@ pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: 
         let pairs = SharedMut::new(&mut buffers.pairs);
         let histograms = SharedMut::new(&mut buffers.histograms);
         let ranked = SharedMut::new(&mut buffers.ranked);
-        let starts = SharedMut::new(&mut buffers.record_start);
+        let starts = SharedMut::new(&mut buffers.pair_start);
         let rank_of_slot = SharedMut::new(&mut buffers.rank_of_slot);
         let (slots, footprints, order) = (&buffers.slots, &buffers.footprints, &buffers.order);
         run_tasks(TASKS, |task| {
             let first = (task * per_task).min(visible);
             let len = per_task.min(visible - first);
-            // SAFETY: ranks, tasks and slots belong to one task each.
+            // SAFETY: ranks and tasks belong to one task each.
             let (pairs, histogram, ranked, starts) =
                 unsafe { (&mut pairs.slice(task, 1)[0], histograms.slice(task * tiles, tiles), ranked.slice(first, len), starts.slice(first, len)) };
-            pairs.clear();
-            histogram.fill(0);
-            for (k, key) in order[first..first + len].iter().enumerate() {
-                let slot = *key as u32 as usize;
-                let splat = slots[slot];
-                ranked[k] = splat;
-                // SAFETY: a slot occurs once in the order.
-                unsafe { rank_of_slot.slice(slot, 1)[0] = (first + k) as u32 };
-                starts[k] = pairs.len() as u32;
-                let limits = rules.square_tiles.then(|| square(splat.center, radii[splat.index as usize], settings));
-                cut_into_tiles(&splat, &footprints[slot], settings, limits, |tile, rows| {
-                    histogram[tile] += 1;
-                    pairs.push(Pair { tile: tile as u32, rank: (first + k) as u32, rows });
-                });
-            }
+            dispatch(Bin {
+                settings,
+                rules,
+                radii,
+                slots,
+                footprints,
+                order: &order[first..first + len],
+                first,
+                pairs,
+                histogram,
+                ranked,
+                starts,
+                rank_of_slot,
+            });
         });
     }
     place_lists(buffers, tiles, per_task);
+}
+
+/// One binning task: a run of the depth order.
+struct Bin<'a> {
+    settings: &'a RasterSettings,
+    rules: &'a RuleConstants,
+    radii: &'a [i64],
+    slots: &'a [ScreenSplat],
+    footprints: &'a [Footprint],
+    order: &'a [u64],
+    first: usize,
+    pairs: &'a mut Vec<Pair>,
+    histogram: &'a mut [u32],
+    ranked: &'a mut [ScreenSplat],
+    starts: &'a mut [u32],
+    rank_of_slot: SharedMut<'a, u32>,
+}
+
+impl WithSimd for Bin<'_> {
+    type Output = ();
+    // No vectors here: the instruction set is for rounding and fused steps.
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { settings, rules, radii, slots, footprints, order, first, pairs, histogram, ranked, starts, rank_of_slot } = self;
+        pairs.clear();
+        histogram.fill(0);
+        for (k, key) in order.iter().enumerate() {
+            if let Some(&ahead) = order.get(k + AHEAD) {
+                prefetch(slots, ahead as u32 as usize);
+                prefetch(footprints, ahead as u32 as usize);
+            }
+            let slot = *key as u32 as usize;
+            let splat = slots[slot];
+            ranked[k] = splat;
+            let rank = (first + k) as u32;
+            // SAFETY: a slot occurs once in the order.
+            unsafe { rank_of_slot.slice(slot, 1)[0] = rank };
+            starts[k] = pairs.len() as u32;
+            let limits = if rules.square_tiles { Some(square(splat.center, radii[splat.index as usize], settings)) } else { None };
+            cut_into_tiles(
+                &splat,
+                &footprints[slot],
+                settings,
+                limits,
+                #[inline(always)]
+                |tile, rows| {
+                    histogram[tile] += 1;
+                    pairs.push(Pair { tile: tile as u32, rank, rows });
+                },
+            );
+        }
+    }
 }
 
 /// Sorts the visible slots by depth, ties by index.
@@ -109,6 +164,12 @@ pub fn square(center: [f32; 2], radius: i64, settings: &RasterSettings) -> [[usi
     [axis(center[0], settings.width), axis(center[1], settings.height)]
 }
 
+/// Half the height of the footprint at `dx` from its centre, pixels.
+#[inline(always)]
+fn half_column(splat: &ScreenSplat, foot: &Footprint, dx: f32) -> f32 {
+    foot.aspect * ((splat.half_width - dx) * (splat.half_width + dx)).max(0.0).sqrt()
+}
+
 /// Calls `found(tile, rows)` for every tile with a pixel centre inside the footprint; `rows` packs the first and the last row of the tile.
 #[inline(always)]
 fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettings, limits: Option<[[usize; 2]; 2]>, mut found: impl FnMut(usize, u32)) {
@@ -127,11 +188,10 @@ fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettin
         // The strip between the outermost pixel centres of the tile column, relative to the centre of the Gaussian.
         let left = ((tile_x * TILE) as f32 + 0.5 - x).max(-splat.half_width);
         let right = ((tile_x * TILE + TILE - 1) as f32 + 0.5 - x).min(splat.half_width);
-        let column = |dx: f32| foot.aspect * ((splat.half_width - dx) * (splat.half_width + dx)).max(0.0).sqrt();
         let dx_bottom = foot.x_of_bottom.max(left).min(right);
         let dx_top = (-foot.x_of_bottom).max(left).min(right);
-        let bottom = (foot.slope * dx_bottom + column(dx_bottom)).min(foot.half_height);
-        let top = (foot.slope * dx_top - column(dx_top)).max(-foot.half_height);
+        let bottom = (foot.slope * dx_bottom + half_column(splat, foot, dx_bottom)).min(foot.half_height);
+        let top = (foot.slope * dx_top - half_column(splat, foot, dx_top)).max(-foot.half_height);
         let first_row = (y + top - 0.5).ceil().max(0.0) as usize;
         let last_row = (y + bottom - 0.5).floor();
         if last_row < 0.0 || last_row.is_nan() {
@@ -166,6 +226,7 @@ fn place_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
     }
     buffers.tile_start[tiles] = position;
     set_len(&mut buffers.list, position as usize);
+    set_len(&mut buffers.place_of_pair, position as usize);
     let mut base = [0u32; TASKS + 1];
     for task in 0..TASKS {
         base[task + 1] = base[task] + buffers.pairs[task].len() as u32;
@@ -173,25 +234,31 @@ fn place_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
     let visible = buffers.ranked.len();
     {
         let list = SharedMut::new(&mut buffers.list);
+        let places = SharedMut::new(&mut buffers.place_of_pair);
         let histograms = SharedMut::new(&mut buffers.histograms);
-        let starts = SharedMut::new(&mut buffers.record_start);
+        let starts = SharedMut::new(&mut buffers.pair_start);
         let pairs = &buffers.pairs;
         run_tasks(TASKS, |task| {
             let first = (task * per_task).min(visible);
-            // SAFETY: a task's ranks and histogram are its own, and the histogram's places in the list are too.
-            let (next, starts) = unsafe { (histograms.slice(task * tiles, tiles), starts.slice(first, per_task.min(visible - first))) };
+            let pairs = &pairs[task];
+            // SAFETY: a task's ranks, pairs and histogram are its own, and the histogram's places in the list are too.
+            let (next, starts, places) = unsafe {
+                let starts = starts.slice(first, per_task.min(visible - first));
+                (histograms.slice(task * tiles, tiles), starts, places.slice(base[task] as usize, pairs.len()))
+            };
             for start in starts {
                 *start += base[task];
             }
-            for (k, pair) in pairs[task].iter().enumerate() {
+            for (pair, place_of_pair) in pairs.iter().zip(places) {
                 let place = &mut next[pair.tile as usize];
                 // SAFETY: as above.
-                unsafe { list.slice(*place as usize, 1)[0] = Entry { rank: pair.rank, record: base[task] + k as u32, rows: pair.rows } };
+                unsafe { list.slice(*place as usize, 1)[0] = Entry { rank: pair.rank, rows: pair.rows } };
+                *place_of_pair = *place;
                 *place += 1;
             }
         });
     }
-    buffers.record_start[visible] = position;
+    buffers.pair_start[visible] = position;
     buffers.tile_order.clear();
     buffers.tile_order.extend(0..tiles as u32);
     let starts = &buffers.tile_start;

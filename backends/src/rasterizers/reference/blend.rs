@@ -1,5 +1,6 @@
 //! Blending pixel by pixel over the whole depth-sorted list, forwards and backwards.
 
+use super::gaussian::TileRange;
 use crate::cpu::raster::RasterSettings;
 use crate::cpu::raster::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
 
@@ -14,7 +15,7 @@ pub struct Item {
     /// Centre (2), conic (3), opacity, colour (3), depth.
     pub numbers: [f64; SCREEN],
     /// Tiles it is restricted to: first and end per axis.
-    pub tiles: Option<[[usize; 2]; 2]>,
+    pub tiles: Option<TileRange>,
 }
 
 /// One Gaussian at one pixel.

@@ -12,6 +12,9 @@ const COMPENSATION_FLOOR: f64 = 0.005;
 /// Side of Inria's tiles in pixels.
 const SQUARE: usize = 16;
 
+/// Tiles along x and y: first and end of each.
+pub type TileRange = [[usize; 2]; 2];
+
 /// 3x3, by rows.
 pub type Matrix3<T> = [[T; 3]; 3];
 
@@ -146,7 +149,7 @@ pub fn project<T: Real>(g: &Gaussian<T>, settings: &RasterSettings) -> Projected
 }
 
 /// Screen radius per axis and tile rectangle (first and end per axis) of a Gaussian, or nothing if it is culled.
-pub fn extent(p: &Projected<f64>, settings: &RasterSettings) -> Option<([f64; 2], Option<[[usize; 2]; 2]>)> {
+pub fn extent(p: &Projected<f64>, settings: &RasterSettings) -> Option<([f64; 2], Option<TileRange>)> {
     let rules = RuleConstants::new(settings.rules);
     let [xx, xy, yy] = p.covariance;
     let numbers = [p.center[0], p.center[1], p.conic[0], p.conic[1], p.conic[2], p.opacity, p.depth];
@@ -168,7 +171,10 @@ pub fn extent(p: &Projected<f64>, settings: &RasterSettings) -> Option<([f64; 2]
         let tiles = size.div_ceil(SQUARE) as f64;
         // Inria counts pixels from their centres: column 0 is at 0, not at 0.5.
         let center = center - 0.5;
-        [((center - radius) / SQUARE as f64).trunc().clamp(0.0, tiles) as usize, ((center + radius + (SQUARE - 1) as f64) / SQUARE as f64).trunc().clamp(0.0, tiles) as usize]
+        [
+            ((center - radius) / SQUARE as f64).trunc().clamp(0.0, tiles) as usize,
+            ((center + radius + (SQUARE - 1) as f64) / SQUARE as f64).trunc().clamp(0.0, tiles) as usize,
+        ]
     };
     let tiles = [axis(p.center[0], settings.width), axis(p.center[1], settings.height)];
     if tiles.iter().any(|t| t[0] >= t[1]) { None } else { Some(([radius; 2], Some(tiles))) }

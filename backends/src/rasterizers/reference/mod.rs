@@ -140,10 +140,10 @@ pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOu
         let p: Projected<f64> = gaussian::project(&input.gaussian(i, settings, |v, _| v), settings);
         let Some((radius, tiles)) = gaussian::extent(&p, settings) else { continue };
         let color = input.color(i, settings.sh_degree, p.direction);
-        let color = if settings.sh_degree.is_some() { color.map(|c| if c < 0.0 { 0.0 } else { c }) } else { color };
         if color.iter().any(|c| !c.is_finite()) {
             continue;
         }
+        let color = if settings.sh_degree.is_some() { color.map(|c| c.max(0.0)) } else { color };
         radii[i] = radius[0].max(radius[1]).min(1e9) as i64;
         let numbers = [p.center[0], p.center[1], p.conic[0], p.conic[1], p.conic[2], p.opacity, color[0], color[1], color[2], p.depth];
         items.push(Item { index: i, numbers, tiles });
