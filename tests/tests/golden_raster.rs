@@ -1,4 +1,5 @@
 //! The rasterizers against the golden renders: images, and gradients of every input, for both rule sets and both CPU devices.
+#![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
 mod raster_fixtures;
 
