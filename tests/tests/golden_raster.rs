@@ -75,7 +75,7 @@ fn golden_reference_in_float64() {
         let g = reference::backward(&input, &scene.settings, &out.items, &scene.upstream());
         let n = input.opacities.len();
         let sh = join_coefficients(&g.colors, &g.sh_rest, n);
-        let mut screen = vec![vec![0.0; 3 * n], vec![0.0; n], vec![0.0; 3 * n]];
+        let mut screen = [vec![0.0; 3 * n], vec![0.0; n], vec![0.0; 3 * n]];
         for (item, d) in out.items.iter().zip(&g.items) {
             let i = item.index;
             screen[0][3 * i..3 * i + 3].copy_from_slice(&d[2..5]);
