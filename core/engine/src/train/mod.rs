@@ -32,6 +32,11 @@ pub const CHECKPOINT: &str = "checkpoint";
 /// Name of the configuration inside a run's folder.
 pub const CONFIG: &str = "config.toml";
 
+/// Fewest iterations an opacity reset leaves the survivors to come back; a shorter stage is not reset.
+const LEAST_RECOVERY: usize = 500;
+/// Fewest iterations between two weight prunings, so that every view had a chance to show a Gaussian.
+const LEAST_WITNESS: usize = 100;
+
 /// What to train, where to, and who listens.
 pub struct TrainJob<'a> {
     /// The configuration.
@@ -248,11 +253,12 @@ impl Context<'_> {
         let at = |reference| self.schedule.at(stage, reference);
         let until = at(if stage == Stage::Coarse { config.until.min(5000) } else { config.until });
         let every = self.schedule.interval(config.every, 25);
-        if config.reset_every > 0 && stage == Stage::Coarse && iteration.is_multiple_of(at(config.reset_every).max(1)) && iteration < self.schedule.length(stage) {
+        let left = self.schedule.length(stage) - iteration;
+        if config.reset_every > 0 && stage == Stage::Coarse && iteration.is_multiple_of(at(config.reset_every).max(1)) && left >= LEAST_RECOVERY {
             reset_opacity(&mut state.set, 0.01);
         }
         let due = iteration > at(config.from) && iteration < until && iteration.is_multiple_of(every);
-        let weight_every = at(config.weight_every).max(1);
+        let weight_every = at(config.weight_every).max(LEAST_WITNESS);
         let prune_weight = config.weight_every > 0 && iteration < until && iteration.is_multiple_of(weight_every);
         if !due && !prune_weight {
             return Ok(());
@@ -269,7 +275,7 @@ impl Context<'_> {
     fn wants_weights(&self, stage: Stage, iteration: usize) -> bool {
         let config = &self.job.config.train.densify;
         let until = self.schedule.at(stage, if stage == Stage::Coarse { config.until.min(5000) } else { config.until });
-        let every = self.schedule.at(stage, config.weight_every).max(1);
+        let every = self.schedule.at(stage, config.weight_every).max(LEAST_WITNESS);
         config.weight_every > 0 && iteration.div_ceil(every) * every < until
     }
 

@@ -1,0 +1,158 @@
+//! Whole runs on the built-in scene, small enough for a test: reproducibility, resuming, archives, switches.
+
+use burn::tensor::Device;
+use cc4dgs::{backends as _, codecs as _, deformers as _};
+use cc4dgs_core::{Error, Event, EventSink, Limits, Recorder, Registry, Scene, Silent, Split};
+use cc4dgs_engine::config::RunConfig;
+use cc4dgs_engine::eval::{EvalReport, evaluate};
+use cc4dgs_engine::model::Model;
+use cc4dgs_engine::play::Player;
+use cc4dgs_engine::train::{CHECKPOINT, TrainJob, TrainReport, train};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+/// The demo, shrunk: every stage runs, every mechanism fires at least once.
+fn tiny(extra: &[&str]) -> RunConfig {
+    let mut sets: Vec<String> = ["scene.width=48", "scene.height=48", "train.iterations=160", "train.batch=2", "init.count=400", "train.log_every=5", "train.lambda_r=0.01"]
+        .iter()
+        .map(ToString::to_string)
+        .collect();
+    sets.extend(extra.iter().map(ToString::to_string));
+    RunConfig::resolve(Some("demo"), None, &sets).unwrap()
+}
+
+fn open(config: &RunConfig) -> Arc<Scene> {
+    Arc::new(cc4dgs_engine::data::open(Path::new("procedural"), &config.scene, &config.limits).unwrap())
+}
+
+fn run(config: &RunConfig, out: &Path, resume: bool, events: &dyn EventSink, stop: &AtomicBool) -> cc4dgs_core::Result<TrainReport> {
+    let registry = Registry::collect().unwrap();
+    train(&TrainJob { config, scene: open(config), out: out.to_path_buf(), resume, registry: &registry, events, stop })
+}
+
+fn load(path: &Path) -> Model {
+    Model::load(path, &Registry::collect().unwrap(), &Device::flex(), &Limits::default(), &Silent).unwrap()
+}
+
+fn score(model: &Model, config: &RunConfig) -> EvalReport {
+    let registry = Registry::collect().unwrap();
+    evaluate(model, &open(config), Split::Test, 0, &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(())).unwrap()
+}
+
+/// Sets the stop flag at the n-th iteration event.
+struct StopAfter<'a> {
+    left: AtomicUsize,
+    stop: &'a AtomicBool,
+}
+
+impl EventSink for StopAfter<'_> {
+    fn emit(&self, event: &Event) {
+        if matches!(event, Event::Iteration { .. }) && self.left.fetch_sub(1, Ordering::Relaxed) == 1 {
+            self.stop.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+#[test]
+fn same_seed_gives_the_same_bytes_and_resuming_does_too() {
+    let config = tiny(&[]);
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let [a, b, c] = ["a", "b", "c"].map(|name| folder.path().join(name));
+    let recorder = Recorder::default();
+    run(&config, &a, false, &recorder, &never).unwrap();
+    run(&config, &b, false, &Silent, &never).unwrap();
+    let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
+    assert!(bytes(&a) == bytes(&b), "two runs of one seed differ");
+
+    // Interrupted in the coarse, the score and the main stage, and resumed each time.
+    let mut resume = false;
+    for events_before_stop in [3, 4, 6] {
+        let stop = AtomicBool::new(false);
+        let listener = StopAfter { left: AtomicUsize::new(events_before_stop), stop: &stop };
+        match run(&config, &c, resume, &listener, &stop) {
+            Err(Error::Interrupted(_)) => resume = true,
+            other => panic!("expected an interruption, got {other:?}"),
+        }
+    }
+    run(&config, &c, true, &Silent, &never).unwrap();
+    assert!(bytes(&a) == bytes(&c), "an interrupted and resumed run differs from an uninterrupted one");
+
+    let stages: Vec<String> = recorder.events().iter().filter_map(|e| if let Event::StageFinished { stage, .. } = e { Some(stage.clone()) } else { None }).collect();
+    assert_eq!(stages, ["coarse", "score", "main"]);
+    assert!(recorder.events().iter().any(|e| matches!(e, Event::Densified { .. })), "nothing was densified");
+
+    // The archive of equal checkpoints is equal too, and plays back what the checkpoint shows.
+    let registry = Registry::collect().unwrap();
+    let archives = [(&a, "a.cc4d"), (&b, "b.cc4d")].map(|(run, name)| {
+        let path = folder.path().join(name);
+        load(run).save_archive(&path, "cca:default", &toml::Table::new(), &registry, &Limits::default(), &Silent).unwrap();
+        std::fs::read(path).unwrap()
+    });
+    assert!(archives[0] == archives[1], "archives of equal checkpoints differ");
+    let (before, after) = (score(&load(&a), &config), score(&load(&folder.path().join("a.cc4d")), &config));
+    assert!((before.psnr_db - after.psnr_db).abs() < 0.5, "{} dB became {} dB", before.psnr_db, after.psnr_db);
+    assert!(after.size_mb.total < before.size_mb.total);
+}
+
+#[test]
+fn resuming_with_another_configuration_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = tiny(&["train.iterations=12", "train.shares=[1,0,0]"]);
+    let never = AtomicBool::new(false);
+    run(&config, folder.path(), false, &Silent, &never).unwrap();
+    let other = tiny(&["train.iterations=12", "train.shares=[1,0,0]", "train.lambda_c=0.5"]);
+    let message = run(&other, folder.path(), true, &Silent, &never).unwrap_err().to_string();
+    assert!(message.contains("--resume"), "{message}");
+}
+
+#[test]
+fn cache_and_reuse_change_the_work_and_not_the_picture() {
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let base = tiny(&["train.dynamic=all", "train.iterations=60"]);
+    run(&base, folder.path(), false, &Silent, &never).unwrap();
+    let registry = Registry::collect().unwrap();
+    let scene = open(&base);
+    let camera = scene.camera(0);
+    let mut pictures = Vec::new();
+    for (cache, reuse) in [(true, true), (false, false)] {
+        let mut model = load(folder.path());
+        let field = model.field.take().unwrap();
+        let mut section = field.section.clone();
+        section.insert("cache".into(), cache.into());
+        section.insert("vertex_reuse".into(), reuse.into());
+        let mut rebuilt = registry.build_deformer(&section, &field.context, &Device::flex()).unwrap();
+        for (to, from) in rebuilt.parameters_mut().into_iter().zip(field.field.parameters()) {
+            to.value = from.value.clone();
+        }
+        model.field = Some(cc4dgs_engine::model::ModelField { field: rebuilt, section, context: field.context });
+        let mut player = Player::new(&model, &registry, &Device::flex()).unwrap();
+        let frames: Vec<Vec<f32>> = [0.0, 0.3, 0.9].iter().map(|&t| player.render(camera, t).unwrap().0.planes.into_data().try_to_vec::<f32>().unwrap()).collect();
+        let work = player.work;
+        assert_eq!(work.spatial_cached, if cache { 2 } else { 0 });
+        if reuse {
+            assert!(work.spatial.vertices_decoded < work.spatial.vertices_queried / 2);
+        } else {
+            assert_eq!(work.spatial.vertices_decoded, work.spatial.vertices_queried);
+        }
+        pictures.push(frames);
+    }
+    assert!(pictures[0] == pictures[1], "caching or reuse changed the picture");
+}
+
+#[test]
+fn static_gaussians_cost_no_field_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let config = tiny(&["train.zeta=3.0"]);
+    let report = run(&config, folder.path(), false, &Silent, &never).unwrap();
+    let model = load(folder.path());
+    let mut player = Player::new(&model, &Registry::collect().unwrap(), &Device::flex()).unwrap();
+    player.gaussians_at(0.5).unwrap();
+    let still = (report.gaussians - report.dynamic_gaussians) as u64;
+    assert!(still > 0 && report.dynamic_gaussians > 0, "{report:?}");
+    assert_eq!((player.work.deformed, player.work.static_skipped), (report.dynamic_gaussians as u64, still));
+    assert_eq!(player.work.spatial.gaussians, report.dynamic_gaussians as u64);
+}
