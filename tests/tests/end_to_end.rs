@@ -14,10 +14,11 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 /// The demo, shrunk: every stage runs, every mechanism fires at least once.
 fn tiny(extra: &[&str]) -> RunConfig {
-    let mut sets: Vec<String> = ["scene.width=48", "scene.height=48", "train.iterations=160", "train.batch=2", "init.count=400", "train.log_every=5", "train.lambda_r=0.01"]
-        .iter()
-        .map(ToString::to_string)
-        .collect();
+    let mut sets: Vec<String> =
+        ["scene.width=48", "scene.height=48", "train.iterations=160", "train.batch=2", "init.count=400", "train.log_every=5", "train.lambda_r=0.01"]
+            .iter()
+            .map(ToString::to_string)
+            .collect();
     sets.extend(extra.iter().map(ToString::to_string));
     RunConfig::resolve(Some("demo"), None, &sets).unwrap()
 }
@@ -79,7 +80,8 @@ fn same_seed_gives_the_same_bytes_and_resuming_does_too() {
     run(&config, &c, true, &Silent, &never).unwrap();
     assert!(bytes(&a) == bytes(&c), "an interrupted and resumed run differs from an uninterrupted one");
 
-    let stages: Vec<String> = recorder.events().iter().filter_map(|e| if let Event::StageFinished { stage, .. } = e { Some(stage.clone()) } else { None }).collect();
+    let stages: Vec<String> =
+        recorder.events().iter().filter_map(|e| if let Event::StageFinished { stage, .. } = e { Some(stage.clone()) } else { None }).collect();
     assert_eq!(stages, ["coarse", "score", "main"]);
     assert!(recorder.events().iter().any(|e| matches!(e, Event::Densified { .. })), "nothing was densified");
 
@@ -129,7 +131,8 @@ fn cache_and_reuse_change_the_work_and_not_the_picture() {
         }
         model.field = Some(cc4dgs_engine::model::ModelField { field: rebuilt, section, context: field.context });
         let mut player = Player::new(&model, &registry, &Device::flex()).unwrap();
-        let frames: Vec<Vec<f32>> = [0.0, 0.3, 0.9].iter().map(|&t| player.render(camera, t).unwrap().0.planes.into_data().try_to_vec::<f32>().unwrap()).collect();
+        let frames: Vec<Vec<f32>> =
+            [0.0, 0.3, 0.9].iter().map(|&t| player.render(camera, t).unwrap().0.planes.into_data().try_to_vec::<f32>().unwrap()).collect();
         let work = player.work;
         assert_eq!(work.spatial_cached, if cache { 2 } else { 0 });
         if reuse {

@@ -76,7 +76,11 @@ impl Checkpoint {
         (now.train.log_every, now.train.checkpoint_every) = (0, 0);
         (then.train.log_every, then.train.checkpoint_every) = (0, 0);
         if now.to_toml()? != then.to_toml()? {
-            return Err(Error::parameter("--resume", "the configuration differs from the checkpoint's", "Resume with the run's own config.toml, or start in another folder"));
+            return Err(Error::parameter(
+                "--resume",
+                "the configuration differs from the checkpoint's",
+                "Resume with the run's own config.toml, or start in another folder",
+            ));
         }
         let h = self.header;
         let set = GaussianSet::from_host(self.columns, h.gaussians, h.sh_degree, h.gaussian_step, &self.device);
@@ -109,7 +113,11 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
         }
     }
     if let Some((name, _, _)) = arrays.iter().find(|(_, _, values)| values.iter().any(|v| !v.is_finite())) {
-        return Err(Error::backend(format!("checkpoint array {name}"), "it holds a value that is not finite", "Resume from the checkpoint on disk with lower learning rates"));
+        return Err(Error::backend(
+            format!("checkpoint array {name}"),
+            "it holds a value that is not finite",
+            "Resume from the checkpoint on disk with lower learning rates",
+        ));
     }
     let header = Header {
         format: FORMAT,
@@ -171,7 +179,11 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
     for (name, width) in &header.columns {
         let kinds = ["value", "first_moment", "second_moment"];
         let len = n.checked_mul(*width).ok_or_else(|| damaged(format!("column {name} claims width {width}")))?;
-        let arrays = [array(&format!("gaussians/{name}/{}", kinds[0]), len)?, array(&format!("gaussians/{name}/{}", kinds[1]), len)?, array(&format!("gaussians/{name}/{}", kinds[2]), len)?];
+        let arrays = [
+            array(&format!("gaussians/{name}/{}", kinds[0]), len)?,
+            array(&format!("gaussians/{name}/{}", kinds[1]), len)?,
+            array(&format!("gaussians/{name}/{}", kinds[2]), len)?,
+        ];
         columns.push(HostColumn { name: name.clone(), width: *width, arrays });
     }
     let host = host_gaussians(header.sh_degree, columns.iter().map(|c| Ok((c.name.clone(), c.width, c.arrays[0].clone()))))?;

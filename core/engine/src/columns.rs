@@ -102,7 +102,11 @@ impl GaussianSet {
             .iter()
             .map(|c| {
                 let leaf = Tensor::<2>::from_inner(c.value.clone());
-                if learn.contains(&c.name.as_str()) || (learn.contains(&"extra") && !CORE_COLUMNS.contains(&c.name.as_str())) { leaf.require_grad() } else { leaf }
+                if learn.contains(&c.name.as_str()) || (learn.contains(&"extra") && !CORE_COLUMNS.contains(&c.name.as_str())) {
+                    leaf.require_grad()
+                } else {
+                    leaf
+                }
             })
             .collect()
     }

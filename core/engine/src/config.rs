@@ -184,7 +184,17 @@ pub struct GaussianRates {
 
 impl Default for GaussianRates {
     fn default() -> Self {
-        Self { means: 1.6e-4, means_end: 1.6e-6, log_scales: 5e-3, quaternions: 1e-3, opacity: 0.05, sh_dc: 2.5e-3, sh_rest: 1.25e-4, score: 0.05, extra: 2.5e-3 }
+        Self {
+            means: 1.6e-4,
+            means_end: 1.6e-6,
+            log_scales: 5e-3,
+            quaternions: 1e-3,
+            opacity: 0.05,
+            sh_dc: 2.5e-3,
+            sh_rest: 1.25e-4,
+            score: 0.05,
+            extra: 2.5e-3,
+        }
     }
 }
 
@@ -308,7 +318,11 @@ impl RunConfig {
             return Err(Error::parameter("render.background", format!("{:?} is not RGB in 0..1", self.render.background), "Give three numbers in 0..1"));
         }
         if !(self.init.opacity > 0.0 && self.init.opacity < 1.0) || self.init.count == 0 {
-            return Err(Error::parameter("init", format!("opacity {} count {}", self.init.opacity, self.init.count), "Opacity lies between 0 and 1, the count is positive"));
+            return Err(Error::parameter(
+                "init",
+                format!("opacity {} count {}", self.init.opacity, self.init.count),
+                "Opacity lies between 0 and 1, the count is positive",
+            ));
         }
         Ok(())
     }

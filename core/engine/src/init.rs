@@ -27,7 +27,9 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
         (other, _) => other,
     };
     let points = match source {
-        "points" => scene.points.clone().ok_or_else(|| Error::parameter("init.source", "the scene has no points", "Use init.source = \"photo\" or \"random\""))?,
+        "points" => {
+            scene.points.clone().ok_or_else(|| Error::parameter("init.source", "the scene has no points", "Use init.source = \"photo\" or \"random\""))?
+        }
         "photo" => crate::data::init::photo_points(scene, count, seed.child("photo"))?,
         _ => random_points(scene, count, seed.child("random"))?,
     };

@@ -70,7 +70,9 @@ fn blur(image: &[f32], w: usize, h: usize) -> Vec<f32> {
             .into_par_iter()
             .flat_map_iter(|line| {
                 let kernel = &kernel;
-                (0..along).map(move |i| (0..kernel.len()).map(|k| kernel[k] * source[line * stride + mirror(i as isize + k as isize - RADIUS, along) * step]).sum::<f32>())
+                (0..along).map(move |i| {
+                    (0..kernel.len()).map(|k| kernel[k] * source[line * stride + mirror(i as isize + k as isize - RADIUS, along) * step]).sum::<f32>()
+                })
             })
             .collect()
     };

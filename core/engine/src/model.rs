@@ -4,7 +4,9 @@ use crate::checkpoint;
 use crate::config::{RenderConfig, RunConfig};
 use crate::train::{CHECKPOINT, Moving};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind, WeightArray, decode_weights, encode_weights};
+use cc4dgs_core::archive::{
+    Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind, WeightArray, decode_weights, encode_weights,
+};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{CodecContext, DeformationField, Error, EventSink, FieldContext, HostGaussians, Limits, Registry, Result, Seed, Stream, split_kind};
 use serde::Serialize;
@@ -65,7 +67,11 @@ impl Model {
         let file = if path.is_dir() { path.join(CHECKPOINT) } else { path.to_path_buf() };
         let mut head = [0u8; 8];
         let read = std::fs::File::open(&file).and_then(|mut f| f.read(&mut head)).map_err(|e| Error::io(&file, e))?;
-        if read == 8 && head == MAGIC { Self::from_archive(&file, registry, device, limits, events) } else { Self::from_checkpoint(&file, registry, device, limits) }
+        if read == 8 && head == MAGIC {
+            Self::from_archive(&file, registry, device, limits, events)
+        } else {
+            Self::from_checkpoint(&file, registry, device, limits)
+        }
     }
     fn from_checkpoint(path: &Path, registry: &Registry, device: &Device, limits: &Limits) -> Result<Self> {
         let stored = checkpoint::load(path, registry, device, limits)?;
@@ -73,7 +79,8 @@ impl Model {
         let (gaussians, moving, frame_count) = (stored.gaussians()?, stored.moving(), stored.frame_count());
         let field = stored.into_field().map(|(field, section, context)| ModelField { field, section, context });
         let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
-        let floats: usize = gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
+        let floats: usize =
+            gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
         let point_cloud = 4 * floats as u64;
         let deform = deform_grid + deform_net;
         Ok(Self {
@@ -99,7 +106,13 @@ impl Model {
         let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
         gaussians.validate(&object, limits)?;
         if gaussians.len() as u64 != manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
-            let problem = format!("the manifest says {} Gaussians of degree {}, the streams hold {} of degree {}", manifest.gaussian_count, manifest.sh_degree, gaussians.len(), gaussians.sh_degree);
+            let problem = format!(
+                "the manifest says {} Gaussians of degree {}, the streams hold {} of degree {}",
+                manifest.gaussian_count,
+                manifest.sh_degree,
+                gaussians.len(),
+                gaussians.sh_degree
+            );
             return Err(Error::data(object, problem, "The archive is damaged; fetch it again"));
         }
         let field = match &manifest.deformer {
@@ -115,14 +128,22 @@ impl Model {
             }
         };
         let moving = match manifest.extra.get("moving") {
-            Some(value) => serde_json::from_value(value.clone()).map_err(|e| Error::data(&object, format!("moving: {e}"), "The archive is damaged; fetch it again"))?,
+            Some(value) => {
+                serde_json::from_value(value.clone()).map_err(|e| Error::data(&object, format!("moving: {e}"), "The archive is damaged; fetch it again"))?
+            }
             None => Moving::Scored { zeta: manifest.dynamic_threshold },
         };
         let mut rasterizer = manifest.rasterizer.settings.clone();
         rasterizer.insert("kind".into(), manifest.rasterizer.name.clone().into());
         let of_kind = |kind| archive.stream_sizes().iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();
         let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
-        let size = ModelSize { deform_grid, deform_net, deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: archive.total_bytes()? };
+        let size = ModelSize {
+            deform_grid,
+            deform_net,
+            deform: of_kind(StreamKind::Field),
+            point_cloud: of_kind(StreamKind::Canonical),
+            total: archive.total_bytes()?,
+        };
         Ok(Self {
             gaussians,
             field,
@@ -154,9 +175,8 @@ impl Model {
         let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
         let moving = if movable { self.moving } else { Moving::Nothing };
         let axis = |k: usize, start: f32, pick: fn(f32, f32) -> f32| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
-        let corner = |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
-            std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k, start, pick) })
-        };
+        let corner =
+            |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] { std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k, start, pick) }) };
         let manifest = Manifest {
             codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
             deformer,
@@ -195,14 +215,22 @@ fn check_version(object: &str, kind: &str, name: &str, stored: &str, known: &str
 }
 
 fn weights_of(field: &dyn DeformationField) -> Result<Vec<WeightArray>> {
-    field.parameters().into_iter().map(|p| Ok(WeightArray { name: p.name.clone(), shape: p.shape.clone(), values: to_vec(p.value.clone(), &p.name)? })).collect()
+    field
+        .parameters()
+        .into_iter()
+        .map(|p| Ok(WeightArray { name: p.name.clone(), shape: p.shape.clone(), values: to_vec(p.value.clone(), &p.name)? }))
+        .collect()
 }
 
 fn load_weights(object: &str, field: &mut dyn DeformationField, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
     let wanted: Vec<(String, Vec<usize>)> = field.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect();
     let found: Vec<(String, Vec<usize>)> = weights.iter().map(|w| (w.name.clone(), w.shape.clone())).collect();
     if wanted != found {
-        let odd = wanted.iter().zip(&found).find(|(a, b)| a != b).map_or_else(|| format!("{} arrays, {} expected", found.len(), wanted.len()), |(a, b)| format!("found {b:?}, expected {a:?}"));
+        let odd = wanted
+            .iter()
+            .zip(&found)
+            .find(|(a, b)| a != b)
+            .map_or_else(|| format!("{} arrays, {} expected", found.len(), wanted.len()), |(a, b)| format!("found {b:?}, expected {a:?}"));
         return Err(Error::data(object, format!("field weights do not fit the field: {odd}"), "The archive is damaged or of another version of the deformer"));
     }
     for (parameter, array) in field.parameters_mut().into_iter().zip(weights) {

@@ -34,11 +34,7 @@ impl Camera {
     /// Rotation and translation of [`Camera::world_to_camera`].
     pub fn rotation_translation(&self) -> (DMat3, DVec3) {
         let m = &self.world_to_camera;
-        let rows = DMat3::from_cols_array_2d(&[
-            [m[0][0], m[0][1], m[0][2]],
-            [m[1][0], m[1][1], m[1][2]],
-            [m[2][0], m[2][1], m[2][2]],
-        ]);
+        let rows = DMat3::from_cols_array_2d(&[[m[0][0], m[0][1], m[0][2]], [m[1][0], m[1][1], m[1][2]], [m[2][0], m[2][1], m[2][2]]]);
         (rows.transpose(), DVec3::new(m[0][3], m[1][3], m[2][3]))
     }
     /// The unit viewing direction (+z of the camera) in world coordinates.

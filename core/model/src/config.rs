@@ -5,7 +5,8 @@ use serde::de::DeserializeOwned;
 
 /// Parses a section into `T`. Unknown keys, wrong types and missing values name the section and the key.
 pub fn parse_section<T: DeserializeOwned>(object: &str, section: &toml::Table) -> Result<T> {
-    T::deserialize(toml::Value::Table(section.clone())).map_err(|e| Error::parameter(object, e.message().trim().to_string(), "`cc4dgs plugins NAME` and the presets show the known keys"))
+    T::deserialize(toml::Value::Table(section.clone()))
+        .map_err(|e| Error::parameter(object, e.message().trim().to_string(), "`cc4dgs plugins NAME` and the presets show the known keys"))
 }
 
 /// Parses TOML text into a table; `object` names the file.

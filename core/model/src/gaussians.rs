@@ -87,7 +87,11 @@ impl HostGaussians {
         let extra = self.extra.iter().map(|(name, a)| (name.as_str(), a.width, &a.values));
         for (name, width, values) in self.columns().into_iter().chain(extra) {
             if values.len() != n * width {
-                return Err(Error::data(object, format!("{name} holds {} values, {} Gaussians need {}", values.len(), n, n * width), "The file is damaged; fetch it again"));
+                return Err(Error::data(
+                    object,
+                    format!("{name} holds {} values, {} Gaussians need {}", values.len(), n, n * width),
+                    "The file is damaged; fetch it again",
+                ));
             }
             if let Some(i) = values.iter().position(|v| !v.is_finite()) {
                 return Err(Error::data(object, format!("{name} of Gaussian {} is {}", i / width.max(1), values[i]), "Remove non-finite Gaussians first"));

@@ -29,7 +29,8 @@ pub fn unknown_name<'a>(kind: &str, name: &str, known: impl Iterator<Item = &'a 
     // Jaro-Winkler misses swapped letters in short names, edit distance misses long names that share only their beginning.
     let few_edits = |k: &str| strsim::damerau_levenshtein(k, name) <= (name.chars().count() / 3).min(2);
     let near: Vec<&str> = known.iter().copied().filter(|k| strsim::jaro_winkler(k, name) > 0.75 || few_edits(k)).take(3).collect();
-    let remedy = if near.is_empty() { format!("Known: {}", known.join(", ")) } else { format!("Did you mean {}? Known: {}", near.join(" or "), known.join(", ")) };
+    let remedy =
+        if near.is_empty() { format!("Known: {}", known.join(", ")) } else { format!("Did you mean {}? Known: {}", near.join(" or "), known.join(", ")) };
     Error::parameter(format!("{kind} '{name}'"), "no such name", remedy)
 }
 

@@ -114,7 +114,11 @@ impl Scene {
             camera.validate()?;
         }
         if let Some(v) = views.iter().find(|v| v.camera >= cameras.len() || !v.time_norm.is_finite()) {
-            return Err(Error::data(name, format!("a view names camera {} of {} at time {}", v.camera, cameras.len(), v.time_norm), "Check the dataset's index files"));
+            return Err(Error::data(
+                name,
+                format!("a view names camera {} of {} at time {}", v.camera, cameras.len(), v.time_norm),
+                "Check the dataset's index files",
+            ));
         }
         if !views.iter().any(|v| v.split == Split::Train) {
             return Err(Error::data(name, "there is no training view", "Check the path and that its pictures exist"));

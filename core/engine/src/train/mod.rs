@@ -90,7 +90,7 @@ pub fn train(job: &TrainJob) -> Result<TrainReport> {
     let began = Instant::now();
     let config = job.config;
     std::fs::create_dir_all(&job.out).map_err(|e| Error::io(&job.out, e))?;
-    write_atomically(&job.out.join(CONFIG), config.to_toml()?.as_bytes())?;
+    write_atomically(job.out.join(CONFIG), config.to_toml()?.as_bytes())?;
     let device = parse_device(&config.device)?;
     let seed = Seed::root(config.seed);
     job.events.emit(&Event::RunStarted { command: "train".into(), device: config.device.clone(), seed: config.seed });
@@ -206,7 +206,7 @@ impl Context<'_> {
                 self.refine(stage, state, iteration)?;
             }
             let every = self.job.config.train.checkpoint_every;
-            if every > 0 && iteration % every == 0 && iteration < length {
+            if every > 0 && iteration.is_multiple_of(every) && iteration < length {
                 self.save(state, path)?;
             }
         }

@@ -50,8 +50,7 @@ pub fn smoothness(
     let mut rng = seed.rng();
     let picked: Vec<i64> = (0..m).map(|_| rng.random_range(0..n as i64)).collect();
     let delta = config.smooth_delta;
-    let shifts: Vec<f32> =
-        (0..3 * m).map(|i| rng.random_range(-delta..=delta) * (context.box_max[i % 3] - context.box_min[i % 3])).collect();
+    let shifts: Vec<f32> = (0..3 * m).map(|i| rng.random_range(-delta..=delta) * (context.box_max[i % 3] - context.box_min[i % 3])).collect();
     let time_shift = rng.random_range(-delta..=delta);
     let device = means_world.device();
     let rows = Rows::Some(Tensor::from_data(TensorData::new(picked, [m]), &device), m);

@@ -36,6 +36,8 @@ impl Moving {
 }
 
 /// The rows the field is asked about, on the device.
+// One value per run: boxing the tensor would only cost an allocation.
+#[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug)]
 pub enum Rows {
     /// Every Gaussian, in order.

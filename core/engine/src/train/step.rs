@@ -28,7 +28,9 @@ impl Context<'_> {
         let gaussians = state.set.gaussians(&leaves);
         let autodiff = leaves[0].device();
         let mut features = None;
-        if moving > 0 && let Some(optimizer) = &mut state.field {
+        if moving > 0
+            && let Some(optimizer) = &mut state.field
+        {
             optimizer.track();
             // The field is asked about the canonical centres as constants (baselines §10, row 22), which also makes caching exact.
             let canonical = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
@@ -87,7 +89,10 @@ impl Context<'_> {
             probes.push((probe, radii, camera));
         }
         let Some(mut loss) = total else { return Ok(()) };
-        if state.smooth && let (Some(optimizer), Some(&view)) = (&state.field, batch.first()) && moving > 0 {
+        if state.smooth
+            && let (Some(optimizer), Some(&view)) = (&state.field, batch.first())
+            && moving > 0
+        {
             let seed = self.seed.child("smoothness").index(iteration as u64);
             let means = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
             let time_norm = scene.views[view].time_norm;
@@ -110,19 +115,23 @@ impl Context<'_> {
         drop(leaves);
         drop(gaussians);
         let visible = if train.sparse_adam { seen } else { None };
-        if let Some(visible) = &visible && read {
+        if let Some(visible) = &visible
+            && read
+        {
             let shown = visible.clone().greater_elem(0).int().sum().into_scalar::<i64>().max(0) as u64;
             log.count_adam(shown, n as u64 - shown.min(n as u64));
         }
         state.set.update(of_columns, |name| gaussian_rate(&train.lr, name, progress, extent), visible.as_ref())?;
-        if features.is_some() && let Some(optimizer) = &mut state.field {
+        if features.is_some()
+            && let Some(optimizer) = &mut state.field
+        {
             optimizer.update(&gradients, progress, extent)?;
         }
         log.step(self.job.events, iteration, state.set.len());
         Ok(())
     }
 
-    /// At a tenth, a quarter and half of the main stage: measure flicker, and switch smoothness on if the scene needs it.
+    /// At a quarter and at half of the main stage, when motion has taken shape: measure flicker, and switch smoothness on if the scene needs it.
     fn decide_smoothness(&self, state: &mut TrainState, iteration: usize, moving: usize) -> Result<()> {
         let train = &self.job.config.train;
         if train.lambda_r <= 0.0 || state.smooth || state.stage != Stage::Main || moving == 0 {
@@ -133,16 +142,17 @@ impl Context<'_> {
             return Ok(());
         }
         let length = self.schedule.length(Stage::Main);
-        if ![10, 4, 2].iter().any(|&share| length >= share && iteration == length / share) {
+        if ![4, 2].iter().any(|&share| length >= share && iteration == length / share) {
             return Ok(());
         }
         let rows = state.moving_rows(&self.device)?;
         let Some(optimizer) = &state.field else { return Ok(()) };
         let measured = flicker(optimizer.field.as_ref(), rows.select(state.set.columns[0].value.clone()), self.job.scene.frame_count)?;
         state.smooth = measured > train.flicker_threshold;
-        let decision = if state.smooth { "smoothness switched on" } else { "no smoothness needed" };
-        let message = format!("flicker {measured:.3} against train.flicker_threshold {}: {decision}", train.flicker_threshold);
-        self.job.events.emit(&Event::Warning { object: "smoothness".into(), message });
+        if state.smooth {
+            let message = format!("flicker {measured:.3} is over train.flicker_threshold {}: smoothness switched on", train.flicker_threshold);
+            self.job.events.emit(&Event::Warning { object: "smoothness".into(), message });
+        }
         Ok(())
     }
 }
