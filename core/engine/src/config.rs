@@ -1,7 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
 use crate::data::SceneOptions;
-use cc4dgs_core::{Error, Limits, Result, Rules, config, unknown_name};
+use cc4dgs_core::{Error, Limits, Result, Rules, Scene, config, unknown_name};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -59,13 +59,14 @@ pub struct RenderConfig {
     pub rules: Rules,
     /// Mip-Splatting's 2D filter.
     pub antialiased: bool,
-    /// Colour behind everything, RGB in 0..1.
-    pub background: [f32; 3],
+    /// Colour behind everything, RGB in 0..1; absent, the dataset's own, else white (Swift4D's choice).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub background: Option<[f32; 3]>,
 }
 
 impl Default for RenderConfig {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, background: [1.0; 3] }
+        Self { rules: Rules::Gsplat099, antialiased: false, background: None }
     }
 }
 
@@ -288,9 +289,16 @@ impl RunConfig {
     pub fn to_toml(&self) -> Result<String> {
         toml::to_string_pretty(self).map_err(|e| Error::parameter("configuration", e.to_string(), "Report this: every configuration should be printable"))
     }
-    /// The colour behind everything: the scene's if it was set, else the renderer's.
+    /// The colour behind everything: `scene.background`, else `render.background`, else white.
     pub fn background(&self) -> Result<[f32; 3]> {
-        self.scene.background.as_ref().map_or(Ok(self.render.background), |b| b.rgb())
+        self.scene.background.as_ref().map_or(Ok(self.render.background.unwrap_or([1.0; 3])), |b| b.rgb())
+    }
+    /// This configuration with its background settled for `scene`, whose own counts when nothing else was asked for.
+    pub fn settled_for(&self, scene: &Scene) -> Result<Self> {
+        let mut settled = self.clone();
+        let wanted = self.scene.background.as_ref().map(|b| b.rgb()).transpose()?.or(self.render.background).or(scene.background);
+        settled.render.background = Some(wanted.unwrap_or([1.0; 3]));
+        Ok(settled)
     }
     fn validate(&self) -> Result<()> {
         self.scene.validate()?;
@@ -314,8 +322,8 @@ impl RunConfig {
         one_of("train.coarse_frames", &t.coarse_frames, &["first", "all"])?;
         one_of("train.dynamic", &t.dynamic, &["auto", "score", "all", "none"])?;
         one_of("init.source", &self.init.source, &["auto", "points", "photo", "random"])?;
-        if self.render.background.iter().any(|c| !(0.0..=1.0).contains(c)) {
-            return Err(Error::parameter("render.background", format!("{:?} is not RGB in 0..1", self.render.background), "Give three numbers in 0..1"));
+        if let Some(background) = self.render.background.filter(|b| b.iter().any(|c| !(0.0..=1.0).contains(c))) {
+            return Err(Error::parameter("render.background", format!("{background:?} is not RGB in 0..1"), "Give three numbers in 0..1"));
         }
         if !(self.init.opacity > 0.0 && self.init.opacity < 1.0) || self.init.count == 0 {
             return Err(Error::parameter(

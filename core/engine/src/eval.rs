@@ -136,7 +136,7 @@ pub fn evaluate(
         let render = Image8::from_planes(&to_vec(output.image(), "render")?, camera.width, camera.height);
         let frame = scene.frame(view)?;
         // Both pictures are rounded to 8 bits before they are compared.
-        let truth = Image8::from_planes(&frame.to_planes(model.render.background), camera.width, camera.height);
+        let truth = Image8::from_planes(&frame.to_planes(model.background), camera.width, camera.height);
         skimage += skimage_metric.score_images(&truth, &render)?;
         let multi_scale = ms_ssim_metric.score_images(&truth, &render).ok();
         ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);

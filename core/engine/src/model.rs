@@ -26,6 +26,8 @@ pub struct Model {
     pub moving: Moving,
     /// How it wants to be drawn.
     pub render: RenderConfig,
+    /// Colour behind everything, RGB in 0..1.
+    pub background: [f32; 3],
     /// The `[rasterizer]` section.
     pub rasterizer: toml::Table,
     /// Frames in the sequence.
@@ -87,7 +89,8 @@ impl Model {
             gaussians,
             field,
             moving,
-            render: RenderConfig { background: config.background()?, ..config.render.clone() },
+            background: config.background()?,
+            render: config.render.clone(),
             rasterizer: config.rasterizer.clone(),
             frame_count,
             provenance: provenance(&config)?,
@@ -148,7 +151,8 @@ impl Model {
             gaussians,
             field,
             moving,
-            render: RenderConfig { rules: manifest.rasterizer.rules, antialiased: manifest.rasterizer.antialiased, background: manifest.background },
+            background: manifest.background,
+            render: RenderConfig { rules: manifest.rasterizer.rules, antialiased: manifest.rasterizer.antialiased, background: Some(manifest.background) },
             rasterizer,
             frame_count: manifest.frame_count,
             provenance: manifest.provenance.clone(),
@@ -184,7 +188,7 @@ impl Model {
             frame_count: self.frame_count,
             time_range: [0.0, 1.0],
             box_world: [corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max)],
-            background: self.render.background,
+            background: self.background,
             sh_degree: self.gaussians.sh_degree,
             dynamic_threshold: if let Moving::Scored { zeta } = moving { zeta } else { 0.0 },
             gaussian_count: self.gaussians.len() as u64,

@@ -53,7 +53,7 @@ impl<'a> Player<'a> {
         let moves = model.field.as_ref().is_some_and(|f| !f.field.is_static());
         let rows = if moves { Rows::new(model.moving.rows(&model.gaussians.dynamic_scores), device) } else { Rows::new(Some(Vec::new()), device) };
         let moving = rows.count(gaussians.len());
-        let background = Tensor::<1>::from_data(TensorData::new(model.render.background.to_vec(), [3]), device);
+        let background = Tensor::<1>::from_data(TensorData::new(model.background.to_vec(), [3]), device);
         Ok(Self {
             device: device.clone(),
             rasterizer: registry.build_rasterizer(&model.rasterizer)?,

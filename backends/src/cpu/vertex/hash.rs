@@ -58,7 +58,7 @@ impl LevelHash {
     }
     /// The signatures [n, k] of `vertices` [n]; entries of a vertex must be below 2^31.
     pub fn signatures(&self, vertices: &[[u32; 3]], out: &mut [f32]) {
-        Arch::new().dispatch(|| {
+        Arch::new().dispatch(#[inline(always)] || {
             for (vertex, row) in vertices.iter().zip(out.chunks_exact_mut(self.len().max(1))) {
                 self.signature(*vertex, row);
             }

@@ -88,7 +88,8 @@ pub(crate) struct Context<'a> {
 /// and whatever the scene, the plug-ins or the disk report.
 pub fn train(job: &TrainJob) -> Result<TrainReport> {
     let began = Instant::now();
-    let config = job.config;
+    let config = &job.config.settled_for(&job.scene)?;
+    let job = &TrainJob { config, scene: job.scene.clone(), out: job.out.clone(), ..*job };
     std::fs::create_dir_all(&job.out).map_err(|e| Error::io(&job.out, e))?;
     write_atomically(job.out.join(CONFIG), config.to_toml()?.as_bytes())?;
     let device = parse_device(&config.device)?;

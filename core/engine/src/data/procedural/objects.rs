@@ -217,7 +217,7 @@ pub(super) fn playground() -> Vec<Object> {
         Object {
             shape: Shape::Sphere { radius: 0.28 },
             material: glossy(Texture::Checker([0.80, 0.15, 0.15], [0.95, 0.85, 0.80], 0.22)),
-            motion: Motion::Arc { center: DVec3::new(0.0, 0.0, 0.28), radius: 1.15, from_to_rad: [-2.6, -0.6], hop: 0.5, hops: 2.0 },
+            motion: Motion::Arc { center: DVec3::new(0.0, 0.0, 0.28), radius: 1.15, from_to_rad: [-2.2, -1.3], hop: 0.3, hops: 1.0 },
         },
         Object {
             shape: Shape::Cuboid { half: DVec3::new(0.26, 0.26, 0.26) },
@@ -227,7 +227,7 @@ pub(super) fn playground() -> Vec<Object> {
         Object {
             shape: Shape::Cuboid { half: DVec3::new(0.11, 0.11, 0.42) },
             material: matte(Texture::Bands([0.65, 0.25, 0.65], [0.95, 0.90, 0.95], 0.0, 6.0)),
-            motion: Motion::Swing { pivot: DVec3::new(0.0, 0.1, 1.95), length: 0.75, amplitude_rad: 0.7, swings: 1.0 },
+            motion: Motion::Swing { pivot: DVec3::new(0.0, 0.1, 1.95), length: 0.75, amplitude_rad: 0.45, swings: 0.5 },
         },
     ]
 }
