@@ -105,10 +105,13 @@ impl Block {
                 (Some(gain), Some(shift), Some((normalized, inverse_std, activated))) => {
                     fill_rows(normalized, b);
                     matmul(normalized, input, w, size, true);
-                    arch.dispatch(#[inline(always)] || {
-                        normalize_rows(normalized, layer.output, inverse_std, &mut self.work);
-                        affine_mish_rows(activated, normalized, &weights[gain.clone()], &weights[shift.clone()]);
-                    });
+                    arch.dispatch(
+                        #[inline(always)]
+                        || {
+                            normalize_rows(normalized, layer.output, inverse_std, &mut self.work);
+                            affine_mish_rows(activated, normalized, &weights[gain.clone()], &weights[shift.clone()]);
+                        },
+                    );
                     input = activated;
                 }
                 _ => {
@@ -181,11 +184,17 @@ fn block_backward(layers: &[MishLayer], weights: &[f32], back: &[Vec<f32>], bloc
             let affine = (&weights[gain.clone()], &weights[shift.clone()]);
             // Gain and shift are neighbours in the flat array.
             let (grad_gain, grad_shift) = total[gain.start..shift.end].split_at_mut(layer.output);
-            arch.dispatch(#[inline(always)] || affine_mish_backward(&mut g[0][..len], normalized, inverse_std, affine, (grad_gain, grad_shift), &mut block.work));
+            arch.dispatch(
+                #[inline(always)]
+                || affine_mish_backward(&mut g[0][..len], normalized, inverse_std, affine, (grad_gain, grad_shift), &mut block.work),
+            );
         }
         let input: &[f32] = if i == 0 { &block.input } else { &block.hidden[i - 1].2 };
         add_transposed_matmul(&mut total[layer.weight.clone()], input, &g[0], (BLOCK, layer.input, layer.output));
-        arch.dispatch(#[inline(always)] || add_column_sums(&mut total[layer.bias.clone()], &g[0][..len]));
+        arch.dispatch(
+            #[inline(always)]
+            || add_column_sums(&mut total[layer.bias.clone()], &g[0][..len]),
+        );
         if i > 0 || wants_input {
             let [from, to] = g;
             matmul(to, from, &back[i], (BLOCK, layer.output, layer.input), false);

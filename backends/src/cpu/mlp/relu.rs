@@ -112,7 +112,10 @@ fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, out
         fill_rows(out, &weights[layer.bias.clone()]);
         matmul(out, input, &weights[layer.weight.clone()], (count, layer.input, layer.output), true);
         if layer.relu {
-            arch.dispatch(#[inline(always)] || relu(out));
+            arch.dispatch(
+                #[inline(always)]
+                || relu(out),
+            );
         }
     }
 }
@@ -209,11 +212,17 @@ fn block_backward(
         let (before, rest) = grads.split_at_mut(i);
         let own = &mut rest[0][..rows * layer.output];
         if layer.relu {
-            arch.dispatch(#[inline(always)] || relu_backward(own, &outputs[i]));
+            arch.dispatch(
+                #[inline(always)]
+                || relu_backward(own, &outputs[i]),
+            );
         }
         let input: &[f32] = layer.parent.map_or(x, |p| &outputs[p]);
         add_transposed_matmul(&mut total[layer.weight.clone()], input, own, (rows, layer.input, layer.output));
-        arch.dispatch(#[inline(always)] || add_column_sums(&mut total[layer.bias.clone()], own));
+        arch.dispatch(
+            #[inline(always)]
+            || add_column_sums(&mut total[layer.bias.clone()], own),
+        );
         let target: &mut [f32] = match layer.parent {
             Some(p) => &mut before[p][..rows * layer.input],
             None if grad_x.is_empty() => continue,

@@ -58,11 +58,14 @@ impl LevelHash {
     }
     /// The signatures [n, k] of `vertices` [n]; entries of a vertex must be below 2^31.
     pub fn signatures(&self, vertices: &[[u32; 3]], out: &mut [f32]) {
-        Arch::new().dispatch(#[inline(always)] || {
-            for (vertex, row) in vertices.iter().zip(out.chunks_exact_mut(self.len().max(1))) {
-                self.signature(*vertex, row);
-            }
-        });
+        Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                for (vertex, row) in vertices.iter().zip(out.chunks_exact_mut(self.len().max(1))) {
+                    self.signature(*vertex, row);
+                }
+            },
+        );
     }
     #[inline(always)]
     fn signature(&self, [x, y, z]: [u32; 3], row: &mut [f32]) {

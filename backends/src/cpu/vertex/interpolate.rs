@@ -15,13 +15,16 @@ pub fn forward(features: &[f32], f: usize, corners: &[u32], weights: &[f32]) -> 
     let arch = Arch::new();
     let chunks = out.par_chunks_mut(ROWS * f).zip(corners.par_chunks(8 * ROWS)).zip(weights.par_chunks(8 * ROWS));
     chunks.for_each(|((out, corners), weights)| {
-        arch.dispatch(#[inline(always)] || {
-            for ((row, corners), weights) in out.chunks_exact_mut(f).zip(corners.chunks_exact(8)).zip(weights.chunks_exact(8)) {
-                for (&corner, &weight) in corners.iter().zip(weights) {
-                    add_scaled(row, &features[corner as usize * f..][..f], weight);
+        arch.dispatch(
+            #[inline(always)]
+            || {
+                for ((row, corners), weights) in out.chunks_exact_mut(f).zip(corners.chunks_exact(8)).zip(weights.chunks_exact(8)) {
+                    for (&corner, &weight) in corners.iter().zip(weights) {
+                        add_scaled(row, &features[corner as usize * f..][..f], weight);
+                    }
                 }
-            }
-        });
+            },
+        );
     });
     out
 }
@@ -34,14 +37,17 @@ pub fn backward(grad: &[f32], f: usize, weights: &[f32], slots: &[u32], starts: 
     }
     let arch = Arch::new();
     out.par_chunks_mut(ROWS * f).enumerate().for_each(|(task, out)| {
-        arch.dispatch(#[inline(always)] || {
-            for (i, row) in out.chunks_exact_mut(f).enumerate() {
-                let vertex = task * ROWS + i;
-                for &slot in &slots[starts[vertex] as usize..starts[vertex + 1] as usize] {
-                    add_scaled(row, &grad[slot as usize / 8 * f..][..f], weights[slot as usize]);
+        arch.dispatch(
+            #[inline(always)]
+            || {
+                for (i, row) in out.chunks_exact_mut(f).enumerate() {
+                    let vertex = task * ROWS + i;
+                    for &slot in &slots[starts[vertex] as usize..starts[vertex + 1] as usize] {
+                        add_scaled(row, &grad[slot as usize / 8 * f..][..f], weights[slot as usize]);
+                    }
                 }
-            }
-        });
+            },
+        );
     });
     out
 }
