@@ -237,6 +237,9 @@ pub struct BenchStep {
     /// Root of the seed tree the scenes are drawn from.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+    /// Also time the Gaussians of this golden scene (raster_*.inputs.f64.safetensors); may be given again.
+    #[arg(long, value_name = "FILE")]
+    pub scene: Vec<PathBuf>,
 }
 
 /// The two sides of a split.

@@ -101,6 +101,8 @@ pub struct TrainConfig {
     pub batch: usize,
     /// Frames the coarse stage sees: `first` or `all` (`all` where no time has several cameras).
     pub coarse_frames: String,
+    /// Share of the main stage over which frames come in one after another, where the coarse stage saw the first frame only; 0 is all at once.
+    pub time_ramp: f64,
     /// Highest spherical-harmonics degree.
     pub sh_degree: usize,
     /// Reference iterations between two degrees.
@@ -140,6 +142,7 @@ impl Default for TrainConfig {
             shares: [5.0, 3.0, 20.0],
             batch: 2,
             coarse_frames: "first".into(),
+            time_ramp: 0.0,
             sh_degree: 3,
             sh_interval: 1000,
             lambda_c: 0.8,
@@ -318,6 +321,9 @@ impl RunConfig {
         }
         if !(0.0..=1.0).contains(&t.lambda_c) {
             return bad("lambda_c", format!("{} is not in 0..1", t.lambda_c), "It is the weight of L1 against 1 - SSIM");
+        }
+        if !(0.0..=1.0).contains(&t.time_ramp) {
+            return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");
         }
         one_of("train.coarse_frames", &t.coarse_frames, &["first", "all"])?;
         one_of("train.dynamic", &t.dynamic, &["auto", "score", "all", "none"])?;

@@ -246,5 +246,5 @@ fn load_weights(object: &str, field: &mut dyn DeformationField, weights: Vec<Wei
 
 fn provenance(config: &RunConfig) -> Result<Provenance> {
     let table = config.to_toml()?.parse().unwrap_or_default();
-    Ok(Provenance { commit: option_env!("CC4DGS_COMMIT").unwrap_or_default().into(), seed: config.seed, device: config.device.clone(), config: table })
+    Ok(Provenance { commit: env!("CC4DGS_COMMIT").into(), seed: config.seed, device: config.device.clone(), config: table })
 }

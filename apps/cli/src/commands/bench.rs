@@ -3,7 +3,7 @@
 use super::Context;
 use crate::args::BenchStep;
 use crate::model_source::resolved_device;
-use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, time_step};
+use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, Workload, time_step};
 use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device};
 use serde::Serialize;
 
@@ -25,10 +25,14 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
     let device = parse_device(&args.device)?;
     let events = context.listeners(None)?;
     let seed = Seed::root(args.seed).child("bench");
-    let mut cases = Vec::with_capacity(STANDARD_CASES.len());
-    for (done, case) in STANDARD_CASES.iter().enumerate() {
-        cases.push(time_step(case, &device, seed, args.repeats as usize)?);
-        events.emit(&Event::Progress { task: "bench".into(), done: done as u64 + 1, total: STANDARD_CASES.len() as u64 });
+    let mut workloads: Vec<Workload> = STANDARD_CASES.iter().map(|case| Workload::random(case, seed)).collect();
+    for path in &args.scene {
+        workloads.push(Workload::from_fixture(path)?);
+    }
+    let mut cases = Vec::with_capacity(workloads.len());
+    for (done, workload) in workloads.iter().enumerate() {
+        cases.push(time_step(workload, &device, seed, args.repeats as usize)?);
+        events.emit(&Event::Progress { task: "bench".into(), done: done as u64 + 1, total: workloads.len() as u64 });
     }
     let report = StepReport {
         version: env!("CARGO_PKG_VERSION"),
@@ -45,10 +49,11 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
 
 fn text(report: &StepReport) -> String {
     let mut lines = vec![format!("training step on {}, {} threads, {} repeats", report.device, report.threads, report.repeats)];
-    lines.push("  picture  Gaussians  median ms   min ms  (render    loss  backward   Adam)   pairs/s  of peak".into());
+    lines.push("workload      picture  Gaussians  median ms   min ms  (render    loss  backward   Adam)   pairs/s  of peak".into());
     lines.extend(report.cases.iter().map(|c| {
         format!(
-            "{:>4}x{:<4} {:>9} {:>10.2} {:>8.2}  {:>7.2} {:>7.2} {:>9.2} {:>6.2}  {:>8.2e}  {:>6.1}%",
+            "{:<12} {:>4}x{:<4} {:>9} {:>10.2} {:>8.2}  {:>7.2} {:>7.2} {:>9.2} {:>6.2}  {:>8.2e}  {:>6.1}%",
+            c.name,
             c.width,
             c.height,
             c.gaussians,

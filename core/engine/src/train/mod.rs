@@ -181,8 +181,12 @@ impl Context<'_> {
         }
         events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
         let began = Instant::now();
-        let views = self.stage_views(stage);
-        let mut sampler = Sampler::new(views, self.seed.child(stage.name()).child("views"), self.job.config.train.batch);
+        let mut sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), self.job.config.train.batch);
+        // Only a canonical space that is the first frame can be left step by step.
+        if stage == Stage::Main && self.stage_views(Stage::Coarse).len() < self.stage_views(Stage::Main).len() {
+            let ramp = (self.job.config.train.time_ramp * length as f64).round() as usize;
+            sampler = sampler.with_ramp(ramp, |view| self.job.scene.views[view].time_norm);
+        }
         let prefetcher = Prefetcher::new(self.job.scene.clone());
         let mut log = step::Log::new(stage, length, self.job.config.train.log_every);
         while state.iteration < length {

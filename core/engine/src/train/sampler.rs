@@ -6,22 +6,45 @@ use std::sync::Arc;
 use std::sync::mpsc::{SyncSender, sync_channel};
 
 /// Draws batches of views.
+///
+/// With a ramp, later frames come in one after another: a field that starts from the first frame then follows a motion step by step, where all
+/// frames at once would first teach the Gaussians to fade away from where things no longer are.
 pub struct Sampler {
+    /// In the order in which they open.
     views: Vec<usize>,
+    /// Iteration from which each may be drawn, ascending.
+    opens: Vec<usize>,
     seed: Seed,
     batch: usize,
     epoch: Option<(usize, Vec<usize>)>,
 }
 
 impl Sampler {
-    /// Batches of `batch` out of `views`.
+    /// Batches of `batch` out of `views`, all open from the start.
     pub fn new(views: Vec<usize>, seed: Seed, batch: usize) -> Self {
-        Self { views, seed, batch, epoch: None }
+        Self { opens: vec![0; views.len()], views, seed, batch, epoch: None }
+    }
+    /// Views of later frames open over the first `ramp` iterations; `time_norm` tells the time of a view.
+    pub fn with_ramp(mut self, ramp: usize, time_norm: impl Fn(usize) -> f32) -> Self {
+        self.views.sort_by(|&a, &b| time_norm(a).total_cmp(&time_norm(b)));
+        if let (Some(&first), Some(&last)) = (self.views.first(), self.views.last()) {
+            let (from, to) = (time_norm(first), time_norm(last));
+            let share = |v: usize| if to > from { (time_norm(v) - from) / (to - from) } else { 0.0 };
+            self.opens = self.views.iter().map(|&v| (f64::from(share(v)) * ramp as f64).floor() as usize).collect();
+        }
+        self
     }
     /// The views of iteration `index`, from 0.
     pub fn batch(&mut self, index: usize) -> Vec<usize> {
         let n = self.views.len();
-        (0..self.batch.min(n))
+        let size = self.batch.min(n);
+        let open = self.opens.partition_point(|&from| from <= index);
+        if open < n {
+            // The set grows from draw to draw, so there are no epochs yet.
+            let mut rng = self.seed.child("ramp").index(index as u64).rng();
+            return rand::seq::index::sample(&mut rng, open.max(1), size.min(open.max(1))).into_iter().map(|i| self.views[i]).collect();
+        }
+        (0..size)
             .map(|b| {
                 let position = index * self.batch + b;
                 let epoch = position / n;
@@ -74,5 +97,21 @@ mod tests {
         }
         let mut late = Sampler::new((10..17).collect(), Seed::root(1), 2);
         assert_eq!(late.batch(5), drawn[10..12]);
+    }
+
+    #[test]
+    fn a_ramp_lets_frames_in_one_after_another() {
+        // Three cameras, four frames: view = 3 * frame + camera.
+        let time = |view: usize| (view / 3) as f32 / 3.0;
+        let mut sampler = Sampler::new((0..12).rev().collect(), Seed::root(1), 1).with_ramp(300, time);
+        for index in 0..300 {
+            let view = sampler.batch(index)[0];
+            assert!(view / 3 <= index / 100, "view {view} at iteration {index}");
+        }
+        let mut epoch: Vec<usize> = (300..312).map(|i| sampler.batch(i)[0]).collect();
+        epoch.sort_unstable();
+        assert_eq!(epoch, (0..12).collect::<Vec<_>>());
+        let early = Sampler::new((0..12).collect(), Seed::root(1), 5).with_ramp(300, time).batch(0);
+        assert_eq!(early.len(), 3, "no more views than are open");
     }
 }

@@ -1,4 +1,8 @@
-//! Seeded workloads for timing a training step: random points in a box, seen from outside.
+//! Timing of whole training steps.
+
+mod workload;
+
+pub use workload::{Workload, random_gaussians, step_camera};
 
 use crate::cpu::simd::{Lanes, dispatch};
 use crate::ops::adam::{AdamSettings, adam_step};
@@ -6,20 +10,10 @@ use crate::ops::photometric::photometric_loss;
 use crate::rasterizers::tile::TileRasterizer;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, Gaussians, HostGaussians, Rasterizer, RenderSettings, Result, Seed, Splats};
+use cc4dgs_core::{Gaussians, Rasterizer, RenderSettings, Result, Seed, Splats};
 use pulp::{Simd, WithSimd};
 use std::time::Instant;
 
-/// Half the side of the box of points, world units.
-const HALF_BOX: f32 = 2.5;
-/// Distance of the camera from the centre of the box, world units.
-const CAMERA_DISTANCE: f64 = 7.0;
-/// Horizontal angle of view in radians (60 degrees).
-const ANGLE_OF_VIEW: f64 = std::f64::consts::FRAC_PI_3;
-/// Opacity of every point.
-const OPACITY: f32 = 0.1;
-/// Spherical-harmonics degree.
-const DEGREE: usize = 3;
 /// Share of L1 in the loss.
 const LAMBDA: f32 = 0.8;
 /// Learning rate; small, so that the scene stays what it is while it is timed.
@@ -46,8 +40,10 @@ pub const STANDARD_CASES: [StepCase; 3] = [
 ];
 
 /// What a case took.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct StepTiming {
+    /// Which workload.
+    pub name: String,
     /// Image width in pixels.
     pub width: u32,
     /// Image height in pixels.
@@ -58,6 +54,8 @@ pub struct StepTiming {
     pub median_ms: f64,
     /// Whole step, fastest, milliseconds.
     pub min_ms: f64,
+    /// The step without Adam (render, loss, backward), median in milliseconds.
+    pub forward_backward_ms: f64,
     /// (Gaussian, pixel) evaluations of the forward pass.
     pub pixel_pairs: u64,
     /// (Gaussian, tile) pairs.
@@ -74,71 +72,6 @@ pub struct StepTiming {
     pub pairs_per_s: f64,
     /// [`OPERATIONS_PER_PAIR`] times `pairs_per_s` over the multiply-add rate measured on all threads (0..1).
     pub peak_share: f64,
-}
-
-/// Uniform numbers in -1..1, the `k`-th of a named stream.
-fn uniform(seed: Seed, k: u64) -> f32 {
-    // 24 bits: every value is exact.
-    (seed.index(k).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
-}
-
-/// Random Gaussians in the box; standard deviations are the root of the mean squared distance to three neighbours.
-pub fn random_gaussians(count: usize, seed: Seed) -> HostGaussians {
-    let stream = |name: &str, len: usize, scale: f32| -> Vec<f32> {
-        let seed = seed.child(name);
-        (0..len as u64).map(|k| scale * uniform(seed, k)).collect()
-    };
-    let means = stream("means", 3 * count, HALF_BOX);
-    let log_scales = neighbour_distances(&means).into_iter().flat_map(|d| [d.max(1e-4).ln(); 3]).collect();
-    HostGaussians {
-        sh_degree: DEGREE,
-        log_scales,
-        quaternions: stream("quaternions", 4 * count, 1.0),
-        opacity_logits: vec![(OPACITY / (1.0 - OPACITY)).ln(); count],
-        sh_dc: stream("sh_dc", 3 * count, 1.5),
-        sh_rest: stream("sh_rest", 3 * cc4dgs_core::gaussians::sh_rest_len(DEGREE) * count, 0.1),
-        dynamic_scores: vec![0.0; count],
-        means,
-        extra: Default::default(),
-    }
-}
-
-/// Root of the mean squared distance of every point to its three nearest others, by a grid of about one point per cell.
-fn neighbour_distances(means: &[f32]) -> Vec<f32> {
-    let n = means.len() / 3;
-    let side = ((n as f64).cbrt().ceil() as usize).max(1);
-    let cell_size = 2.0 * HALF_BOX / side as f32;
-    let cell = |v: f32| (((v + HALF_BOX) / cell_size) as usize).min(side - 1);
-    let cell_of = |i: usize| [cell(means[3 * i]), cell(means[3 * i + 1]), cell(means[3 * i + 2])];
-    let mut members = vec![Vec::new(); side * side * side];
-    for i in 0..n {
-        let [x, y, z] = cell_of(i);
-        members[(x * side + y) * side + z].push(i);
-    }
-    let nearest = |i: usize| {
-        let home = cell_of(i);
-        let mut ring = 1;
-        loop {
-            let range = |k: usize| home[k].saturating_sub(ring)..(home[k] + ring + 1).min(side);
-            let cells = range(0).flat_map(|x| range(1).flat_map(move |y| range(2).map(move |z| (x * side + y) * side + z)));
-            let mut squared: Vec<f32> =
-                cells.flat_map(|c| &members[c]).filter(|&&j| j != i).map(|&j| (0..3).map(|k| (means[3 * i + k] - means[3 * j + k]).powi(2)).sum()).collect();
-            squared.sort_by(f32::total_cmp);
-            // Anything nearer than the ring is wide has been seen.
-            let certain = squared.len() >= 3 && squared[2].sqrt() <= ring as f32 * cell_size;
-            if certain || ring >= side {
-                let found = squared.len().clamp(1, 3);
-                return (squared.iter().take(3).sum::<f32>() / found as f32).sqrt();
-            }
-            ring += 1;
-        }
-    };
-    (0..n).map(nearest).collect()
-}
-
-/// The camera of the cases.
-pub fn step_camera(case: &StepCase) -> Camera {
-    Camera::look_at("bench", (case.width, case.height), ANGLE_OF_VIEW, [0.0, 0.0, -CAMERA_DISTANCE], [0.0; 3], [0.0, -1.0, 0.0])
 }
 
 /// A parameter with its Adam moments.
@@ -170,20 +103,20 @@ fn median(values: &mut [f64]) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Times `repetitions` whole training steps of `case` on `device` after a few that are not counted.
-pub fn time_step(case: &StepCase, device: &Device, seed: Seed, repetitions: usize) -> Result<StepTiming> {
+/// Times `repetitions` whole training steps of `workload` on `device` after a few that are not counted.
+pub fn time_step(workload: &Workload, device: &Device, seed: Seed, repetitions: usize) -> Result<StepTiming> {
     let tracked = device.clone().autodiff();
-    let start = Gaussians::from_host(&random_gaussians(case.gaussians, seed.child("gaussians")), device);
-    let camera = step_camera(case);
-    let pixels = 3 * case.width as usize * case.height as usize;
+    let (camera, degree, n) = (&workload.camera, workload.gaussians.sh_degree, workload.gaussians.len());
+    let start = Gaussians::from_host(&workload.gaussians, device);
+    let pixels = 3 * camera.width as usize * camera.height as usize;
     let target_seed = seed.child("target");
-    let target: Vec<f32> = (0..pixels as u64).map(|k| 0.5 + 0.5 * uniform(target_seed, k)).collect();
-    let target = Tensor::<3>::from_data(TensorData::new(target, [3, case.height as usize, case.width as usize]), &tracked);
+    let target: Vec<f32> = (0..pixels as u64).map(|k| 0.5 + 0.5 * workload::uniform(target_seed, k)).collect();
+    let target = Tensor::<3>::from_data(TensorData::new(target, [3, camera.height as usize, camera.width as usize]), &tracked);
     let mut matrices = [start.means, start.log_scales, start.quaternions, start.sh_dc].map(Trained::new);
     let mut opacities = Trained::new(start.opacity_logits);
     let mut rest = Trained::new(start.sh_rest);
     const WARM_UP: usize = 3;
-    let mut times: [Vec<f64>; 5] = Default::default();
+    let mut times: [Vec<f64>; 6] = Default::default();
     let mut work = cc4dgs_core::RenderWork::default();
     for step in 0..repetitions.max(1) + WARM_UP {
         let begin = Instant::now();
@@ -195,12 +128,12 @@ pub fn time_step(case: &StepCase, device: &Device, seed: Seed, repetitions: usiz
             scales: scales.clone(),
             quaternions: quaternions.clone(),
             opacities: opacity.clone(),
-            colors: cc4dgs_core::SplatColors::Sh { dc: dc.clone(), rest: higher.clone(), degree: DEGREE },
+            colors: cc4dgs_core::SplatColors::Sh { dc: dc.clone(), rest: higher.clone(), degree },
             space: cc4dgs_core::ParameterSpace::Raw,
-            screen_probe: Some(Tensor::zeros([case.gaussians, 2], &tracked).require_grad()),
+            screen_probe: Some(Tensor::zeros([n, 2], &tracked).require_grad()),
             camera_probe: None,
         };
-        let out = TileRasterizer.render(&splats, &camera, &RenderSettings::default())?;
+        let out = TileRasterizer.render(&splats, camera, &RenderSettings::default())?;
         work = out.stats.work;
         let rendered = Instant::now();
         let loss = photometric_loss(out.planes, target.clone(), LAMBDA)?;
@@ -218,24 +151,26 @@ pub fn time_step(case: &StepCase, device: &Device, seed: Seed, repetitions: usiz
         rest.step(d_rest, &settings)?;
         // Reading one number back makes sure that nothing is still queued on devices that run behind.
         if let Some(value) = &opacities.value {
-            to_vec(value.clone().narrow(0, 0, 1.min(case.gaussians)), "opacities")?;
+            to_vec(value.clone().narrow(0, 0, 1.min(n)), "opacities")?;
         }
         let done = Instant::now();
         if step >= WARM_UP {
-            let spans = [(begin, done), (begin, rendered), (rendered, judged), (judged, derived), (derived, done)];
+            let spans = [(begin, done), (begin, derived), (begin, rendered), (rendered, judged), (judged, derived), (derived, done)];
             for (list, (from, to)) in times.iter_mut().zip(spans) {
                 list.push((to - from).as_secs_f64() * 1e3);
             }
         }
     }
-    let [mut whole, mut forward, mut loss, mut backward, mut adam] = times;
+    let [mut whole, mut without_adam, mut forward, mut loss, mut backward, mut adam] = times;
     let median_ms = median(&mut whole);
     let pairs_per_s = if median_ms > 0.0 { work.pixel_pairs as f64 / (median_ms * 1e-3) } else { 0.0 };
     Ok(StepTiming {
-        width: case.width,
-        height: case.height,
-        gaussians: case.gaussians,
+        name: workload.name.clone(),
+        width: camera.width,
+        height: camera.height,
+        gaussians: n,
         median_ms,
+        forward_backward_ms: median(&mut without_adam),
         min_ms: whole.first().copied().unwrap_or(0.0),
         pixel_pairs: work.pixel_pairs,
         tile_pairs: work.tile_pairs,
