@@ -42,6 +42,7 @@ fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> 
         cy: camera.cy,
         world_to_camera: camera.world_to_camera,
         rules,
+        near: None,
         antialiased,
         space: ParameterSpace::Raw,
         sh_degree: Some(degree),

@@ -68,7 +68,15 @@ impl Workload {
             means: narrow(read("in.means", 3, n)?),
             log_scales: narrow(read("in.scales", 3, n)?.into_iter().map(f64::ln).collect()),
             quaternions: narrow(read("in.quats_wxyz", 4, n)?),
-            opacity_logits: narrow(read("in.opacities", 1, n)?.into_iter().map(|o| { let o = o.clamp(1e-6, 1.0 - 1e-6); (o / (1.0 - o)).ln() }).collect()),
+            opacity_logits: narrow(
+                read("in.opacities", 1, n)?
+                    .into_iter()
+                    .map(|o| {
+                        let o = o.clamp(1e-6, 1.0 - 1e-6);
+                        (o / (1.0 - o)).ln()
+                    })
+                    .collect(),
+            ),
             sh_dc: narrow(sh.chunks_exact(3 * count).flat_map(|row| row[..3].to_vec()).collect()),
             sh_rest: narrow(sh.chunks_exact(3 * count).flat_map(|row| row[3..].to_vec()).collect()),
             dynamic_scores: vec![0.0; n],

@@ -55,6 +55,9 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
     if let Some(probe) = &splats.camera_probe {
         shape("camera_probe", &probe.dims(), &[4, 4])?;
     }
+    if let Some(near) = settings.near.filter(|near| !near.is_finite() || *near < 0.0) {
+        return Err(Error::parameter("render.near", format!("{near} is not a depth"), "Give a finite depth of 0 or more, in world units"));
+    }
     if let Some(background) = &settings.background {
         shape("background", &background.dims(), &[3])?;
     }
@@ -67,6 +70,7 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
         cy: camera.cy,
         world_to_camera: camera.world_to_camera,
         rules: settings.rules,
+        near: settings.near,
         antialiased: settings.antialiased,
         space: splats.space,
         sh_degree,

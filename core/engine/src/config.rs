@@ -1,7 +1,8 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
 use crate::data::SceneOptions;
-use cc4dgs_core::{Error, Limits, Result, Rules, Scene, config, unknown_name};
+use burn::tensor::Tensor;
+use cc4dgs_core::{Error, Limits, RenderSettings, Result, Rules, Scene, config, unknown_name};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -59,6 +60,9 @@ pub struct RenderConfig {
     pub rules: Rules,
     /// Mip-Splatting's 2D filter.
     pub antialiased: bool,
+    /// Smallest camera depth drawn, world units; absent, the rules' own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub near: Option<f32>,
     /// Colour behind everything, RGB in 0..1; absent, the dataset's own, else white (Swift4D's choice).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub background: Option<[f32; 3]>,
@@ -66,7 +70,14 @@ pub struct RenderConfig {
 
 impl Default for RenderConfig {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, background: None }
+        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None }
+    }
+}
+
+impl RenderConfig {
+    /// What a rasterizer is told; the colour behind everything comes as a tensor, `None` is black.
+    pub fn settings(&self, background: Option<Tensor<1>>) -> RenderSettings {
+        RenderSettings { rules: self.rules, antialiased: self.antialiased, near: self.near, background, max_weights: false }
     }
 }
 
@@ -328,6 +339,9 @@ impl RunConfig {
         one_of("train.coarse_frames", &t.coarse_frames, &["first", "all"])?;
         one_of("train.dynamic", &t.dynamic, &["auto", "score", "all", "none"])?;
         one_of("init.source", &self.init.source, &["auto", "points", "photo", "random"])?;
+        if let Some(near) = self.render.near.filter(|near| !near.is_finite() || *near < 0.0) {
+            return Err(Error::parameter("render.near", format!("{near} is not a depth"), "Give a finite depth of 0 or more, in world units"));
+        }
         if let Some(background) = self.render.background.filter(|b| b.iter().any(|c| !(0.0..=1.0).contains(c))) {
             return Err(Error::parameter("render.background", format!("{background:?} is not RGB in 0..1"), "Give three numbers in 0..1"));
         }

@@ -152,7 +152,12 @@ impl Model {
             field,
             moving,
             background: manifest.background,
-            render: RenderConfig { rules: manifest.rasterizer.rules, antialiased: manifest.rasterizer.antialiased, background: Some(manifest.background) },
+            render: RenderConfig {
+                rules: manifest.rasterizer.rules,
+                antialiased: manifest.rasterizer.antialiased,
+                near: manifest.rasterizer.near,
+                background: Some(manifest.background),
+            },
             rasterizer,
             frame_count: manifest.frame_count,
             provenance: manifest.provenance.clone(),
@@ -184,7 +189,13 @@ impl Model {
         let manifest = Manifest {
             codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
             deformer,
-            rasterizer: RasterizerEntry { name: rasterizer, rules: self.render.rules, antialiased: self.render.antialiased, settings: rasterizer_settings },
+            rasterizer: RasterizerEntry {
+                name: rasterizer,
+                rules: self.render.rules,
+                antialiased: self.render.antialiased,
+                near: self.render.near,
+                settings: rasterizer_settings,
+            },
             frame_count: self.frame_count,
             time_range: [0.0, 1.0],
             box_world: [corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max)],

@@ -62,7 +62,7 @@ impl<'a> Player<'a> {
             rows,
             moving,
             cache: None,
-            settings: RenderSettings { rules: model.render.rules, antialiased: model.render.antialiased, background: Some(background), max_weights: false },
+            settings: model.render.settings(Some(background)),
             work: PlayWork::default(),
             model,
         })

@@ -14,6 +14,7 @@ mod field;
 pub mod gaussians;
 mod limits;
 pub mod metrics;
+mod module_field;
 mod offsets;
 mod plugin;
 mod raster;
@@ -30,6 +31,7 @@ pub use field::{DeformationField, FieldContext, FieldPlugin, FieldWork, Paramete
 pub use gaussians::{ExtraAttribute, Gaussians, HostGaussians};
 pub use inventory;
 pub use limits::Limits;
+pub use module_field::ModuleField;
 pub use offsets::Offsets;
 pub use plugin::Plugin;
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, Rules, SplatColors, Splats};

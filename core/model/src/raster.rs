@@ -90,6 +90,8 @@ pub struct RenderSettings {
     pub rules: Rules,
     /// Scale opacity by the share of the footprint the pixel blur added (Mip-Splatting's 2D filter).
     pub antialiased: bool,
+    /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
+    pub near: Option<f32>,
     /// Colour behind everything, linear RGB in 0..1 [3]; may carry a gradient. `None` is black.
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
@@ -98,7 +100,7 @@ pub struct RenderSettings {
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, background: None, max_weights: false }
+        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false }
     }
 }
 

@@ -90,6 +90,7 @@ pub fn settings(width: usize, height: usize, k: &[f64], view: &[f64]) -> RasterS
         cy: k[5],
         world_to_camera: matrix(view),
         rules: Rules::Gsplat099,
+        near: None,
         antialiased: false,
         space: ParameterSpace::Activated,
         sh_degree: None,

@@ -14,7 +14,7 @@ use pulp::{Simd, WithSimd};
 
 /// Fills the gradient records of all pairs from `upstream` [5,H,W].
 pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32]) {
-    let rules = RuleConstants::new(settings.rules);
+    let rules = RuleConstants::new(settings);
     let tiles_x = settings.width.div_ceil(TILE);
     let buffers = &mut **workspace;
     set_len(&mut buffers.records, buffers.list.len());

@@ -29,8 +29,12 @@ pub struct RuleConstants {
 }
 
 impl RuleConstants {
-    /// The constants of `rules`.
-    pub fn new(rules: Rules) -> Self {
+    /// The constants of the rules in `settings`, whose near plane may be its own.
+    pub fn new(settings: &RasterSettings) -> Self {
+        let rules = Self::of(settings.rules);
+        Self { near: settings.near.unwrap_or(rules.near), ..rules }
+    }
+    fn of(rules: Rules) -> Self {
         match rules {
             Rules::Gsplat099 => Self { near: 0.01, alpha_max: 0.99, pass_capped: false, square_tiles: false },
             Rules::Gsplat0999 => Self { near: 0.01, alpha_max: 0.999, pass_capped: false, square_tiles: false },

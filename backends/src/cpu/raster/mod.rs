@@ -53,6 +53,8 @@ pub struct RasterSettings {
     pub world_to_camera: [[f64; 4]; 4],
     /// Corner-case rules.
     pub rules: Rules,
+    /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
+    pub near: Option<f32>,
     /// Multiply opacity by the compensation of the pixel blur.
     pub antialiased: bool,
     /// Whether scales and opacities still want their activations.
@@ -146,7 +148,7 @@ pub fn forward(splats: &SplatArrays, settings: &RasterSettings) -> Result<Forwar
 
 fn forward_in_pool(splats: &SplatArrays, settings: &RasterSettings) -> Result<Forward, TooManyPairs> {
     let camera = CameraConstants::new(settings);
-    let rules = RuleConstants::new(settings.rules);
+    let rules = RuleConstants::new(settings);
     let mut workspace = Workspace::take();
     let mut radii = vec![0i64; splats.len()];
     project::project_all(splats, settings, &camera, &rules, &mut workspace, &mut radii)?;

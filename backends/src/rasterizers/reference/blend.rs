@@ -32,7 +32,7 @@ struct Touch {
 
 /// The Gaussians that contribute at a pixel, front to back, and the transmittance left.
 fn touches(items: &[Item], settings: &RasterSettings, column: usize, row: usize) -> (Vec<Touch>, f64) {
-    let rules = RuleConstants::new(settings.rules);
+    let rules = RuleConstants::new(settings);
     let (cap, least, stop) = (f64::from(rules.alpha_max), f64::from(ALPHA_MIN), f64::from(TRANSMITTANCE_STOP));
     let mut found = Vec::new();
     let mut left = 1.0;
@@ -99,7 +99,7 @@ pub fn blend(items: &[Item], settings: &RasterSettings, background: [f64; 3]) ->
 
 /// Gradients of the items' numbers and of the background for `upstream` [5,H,W].
 pub fn blend_backward(items: &[Item], settings: &RasterSettings, background: [f64; 3], upstream: &[f64]) -> (Vec<[f64; SCREEN]>, [f64; 3]) {
-    let rules = RuleConstants::new(settings.rules);
+    let rules = RuleConstants::new(settings);
     let plane = settings.width * settings.height;
     let mut d_items = vec![[0.0; SCREEN]; items.len()];
     let mut d_background = [0.0; 3];

@@ -150,7 +150,7 @@ pub fn project<T: Real>(g: &Gaussian<T>, settings: &RasterSettings) -> Projected
 
 /// Screen radius per axis and tile rectangle (first and end per axis) of a Gaussian, or nothing if it is culled.
 pub fn extent(p: &Projected<f64>, settings: &RasterSettings) -> Option<([f64; 2], Option<TileRange>)> {
-    let rules = RuleConstants::new(settings.rules);
+    let rules = RuleConstants::new(settings);
     let [xx, xy, yy] = p.covariance;
     let numbers = [p.center[0], p.center[1], p.conic[0], p.conic[1], p.conic[2], p.opacity, p.depth];
     let finite = numbers.iter().all(|v| v.is_finite());

@@ -7,7 +7,7 @@ use crate::schedule::Stage;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::ops::photometric::bce_with_logits_loss;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{RenderSettings, Result, SplatColors, Splats};
+use cc4dgs_core::{Result, SplatColors, Splats};
 
 impl Context<'_> {
     /// One iteration (from 1): one camera, black background, gradient to the scores alone.
@@ -25,7 +25,7 @@ impl Context<'_> {
         let mut splats = Splats::from_gaussians(&gaussians, 0);
         splats.colors = SplatColors::Direct(leaves[6].clone().repeat_dim(1, 3));
         let camera = self.job.scene.camera(mask.view);
-        let settings = RenderSettings { rules: self.job.config.render.rules, antialiased: self.job.config.render.antialiased, ..Default::default() };
+        let settings = self.job.config.render.settings(None);
         let output = self.rasterizer.render(&splats, camera, &settings)?;
         let (w, h) = (camera.width as usize, camera.height as usize);
         let target = Tensor::<2>::from_inner(Tensor::from_data(TensorData::new(mask.mask.clone(), [h, w]), &self.device));

@@ -45,12 +45,8 @@ impl Context<'_> {
         };
         let background_rgb = self.job.config.background()?;
         let background = Tensor::<1>::from_data(TensorData::new(background_rgb.to_vec(), [3]), &self.device);
-        let settings = RenderSettings {
-            rules: self.job.config.render.rules,
-            antialiased: self.job.config.render.antialiased,
-            background: Some(Tensor::from_inner(background)),
-            max_weights: self.wants_weights(stage, iteration),
-        };
+        let settings =
+            RenderSettings { max_weights: self.wants_weights(stage, iteration), ..self.job.config.render.settings(Some(Tensor::from_inner(background))) };
         let mut total: Option<Tensor<1>> = None;
         let mut probes = Vec::with_capacity(batch.len());
         let mut seen: Option<Tensor<1, Int>> = None;

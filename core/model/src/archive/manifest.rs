@@ -42,6 +42,9 @@ pub struct RasterizerEntry {
     pub rules: Rules,
     /// Whether the antialiasing compensation was on.
     pub antialiased: bool,
+    /// Smallest camera depth drawn, world units, where the rules' own was not used.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub near: Option<f32>,
     /// Its settings, without `kind`.
     pub settings: toml::Table,
 }

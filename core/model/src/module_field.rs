@@ -1,0 +1,168 @@
+//! From a burn module and two functions to a deformation field.
+//!
+//! burn's `Module` is not object safe and owns its weights; a field is a trait object whose weights the optimizer replaces. This adapter keeps the weights
+//! flat and hands a module made of the current ones to the author's functions, so that a new field is its layers, its two functions and a registration.
+
+use crate::{DeformationField, FieldWork, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures};
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::tensor::Tensor;
+
+/// A [`DeformationField`] made of a module `M`: `spatial(module, means_world [M,3])` gives features [M,F], `deform(module, features, time_norm)` offsets.
+///
+/// Both functions see the weights of the current step; gradients flow through them. Register it like any field: `build` returns it in a box.
+pub struct ModuleField<M, S, D> {
+    module: M,
+    spatial: S,
+    deform: D,
+    parameters: Vec<Parameter>,
+    groups: Vec<ParameterGroup>,
+    cached: bool,
+}
+
+impl<M, S, D> ModuleField<M, S, D>
+where
+    M: Module,
+    S: Fn(&M, Tensor<2>) -> Result<Tensor<2>> + Send,
+    D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
+{
+    /// All float weights of `module` in one optimizer group, counted as network bytes. Names are the paths of the module tree (`trunk.0.weight`).
+    pub fn new(module: M, group: ParameterGroup, spatial: S, deform: D) -> Self {
+        let mut list = Collector { path: Vec::new(), parameters: Vec::new() };
+        module.visit(&mut list);
+        Self { module, spatial, deform, parameters: list.parameters, groups: vec![group], cached: true }
+    }
+    /// Counts weights whose path starts with `prefix` as grid bytes, and gives them an optimizer group of their own if one is named.
+    pub fn with_grid(mut self, prefix: &str, group: Option<ParameterGroup>) -> Self {
+        let place = match group {
+            Some(group) => {
+                self.groups.push(group);
+                self.groups.len() - 1
+            }
+            None => 0,
+        };
+        for parameter in self.parameters.iter_mut().filter(|p| p.name.starts_with(prefix)) {
+            parameter.part = Part::Grid;
+            parameter.group = place;
+        }
+        self
+    }
+    /// Whether playback may keep spatial features between frames (it may, unless told otherwise).
+    pub fn with_cache(mut self, cached: bool) -> Self {
+        self.cached = cached;
+        self
+    }
+    /// The module with the weights of this step.
+    fn current(&self) -> M {
+        self.module.clone().map(&mut Assigner { parameters: self.parameters.iter() })
+    }
+}
+
+impl<M, S, D> DeformationField for ModuleField<M, S, D>
+where
+    M: Module,
+    S: Fn(&M, Tensor<2>) -> Result<Tensor<2>> + Send,
+    D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
+{
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let work = FieldWork { gaussians: means_world.dims()[0] as u64, ..FieldWork::default() };
+        Ok(SpatialFeatures { values: (self.spatial)(&self.current(), means_world)?, work })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        (self.deform)(&self.current(), features, time_norm)
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        self.groups.clone()
+    }
+    fn caches_spatial(&self) -> bool {
+        self.cached
+    }
+}
+
+/// Flattens every float weight, in the order of the module tree.
+struct Collector {
+    path: Vec<String>,
+    parameters: Vec<Parameter>,
+}
+
+impl ModuleVisitor for Collector {
+    fn enter_module(&mut self, name: &str, _: &str) {
+        self.path.push(name.to_string());
+    }
+    fn exit_module(&mut self, _: &str, _: &str) {
+        self.path.pop();
+    }
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let value = param.val();
+        let shape = value.dims().to_vec();
+        let count: usize = shape.iter().product();
+        let mut name = self.path.join(".");
+        if name.is_empty() || self.parameters.iter().any(|p| p.name == name) {
+            // A path that does not tell weights apart still needs unique names in files.
+            name = format!("{name}#{}", self.parameters.len());
+        }
+        self.parameters.push(Parameter { name, part: Part::Net, shape, value: value.reshape([count]), group: 0 });
+    }
+}
+
+/// Puts flat weights back into a module, in the same order.
+struct Assigner<'a> {
+    parameters: std::slice::Iter<'a, Parameter>,
+}
+
+impl ModuleMapper for Assigner<'_> {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let Some(parameter) = self.parameters.next() else { return param };
+        let (id, old, mapper) = param.consume();
+        Param::from_mapped_value(id, parameter.value.clone().reshape(old.dims()), mapper)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gaussians::to_vec;
+    use burn::tensor::Device;
+
+    #[derive(Module, Debug)]
+    struct Drift {
+        table: Param<Tensor<2>>,
+        velocity: Param<Tensor<2>>,
+    }
+
+    fn field(device: &Device) -> impl DeformationField {
+        let param = |rows: usize, value: f32| Param::from_tensor(Tensor::<2>::full([rows, 3], value, device));
+        let module = Drift { table: param(3, 0.5), velocity: param(3, 2.0) };
+        let group =
+            |name: &str| ParameterGroup { name: name.into(), lr_start: 1e-3, lr_end: 1e-3, warmup: 0.0, times_extent: false, epsilon: 1e-15, clip_norm: 0.0 };
+        let spatial = |m: &Drift, means: Tensor<2>| Ok(means.matmul(m.table.val()));
+        let deform = |m: &Drift, features: Tensor<2>, t: f32| Ok(Offsets { means: Some(features.matmul(m.velocity.val()) * t), ..Offsets::default() });
+        ModuleField::new(module, group("net"), spatial, deform).with_grid("table", Some(group("grid")))
+    }
+
+    #[test]
+    fn a_module_becomes_a_field_whose_weights_learn() {
+        let device = Device::flex();
+        let mut field = field(&device);
+        let names: Vec<(String, Part, usize)> = field.parameters().iter().map(|p| (p.name.clone(), p.part, p.group)).collect();
+        assert_eq!(names, [("table".into(), Part::Grid, 1), ("velocity".into(), Part::Net, 0)]);
+        assert_eq!(field.size_bytes(), (36, 36));
+
+        for parameter in field.parameters_mut() {
+            parameter.value = Tensor::from_inner(parameter.value.clone()).require_grad();
+        }
+        let means = Tensor::<2>::from_inner(Tensor::ones([2, 3], &device));
+        let features = field.spatial(means).unwrap().values;
+        let moved = field.deform(features, 0.5).unwrap().means.unwrap();
+        assert_eq!(to_vec(moved.clone().inner(), "moved").unwrap(), vec![4.5; 6]);
+        let gradients = moved.sum().backward();
+        // d/dV = features^T 1 t: two Gaussians, each with feature 1.5, half way through time.
+        let gradient = field.parameters()[1].value.grad(&gradients).unwrap();
+        assert_eq!(to_vec(gradient, "gradient").unwrap(), vec![1.5; 9]);
+    }
+}
