@@ -3,7 +3,8 @@
 use super::geometry::{CONDITIONS, Normalisation, interleave, load, split, store};
 use super::network::{Decoder, Scratch, decoder_len, latents};
 use super::profile::{Profile, Settings};
-use super::train::{self, Data};
+use super::shard::Data;
+use super::train;
 use crate::column::{self, Column, Target};
 use crate::kmeans;
 use crate::streams::StreamSet;

@@ -17,6 +17,7 @@ mod geometry;
 mod network;
 mod principal;
 mod profile;
+mod shard;
 mod train;
 
 use crate::morton;

@@ -174,7 +174,7 @@ impl Context<'_> {
             return Ok(());
         }
         if state.iteration == 0 {
-            state.begin_stage(&self.device);
+            state.begin_stage();
             if stage == Stage::Main {
                 self.begin_main(state)?;
             }
@@ -215,7 +215,7 @@ impl Context<'_> {
                 self.save(state, path)?;
             }
         }
-        log.finish(events, state.set.len());
+        log.finish(events);
         events.emit(&Event::StageFinished { stage: stage.name().into(), seconds: began.elapsed().as_secs_f64(), gaussians: state.set.len() });
         if stage == Stage::Score {
             let rows = state.moving_rows(&self.device)?.count(state.set.len()) as u64;

@@ -67,3 +67,60 @@ pub fn smoothness(
         _ => None,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::Device;
+    use cc4dgs_core::{FieldWork, Offsets, Parameter, ParameterGroup, SpatialFeatures};
+
+    /// Moves everything along x by a function of time, scaled by the canonical x.
+    struct Along(fn(f32) -> f32);
+
+    impl DeformationField for Along {
+        fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+            Ok(SpatialFeatures { values: means_world, work: FieldWork::default() })
+        }
+        fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+            Ok(Offsets { means: Some(features.mul_scalar(self.0(time_norm))), ..Offsets::default() })
+        }
+        fn parameters(&self) -> Vec<&Parameter> {
+            Vec::new()
+        }
+        fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+            Vec::new()
+        }
+        fn groups(&self) -> Vec<ParameterGroup> {
+            Vec::new()
+        }
+    }
+
+    fn means() -> Tensor<2> {
+        Tensor::from_floats([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0], [-1.0, 0.0, 3.0]], &Device::flex())
+    }
+
+    #[test]
+    fn flicker_tells_jitter_from_motion() {
+        let threshold = TrainConfig::default().flicker_threshold;
+        let of = |path: fn(f32) -> f32| flicker(&Along(path), means(), 30).unwrap();
+        // At 30 frames: a sway of one cycle, a straight line, and a sign that flips with every frame.
+        let (sway, line, jitter) = (of(|t| (std::f32::consts::TAU * t).sin()), of(|t| t), of(|t| if (t * 30.0).round() as i32 % 2 == 0 { 1.0 } else { -1.0 }));
+        assert!(line < 1e-3 && sway < 0.1 && sway < threshold, "line {line}, sway {sway}");
+        assert!((jitter - 4.0).abs() < 0.05 && jitter > threshold, "second differences of +-1 are 4: {jitter}");
+        assert_eq!(of(|_| 0.3), 0.0, "what stands still does not flicker");
+        assert_eq!(flicker(&Along(|t| t), means().narrow(0, 0, 0), 30).unwrap(), 0.0);
+    }
+
+    #[test]
+    fn the_weight_ramps_and_a_constant_field_costs_nothing() {
+        let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 30, sh_degree: 0, seed: Seed::root(1) };
+        let config = TrainConfig { smooth_delta: 0.1, ..TrainConfig::default() };
+        let term = |path: fn(f32) -> f32, progress: f64| {
+            let term = smoothness(&Along(path), &context, means(), 0.5, &config, progress, Seed::root(3)).unwrap().unwrap();
+            to_vec(term, "smoothness").unwrap()[0]
+        };
+        let (half, whole) = (term(|t| t, 0.5), term(|t| t, 1.0));
+        assert!(half > 0.0 && (whole / half - 2.0).abs() < 1e-4, "{half} and {whole}");
+        assert_eq!(term(|_| 0.0, 1.0), 0.0);
+    }
+}

@@ -112,7 +112,7 @@ impl TrainState {
         Self { stage, iteration, set, stats, moving, field, smooth, rows: None }
     }
     /// New optimisers and statistics, as every stage starts with (baselines §2.3).
-    pub fn begin_stage(&mut self, _device: &Device) {
+    pub fn begin_stage(&mut self) {
         self.set.step = 0;
         for column in &mut self.set.columns {
             column.first_moment = column.first_moment.zeros_like();

@@ -214,7 +214,7 @@ impl Log {
         events.emit(&Event::Iteration { stage, iteration, of: self.length, loss: self.loss, psnr_db: self.psnr_db, gaussians, ms });
     }
     /// Tells the counted work of the stage.
-    pub(crate) fn finish(&self, events: &dyn EventSink, _gaussians: usize) {
+    pub(crate) fn finish(&self, events: &dyn EventSink) {
         let names = ["vertices decoded", "Gaussians deformed", "Gaussians in Adam (sampled)"];
         for (name, (done, skipped)) in names.into_iter().zip(self.work) {
             if done + skipped > 0 {
