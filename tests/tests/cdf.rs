@@ -164,26 +164,27 @@ impl Plain<'_> {
         let (sizes, scene) = (self.field.sizes(), context(300));
         let inner = self.device.clone().inner();
         let mut levels = Vec::new();
-        for (level, &resolution) in sizes.resolutions.iter().enumerate() {
+        for (level, &resolution) in sizes.voxels.resolutions.iter().enumerate() {
             let grid = GridBox { min: scene.box_min, max: scene.box_max, resolution };
             let c = VoxelCorners::find(matrix(points.to_vec(), 3, &inner), grid, true).expect("corners");
             let vertices: Vec<[u32; 3]> =
                 c.vertices.into_data().iter::<i64>().collect::<Vec<_>>().chunks_exact(3).map(|v| [v[0] as u32, v[1] as u32, v[2] as u32]).collect();
-            let hash = LevelHash::new(scene.seed.child("level").index(level as u64).child("hash"), sizes.decoder.input, 1_000_000);
-            let mut signatures = vec![0.0; vertices.len() * sizes.decoder.input];
+            let hash = LevelHash::new(scene.seed.child("level").index(level as u64).child("hash"), sizes.voxels.decoder.input, 1_000_000);
+            let mut signatures = vec![0.0; vertices.len() * sizes.voxels.decoder.input];
             hash.signatures(&vertices, &mut signatures);
-            let features = self.decoder(matrix(signatures, sizes.decoder.input, &self.device), &self.weight(&format!("grid.level{level}")), &sizes.decoder);
+            let features =
+                self.decoder(matrix(signatures, sizes.voxels.decoder.input, &self.device), &self.weight(&format!("grid.level{level}")), &sizes.voxels.decoder);
             let m = points.len() / 3;
             let gathered = features.select(0, Tensor::<1, Int>::from_data(c.corners.into_data(), &self.device));
             let weights = Tensor::<1>::from_data(c.weights.into_data(), &self.device).reshape([8 * m, 1]);
-            levels.push((gathered * weights).reshape([m, 8, sizes.decoder.output]).sum_dim(1).reshape([m, sizes.decoder.output]));
+            levels.push((gathered * weights).reshape([m, 8, sizes.voxels.decoder.output]).sum_dim(1).reshape([m, sizes.voxels.decoder.output]));
         }
         let (voxel, w) = (Tensor::cat(levels, 1), sizes.width);
         let bands = (0..8).flat_map(|l| [f64::sin, f64::cos].map(|f| f(std::f64::consts::TAU * f64::from(1 << l) * f64::from(time)) as f32));
         let encoding = matrix(std::iter::once(time).chain(bands).collect(), 17, &self.device);
         let f_time = self.chain(encoding, &self.weight("net.time"), &[17, w, w, w, w], false);
         let fused = if sizes.film.is_some() {
-            let h = self.chain(voxel, &self.weight("net.spatial"), &[sizes.voxel_features(), w], false);
+            let h = self.chain(voxel, &self.weight("net.spatial"), &[sizes.voxels.width(), w], false);
             let modulation = self.chain(f_time, &self.weight("net.film"), &[w, w, 2 * w], false);
             h * modulation.clone().narrow(1, 0, w) + modulation.narrow(1, w, w)
         } else {

@@ -1,7 +1,9 @@
 //! Timing of whole training steps.
 
+mod scene;
 mod workload;
 
+pub use scene::{ROOM_CASES, RoomCase, room};
 pub use workload::{Workload, random_gaussians, step_camera};
 
 use crate::cpu::simd::{Lanes, dispatch};

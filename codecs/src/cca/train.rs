@@ -205,7 +205,8 @@ mod tests {
         let mut parameters = principal_start(&data, &net, Seed::root(1));
         let mut rng = Seed::root(2).rng();
         parameters.iter_mut().for_each(|p| *p += rng.random_range(-0.1..0.1));
-        let mut shard = Shard { rows: (0..20).collect(), ..Default::default() };
+        let mut shard = Shard::default();
+        shard.rows.extend(0..20);
         forward(&net, &parameters, &data, &mut shard, None);
         backward(&net, &parameters, &data, &mut shard, 20);
         let mean = 1.0 / (20 * width) as f64;

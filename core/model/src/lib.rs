@@ -7,6 +7,7 @@ pub mod archive;
 mod camera;
 mod codec;
 pub mod config;
+pub mod conformance;
 mod device;
 mod error;
 mod events;

@@ -6,13 +6,15 @@
 //! first trunk layer: h (gamma ⊙ T) + (beta T + b) in place of (gamma ⊙ h + beta) T + b.
 
 mod config;
-mod time;
-mod weights;
 
-pub use config::{Capacity, CdfConfig, Fusion, Head, SCHEMA, Sizes, TimeEncoding};
+pub use crate::parts::heads::Head;
+pub use crate::parts::settings::Capacity;
+pub use config::{CdfConfig, Fusion, SCHEMA, Sizes, TimeEncoding};
 
+use crate::parts::voxels::{Voxels, parameter};
+use crate::parts::{heads, time, weights};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_backends::ops::field::{Decoder, GridBox, LevelHash, ReluShape, VoxelCorners, mlp_relu};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
     DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
     config as toml_config, inventory,
@@ -27,9 +29,7 @@ const NET: usize = 1;
 pub struct Cdf {
     config: CdfConfig,
     sizes: Sizes,
-    box_min: [f32; 3],
-    box_max: [f32; 3],
-    decoders: Vec<Arc<Decoder>>,
+    voxels: Voxels,
     spatial: Arc<ReluShape>,
     time: Arc<ReluShape>,
     film: Option<Arc<ReluShape>>,
@@ -44,36 +44,23 @@ impl Cdf {
     pub fn new(config: CdfConfig, context: &FieldContext, device: &Device) -> Result<Self> {
         let sizes = config.sizes(context)?;
         let seed = context.seed;
-        let mut parameters = Vec::new();
-        let mut add = |name: String, part: Part, values: Vec<f32>| {
-            let count = values.len();
-            let group = if part == Part::Grid { GRID } else { NET };
-            parameters.push(Parameter { name, part, shape: vec![count], value: Tensor::from_data(TensorData::new(values, [count]), device), group });
-        };
-        let mut decoders = Vec::new();
-        for level in 0..sizes.resolutions.len() {
-            let level_seed = seed.child("level").index(level as u64);
-            add(format!("grid.level{level}"), Part::Grid, weights::decoder(level_seed.child("weights"), &sizes.decoder));
-            let hash = LevelHash::new(level_seed.child("hash"), config.hashes, config.modulus);
-            decoders.push(Arc::new(Decoder { hash, shape: sizes.decoder.clone() }));
-        }
+        let (voxels, mut parameters) = Voxels::new(&config.voxels, context, GRID, device)?;
+        let mut add = |name: String, values: Vec<f32>| parameters.push(parameter(name, Part::Net, NET, values, device));
         let width = sizes.width;
-        add("net.spatial".into(), Part::Net, weights::linear(seed.child("spatial"), sizes.spatial_inputs(), width));
-        add("net.time".into(), Part::Net, weights::chain(seed.child("time"), &weights::widths(&sizes.time)));
+        add("net.spatial".into(), weights::linear(seed.child("spatial"), sizes.spatial_inputs(), width));
+        add("net.time".into(), weights::chain(seed.child("time"), &weights::widths(&sizes.time)));
         if let Some(film) = &sizes.film {
-            add("net.film".into(), Part::Net, weights::film(seed.child("film"), film, width));
+            add("net.film".into(), weights::film(seed.child("film"), film, width));
         }
         let trunk: Vec<usize> = std::iter::once(width).chain(sizes.network.trunk.iter().copied()).collect();
-        add("net.trunk".into(), Part::Net, weights::chain(seed.child("trunk"), &trunk));
-        for head in &config.heads {
+        add("net.trunk".into(), weights::chain(seed.child("trunk"), &trunk));
+        for head in &config.network.heads {
             let values = weights::head(seed.child(head.name()), width, head.width(context.sh_degree));
-            add(format!("net.head.{}", head.name()), Part::Net, values);
+            add(format!("net.head.{}", head.name()), values);
         }
         Ok(Self {
-            box_min: context.box_min,
-            box_max: context.box_max,
-            decoders,
-            spatial: Arc::new(ReluShape::chain(&[sizes.voxel_features(), width])),
+            spatial: Arc::new(ReluShape::chain(&[voxels.width(), width])),
+            voxels,
             time: Arc::new(sizes.time.clone()),
             film: sizes.film.clone().map(Arc::new),
             network: Arc::new(sizes.network.clone()),
@@ -91,23 +78,7 @@ impl Cdf {
 
     /// The weights of the parameter after the decoders, by place.
     fn net(&self, place: usize) -> Tensor<1> {
-        self.parameters[self.decoders.len() + place].value.clone()
-    }
-
-    /// f_voxel [M, levels * features] and what it cost.
-    fn voxel_features(&self, means_world: Tensor<2>) -> Result<(Tensor<2>, FieldWork)> {
-        let [m, _] = means_world.dims();
-        let mut work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
-        let mut levels = Vec::with_capacity(self.decoders.len());
-        for (level, decoder) in self.decoders.iter().enumerate() {
-            let grid = GridBox { min: self.box_min, max: self.box_max, resolution: self.sizes.resolutions[level] };
-            let corners = VoxelCorners::find(means_world.clone(), grid, self.config.vertex_reuse)?;
-            work.vertices_queried += 8 * m as u64;
-            work.vertices_decoded += corners.vertices.dims()[0] as u64;
-            let features = corners.decode(self.parameters[level].value.clone(), decoder)?;
-            levels.push(corners.interpolate(features)?);
-        }
-        Ok((Tensor::cat(levels, 1), work))
+        self.parameters[self.voxels.levels() + place].value.clone()
     }
 
     /// The trunk's weights at a time, modulation folded into its first layer.
@@ -130,7 +101,7 @@ impl Cdf {
                 (matrix * scale, shift)
             }
             None => {
-                let from_time = self.net(0).narrow(0, self.sizes.voxel_features() * w, w * w).reshape([w, w]);
+                let from_time = self.net(0).narrow(0, self.voxels.width() * w, w * w).reshape([w, w]);
                 let shift = f_time.matmul(from_time).matmul(matrix.clone());
                 (matrix, shift)
             }
@@ -149,8 +120,8 @@ impl DeformationField for Cdf {
         if m == 0 {
             return Ok(SpatialFeatures { values: Tensor::zeros([0, self.sizes.width], &means_world.inner().device()), work: FieldWork::default() });
         }
-        let (voxel, work) = self.voxel_features(means_world)?;
-        let (rows, w) = (self.sizes.voxel_features(), self.sizes.width);
+        let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
+        let (rows, w) = (self.voxels.width(), self.sizes.width);
         let layer = self.net(0);
         let layer = if self.film.is_some() {
             layer
@@ -171,22 +142,12 @@ impl DeformationField for Cdf {
             let device = features.device();
             self.network.output_widths().into_iter().map(|w| Tensor::zeros([0, w], &device)).collect()
         } else {
-            let first_head = self.parameters.len() - self.config.heads.len();
+            let first_head = self.parameters.len() - self.config.network.heads.len();
             let heads = self.parameters[first_head..].iter().map(|p| p.value.clone());
             let weights = std::iter::once(self.modulated_trunk(time_norm)?).chain(heads).collect();
             mlp_relu(features, Tensor::cat(weights, 0), &self.network)?
         };
-        let mut offsets = Offsets::default();
-        for (head, out) in self.config.heads.iter().zip(outputs) {
-            match head {
-                Head::Means => offsets.means = Some(out),
-                Head::LogScales => offsets.log_scales = Some(out),
-                Head::Quaternions => offsets.quaternions = Some(out),
-                Head::Opacity => offsets.opacity_logits = Some(out.reshape([m])),
-                Head::Sh => offsets.sh = Some(out.reshape([m, (self.sh_degree + 1).pow(2), 3])),
-            }
-        }
-        Ok(offsets)
+        Ok(heads::offsets(&self.config.network.heads, outputs, self.sh_degree))
     }
 
     fn parameters(&self) -> Vec<&Parameter> {
@@ -198,20 +159,11 @@ impl DeformationField for Cdf {
     }
 
     fn groups(&self) -> Vec<ParameterGroup> {
-        let group = |name: &str| ParameterGroup {
-            name: name.into(),
-            lr_start: self.config.lr_start,
-            lr_end: self.config.lr_end,
-            warmup: self.config.warmup,
-            times_extent: false,
-            epsilon: 1e-15,
-            clip_norm: self.config.clip_norm,
-        };
-        vec![group("cdf grid"), group("cdf net")]
+        vec![self.config.rates.group("cdf grid"), self.config.rates.group("cdf net")]
     }
 
     fn caches_spatial(&self) -> bool {
-        self.config.cache
+        self.config.network.cache
     }
 }
 
@@ -228,7 +180,7 @@ inventory::submit! {
             summary: "computational deformation field: hash signatures, decoders per grid level, FiLM, trunk and five heads",
             paper: "CC-4DGS, Section IV-B",
             schema: SCHEMA,
-            capabilities: &["differentiable", "vertex-reuse", "cached-spatial", "fusion=film,concat"],
+            capabilities: &["differentiable", "starts-as-identity", "vertex-reuse", "cached-spatial", "fusion=film,concat"],
         },
         build,
     }

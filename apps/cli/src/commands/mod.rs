@@ -60,6 +60,7 @@ pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
         Command::Doctor(_) => doctor::run(&context),
         Command::Bench(args) => match &args.what {
             BenchWhat::Step(args) => bench::step(&context, args),
+            BenchWhat::Frame(args) => bench::frame(&context, args),
         },
     }
 }

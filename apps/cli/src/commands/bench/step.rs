@@ -1,7 +1,7 @@
-//! `cc4dgs bench`.
+//! Whole training steps.
 
-use super::Context;
 use crate::args::BenchStep;
+use crate::commands::Context;
 use crate::model_source::resolved_device;
 use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, Workload, time_step};
 use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device};
@@ -38,7 +38,7 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
         version: env!("CARGO_PKG_VERSION"),
         device: resolved_device(&args.device)?,
         threads: rayon::current_num_threads(),
-        cpu_features: super::doctor::cpu_features(),
+        cpu_features: crate::commands::doctor::cpu_features(),
         seed: args.seed,
         repeats: args.repeats,
         operations_per_pair: OPERATIONS_PER_PAIR,

@@ -1,0 +1,231 @@
+//! Playback of a room with people: field and rasterizer, frame by frame, and the field's own costs.
+
+use super::Spread;
+use crate::args::BenchFrame;
+use crate::commands::Context;
+use crate::model_source::resolved_device;
+use burn::tensor::{Tensor, TensorData};
+use cc4dgs_backends::bench::{ROOM_CASES, RoomCase, StepCase, room};
+use cc4dgs_core::archive::Provenance;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Event, EventSink, FieldContext, Result, Seed, config, parse_device, unknown_name};
+use cc4dgs_engine::config::{RenderConfig, RunConfig};
+use cc4dgs_engine::model::{Model, ModelField, ModelSize};
+use cc4dgs_engine::play::{PlayWork, Player};
+use cc4dgs_engine::train::Moving;
+use serde::Serialize;
+use std::time::Instant;
+
+/// Frames drawn before the clock counts: caches fill and kernels compile.
+const WARM_UP: usize = 2;
+/// Frames of the sequence the rooms stand for.
+const SEQUENCE: usize = 300;
+
+#[derive(Serialize)]
+struct FrameReport<'a> {
+    version: &'static str,
+    device: &'a str,
+    threads: usize,
+    cpu_features: Vec<&'static str>,
+    seed: u64,
+    deformer: String,
+    cases: Vec<FrameCase>,
+}
+
+#[derive(Serialize)]
+struct FrameCase {
+    name: String,
+    width: u32,
+    height: u32,
+    gaussians: usize,
+    dynamic_gaussians: usize,
+    /// Field and rasterizer of the first frame, milliseconds; kernels are compiled and caches are empty.
+    first_field_ms: f64,
+    first_raster_ms: f64,
+    field: Spread,
+    raster: Spread,
+    frame: Spread,
+    frames_per_s: f64,
+    visible: u64,
+    tile_pairs: u64,
+    pixel_pairs: u64,
+    work: PlayWork,
+    /// Spatial pass, offsets at one time, and both with the gradient of all weights.
+    field_spatial: Spread,
+    field_forward_backward: Spread,
+}
+
+/// Times playback of the rooms.
+pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
+    let device = parse_device(&args.device)?;
+    let events = context.listeners(None)?;
+    let mut table = toml::Table::from_iter([("deformer".to_string(), toml::Value::Table(toml::Table::from_iter([("kind".into(), "cdf".into())])))]);
+    for assignment in &args.set {
+        config::set(&mut table, assignment)?;
+    }
+    let config: RunConfig = config::parse_section("configuration", &table)?;
+    let mut cases = Vec::new();
+    let wanted = selected(args)?;
+    for (done, case) in wanted.iter().enumerate() {
+        cases.push(time_case(context, case, &config, &device, args)?);
+        events.emit(&Event::Progress { task: "bench".into(), done: done as u64 + 1, total: wanted.len() as u64 });
+    }
+    let deformer = config.deformer.get("kind").and_then(|k| k.as_str()).unwrap_or_default().to_string();
+    let report = FrameReport {
+        version: env!("CARGO_PKG_VERSION"),
+        device: resolved_device(&args.device)?,
+        threads: rayon::current_num_threads(),
+        cpu_features: crate::commands::doctor::cpu_features(),
+        seed: args.seed,
+        deformer,
+        cases,
+    };
+    context.output.result(&report, || text(&report))
+}
+
+/// The cases asked for, shrunk by `--scale` (pictures and Gaussians alike).
+fn selected(args: &BenchFrame) -> Result<Vec<RoomCase>> {
+    let names = ROOM_CASES.iter().map(|c| c.name);
+    if let Some(unknown) = args.case.iter().find(|name| !names.clone().any(|n| n == name.as_str())) {
+        return Err(unknown_name("--case", unknown, names));
+    }
+    let shrink = |v: f64, by: f64| (v * by).round().max(1.0);
+    Ok(ROOM_CASES
+        .iter()
+        .filter(|c| args.case.is_empty() || args.case.iter().any(|name| name == c.name))
+        .map(|c| {
+            let side = args.scale.sqrt();
+            let size = StepCase {
+                width: shrink(f64::from(c.size.width), side) as u32,
+                height: shrink(f64::from(c.size.height), side) as u32,
+                gaussians: shrink(c.size.gaussians as f64, args.scale) as usize,
+            };
+            RoomCase { size, ..*c }
+        })
+        .collect())
+}
+
+fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &burn::tensor::Device, args: &BenchFrame) -> Result<FrameCase> {
+    let seed = Seed::root(args.seed).child("bench").child(case.name);
+    let workload = room(case, seed);
+    let moving = Moving::Scored { zeta: 0.0 };
+    let rows = moving.rows(&workload.gaussians.dynamic_scores).unwrap_or_default();
+    let axis = |k: usize, from: f32, pick: fn(f32, f32) -> f32| rows.iter().map(|&i| workload.gaussians.means[3 * i + k]).fold(from, pick);
+    let field_context = FieldContext {
+        box_min: std::array::from_fn(|k| if rows.is_empty() { 0.0 } else { axis(k, f32::INFINITY, f32::min) }),
+        box_max: std::array::from_fn(|k| if rows.is_empty() { 1.0 } else { axis(k, f32::NEG_INFINITY, f32::max) }),
+        frame_count: SEQUENCE,
+        sh_degree: workload.gaussians.sh_degree,
+        seed: seed.child("field"),
+    };
+    let mut field = context.registry.build_deformer(&config.deformer, &field_context, device)?;
+    let means: Vec<f32> = rows.iter().flat_map(|&i| workload.gaussians.means[3 * i..3 * i + 3].to_vec()).collect();
+    let means = Tensor::<2>::from_data(TensorData::new(means, [rows.len(), 3]), device);
+    let (field_spatial, field_forward_backward) = time_field(field.as_mut(), means, args.frames)?;
+
+    let (n, camera) = (workload.gaussians.len(), workload.camera);
+    let model = Model {
+        gaussians: workload.gaussians,
+        field: Some(ModelField { field, section: config.deformer.clone(), context: field_context }),
+        moving,
+        render: RenderConfig::default(),
+        background: [0.0; 3],
+        rasterizer: config.rasterizer.clone(),
+        frame_count: SEQUENCE,
+        provenance: Provenance::default(),
+        size: ModelSize::default(),
+    };
+    let mut player = Player::new(&model, &context.registry, device)?;
+    let mut times: [Vec<f64>; 3] = Default::default();
+    let (mut first, mut counts) = ((0.0, 0.0), cc4dgs_core::RenderWork::default());
+    for frame in 0..WARM_UP + args.frames as usize {
+        let (output, time) = player.render(&camera, frame as f32 / SEQUENCE as f32)?;
+        counts = output.stats.work;
+        if frame == 0 {
+            first = (time.field_ms, time.raster_ms);
+        }
+        if frame >= WARM_UP {
+            for (list, ms) in times.iter_mut().zip([time.field_ms, time.raster_ms, time.field_ms + time.raster_ms]) {
+                list.push(ms);
+            }
+        }
+    }
+    let [field, raster, frame] = times.map(Spread::of);
+    Ok(FrameCase {
+        name: case.name.into(),
+        width: camera.width,
+        height: camera.height,
+        gaussians: n,
+        dynamic_gaussians: player.moving(),
+        first_field_ms: first.0,
+        first_raster_ms: first.1,
+        field,
+        raster,
+        frames_per_s: if frame.median_ms > 0.0 { 1000.0 / frame.median_ms } else { 0.0 },
+        frame,
+        visible: counts.visible,
+        tile_pairs: counts.tile_pairs,
+        pixel_pairs: counts.pixel_pairs,
+        work: player.work,
+        field_spatial,
+        field_forward_backward,
+    })
+}
+
+/// The spatial pass alone, and a pass forwards and backwards through the whole field.
+fn time_field(field: &mut dyn cc4dgs_core::DeformationField, means_world: Tensor<2>, repeats: u32) -> Result<(Spread, Spread)> {
+    if field.is_static() || means_world.dims()[0] == 0 {
+        return Ok((Spread::of(Vec::new()), Spread::of(Vec::new())));
+    }
+    let (mut spatial, mut both) = (Vec::new(), Vec::new());
+    for round in 0..WARM_UP + repeats as usize {
+        let began = Instant::now();
+        let features = field.spatial(means_world.clone())?.values;
+        // One number read back says that everything before it is done.
+        to_vec(features.narrow(0, 0, 1), "features")?;
+        let spatial_ms = began.elapsed().as_secs_f64() * 1e3;
+        for parameter in field.parameters_mut() {
+            parameter.value = Tensor::from_inner(parameter.value.clone()).require_grad();
+        }
+        let began = Instant::now();
+        let tracked = Tensor::<2>::from_inner(means_world.clone());
+        let features = field.spatial(tracked)?.values;
+        if let Some(offsets) = field.deform(features, 0.3)?.concatenated() {
+            let gradients = offsets.sum().backward();
+            if let Some(gradient) = field.parameters().first().and_then(|p| p.value.grad(&gradients)) {
+                to_vec(gradient.narrow(0, 0, 1), "gradient")?;
+            }
+        }
+        let both_ms = began.elapsed().as_secs_f64() * 1e3;
+        for parameter in field.parameters_mut() {
+            parameter.value = parameter.value.clone().inner();
+        }
+        if round >= WARM_UP {
+            spatial.push(spatial_ms);
+            both.push(both_ms);
+        }
+    }
+    Ok((Spread::of(spatial), Spread::of(both)))
+}
+
+fn text(report: &FrameReport) -> String {
+    let mut lines = vec![format!("playback on {}, {} threads, deformer {}", report.device, report.threads, report.deformer)];
+    lines.push("case           picture  Gaussians  moving   field ms  raster ms   frames/s  first ms  spatial ms  field fwd+bwd ms".into());
+    lines.extend(report.cases.iter().map(|c| {
+        format!(
+            "{:<12} {:>4}x{:<4} {:>9} {:>7} {:>10.3} {:>10.2} {:>10.1} {:>9.1} {:>11.2} {:>17.2}",
+            c.name,
+            c.width,
+            c.height,
+            c.gaussians,
+            c.dynamic_gaussians,
+            c.field.median_ms,
+            c.raster.median_ms,
+            c.frames_per_s,
+            c.first_field_ms + c.first_raster_ms,
+            c.field_spatial.median_ms,
+            c.field_forward_backward.median_ms
+        )
+    }));
+    lines.join("\n")
+}

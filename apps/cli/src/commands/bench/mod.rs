@@ -1,0 +1,39 @@
+//! `cc4dgs bench`: timings on workloads that are made from a seed.
+
+mod frame;
+mod step;
+
+pub use frame::frame;
+pub use step::step;
+
+/// Middle and spread of some times.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Spread {
+    /// Half of the times are shorter.
+    pub median_ms: f64,
+    /// The shortest.
+    pub min_ms: f64,
+    /// A tenth of the times are longer.
+    pub p90_ms: f64,
+}
+
+impl Spread {
+    /// Of `times` in milliseconds; zeros if there are none.
+    pub fn of(mut times: Vec<f64>) -> Self {
+        times.sort_by(f64::total_cmp);
+        let at = |share: f64| times.get((share * times.len() as f64) as usize).or(times.last()).copied().unwrap_or(0.0);
+        Self { median_ms: at(0.5), min_ms: at(0.0), p90_ms: at(0.9) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Spread;
+
+    #[test]
+    fn the_spread_is_of_the_sorted_times() {
+        let spread = Spread::of((0..10).rev().map(f64::from).collect());
+        assert_eq!(spread, Spread { median_ms: 5.0, min_ms: 0.0, p90_ms: 9.0 });
+        assert_eq!(Spread::of(Vec::new()).median_ms, 0.0);
+    }
+}

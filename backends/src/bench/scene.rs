@@ -1,0 +1,100 @@
+//! A room with people, as large as the scenes of the field: Gaussians on walls, floor and moving bodies, with the statistics of a trained scene.
+
+use super::workload::uniform;
+use super::{StepCase, Workload};
+use cc4dgs_core::gaussians::sh_rest_len;
+use cc4dgs_core::{Camera, HostGaussians, Seed};
+
+/// Size of a room.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RoomCase {
+    /// For tables.
+    pub name: &'static str,
+    /// Pictures and Gaussians.
+    pub size: StepCase,
+    /// Share of the Gaussians that moves.
+    pub dynamic_share: f32,
+}
+
+/// Rooms of the size of published scenes.
+pub const ROOM_CASES: [RoomCase; 2] = [
+    RoomCase { name: "n3dv", size: StepCase { width: 1352, height: 1014, gaussians: 335_000 }, dynamic_share: 0.12 },
+    RoomCase { name: "technicolor", size: StepCase { width: 2048, height: 1088, gaussians: 335_000 }, dynamic_share: 0.12 },
+];
+
+/// Gaussians the statistics below were measured on: `panoptic_basketball` trained for 12,000 iterations.
+const MEASURED: f32 = 50_000.0;
+/// Mean and deviation of the log-scale of the longest axis there.
+const LONGEST: (f32, f32) = (-3.24, 0.9);
+/// How much shorter the other axes are, in log-scale, on average and in deviation.
+const SHORTER: [(f32, f32); 2] = [(0.6, 0.5), (1.9, 1.4)];
+/// Mean and deviation of the opacity logit there.
+const LOGIT: (f32, f32) = (0.1, 2.9);
+/// Half the width and the height of the room, its depth, world units; the camera stands at the origin and looks along z.
+const HALF_WIDTH: f32 = 3.0;
+const HEIGHT: f32 = 3.0;
+const DEPTH: f32 = 6.0;
+/// Bodies that move.
+const BODIES: u64 = 4;
+/// Dynamic score of what moves and of what does not.
+const SCORES: [f32; 2] = [10.0, -10.0];
+
+/// The room of `case`; the same for the same seed. Gaussians that move come first.
+pub fn room(case: &RoomCase, seed: Seed) -> Workload {
+    let n = case.size.gaussians;
+    let moving = (n as f32 * case.dynamic_share).round() as usize;
+    let normal = |seed: Seed, k: u64| {
+        // Box-Muller; the radius is kept finite.
+        let (u, v) = (0.5 + 0.5 * uniform(seed, 2 * k), uniform(seed, 2 * k + 1));
+        (-2.0 * u.max(1e-7).ln()).sqrt() * (std::f32::consts::PI * v).cos()
+    };
+    let place = seed.child("place");
+    let body_of = seed.child("bodies");
+    let mut means = Vec::with_capacity(3 * n);
+    for i in 0..n as u64 {
+        let [u, v, w] = std::array::from_fn(|k| uniform(place, 3 * i + k as u64));
+        if (i as usize) < moving {
+            // An ellipsoid's surface per body: 0.3 wide, 1.7 high.
+            let body = i % BODIES;
+            let [bx, bz] = std::array::from_fn(|k| uniform(body_of, 2 * body + k as u64));
+            let length = (u * u + v * v + w * w).sqrt().max(1e-3);
+            means.extend([1.8 * bx + 0.3 * u / length, 0.35 + 0.85 * v / length, 3.8 + 0.8 * bz + 0.3 * w / length]);
+        } else {
+            let (x, y, z) = (HALF_WIDTH * u, 0.5 * HEIGHT * v - 0.3, 0.5 * DEPTH * (w + 1.0));
+            means.extend(match i % 5 {
+                0 | 1 => [x, y, DEPTH],
+                2 => [x, 0.5 * HEIGHT - 0.3, z],
+                3 => [-HALF_WIDTH, y, z],
+                _ => [HALF_WIDTH, y, z],
+            });
+        }
+    }
+    // More Gaussians share the same surfaces, so each is smaller.
+    let shrink = 0.5 * (n as f32 / MEASURED).ln();
+    let (size, shape) = (seed.child("size"), seed.child("shape"));
+    let mut log_scales = Vec::with_capacity(3 * n);
+    for i in 0..n as u64 {
+        let longest = LONGEST.0 - shrink + LONGEST.1 * normal(size, i);
+        let [a, b] = std::array::from_fn(|k| longest - (SHORTER[k].0 + SHORTER[k].1 * normal(shape, 2 * i + k as u64)).max(0.0));
+        log_scales.extend([longest, a, b]);
+    }
+    let stream = |name: &str, len: usize, scale: f32| -> Vec<f32> {
+        let seed = seed.child(name);
+        (0..len as u64).map(|k| scale * uniform(seed, k)).collect()
+    };
+    let opacity = seed.child("opacity");
+    let degree = 3;
+    let gaussians = HostGaussians {
+        sh_degree: degree,
+        means,
+        log_scales,
+        quaternions: stream("quaternions", 4 * n, 1.0),
+        opacity_logits: (0..n as u64).map(|i| LOGIT.0 + LOGIT.1 * normal(opacity, i)).collect(),
+        sh_dc: stream("sh_dc", 3 * n, 1.5),
+        sh_rest: stream("sh_rest", 3 * sh_rest_len(degree) * n, 0.2),
+        dynamic_scores: (0..n).map(|i| SCORES[usize::from(i >= moving)]).collect(),
+        extra: Default::default(),
+    };
+    let camera = Camera::look_at("room", (case.size.width, case.size.height), 1.2, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]);
+    Workload { name: case.name.into(), gaussians, camera }
+}

@@ -1,0 +1,21 @@
+//! Suites that every plug-in passes, ours and anyone's: call them from a test of your own crate.
+//!
+//! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data.
+
+mod deformer;
+
+pub use deformer::deformer;
+
+use crate::Seed;
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// A number of the `k`-th draw of a stream, uniform in -1..1.
+fn uniform(seed: Seed, k: usize) -> f32 {
+    (seed.index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+}
+
+/// [rows, width] uniform in -1..1.
+fn matrix(seed: Seed, rows: usize, width: usize, device: &Device) -> Tensor<2> {
+    let values: Vec<f32> = (0..rows * width).map(|k| uniform(seed, k)).collect();
+    Tensor::from_data(TensorData::new(values, [rows, width]), device)
+}

@@ -1,0 +1,70 @@
+//! The outputs of a field: which there are, how wide, and how they become offsets.
+
+use burn::tensor::Tensor;
+use cc4dgs_core::{Error, Offsets, Result};
+use serde::Deserialize;
+
+/// An output of the field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Head {
+    /// Centres, world units.
+    Means,
+    /// Log-scales.
+    LogScales,
+    /// Raw quaternions.
+    Quaternions,
+    /// Opacity logits.
+    Opacity,
+    /// Spherical-harmonics coefficients.
+    Sh,
+}
+
+impl Head {
+    /// Its name in settings and weights.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Means => "means",
+            Self::LogScales => "log_scales",
+            Self::Quaternions => "quaternions",
+            Self::Opacity => "opacity",
+            Self::Sh => "sh",
+        }
+    }
+    /// Its width for Gaussians of `sh_degree`.
+    pub fn width(self, sh_degree: usize) -> usize {
+        match self {
+            Self::Means | Self::LogScales => 3,
+            Self::Quaternions => 4,
+            Self::Opacity => 1,
+            Self::Sh => 3 * (sh_degree + 1) * (sh_degree + 1),
+        }
+    }
+}
+
+/// Refuses a list without heads or with one named twice.
+pub fn check(heads: &[Head]) -> Result<()> {
+    if heads.is_empty() {
+        return Err(Error::parameter("deformer.heads", "the list is empty", "Name at least one head, or use deformer kind = \"none\""));
+    }
+    if let Some((i, head)) = heads.iter().enumerate().find(|(i, h)| heads[..*i].contains(h)) {
+        return Err(Error::parameter("deformer.heads", format!("'{}' appears again at place {}", head.name(), i + 1), "Name each head once"));
+    }
+    Ok(())
+}
+
+/// Offsets from one output [M, width] per head.
+pub fn offsets(heads: &[Head], outputs: Vec<Tensor<2>>, sh_degree: usize) -> Offsets {
+    let mut offsets = Offsets::default();
+    for (head, out) in heads.iter().zip(outputs) {
+        let [m, _] = out.dims();
+        match head {
+            Head::Means => offsets.means = Some(out),
+            Head::LogScales => offsets.log_scales = Some(out),
+            Head::Quaternions => offsets.quaternions = Some(out),
+            Head::Opacity => offsets.opacity_logits = Some(out.reshape([m])),
+            Head::Sh => offsets.sh = Some(out.reshape([m, (sh_degree + 1).pow(2), 3])),
+        }
+    }
+    offsets
+}

@@ -1,0 +1,7 @@
+//! What fields are made of: each part is one idea that several fields share.
+
+pub mod heads;
+pub mod settings;
+pub mod time;
+pub mod voxels;
+pub mod weights;

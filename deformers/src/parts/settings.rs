@@ -1,0 +1,92 @@
+//! Settings that several fields share, taken out of a `[deformer]` section before the field reads the rest of it.
+
+use cc4dgs_core::{Error, ParameterGroup, Result, config};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+
+/// Named sizes of the rate-distortion curve.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Capacity {
+    /// 4 levels, decoders 128-64-64-16, network 64 wide.
+    Small,
+    /// 5 levels, decoders 128-96-96-32, network 96 wide.
+    Mid,
+    /// 5 levels, decoders 128-128-128-32, network 128 wide (the paper's).
+    #[default]
+    Default,
+}
+
+impl Capacity {
+    /// Width of the networks behind the voxels.
+    pub fn width(self) -> usize {
+        match self {
+            Self::Small => 64,
+            Self::Mid => 96,
+            Self::Default => 128,
+        }
+    }
+}
+
+/// How the weights are optimised.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Rates {
+    /// First learning rate.
+    pub lr_start: f64,
+    /// Last learning rate.
+    pub lr_end: f64,
+    /// Share of the stage spent warming up.
+    pub warmup: f64,
+    /// Gradient-norm clip per group; 0 is off.
+    pub clip_norm: f64,
+}
+
+impl Default for Rates {
+    fn default() -> Self {
+        Self { lr_start: 1e-3, lr_end: 1e-5, warmup: 500.0 / 20_000.0, clip_norm: 1.0 }
+    }
+}
+
+impl Rates {
+    /// The keys of a section that belong here.
+    pub const KEYS: [&'static str; 4] = ["lr_start", "lr_end", "warmup", "clip_norm"];
+    /// Refuses rates that are not numbers or below 0.
+    pub fn check(&self) -> Result<()> {
+        let rates = [self.lr_start, self.lr_end, self.clip_norm];
+        if rates.iter().any(|r| !r.is_finite() || *r < 0.0) || !(0.0..=1.0).contains(&self.warmup) {
+            return Err(Error::parameter(
+                "deformer",
+                format!("lr_start, lr_end, clip_norm = {rates:?}, warmup = {}", self.warmup),
+                "Use finite rates of 0 or more and a warm-up in 0..1",
+            ));
+        }
+        Ok(())
+    }
+    /// An optimizer group at these rates.
+    pub fn group(&self, name: &str) -> ParameterGroup {
+        ParameterGroup {
+            name: name.into(),
+            lr_start: self.lr_start,
+            lr_end: self.lr_end,
+            warmup: self.warmup,
+            times_extent: false,
+            epsilon: 1e-15,
+            clip_norm: self.clip_norm,
+        }
+    }
+}
+
+/// Moves `keys` out of `section` and reads them.
+pub fn take<T: DeserializeOwned>(section: &mut toml::Table, keys: &[&str]) -> Result<T> {
+    let own: toml::Table = keys.iter().filter_map(|k| section.remove(*k).map(|v| (k.to_string(), v))).collect();
+    config::parse_section("deformer", &own)
+}
+
+/// Refuses a size outside `low..=high`.
+pub fn within(name: &str, value: usize, low: usize, high: usize) -> Result<()> {
+    if (low..=high).contains(&value) {
+        return Ok(());
+    }
+    Err(Error::parameter(format!("deformer.{name}"), format!("{value} is outside {low}..={high}"), "Choose a value in that range"))
+}

@@ -1,0 +1,146 @@
+//! Features of canonical centres without stored tables: the vertices of a multi-resolution grid get hash signatures, one small decoder per level turns
+//! those into features, and a centre interpolates the features of its eight corners (paper Section IV-B).
+
+use super::settings::{Capacity, within};
+use super::weights;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::field::{Decoder, GridBox, LevelHash, MAX_RESOLUTION, MishShape, VoxelCorners};
+use cc4dgs_core::{Error, FieldContext, FieldWork, Parameter, Part, Result};
+use serde::Deserialize;
+use std::sync::Arc;
+
+/// Settings of the grid and its decoders.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct VoxelSettings {
+    /// The sizes that are not given one by one.
+    pub capacity: Capacity,
+    /// Grid levels.
+    pub levels: Option<usize>,
+    /// Cells per axis of each level.
+    pub resolutions: Option<Vec<u32>>,
+    /// Widths of the decoders' hidden layers.
+    pub hidden: Option<Vec<usize>>,
+    /// Features per level.
+    pub features: Option<usize>,
+    /// Hash functions per vertex.
+    pub hashes: usize,
+    /// m of the hash functions.
+    pub modulus: u32,
+    /// Whether equal vertices are decoded once.
+    pub vertex_reuse: bool,
+}
+
+impl Default for VoxelSettings {
+    fn default() -> Self {
+        Self { capacity: Capacity::Default, levels: None, resolutions: None, hidden: None, features: None, hashes: 128, modulus: 1_000_000, vertex_reuse: true }
+    }
+}
+
+/// The settled sizes of grid and decoders.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VoxelSizes {
+    /// Cells per axis of each level.
+    pub resolutions: Vec<u32>,
+    /// The decoder of every level.
+    pub decoder: MishShape,
+}
+
+impl VoxelSizes {
+    /// The features of all levels side by side.
+    pub fn width(&self) -> usize {
+        self.resolutions.len() * self.decoder.output
+    }
+}
+
+impl VoxelSettings {
+    /// The keys of a section that belong here.
+    pub const KEYS: [&'static str; 8] = ["capacity", "levels", "resolutions", "hidden", "features", "hashes", "modulus", "vertex_reuse"];
+
+    /// Settles the sizes, refusing what cannot work.
+    pub fn sizes(&self) -> Result<VoxelSizes> {
+        let (levels, hidden, features) = match self.capacity {
+            Capacity::Small => (4, vec![64, 64], 16),
+            Capacity::Mid => (5, vec![96, 96], 32),
+            Capacity::Default => (5, vec![128, 128], 32),
+        };
+        let levels = self.levels.or(self.resolutions.as_ref().map(Vec::len)).unwrap_or(levels);
+        within("levels", levels, 1, 16)?;
+        let doubling = || (0..levels).map(|l| 16u32.checked_shl(l as u32).unwrap_or(u32::MAX)).collect();
+        let resolutions: Vec<u32> = self.resolutions.clone().unwrap_or_else(doubling);
+        if resolutions.len() != levels {
+            return Err(Error::parameter("deformer.resolutions", format!("{} entries for {levels} levels", resolutions.len()), "Give one per level"));
+        }
+        for &r in &resolutions {
+            within("resolutions", r as usize, 1, MAX_RESOLUTION as usize)?;
+        }
+        let hidden = self.hidden.clone().unwrap_or(hidden);
+        within("hidden (layers)", hidden.len(), 0, 8)?;
+        let features = self.features.unwrap_or(features);
+        for (name, value) in hidden.iter().map(|&h| ("hidden", h)).chain([("features", features), ("hashes", self.hashes)]) {
+            within(name, value, 1, 4096)?;
+        }
+        within("modulus", self.modulus as usize, 2, 1 << 24)?;
+        Ok(VoxelSizes { resolutions, decoder: MishShape { input: self.hashes, hidden, output: features } })
+    }
+}
+
+/// The grid over a scene's box with the hash functions and layer shapes of its decoders. Weights are [`Parameter`]s of the field that owns it.
+#[derive(Clone, Debug)]
+pub struct Voxels {
+    box_min: [f32; 3],
+    box_max: [f32; 3],
+    resolutions: Vec<u32>,
+    decoders: Vec<Arc<Decoder>>,
+    reuse: bool,
+    width: usize,
+}
+
+impl Voxels {
+    /// A grid for the scene of `context` and the fresh weights of its decoders, one parameter per level in optimizer group `group`.
+    pub fn new(settings: &VoxelSettings, context: &FieldContext, group: usize, device: &Device) -> Result<(Self, Vec<Parameter>)> {
+        if context.box_min.iter().chain(&context.box_max).any(|v| !v.is_finite()) {
+            return Err(Error::parameter("deformer box", format!("{:?} to {:?}", context.box_min, context.box_max), "Give finite corners"));
+        }
+        let sizes = settings.sizes()?;
+        let (mut decoders, mut parameters) = (Vec::new(), Vec::new());
+        for level in 0..sizes.resolutions.len() {
+            let seed = context.seed.child("level").index(level as u64);
+            let values = weights::decoder(seed.child("weights"), &sizes.decoder);
+            parameters.push(parameter(format!("grid.level{level}"), Part::Grid, group, values, device));
+            let hash = LevelHash::new(seed.child("hash"), settings.hashes, settings.modulus);
+            decoders.push(Arc::new(Decoder { hash, shape: sizes.decoder.clone() }));
+        }
+        let (box_min, box_max, width) = (context.box_min, context.box_max, sizes.width());
+        Ok((Self { box_min, box_max, resolutions: sizes.resolutions, decoders, reuse: settings.vertex_reuse, width }, parameters))
+    }
+    /// Number of levels, which is the number of parameters.
+    pub fn levels(&self) -> usize {
+        self.decoders.len()
+    }
+    /// Features per centre.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+    /// f_voxel [M, width] of `means_world` [M,3] (M > 0) by the decoders of `parameters` (the first [`Voxels::levels`]), and what it cost.
+    pub fn features(&self, parameters: &[Parameter], means_world: Tensor<2>) -> Result<(Tensor<2>, FieldWork)> {
+        let [m, _] = means_world.dims();
+        let mut work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        let mut levels = Vec::with_capacity(self.decoders.len());
+        for ((decoder, parameter), &resolution) in self.decoders.iter().zip(parameters).zip(&self.resolutions) {
+            let grid = GridBox { min: self.box_min, max: self.box_max, resolution };
+            let corners = VoxelCorners::find(means_world.clone(), grid, self.reuse)?;
+            work.vertices_queried += 8 * m as u64;
+            work.vertices_decoded += corners.vertices.dims()[0] as u64;
+            let features = corners.decode(parameter.value.clone(), decoder)?;
+            levels.push(corners.interpolate(features)?);
+        }
+        Ok((Tensor::cat(levels, 1), work))
+    }
+}
+
+/// A flat parameter from host values.
+pub fn parameter(name: String, part: Part, group: usize, values: Vec<f32>, device: &Device) -> Parameter {
+    let count = values.len();
+    Parameter { name, part, shape: vec![count], value: Tensor::from_data(TensorData::new(values, [count]), device), group }
+}

@@ -1,0 +1,29 @@
+//! Every registered plug-in against the suites that `cc4dgs-core` exports.
+
+use cc4dgs_core::{Registry, config, conformance, parse_device};
+use cc4dgs_deformers as _;
+
+/// Sizes that keep the suite quick, for the fields that have sizes.
+fn small(name: &str) -> toml::Table {
+    let text = match name {
+        "cdf" => "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = [20, 12]\nfeatures = 6\nwidth = 16",
+        "cdf-basis" => "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = [20, 12]\nfeatures = 6\nwidth = 16\nlearned = 5",
+        _ => "",
+    };
+    config::parse_table("test", text).unwrap()
+}
+
+#[test]
+fn every_deformer_conforms() {
+    let registry = Registry::collect().unwrap();
+    let names: Vec<&str> = registry.plugins().into_iter().filter(|(kind, _)| *kind == "deformer").map(|(_, p)| p.name).collect();
+    assert!(names.len() >= 3, "{names:?}");
+    let mut findings = Vec::new();
+    for device in ["flex", "ndarray"] {
+        let device = parse_device(device).unwrap();
+        for name in &names {
+            findings.extend(conformance::deformer(registry.deformer(name).unwrap(), &small(name), &device));
+        }
+    }
+    assert!(findings.is_empty(), "{}", findings.join("\n"));
+}
