@@ -2,5 +2,6 @@
 
 pub mod bench;
 pub mod cpu;
+mod cube;
 pub mod ops;
 pub mod rasterizers;

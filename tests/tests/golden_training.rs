@@ -1,9 +1,10 @@
-//! Loss, optimizer and network kernels against the reference numbers of `golden/` on every CPU device.
+//! Loss, optimizer and network kernels against the reference numbers of `golden/` on every device.
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::cpu::mlp::{activation, mish};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
 use cc4dgs_backends::ops::photometric::{bce_with_logits_loss, photometric_loss};
+use cc4dgs_tests::devices;
 use std::collections::HashMap;
 use std::path::PathBuf;
 
@@ -33,10 +34,6 @@ fn distance(got: &[f32], want: &[f64]) -> f64 {
 fn check(what: &str, got: &[f32], want: &[f64], tolerance: f64) {
     let d = distance(got, want);
     assert!(d < tolerance, "{what}: relative L2 distance {d:.3e}, allowed {tolerance:.1e}");
-}
-
-fn devices() -> [(&'static str, Device); 2] {
-    ["flex", "ndarray"].map(|name| (name, cc4dgs_core::parse_device(name).expect("a device")))
 }
 
 fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
