@@ -105,7 +105,7 @@ impl CdfBasis {
         Ok(Self { rates, voxels, bands, functions, learned: learned.map(Arc::new), coefficients, sh_degree: context.sh_degree, parameters, settings })
     }
     /// The weights of the parameters from `place` after the decoders to the end, side by side.
-    fn from_place(&self, place: usize) -> Tensor<1> {
+    fn weights_after(&self, place: usize) -> Tensor<1> {
         Tensor::cat(self.parameters[self.voxels.levels() + place..].iter().map(|p| p.value.clone()).collect(), 0)
     }
     /// φ(t) [functions, 1].
@@ -134,7 +134,7 @@ impl DeformationField for CdfBasis {
             return Ok(SpatialFeatures { values: Tensor::zeros([0, total], &means_world.inner().device()), work: FieldWork::default() });
         }
         let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
-        let weights = self.from_place(usize::from(self.learned.is_some()));
+        let weights = self.weights_after(usize::from(self.learned.is_some()));
         Ok(SpatialFeatures { values: Tensor::cat(mlp_relu(voxel, weights, &self.coefficients)?, 1), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {

@@ -132,7 +132,7 @@ fn ssim_and_derivatives(
         for k in 0..UNITS {
             sum += terms[(UNIT_POS * UNITS + k) as usize];
         }
-        let slot = CUBE_POS as usize * 3 + unit;
+        let slot = CUBE_POS * 3 + unit;
         if slot < partial.len() {
             partial[slot] = sum;
         }
@@ -238,8 +238,8 @@ fn bce_terms(logits: &[f32], mask: &[f32], grad: &mut [f32], partial: &mut [f32]
         for k in 0..UNITS as usize {
             sum += terms[k];
         }
-        if (CUBE_POS as usize) < partial.len() {
-            partial[CUBE_POS as usize] = sum;
+        if CUBE_POS < partial.len() {
+            partial[CUBE_POS] = sum;
         }
     }
 }

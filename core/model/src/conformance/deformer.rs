@@ -21,7 +21,7 @@ const CENTRES: usize = 48;
 /// `settings` is the `[deformer]` section without `kind`; small sizes make the suite quick.
 pub fn deformer<'a>(plugin: &'a FieldPlugin, settings: &'a toml::Table, device: &'a Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
-    let checks: [(&str, fn(&Suite<'a>) -> Result<Option<String>>); 7] = [
+    let checks: [(&str, Check<'a>); 7] = [
         ("settings", Suite::refuses_unknown_settings),
         ("seeds", Suite::equal_seeds_equal_weights),
         ("start", Suite::starts_as_declared),
@@ -47,6 +47,8 @@ struct Suite<'a> {
 }
 
 type Field = Box<dyn DeformationField>;
+/// One check: what it found, if anything.
+type Check<'a> = fn(&Suite<'a>) -> Result<Option<String>>;
 
 impl Suite<'_> {
     fn context(&self) -> FieldContext {

@@ -1,0 +1,224 @@
+//! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per unit.
+
+use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
+use crate::cpu::raster::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
+use cubecl::prelude::*;
+
+/// Places in the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size.
+pub const TRANSLATION: usize = 9;
+pub const CENTER: usize = 12;
+pub const FOCAL: usize = 15;
+pub const PRINCIPAL: usize = 17;
+pub const LIMITS: usize = 19;
+pub const NEAR: usize = 23;
+pub const SIZE: usize = 24;
+
+/// The camera as the kernels read it.
+pub fn camera_buffer(camera: &CameraConstants, rules: &RuleConstants, width: usize, height: usize) -> Vec<f32> {
+    let mut values: Vec<f32> = camera.rotation.iter().flatten().copied().collect();
+    values.extend(camera.translation);
+    values.extend(camera.center);
+    values.extend(camera.focal);
+    values.extend(camera.principal);
+    values.extend(camera.ratio_limits.iter().flatten());
+    values.extend([rules.near, width as f32, height as f32]);
+    values
+}
+
+/// A projected Gaussian with everything its derivative needs.
+#[derive(CubeType, Clone, Copy)]
+pub struct Projected {
+    pub point: V3,
+    pub center_x: f32,
+    pub center_y: f32,
+    /// Covariance in square pixels with the blur.
+    pub xx: f32,
+    pub xy: f32,
+    pub yy: f32,
+    pub determinant: f32,
+    pub raw_determinant: f32,
+    pub conic: V3,
+    pub compensation: f32,
+    pub norm_squared: f32,
+    pub inverse_norm: f32,
+    pub unit: V4,
+    pub rotation0: V3,
+    pub rotation1: V3,
+    pub rotation2: V3,
+    pub turned0: V3,
+    pub turned1: V3,
+    pub turned2: V3,
+    pub scaled0: V3,
+    pub scaled1: V3,
+    pub scaled2: V3,
+    pub row0: V3,
+    pub row1: V3,
+    pub inverse_depth: f32,
+    pub ratio_x: f32,
+    pub ratio_y: f32,
+    /// 1 where the ratio was not clamped, else 0.
+    pub inside_x: f32,
+    pub inside_y: f32,
+}
+
+#[cube]
+fn clamp_to(v: f32, low: f32, high: f32) -> f32 {
+    select(v < low, low, select(v > high, high, v))
+}
+
+/// Projects a Gaussian of centre `mean`, raw quaternion `q` and linear scales `s`.
+#[cube]
+pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
+    let w0 = load3(cam, 0);
+    let w1 = load3(cam, 3);
+    let w2 = load3(cam, 6);
+    let point = add(v3(dot(w0, mean), dot(w1, mean), dot(w2, mean)), load3(cam, TRANSLATION));
+    let inverse_depth = 1.0 / point.z;
+    let norm_squared = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z;
+    let inverse_norm = 1.0 / norm_squared.sqrt();
+    let unit = V4 { w: q.w * inverse_norm, x: q.x * inverse_norm, y: q.y * inverse_norm, z: q.z * inverse_norm };
+    let (w, x, y, z) = (unit.w, unit.x, unit.y, unit.z);
+    let rotation0 = v3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y));
+    let rotation1 = v3(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x));
+    let rotation2 = v3(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y));
+    let turned0 = combine(rotation0, w0.x, rotation1, w0.y, rotation2, w0.z);
+    let turned1 = combine(rotation0, w1.x, rotation1, w1.y, rotation2, w1.z);
+    let turned2 = combine(rotation0, w2.x, rotation1, w2.y, rotation2, w2.z);
+    let scaled0 = times(turned0, s);
+    let scaled1 = times(turned1, s);
+    let scaled2 = times(turned2, s);
+    let raw_x = point.x * inverse_depth;
+    let raw_y = point.y * inverse_depth;
+    let ratio_x = clamp_to(raw_x, cam[LIMITS], cam[LIMITS + 1]);
+    let ratio_y = clamp_to(raw_y, cam[LIMITS + 2], cam[LIMITS + 3]);
+    // J's third column is -f x / z^2 = -(f / z) (x / z).
+    let row0 = scale(add(scaled0, scale(scaled2, -ratio_x)), inverse_depth * cam[FOCAL]);
+    let row1 = scale(add(scaled1, scale(scaled2, -ratio_y)), inverse_depth * cam[FOCAL + 1]);
+    let raw_xx = dot(row0, row0);
+    let xy = dot(row0, row1);
+    let raw_yy = dot(row1, row1);
+    let normal = cross(row0, row1);
+    let raw_determinant = dot(normal, normal);
+    let determinant = raw_determinant + (raw_xx + raw_yy) * EPS_2D + EPS_2D * EPS_2D;
+    let inverse = 1.0 / determinant;
+    let (xx, yy) = (raw_xx + EPS_2D, raw_yy + EPS_2D);
+    let share = raw_determinant * inverse;
+    let floor = MIN_COMPENSATION * MIN_COMPENSATION;
+    Projected {
+        point,
+        center_x: raw_x * cam[FOCAL] + cam[PRINCIPAL],
+        center_y: raw_y * cam[FOCAL + 1] + cam[PRINCIPAL + 1],
+        xx,
+        xy,
+        yy,
+        determinant,
+        raw_determinant,
+        conic: v3(yy * inverse, -(xy * inverse), xx * inverse),
+        compensation: select(share > floor, share, floor).sqrt(),
+        norm_squared,
+        inverse_norm,
+        unit,
+        rotation0,
+        rotation1,
+        rotation2,
+        turned0,
+        turned1,
+        turned2,
+        scaled0,
+        scaled1,
+        scaled2,
+        row0,
+        row1,
+        inverse_depth,
+        ratio_x,
+        ratio_y,
+        inside_x: select(raw_x == ratio_x, 1.0f32, 0.0f32),
+        inside_y: select(raw_y == ratio_y, 1.0f32, 0.0f32),
+    }
+}
+
+/// What flows out of a [`Projected`].
+#[derive(CubeType, Clone, Copy)]
+pub struct GeometryGradient {
+    pub mean: V3,
+    pub quaternion: V4,
+    pub scales: V3,
+    /// d loss / d camera rotation, by rows, and translation.
+    pub camera0: V3,
+    pub camera1: V3,
+    pub camera2: V3,
+    pub translation: V3,
+}
+
+/// The derivative of [`project`]: upstream of centre in pixels, of (A,B,C), of depth and of the compensation.
+#[cube]
+pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_y: f32, d_conic: V3, d_depth: f32, d_compensation: f32) -> GeometryGradient {
+    let w0 = load3(cam, 0);
+    let w1 = load3(cam, 3);
+    let w2 = load3(cam, 6);
+    // The conic is the inverse of the covariance: d covariance = -K G K with G the symmetric gradient.
+    let (a, b, c) = (p.conic.x, p.conic.y, p.conic.z);
+    let half = d_conic.y * 0.5;
+    let left0 = a * d_conic.x + b * half;
+    let left1 = a * half + b * d_conic.z;
+    let left2 = b * d_conic.x + c * half;
+    let left3 = b * half + c * d_conic.z;
+    // Compensation^2 = raw determinant / determinant, where that is over its floor.
+    let inverse = 1.0 / p.determinant;
+    let share = p.raw_determinant * inverse;
+    let d_share = select(share > MIN_COMPENSATION * MIN_COMPENSATION, d_compensation * 0.5 / p.compensation, 0.0f32) * inverse;
+    let d_raw = d_share * (1.0 - share);
+    let d_trace = -(d_share * share * EPS_2D);
+    let d_xx = -(left0 * a + left1 * b) + d_trace;
+    // Half the gradient of the off-diagonal entry, which appears twice.
+    let d_xy = -(left0 * b + left1 * c);
+    let d_yy = -(left2 * b + left3 * c) + d_trace;
+    // raw determinant = xx yy - xy^2, before the blur.
+    let m0 = d_raw * (p.yy - EPS_2D) + d_xx;
+    let m1 = d_xy - d_raw * p.xy;
+    let m2 = d_raw * (p.xx - EPS_2D) + d_yy;
+    let d_row0 = scale(add(scale(p.row0, m0), scale(p.row1, m1)), 2.0f32);
+    let d_row1 = scale(add(scale(p.row0, m1), scale(p.row1, m2)), 2.0f32);
+    // rows[k] = (f_k / z) (scaled[k] - ratio_k scaled[2]).
+    let d_scaled0 = scale(d_row0, p.inverse_depth * cam[FOCAL]);
+    let d_scaled1 = scale(d_row1, p.inverse_depth * cam[FOCAL + 1]);
+    let d_scaled2 = add(scale(d_scaled0, -p.ratio_x), scale(d_scaled1, -p.ratio_y));
+    // The clamped ratio passes no gradient; the projected centre always does. 1/z scales the whole row.
+    let step_x = (d_x * cam[FOCAL] - p.inside_x * dot(d_scaled0, p.scaled2)) * p.inverse_depth;
+    let step_y = (d_y * cam[FOCAL + 1] - p.inside_y * dot(d_scaled1, p.scaled2)) * p.inverse_depth;
+    let d_z = d_depth
+        - (dot(d_row0, p.row0) + dot(d_row1, p.row1)) * p.inverse_depth
+        - (step_x * p.point.x + step_y * p.point.y) * p.inverse_depth;
+    let d_point = v3(step_x, step_y, d_z);
+    let d_turned0 = times(d_scaled0, s);
+    let d_turned1 = times(d_scaled1, s);
+    let d_turned2 = times(d_scaled2, s);
+    let d_scales = add(add(times(d_scaled0, p.turned0), times(d_scaled1, p.turned1)), times(d_scaled2, p.turned2));
+    let r0 = combine(d_turned0, w0.x, d_turned1, w1.x, d_turned2, w2.x);
+    let r1 = combine(d_turned0, w0.y, d_turned1, w1.y, d_turned2, w2.y);
+    let r2 = combine(d_turned0, w0.z, d_turned1, w1.z, d_turned2, w2.z);
+    let (w, x, y, z) = (p.unit.w, p.unit.x, p.unit.y, p.unit.z);
+    let g_w = x * (r2.y - r1.z) + y * (r0.z - r2.x) + z * (r1.x - r0.y);
+    let g_x = -2.0 * x * (r1.y + r2.z) + y * (r0.y + r1.x) + z * (r0.z + r2.x) + w * (r2.y - r1.z);
+    let g_y = x * (r0.y + r1.x) - 2.0 * y * (r0.x + r2.z) + z * (r1.z + r2.y) + w * (r0.z - r2.x);
+    let g_z = x * (r0.z + r2.x) + y * (r1.z + r2.y) - 2.0 * z * (r0.x + r1.y) + w * (r1.x - r0.y);
+    // The matrix is quadratic in the quaternion: a factor 2 in all; then the part along the quaternion is projected out.
+    let along = g_w * w + g_x * x + g_y * y + g_z * z;
+    let factor = p.inverse_norm * 2.0;
+    let (t0, t1, t2) = (through(d_turned0, p), through(d_turned1, p), through(d_turned2, p));
+    GeometryGradient {
+        mean: combine(w0, d_point.x, w1, d_point.y, w2, d_point.z),
+        quaternion: V4 { w: (g_w - w * along) * factor, x: (g_x - x * along) * factor, y: (g_y - y * along) * factor, z: (g_z - z * along) * factor },
+        scales: d_scales,
+        camera0: add(scale(mean, d_point.x), t0),
+        camera1: add(scale(mean, d_point.y), t1),
+        camera2: add(scale(mean, d_point.z), t2),
+        translation: d_point,
+    }
+}
+
+/// Dot products with the rows of the Gaussian's rotation.
+#[cube]
+fn through(d: V3, p: Projected) -> V3 {
+    v3(dot(d, p.rotation0), dot(d, p.rotation1), dot(d, p.rotation2))
+}
