@@ -210,15 +210,10 @@ fn check_operation(scene: &Scene, device: &Device, findings: &mut Findings) {
 }
 
 #[test]
-fn golden_tile_on_flex() {
-    let mut findings = Findings::default();
-    scenes().iter().for_each(|scene| check_operation(scene, &Device::flex(), &mut findings));
-    findings.finish();
-}
-
-#[test]
-fn golden_tile_on_ndarray() {
-    let mut findings = Findings::default();
-    scenes().iter().for_each(|scene| check_operation(scene, &Device::ndarray(), &mut findings));
-    findings.finish();
+fn golden_tile_on_every_device() {
+    for (name, device) in cc4dgs_tests::devices() {
+        let mut findings = Findings::default();
+        scenes().iter().for_each(|scene| check_operation(scene, &device, &mut findings));
+        assert!(findings.0.is_empty(), "{name}:\n{}", findings.0.join("\n"));
+    }
 }

@@ -4,4 +4,6 @@
 
 mod adam;
 mod photometric;
+mod raster;
+mod sort;
 pub(crate) mod tensor;

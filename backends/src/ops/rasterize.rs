@@ -66,7 +66,7 @@ pub struct Rasterized<B: Backend> {
 }
 
 /// Rasterization per device. The screen and camera probes are not read; they are there to receive gradients.
-#[backend_extension(Flex, NdArray, Autodiff)]
+#[backend_extension(Flex, NdArray, Cube, Autodiff)]
 pub trait RasterOps: Backend {
     /// Renders Gaussians: `means` [N,3], `scales` [N,3], `quaternions` [N,4], `opacities` [N], `colors` [N,3], `sh_rest` [N,K,3],
     /// `screen_probe` [N,2], `camera_probe` [4,4], `background` [3].
@@ -337,9 +337,15 @@ pub struct RasterInputs {
 }
 
 /// Refuses a device that lacks the operation.
-fn check_device(device: &Device) -> Result<()> {
+fn check_device(device: &Device, method: Method) -> Result<()> {
     match device.clone().without_autodiff().as_dispatch() {
         DispatchDevice::Flex(_) | DispatchDevice::NdArray(_) => Ok(()),
+        DispatchDevice::Cube(_) if method == Method::Tiles => Ok(()),
+        DispatchDevice::Cube(_) => Err(Error::unsupported(
+            format!("rasterizer reference on {device:?}"),
+            "it computes in float64, on the host",
+            "Use --device flex, or the rasterizer tile",
+        )),
         _ => Err(Error::unsupported(format!("rasterize on {device:?}"), "this device has no rasterizer yet", "Use --device flex or ndarray")),
     }
 }
@@ -347,7 +353,7 @@ fn check_device(device: &Device) -> Result<()> {
 /// Renders; shapes must agree with `settings` (the rasterizer plug-ins check them).
 pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method) -> Result<RenderOutput> {
     let device = inputs.means.device();
-    check_device(&device)?;
+    check_device(&device, method)?;
     // A stand-in for what is absent; never read.
     let absent = || Tensor::<1>::zeros([3], &device);
     let wants_weights = settings.max_weights;

@@ -48,8 +48,6 @@ pub struct Projected {
     pub turned0: V3,
     pub turned1: V3,
     pub turned2: V3,
-    pub scaled0: V3,
-    pub scaled1: V3,
     pub scaled2: V3,
     pub row0: V3,
     pub row1: V3,
@@ -124,8 +122,6 @@ pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
         turned0,
         turned1,
         turned2,
-        scaled0,
-        scaled1,
         scaled2,
         row0,
         row1,
@@ -186,9 +182,7 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     // The clamped ratio passes no gradient; the projected centre always does. 1/z scales the whole row.
     let step_x = (d_x * cam[FOCAL] - p.inside_x * dot(d_scaled0, p.scaled2)) * p.inverse_depth;
     let step_y = (d_y * cam[FOCAL + 1] - p.inside_y * dot(d_scaled1, p.scaled2)) * p.inverse_depth;
-    let d_z = d_depth
-        - (dot(d_row0, p.row0) + dot(d_row1, p.row1)) * p.inverse_depth
-        - (step_x * p.point.x + step_y * p.point.y) * p.inverse_depth;
+    let d_z = d_depth - (dot(d_row0, p.row0) + dot(d_row1, p.row1)) * p.inverse_depth - (step_x * p.point.x + step_y * p.point.y) * p.inverse_depth;
     let d_point = v3(step_x, step_y, d_z);
     let d_turned0 = times(d_scaled0, s);
     let d_turned1 = times(d_scaled1, s);
@@ -199,7 +193,7 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     let r2 = combine(d_turned0, w0.z, d_turned1, w1.z, d_turned2, w2.z);
     let (w, x, y, z) = (p.unit.w, p.unit.x, p.unit.y, p.unit.z);
     let g_w = x * (r2.y - r1.z) + y * (r0.z - r2.x) + z * (r1.x - r0.y);
-    let g_x = -2.0 * x * (r1.y + r2.z) + y * (r0.y + r1.x) + z * (r0.z + r2.x) + w * (r2.y - r1.z);
+    let g_x = -2.0f32 * x * (r1.y + r2.z) + y * (r0.y + r1.x) + z * (r0.z + r2.x) + w * (r2.y - r1.z);
     let g_y = x * (r0.y + r1.x) - 2.0 * y * (r0.x + r2.z) + z * (r1.z + r2.y) + w * (r0.z - r2.x);
     let g_z = x * (r0.z + r2.x) + y * (r1.z + r2.y) - 2.0 * z * (r0.x + r1.y) + w * (r1.x - r0.y);
     // The matrix is quadratic in the quaternion: a factor 2 in all; then the part along the quaternion is projected out.
@@ -222,3 +216,17 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
 fn through(d: V3, p: Projected) -> V3 {
     v3(dot(d, p.rotation0), dot(d, p.rotation1), dot(d, p.rotation2))
 }
+
+impl Clone for ProjectedExpand {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+impl Copy for ProjectedExpand {}
+
+impl Clone for GeometryGradientExpand {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+impl Copy for GeometryGradientExpand {}

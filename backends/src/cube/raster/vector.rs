@@ -60,3 +60,18 @@ pub fn times(a: V3, b: V3) -> V3 {
 pub fn combine(a: V3, x: f32, b: V3, y: f32, c: V3, z: f32) -> V3 {
     add(add(scale(a, x), scale(b, y)), scale(c, z))
 }
+
+// The translated forms hold handles of values, which may be used again and again.
+impl Clone for V3Expand {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+impl Copy for V3Expand {}
+
+impl Clone for V4Expand {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+impl Copy for V4Expand {}

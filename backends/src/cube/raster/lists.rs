@@ -1,0 +1,78 @@
+//! Tile lists: which Gaussians meet a tile, in depth order.
+
+use super::project::KEYS;
+use cubecl::prelude::*;
+
+/// Depth keys and indices of all Gaussians, to be sorted.
+#[cube(launch)]
+pub fn depth_keys(keys: &[u32], depth: &mut [u32], index: &mut [u32]) {
+    if ABSOLUTE_POS < depth.len() {
+        depth[ABSOLUTE_POS] = keys[KEYS * ABSOLUTE_POS];
+        index[ABSOLUTE_POS] = ABSOLUTE_POS as u32;
+    }
+}
+
+/// Tiles met by the Gaussian of every depth rank.
+#[cube(launch)]
+pub fn counts_by_rank(keys: &[u32], order: &[u32], counts: &mut [u32]) {
+    if ABSOLUTE_POS < order.len() {
+        counts[ABSOLUTE_POS] = keys[KEYS * order[ABSOLUTE_POS] as usize + 1];
+    }
+}
+
+/// Pairs of tiles and Gaussians in depth order: tile and Gaussian of each pair, its own number (which sorting carries along), and where the pairs of
+/// each Gaussian start.
+#[cube(launch)]
+pub fn emit_pairs(
+    keys: &[u32],
+    order: &[u32],
+    starts: &[u32],
+    tile_of_pair: &mut [u32],
+    pair: &mut [u32],
+    gaussian_of_pair: &mut [u32],
+    start_of_gaussian: &mut [u32],
+    tiles_x: u32,
+) {
+    if ABSOLUTE_POS < order.len() {
+        let gaussian = order[ABSOLUTE_POS];
+        let at = KEYS * gaussian as usize;
+        let mut place = starts[ABSOLUTE_POS];
+        start_of_gaussian[gaussian as usize] = place;
+        if keys[at + 1] > 0 {
+            let (columns, rows) = (keys[at + 2], keys[at + 3]);
+            for row in (rows & 0xffffu32)..(rows >> 16) {
+                for column in (columns & 0xffffu32)..(columns >> 16) {
+                    if (place as usize) < tile_of_pair.len() {
+                        tile_of_pair[place as usize] = row * tiles_x + column;
+                        pair[place as usize] = place;
+                        gaussian_of_pair[place as usize] = gaussian;
+                    }
+                    place += 1;
+                }
+            }
+        }
+    }
+}
+
+/// starts[tile] is the first of the sorted pairs of a tile; starts[tiles] their number.
+#[cube(launch)]
+pub fn tile_starts(tile_of_pair: &[u32], starts: &mut [u32], pairs: u32) {
+    let tiles = starts.len() as u32 - 1;
+    let at = ABSOLUTE_POS as u32;
+    if at <= pairs {
+        // Pair `at` starts its own tile and all empty ones since the pair before it.
+        let mut from = 0u32;
+        if at > 0 {
+            from = tile_of_pair[at as usize - 1] + 1;
+        }
+        let mut to = tiles;
+        if at < pairs {
+            to = tile_of_pair[at as usize];
+        }
+        let mut tile = from;
+        while tile <= to {
+            starts[tile as usize] = at;
+            tile += 1;
+        }
+    }
+}

@@ -1,0 +1,203 @@
+//! Exclusive sums and a stable radix sort of pairs of words. Ranks are counted, not raced for, so equal inputs give equal outputs.
+
+use super::tensor::{UNITS, cubes_for, empty, spread, upload};
+use burn::tensor::DType;
+use burn_cubecl::tensor::CubeTensor;
+use cubecl::prelude::*;
+
+/// Bits of a digit, and the digits there are (one per unit of a cube).
+const DIGIT: u32 = 8;
+const MASK: u32 = (1 << DIGIT) - 1;
+/// Items a cube sorts, in rounds of one per unit.
+const ROUNDS: u32 = 4;
+const BLOCK: u32 = ROUNDS * UNITS;
+
+/// values[i] becomes the sum of those before it within its cube; `sums` gets the cubes' totals.
+#[cube(launch)]
+fn scan_in_cubes(values: &mut [u32], sums: &mut [u32], count: u32) {
+    let mut running = Shared::<[u32]>::new_slice(UNITS as usize);
+    let at = ABSOLUTE_POS;
+    let unit = UNIT_POS as usize;
+    let mut value = 0u32;
+    if at < count as usize {
+        value = values[at];
+    }
+    running[unit] = value;
+    sync_cube();
+    let mut reach = 1usize;
+    while reach < UNITS as usize {
+        let mut before = 0u32;
+        if unit >= reach {
+            before = running[unit - reach];
+        }
+        sync_cube();
+        running[unit] += before;
+        sync_cube();
+        reach *= 2;
+    }
+    if at < count as usize {
+        values[at] = running[unit] - value;
+    }
+    if UNIT_POS == UNITS - 1 && CUBE_POS < sums.len() {
+        sums[CUBE_POS] = running[unit];
+    }
+}
+
+/// The same over the cubes' totals, by one cube; `total` gets the sum of all.
+#[cube(launch)]
+fn scan_sums(sums: &mut [u32], total: &mut [u32], count: u32) {
+    let mut running = Shared::<[u32]>::new_slice(UNITS as usize);
+    let unit = UNIT_POS as usize;
+    let mut carry = 0u32;
+    let mut start = 0u32;
+    while start < count {
+        let at = start as usize + unit;
+        let mut value = 0u32;
+        if at < count as usize {
+            value = sums[at];
+        }
+        running[unit] = value;
+        sync_cube();
+        let mut reach = 1usize;
+        while reach < UNITS as usize {
+            let mut before = 0u32;
+            if unit >= reach {
+                before = running[unit - reach];
+            }
+            sync_cube();
+            running[unit] += before;
+            sync_cube();
+            reach *= 2;
+        }
+        if at < count as usize {
+            sums[at] = carry + running[unit] - value;
+        }
+        let end = running[UNITS as usize - 1];
+        sync_cube();
+        carry += end;
+        start += UNITS;
+    }
+    if UNIT_POS == 0 {
+        total[0] = carry;
+    }
+}
+
+#[cube(launch)]
+fn add_sums(values: &mut [u32], sums: &[u32], count: u32) {
+    if ABSOLUTE_POS < count as usize {
+        values[ABSOLUTE_POS] += sums[ABSOLUTE_POS / UNITS as usize];
+    }
+}
+
+/// Replaces each of the first `count` values by the sum of those before it; returns the sum of all [1].
+pub fn exclusive_sums(values: &CubeTensor, count: usize) -> CubeTensor {
+    let client = values.client.clone();
+    let total = upload(values, &[0u32], DType::U32);
+    if count == 0 {
+        return total;
+    }
+    let cubes = count.div_ceil(UNITS as usize);
+    let sums = empty(values, [cubes], DType::U32);
+    let dim = CubeDim::new_1d(UNITS);
+    scan_in_cubes::launch(&client, cubes_for(count), dim, values.clone().into_buffer_arg(), sums.clone().into_buffer_arg(), count as u32);
+    scan_sums::launch(&client, CubeCount::Static(1, 1, 1), dim, sums.clone().into_buffer_arg(), total.clone().into_buffer_arg(), cubes as u32);
+    if cubes > 1 {
+        add_sums::launch(&client, cubes_for(count), dim, values.clone().into_buffer_arg(), sums.into_buffer_arg(), count as u32);
+    }
+    total
+}
+
+/// counts[digit * blocks + block]: how often each digit occurs in each block.
+#[cube(launch)]
+fn count_digits(keys: &[u32], counts: &mut [u32], count: u32, blocks: u32, shift: u32) {
+    let local = Shared::<[Atomic<u32>]>::new_slice(UNITS as usize);
+    let unit = UNIT_POS as usize;
+    local[unit].store(0u32);
+    sync_cube();
+    let block = CUBE_POS as u32;
+    for round in 0..ROUNDS {
+        let at = block * BLOCK + round * UNITS + UNIT_POS;
+        if at < count {
+            local[((keys[at as usize] >> shift) & MASK) as usize].fetch_add(1u32);
+        }
+    }
+    sync_cube();
+    if block < blocks {
+        counts[(UNIT_POS * blocks + block) as usize] = local[unit].load();
+    }
+}
+
+/// Moves every item behind those with a smaller digit and the earlier ones with its own.
+#[cube(launch)]
+fn place_by_digit(keys: &[u32], values: &[u32], starts: &[u32], keys_out: &mut [u32], values_out: &mut [u32], count: u32, blocks: u32, shift: u32) {
+    let mut next = Shared::<[u32]>::new_slice(UNITS as usize);
+    let mut digits = Shared::<[u32]>::new_slice(UNITS as usize);
+    let unit = UNIT_POS as usize;
+    let block = CUBE_POS as u32;
+    if block < blocks {
+        next[unit] = starts[(UNIT_POS * blocks + block) as usize];
+    }
+    for round in 0..ROUNDS {
+        let at = block * BLOCK + round * UNITS + UNIT_POS;
+        let mut key = 0u32;
+        // No item has this digit.
+        let mut digit = UNITS.runtime();
+        if at < count {
+            key = keys[at as usize];
+            digit = (key >> shift) & MASK;
+        }
+        digits[unit] = digit;
+        sync_cube();
+        let mut rank = 0u32;
+        let mut later = 0u32;
+        for other in 0..UNITS {
+            let same = select(digits[other as usize] == digit, 1u32, 0u32);
+            rank += select(other < UNIT_POS, same, 0u32);
+            later += select(other > UNIT_POS, same, 0u32);
+        }
+        if at < count {
+            let place = (next[digit as usize] + rank) as usize;
+            keys_out[place] = key;
+            values_out[place] = values[at as usize];
+        }
+        sync_cube();
+        if at < count && later == 0 {
+            next[digit as usize] += rank + 1;
+        }
+        sync_cube();
+    }
+}
+
+/// `keys` and `values` [count] in ascending order of the lowest `bits` of the keys; equal keys keep their order.
+pub fn sort_pairs(keys: CubeTensor, values: CubeTensor, count: usize, bits: u32) -> (CubeTensor, CubeTensor) {
+    let (mut keys, mut values) = (keys, values);
+    if count < 2 {
+        return (keys, values);
+    }
+    let client = keys.client.clone();
+    let blocks = count.div_ceil(BLOCK as usize);
+    let dim = CubeDim::new_1d(UNITS);
+    let counts = empty(&keys, [blocks << DIGIT], DType::U32);
+    for pass in 0..bits.div_ceil(DIGIT) {
+        let shift = pass * DIGIT;
+        let (count32, blocks32) = (count as u32, blocks as u32);
+        count_digits::launch(&client, spread(blocks), dim, keys.clone().into_buffer_arg(), counts.clone().into_buffer_arg(), count32, blocks32, shift);
+        exclusive_sums(&counts, blocks << DIGIT);
+        let (keys_out, values_out) = (empty(&keys, [count], DType::U32), empty(&keys, [count], DType::U32));
+        place_by_digit::launch(
+            &client,
+            spread(blocks),
+            dim,
+            keys.into_buffer_arg(),
+            values.into_buffer_arg(),
+            counts.clone().into_buffer_arg(),
+            keys_out.clone().into_buffer_arg(),
+            values_out.clone().into_buffer_arg(),
+            count32,
+            blocks32,
+            shift,
+        );
+        (keys, values) = (keys_out, values_out);
+    }
+    (keys, values)
+}
