@@ -6,6 +6,7 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{GridBox, LevelHash, MishShape, VoxelCorners};
 use cc4dgs_core::{DeformationField, FieldContext, Offsets, Registry, Seed};
 use cc4dgs_deformers::cdf::{Cdf, CdfConfig};
+use cc4dgs_tests::devices;
 use rand::{Rng, SeedableRng};
 
 fn context(frames: usize) -> FieldContext {
@@ -21,10 +22,6 @@ const TINY: &str = "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = 
 
 fn field(text: &str, device: &Device) -> Cdf {
     Cdf::new(config(text), &context(300), device).expect("a field")
-}
-
-fn devices() -> [(&'static str, Device); 2] {
-    ["flex", "ndarray"].map(|name| (name, cc4dgs_core::parse_device(name).expect("a device")))
 }
 
 fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {

@@ -1,7 +1,8 @@
 //! Every registered plug-in against the suites that `cc4dgs-core` exports.
 
-use cc4dgs_core::{Registry, config, conformance, parse_device};
+use cc4dgs_core::{Registry, config, conformance};
 use cc4dgs_deformers as _;
+use cc4dgs_tests::devices;
 
 /// Sizes that keep the suite quick, for the fields that have sizes.
 fn small(name: &str) -> toml::Table {
@@ -19,8 +20,7 @@ fn every_deformer_conforms() {
     let names: Vec<&str> = registry.plugins().into_iter().filter(|(kind, _)| *kind == "deformer").map(|(_, p)| p.name).collect();
     assert!(names.len() >= 3, "{names:?}");
     let mut findings = Vec::new();
-    for device in ["flex", "ndarray"] {
-        let device = parse_device(device).unwrap();
+    for (_, device) in devices() {
         for name in &names {
             findings.extend(conformance::deformer(registry.deformer(name).unwrap(), &small(name), &device));
         }

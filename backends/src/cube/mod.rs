@@ -3,6 +3,7 @@
 #![allow(clippy::needless_range_loop, clippy::collapsible_if, clippy::collapsible_else_if)]
 
 mod adam;
+mod field;
 mod photometric;
 mod raster;
 mod sort;

@@ -54,7 +54,7 @@ pub trait FieldKernels: Backend {
 }
 
 /// The differentiable operations of this module per device.
-#[backend_extension(Flex, NdArray, Autodiff)]
+#[backend_extension(Flex, NdArray, Cube, Autodiff)]
 pub trait FieldOps: Backend {
     /// Features [U, F] of vertices [U, 3]; differentiable in the weights.
     fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self>;
@@ -71,7 +71,7 @@ pub trait FieldOps: Backend {
 }
 
 /// Finding corners has no gradient: the paper's field is not differentiated with respect to the canonical centres.
-#[backend_extension(Flex, NdArray)]
+#[backend_extension(Flex, NdArray, Cube)]
 pub trait CornerOps: Backend {
     /// `(vertices [U,3], corners [8M], weights [8M], slots [8M], starts [U+1])`, see [`VoxelCorners`].
     #[allow(clippy::type_complexity, reason = "the dispatch macro must see the tuple of tensors")]

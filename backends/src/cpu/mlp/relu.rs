@@ -27,16 +27,16 @@ pub struct ReluShape {
 
 /// One layer: its place in the tree and in the flat weights.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Layer {
+pub(crate) struct Layer {
     /// The layer whose output it reads; `None` is the network's input.
-    parent: Option<usize>,
-    input: usize,
-    output: usize,
-    weight: Range<usize>,
-    bias: Range<usize>,
-    relu: bool,
+    pub(crate) parent: Option<usize>,
+    pub(crate) input: usize,
+    pub(crate) output: usize,
+    pub(crate) weight: Range<usize>,
+    pub(crate) bias: Range<usize>,
+    pub(crate) relu: bool,
     /// Which output it writes, if any.
-    slot: Option<usize>,
+    pub(crate) slot: Option<usize>,
 }
 
 impl ReluShape {
@@ -47,7 +47,7 @@ impl ReluShape {
             [] => Self::default(),
         }
     }
-    fn layers(&self) -> Vec<Layer> {
+    pub(crate) fn layers(&self) -> Vec<Layer> {
         let mut layers: Vec<Layer> = Vec::new();
         let mut at = 0;
         let mut push = |parent: Option<usize>, input: usize, output: usize, relu: bool, slot: Option<usize>| {

@@ -52,6 +52,14 @@ impl LevelHash {
     pub fn len(&self) -> usize {
         self.b.len()
     }
+    /// A's three rows [k] each, then b [k]: the constants as other devices read them.
+    pub(crate) fn constants(&self) -> Vec<u32> {
+        self.a.iter().chain([&self.b]).flatten().copied().collect()
+    }
+    /// m.
+    pub(crate) fn modulus(&self) -> u32 {
+        self.modulus
+    }
     /// Whether there are no functions.
     pub fn is_empty(&self) -> bool {
         self.b.is_empty()

@@ -1,0 +1,58 @@
+//! The computational deformation field on the device.
+
+mod decoder;
+mod layers;
+mod network;
+mod voxels;
+
+use crate::ops::field::{CornerOps, Decoder, FieldKernels, FieldOps, GridBox, ReluShape};
+use burn::backend::tensor::{FloatTensor, IntTensor};
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
+use std::sync::Arc;
+
+impl FieldKernels for CubeBackend {
+    fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        decoder::backward(&into_contiguous(weights), &into_contiguous(vertices), &decoder, into_contiguous(grad))
+    }
+    fn trilinear_backward(grad: FloatTensor<Self>, weights: FloatTensor<Self>, slots: IntTensor<Self>, starts: IntTensor<Self>) -> FloatTensor<Self> {
+        voxels::interpolate_backward(into_contiguous(grad), into_contiguous(weights), into_contiguous(slots), into_contiguous(starts))
+    }
+    fn network_backward(
+        x: FloatTensor<Self>,
+        weights: FloatTensor<Self>,
+        shape: Arc<ReluShape>,
+        grad: FloatTensor<Self>,
+        wants_input: bool,
+    ) -> (Option<FloatTensor<Self>>, FloatTensor<Self>) {
+        network::backward(&into_contiguous(x), &into_contiguous(weights), &shape, &into_contiguous(grad), wants_input)
+    }
+}
+
+impl FieldOps for CubeBackend {
+    fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
+        decoder::forward(&into_contiguous(weights), &into_contiguous(vertices), &decoder)
+    }
+    fn trilinear(
+        features: FloatTensor<Self>,
+        corners: IntTensor<Self>,
+        weights: FloatTensor<Self>,
+        _slots: IntTensor<Self>,
+        _starts: IntTensor<Self>,
+    ) -> FloatTensor<Self> {
+        voxels::interpolate(into_contiguous(features), into_contiguous(corners), into_contiguous(weights))
+    }
+    fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
+        network::forward(&into_contiguous(x), &into_contiguous(weights), &shape)
+    }
+}
+
+impl CornerOps for CubeBackend {
+    fn voxel_corners(
+        points: FloatTensor<Self>,
+        grid: GridBox,
+        reuse: bool,
+    ) -> (IntTensor<Self>, IntTensor<Self>, FloatTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
+        voxels::corners(&into_contiguous(points), grid, reuse).into()
+    }
+}
