@@ -1,6 +1,6 @@
 //! Finding what a command works on: models and the scenes they are measured against.
 
-use cc4dgs_core::{DEVICE_NAMES, EventSink, Limits, Registry, Result, Scene, config, parse_device};
+use cc4dgs_core::{EventSink, Limits, Registry, Result, Scene, auto_device, config, parse_device};
 use cc4dgs_engine::data::{self, SceneOptions};
 use cc4dgs_engine::model::Model;
 use std::path::Path;
@@ -21,9 +21,8 @@ pub fn load_model(path: &Path, device_name: &str, registry: &Registry, limits: &
 
 /// The device a name stands for: `auto` becomes the one it takes, others stay.
 pub fn resolved_device(name: &str) -> Result<&str> {
-    let device = parse_device(name)?;
-    let same = |n: &&str| *n != "auto" && parse_device(n).is_ok_and(|d| d == device);
-    Ok(if name == "auto" { DEVICE_NAMES.into_iter().find(same).unwrap_or(name) } else { name })
+    parse_device(name)?;
+    Ok(if name == "auto" { auto_device().0 } else { name })
 }
 
 /// Opens the dataset at `path` as the model was trained on it, with `--set scene.key=value` laid over.

@@ -3,6 +3,7 @@
 //! A plug-in crate depends on this crate alone: implement [`DeformationField`], [`AttributeCodec`] or [`Rasterizer`] and
 //! `inventory::submit!` a [`FieldPlugin`], [`CodecPlugin`] or [`RasterizerPlugin`].
 
+mod adapters;
 pub mod archive;
 mod camera;
 mod codec;
@@ -23,6 +24,7 @@ mod registry;
 mod scene;
 mod seed;
 
+pub use adapters::{Adapter, AdapterKind, adapters, auto_device};
 pub use camera::Camera;
 pub use codec::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Stream};
 pub use device::{DEVICE_NAMES, parse_device};

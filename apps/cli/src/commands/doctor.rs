@@ -1,16 +1,18 @@
 //! `cc4dgs doctor`: what this machine offers, and whether pictures come out right on it.
 
 use super::{Context, video};
-use crate::model_source::resolved_device;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, parse_device};
+use cc4dgs_core::{Adapter, Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, adapters, auto_device, parse_device};
 use serde::Serialize;
+use std::time::Instant;
 
 /// The rasterizer that is slow, obvious, and right.
 const ORACLE: &str = "reference";
 /// Half a level of an 8-bit picture: what float32 may cost. Two correct rasterizers differ by more only where a Gaussian is just at the cut-off.
 const TOLERANCE: f32 = 0.5 / 255.0;
+/// Relative, of the whole gradient of the centres.
+const GRADIENT_TOLERANCE: f32 = 1e-3;
 
 #[derive(Serialize)]
 struct Report {
@@ -20,8 +22,9 @@ struct Report {
     cpu_features: Vec<&'static str>,
     threads: usize,
     devices: Vec<DeviceReport>,
+    adapters: &'static [Adapter],
     auto: &'static str,
-    auto_reason: &'static str,
+    auto_reason: String,
     ffmpeg: Option<String>,
     self_check: Vec<Check>,
     healthy: bool,
@@ -40,21 +43,31 @@ struct Check {
     rasterizer: String,
     /// Largest difference of a pixel from the reference, 0..1.
     max_difference: Option<f32>,
+    /// Relative difference of the gradient of the centres from the reference's.
+    gradient_difference: Option<f32>,
+    /// Wall milliseconds of picture and gradient, kernels compiled on the way.
+    ms: f64,
     problem: Option<String>,
 }
 
 pub fn run(context: &Context) -> Result<()> {
+    let truth = draw(context, ORACLE, &Device::flex())?;
     let mut devices = Vec::new();
     let mut self_check = Vec::new();
     for name in DEVICE_NAMES.into_iter().filter(|n| *n != "auto") {
         let device = parse_device(name);
         if let Ok(device) = &device {
-            self_check.extend(check_device(context, name, device));
+            self_check.extend(check_device(context, name, device, &truth));
         }
-        let note = device.as_ref().err().map_or_else(|| "computes on the processor".to_string(), Error::to_string);
+        let note = match &device {
+            Err(e) => e.to_string(),
+            Ok(_) if name == "wgpu" => adapters().first().map_or_else(String::new, |a| format!("computes on {}", a.name)),
+            Ok(_) => "computes on the processor".to_string(),
+        };
         devices.push(DeviceReport { name, available: device.is_ok(), note });
     }
     let healthy = !self_check.is_empty() && self_check.iter().all(|c| c.problem.is_none());
+    let (auto, auto_reason) = auto_device();
     let report = Report {
         version: env!("CARGO_PKG_VERSION"),
         os: std::env::consts::OS,
@@ -62,8 +75,9 @@ pub fn run(context: &Context) -> Result<()> {
         cpu_features: cpu_features(),
         threads: rayon::current_num_threads(),
         devices,
-        auto: resolved_device("auto")?,
-        auto_reason: "this build has no GPU operations yet, and flex is the CPU device burn recommends",
+        adapters: adapters(),
+        auto,
+        auto_reason,
         ffmpeg: video::ffmpeg_version().ok(),
         self_check,
         healthy,
@@ -78,44 +92,86 @@ fn text(r: &Report) -> String {
         format!("processor: {}", if r.cpu_features.is_empty() { "no vector extension known here".to_string() } else { r.cpu_features.join(" ") }),
     ];
     lines.extend(r.devices.iter().map(|d| format!("device {:<8} {:<4} {}", d.name, if d.available { "yes" } else { "no" }, d.note)));
+    lines.extend(r.adapters.iter().enumerate().map(|(i, a)| adapter_text(i, a)));
     lines.push(format!("device auto     takes {}: {}", r.auto, r.auto_reason));
     lines.push(format!("ffmpeg: {}", r.ffmpeg.as_deref().unwrap_or("not found (needed only for videos)")));
     lines.extend(r.self_check.iter().map(|c| {
         let result = match (&c.problem, c.max_difference) {
             (Some(problem), _) => format!("FAILED: {problem}"),
-            (None, difference) => format!("ok, within {:.1e} of the reference", difference.unwrap_or_default()),
+            (None, difference) => {
+                format!("ok, within {:.1e} of the reference, gradient within {:.1e}", difference.unwrap_or_default(), c.gradient_difference.unwrap_or_default())
+            }
         };
-        format!("self-check {} on {}: {result}", c.rasterizer, c.device)
+        format!("self-check {} on {}: {result} ({:.0} ms)", c.rasterizer, c.device, c.ms)
     }));
     lines.join("\n")
 }
 
-/// Draws one picture with every rasterizer and compares it with the reference's.
-fn check_device(context: &Context, device_name: &'static str, device: &Device) -> Vec<Check> {
+fn adapter_text(index: usize, a: &Adapter) -> String {
+    let mib = |bytes: u64| bytes >> 20;
+    let subgroups = a.subgroup_units.map_or_else(|| "no subgroups".to_string(), |[low, high]| format!("subgroups of {low} to {high}"));
+    format!(
+        "adapter wgpu:{index}  {} ({:?}, {}, {})\n    bindings to {} MiB, buffers to {} MiB, {} KiB per workgroup of {} units, {} buffers per kernel, {subgroups}",
+        a.name,
+        a.kind,
+        a.api,
+        a.driver,
+        mib(a.max_binding_bytes),
+        mib(a.max_buffer_bytes),
+        a.workgroup_memory_bytes >> 10,
+        a.max_workgroup_units,
+        a.max_storage_buffers,
+    )
+}
+
+/// A picture, and the gradient of its sum of squares with respect to the centres.
+struct Drawn {
+    picture: Vec<f32>,
+    gradient: Vec<f32>,
+}
+
+/// Draws one picture with every rasterizer and compares it, and its gradient, with the reference's.
+fn check_device(context: &Context, device_name: &'static str, device: &Device, truth: &Drawn) -> Vec<Check> {
     let names = context.registry.plugins().into_iter().filter(|(kind, p)| *kind == "rasterizer" && p.name != ORACLE).map(|(_, p)| p.name);
     names
         .map(|name| {
-            let difference = draw(context, ORACLE, device).and_then(|truth| {
-                let picture = draw(context, name, device)?;
-                // A value that is not a number must fail: `max` would drop it.
-                Ok(truth.iter().zip(&picture).map(|(a, b)| (a - b).abs()).fold(0.0f32, |m, d| if d <= m { m } else { d }))
-            });
-            let problem = match &difference {
-                Ok(d) if *d <= TOLERANCE => None,
-                Ok(d) => Some(format!("a pixel differs by {d} from the reference, {TOLERANCE} is allowed")),
-                Err(e) => Some(e.to_string()),
+            let began = Instant::now();
+            let drawn = draw(context, name, device);
+            let ms = began.elapsed().as_secs_f64() * 1e3;
+            let (max, gradient, problem) = match &drawn {
+                Err(e) => (None, None, Some(e.to_string())),
+                Ok(drawn) => {
+                    // A value that is not a number must fail: `max` would drop it.
+                    let max = truth.picture.iter().zip(&drawn.picture).map(|(a, b)| (a - b).abs()).fold(0.0f32, |m, d| if d <= m { m } else { d });
+                    let gradient = relative(&truth.gradient, &drawn.gradient);
+                    let close = max <= TOLERANCE && gradient <= GRADIENT_TOLERANCE;
+                    let problem = || format!("a pixel differs by {max} ({TOLERANCE} is allowed), the gradient by {gradient} ({GRADIENT_TOLERANCE})");
+                    (Some(max), Some(gradient), (!close).then(problem))
+                }
             };
-            Check { device: device_name, rasterizer: name.to_string(), max_difference: difference.ok().filter(|d| d.is_finite()), problem }
+            let finite = |value: Option<f32>| value.filter(|v| v.is_finite());
+            Check { device: device_name, rasterizer: name.to_string(), max_difference: finite(max), gradient_difference: finite(gradient), ms, problem }
         })
         .collect()
 }
 
-fn draw(context: &Context, rasterizer: &str, device: &Device) -> Result<Vec<f32>> {
+fn relative(truth: &[f32], found: &[f32]) -> f32 {
+    let norm = |values: &mut dyn Iterator<Item = f32>| values.map(|v| v * v).sum::<f32>().sqrt();
+    norm(&mut truth.iter().zip(found).map(|(a, b)| a - b)) / norm(&mut truth.iter().copied()).max(f32::MIN_POSITIVE)
+}
+
+fn draw(context: &Context, rasterizer: &str, device: &Device) -> Result<Drawn> {
     let section = toml::Table::from_iter([("kind".to_string(), toml::Value::from(rasterizer))]);
     let camera = Camera::look_at("doctor", (96, 64), 0.9, [0.4, -3.0, 0.8], [0.0; 3], [0.0, 0.0, 1.0]);
-    let gaussians = Gaussians::from_host(&spiral(), device);
-    let output = context.registry.build_rasterizer(&section)?.render(&Splats::from_gaussians(&gaussians, 1), &camera, &RenderSettings::default())?;
-    to_vec(output.image(), "self-check picture")
+    let gaussians = Gaussians::from_host(&spiral(), &device.clone().autodiff());
+    let mut splats = Splats::from_gaussians(&gaussians, 1);
+    let means = splats.means.clone().require_grad();
+    splats.means = means.clone();
+    let output = context.registry.build_rasterizer(&section)?.render(&splats, &camera, &RenderSettings::default())?;
+    let image = output.image();
+    let gradients = (image.clone() * image.clone()).sum().backward();
+    let gradient = means.grad(&gradients).ok_or_else(|| Error::backend("self-check", "the centres have no gradient", "Report this"))?;
+    Ok(Drawn { picture: to_vec(image.inner(), "self-check picture")?, gradient: to_vec(gradient, "self-check gradient")? })
 }
 
 /// Coloured Gaussians on a spiral around a ball: every size, direction and opacity occurs, and no random number is needed.

@@ -52,7 +52,16 @@ fn mark_heads(sorted: &[u32], heads: &mut [u32]) {
 
 /// Vertices, where their slots start, and the vertex of every slot, from the sorted keys and the number of heads before each.
 #[cube(launch)]
-fn list_vertices(sorted: &[u32], slots: &[u32], before: &[u32], vertices: &mut [i32], starts: &mut [i32], corners: &mut [i32], resolution: u32, vertex_count: u32) {
+fn list_vertices(
+    sorted: &[u32],
+    slots: &[u32],
+    before: &[u32],
+    vertices: &mut [i32],
+    starts: &mut [i32],
+    corners: &mut [i32],
+    resolution: u32,
+    vertex_count: u32,
+) {
     let at = ABSOLUTE_POS;
     if at < sorted.len() {
         let key = sorted[at];

@@ -153,10 +153,9 @@ pub fn blend_tiles_backward(
                 let d_alpha = left * q - behind * inverse;
                 behind += weight * q;
                 // d alpha / d sigma = -alpha, uncapped.
-                if comptime!(pass_capped) {
-                    v = full * d_alpha;
-                } else if full <= alpha_max {
-                    v = full * d_alpha;
+                v = full * d_alpha;
+                if comptime!(!pass_capped) {
+                    v = select(full <= alpha_max, v, 0.0f32);
                 }
             }
         }

@@ -69,7 +69,7 @@ fn nothing_drawn(like: &CubeTensor, pairs: u64) -> Rasterized<CubeBackend> {
 
 /// Floats of higher coefficients per Gaussian.
 fn rest_width(sh_rest: &CubeTensor, n: usize) -> usize {
-    if n == 0 { 0 } else { sh_rest.meta.shape().num_elements() / n }
+    sh_rest.meta.shape().num_elements().checked_div(n).unwrap_or(0)
 }
 
 fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> Rasterized<CubeBackend> {
