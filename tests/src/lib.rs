@@ -9,7 +9,8 @@ pub fn devices() -> Vec<(&'static str, Device)> {
     let mut devices: Vec<(&str, Device)> = vec![("flex", Device::flex()), ("ndarray", Device::ndarray())];
     match parse_device("wgpu") {
         Ok(device) => devices.push(("wgpu", device)),
-        // A machine without Vulkan may still run everything else; CI installs lavapipe.
+        Err(e) if std::env::var_os("CC4DGS_REQUIRE_WGPU").is_some() => panic!("{e}"),
+        // A machine without Vulkan may still run everything else; CI installs lavapipe and sets the variable.
         Err(e) => eprintln!("{e}: its part of the suite is skipped"),
     }
     devices
