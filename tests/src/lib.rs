@@ -1,7 +1,7 @@
 //! What the suites share.
 #![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use cc4dgs_core::parse_device;
 
 /// The devices every suite runs on: the CPU's, and wgpu where an adapter answers (Mesa's lavapipe is enough).
@@ -14,4 +14,13 @@ pub fn devices() -> Vec<(&'static str, Device)> {
         Err(e) => eprintln!("{e}: its part of the suite is skipped"),
     }
     devices
+}
+
+/// Leaves the device's free memory full of NaNs, so that a kernel that reads what nobody wrote is found out.
+pub fn poison(device: &Device) {
+    let mut held = Vec::new();
+    for bits in 6..22 {
+        held.extend((0..4).map(|_| Tensor::<1>::full([1 << bits], f32::NAN, device)));
+    }
+    device.sync().expect("the device answers");
 }

@@ -1,11 +1,9 @@
 //! The computational deformation field: sizes, start, switches, and its outputs and gradients against the paper's formulas written in
 //! burn primitives.
 
-use burn::tensor::activation::{mish, relu};
-use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_backends::ops::field::{GridBox, LevelHash, MishShape, VoxelCorners};
+use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::{DeformationField, FieldContext, Offsets, Registry, Seed};
-use cc4dgs_deformers::cdf::{Cdf, CdfConfig};
+use cc4dgs_deformers::cdf::{Cdf, CdfConfig, Formulas};
 use cc4dgs_tests::devices;
 use rand::{Rng, SeedableRng};
 
@@ -117,84 +115,6 @@ fn vertex_reuse_changes_the_work_and_not_one_bit() {
     }
 }
 
-/// The same field by the paper's formulas: no folding, no fused kernels.
-struct Plain<'a> {
-    field: &'a Cdf,
-    device: Device,
-}
-
-impl Plain<'_> {
-    fn weight(&self, name: &str) -> Tensor<1> {
-        self.field.parameters().into_iter().find(|p| p.name == name).unwrap_or_else(|| panic!("no weight {name}")).value.clone()
-    }
-    /// Consecutive Linear layers of `widths` out of a flat array from `at`.
-    fn linear(&self, x: Tensor<2>, weights: &Tensor<1>, at: &mut usize, (input, output): (usize, usize)) -> Tensor<2> {
-        let w = weights.clone().narrow(0, *at, input * output).reshape([input, output]);
-        let b = weights.clone().narrow(0, *at + input * output, output).reshape([1, output]);
-        *at += (input + 1) * output;
-        x.matmul(w) + b
-    }
-    fn decoder(&self, x: Tensor<2>, weights: &Tensor<1>, shape: &MishShape) -> Tensor<2> {
-        let (mut x, mut at, mut input) = (x, 0, shape.input);
-        for &h in &shape.hidden {
-            x = self.linear(x, weights, &mut at, (input, h));
-            let centred = x.clone() - x.mean_dim(1);
-            let deviation = (centred.clone().powi_scalar(2).mean_dim(1) + 1e-5).sqrt();
-            let [gain, shift] = [0, h].map(|offset| weights.clone().narrow(0, at + offset, h).reshape([1, h]));
-            at += 2 * h;
-            x = mish(centred / deviation * gain + shift);
-            input = h;
-        }
-        self.linear(x, weights, &mut at, (input, shape.output))
-    }
-    fn chain(&self, mut x: Tensor<2>, weights: &Tensor<1>, widths: &[usize], last_relu: bool) -> Tensor<2> {
-        let mut at = 0;
-        for (i, pair) in widths.windows(2).enumerate() {
-            x = self.linear(x, weights, &mut at, (pair[0], pair[1]));
-            if last_relu || i + 2 < widths.len() {
-                x = relu(x);
-            }
-        }
-        x
-    }
-    fn offsets(&self, points: &[f32], time: f32) -> Tensor<2> {
-        let (sizes, scene) = (self.field.sizes(), context(300));
-        let inner = self.device.clone().inner();
-        let mut levels = Vec::new();
-        for (level, &resolution) in sizes.voxels.resolutions.iter().enumerate() {
-            let grid = GridBox { min: scene.box_min, max: scene.box_max, resolution };
-            let c = VoxelCorners::find(matrix(points.to_vec(), 3, &inner), grid, true).expect("corners");
-            let vertices: Vec<[u32; 3]> =
-                c.vertices.into_data().iter::<i64>().collect::<Vec<_>>().chunks_exact(3).map(|v| [v[0] as u32, v[1] as u32, v[2] as u32]).collect();
-            let hash = LevelHash::new(scene.seed.child("level").index(level as u64).child("hash"), sizes.voxels.decoder.input, 1_000_000);
-            let mut signatures = vec![0.0; vertices.len() * sizes.voxels.decoder.input];
-            hash.signatures(&vertices, &mut signatures);
-            let features =
-                self.decoder(matrix(signatures, sizes.voxels.decoder.input, &self.device), &self.weight(&format!("grid.level{level}")), &sizes.voxels.decoder);
-            let m = points.len() / 3;
-            let gathered = features.select(0, Tensor::<1, Int>::from_data(c.corners.into_data(), &self.device));
-            let weights = Tensor::<1>::from_data(c.weights.into_data(), &self.device).reshape([8 * m, 1]);
-            levels.push((gathered * weights).reshape([m, 8, sizes.voxels.decoder.output]).sum_dim(1).reshape([m, sizes.voxels.decoder.output]));
-        }
-        let (voxel, w) = (Tensor::cat(levels, 1), sizes.width);
-        let bands = (0..8).flat_map(|l| [f64::sin, f64::cos].map(|f| f(std::f64::consts::TAU * f64::from(1 << l) * f64::from(time)) as f32));
-        let encoding = matrix(std::iter::once(time).chain(bands).collect(), 17, &self.device);
-        let f_time = self.chain(encoding, &self.weight("net.time"), &[17, w, w, w, w], false);
-        let fused = if sizes.film.is_some() {
-            let h = self.chain(voxel, &self.weight("net.spatial"), &[sizes.voxels.width(), w], false);
-            let modulation = self.chain(f_time, &self.weight("net.film"), &[w, w, 2 * w], false);
-            h * modulation.clone().narrow(1, 0, w) + modulation.narrow(1, w, w)
-        } else {
-            let m = voxel.dims()[0];
-            let both = Tensor::cat(vec![voxel, f_time.repeat_dim(0, m)], 1);
-            self.chain(both, &self.weight("net.spatial"), &[sizes.spatial_inputs(), w], false)
-        };
-        let hidden = self.chain(fused, &self.weight("net.trunk"), &[w; 5], true);
-        let heads = [("means", 3), ("log_scales", 3), ("quaternions", 4), ("opacity", 1), ("sh", 48)];
-        Tensor::cat(heads.map(|(name, out)| self.chain(hidden.clone(), &self.weight(&format!("net.head.{name}")), &[w, w, out], false)).to_vec(), 1)
-    }
-}
-
 #[test]
 fn outputs_and_all_gradients_match_the_formulas() {
     for (name, device) in devices() {
@@ -205,7 +125,7 @@ fn outputs_and_all_gradients_match_the_formulas() {
             let points = centres(300);
             let (_, offsets) = evaluate(&field, &points, 0.43, &device);
             let fast = offsets.concatenated().expect("heads");
-            let plain = Plain { field: &field, device: device.clone() }.offsets(&points, 0.43);
+            let plain = Formulas(&field).offsets(matrix(points.clone(), 3, &device), 0.43).expect("offsets");
             let d = distance(&values(fast.clone()), &values(plain.clone()));
             assert!(d < 1e-5, "{name} {fusion}: outputs differ by {d:.2e}");
             let wave: Vec<f32> = (0..300 * 59).map(|i| (i as f32 * 0.7).sin()).collect();

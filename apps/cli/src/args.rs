@@ -1,5 +1,9 @@
 //! The command line.
 
+mod bench;
+
+pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLoss, BenchSort, BenchStep, BenchWhat};
+
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -77,7 +81,7 @@ pub struct Train {
     /// Override a setting, such as train.iterations=5000; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// Device to compute on: auto, flex, ndarray.
+    /// Device to compute on: auto, flex, ndarray, wgpu, cuda.
     #[arg(long, value_name = "NAME")]
     pub device: Option<String>,
     /// The run's folder.
@@ -213,65 +217,6 @@ pub struct Plugins {
 
 #[derive(Debug, Args)]
 pub struct Doctor {}
-
-#[derive(Debug, Args)]
-pub struct Bench {
-    #[command(subcommand)]
-    pub what: BenchWhat,
-}
-
-#[derive(Debug, Subcommand)]
-pub enum BenchWhat {
-    /// A whole static training step: project, rasterize, L1 and SSIM, backward, Adam.
-    Step(BenchStep),
-    /// Playback of a room with people as large as published scenes: field and rasterizer, frame by frame.
-    Frame(BenchFrame),
-}
-
-#[derive(Debug, Args)]
-pub struct BenchFrame {
-    /// Device to compute on.
-    #[arg(long, value_name = "NAME", default_value = "auto")]
-    pub device: String,
-    /// Time only this case; may be given again.
-    #[arg(long, value_name = "NAME")]
-    pub case: Vec<String>,
-    /// Frames measured per case, after warming up.
-    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
-    pub frames: u32,
-    /// Share of the pixels and Gaussians to keep, for machines that are slow.
-    #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = positive)]
-    pub scale: f64,
-    /// Settings of the deformer or rasterizer, such as deformer.kind=none; may be given several times.
-    #[arg(long, value_name = "KEY=VALUE")]
-    pub set: Vec<String>,
-    /// Root of the seed tree the rooms are made from.
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    pub seed: u64,
-}
-
-fn positive(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(v) if v.is_finite() && v > 0.0 && v <= 100.0 => Ok(v),
-        _ => Err(format!("'{text}' is not a number above 0 and up to 100")),
-    }
-}
-
-#[derive(Debug, Args)]
-pub struct BenchStep {
-    /// Device to compute on.
-    #[arg(long, value_name = "NAME", default_value = "auto")]
-    pub device: String,
-    /// Steps measured per case, after warming up.
-    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
-    pub repeats: u32,
-    /// Root of the seed tree the scenes are drawn from.
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    pub seed: u64,
-    /// Also time the Gaussians of this golden scene (raster_*.inputs.f64.safetensors); may be given again.
-    #[arg(long, value_name = "FILE")]
-    pub scene: Vec<PathBuf>,
-}
 
 /// The two sides of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

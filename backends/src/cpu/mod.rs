@@ -6,5 +6,6 @@ pub mod photometric;
 pub mod raster;
 pub mod scratch;
 pub mod simd;
+pub mod sort;
 pub mod tensor;
 pub mod vertex;

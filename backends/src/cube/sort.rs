@@ -1,7 +1,11 @@
 //! Exclusive sums and a stable radix sort of pairs of words. Ranks are counted, not raced for, so equal inputs give equal outputs.
 
 use super::tensor::{UNITS, cubes_for, empty, spread, upload};
+use crate::ops::sort::SortOps;
+use burn::backend::tensor::IntTensor;
 use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
@@ -200,4 +204,29 @@ pub fn sort_pairs(keys: CubeTensor, values: CubeTensor, count: usize, bits: u32)
         (keys, values) = (keys_out, values_out);
     }
     (keys, values)
+}
+
+/// The places of keys, and the keys cut to the bits that count.
+#[cube(launch)]
+fn number(keys: &[i32], cut: &mut [u32], places: &mut [u32], mask: u32) {
+    if ABSOLUTE_POS < cut.len() {
+        cut[ABSOLUTE_POS] = u32::reinterpret(keys[ABSOLUTE_POS]) & mask;
+        places[ABSOLUTE_POS] = ABSOLUTE_POS as u32;
+    }
+}
+
+impl SortOps for CubeBackend {
+    fn order(keys: IntTensor<Self>, bits: u32) -> IntTensor<Self> {
+        let keys = into_contiguous(keys);
+        let count = keys.meta.shape().num_elements();
+        let (cut, places) = (empty(&keys, [count], DType::U32), empty(&keys, [count], DType::U32));
+        if count > 0 {
+            let client = keys.client.clone();
+            let (k, c, p) = (keys.into_buffer_arg(), cut.clone().into_buffer_arg(), places.clone().into_buffer_arg());
+            number::launch(&client, cubes_for(count), CubeDim::new_1d(UNITS), k, c, p, u32::MAX >> (32 - bits));
+        }
+        // Places are below 2^31, so their bits are those of signed numbers too.
+        let order = sort_pairs(cut, places, count, bits).1;
+        CubeTensor::new_contiguous(order.client.clone(), order.device.clone(), order.meta.shape().clone(), order.handle.clone(), DType::I32)
+    }
 }

@@ -4,3 +4,4 @@ pub mod adam;
 pub mod field;
 pub mod photometric;
 pub mod rasterize;
+pub mod sort;

@@ -1,5 +1,6 @@
 //! The engine: readers, initialisation, the three-stage trainer, checkpoints, playback, evaluation. It names no concrete plug-in.
 
+pub mod agreement;
 pub mod checkpoint;
 pub mod columns;
 pub mod config;

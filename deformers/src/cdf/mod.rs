@@ -6,10 +6,12 @@
 //! first trunk layer: h (gamma ⊙ T) + (beta T + b) in place of (gamma ⊙ h + beta) T + b.
 
 mod config;
+mod formulas;
 
 pub use crate::parts::heads::Head;
 pub use crate::parts::settings::Capacity;
 pub use config::{CdfConfig, Fusion, SCHEMA, Sizes, TimeEncoding};
+pub use formulas::Formulas;
 
 use crate::parts::voxels::{Voxels, parameter};
 use crate::parts::{heads, time, weights};

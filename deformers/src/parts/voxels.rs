@@ -118,6 +118,13 @@ impl Voxels {
     pub fn levels(&self) -> usize {
         self.decoders.len()
     }
+    /// The grid and the decoder of every level.
+    pub fn grids(&self) -> impl Iterator<Item = (GridBox, &Decoder)> {
+        self.resolutions
+            .iter()
+            .zip(&self.decoders)
+            .map(|(&resolution, decoder)| (GridBox { min: self.box_min, max: self.box_max, resolution }, decoder.as_ref()))
+    }
     /// Features per centre.
     pub fn width(&self) -> usize {
         self.width

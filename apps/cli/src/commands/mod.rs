@@ -61,6 +61,10 @@ pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
         Command::Bench(args) => match &args.what {
             BenchWhat::Step(args) => bench::step(&context, args),
             BenchWhat::Frame(args) => bench::frame(&context, args),
+            BenchWhat::Agree(args) => bench::agree(&context, args),
+            BenchWhat::Field(args) => bench::field(&context, args),
+            BenchWhat::Sort(args) => bench::sort(&context, args),
+            BenchWhat::Loss(args) => bench::loss(&context, args),
         },
     }
 }

@@ -1,5 +1,6 @@
 //! Which grid vertices surround each point, and which of them are the same (paper Sections IV-B and IV-C, vertex reuse).
 
+use crate::cpu::sort::stable_order;
 use rayon::prelude::*;
 
 /// The most cells per axis; (cells + 1)^3 keys then fit in 32 bits.
@@ -56,7 +57,7 @@ pub fn corners(points: &[f32], box_min: [f32; 3], box_max: [f32; 3], resolution:
         let starts = (0..=8 * m as u32).collect();
         return Corners { vertices: keys.into_par_iter().map(vertex).collect(), corners: identity.clone(), weights, slots: identity, starts };
     }
-    let slots = sort_slots(&keys, side * side * side);
+    let slots = stable_order(&keys, side * side * side);
     let mut corners = vec![0u32; 8 * m];
     let (mut vertices, mut starts) = (Vec::new(), Vec::new());
     let mut previous = None;
@@ -71,32 +72,6 @@ pub fn corners(points: &[f32], box_min: [f32; 3], box_max: [f32; 3], resolution:
     }
     starts.push(slots.len() as u32);
     Corners { vertices, corners, weights, slots, starts }
-}
-
-/// The slots ordered by key, equal keys in slot order: a radix sort over as many 11-bit digits as `bound` needs.
-fn sort_slots(keys: &[u32], bound: u64) -> Vec<u32> {
-    const BITS: u32 = 11;
-    let mut slots: Vec<u32> = (0..keys.len() as u32).collect();
-    let mut other = vec![0u32; keys.len()];
-    let mut shift = 0;
-    while bound.saturating_sub(1) >> shift > 0 {
-        let digit = |slot: u32| (keys[slot as usize] >> shift) as usize & ((1 << BITS) - 1);
-        let mut starts = vec![0u32; (1 << BITS) + 1];
-        for &slot in &slots {
-            starts[digit(slot) + 1] += 1;
-        }
-        for i in 0..1 << BITS {
-            starts[i + 1] += starts[i];
-        }
-        for &slot in &slots {
-            let place = &mut starts[digit(slot)];
-            other[*place as usize] = slot;
-            *place += 1;
-        }
-        std::mem::swap(&mut slots, &mut other);
-        shift += BITS;
-    }
-    slots
 }
 
 #[cfg(test)]

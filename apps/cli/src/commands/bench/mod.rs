@@ -1,10 +1,35 @@
 //! `cc4dgs bench`: timings on workloads that are made from a seed.
 
+mod agree;
+mod field;
 mod frame;
+mod parts;
 mod step;
 
+pub use agree::agree;
+pub use field::field;
 pub use frame::frame;
+pub use parts::{loss, sort};
 pub use step::step;
+
+use cc4dgs_core::Result;
+use std::time::Instant;
+
+/// Runs that are not counted: caches fill and kernels compile.
+const WARM_UP: usize = 2;
+
+/// Times of `repeats` runs of what ends with a read-back.
+pub fn timed(repeats: usize, mut run: impl FnMut() -> Result<()>) -> Result<Spread> {
+    let mut times = Vec::with_capacity(repeats);
+    for round in 0..WARM_UP + repeats {
+        let began = Instant::now();
+        run()?;
+        if round >= WARM_UP {
+            times.push(began.elapsed().as_secs_f64() * 1e3);
+        }
+    }
+    Ok(Spread::of(times))
+}
 
 /// Middle and spread of some times.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]

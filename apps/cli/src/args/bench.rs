@@ -1,0 +1,145 @@
+//! The options of `cc4dgs bench`.
+
+use super::SplitArg;
+use clap::{Args, Subcommand};
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub struct Bench {
+    #[command(subcommand)]
+    pub what: BenchWhat,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum BenchWhat {
+    /// A whole static training step: project, rasterize, L1 and SSIM, backward, Adam.
+    Step(BenchStep),
+    /// Playback of a room with people as large as published scenes: field and rasterizer, frame by frame.
+    Frame(BenchFrame),
+    /// The same model on several devices: how far their pictures differ.
+    Agree(BenchAgree),
+    /// The computational field forwards and backwards, against the same field in burn's primitives.
+    Field(BenchField),
+    /// Sorting of growing numbers of pairs.
+    Sort(BenchSort),
+    /// L1 and SSIM with their gradient on growing pictures.
+    Loss(BenchLoss),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchField {
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Moving Gaussians.
+    #[arg(long, value_name = "N", default_value_t = 5_000, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    pub gaussians: u64,
+    /// Runs measured, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeats: u32,
+    /// Settings of the field, such as capacity=small; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Root of the seed tree.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchSort {
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Numbers of pairs.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "10000,100000,1000000")]
+    pub pairs: Vec<usize>,
+    /// Runs measured per size, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeats: u32,
+    /// Root of the seed tree.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchLoss {
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Sizes of the pictures, 4:3.
+    #[arg(long, value_name = "MP", value_delimiter = ',', default_value = "0.1,0.5,1.4,2.2", value_parser = positive)]
+    pub megapixels: Vec<f64>,
+    /// Runs measured per size, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeats: u32,
+    /// Root of the seed tree.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchAgree {
+    /// A run's folder, a checkpoint or an archive.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The dataset whose views are drawn, or `procedural`.
+    #[arg(long, value_name = "PATH")]
+    pub scene: PathBuf,
+    /// Which views.
+    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
+    pub split: SplitArg,
+    /// Devices, or DEVICE/RASTERIZER where it is not to be the model's rasterizer; all are compared with the first.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "flex,ndarray,wgpu")]
+    pub devices: Vec<String>,
+    /// Draw at most this many views, evenly spread; 0 is all.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub max_views: usize,
+    /// Override a scene option, such as scene.downscale=2; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchFrame {
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Time only this case; may be given again.
+    #[arg(long, value_name = "NAME")]
+    pub case: Vec<String>,
+    /// Frames measured per case, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub frames: u32,
+    /// Share of the pixels and Gaussians to keep, for machines that are slow.
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = positive)]
+    pub scale: f64,
+    /// Settings of the deformer or rasterizer, such as deformer.kind=none; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Root of the seed tree the rooms are made from.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(v) if v.is_finite() && v > 0.0 && v <= 100.0 => Ok(v),
+        _ => Err(format!("'{text}' is not a number above 0 and up to 100")),
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct BenchStep {
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Steps measured per case, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeats: u32,
+    /// Root of the seed tree the scenes are drawn from.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+    /// Also time the Gaussians of this golden scene (raster_*.inputs.f64.safetensors); may be given again.
+    #[arg(long, value_name = "FILE")]
+    pub scene: Vec<PathBuf>,
+}
