@@ -5,3 +5,5 @@ pub mod cpu;
 mod cube;
 pub mod ops;
 pub mod rasterizers;
+
+pub use cube::cap_bindings;

@@ -47,6 +47,7 @@ fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> 
         space: ParameterSpace::Raw,
         sh_degree: Some(degree),
         max_weights: true,
+        pair_room: None,
     }
 }
 

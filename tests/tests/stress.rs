@@ -3,6 +3,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::random_gaussians;
+use cc4dgs_backends::cap_bindings;
 use cc4dgs_backends::rasterizers::reference::ReferenceRasterizer;
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::gaussians::to_vec;
@@ -129,6 +130,56 @@ fn every_device_draws_the_edges_like_the_reference() {
                 let error = found.iter().zip(&wanted).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt();
                 assert!(error <= case.tolerance * norm + 1e-5, "{}, {name}, {column}: {error:.2e} of {norm:.2e}", case.name);
             }
+        }
+    }
+}
+
+/// Adapters may let a kernel read as little as 128 MiB of a buffer. Here it is 1 MiB, so that 10,000 Gaussians do what a million would.
+#[test]
+fn small_bindings_change_nothing_or_are_an_error() {
+    let case = |count| Case {
+        name: "small bindings",
+        gaussians: changed(count, 11, |g| g.log_scales.fill(-4.5)),
+        size: (64, 48),
+        rules: Rules::Gsplat099,
+        tolerance: 1e-3,
+    };
+    let upstream = noise(Seed::root(91), 5 * 64 * 48);
+    for (name, device) in devices().into_iter().filter(|(name, _)| *name == "wgpu") {
+        let whole = draw(&TileRasterizer, &case(10_000), &device, &upstream);
+        cap_bindings(1 << 20);
+        let parts = draw(&TileRasterizer, &case(10_000), &device, &upstream);
+        let many = Gaussians::from_host(&case(20_000).gaussians, &device);
+        let camera = Camera::look_at("stress", (64, 48), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
+        let refused = TileRasterizer.render(&Splats::from_gaussians(&many, 3), &camera, &RenderSettings::default());
+        cap_bindings(u64::MAX);
+        assert!(whole == parts, "{name}: pictures or gradients differ");
+        let message = refused.map(|_| ()).expect_err("20,000 Gaussians need more").to_string();
+        assert!(message.contains("20000") && message.contains("Gaussians"), "{message}");
+    }
+}
+
+#[test]
+fn room_for_pairs_changes_nothing_unless_it_is_too_small() {
+    let gaussians = changed(800, 12, |_| {});
+    let camera = Camera::look_at("stress", (80, 48), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
+    for (name, device) in devices() {
+        let g = Gaussians::from_host(&gaussians, &device);
+        let draw = |pair_room| {
+            poison(&device);
+            let settings = RenderSettings { pair_room, ..Default::default() };
+            let out = TileRasterizer.render(&Splats::from_gaussians(&g, 3), &camera, &settings).unwrap();
+            (to_vec(out.planes, "planes").unwrap(), out.stats.pair_count.unwrap().into_scalar::<i64>() as usize)
+        };
+        let (exact, count) = draw(None);
+        assert!(count > 800);
+        for room in [count, count + 1, 3 * count] {
+            assert!(draw(Some(room)) == (exact.clone(), count), "{name}: room for {room} of {count}");
+        }
+        let (less, still) = draw(Some(count / 2));
+        assert!(still == count && less.iter().all(|v| v.is_finite()));
+        if name == "wgpu" {
+            assert!(less != exact, "half of the pairs cannot draw the same picture");
         }
     }
 }

@@ -8,3 +8,5 @@ mod photometric;
 mod raster;
 mod sort;
 pub(crate) mod tensor;
+
+pub use tensor::cap_bindings;

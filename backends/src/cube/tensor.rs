@@ -3,7 +3,10 @@
 use burn::tensor::{DType, Shape};
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
+use cubecl::client::Client;
 use cubecl::prelude::*;
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Units of a cube in kernels that treat one item per unit.
 pub const UNITS: u32 = 256;
@@ -38,6 +41,37 @@ pub fn floats(like: &CubeTensor, shape: impl Into<Shape>) -> CubeTensor {
 pub fn upload<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> CubeTensor {
     let buffer = like.client.create_from_slice(T::as_bytes(values));
     CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), Shape::from([values.len()]), buffer, dtype)
+}
+
+static BINDING_CAP: AtomicU64 = AtomicU64::new(u64::MAX);
+
+/// Pretends from now on that kernels may read no more than so many bytes of a buffer: for tests, and to see what a smaller adapter would do.
+pub fn cap_bindings(bytes: u64) {
+    BINDING_CAP.store(bytes, Ordering::Relaxed);
+}
+
+/// The most bytes of one buffer that a kernel may read.
+pub fn binding_bytes(client: &Client) -> u64 {
+    client.properties().memory.max_page_size.min(BINDING_CAP.load(Ordering::Relaxed))
+}
+
+/// 0..`rows` in parts whose rows of `width` floats a kernel may read at once. Parts start at multiples of 256 bytes, as bindings must.
+pub fn row_blocks(client: &Client, rows: usize, width: usize) -> Vec<Range<usize>> {
+    const ALIGNED: usize = 64;
+    let fit = (binding_bytes(client) / (4 * width.max(1) as u64)) as usize / ALIGNED * ALIGNED;
+    let step = fit.max(ALIGNED);
+    (0..rows).step_by(step).map(|first| first..(first + step).min(rows)).collect()
+}
+
+/// Some rows of a contiguous tensor of `width` floats per row, in the same buffer.
+pub fn rows_of(tensor: &CubeTensor, rows: &Range<usize>, width: usize) -> CubeTensor {
+    let bytes = |rows: usize| 4 * (rows * width) as u64;
+    let all = tensor.handle.size_in_used();
+    if width == 0 || bytes(rows.len()) == all {
+        return tensor.clone();
+    }
+    let handle = tensor.handle.clone().offset_start(bytes(rows.start)).offset_end(all.saturating_sub(bytes(rows.end)));
+    CubeTensor::new_contiguous(tensor.client.clone(), tensor.device.clone(), Shape::from([rows.len() * width]), handle, tensor.dtype)
 }
 
 /// `tensor` with its elements side by side in a buffer nobody else holds, so that a kernel may write to it.

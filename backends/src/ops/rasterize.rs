@@ -48,6 +48,41 @@ impl fmt::Debug for Saved {
     }
 }
 
+/// Why a device does not draw.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refusal {
+    /// More (Gaussian, tile) pairs than there may be.
+    Pairs {
+        /// Pairs there are.
+        found: u64,
+        /// Pairs there may be.
+        limit: u64,
+    },
+    /// An array of so many Gaussians is larger than a kernel of the device may read.
+    Gaussians {
+        /// Gaussians there are.
+        found: u64,
+        /// Gaussians that fit.
+        limit: u64,
+    },
+}
+
+impl Refusal {
+    fn error(self) -> Error {
+        match self {
+            Self::Pairs { found, limit } => {
+                Error::limit("render", found, limit, "The value counts (Gaussian, tile) pairs: prune huge Gaussians or render a smaller image")
+            }
+            Self::Gaussians { found, limit } => Error::limit(
+                "render",
+                found,
+                limit,
+                "The value counts Gaussians; the limit is what the adapter lets a kernel read at once. Use a device with larger bindings (cc4dgs doctor), or fewer Gaussians",
+            ),
+        }
+    }
+}
+
 /// What the forward pass of a device returns.
 #[derive(ExtensionType)]
 pub struct Rasterized<B: Backend> {
@@ -59,8 +94,10 @@ pub struct Rasterized<B: Backend> {
     pub max_weights: FloatTensor<B>,
     /// Counts of work.
     pub work: RenderWork,
-    /// Pairs of bounding boxes and tiles if they were too many to render; the planes are empty then.
-    pub too_many_pairs: Option<u64>,
+    /// Pairs of Gaussians and tiles [1].
+    pub pair_count: IntTensor<B>,
+    /// Why nothing was drawn, if so; the planes are empty then.
+    pub refused: Option<Refusal>,
     /// For the backward pass.
     pub saved: Saved,
 }
@@ -129,8 +166,9 @@ fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSet
                 planes: B::from_floats(out.planes, [5, settings.height, settings.width]),
                 radii: B::from_ints(out.radii, [splats.len()]),
                 max_weights: B::from_floats(out.max_weights, [weights]),
+                pair_count: B::from_ints(vec![out.work.tile_pairs as i64], [1]),
                 work: out.work,
-                too_many_pairs: None,
+                refused: None,
                 saved: Saved::new(Mutex::new(out.workspace)),
             }
         }
@@ -139,7 +177,8 @@ fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSet
             radii: B::from_ints(Vec::new(), [0]),
             max_weights: B::from_floats(Vec::new(), [0]),
             work: RenderWork::default(),
-            too_many_pairs: Some(pairs),
+            pair_count: B::from_ints(vec![pairs as i64], [1]),
+            refused: Some(Refusal::Pairs { found: pairs, limit: raster::MAX_TILE_PAIRS }),
             saved: Saved::new(()),
         },
     }
@@ -159,7 +198,8 @@ fn reference_forward<B: CpuBackend>(splats: &SplatArrays, settings: &RasterSetti
         radii: B::from_ints(out.radii, [n]),
         max_weights: B::from_floats(weights, [weights_len]),
         work: RenderWork { visible: out.items.len() as u64, tile_pairs: 0, pixel_pairs: out.pairs },
-        too_many_pairs: None,
+        pair_count: B::from_ints(vec![0], [1]),
+        refused: None,
         saved: Saved::new(out.items),
     }
 }
@@ -305,12 +345,12 @@ impl<B: RasterOps + RasterBackward, C: CheckpointStrategy> RasterOps for Autodif
         let [means, scales, quaternions, opacities, colors, sh_rest, background] = inputs.clone();
         let prep = RasterNode.prepare::<C>([n0, n1, n2, n3, n4, n5, n6, n7, n8]).compute_bound().stateful();
         let out = B::rasterize(means, scales, quaternions, opacities, colors, sh_rest, screen_probe, camera_probe, background, settings.clone(), method);
-        let Rasterized { planes, radii, max_weights, work, too_many_pairs, saved } = out;
+        let Rasterized { planes, radii, max_weights, work, pair_count, refused, saved } = out;
         let planes = match prep {
             OpsKind::Tracked(prep) => prep.finish((inputs, settings, saved.clone()), planes),
             OpsKind::UnTracked(prep) => prep.finish(planes),
         };
-        Rasterized { planes, radii, max_weights: Self::from_inner(max_weights), work, too_many_pairs, saved }
+        Rasterized { planes, radii, max_weights: Self::from_inner(max_weights), work, pair_count, refused, saved }
     }
 }
 
@@ -370,19 +410,15 @@ pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method)
         settings,
         method,
     );
-    if let Some(pairs) = out.too_many_pairs {
-        return Err(Error::limit(
-            "render",
-            pairs,
-            raster::MAX_TILE_PAIRS,
-            "The value counts (Gaussian, tile) pairs: prune huge Gaussians or render a smaller image",
-        ));
+    if let Some(refusal) = out.refused {
+        return Err(refusal.error());
     }
     Ok(RenderOutput {
         planes: Tensor::from_dispatch(out.planes),
         stats: RenderStats {
             radii: Tensor::<1, Int>::from_dispatch(out.radii),
             max_weights: wants_weights.then(|| Tensor::from_dispatch(out.max_weights)),
+            pair_count: Some(Tensor::from_dispatch(out.pair_count)),
             work: out.work,
         },
     })

@@ -75,5 +75,6 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
         space: splats.space,
         sh_degree,
         max_weights: settings.max_weights,
+        pair_room: settings.pair_room,
     })
 }

@@ -77,7 +77,7 @@ impl Default for RenderConfig {
 impl RenderConfig {
     /// What a rasterizer is told; the colour behind everything comes as a tensor, `None` is black.
     pub fn settings(&self, background: Option<Tensor<1>>) -> RenderSettings {
-        RenderSettings { rules: self.rules, antialiased: self.antialiased, near: self.near, background, max_weights: false }
+        RenderSettings { rules: self.rules, antialiased: self.antialiased, near: self.near, background, ..RenderSettings::default() }
     }
 }
 

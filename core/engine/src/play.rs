@@ -2,10 +2,42 @@
 
 use crate::model::Model;
 use crate::train::Rows;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::{Camera, FieldWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
 use serde::Serialize;
 use std::time::Instant;
+
+/// Frames between two looks at how many pairs there were, in playback without waiting.
+const LOOK_EVERY: u64 = 16;
+/// Room for pairs over the most seen, so that a little more does not overflow.
+const SPARE: f64 = 1.25;
+
+/// Room for (Gaussian, tile) pairs, learned from frames past.
+#[derive(Default)]
+struct PairRoom {
+    room: Option<usize>,
+    /// The most pairs of any frame since the last look, on the device.
+    most: Option<Tensor<1, Int>>,
+    frames: u64,
+}
+
+impl PairRoom {
+    fn note(&mut self, count: Tensor<1, Int>) {
+        self.frames += 1;
+        self.most = Some(match self.most.take() {
+            Some(most) => most.max_pair(count),
+            None => count,
+        });
+        if self.room.is_none() || self.frames.is_multiple_of(LOOK_EVERY) {
+            let most = self.most.take().map_or(0, |most| most.into_scalar::<i64>().max(0)) as f64;
+            let wanted = (most * SPARE) as usize + 1024;
+            // Room shrinks too, once it is twice what is needed: sorting takes as long as there is room.
+            if self.room.is_none_or(|room| most as usize > room || wanted * 2 < room || most * 1.1 > room as f64) {
+                self.room = Some(wanted);
+            }
+        }
+    }
+}
 
 /// Plays one model on one device.
 pub struct Player<'a> {
@@ -18,6 +50,7 @@ pub struct Player<'a> {
     moving: usize,
     cache: Option<Tensor<2>>,
     settings: RenderSettings,
+    pair_room: PairRoom,
     /// Work of the field since the start.
     pub work: PlayWork,
 }
@@ -63,6 +96,7 @@ impl<'a> Player<'a> {
             moving,
             cache: None,
             settings: model.render.settings(Some(background)),
+            pair_room: PairRoom::default(),
             work: PlayWork::default(),
             model,
         })
@@ -107,7 +141,20 @@ impl<'a> Player<'a> {
         self.sync()?;
         Ok((output, FrameTime { field_ms, raster_ms: began.elapsed().as_secs_f64() * 1000.0 }))
     }
-    fn sync(&self) -> Result<()> {
+    /// Draws one frame without waiting for the device: nothing is read back but, every 16 frames, the number of (Gaussian, tile) pairs, by which room for
+    /// them is made. If a frame has suddenly more than a quarter over the most seen, its farthest Gaussians are left out until the next look.
+    pub fn play(&mut self, camera: &Camera, time_norm: f32) -> Result<RenderOutput> {
+        let gaussians = self.gaussians_at(time_norm)?;
+        let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
+        let settings = RenderSettings { pair_room: self.pair_room.room, ..self.settings.clone() };
+        let output = self.rasterizer.render(&splats, camera, &settings)?;
+        if let Some(count) = &output.stats.pair_count {
+            self.pair_room.note(count.clone());
+        }
+        Ok(output)
+    }
+    /// Waits until everything asked for is done.
+    pub fn sync(&self) -> Result<()> {
         self.device.sync().map_err(|e| cc4dgs_core::Error::backend("device", format!("{e:?}"), "Try another device (--device flex)"))
     }
 }

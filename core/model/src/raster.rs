@@ -96,11 +96,14 @@ pub struct RenderSettings {
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
+    /// Room for so many (Gaussian, tile) pairs, for playback on devices that would otherwise wait for the count of every frame. What does not fit is not
+    /// drawn, farthest Gaussians first; [`RenderStats::pair_count`] tells afterwards. Not for gradients. `None` makes room for all.
+    pub pair_room: Option<usize>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false }
+        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false, pair_room: None }
     }
 }
 
@@ -136,6 +139,8 @@ pub struct RenderStats {
     pub radii: Tensor<1, Int>,
     /// Largest blending weight of each Gaussian over the image [N], when asked for.
     pub max_weights: Option<Tensor<1>>,
+    /// (Gaussian, tile) pairs there were [1], still on the device; `None` where a rasterizer has no such thing.
+    pub pair_count: Option<Tensor<1, Int>>,
     /// Counts of work done.
     pub work: RenderWork,
 }

@@ -95,6 +95,7 @@ pub fn settings(width: usize, height: usize, k: &[f64], view: &[f64]) -> RasterS
         space: ParameterSpace::Activated,
         sh_degree: None,
         max_weights: false,
+        pair_room: None,
     }
 }
 

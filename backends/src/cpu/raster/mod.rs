@@ -63,6 +63,8 @@ pub struct RasterSettings {
     pub sh_degree: Option<usize>,
     /// Find the largest blending weight of every Gaussian.
     pub max_weights: bool,
+    /// Room for so many (Gaussian, tile) pairs where asking for their number would cost a wait; `None` makes room for all.
+    pub pair_room: Option<usize>,
 }
 
 /// The arrays of N Gaussians, row-major.

@@ -1,6 +1,7 @@
 //! Hash signatures and the decoders behind them (Linear, LayerNorm, Mish per hidden layer), one row per vertex.
 
 use super::layers::{self, Dense};
+use super::program::{Input, Place, Program, Step};
 use crate::cpu::vertex::hash::LevelHash;
 use crate::cube::tensor::{UNITS, cubes_for, floats, upload};
 use crate::ops::field::{Decoder, MishShape};
@@ -11,7 +12,7 @@ use cubecl::prelude::*;
 /// 2^31 - 1.
 const P: u32 = 0x7fff_ffff;
 /// Added to variances.
-const EPSILON: f32 = 1e-5;
+pub const EPSILON: f32 = 1e-5;
 
 /// Congruent to `v` modulo P: 2^31 = 1 there.
 #[cube]
@@ -28,25 +29,30 @@ fn product(a: u32, x: u32) -> u32 {
     fold(fold(((high & 0x7fffu32) << 16) + (high >> 15)) + low)
 }
 
-/// signatures [U,k] of vertices [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold A's three rows [k] each, then b [k].
+/// Number `k` of the signature of a vertex of `vertices` [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold A's three rows [k] each, then b [k].
+#[cube]
+pub fn signature(vertices: &[i32], constants: &[u32], vertex: usize, k: usize, hashes: usize, modulus: u32, scale: f32) -> f32 {
+    let mut sum = constants[3 * hashes + k];
+    #[unroll]
+    for d in 0..3usize {
+        sum = fold(sum + product(constants[d * hashes + k], vertices[3 * vertex + d] as u32));
+    }
+    let residue = select(sum >= P, sum - P, sum);
+    (residue % modulus) as f32 * scale - 1.0
+}
+
+/// Signatures [U,k] of vertices [U,3].
 #[cube(launch)]
 fn signatures(vertices: &[i32], constants: &[u32], out: &mut [f32], hashes: u32, modulus: u32, scale: f32) {
     if ABSOLUTE_POS < out.len() {
-        let (vertex, k) = (ABSOLUTE_POS / hashes as usize, ABSOLUTE_POS % hashes as usize);
         let h = hashes as usize;
-        let mut sum = constants[3 * h + k];
-        #[unroll]
-        for d in 0..3usize {
-            sum = fold(sum + product(constants[d * h + k], vertices[3 * vertex + d] as u32));
-        }
-        let residue = select(sum >= P, sum - P, sum);
-        out[ABSOLUTE_POS] = (residue % modulus) as f32 * scale - 1.0;
+        out[ABSOLUTE_POS] = signature(vertices, constants, ABSOLUTE_POS / h, ABSOLUTE_POS % h, h, modulus, scale);
     }
 }
 
 /// e^x - 1 cannot cancel here: with w = e^x, tanh(ln(1 + w)) = (w^2 + 2 w) / (w^2 + 2 w + 2).
 #[cube]
-fn mish(x: f32) -> f32 {
+pub fn mish(x: f32) -> f32 {
     // Beyond 20 the factor is 1 to float32.
     let w = select(x < 20.0, x, 20.0f32).exp();
     let n = w * (w + 2.0);
@@ -167,7 +173,18 @@ fn run(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, rows: usi
 /// Features [U, F] of `vertices` [U,3].
 pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -> CubeTensor {
     let rows = vertices.meta.shape()[0];
-    if rows == 0 { floats(weights, [0, decoder.shape.output]) } else { run(weights, vertices, decoder, rows).output }
+    let out = floats(weights, [rows, decoder.shape.output]);
+    let layers = decoder.shape.layers().into_iter().map(|layer| Step {
+        input: layer.input,
+        output: layer.output,
+        weights: layer.weight.start,
+        norm: layer.gain.as_ref().map(|gain| gain.start),
+        relu: false,
+        source: Place::First,
+        target: if layer.gain.is_some() { Place::First } else { Place::Output(0) },
+    });
+    let done = Program(layers.collect()).run(&Input::Signatures(vertices, &decoder.hash), weights, &out, rows);
+    if done { out } else { run(weights, vertices, decoder, rows).output }
 }
 
 /// The gradient of the flat weights from that of the features. Activations are computed again rather than kept.

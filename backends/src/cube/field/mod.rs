@@ -3,6 +3,7 @@
 mod decoder;
 mod layers;
 mod network;
+mod program;
 mod voxels;
 
 use crate::ops::field::{CornerOps, Decoder, FieldKernels, FieldOps, GridBox, ReluShape};

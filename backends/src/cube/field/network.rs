@@ -1,6 +1,7 @@
 //! Trunk and heads of Linear + ReLU layers.
 
 use super::layers::{self, Dense};
+use super::program::{Input, Place, Program, Step};
 use crate::cpu::mlp::relu::ReluShape;
 use crate::cube::tensor::{floats, upload};
 use burn::tensor::DType;
@@ -26,7 +27,21 @@ fn run(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, rows: usize) -> 
 
 /// Flat outputs, head after head.
 pub fn forward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape) -> CubeTensor {
-    run(x, weights, shape, x.meta.shape()[0]).1
+    let rows = x.meta.shape()[0];
+    let widths = shape.output_widths();
+    let flat = floats(x, [rows * widths.iter().sum::<usize>()]);
+    let mut steps: Vec<Step> = Vec::new();
+    for (i, layer) in shape.layers().into_iter().enumerate() {
+        let target = match layer.slot {
+            Some(slot) => Place::Output(rows * widths[..slot].iter().sum::<usize>()),
+            // The trunk's last values are read by every head, so heads work in the other tile.
+            None if i < shape.trunk.len() => Place::First,
+            None => Place::Second,
+        };
+        let source = layer.parent.map_or(Place::First, |parent| steps[parent].target);
+        steps.push(Step { input: layer.input, output: layer.output, weights: layer.weight.start, norm: None, relu: layer.relu, source, target });
+    }
+    if Program(steps).run(&Input::Rows(x), weights, &flat, rows) { flat } else { run(x, weights, shape, rows).1 }
 }
 
 /// Gradients of the input, if wanted, and of the flat weights from that of the flat outputs.

@@ -57,7 +57,8 @@ pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], spl
     }
 }
 
-/// Gradients of the degree-0 coefficients (or colours) [N,3] and of the higher ones [N,K,3]; that of the offset goes to the screen gradients.
+/// Gradients of the degree-0 coefficients (or colours) [N,3] and of the higher ones [N,K,3], for `count` Gaussians from `first` on, whose higher coefficients
+/// `sh_rest` and `d_rest` hold; that of the offset goes to the screen gradients.
 #[cube(launch)]
 pub fn color_backward(
     means: &[f32],
@@ -67,14 +68,16 @@ pub fn color_backward(
     screen: &mut [f32],
     d_colors: &mut [f32],
     d_rest: &mut [f32],
-    gaussians: u32,
+    first: u32,
+    count: u32,
     rest_width: u32,
     #[comptime] degree: usize,
     #[comptime] harmonics: bool,
     #[comptime] wants_rest: bool,
 ) {
-    let i = ABSOLUTE_POS;
-    if i < gaussians as usize {
+    let row = ABSOLUTE_POS;
+    let i = first as usize + row;
+    if row < count as usize {
         let from = SCREEN * i + 6;
         let mut red = screen[from];
         let mut green = screen[from + 1];
@@ -89,7 +92,7 @@ pub fn color_backward(
             blue = 0.0;
             if comptime!(wants_rest) {
                 for k in 0..rest_width as usize {
-                    d_rest[i * rest_width as usize + k] = 0.0;
+                    d_rest[row * rest_width as usize + k] = 0.0;
                 }
             }
             let mean = load3(means, 3 * i);
@@ -102,7 +105,7 @@ pub fn color_backward(
                 let mut h = Array::<f32>::new(25usize);
                 #[unroll]
                 for k in 1..comptime!((degree + 1) * (degree + 1)) {
-                    let at = i * rest_width as usize + 3 * (k - 1);
+                    let at = row * rest_width as usize + 3 * (k - 1);
                     h[k] = dot(load3(sh_rest, at), d);
                     if comptime!(wants_rest) {
                         d_rest[at] = values[k] * d.x;

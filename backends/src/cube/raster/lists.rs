@@ -54,6 +54,15 @@ pub fn emit_pairs(
     }
 }
 
+/// Pairs behind the last one belong to no tile.
+#[cube(launch)]
+pub fn fill_unused(tile_of_pair: &mut [u32], pair: &mut [u32], total: &[u32], tiles: u32) {
+    if ABSOLUTE_POS < tile_of_pair.len() && ABSOLUTE_POS >= total[0] as usize {
+        tile_of_pair[ABSOLUTE_POS] = tiles;
+        pair[ABSOLUTE_POS] = ABSOLUTE_POS as u32;
+    }
+}
+
 /// starts[tile] is the first of the sorted pairs of a tile; starts[tiles] their number.
 #[cube(launch)]
 pub fn tile_starts(tile_of_pair: &[u32], starts: &mut [u32], pairs: u32) {

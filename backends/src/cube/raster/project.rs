@@ -181,7 +181,7 @@ pub fn view_direction(cam: &[f32], mean: V3) -> V3 {
     scale(offset, 1.0 / dot(offset, offset).sqrt())
 }
 
-/// Colours into the screen records; Gaussians whose colour is not finite are culled.
+/// Colours into the screen records, for `count` Gaussians from `first` on, whose coefficients `sh_rest` holds; Gaussians whose colour is not finite are culled.
 #[cube(launch)]
 pub fn color_gaussians(
     means: &[f32],
@@ -191,12 +191,15 @@ pub fn color_gaussians(
     splats: &mut [f32],
     keys: &mut [u32],
     radii: &mut [i32],
+    first: u32,
+    count: u32,
     rest_width: u32,
     #[comptime] degree: usize,
     #[comptime] harmonics: bool,
 ) {
-    let i = ABSOLUTE_POS;
-    if i < radii.len() && radii[i] > 0 {
+    let row = ABSOLUTE_POS;
+    let i = first as usize + row;
+    if row < count as usize && radii[i] > 0 {
         let mut red = colors[3 * i];
         let mut green = colors[3 * i + 1];
         let mut blue = colors[3 * i + 2];
@@ -207,7 +210,7 @@ pub fn color_gaussians(
             blue = blue * values[0] + 0.5;
             #[unroll]
             for k in 1..comptime!((degree + 1) * (degree + 1)) {
-                let at = i * rest_width as usize + 3 * (k - 1);
+                let at = row * rest_width as usize + 3 * (k - 1);
                 red += sh_rest[at] * values[k];
                 green += sh_rest[at + 1] * values[k];
                 blue += sh_rest[at + 2] * values[k];

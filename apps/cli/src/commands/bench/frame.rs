@@ -45,6 +45,8 @@ struct FrameCase {
     field: Spread,
     raster: Spread,
     frame: Spread,
+    /// Frames drawn one after another without waiting in between, per frame.
+    playback_ms: f64,
     frames_per_s: f64,
     visible: u64,
     tile_pairs: u64,
@@ -151,6 +153,16 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         }
     }
     let [field, raster, frame] = times.map(Spread::of);
+    let mut play = |frames: usize| -> Result<f64> {
+        let began = Instant::now();
+        for frame in 0..frames {
+            player.play(&camera, frame as f32 / SEQUENCE as f32)?;
+        }
+        player.sync()?;
+        Ok(began.elapsed().as_secs_f64() * 1e3 / frames as f64)
+    };
+    play(WARM_UP)?;
+    let playback_ms = play(args.frames as usize)?;
     Ok(FrameCase {
         name: case.name.into(),
         width: camera.width,
@@ -161,7 +173,8 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         first_raster_ms: first.1,
         field,
         raster,
-        frames_per_s: if frame.median_ms > 0.0 { 1000.0 / frame.median_ms } else { 0.0 },
+        playback_ms,
+        frames_per_s: if playback_ms > 0.0 { 1000.0 / playback_ms } else { 0.0 },
         frame,
         visible: counts.visible,
         tile_pairs: counts.tile_pairs,
@@ -210,10 +223,10 @@ fn time_field(field: &mut dyn cc4dgs_core::DeformationField, means_world: Tensor
 
 fn text(report: &FrameReport) -> String {
     let mut lines = vec![format!("playback on {}, {} threads, deformer {}", report.device, report.threads, report.deformer)];
-    lines.push("case           picture  Gaussians  moving   field ms  raster ms   frames/s  first ms  spatial ms  field fwd+bwd ms".into());
+    lines.push("case           picture  Gaussians  moving   field ms  raster ms    play ms   frames/s  first ms  spatial ms  field fwd+bwd ms".into());
     lines.extend(report.cases.iter().map(|c| {
         format!(
-            "{:<12} {:>4}x{:<4} {:>9} {:>7} {:>10.3} {:>10.2} {:>10.1} {:>9.1} {:>11.2} {:>17.2}",
+            "{:<12} {:>4}x{:<4} {:>9} {:>7} {:>10.3} {:>10.2} {:>10.2} {:>10.1} {:>9.1} {:>11.2} {:>17.2}",
             c.name,
             c.width,
             c.height,
@@ -221,6 +234,7 @@ fn text(report: &FrameReport) -> String {
             c.dynamic_gaussians,
             c.field.median_ms,
             c.raster.median_ms,
+            c.playback_ms,
             c.frames_per_s,
             c.first_field_ms + c.first_raster_ms,
             c.field_spatial.median_ms,

@@ -1,0 +1,163 @@
+//! From the gradient of a picture to those of the Gaussians.
+
+use super::blend;
+use super::gradient::{self, GEOMETRY, SCREEN};
+use super::{DIM, Lists, read_floats, rest_width};
+use crate::cpu::raster::camera::{CameraSums, RuleConstants};
+use crate::cpu::raster::{RECORD, RasterSettings, TILE, TILE_PIXELS};
+use crate::cube::tensor::{cubes_for, floats, row_blocks, rows_of, spread, upload};
+use crate::ops::rasterize::{PARENTS, Saved, SavedInputs};
+use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::tensor::CubeTensor;
+use cc4dgs_core::ParameterSpace;
+use cubecl::prelude::*;
+
+/// Gradients of the parents in the order of [`crate::ops::rasterize::RasterOps::rasterize`]; only those wanted.
+pub fn backward(
+    inputs: SavedInputs<CubeBackend>,
+    settings: &RasterSettings,
+    saved: &Saved,
+    upstream: CubeTensor,
+    wanted: [bool; PARENTS],
+) -> [Option<CubeTensor>; PARENTS] {
+    // Nothing was drawn (too many pairs), so nothing flows back.
+    let Some(lists) = saved.get::<Lists>() else { return std::array::from_fn(|_| None) };
+    let rest_shape = inputs[5].meta.shape().clone();
+    let [means, scales, quaternions, opacities, _, sh_rest, background] = inputs.map(into_contiguous);
+    let upstream = into_contiguous(upstream);
+    let client = means.client.clone();
+    let n = means.meta.shape()[0];
+    let (width, height) = (settings.width, settings.height);
+    let tiles_x = width.div_ceil(TILE);
+    let rules = RuleConstants::new(settings);
+    let records = floats(&means, [lists.pairs, RECORD]);
+    if lists.pairs > 0 {
+        blend::blend_tiles_backward::launch(
+            &client,
+            spread(tiles_x * height.div_ceil(TILE)),
+            CubeDim::new_1d(TILE_PIXELS as u32),
+            lists.splats.clone().into_buffer_arg(),
+            lists.gaussian_of_pair.clone().into_buffer_arg(),
+            lists.sorted.clone().into_buffer_arg(),
+            lists.tile_starts.clone().into_buffer_arg(),
+            background.clone().into_buffer_arg(),
+            lists.state.clone().into_buffer_arg(),
+            upstream.clone().into_buffer_arg(),
+            records.clone().into_buffer_arg(),
+            width as u32,
+            height as u32,
+            tiles_x as u32,
+            rules.alpha_max,
+            rules.pass_capped,
+        );
+    }
+    let (screen, geometry) = (floats(&means, [n, SCREEN]), floats(&means, [n, GEOMETRY]));
+    let d_colors = floats(&means, [n, 3]);
+    let degree = settings.sh_degree.unwrap_or(0);
+    let wants_rest = wanted[5] && settings.sh_degree.is_some();
+    let rest_floats = rest_shape.num_elements();
+    let d_rest = match (wanted[5], wants_rest) {
+        (true, true) => floats(&means, rest_shape),
+        // Colours that are blended as they are do not depend on the coefficients.
+        (true, false) => {
+            let zeros = upload(&means, &vec![0.0f32; rest_floats.max(1)], DType::F32);
+            CubeTensor::new_contiguous(zeros.client.clone(), zeros.device.clone(), rest_shape, zeros.handle.clone(), DType::F32)
+        }
+        _ => floats(&means, [1]),
+    };
+    if n > 0 {
+        gradient::sum_records::launch(
+            &client,
+            cubes_for(n),
+            DIM(),
+            records.into_buffer_arg(),
+            lists.start_of_gaussian.clone().into_buffer_arg(),
+            lists.keys.clone().into_buffer_arg(),
+            lists.splats.clone().into_buffer_arg(),
+            screen.clone().into_buffer_arg(),
+        );
+        let width = rest_width(&sh_rest, n);
+        for rows in row_blocks(&client, n, width) {
+            gradient::color_backward::launch(
+                &client,
+                cubes_for(rows.len()),
+                DIM(),
+                means.clone().into_buffer_arg(),
+                rows_of(&sh_rest, &rows, width).into_buffer_arg(),
+                lists.cam.clone().into_buffer_arg(),
+                lists.splats.clone().into_buffer_arg(),
+                screen.clone().into_buffer_arg(),
+                d_colors.clone().into_buffer_arg(),
+                if wants_rest { rows_of(&d_rest, &rows, width) } else { d_rest.clone() }.into_buffer_arg(),
+                rows.start as u32,
+                rows.len() as u32,
+                width as u32,
+                degree,
+                settings.sh_degree.is_some(),
+                wants_rest,
+            );
+        }
+        gradient::geometry_backward::launch(
+            &client,
+            cubes_for(n),
+            DIM(),
+            means.clone().into_buffer_arg(),
+            scales.into_buffer_arg(),
+            quaternions.into_buffer_arg(),
+            opacities.into_buffer_arg(),
+            lists.cam.clone().into_buffer_arg(),
+            lists.keys.clone().into_buffer_arg(),
+            screen.clone().into_buffer_arg(),
+            geometry.clone().into_buffer_arg(),
+            n as u32,
+            settings.space == ParameterSpace::Raw,
+            settings.antialiased,
+        );
+    }
+    let columns = |from: &CubeTensor, stride: usize, first: usize, shape: Vec<usize>| {
+        let count: usize = shape.iter().product();
+        let out = floats(&means, shape.clone());
+        if count > 0 {
+            let width = (count / n) as u32;
+            let (from, to) = (from.clone().into_buffer_arg(), out.clone().into_buffer_arg());
+            gradient::take_columns::launch(&client, cubes_for(count), DIM(), from, to, stride as u32, first as u32, width);
+        }
+        out
+    };
+    let camera = || {
+        let mut sums = CameraSums::default();
+        if n > 0 {
+            let (of_camera, of_offset) = (floats(&means, [12]), floats(&means, [3]));
+            for (from, to, stride, first) in [(&geometry, &of_camera, GEOMETRY, 11), (&screen, &of_offset, SCREEN, RECORD)] {
+                let (from, to) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
+                gradient::sum_rows::launch(&client, CubeCount::Static(1, 1, 1), CubeDim::new_1d(32), from, to, n as u32, stride as u32, first as u32);
+            }
+            let (matrix, offset) = (read_floats(&of_camera), read_floats(&of_offset));
+            sums.rotation = std::array::from_fn(|k| f64::from(matrix[k]));
+            sums.translation = std::array::from_fn(|k| f64::from(matrix[9 + k]));
+            sums.center = std::array::from_fn(|k| -f64::from(offset[k]));
+        }
+        let gradient = upload(&means, &sums.matrix_gradient(&settings.world_to_camera), DType::F32);
+        CubeTensor::new_contiguous(gradient.client.clone(), gradient.device.clone(), [4, 4].into(), gradient.handle.clone(), DType::F32)
+    };
+    let of_background = || {
+        let out = floats(&means, [3]);
+        let (state, upstream) = (lists.state.clone().into_buffer_arg(), upstream.clone().into_buffer_arg());
+        let one = CubeCount::Static(1, 1, 1);
+        gradient::background_backward::launch(&client, one, CubeDim::new_1d(32), state, upstream, out.clone().into_buffer_arg(), (width * height) as u32);
+        out
+    };
+    [
+        wanted[0].then(|| columns(&geometry, GEOMETRY, 0, vec![n, 3])),
+        wanted[1].then(|| columns(&geometry, GEOMETRY, 3, vec![n, 3])),
+        wanted[2].then(|| columns(&geometry, GEOMETRY, 6, vec![n, 4])),
+        wanted[3].then(|| columns(&geometry, GEOMETRY, 10, vec![n])),
+        wanted[4].then_some(d_colors),
+        wanted[5].then_some(d_rest),
+        wanted[6].then(|| columns(&screen, SCREEN, 0, vec![n, 2])),
+        wanted[7].then(camera),
+        wanted[8].then(of_background),
+    ]
+}
