@@ -3,6 +3,7 @@
 use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _};
 use cc4dgs_core::{Error, Event, EventSink, Limits, Recorder, Registry, Scene, Silent, Split};
+use cc4dgs_engine::agreement::agreement;
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::eval::{EvalReport, evaluate};
 use cc4dgs_engine::model::Model;
@@ -158,4 +159,28 @@ fn static_gaussians_cost_no_field_time() {
     assert!(still > 0 && report.dynamic_gaussians > 0, "{report:?}");
     assert_eq!((player.work.deformed, player.work.static_skipped), (report.dynamic_gaussians as u64, still));
     assert_eq!(player.work.spatial.gaussians, report.dynamic_gaussians as u64);
+}
+
+#[test]
+fn runs_on_wgpu_are_reproducible_and_every_device_draws_the_same() {
+    let devices = cc4dgs_tests::devices();
+    if !devices.iter().any(|(name, _)| *name == "wgpu") {
+        return;
+    }
+    let mut config = tiny(&["train.iterations=30", "scene.width=32", "scene.height=32"]);
+    config.device = "wgpu".into();
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
+    run(&config, &a, false, &Silent, &never).unwrap();
+    run(&config, &b, false, &Silent, &never).unwrap();
+    let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
+    assert!(bytes(&a) == bytes(&b), "two runs of one seed differ");
+
+    let (scene, registry) = (open(&config), Registry::collect().unwrap());
+    let load = |device: &Device| Model::load(&a, &registry, device, &Limits::default(), &Silent).unwrap();
+    let models: Vec<(String, Device, Model)> = devices.into_iter().map(|(name, device)| (name.to_string(), device.clone(), load(&device))).collect();
+    for found in agreement(&models, &scene, &scene.split(Split::Test), &registry, &Silent).unwrap() {
+        assert!(found.max_difference <= 1.0 / 255.0 && found.psnr_difference_db.abs() < 0.01, "{found:?}");
+    }
 }

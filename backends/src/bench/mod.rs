@@ -3,7 +3,7 @@
 mod scene;
 mod workload;
 
-pub use scene::{ROOM_CASES, RoomCase, room};
+pub use scene::{ROOM_CASES, RoomCase, growth, room, shrunk};
 pub use workload::{Workload, random_gaussians, step_camera};
 
 use crate::cpu::simd::{Lanes, dispatch};

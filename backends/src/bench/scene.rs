@@ -4,12 +4,13 @@ use super::workload::uniform;
 use super::{StepCase, Workload};
 use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::{Camera, HostGaussians, Seed};
+use std::borrow::Cow;
 
 /// Size of a room.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct RoomCase {
     /// For tables.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// Pictures and Gaussians.
     pub size: StepCase,
     /// Share of the Gaussians that moves.
@@ -18,9 +19,36 @@ pub struct RoomCase {
 
 /// Rooms of the size of published scenes.
 pub const ROOM_CASES: [RoomCase; 2] = [
-    RoomCase { name: "n3dv", size: StepCase { width: 1352, height: 1014, gaussians: 335_000 }, dynamic_share: 0.12 },
-    RoomCase { name: "technicolor", size: StepCase { width: 2048, height: 1088, gaussians: 335_000 }, dynamic_share: 0.12 },
+    RoomCase { name: Cow::Borrowed("n3dv"), size: StepCase { width: 1352, height: 1014, gaussians: 335_000 }, dynamic_share: 0.12 },
+    RoomCase { name: Cow::Borrowed("technicolor"), size: StepCase { width: 2048, height: 1088, gaussians: 335_000 }, dynamic_share: 0.12 },
 ];
+
+/// Gaussians and megapixels along which costs are followed.
+const GROWTH: ([usize; 8], [f64; 6]) = ([10_000, 30_000, 100_000, 335_000, 1_000_000, 2_000_000, 3_000_000, 5_000_000], [0.1, 0.3, 1.0, 2.0, 4.0, 8.0]);
+
+/// The first room with ever more Gaussians, then with ever larger pictures.
+pub fn growth() -> Vec<RoomCase> {
+    let [room, _] = ROOM_CASES;
+    let gaussians = GROWTH.0.map(|n| RoomCase { name: format!("{}k", n / 1000).into(), size: StepCase { gaussians: n, ..room.size }, ..room });
+    let pixels = GROWTH.1.map(|megapixels| {
+        let width = (megapixels * 1e6 * 4.0 / 3.0).sqrt().round();
+        let size = StepCase { width: width as u32, height: (megapixels * 1e6 / width).round() as u32, ..room.size };
+        RoomCase { name: format!("{megapixels} MP").into(), size, ..room }
+    });
+    gaussians.into_iter().chain(pixels).collect()
+}
+
+/// `case` with a share of its pixels and Gaussians.
+pub fn shrunk(case: &RoomCase, share: f64) -> RoomCase {
+    let shrink = |v: f64, by: f64| (v * by).round().max(1.0);
+    let side = share.sqrt();
+    let size = StepCase {
+        width: shrink(f64::from(case.size.width), side) as u32,
+        height: shrink(f64::from(case.size.height), side) as u32,
+        gaussians: shrink(case.size.gaussians as f64, share) as usize,
+    };
+    RoomCase { size, ..case.clone() }
+}
 
 /// Gaussians the statistics below were measured on: `panoptic_basketball` trained for 12,000 iterations.
 const MEASURED: f32 = 50_000.0;
@@ -96,5 +124,5 @@ pub fn room(case: &RoomCase, seed: Seed) -> Workload {
         extra: Default::default(),
     };
     let camera = Camera::look_at("room", (case.size.width, case.size.height), 1.2, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]);
-    Workload { name: case.name.into(), gaussians, camera }
+    Workload { name: case.name.to_string(), gaussians, camera }
 }

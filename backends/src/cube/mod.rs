@@ -5,6 +5,7 @@
 mod adam;
 mod field;
 mod photometric;
+mod picture;
 mod raster;
 mod sort;
 pub(crate) mod tensor;

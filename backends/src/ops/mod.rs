@@ -3,5 +3,6 @@
 pub mod adam;
 pub mod field;
 pub mod photometric;
+pub mod picture;
 pub mod rasterize;
 pub mod sort;

@@ -107,6 +107,9 @@ pub struct BenchFrame {
     /// Time only this case; may be given again.
     #[arg(long, value_name = "NAME")]
     pub case: Vec<String>,
+    /// In place of the cases: one room with 10 thousand to 5 million Gaussians, then with pictures of 0.1 to 8 megapixels.
+    #[arg(long)]
+    pub growth: bool,
     /// Frames measured per case, after warming up.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub frames: u32,
@@ -133,6 +136,12 @@ pub struct BenchStep {
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
+    /// In place of the standard cases, a room with people (n3dv, technicolor); may be given again.
+    #[arg(long, value_name = "NAME")]
+    pub case: Vec<String>,
+    /// Share of the pixels and Gaussians of rooms to keep.
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = positive)]
+    pub scale: f64,
     /// Steps measured per case, after warming up.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub repeats: u32,

@@ -130,10 +130,25 @@ pub fn blend_tiles_backward(
         behind = left * (background[0] * g_red + background[1] * g_green + background[2] * g_blue - upstream[at + 3 * pixels]);
     }
     let mut start = 0u32;
-    let mut i = 0u32;
+    let mut end = 0u32;
     if (tile as usize) + 1 < starts.len() {
         start = starts[tile as usize];
-        i = starts[tile as usize + 1];
+        end = starts[tile as usize + 1];
+    }
+    // Behind the last Gaussian that any pixel of the tile shows, there is nothing to derive.
+    let deepest = Shared::<[Atomic<u32>]>::new_slice(1usize);
+    if UNIT_POS == 0 {
+        deepest[0].store(start);
+    }
+    sync_cube();
+    deepest[0].fetch_max(stop);
+    sync_cube();
+    let mut i = deepest[0].load();
+    let unseen = (end - i) as usize * RECORD;
+    let mut k = unit;
+    while k < unseen {
+        records[RECORD * sorted[i as usize + k / RECORD] as usize + k % RECORD] = 0.0;
+        k += TILE_PIXELS;
     }
     while i > start {
         i -= 1;

@@ -6,6 +6,7 @@ use crate::columns::gaussian_rate;
 use crate::schedule::Stage;
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::ops::photometric::photometric_loss;
+use cc4dgs_backends::ops::picture::picture_planes;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, EventSink, RenderSettings, Result, Splats};
 use std::time::Instant;
@@ -61,10 +62,7 @@ impl Context<'_> {
             let probe = Tensor::<2>::zeros([n, 2], &autodiff).require_grad();
             splats.screen_probe = Some(probe.clone());
             let output = self.rasterizer.render(&splats, camera, &settings)?;
-            let frame = scene.frame(view)?;
-            let (w, h) = (camera.width as usize, camera.height as usize);
-            let planes = frame.to_planes(background_rgb);
-            let target = Tensor::<3>::from_inner(Tensor::from_data(TensorData::new(planes, [3, h, w]), &self.device));
+            let target = Tensor::<3>::from_inner(picture_planes(&scene.frame(view)?, background_rgb, &self.device));
             let photometric = photometric_loss(output.planes, target, train.lambda_c)?;
             if read {
                 log.psnr(photometric.numbers()?.psnr_db());

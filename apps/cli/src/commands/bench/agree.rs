@@ -2,7 +2,6 @@
 
 use crate::args::BenchAgree;
 use crate::commands::{Context, evenly};
-use crate::interrupt;
 use crate::model_source::{load_model, open_scene};
 use cc4dgs_core::{Error, Result};
 use cc4dgs_engine::agreement::{Agreement, agreement};
@@ -19,7 +18,6 @@ struct AgreeReport {
 /// Draws the views of a split on several devices and compares the pictures.
 pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
     let events = context.listeners(None)?;
-    interrupt::stop_flag()?;
     let mut models = Vec::new();
     for name in &args.devices {
         let (device, rasterizer) = name.split_once('/').map_or((name.as_str(), None), |(device, rasterizer)| (device, Some(rasterizer)));

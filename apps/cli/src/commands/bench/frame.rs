@@ -1,19 +1,21 @@
 //! Playback of a room with people: field and rasterizer, frame by frame, and the field's own costs.
 
-use super::Spread;
+use super::{Spread, rooms};
 use crate::args::BenchFrame;
 use crate::commands::Context;
+use crate::interrupt;
 use crate::model_source::resolved_device;
 use burn::tensor::{Tensor, TensorData};
-use cc4dgs_backends::bench::{ROOM_CASES, RoomCase, StepCase, room};
+use cc4dgs_backends::bench::{RoomCase, growth, room, shrunk};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Event, EventSink, FieldContext, Result, Seed, config, parse_device, unknown_name};
+use cc4dgs_core::{Event, EventSink, FieldContext, Result, Seed, config, parse_device};
 use cc4dgs_engine::config::{RenderConfig, RunConfig};
 use cc4dgs_engine::model::{Model, ModelField, ModelSize};
 use cc4dgs_engine::play::{PlayWork, Player};
 use cc4dgs_engine::train::Moving;
 use serde::Serialize;
+use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 /// Frames drawn before the clock counts: caches fill and kernels compile.
@@ -67,8 +69,13 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     }
     let config: RunConfig = config::parse_section("configuration", &table)?;
     let mut cases = Vec::new();
-    let wanted = selected(args)?;
+    let wanted = if args.growth { growth().iter().map(|case| shrunk(case, args.scale)).collect() } else { rooms(&args.case, args.scale)? };
+    let stop = interrupt::stop_flag()?;
     for (done, case) in wanted.iter().enumerate() {
+        // What was measured so far is worth keeping.
+        if done > 0 && stop.load(Ordering::Relaxed) {
+            break;
+        }
         cases.push(time_case(context, case, &config, &device, args)?);
         events.emit(&Event::Progress { task: "bench".into(), done: done as u64 + 1, total: wanted.len() as u64 });
     }
@@ -85,30 +92,8 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     context.output.result(&report, || text(&report))
 }
 
-/// The cases asked for, shrunk by `--scale` (pictures and Gaussians alike).
-fn selected(args: &BenchFrame) -> Result<Vec<RoomCase>> {
-    let names = ROOM_CASES.iter().map(|c| c.name);
-    if let Some(unknown) = args.case.iter().find(|name| !names.clone().any(|n| n == name.as_str())) {
-        return Err(unknown_name("--case", unknown, names));
-    }
-    let shrink = |v: f64, by: f64| (v * by).round().max(1.0);
-    Ok(ROOM_CASES
-        .iter()
-        .filter(|c| args.case.is_empty() || args.case.iter().any(|name| name == c.name))
-        .map(|c| {
-            let side = args.scale.sqrt();
-            let size = StepCase {
-                width: shrink(f64::from(c.size.width), side) as u32,
-                height: shrink(f64::from(c.size.height), side) as u32,
-                gaussians: shrink(c.size.gaussians as f64, args.scale) as usize,
-            };
-            RoomCase { size, ..*c }
-        })
-        .collect())
-}
-
 fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &burn::tensor::Device, args: &BenchFrame) -> Result<FrameCase> {
-    let seed = Seed::root(args.seed).child("bench").child(case.name);
+    let seed = Seed::root(args.seed).child("bench").child(&case.name);
     let workload = room(case, seed);
     let moving = Moving::Scored { zeta: 0.0 };
     let rows = moving.rows(&workload.gaussians.dynamic_scores).unwrap_or_default();
@@ -123,7 +108,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
     let mut field = context.registry.build_deformer(&config.deformer, &field_context, device)?;
     let means: Vec<f32> = rows.iter().flat_map(|&i| workload.gaussians.means[3 * i..3 * i + 3].to_vec()).collect();
     let means = Tensor::<2>::from_data(TensorData::new(means, [rows.len(), 3]), device);
-    let (field_spatial, field_forward_backward) = time_field(field.as_mut(), means, args.frames)?;
+    let (field_spatial, field_forward_backward) = time_field(field.as_mut(), means, args.frames.min(10))?;
 
     let (n, camera) = (workload.gaussians.len(), workload.camera);
     let model = Model {
@@ -164,7 +149,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
     play(WARM_UP)?;
     let playback_ms = play(args.frames as usize)?;
     Ok(FrameCase {
-        name: case.name.into(),
+        name: case.name.to_string(),
         width: camera.width,
         height: camera.height,
         gaussians: n,

@@ -12,7 +12,8 @@ pub use frame::frame;
 pub use parts::{loss, sort};
 pub use step::step;
 
-use cc4dgs_core::Result;
+use cc4dgs_backends::bench::{ROOM_CASES, RoomCase, shrunk};
+use cc4dgs_core::{Result, unknown_name};
 use std::time::Instant;
 
 /// Runs that are not counted: caches fill and kernels compile.
@@ -29,6 +30,15 @@ pub fn timed(repeats: usize, mut run: impl FnMut() -> Result<()>) -> Result<Spre
         }
     }
     Ok(Spread::of(times))
+}
+
+/// The rooms of these names (all if there are none), shrunk to a share of their pixels and Gaussians.
+pub fn rooms(names: &[String], share: f64) -> Result<Vec<RoomCase>> {
+    if let Some(unknown) = names.iter().find(|name| !ROOM_CASES.iter().any(|c| c.name == name.as_str())) {
+        return Err(unknown_name("--case", unknown, ROOM_CASES.iter().map(|c| c.name.as_ref())));
+    }
+    let wanted = |case: &&RoomCase| names.is_empty() || names.iter().any(|name| case.name == name.as_str());
+    Ok(ROOM_CASES.iter().filter(wanted).map(|case| shrunk(case, share)).collect())
 }
 
 /// Middle and spread of some times.

@@ -1,0 +1,79 @@
+//! Pictures from 8-bit files.
+
+use super::tensor::{UNITS, cubes_for, empty, floats, upload};
+use crate::ops::picture::PictureOps;
+use burn::backend::tensor::{FloatTensor, IntTensor};
+use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::tensor::CubeTensor;
+use cc4dgs_core::Image8;
+use cubecl::prelude::*;
+use std::sync::Arc;
+
+/// Byte `at` of words that hold four each, lowest first, as 0..1.
+#[cube]
+fn byte(words: &[u32], at: usize) -> f32 {
+    ((words[at / 4] >> ((at % 4) as u32 * 8)) & 255u32) as f32 / 255.0
+}
+
+/// planes [3,H,W] of interleaved bytes.
+#[cube(launch)]
+fn unpack(words: &[u32], background: &[f32], planes: &mut [f32], pixels: u32, #[comptime] channels: usize) {
+    let (pixel, plane) = (ABSOLUTE_POS % pixels as usize, ABSOLUTE_POS / pixels as usize);
+    if plane < 3usize {
+        let mut alpha = 1.0f32;
+        if comptime!(channels == 4) {
+            alpha = byte(words, pixel * channels + 3);
+        }
+        planes[ABSOLUTE_POS] = alpha * byte(words, pixel * channels + plane) + (1.0 - alpha) * background[plane];
+    }
+}
+
+/// 0..1 as a byte, rounded half up; what is no number is black.
+#[cube]
+fn rounded(value: f32) -> u32 {
+    let low = select(value > 0.0, value, 0.0f32);
+    (select(low < 1.0, low, 1.0f32) * 255.0 + 0.5) as u32
+}
+
+/// words [H W] of planes [C,H,W].
+#[cube(launch)]
+fn pack(planes: &[f32], words: &mut [u32]) {
+    let pixels = words.len();
+    if ABSOLUTE_POS < pixels {
+        let (red, green) = (rounded(planes[ABSOLUTE_POS]), rounded(planes[pixels + ABSOLUTE_POS]));
+        words[ABSOLUTE_POS] = red | (green << 8) | (rounded(planes[2 * pixels + ABSOLUTE_POS]) << 16) | 0xff00_0000u32;
+    }
+}
+
+impl PictureOps for CubeBackend {
+    fn words(planes: FloatTensor<Self>) -> IntTensor<Self> {
+        let planes = into_contiguous(planes);
+        let pixels = planes.meta.shape()[1] * planes.meta.shape()[2];
+        let words = empty(&planes, [pixels], DType::U32);
+        let client = planes.client.clone();
+        let arguments = (planes.into_buffer_arg(), words.clone().into_buffer_arg());
+        pack::launch(&client, cubes_for(pixels), CubeDim::new_1d(UNITS), arguments.0, arguments.1);
+        CubeTensor::new_contiguous(words.client.clone(), words.device.clone(), words.meta.shape().clone(), words.handle.clone(), DType::I32)
+    }
+    fn planes(like: FloatTensor<Self>, picture: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
+        let (width, height) = (picture.width as usize, picture.height as usize);
+        let planes = floats(&like, [3, height, width]);
+        let words: Vec<u32> = picture.data.chunks(4).map(|b| b.iter().rev().fold(0, |word, &byte| word << 8 | u32::from(byte))).collect();
+        let client = like.client.clone();
+        let (w, b) = (upload(&like, &words, DType::U32).into_buffer_arg(), upload(&like, &background, DType::F32).into_buffer_arg());
+        let pixels = width * height;
+        unpack::launch(
+            &client,
+            cubes_for(3 * pixels),
+            CubeDim::new_1d(UNITS),
+            w,
+            b,
+            planes.clone().into_buffer_arg(),
+            pixels as u32,
+            if picture.channels == 4 { 4 } else { 3 },
+        );
+        planes
+    }
+}
