@@ -4,6 +4,7 @@
 
 mod adam;
 mod field;
+mod lookup;
 mod photometric;
 mod picture;
 mod raster;

@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod field;
+pub mod lookup;
 pub mod photometric;
 pub mod picture;
 pub mod rasterize;

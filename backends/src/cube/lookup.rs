@@ -1,0 +1,229 @@
+//! Interpolated lookups in grids of stored features; the arithmetic of `cpu::lookup`.
+
+use super::sort::sort_pairs;
+use super::tensor::{UNITS, cubes_for, empty, floats, upload};
+use crate::ops::lookup::{GridShape, LookupBackward, LookupOps, Outside, PRIMES};
+use burn::backend::tensor::FloatTensor;
+use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::tensor::CubeTensor;
+use cubecl::prelude::*;
+use std::sync::Arc;
+
+/// Words per level: sizes, bits of scales, first row, rows, whether hashed.
+const WORDS: usize = 11;
+
+fn words(shape: &GridShape) -> Vec<u32> {
+    let level = |l: &crate::ops::lookup::GridLevel| {
+        let scales = l.scale.map(f32::to_bits);
+        l.size.into_iter().chain(scales).chain([l.first_row as u32, l.rows as u32, u32::from(l.hashed)]).collect::<Vec<_>>()
+    };
+    shape.levels.iter().flat_map(level).collect()
+}
+
+/// What the kernels know of a grid while they are compiled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+struct Rules {
+    dims: usize,
+    staggered: bool,
+    smooth: bool,
+    clamps: bool,
+    zero_outside: bool,
+}
+
+impl Rules {
+    fn of(shape: &GridShape) -> Self {
+        Self {
+            dims: shape.dims,
+            staggered: shape.stagger != 0.0,
+            smooth: shape.smooth,
+            clamps: shape.clamps,
+            zero_outside: shape.outside == Outside::Zero,
+        }
+    }
+}
+
+/// Lower vertex of a coordinate on an axis of a level, and how far it is past it.
+#[cube]
+fn along(raw: f32, size: u32, scale: f32, #[comptime] rules: Rules) -> (u32, f32) {
+    let low = select(raw > 0.0, raw, 0.0f32);
+    let mut position = select(low < 1.0, low, 1.0f32) * scale;
+    if comptime!(rules.staggered) {
+        position += 0.5;
+    }
+    let mut floor = position.floor();
+    if comptime!(rules.clamps) {
+        let last = (size - 2) as f32;
+        floor = select(floor < last, floor, last);
+    }
+    let mut part = position - floor;
+    if comptime!(rules.smooth) {
+        part = part * part * (3.0 - 2.0 * part);
+    }
+    (floor as u32, part)
+}
+
+/// Row and weight of a corner of the cell of a point on a level; weight 0 where the grid has nothing.
+#[cube]
+fn corner(points: &[f32], levels: &[u32], point: usize, level: usize, corner: u32, #[comptime] rules: Rules) -> (u32, f32) {
+    let at = level * 11usize;
+    let mut weight = 1.0f32;
+    let mut hash = 0u32;
+    let mut index = 0u32;
+    let mut stride = 1u32;
+    #[unroll]
+    for d in 0..comptime!(rules.dims) {
+        let raw = points[point * rules.dims + d];
+        let size = levels[at + d];
+        let (low, part) = along(raw, size, f32::reinterpret(levels[at + 4 + d]), rules);
+        if comptime!(rules.zero_outside) {
+            // False for what is no number, too.
+            weight = select(raw >= 0.0 && raw <= 1.0, weight, 0.0f32);
+        }
+        let upper = (corner >> comptime!(d as u32)) & 1u32;
+        weight *= select(upper == 1, part, 1.0 - part);
+        let vertex = low + upper;
+        hash ^= vertex * comptime!(PRIMES[d]);
+        index += vertex * stride;
+        stride *= size;
+    }
+    let row = select(levels[at + 10] == 1, hash, index) % levels[at + 9];
+    (levels[at + 8] + row, weight)
+}
+
+/// out [M, levels * features], a unit per number.
+#[cube(launch)]
+fn look_up(table: &[f32], points: &[f32], levels: &[u32], out: &mut [f32], features: u32, level_count: u32, #[comptime] rules: Rules) {
+    if ABSOLUTE_POS < out.len() {
+        let f = features as usize;
+        let width = level_count as usize * f;
+        let (point, column) = (ABSOLUTE_POS / width, ABSOLUTE_POS % width);
+        let mut sum = 0.0f32;
+        for c in 0..comptime!(1u32 << rules.dims) {
+            let (row, weight) = corner(points, levels, point, column / f, c, rules);
+            sum += weight * table[row as usize * f + column % f];
+        }
+        out[ABSOLUTE_POS] = sum;
+    }
+}
+
+/// The row of every (point, level, corner) slot.
+#[cube(launch)]
+fn rows_of_slots(points: &[f32], levels: &[u32], rows: &mut [u32], slots: &mut [u32], level_count: u32, #[comptime] rules: Rules) {
+    if ABSOLUTE_POS < rows.len() {
+        let corners = comptime!(1usize << rules.dims);
+        let cell = ABSOLUTE_POS / corners;
+        let (row, _) = corner(points, levels, cell / level_count as usize, cell % level_count as usize, (ABSOLUTE_POS % corners) as u32, rules);
+        rows[ABSOLUTE_POS] = row;
+        slots[ABSOLUTE_POS] = ABSOLUTE_POS as u32;
+    }
+}
+
+/// Gradient of the table: each row finds its slots among the sorted ones and visits them in order.
+#[cube(launch)]
+fn gather(
+    sorted: &[u32],
+    slots: &[u32],
+    points: &[f32],
+    levels: &[u32],
+    grad: &[f32],
+    out: &mut [f32],
+    features: u32,
+    level_count: u32,
+    #[comptime] rules: Rules,
+) {
+    if ABSOLUTE_POS < out.len() {
+        let (f, count) = (features as usize, level_count as usize);
+        let (row, feature) = ((ABSOLUTE_POS / f) as u32, ABSOLUTE_POS % f);
+        let mut low = 0usize.runtime();
+        let mut high = sorted.len();
+        while low < high {
+            let middle = (low + high) / 2;
+            if sorted[middle] < row {
+                low = middle + 1;
+            } else {
+                high = middle;
+            }
+        }
+        let corners = comptime!(1usize << rules.dims);
+        let mut sum = 0.0f32;
+        let mut more = low < sorted.len();
+        while more {
+            if sorted[low] == row {
+                let slot = slots[low] as usize;
+                let cell = slot / corners;
+                let (_, weight) = corner(points, levels, cell / count, cell % count, (slot % corners) as u32, rules);
+                sum += weight * grad[cell * f + feature];
+                low += 1;
+                more = low < sorted.len();
+            } else {
+                more = false;
+            }
+        }
+        out[ABSOLUTE_POS] = sum;
+    }
+}
+
+impl LookupOps for CubeBackend {
+    fn lookup(table: FloatTensor<Self>, points: FloatTensor<Self>, shape: Arc<GridShape>) -> FloatTensor<Self> {
+        let (table, points) = (into_contiguous(table), into_contiguous(points));
+        let m = points.meta.shape()[0];
+        let out = floats(&points, [m, shape.width()]);
+        let client = points.client.clone();
+        let levels = upload(&points, &words(&shape), DType::U32);
+        look_up::launch(
+            &client,
+            cubes_for(m * shape.width()),
+            CubeDim::new_1d(UNITS),
+            table.into_buffer_arg(),
+            points.into_buffer_arg(),
+            levels.into_buffer_arg(),
+            out.clone().into_buffer_arg(),
+            shape.features as u32,
+            shape.levels.len() as u32,
+            Rules::of(&shape),
+        );
+        out
+    }
+}
+
+impl LookupBackward for CubeBackend {
+    fn lookup_backward(points: FloatTensor<Self>, shape: Arc<GridShape>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        let (points, grad): (CubeTensor, CubeTensor) = (into_contiguous(points), into_contiguous(grad));
+        debug_assert_eq!(words(&shape).len(), WORDS * shape.levels.len());
+        let client = points.client.clone();
+        let dim = CubeDim::new_1d(UNITS);
+        let count = (points.meta.shape()[0] * shape.levels.len()) << shape.dims;
+        let levels = upload(&points, &words(&shape), DType::U32);
+        let (rows, slots) = (empty(&points, [count], DType::U32), empty(&points, [count], DType::U32));
+        rows_of_slots::launch(
+            &client,
+            cubes_for(count),
+            dim,
+            points.clone().into_buffer_arg(),
+            levels.clone().into_buffer_arg(),
+            rows.clone().into_buffer_arg(),
+            slots.clone().into_buffer_arg(),
+            shape.levels.len() as u32,
+            Rules::of(&shape),
+        );
+        let (sorted, slots) = sort_pairs(rows, slots, count, usize::BITS - shape.rows().leading_zeros());
+        let out = floats(&grad, [shape.parameter_count()]);
+        gather::launch(
+            &client,
+            cubes_for(shape.parameter_count()),
+            dim,
+            sorted.into_buffer_arg(),
+            slots.into_buffer_arg(),
+            points.into_buffer_arg(),
+            levels.into_buffer_arg(),
+            grad.into_buffer_arg(),
+            out.clone().into_buffer_arg(),
+            shape.features as u32,
+            shape.levels.len() as u32,
+            Rules::of(&shape),
+        );
+        out
+    }
+}
