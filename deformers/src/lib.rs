@@ -2,5 +2,10 @@
 
 pub mod basis;
 pub mod cdf;
+pub mod deform_mlp;
+pub mod embedding;
+pub mod grid4d;
+pub mod hexplane;
 pub mod none;
 pub mod parts;
+pub mod swift4d;

@@ -34,13 +34,7 @@ struct Rules {
 
 impl Rules {
     fn of(shape: &GridShape) -> Self {
-        Self {
-            dims: shape.dims,
-            staggered: shape.stagger != 0.0,
-            smooth: shape.smooth,
-            clamps: shape.clamps,
-            zero_outside: shape.outside == Outside::Zero,
-        }
+        Self { dims: shape.dims, staggered: shape.stagger != 0.0, smooth: shape.smooth, clamps: shape.clamps, zero_outside: shape.outside == Outside::Zero }
     }
 }
 

@@ -84,12 +84,34 @@ pub struct SpatialFeatures {
     pub work: FieldWork,
 }
 
+/// A number or vector that a field keeps per Gaussian, learned beside its weights. It lives among the Gaussians' extra attributes: it grows and is pruned with
+/// them, and goes into checkpoints and archives.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AttributeSpec {
+    /// Name of the extra attribute.
+    pub name: String,
+    /// Floats per Gaussian.
+    pub width: usize,
+    /// What every float starts as.
+    pub start: f32,
+    /// Learning rate (Adam).
+    pub lr: f64,
+}
+
 /// A deformation field: canonical Gaussians in, offsets at a time out (paper Section IV-B).
 ///
 /// The time-invariant half is a call of its own so that playback can cache it; training recomputes it every step.
 pub trait DeformationField: Send {
     /// Features of the canonical centres `means_world` [M,3]; no gradient flows to the centres.
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures>;
+    /// What the field keeps per Gaussian; see [`DeformationField::spatial_with`].
+    fn attributes(&self) -> Vec<AttributeSpec> {
+        Vec::new()
+    }
+    /// As [`DeformationField::spatial`], for a field with [`DeformationField::attributes`]: their values [M,width], in that order, through which gradients flow.
+    fn spatial_with(&self, means_world: Tensor<2>, _attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
+        self.spatial(means_world)
+    }
     /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F].
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
     /// The weights, in a fixed order.

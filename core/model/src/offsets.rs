@@ -3,17 +3,26 @@
 use crate::Gaussians;
 use burn::tensor::{Int, Tensor};
 
+/// Scales that changes would take below this stay there, world units.
+const LEAST_SCALE: f32 = 1e-7;
+/// Norms of quaternions are not taken for smaller than this.
+const LEAST_NORM: f32 = 1e-12;
+
 /// Time-dependent changes of M Gaussians (a row per Gaussian the field was asked about). Every head is optional.
 ///
-/// Offsets are added to the raw parameters, before activation (paper Section IV-B, `facts` of Swift4D and 4DGS).
+/// Offsets are added to the raw parameters, before activation (paper Section IV-B; Swift4D, 4DGS, E-D3DGS), except where a field says otherwise.
 #[derive(Clone, Debug, Default)]
 pub struct Offsets {
     /// Change of the centres in world units [M,3].
     pub means: Option<Tensor<2>>,
     /// Change of the log-scales [M,3].
     pub log_scales: Option<Tensor<2>>,
+    /// Change of the scales after activation, world units [M,3] (Deformable 3DGS, Grid4D). Results stay positive.
+    pub scales: Option<Tensor<2>>,
     /// Change of the raw quaternions [M,4].
     pub quaternions: Option<Tensor<2>>,
+    /// Whether quaternions are normalised before they are changed (Deformable 3DGS, Grid4D).
+    pub unit_quaternions: bool,
     /// Change of the opacity logits [M].
     pub opacity_logits: Option<Tensor<1>>,
     /// Change of all spherical-harmonics coefficients, degree 0 first [M, (d+1)^2, 3].
@@ -27,7 +36,20 @@ impl Offsets {
         let mut moved = canonical.clone();
         moved.means = add(moved.means, self.means, rows);
         moved.log_scales = add(moved.log_scales, self.log_scales, rows);
-        moved.quaternions = add(moved.quaternions, self.quaternions, rows);
+        if let Some(scales) = self.scales {
+            let before = select(&moved.log_scales, rows);
+            let after = (before.clone().exp() + scales).clamp_min(LEAST_SCALE).log();
+            moved.log_scales = add(moved.log_scales, Some(after - before), rows);
+        }
+        let quaternions = self.quaternions.map(|change| {
+            if !self.unit_quaternions {
+                return change;
+            }
+            let raw = select(&moved.quaternions, rows);
+            let norm = raw.clone().powi_scalar(2).sum_dim(1).sqrt().clamp_min(LEAST_NORM);
+            raw.clone() / norm - raw + change
+        });
+        moved.quaternions = add(moved.quaternions, quaternions, rows);
         moved.opacity_logits = add(moved.opacity_logits, self.opacity_logits, rows);
         if let Some(sh) = self.sh {
             let [m, k, _] = sh.dims();
@@ -53,10 +75,18 @@ impl Offsets {
         let mut parts: Vec<Tensor<2>> = Vec::new();
         parts.extend(self.means.clone());
         parts.extend(self.log_scales.clone());
+        parts.extend(self.scales.clone());
         parts.extend(self.quaternions.clone());
         parts.extend(self.opacity_logits.clone().map(|o| o.unsqueeze_dim(1)));
         parts.extend(self.sh.clone().map(|s| s.flatten(1, 2)));
         if parts.is_empty() { None } else { Some(Tensor::cat(parts, 1)) }
+    }
+}
+
+fn select(values: &Tensor<2>, rows: Option<&Tensor<1, Int>>) -> Tensor<2> {
+    match rows {
+        None => values.clone(),
+        Some(rows) => values.clone().select(0, rows.clone()),
     }
 }
 

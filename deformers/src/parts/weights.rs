@@ -2,6 +2,7 @@
 //! ReLU layers between time and motion shrink it a hundredfold, the biases take over, and Adam then kills the trunk before anything moves.
 //! Decoders normalise their layers themselves and use that default.
 
+use burn::tensor::Tensor;
 use cc4dgs_backends::ops::field::{MishShape, ReluShape};
 use cc4dgs_core::Seed;
 use rand::Rng;
@@ -66,4 +67,38 @@ pub fn head(seed: Seed, width: usize, output: usize) -> Vec<f32> {
     let mut out = rectified(seed, width, width);
     out.extend(std::iter::repeat_n(0.0, (width + 1) * output));
     out
+}
+
+/// A linear layer as PyTorch's `nn.Linear` starts: W [input, output] and b [output] uniform in ±1/sqrt(inputs).
+pub fn torch(seed: Seed, input: usize, output: usize) -> Vec<f32> {
+    decoder_layer(seed, input, output)
+}
+
+/// W [input, output] uniform in ±sqrt(6 / (input + output)) (Glorot), without a bias.
+pub fn glorot(seed: Seed, input: usize, output: usize) -> Vec<f32> {
+    uniform(seed, input * output, (6.0 / (input + output) as f32).sqrt())
+}
+
+/// `count` numbers in ±`bound`.
+pub fn uniform(seed: Seed, count: usize, bound: f32) -> Vec<f32> {
+    let mut random = seed.rng();
+    (0..count).map(|_| random.random_range(-bound..=bound)).collect()
+}
+
+/// A linear layer with Glorot weights and PyTorch's bias, as 4DGS and E-D3DGS start.
+pub fn glorot_with_bias(seed: Seed, input: usize, output: usize) -> Vec<f32> {
+    let bias = uniform(seed.child("bias"), output, 1.0 / (input.max(1) as f32).sqrt());
+    glorot(seed.child("matrix"), input, output).into_iter().chain(bias).collect()
+}
+
+/// The flat weights of layers that have no bias, given their matrices one after another: zeros are laid between.
+pub fn without_biases(matrices: Tensor<1>, layers: &[(usize, usize)]) -> Tensor<1> {
+    let mut at = 0;
+    let mut parts = Vec::with_capacity(2 * layers.len());
+    for &(input, output) in layers {
+        parts.push(matrices.clone().narrow(0, at, input * output));
+        parts.push(Tensor::zeros([output], &matrices.device()));
+        at += input * output;
+    }
+    Tensor::cat(parts, 0)
 }

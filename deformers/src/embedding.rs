@@ -1,0 +1,187 @@
+//! E-D3DGS's field: no coordinates, but a learned vector per Gaussian and one per time, into a coarse and a fine network (Bae et al. 2024).
+//!
+//! The table of times is read by linear interpolation, resized first: the coarse network sees few rows, the fine one all of it. The
+//! published code's time offsets per camera are left out; a model here has no cameras.
+
+use crate::parts::centres::check_time;
+use crate::parts::heads::{self, Head};
+use crate::parts::settings::within;
+use crate::parts::voxels::parameter;
+use crate::parts::weights;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_core::{
+    AttributeSpec, DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
+    inventory,
+};
+use serde::Deserialize;
+use std::sync::Arc;
+
+const SCHEMA: &str = r#"gaussian_features = 32   # learned per Gaussian
+time_features = 256      # learned per time
+time_rows = 150          # rows of the table of times (published: 150, Technicolor 25)
+coarse_rows = 30         # what the coarse network sees of it (30; Technicolor 5)
+width = 128
+heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
+gaussian_lr = 2.5e-3     # Adam on what is learned per Gaussian
+lr_start = 1.6e-4        # and on the rest, times the extent of the cameras, log-linear to lr_end
+lr_end = 1.6e-5
+"#;
+
+/// Name of the attribute among the Gaussians' extras.
+const ATTRIBUTE: &str = "embedding";
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    gaussian_features: usize,
+    time_features: usize,
+    time_rows: usize,
+    coarse_rows: usize,
+    width: usize,
+    heads: Vec<Head>,
+    gaussian_lr: f64,
+    lr_start: f64,
+    lr_end: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            gaussian_features: 32,
+            time_features: 256,
+            time_rows: 150,
+            coarse_rows: 30,
+            width: 128,
+            heads: vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh],
+            gaussian_lr: 2.5e-3,
+            lr_start: 1.6e-4,
+            lr_end: 1.6e-5,
+        }
+    }
+}
+
+/// Parameters: table of times, coarse network, fine network.
+struct Embedding {
+    settings: Settings,
+    sh_degree: usize,
+    network: Arc<ReluShape>,
+    parameters: Vec<Parameter>,
+}
+
+impl Embedding {
+    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+        within("gaussian_features", settings.gaussian_features, 1, 1024)?;
+        within("time_features", settings.time_features, 1, 4096)?;
+        within("time_rows", settings.time_rows, 2, 100_000)?;
+        within("coarse_rows", settings.coarse_rows, 2, settings.time_rows)?;
+        within("width", settings.width, 1, 4096)?;
+        heads::check(&settings.heads)?;
+        let (w, input) = (settings.width, settings.gaussian_features + settings.time_features);
+        let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
+        let seed = context.seed;
+        // Normal with deviation 0.01 / sqrt(width), by its uniform counterpart.
+        let bound = 0.01 * 3f32.sqrt() / (settings.time_features as f32).sqrt();
+        let times = weights::uniform(seed.child("times"), settings.time_rows * settings.time_features, bound);
+        let mut parameters = vec![parameter("grid.times".into(), Part::Grid, 0, times, device)];
+        for name in ["coarse", "fine"] {
+            let own = seed.child(name);
+            let mut values = weights::glorot_with_bias(own.child("trunk"), input, w);
+            for (i, head) in network.heads.iter().enumerate() {
+                values.extend(weights::glorot_with_bias(own.index(i as u64).child("first"), w, w));
+                values.extend(weights::glorot_with_bias(own.index(i as u64).child("second"), w, head[1]));
+            }
+            parameters.push(parameter(format!("net.{name}"), Part::Net, 0, values, device));
+        }
+        Ok(Self { sh_degree: context.sh_degree, network: Arc::new(network), parameters, settings })
+    }
+    /// The row [1, F] at a time of the table resized to `rows` rows, corners aligned.
+    fn time_row(&self, time_norm: f32, rows: usize) -> Tensor<2> {
+        let s = &self.settings;
+        let table = self.parameters[0].value.clone().reshape([s.time_rows, s.time_features]);
+        let between = |position: f64, last: usize| {
+            let low = (position.floor() as usize).min(last.saturating_sub(1));
+            (low, (position - low as f64) as f32)
+        };
+        // Two rows of the small table, each a mixture of two rows of the stored one: four weights.
+        let mut mixture = vec![0.0f32; s.time_rows];
+        let (low, part) = between(f64::from(time_norm.clamp(0.0, 1.0)) * (rows - 1) as f64, rows - 1);
+        for (row, share) in [(low, 1.0 - part), (low + 1, part)] {
+            let (first, rest) = between(row as f64 / (rows - 1) as f64 * (s.time_rows - 1) as f64, s.time_rows - 1);
+            mixture[first] += share * (1.0 - rest);
+            mixture[first + 1] += share * rest;
+        }
+        let mixture = Tensor::<2>::from_data(TensorData::new(mixture, [1, s.time_rows]), &table.device());
+        mixture.matmul(table)
+    }
+}
+
+impl DeformationField for Embedding {
+    fn attributes(&self) -> Vec<AttributeSpec> {
+        vec![AttributeSpec { name: ATTRIBUTE.into(), width: self.settings.gaussian_features, start: 0.0, lr: self.settings.gaussian_lr }]
+    }
+    /// Gaussians without a vector of their own get zeros, which is what they start as.
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let zeros = Tensor::zeros([means_world.dims()[0], self.settings.gaussian_features], &means_world.device());
+        self.spatial_with(means_world, &[zeros])
+    }
+    fn spatial_with(&self, means_world: Tensor<2>, attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
+        let [m, _] = means_world.dims();
+        match attributes {
+            [own] if own.dims() == [m, self.settings.gaussian_features] => {
+                Ok(SpatialFeatures { values: own.clone(), work: FieldWork { gaussians: m as u64, ..FieldWork::default() } })
+            }
+            _ => Err(cc4dgs_core::Error::parameter(
+                "deformer embedding",
+                format!("the Gaussians lack the attribute {ATTRIBUTE} of width {}", self.settings.gaussian_features),
+                "Load a model that was trained with this field",
+            )),
+        }
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        check_time(time_norm)?;
+        let m = features.dims()[0];
+        if m == 0 {
+            let empty = self.network.output_widths().into_iter().map(|width| Tensor::zeros([0, width], &features.device())).collect();
+            return Ok(heads::offsets(&self.settings.heads, empty, self.sh_degree));
+        }
+        let mut outputs: Option<Vec<Tensor<2>>> = None;
+        for (place, rows) in [(1, self.settings.coarse_rows), (2, self.settings.time_rows)] {
+            let input = Tensor::cat(vec![features.clone(), self.time_row(time_norm, rows).repeat_dim(0, m)], 1);
+            let own = mlp_relu(input, self.parameters[place].value.clone(), &self.network)?;
+            outputs = Some(match outputs {
+                None => own,
+                Some(coarse) => coarse.into_iter().zip(own).map(|(a, b)| a + b).collect(),
+            });
+        }
+        Ok(heads::offsets(&self.settings.heads, outputs.unwrap_or_default(), self.sh_degree))
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        let (lr_start, lr_end) = (self.settings.lr_start, self.settings.lr_end);
+        vec![ParameterGroup { name: "embedding".into(), lr_start, lr_end, warmup: 0.0, times_extent: true, epsilon: 1e-15, clip_norm: 0.0 }]
+    }
+}
+
+fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+    Ok(Box::new(Embedding::new(config::parse_section("deformer embedding", section)?, context, device)?))
+}
+
+inventory::submit! {
+    FieldPlugin {
+        info: Plugin {
+            name: "embedding",
+            version: "1",
+            summary: "learned vectors per Gaussian and per time, a coarse and a fine network",
+            paper: "E-D3DGS (Bae et al. 2024)",
+            schema: SCHEMA,
+            capabilities: &["differentiable", "per-gaussian-attributes"],
+        },
+        build,
+    }
+}

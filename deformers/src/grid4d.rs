@@ -1,0 +1,273 @@
+//! Grid4D's field: a spatial hash grid whose features, turned into attention, weigh those of three grids over pairs of axes and time (Xu et al. 2024).
+//!
+//! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are taken
+//! from the field's box rather than from a fixed bound per dataset. R(q) passes no gradient to the canonical centre.
+
+use crate::parts::centres::{check_time, column, finite, in_box};
+use crate::parts::settings::within;
+use crate::parts::voxels::parameter;
+use crate::parts::weights;
+use burn::tensor::activation::sigmoid;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
+use cc4dgs_core::{
+    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+};
+use rand::Rng;
+use serde::Deserialize;
+use std::sync::Arc;
+
+const SCHEMA: &str = r#"log2_rows = 19           # most rows of a level's table
+space_levels = 16        # of the spatial grid,
+space_base = 16          # from so many
+space_final = 2048       # to so many vertices per axis
+time_levels = 32         # of the three grids with time,
+time_base = [8, 8, 8]    # from so many
+time_final = [32, 32, 16]    # to so many vertices (published: [512, 512, 128] or [64, 64, 128] on N3DV)
+features = 2             # per level
+width = 256
+depth = 0                # hidden layers after the attention
+smooth_weight = 0.5      # of the squared difference of features at perturbed centres
+smooth_delta = 5e-3      # the perturbation, as a share of the box
+lr_grid_start = 8e-3     # Adam on the tables
+lr_grid_end = 8e-5
+lr_start = 8e-4          # and on the network
+lr_end = 1.6e-6
+"#;
+
+/// The axes of the three grids with time (3).
+const PLANES: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 3], [0, 2, 3]];
+const NAMES: [&str; 3] = ["xyt", "yzt", "xzt"];
+/// Times take up this middle part of their axis.
+const TIME_SHARE: f32 = 0.9;
+/// Table entries start uniform in ± this.
+const TABLE: f32 = 1e-4;
+/// Rotation and translation, quaternion, scales.
+const OUTPUTS: [usize; 3] = [7, 4, 3];
+/// Parameter groups by index.
+const NET: usize = 0;
+const GRID: usize = 1;
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    log2_rows: u32,
+    space_levels: usize,
+    space_base: u32,
+    space_final: u32,
+    time_levels: usize,
+    time_base: [u32; 3],
+    time_final: [u32; 3],
+    features: usize,
+    width: usize,
+    depth: usize,
+    smooth_weight: f32,
+    smooth_delta: f32,
+    lr_grid_start: f64,
+    lr_grid_end: f64,
+    lr_start: f64,
+    lr_end: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            log2_rows: 19,
+            space_levels: 16,
+            space_base: 16,
+            space_final: 2048,
+            time_levels: 32,
+            time_base: [8; 3],
+            time_final: [32, 32, 16],
+            features: 2,
+            width: 256,
+            depth: 0,
+            smooth_weight: 0.5,
+            smooth_delta: 5e-3,
+            lr_grid_start: 8e-3,
+            lr_grid_end: 8e-5,
+            lr_start: 8e-4,
+            lr_end: 1.6e-6,
+        }
+    }
+}
+
+/// A 3D grid whose axes grow geometrically from `base` to `last`.
+fn grid(levels: usize, features: usize, base: [u32; 3], last: [u32; 3], log2_rows: u32) -> GridShape {
+    let mut shape = GridShape { dims: 3, features, levels: Vec::new(), stagger: 0.0, smooth: true, clamps: false, outside: Outside::Zero };
+    for level in 0..levels {
+        let share = level as f64 / (levels - 1).max(1) as f64;
+        let scale: [f64; 3] = std::array::from_fn(|d| f64::from(base[d]) * (f64::from(last[d]) / f64::from(base[d])).powf(share) - 1.0);
+        shape.push(&scale.map(|s| s.ceil() as u32 + 1), &scale.map(|s| s as f32), 1 << log2_rows);
+    }
+    shape
+}
+
+/// Parameters: four tables, attention layer, temporal layer, what follows them.
+struct Grid4d {
+    settings: Settings,
+    context: FieldContext,
+    space: Arc<GridShape>,
+    time: Arc<GridShape>,
+    attention: Arc<ReluShape>,
+    temporal: Arc<ReluShape>,
+    network: Arc<ReluShape>,
+    parameters: Vec<Parameter>,
+}
+
+impl Grid4d {
+    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+        let s = &settings;
+        within("log2_rows", s.log2_rows as usize, 4, 24)?;
+        within("space_levels", s.space_levels, 1, 64)?;
+        within("time_levels", s.time_levels, 1, 64)?;
+        within("features", s.features, 1, 16)?;
+        within("width", s.width, 1, 4096)?;
+        within("depth", s.depth, 0, 16)?;
+        for (name, base, last) in
+            [("space_base", s.space_base, s.space_final)].into_iter().chain((0..3).map(|d| ("time_base", s.time_base[d], s.time_final[d])))
+        {
+            within(name, base as usize, 2, last.max(2) as usize)?;
+            within(name, last as usize, 2, 65_536)?;
+        }
+        let space = grid(s.space_levels, s.features, [s.space_base; 3], [s.space_final; 3], s.log2_rows);
+        let time = grid(s.time_levels, s.features, s.time_base, s.time_final, s.log2_rows);
+        let attention = ReluShape::chain(&[space.width(), s.width]);
+        let temporal = ReluShape { input: 3 * time.width(), trunk: vec![s.width], heads: Vec::new() };
+        let network = ReluShape { input: s.width, trunk: vec![s.width; s.depth], heads: OUTPUTS.iter().map(|&out| vec![out]).collect() };
+        let seed = context.seed;
+        let table = |name: &str, shape: &GridShape| {
+            parameter(format!("grid.{name}"), Part::Grid, GRID, weights::uniform(seed.child(name), shape.parameter_count(), TABLE), device)
+        };
+        let mut parameters = vec![table("xyz", &space)];
+        parameters.extend(NAMES.map(|name| table(name, &time)));
+        let mut add = |name: &str, layers: Vec<(usize, usize)>| {
+            let values = layers.into_iter().enumerate().flat_map(|(i, (a, b))| weights::torch(seed.child(name).index(i as u64), a, b)).collect();
+            parameters.push(parameter(format!("net.{name}"), Part::Net, NET, values, device));
+        };
+        add("attention", vec![(space.width(), s.width)]);
+        add("temporal", vec![(3 * time.width(), s.width)]);
+        add("heads", std::iter::repeat_n((s.width, s.width), s.depth).chain(OUTPUTS.map(|out| (s.width, out))).collect());
+        let (space, time, attention, temporal, network) = (Arc::new(space), Arc::new(time), Arc::new(attention), Arc::new(temporal), Arc::new(network));
+        Ok(Self { context: context.clone(), space, time, attention, temporal, network, parameters, settings })
+    }
+    fn weight(&self, place: usize) -> Tensor<1> {
+        self.parameters[place].value.clone()
+    }
+    /// Features of the three grids with time at positions [M,3] in the box, side by side.
+    fn with_time(&self, position: &Tensor<2>, time_norm: f32) -> Result<Tensor<2>> {
+        let time = column(position, 0.5 + TIME_SHARE * (time_norm - 0.5));
+        let points = Tensor::cat(vec![position.clone(), time], 1);
+        let found = PLANES.iter().enumerate().map(|(p, axes)| {
+            let own = Tensor::cat(axes.map(|axis| points.clone().narrow(1, axis, 1)).to_vec(), 1);
+            lookup(self.weight(1 + p), own, &self.time)
+        });
+        Ok(Tensor::cat(found.collect::<Result<Vec<_>>>()?, 1))
+    }
+}
+
+fn only(outputs: Vec<Tensor<2>>) -> Result<Tensor<2>> {
+    outputs.into_iter().next().ok_or_else(|| Error::backend("deformer grid4d", "a network returned no output", "Report this as a defect"))
+}
+
+/// R(q) x for quaternions [M,4] (w,x,y,z), divided by their squared norm, and points [M,3].
+fn rotate(q: Tensor<2>, x: Tensor<2>) -> Tensor<2> {
+    let part = |t: &Tensor<2>, k: usize| t.clone().narrow(1, k, 1);
+    let [w, a, b, c] = std::array::from_fn(|k| part(&q, k));
+    let [x0, x1, x2] = std::array::from_fn(|k| part(&x, k));
+    let norm = q.clone().powi_scalar(2).sum_dim(1).clamp_min(1e-12);
+    // x + 2 w (v × x) + 2 v × (v × x), with v the vector part.
+    let cross = |p: [&Tensor<2>; 3], r: [&Tensor<2>; 3]| -> [Tensor<2>; 3] {
+        std::array::from_fn(|k| p[(k + 1) % 3].clone() * r[(k + 2) % 3].clone() - p[(k + 2) % 3].clone() * r[(k + 1) % 3].clone())
+    };
+    let once = cross([&a, &b, &c], [&x0, &x1, &x2]);
+    let twice = cross([&a, &b, &c], [&once[0], &once[1], &once[2]]);
+    let turn = once.into_iter().zip(twice).map(|(once, twice)| (w.clone() * once + twice).mul_scalar(2.0) / norm.clone());
+    x + Tensor::cat(turn.collect(), 1)
+}
+
+impl DeformationField for Grid4d {
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let m = means_world.dims()[0];
+        let work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        if m == 0 {
+            return Ok(SpatialFeatures { values: Tensor::zeros([0, 6 + self.settings.width], &means_world.device()), work });
+        }
+        let position = in_box(means_world.clone(), &self.context);
+        let encoded = lookup(self.weight(0), position.clone(), &self.space)?;
+        let attention = sigmoid(only(mlp_relu(encoded, self.weight(4), &self.attention)?)?).mul_scalar(2.0) - 1.0;
+        Ok(SpatialFeatures { values: Tensor::cat(vec![finite(means_world), position, attention], 1), work })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        check_time(time_norm)?;
+        let m = features.dims()[0];
+        if m == 0 {
+            let [means, quaternions, scales] = [3, 4, 3].map(|width| Some(Tensor::zeros([0, width], &features.device())));
+            return Ok(Offsets { means, quaternions, unit_quaternions: true, scales, ..Offsets::default() });
+        }
+        let (x, position) = (features.clone().narrow(1, 0, 3), features.clone().narrow(1, 3, 3));
+        let attention = features.narrow(1, 6, self.settings.width);
+        let temporal = only(mlp_relu(self.with_time(&position, time_norm)?, self.weight(5), &self.temporal)?)?;
+        let outputs = mlp_relu(attention * temporal, self.weight(6), &self.network)?;
+        let [motion, quaternions, scales]: [Tensor<2>; 3] =
+            outputs.try_into().map_err(|_| Error::backend("deformer grid4d", "it has another number of heads", "Report this as a defect"))?;
+        let identity = Tensor::<2>::from_data(TensorData::new(vec![1.0f32, 0.0, 0.0, 0.0], [1, 4]), &motion.device());
+        let turned = rotate(motion.clone().narrow(1, 0, 4) + identity, x.clone());
+        let means = turned - x + motion.narrow(1, 4, 3);
+        Ok(Offsets { means: Some(means), quaternions: Some(quaternions), unit_quaternions: true, scales: Some(scales), ..Offsets::default() })
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        let s = &self.settings;
+        [("grid4d net", s.lr_start, s.lr_end), ("grid4d tables", s.lr_grid_start, s.lr_grid_end)]
+            .map(|(name, lr_start, lr_end)| ParameterGroup {
+                name: name.into(),
+                lr_start,
+                lr_end,
+                warmup: 0.0,
+                times_extent: false,
+                epsilon: 1e-15,
+                clip_norm: 0.0,
+            })
+            .to_vec()
+    }
+    /// Features at slightly other places shall be alike: squared differences, summed over channels and averaged over centres.
+    fn regularizer(&self, means_world: Tensor<2>, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
+        let s = &self.settings;
+        let m = means_world.dims()[0];
+        if m == 0 || s.smooth_weight <= 0.0 {
+            return Ok(None);
+        }
+        let mut random = self.context.seed.child("perturb").index(u64::from(progress.to_bits())).rng();
+        let shift: Vec<f32> = (0..3 * m).map(|_| random.random_range(-s.smooth_delta..=s.smooth_delta)).collect();
+        let here = in_box(means_world, &self.context);
+        let there = here.clone() + Tensor::<2>::from_data(TensorData::new(shift, [m, 3]), &here.device());
+        let squares = |a: Tensor<2>, b: Tensor<2>| (a - b).powi_scalar(2).sum().mul_scalar(s.smooth_weight / m as f32);
+        let still = squares(lookup(self.weight(0), here.clone(), &self.space)?, lookup(self.weight(0), there.clone(), &self.space)?);
+        Ok(Some(still + squares(self.with_time(&here, time_norm)?, self.with_time(&there, time_norm)?)))
+    }
+}
+
+fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+    Ok(Box::new(Grid4d::new(config::parse_section("deformer grid4d", section)?, context, device)?))
+}
+
+inventory::submit! {
+    FieldPlugin {
+        info: Plugin {
+            name: "grid4d",
+            version: "1",
+            summary: "four 3D hash grids, spatial attention over temporal features, rigid motion",
+            paper: "Grid4D (Xu et al. 2024)",
+            schema: SCHEMA,
+            capabilities: &["differentiable", "cached-spatial", "regularized"],
+        },
+        build,
+    }
+}

@@ -1,0 +1,240 @@
+//! 4DGS's field: six planes of features over the pairs of x, y, z and t at two resolutions, multiplied, then five heads (Wu et al. 2024).
+//!
+//! Its published code feeds times of 0..1 to planes that expect -1..1, so that half of the time axis is never read; `half_time` does the same.
+
+use crate::parts::centres::{check_time, column, in_box};
+use crate::parts::heads::{self, Head};
+use crate::parts::settings::within;
+use crate::parts::voxels::parameter;
+use crate::parts::weights;
+use burn::tensor::{Device, Tensor};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
+use cc4dgs_core::{
+    DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+};
+use rand::Rng;
+use serde::Deserialize;
+use std::sync::Arc;
+
+const SCHEMA: &str = r#"resolution = 64          # vertices per spatial axis of the first resolution
+multires = [1, 2]        # factors of the spatial axes; time keeps its vertices
+time_resolution = 150    # vertices of the time axis
+features = 16            # per plane
+width = 128              # of the network
+heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
+half_time = false        # read only the upper half of the time axis, as the published code does
+tv_space = 2e-4          # weight of the squared second differences of spatial planes,
+tv_time = 1e-3           # of the others along time,
+time_one = 1e-4          # and of the distance of the others from 1
+lr_start = 1.6e-4        # Adam on the network, times the extent of the cameras, log-linear to lr_end
+lr_end = 1.6e-5
+grid_rate = 10.0         # the planes' rate is this much higher
+"#;
+
+/// The axes of each plane; those with axis 3 see time.
+const PLANES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
+const TIME: usize = 3;
+/// Parameter groups by index.
+const NET: usize = 0;
+const GRID: usize = 1;
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    resolution: u32,
+    multires: Vec<u32>,
+    time_resolution: u32,
+    features: usize,
+    width: usize,
+    heads: Vec<Head>,
+    half_time: bool,
+    tv_space: f32,
+    tv_time: f32,
+    time_one: f32,
+    lr_start: f64,
+    lr_end: f64,
+    grid_rate: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            resolution: 64,
+            multires: vec![1, 2],
+            time_resolution: 150,
+            features: 16,
+            width: 128,
+            heads: vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh],
+            half_time: false,
+            tv_space: 2e-4,
+            tv_time: 1e-3,
+            time_one: 1e-4,
+            lr_start: 1.6e-4,
+            lr_end: 1.6e-5,
+            grid_rate: 10.0,
+        }
+    }
+}
+
+/// Parameters: six planes (all resolutions of each), the network.
+struct HexPlane {
+    settings: Settings,
+    context: FieldContext,
+    planes: Vec<Arc<GridShape>>,
+    network: Arc<ReluShape>,
+    parameters: Vec<Parameter>,
+}
+
+impl HexPlane {
+    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+        within("resolution", settings.resolution as usize, 2, 4096)?;
+        within("time_resolution", settings.time_resolution as usize, 2, 100_000)?;
+        within("multires", settings.multires.len(), 1, 8)?;
+        settings.multires.iter().try_for_each(|&m| within("multires", m as usize, 1, 64))?;
+        within("features", settings.features, 1, 256)?;
+        within("width", settings.width, 1, 4096)?;
+        heads::check(&settings.heads)?;
+        let seed = context.seed;
+        let (mut planes, mut parameters) = (Vec::new(), Vec::new());
+        for (p, axes) in PLANES.iter().enumerate() {
+            let mut shape =
+                GridShape { dims: 2, features: settings.features, levels: Vec::new(), stagger: 0.0, smooth: false, clamps: true, outside: Outside::Clamp };
+            for &factor in &settings.multires {
+                let size = axes.map(|axis| if axis == TIME { settings.time_resolution } else { settings.resolution * factor });
+                shape.push(&size, &size.map(|s| s as f32 - 1.0), usize::MAX);
+            }
+            let mut random = seed.child("planes").index(p as u64).rng();
+            let values = (0..shape.parameter_count()).map(|_| if axes[1] == TIME { 1.0 } else { random.random_range(0.1f32..0.5) }).collect();
+            parameters.push(parameter(format!("grid.{}", ["xy", "xz", "xt", "yz", "yt", "zt"][p]), Part::Grid, GRID, values, device));
+            planes.push(Arc::new(shape));
+        }
+        let (input, w) = (settings.features * settings.multires.len(), settings.width);
+        let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
+        let mut values = weights::glorot_with_bias(seed.child("trunk"), input, w);
+        for (i, head) in network.heads.iter().enumerate() {
+            let own = seed.child("heads").index(i as u64);
+            values.extend(weights::glorot_with_bias(own.child("first"), w, w));
+            values.extend(weights::glorot_with_bias(own.child("second"), w, head[1]));
+        }
+        parameters.push(parameter("net".into(), Part::Net, NET, values, device));
+        Ok(Self { settings, context: context.clone(), planes, network: Arc::new(network), parameters })
+    }
+    fn net(&self) -> Tensor<1> {
+        self.parameters[PLANES.len()].value.clone()
+    }
+    /// The product over the planes of `wanted` at points [M,4].
+    fn product(&self, points: &Tensor<2>, wanted: impl Fn(&[usize; 2]) -> bool) -> Result<Option<Tensor<2>>> {
+        let mut product: Option<Tensor<2>> = None;
+        for ((axes, shape), parameter) in PLANES.iter().zip(&self.planes).zip(&self.parameters) {
+            if !wanted(axes) {
+                continue;
+            }
+            let pair = Tensor::cat(axes.map(|axis| points.clone().narrow(1, axis, 1)).to_vec(), 1);
+            let found = lookup(parameter.value.clone(), pair, shape)?;
+            product = Some(match product {
+                Some(sofar) => sofar * found,
+                None => found,
+            });
+        }
+        Ok(product)
+    }
+}
+
+impl DeformationField for HexPlane {
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let m = means_world.dims()[0];
+        let work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        let position = in_box(means_world, &self.context);
+        if m == 0 {
+            return Ok(SpatialFeatures { values: Tensor::zeros([0, 3 + self.network.input], &position.device()), work });
+        }
+        // Half of the planes do not see time.
+        let still = Tensor::cat(vec![position.clone(), column(&position, 0.0)], 1);
+        let product = self.product(&still, |axes| axes[1] != TIME)?;
+        Ok(SpatialFeatures { values: Tensor::cat(std::iter::once(position).chain(product).collect(), 1), work })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        check_time(time_norm)?;
+        let (m, degree) = (features.dims()[0], self.context.sh_degree);
+        if m == 0 {
+            let empty = self.network.output_widths().into_iter().map(|width| Tensor::zeros([0, width], &features.device())).collect();
+            return Ok(heads::offsets(&self.settings.heads, empty, degree));
+        }
+        let time = if self.settings.half_time { 0.5 + 0.5 * time_norm } else { time_norm };
+        let position = features.clone().narrow(1, 0, 3);
+        let points = Tensor::cat(vec![position, column(&features, time)], 1);
+        let still = features.narrow(1, 3, self.network.input);
+        let all = match self.product(&points, |axes| axes[1] == TIME)? {
+            Some(moving) => still * moving,
+            None => still,
+        };
+        Ok(heads::offsets(&self.settings.heads, mlp_relu(all, self.net(), &self.network)?, degree))
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        let s = &self.settings;
+        let group = |name: &str, factor: f64| ParameterGroup {
+            name: name.into(),
+            lr_start: s.lr_start * factor,
+            lr_end: s.lr_end * factor,
+            warmup: 0.0,
+            times_extent: true,
+            epsilon: 1e-15,
+            clip_norm: 0.0,
+        };
+        vec![group("hexplane net", 1.0), group("hexplane planes", s.grid_rate)]
+    }
+    /// Smooth planes, and planes of time near 1 (weights of the published code): squared second differences along a plane's second axis, which is time
+    /// where it has one.
+    fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
+        let s = &self.settings;
+        let mut total: Option<Tensor<1>> = None;
+        let mut add = |term: Tensor<1>| {
+            total = Some(match total.take() {
+                Some(sum) => sum + term,
+                None => term,
+            });
+        };
+        for ((axes, shape), parameter) in PLANES.iter().zip(&self.planes).zip(&self.parameters) {
+            let (is_time, f) = (axes[1] == TIME, s.features);
+            let weight = if is_time { s.tv_time } else { s.tv_space };
+            for level in &shape.levels {
+                let [across, along] = [level.size[0] as usize, level.size[1] as usize];
+                let plane = parameter.value.clone().narrow(0, level.first_row * f, level.rows * f).reshape([along, across * f]);
+                if weight > 0.0 && along > 2 {
+                    let n = along - 2;
+                    let bend = plane.clone().narrow(0, 0, n) - plane.clone().narrow(0, 1, n).mul_scalar(2.0) + plane.clone().narrow(0, 2, n);
+                    add((bend.clone() * bend).mean().mul_scalar(weight));
+                }
+                if is_time && s.time_one > 0.0 {
+                    add((plane - 1.0).abs().mean().mul_scalar(s.time_one));
+                }
+            }
+        }
+        Ok(total)
+    }
+}
+
+fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+    Ok(Box::new(HexPlane::new(config::parse_section("deformer hexplane", section)?, context, device)?))
+}
+
+inventory::submit! {
+    FieldPlugin {
+        info: Plugin {
+            name: "hexplane",
+            version: "1",
+            summary: "six feature planes over space and time at two resolutions, multiplied",
+            paper: "4DGS (Wu et al. 2024)",
+            schema: SCHEMA,
+            capabilities: &["differentiable", "cached-spatial", "regularized"],
+        },
+        build,
+    }
+}

@@ -1,0 +1,149 @@
+//! Swift4D's field: one joint 4D hash grid over position and time, an encoder, five heads, no biases (Wu et al. 2025, facts of its published code).
+//!
+//! Gaussians outside the box find nothing in the grid, and without biases nothing becomes nothing: they stay where they are. Swift4D's box spans all
+//! Gaussians, ours those that move; its time ends just before 1, ours at 1.
+
+use crate::parts::centres::{check_time, column, in_box};
+use crate::parts::heads::{self, Head};
+use crate::parts::settings::within;
+use crate::parts::voxels::parameter;
+use crate::parts::weights;
+use burn::tensor::{Device, Tensor};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
+use cc4dgs_core::{
+    DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+};
+use serde::Deserialize;
+use std::sync::Arc;
+
+const SCHEMA: &str = r#"log2_rows = 15           # rows of a level's table: 15 (9.2 MB) or 19 (127.7 MB), per scene
+levels = 16
+features = 4             # per level
+base = 16                # vertices per axis of the first level; each level doubles them
+width = 128              # of encoder and heads
+heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
+lr_start = 2e-4          # Adam, times the extent of the cameras, log-linear to lr_end
+lr_end = 2e-6
+"#;
+
+/// Heads are padded to this many columns, as the published weights are.
+const PADDED: usize = 16;
+/// Table entries start uniform in ± this.
+const TABLE: f32 = 1e-4;
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    log2_rows: u32,
+    levels: usize,
+    features: usize,
+    base: u32,
+    width: usize,
+    heads: Vec<Head>,
+    lr_start: f64,
+    lr_end: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        let heads = vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh];
+        Self { log2_rows: 15, levels: 16, features: 4, base: 16, width: 128, heads, lr_start: 2e-4, lr_end: 2e-6 }
+    }
+}
+
+/// Parameters: table, encoder, one per head.
+struct Swift4d {
+    settings: Settings,
+    context: FieldContext,
+    grid: Arc<GridShape>,
+    network: Arc<ReluShape>,
+    parameters: Vec<Parameter>,
+}
+
+impl Swift4d {
+    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+        within("log2_rows", settings.log2_rows as usize, 4, 24)?;
+        within("levels", settings.levels, 1, 20)?;
+        within("features", settings.features, 1, 16)?;
+        within("base", settings.base as usize, 2, 256)?;
+        within("width", settings.width, 1, 4096)?;
+        heads::check(&settings.heads)?;
+        let mut grid =
+            GridShape { dims: 4, features: settings.features, levels: Vec::new(), stagger: 0.5, smooth: false, clamps: false, outside: Outside::Zero };
+        for level in 0..settings.levels {
+            let vertices = settings.base << level;
+            grid.push(&[vertices; 4], &[vertices as f32 - 1.0; 4], 1 << settings.log2_rows);
+        }
+        let w = settings.width;
+        let outputs: Vec<usize> = settings.heads.iter().map(|h| h.width(context.sh_degree).next_multiple_of(PADDED)).collect();
+        let network = ReluShape { input: grid.width(), trunk: vec![w, w], heads: outputs.iter().map(|&out| vec![w, w, out]).collect() };
+        let seed = context.seed;
+        let matrices = |seed: cc4dgs_core::Seed, widths: &[usize]| -> Vec<f32> {
+            widths.windows(2).enumerate().flat_map(|(i, pair)| weights::glorot(seed.index(i as u64), pair[0], pair[1])).collect()
+        };
+        let table = weights::uniform(seed.child("table"), grid.parameter_count(), TABLE);
+        let mut parameters = vec![parameter("grid.table".into(), Part::Grid, 0, table, device)];
+        // The encoder counts towards the grid in the paper's tables.
+        parameters.push(parameter("grid.encoder".into(), Part::Grid, 0, matrices(seed.child("encoder"), &[grid.width(), w, w]), device));
+        for (head, &out) in settings.heads.iter().zip(&outputs) {
+            let values = matrices(seed.child(head.name()), &[w, w, w, out]);
+            parameters.push(parameter(format!("net.head.{}", head.name()), Part::Net, 0, values, device));
+        }
+        Ok(Self { settings, context: context.clone(), grid: Arc::new(grid), network: Arc::new(network), parameters })
+    }
+}
+
+impl DeformationField for Swift4d {
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let work = FieldWork { gaussians: means_world.dims()[0] as u64, ..FieldWork::default() };
+        // Space and time share one table, so nothing but the normalised position is time-invariant.
+        Ok(SpatialFeatures { values: in_box(means_world, &self.context), work })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        check_time(time_norm)?;
+        let (m, w, degree) = (features.dims()[0], self.settings.width, self.context.sh_degree);
+        let widths = self.settings.heads.iter().map(|h| h.width(degree));
+        if m == 0 {
+            let empty = widths.map(|width| Tensor::zeros([0, width], &features.device())).collect();
+            return Ok(heads::offsets(&self.settings.heads, empty, degree));
+        }
+        let points = Tensor::cat(vec![features.clone(), column(&features, time_norm)], 1);
+        let encoded = lookup(self.parameters[0].value.clone(), points, &self.grid)?;
+        let mut layers = vec![weights::without_biases(self.parameters[1].value.clone(), &[(self.grid.width(), w), (w, w)])];
+        for (parameter, shape) in self.parameters[2..].iter().zip(&self.network.heads) {
+            layers.push(weights::without_biases(parameter.value.clone(), &[(w, w), (w, w), (w, shape[2])]));
+        }
+        let padded = mlp_relu(encoded, Tensor::cat(layers, 0), &self.network)?;
+        let outputs = padded.into_iter().zip(widths).map(|(out, width)| out.narrow(1, 0, width)).collect();
+        Ok(heads::offsets(&self.settings.heads, outputs, degree))
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        let (lr_start, lr_end) = (self.settings.lr_start, self.settings.lr_end);
+        vec![ParameterGroup { name: "swift4d-hash".into(), lr_start, lr_end, warmup: 0.0, times_extent: true, epsilon: 1e-8, clip_norm: 0.0 }]
+    }
+}
+
+fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+    Ok(Box::new(Swift4d::new(config::parse_section("deformer swift4d-hash", section)?, context, device)?))
+}
+
+inventory::submit! {
+    FieldPlugin {
+        info: Plugin {
+            name: "swift4d-hash",
+            version: "1",
+            summary: "one joint hash grid over space and time, five heads without biases",
+            paper: "Swift4D (Wu et al. 2025)",
+            schema: SCHEMA,
+            capabilities: &["differentiable", "joint-space-time"],
+        },
+        build,
+    }
+}
