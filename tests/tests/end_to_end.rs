@@ -184,3 +184,42 @@ fn runs_on_wgpu_are_reproducible_and_every_device_draws_the_same() {
         assert!(found.max_difference <= 1.0 / 255.0 && found.psnr_difference_db.abs() < 0.01, "{found:?}");
     }
 }
+
+/// Every field, with whatever it keeps per Gaussian: learns, resumes to the same bytes, plays, and survives an archive.
+#[test]
+fn every_field_trains_resumes_plays_and_is_archived() {
+    let registry = Registry::collect().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    for (method, _) in cc4dgs_engine::presets::methods() {
+        let sets: Vec<String> = ["scene.width=32", "scene.height=32", "train.iterations=40", "init.count=150", "train.log_every=5", "train.dynamic=all"]
+            .iter()
+            .map(ToString::to_string)
+            .collect();
+        let config = RunConfig::resolve(Some(&format!("demo+{method}")), None, &sets).unwrap();
+        let [whole, parts] = ["whole", "parts"].map(|name| folder.path().join(format!("{method}-{name}")));
+        run(&config, &whole, false, &Silent, &never).unwrap();
+        let stop = AtomicBool::new(false);
+        let listener = StopAfter { left: AtomicUsize::new(6), stop: &stop };
+        assert!(matches!(run(&config, &parts, false, &listener, &stop), Err(Error::Interrupted(_))), "{method}");
+        run(&config, &parts, true, &Silent, &never).unwrap();
+        let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
+        assert!(bytes(&whole) == bytes(&parts), "{method}: resuming ends in other bytes");
+
+        let model = load(&whole);
+        if let Some(field) = &model.field {
+            for spec in field.field.attributes() {
+                let own = &model.gaussians.extra[&spec.name];
+                assert!(
+                    own.values.len() == spec.width * model.gaussians.len() && own.values.iter().any(|v| *v != spec.start),
+                    "{method}: {} was not learned",
+                    spec.name
+                );
+            }
+        }
+        let archive = folder.path().join(format!("{method}.cc4d"));
+        model.save_archive(&archive, "raw", &toml::Table::new(), &registry, &Limits::default(), &Silent).unwrap();
+        let (before, after) = (score(&model, &config).psnr_db, score(&load(&archive), &config).psnr_db);
+        assert!(before.is_finite() && (before - after).abs() < 1e-3, "{method}: {before} dB, {after} from the archive");
+    }
+}

@@ -5,7 +5,7 @@ use crate::config::GaussianRates;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
 use cc4dgs_core::gaussians::{sh_rest_len, to_vec};
-use cc4dgs_core::{ExtraAttribute, Gaussians, HostGaussians, Result};
+use cc4dgs_core::{AttributeSpec, ExtraAttribute, Gaussians, HostGaussians, Result};
 
 /// Names of the attributes every Gaussian has, in order.
 pub const CORE_COLUMNS: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
@@ -109,6 +109,18 @@ impl GaussianSet {
                 }
             })
             .collect()
+    }
+    /// The leaf of the column called `name`, out of `leaves` in the order of the columns; zero columns wide if there is none.
+    pub fn leaf(&self, leaves: &[Tensor<2>], name: &str) -> Tensor<2> {
+        let found = self.columns.iter().zip(leaves).find(|(c, _)| c.name == name).map(|(_, leaf)| leaf.clone());
+        found.unwrap_or_else(|| Tensor::zeros([self.len(), 0], &leaves[0].device()))
+    }
+    /// Adds the attributes of `wanted` that there are not, with their start values and zero moments.
+    pub fn add_attributes(&mut self, wanted: &[AttributeSpec]) {
+        for spec in wanted.iter().filter(|spec| self.column(&spec.name).is_none()).collect::<Vec<_>>() {
+            let value = Tensor::<2>::full([self.len(), spec.width], spec.start, &self.columns[0].value.device());
+            self.columns.push(Column { name: spec.name.clone(), first_moment: value.zeros_like(), second_moment: value.zeros_like(), value });
+        }
     }
     /// The Gaussians made of `leaves`.
     pub fn gaussians(&self, leaves: &[Tensor<2>]) -> Gaussians {

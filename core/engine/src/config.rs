@@ -1,6 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
 use crate::data::SceneOptions;
+use crate::presets;
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Limits, RenderSettings, Result, Rules, Scene, config, unknown_name};
 use serde::{Deserialize, Serialize};
@@ -259,21 +260,10 @@ impl Default for DensifyConfig {
     }
 }
 
-/// The presets: name, summary, TOML.
-const PRESETS: [(&str, &str, &str); 7] = [
-    ("demo", "the built-in ray-traced scene, minutes on two cores", include_str!("../presets/demo.toml")),
-    ("n3dv", "Neural 3D Video, the paper's protocol", include_str!("../presets/n3dv.toml")),
-    ("technicolor", "Technicolor light field, the paper's protocol", include_str!("../presets/technicolor.toml")),
-    ("dnerf", "D-NeRF synthetic scenes at full protocol", include_str!("../presets/dnerf.toml")),
-    ("dnerf-cpu", "D-NeRF at 400x400 on two cores", include_str!("../presets/dnerf-cpu.toml")),
-    ("panoptic", "PanopticSports, all frames", include_str!("../presets/panoptic.toml")),
-    ("panoptic-cpu", "PanopticSports, 30 frames on two cores", include_str!("../presets/panoptic-cpu.toml")),
-];
-
 impl RunConfig {
-    /// Names and summaries of the presets.
+    /// Names and summaries of the presets; see [`presets::methods`] for what may follow them.
     pub fn presets() -> Vec<(&'static str, &'static str)> {
-        PRESETS.iter().map(|&(name, summary, _)| (name, summary)).collect()
+        presets::families()
     }
     /// Layers a preset, a TOML file and `key=value` overrides, in that order, and reads the result strictly.
     pub fn resolve(preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
@@ -287,9 +277,7 @@ impl RunConfig {
         };
         let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
         if let Some(name) = preset.map(str::to_string).or(named) {
-            let (_, _, text) = PRESETS.iter().find(|p| p.0 == name).ok_or_else(|| unknown_name("preset", &name, PRESETS.iter().map(|p| p.0)))?;
-            table = config::parse_table(&format!("preset {name}"), text)?;
-            table.insert("preset".into(), name.into());
+            table = presets::table(&name)?;
         }
         config::merge(&mut table, &from_file);
         for assignment in sets {

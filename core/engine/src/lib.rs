@@ -14,5 +14,6 @@ pub mod model;
 pub mod pictures;
 pub mod play;
 pub mod ply;
+pub mod presets;
 pub mod schedule;
 pub mod train;

@@ -46,6 +46,8 @@ pub struct Player<'a> {
     rasterizer: Box<dyn Rasterizer>,
     gaussians: Gaussians,
     moving_means: Tensor<2>,
+    /// What the field keeps per Gaussian, of those that move.
+    moving_attributes: Vec<Tensor<2>>,
     rows: Rows,
     moving: usize,
     cache: Option<Tensor<2>>,
@@ -87,11 +89,17 @@ impl<'a> Player<'a> {
         let rows = if moves { Rows::new(model.moving.rows(&model.gaussians.dynamic_scores), device) } else { Rows::new(Some(Vec::new()), device) };
         let moving = rows.count(gaussians.len());
         let background = Tensor::<1>::from_data(TensorData::new(model.background.to_vec(), [3]), device);
+        let wanted = model.field.iter().filter(|_| moving > 0).flat_map(|f| f.field.attributes());
+        let moving_attributes = wanted
+            .filter_map(|spec| model.gaussians.extra.get(&spec.name))
+            .map(|a| rows.select(Tensor::<2>::from_data(TensorData::new(a.values.clone(), [model.gaussians.len(), a.width]), device)))
+            .collect();
         Ok(Self {
             device: device.clone(),
             rasterizer: registry.build_rasterizer(&model.rasterizer)?,
             moving_means: if moving > 0 { rows.select(gaussians.means.clone()) } else { gaussians.means.clone() },
             gaussians,
+            moving_attributes,
             rows,
             moving,
             cache: None,
@@ -117,7 +125,7 @@ impl<'a> Player<'a> {
                 features.clone()
             }
             None => {
-                let spatial = field.field.spatial(self.moving_means.clone())?;
+                let spatial = field.field.spatial_with(self.moving_means.clone(), &self.moving_attributes)?;
                 self.work.spatial.gaussians += spatial.work.gaussians;
                 self.work.spatial.vertices_queried += spatial.work.vertices_queried;
                 self.work.spatial.vertices_decoded += spatial.work.vertices_decoded;

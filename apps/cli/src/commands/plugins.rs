@@ -4,7 +4,7 @@ use super::Context;
 use crate::args::Plugins;
 use cc4dgs_core::{DEVICE_NAMES, Result, unknown_name};
 use cc4dgs_engine::config::RunConfig;
-use cc4dgs_engine::data;
+use cc4dgs_engine::{data, presets};
 use serde_json::json;
 
 pub fn run(context: &Context, args: &Plugins) -> Result<()> {
@@ -21,6 +21,11 @@ fn list(context: &Context) -> Result<()> {
         let mut lines: Vec<String> = plugins.iter().map(|(kind, p)| format!("{kind:<11} {:<12} {:<6} {}", p.name, p.version, p.summary)).collect();
         lines.push(String::new());
         lines.extend(RunConfig::presets().into_iter().map(|(name, summary)| format!("{:<11} {name:<12} {:<6} {summary}", "preset", "")));
+        lines.extend(
+            presets::methods()
+                .into_iter()
+                .map(|(name, summary)| format!("{:<11} {:<12} {:<6} {summary}, as in dnerf+{name}", "preset", format!("...+{name}"), "")),
+        );
         lines.extend(data::readers().into_iter().map(|(name, looks_for)| format!("{:<11} {name:<12} {:<6} looks for {looks_for}", "reader", "")));
         lines.push(format!("{:<11} {}", "devices", DEVICE_NAMES.join(", ")));
         lines.push("\n`cc4dgs plugins NAME` shows the settings of a plug-in.".into());

@@ -9,6 +9,7 @@ use cc4dgs_backends::ops::photometric::photometric_loss;
 use cc4dgs_backends::ops::picture::picture_planes;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, EventSink, RenderSettings, Result, Splats};
+use std::collections::BTreeMap;
 use std::time::Instant;
 
 /// The columns a photometric step learns.
@@ -35,7 +36,8 @@ impl Context<'_> {
             optimizer.track();
             // The field is asked about the canonical centres as constants (baselines §10, row 22), which also makes caching exact.
             let canonical = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
-            let spatial = optimizer.field.spatial(canonical)?;
+            let own: Vec<Tensor<2>> = optimizer.field.attributes().iter().map(|a| rows.select(state.set.leaf(&leaves, &a.name))).collect();
+            let spatial = optimizer.field.spatial_with(canonical, &own)?;
             log.count_field(spatial.work.vertices_decoded, spatial.work.vertices_queried - spatial.work.vertices_decoded, moving as u64, (n - moving) as u64);
             features = Some(spatial.values);
         }
@@ -94,6 +96,14 @@ impl Context<'_> {
                 loss = loss + term;
             }
         }
+        if moving > 0
+            && let (Some(optimizer), Some(&view)) = (&state.field, batch.first())
+        {
+            let means = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
+            if let Some(term) = optimizer.field.regularizer(means, scene.views[view].time_norm, progress as f32)? {
+                loss = loss + term;
+            }
+        }
         if read {
             log.loss(to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN), stage, iteration)?;
         }
@@ -115,7 +125,9 @@ impl Context<'_> {
             let shown = visible.clone().greater_elem(0).int().sum().into_scalar::<i64>().max(0) as u64;
             log.count_adam(shown, n as u64 - shown.min(n as u64));
         }
-        state.set.update(of_columns, |name| gaussian_rate(&train.lr, name, progress, extent), visible.as_ref())?;
+        let own: BTreeMap<String, f64> = state.field.iter().flat_map(|f| f.field.attributes()).map(|a| (a.name, a.lr)).collect();
+        let rate = |name: &str| own.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
+        state.set.update(of_columns, rate, visible.as_ref())?;
         if features.is_some()
             && let Some(optimizer) = &mut state.field
         {
