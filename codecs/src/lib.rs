@@ -3,12 +3,18 @@
 //! * `raw`: float32, nothing lost; the base line of every size table.
 //! * `cca`: the compression of canonical attributes of CC-4DGS (paper Section IV-D).
 //!
-//! Both register themselves; link this crate and ask the [`cc4dgs_core::Registry`].
+//! * `quantize`: every component by itself, in so many bits; the honest simple one.
+//! * `vq`: codebooks for shape and colour, as CompGS has them.
+//!
+//! All register themselves; link this crate and ask the [`cc4dgs_core::Registry`].
 
 pub mod cca;
 mod column;
 pub mod kmeans;
 pub mod morton;
 pub mod mulaw;
+mod quantize;
 mod raw;
+mod rows;
 mod streams;
+mod vq;

@@ -1,12 +1,13 @@
 //! The colour coefficients above degree 0: conditional autoencoder and residual codebook, or plain quantisation where that is better.
 
-use super::geometry::{CONDITIONS, Normalisation, interleave, load, split, store};
+use super::geometry::{CONDITIONS, Normalisation};
 use super::network::{Decoder, Scratch, decoder_len, latents};
 use super::profile::{Profile, Settings};
 use super::shard::Data;
 use super::train;
 use crate::column::{self, Column, Target};
 use crate::kmeans;
+use crate::rows::{interleave, load, split, store};
 use crate::streams::StreamSet;
 use cc4dgs_core::archive::{ByteReader, estimate_stored_len};
 use cc4dgs_core::gaussians::sh_rest_len;

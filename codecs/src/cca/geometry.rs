@@ -1,7 +1,8 @@
 //! The quantised path: log-scales, opacity logits, quaternions, dynamic scores; and the conditions made of them.
 
 use super::profile::Profile;
-use crate::column::{self, Column, Form, Target};
+use crate::column::{self, Column, Target};
+use crate::rows::{interleave, load, split, store};
 use crate::streams::StreamSet;
 use cc4dgs_core::archive::ByteReader;
 use cc4dgs_core::{HostGaussians, Result, Stream};
@@ -52,40 +53,6 @@ pub(super) fn decode(set: &StreamSet, count: usize, meta: &mut ByteReader, escap
     out.dynamic_scores = interleave(&take("dynamic_scores", 1)?, count);
     out.quaternions = times_norm(&take(QUATERNIONS, 5)?, count);
     Ok(())
-}
-
-/// Writes the forms and outliers of `columns` and returns their codes, one column after the other.
-pub(super) fn store(columns: &[Column], meta: &mut Vec<u8>, escapes: &mut Vec<u8>) -> Vec<u8> {
-    for column in columns {
-        column.form.write(meta);
-        column::write_escapes(&column.escapes, escapes);
-    }
-    columns.iter().flat_map(|c| &c.codes).copied().collect()
-}
-
-/// Undoes [`store`].
-pub(super) fn load(mut codes: ByteReader, count: usize, width: usize, meta: &mut ByteReader, escapes: &mut ByteReader) -> Result<Vec<Vec<f32>>> {
-    let mut columns = Vec::with_capacity(width);
-    for _ in 0..width {
-        let form = Form::read(meta)?;
-        columns.push(column::read(&mut codes, form, count, &column::read_escapes(escapes)?)?);
-    }
-    codes.finish()?;
-    Ok(columns)
-}
-
-/// The columns of rows [N,width].
-pub(super) fn split(rows: &[f32], width: usize) -> Vec<Vec<f32>> {
-    (0..width).map(|c| rows.iter().skip(c).step_by(width).copied().collect()).collect()
-}
-
-/// Rows [N,columns].
-pub(super) fn interleave(columns: &[Vec<f32>], count: usize) -> Vec<f32> {
-    let mut rows = Vec::with_capacity(count * columns.len());
-    for i in 0..count {
-        rows.extend(columns.iter().map(|c| c[i]));
-    }
-    rows
 }
 
 /// Columns w, x, y, z of the unit quaternions with their signs, and the natural logarithm of the norms. A zero quaternion becomes the

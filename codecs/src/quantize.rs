@@ -1,0 +1,153 @@
+//! `quantize`: each component of each attribute by itself, in even steps between percentiles. No model, no training; what a cleverer codec must beat.
+
+use crate::column::{self, Target};
+use crate::morton;
+use crate::rows::{interleave, load, split, store};
+use crate::streams::{META, Shape, StreamSet};
+use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
+use serde::Deserialize;
+
+/// Version of the stored form.
+const VERSION: u8 = 1;
+/// Name of the stream with values beyond the steps.
+const ESCAPES: &str = "escapes";
+/// Share of the values at either end that may be kept exactly, beside the steps.
+const TAIL: f64 = 1e-3;
+/// A step is at most so many standard deviations times 2^-bits wide, or more bits are taken: percentiles of long-tailed values lie some ten deviations apart.
+const SPREAD: f64 = 8.0;
+
+const SCHEMA: &str = "\
+means = 16               # bits of a coordinate of a centre; 32 keeps float32 anywhere below
+log_scales = 8
+quaternions = 8
+opacity_logits = 8
+sh_dc = 8
+sh_rest = 6
+dynamic_scores = 8
+";
+
+/// Bits per component of each attribute.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Bits {
+    means: u8,
+    log_scales: u8,
+    quaternions: u8,
+    opacity_logits: u8,
+    sh_dc: u8,
+    sh_rest: u8,
+    dynamic_scores: u8,
+}
+
+impl Default for Bits {
+    fn default() -> Self {
+        Self { means: 16, log_scales: 8, quaternions: 8, opacity_logits: 8, sh_dc: 8, sh_rest: 6, dynamic_scores: 8 }
+    }
+}
+
+impl Bits {
+    /// By the name of a column of [`HostGaussians`].
+    fn of(&self, column: &str) -> u8 {
+        match column {
+            "means" => self.means,
+            "log_scales" => self.log_scales,
+            "quaternions" => self.quaternions,
+            "opacity_logits" => self.opacity_logits,
+            "sh_dc" => self.sh_dc,
+            "sh_rest" => self.sh_rest,
+            _ => self.dynamic_scores,
+        }
+    }
+}
+
+/// Largest relative error of a column in so many bits; 32 is exact.
+fn loss(bits: u8) -> f64 {
+    if bits == 32 { 0.0 } else { SPREAD / f64::from(1u32 << bits) }
+}
+
+struct Quantize {
+    bits: Bits,
+}
+
+impl AttributeCodec for Quantize {
+    fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        gaussians.validate("Gaussians to encode", &context.limits)?;
+        // Neighbours in space are neighbours in the streams, which Zstandard likes.
+        let sorted = gaussians.select(&morton::order(&gaussians.means));
+        let (mut meta, mut escapes) = (vec![VERSION], Vec::new());
+        Shape::of(&sorted).write(&mut meta)?;
+        let mut streams = Vec::new();
+        for (name, width, values) in sorted.columns() {
+            let bits = self.bits.of(name);
+            let columns: Vec<_> = split(values, width)
+                .iter()
+                .map(|c| if bits == 32 { column::encode_exact(c) } else { column::encode(c, Target { bits, mu_law: false, loss: loss(bits), tail: TAIL }) })
+                .collect();
+            streams.push(Stream { name: name.into(), bytes: store(&columns, &mut meta, &mut escapes) });
+        }
+        streams.extend(Shape::extra_streams(&sorted));
+        streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
+        streams.insert(0, Stream { name: META.into(), bytes: meta });
+        Ok(streams)
+    }
+
+    fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        let set = StreamSet::new("quantize", streams);
+        let (mut meta, mut escapes) = (set.reader(META)?, set.reader(ESCAPES)?);
+        let version = meta.u8()?;
+        if version != VERSION {
+            return Err(Error::unsupported("quantize streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
+        }
+        let shape = Shape::read(&mut meta, &context.limits)?;
+        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+        for (name, width, values) in out.columns_mut() {
+            *values = interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count);
+        }
+        meta.finish()?;
+        escapes.finish()?;
+        shape.read_extra(&set, &mut out)?;
+        out.validate("decoded Gaussians", &context.limits)?;
+        Ok(out)
+    }
+
+    fn losses(&self) -> Vec<DeclaredLoss> {
+        let columns = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
+        let lossy = columns.into_iter().filter(|c| self.bits.of(c) != 32);
+        lossy.map(|c| DeclaredLoss { attribute: c.into(), relative_rms: loss(self.bits.of(c)) }).collect()
+    }
+}
+
+fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+    let base = match profile {
+        "" | "default" => Bits::default(),
+        "high" => Bits { means: 16, log_scales: 10, quaternions: 10, opacity_logits: 10, sh_dc: 12, sh_rest: 8, dynamic_scores: 12 },
+        _ => return Err(unknown_name("profile of codec quantize", profile, ["default", "high"].into_iter())),
+    };
+    let mut section = toml::Table::new();
+    for column in ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"] {
+        section.insert(column.into(), i64::from(base.of(column)).into());
+    }
+    config::merge(&mut section, settings);
+    let bits: Bits = config::parse_section("codec quantize", &section)?;
+    for column in ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"] {
+        let wanted = bits.of(column);
+        if !(4..=16).contains(&wanted) && wanted != 32 {
+            return Err(Error::parameter(format!("codec quantize.{column}"), format!("{wanted} bits"), "Choose 4 to 16, or 32 for float32"));
+        }
+    }
+    Ok(Box::new(Quantize { bits }))
+}
+
+inventory::submit! {
+    CodecPlugin {
+        info: Plugin {
+            name: "quantize",
+            version: "1",
+            summary: "every component by itself in 6 to 16 bits, no training",
+            paper: "the simple base line",
+            schema: SCHEMA,
+            capabilities: &["lossy", "reorders", "profiles=default,high"],
+        },
+        build,
+    }
+}

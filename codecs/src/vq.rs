@@ -1,0 +1,187 @@
+//! `vq`: codebooks for scales, rotations and higher colour coefficients, even steps for the rest (the idea of CompGS, Navaneet et al. 2024).
+//!
+//! A codebook is worth its bytes only where rows resemble each other. Where the best codebook loses more than is declared, the attribute is stored in even
+//! steps instead.
+
+use crate::column::{self, Target};
+use crate::rows::{interleave, load, split, store};
+use crate::streams::{META, Shape, StreamSet, from_planes, to_planes};
+use crate::{kmeans, morton};
+use cc4dgs_core::{
+    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, config, inventory, unknown_name,
+};
+use rand::seq::index::sample;
+use serde::Deserialize;
+
+/// Version of the stored form.
+const VERSION: u8 = 1;
+/// Name of the stream with values beyond the steps.
+const ESCAPES: &str = "escapes";
+/// The attributes that get codebooks.
+const BOOKS: [&str; 3] = ["log_scales", "quaternions", "sh_rest"];
+/// What the others may lose, by their bits.
+const STEPS: [(&str, u8, f64); 4] = [("means", 16, 2e-4), ("opacity_logits", 8, 0.03), ("sh_dc", 8, 0.03), ("dynamic_scores", 8, 0.03)];
+/// What a codebook may lose of an attribute.
+const BOOK_LOSS: f64 = 0.5;
+/// Bits of the even steps that replace a codebook, and the share of outliers kept beside steps.
+const REPLACEMENT_BITS: u8 = 8;
+const TAIL: f64 = 1e-3;
+
+const SCHEMA: &str = "\
+codebook = 4096          # rows of a codebook, at most 65536
+iterations = 8           # of K-means
+sample = 32768           # rows it looks at while it learns
+";
+
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    codebook: usize,
+    iterations: usize,
+    sample: usize,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { codebook: 4096, iterations: 8, sample: 32_768 }
+    }
+}
+
+struct Vq(Settings);
+
+impl Vq {
+    /// A codebook for `rows` [N,width] and which of its rows each is; `None` where it would lose too much.
+    fn book(&self, rows: &[f32], width: usize, seed: Seed) -> Option<(Vec<f32>, Vec<u32>)> {
+        let n = rows.len().checked_div(width).unwrap_or(0);
+        if n == 0 {
+            return None;
+        }
+        let seen: Vec<f32> = if n > self.0.sample {
+            let mut picked: Vec<usize> = sample(&mut seed.child("sample").rng(), n, self.0.sample).into_vec();
+            picked.sort_unstable();
+            picked.into_iter().flat_map(|i| rows[i * width..(i + 1) * width].to_vec()).collect()
+        } else {
+            rows.to_vec()
+        };
+        let book = kmeans::cluster(&seen, width, self.0.codebook.min(n), self.0.iterations, seed);
+        if book.is_empty() || book.iter().any(|v| !v.is_finite()) {
+            return None;
+        }
+        let labels = kmeans::assign(rows, width, &book).labels;
+        let decoded: Vec<f32> = labels.iter().flat_map(|&l| book[l as usize * width..(l as usize + 1) * width].to_vec()).collect();
+        (column::relative_rms(rows, &decoded) <= BOOK_LOSS).then_some((book, labels))
+    }
+}
+
+fn steps(values: &[f32], width: usize, bits: u8, loss: f64, meta: &mut Vec<u8>, escapes: &mut Vec<u8>) -> Vec<u8> {
+    let columns: Vec<_> = split(values, width).iter().map(|c| column::encode(c, Target { bits, mu_law: false, loss, tail: TAIL })).collect();
+    store(&columns, meta, escapes)
+}
+
+impl AttributeCodec for Vq {
+    fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        gaussians.validate("Gaussians to encode", &context.limits)?;
+        let sorted = gaussians.select(&morton::order(&gaussians.means));
+        let (mut meta, mut escapes, mut streams) = (vec![VERSION], Vec::new(), Vec::new());
+        Shape::of(&sorted).write(&mut meta)?;
+        for (name, width, values) in sorted.columns() {
+            let mut put = |name: String, bytes| streams.push(Stream { name, bytes });
+            if let Some((_, bits, loss)) = STEPS.into_iter().find(|s| s.0 == name) {
+                put(name.into(), steps(values, width, bits, loss, &mut meta, &mut escapes));
+                continue;
+            }
+            match self.book(values, width, context.seed.child(name)) {
+                Some((book, labels)) => {
+                    meta.extend((book.len() as u32 / width as u32).to_le_bytes());
+                    put(format!("{name}.book"), to_planes(&book, width));
+                    put(name.into(), labels.into_iter().flat_map(|l| (l as u16).to_le_bytes()).collect());
+                }
+                None => {
+                    meta.extend(0u32.to_le_bytes());
+                    put(name.into(), steps(values, width, REPLACEMENT_BITS, BOOK_LOSS, &mut meta, &mut escapes));
+                }
+            }
+        }
+        streams.extend(Shape::extra_streams(&sorted));
+        streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
+        streams.insert(0, Stream { name: META.into(), bytes: meta });
+        Ok(streams)
+    }
+
+    fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        let set = StreamSet::new("vq", streams);
+        let (mut meta, mut escapes) = (set.reader(META)?, set.reader(ESCAPES)?);
+        let version = meta.u8()?;
+        if version != VERSION {
+            return Err(Error::unsupported("vq streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
+        }
+        let shape = Shape::read(&mut meta, &context.limits)?;
+        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+        for (name, width, values) in out.columns_mut() {
+            let book_rows = if BOOKS.contains(&name) { meta.u32()? as usize } else { 0 };
+            if book_rows == 0 {
+                *values = interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count);
+                continue;
+            }
+            if book_rows > 1 << 16 || book_rows > shape.count {
+                return Err(meta.error(format!("a codebook of {book_rows} rows for {} Gaussians is impossible", shape.count)));
+            }
+            let book = from_planes(set.reader(&format!("{name}.book"))?, book_rows, width)?;
+            let mut labels = set.reader(name)?;
+            let bytes = labels.take(shape.count.saturating_mul(2))?;
+            values.reserve(shape.count * width);
+            for code in bytes.as_chunks::<2>().0 {
+                let row = usize::from(u16::from_le_bytes(*code));
+                let Some(found) = book.get(row * width..(row + 1) * width) else {
+                    return Err(labels.error(format!("label {row} is beyond the {book_rows} rows of the codebook")));
+                };
+                values.extend_from_slice(found);
+            }
+            labels.finish()?;
+        }
+        meta.finish()?;
+        escapes.finish()?;
+        shape.read_extra(&set, &mut out)?;
+        out.validate("decoded Gaussians", &context.limits)?;
+        Ok(out)
+    }
+
+    fn losses(&self) -> Vec<DeclaredLoss> {
+        let books = BOOKS.map(|name| (name, BOOK_LOSS));
+        STEPS
+            .map(|(name, _, loss)| (name, loss))
+            .into_iter()
+            .chain(books)
+            .map(|(name, loss)| DeclaredLoss { attribute: name.into(), relative_rms: loss })
+            .collect()
+    }
+}
+
+fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+    if !matches!(profile, "" | "default") {
+        return Err(unknown_name("profile of codec vq", profile, ["default"].into_iter()));
+    }
+    let settings: Settings = config::parse_section("codec vq", settings)?;
+    if !(1..=1 << 16).contains(&settings.codebook) || !(1..=1000).contains(&settings.iterations) || settings.sample == 0 {
+        return Err(Error::parameter(
+            "codec vq",
+            format!("{settings:?}"),
+            "Use a codebook of 1 to 65536 rows, 1 to 1000 iterations and a sample of at least 1",
+        ));
+    }
+    Ok(Box::new(Vq(settings)))
+}
+
+inventory::submit! {
+    CodecPlugin {
+        info: Plugin {
+            name: "vq",
+            version: "1",
+            summary: "codebooks for scales, rotations and colours, even steps for the rest",
+            paper: "CompGS (Navaneet et al. 2024)",
+            schema: SCHEMA,
+            capabilities: &["lossy", "reorders", "profiles=default"],
+        },
+        build,
+    }
+}
