@@ -1,5 +1,7 @@
 //! Every registered plug-in against the suites that `cc4dgs-core` exports.
 
+use cc4dgs_backends as _;
+use cc4dgs_codecs as _;
 use cc4dgs_core::{Registry, config, conformance};
 use cc4dgs_deformers as _;
 use cc4dgs_tests::devices;
@@ -28,6 +30,36 @@ fn every_deformer_conforms() {
     for (_, device) in devices() {
         for name in &names {
             findings.extend(conformance::deformer(registry.deformer(name).unwrap(), &small(name), &device));
+        }
+    }
+    assert!(findings.is_empty(), "{}", findings.join("\n"));
+}
+
+#[test]
+fn every_codec_conforms() {
+    let registry = Registry::collect().unwrap();
+    let mut findings = Vec::new();
+    let mut seen = 0;
+    for (_, plugin) in registry.plugins().into_iter().filter(|(kind, _)| *kind == "codec") {
+        let profiles = plugin.capabilities.iter().find_map(|c| c.strip_prefix("profiles=")).unwrap_or("");
+        for profile in profiles.split(',') {
+            // A codec that trains is told to be quick about it.
+            let quick = if plugin.schema.contains("sample_budget") { "sample_budget = 5000" } else { "" };
+            findings.extend(conformance::codec(registry.codec(plugin.name).unwrap(), profile, &config::parse_table("test", quick).unwrap()));
+            seen += 1;
+        }
+    }
+    assert!(findings.is_empty() && seen >= 7, "{seen} codecs and profiles\n{}", findings.join("\n"));
+}
+
+#[test]
+fn every_rasterizer_conforms() {
+    let registry = Registry::collect().unwrap();
+    let mut findings = Vec::new();
+    for (name, device) in devices() {
+        // The reference computes on the host.
+        for rasterizer in if name == "wgpu" { &["tile"][..] } else { &["tile", "reference"] } {
+            findings.extend(conformance::rasterizer(registry.rasterizer(rasterizer).unwrap(), &toml::Table::new(), &device));
         }
     }
     assert!(findings.is_empty(), "{}", findings.join("\n"));

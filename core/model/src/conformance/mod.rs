@@ -2,9 +2,13 @@
 //!
 //! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data.
 
+mod codec;
 mod deformer;
+mod rasterizer;
 
+pub use codec::codec;
 pub use deformer::deformer;
+pub use rasterizer::rasterizer;
 
 use crate::Seed;
 use burn::tensor::{Device, Tensor, TensorData};

@@ -1,0 +1,185 @@
+//! What an attribute codec must keep to.
+
+use super::uniform;
+use crate::gaussians::sh_rest_len;
+use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, Result, Seed, Silent, Stream};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// Name of the extra attribute that tells the Gaussians apart after a codec has reordered them.
+const MARK: &str = "conformance-mark";
+/// Damaged versions of each stream that are tried.
+const DAMAGES: usize = 24;
+
+/// Holds a codec to its promises: unknown settings are refused; what comes back has the same Gaussians (in any order), the same extra attributes bit for bit,
+/// and loses of each column at most what is declared; the same input gives the same bytes; no Gaussians and a single one come back; Gaussians that are not
+/// finite are refused; streams that are truncated, damaged or missing give an error or sound Gaussians, never a panic, and never more than the limits allow.
+///
+/// `profile` is what follows the colon of `name:profile`; `settings` can make an expensive codec quick.
+pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec<String> {
+    let name = format!("{}:{profile}", plugin.info.name);
+    let codec = match (plugin.build)(profile, settings) {
+        Ok(codec) => codec,
+        Err(e) => return vec![format!("{name}: it cannot be built: {e}")],
+    };
+    let codec = codec.as_ref();
+    let mut findings = Vec::new();
+    let mut note = |check: &str, outcome: Result<Option<String>>| match outcome {
+        Ok(None) => {}
+        Ok(Some(finding)) => findings.push(format!("{name}, {check}: {finding}")),
+        Err(e) => findings.push(format!("{name}, {check}: {e}")),
+    };
+    note("settings", refuses_unknown_settings(plugin, profile, settings));
+    for (count, degree) in [(0, 3), (1, 2), (2, 0), (700, 3), (400, 1)] {
+        note(&format!("{count} Gaussians of degree {degree}"), comes_back(codec, &scene(count, degree)));
+    }
+    note("repeats", repeats(codec));
+    note("numbers that are none", refuses_what_is_not_finite(codec));
+    note("damaged streams", survives_damage(codec));
+    findings
+}
+
+fn context() -> CodecContext<'static> {
+    CodecContext { seed: Seed::root(7).child("conformance"), limits: Limits::default(), events: &Silent }
+}
+
+/// Clustered Gaussians with colours that have some structure, marked by an extra attribute.
+fn scene(count: usize, sh_degree: usize) -> HostGaussians {
+    let mut g = HostGaussians { sh_degree, ..Default::default() };
+    let rest = 3 * sh_rest_len(sh_degree);
+    let seed = Seed::root(21);
+    for i in 0..count {
+        let draw = |k: usize| uniform(seed.index(i as u64), k);
+        let cluster = (i % 9) as f32;
+        let p = [3.0 * cluster.sin() + 0.3 * draw(0), 3.0 * cluster.cos() + 0.3 * draw(1), 0.5 * draw(2)];
+        g.means.extend(p);
+        g.log_scales.extend([-4.0 + draw(3), -4.3 + draw(4), -5.0 + 2.0 * draw(5)]);
+        g.quaternions.extend([0.5 + draw(6), draw(7), draw(8), draw(9)]);
+        g.opacity_logits.push(4.0 * draw(10));
+        g.sh_dc.extend([draw(11), draw(12), draw(13)]);
+        g.sh_rest.extend((0..rest).map(|c| 0.2 * (p[c % 3] + c as f32).sin() + 0.02 * draw(14 + c)));
+        g.dynamic_scores.push(if i % 5 == 0 { 8.0 + draw(100) } else { 0.3 * draw(100) });
+    }
+    g.extra.insert(MARK.into(), ExtraAttribute { width: 1, values: (0..count).map(|i| i as f32).collect() });
+    g.extra.insert("conformance-pair".into(), ExtraAttribute { width: 2, values: (0..2 * count).map(|i| 0.1 + i as f32).collect() });
+    g
+}
+
+fn refuses_unknown_settings(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Result<Option<String>> {
+    let mut settings = settings.clone();
+    settings.insert("no_such_setting".into(), 1.into());
+    Ok(match (plugin.build)(profile, &settings) {
+        Ok(_) => Some("an unknown setting was accepted".into()),
+        Err(e) if !e.to_string().contains("no_such_setting") => Some(format!("the error does not name the unknown setting: {e}")),
+        Err(_) => (plugin.build)("no-such-profile", &toml::Table::new()).is_ok().then(|| "an unknown profile was accepted".into()),
+    })
+}
+
+fn relative_rms(before: &[f32], after: &[f32]) -> f64 {
+    let n = before.len().max(1) as f64;
+    let mean = before.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
+    let error: f64 = before.iter().zip(after).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
+    let variance: f64 = before.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum();
+    if error == 0.0 { 0.0 } else { (error / variance).sqrt() }
+}
+
+fn comes_back(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Option<String>> {
+    let found = codec.decode(&codec.encode(given, &context())?, &context())?;
+    if (found.len(), found.sh_degree) != (given.len(), given.sh_degree) {
+        return Ok(Some(format!("{} Gaussians of degree {} came back", found.len(), found.sh_degree)));
+    }
+    let Some(marks) = found.extra.get(MARK).filter(|a| a.width == 1 && a.values.len() == given.len()) else {
+        return Ok(Some("extra attributes were lost".into()));
+    };
+    let order: Vec<usize> = marks.values.iter().map(|&v| v as usize).collect();
+    let mut all = order.clone();
+    all.sort_unstable();
+    if all != (0..given.len()).collect::<Vec<_>>() {
+        return Ok(Some("extra attributes were changed".into()));
+    }
+    let expected = given.select(&order);
+    if expected.extra != found.extra {
+        return Ok(Some("extra attributes were changed or belong to other Gaussians".into()));
+    }
+    let losses = codec.losses();
+    for ((column, _, before), (_, _, after)) in expected.columns().into_iter().zip(found.columns()) {
+        let allowed = losses.iter().find(|l| l.attribute == column).map_or(0.0, |l| l.relative_rms);
+        if before.len() != after.len() || !after.iter().all(|v| v.is_finite()) {
+            return Ok(Some(format!("{column} has another length or holds what is no number")));
+        }
+        let lost = relative_rms(before, after);
+        let exact = before.iter().zip(after.iter()).all(|(a, b)| a.to_bits() == b.to_bits());
+        if lost > allowed || (allowed == 0.0 && !exact) {
+            return Ok(Some(format!("{column} lost {lost:.2e} of its deviation, {allowed:.2e} is declared")));
+        }
+    }
+    Ok(None)
+}
+
+fn repeats(codec: &dyn AttributeCodec) -> Result<Option<String>> {
+    let given = scene(300, 2);
+    let (first, second) = (codec.encode(&given, &context())?, codec.encode(&given, &context())?);
+    if first != second {
+        return Ok(Some("two encodings of the same Gaussians differ".into()));
+    }
+    let mut names: Vec<&str> = first.iter().map(|s| s.name.as_str()).collect();
+    names.sort_unstable();
+    if let Some(twice) = names.windows(2).find(|w| w[0] == w[1]) {
+        return Ok(Some(format!("two streams are called {}", twice[0])));
+    }
+    let (a, b) = (codec.decode(&first, &context())?, codec.decode(&second, &context())?);
+    Ok((a != b).then(|| "two decodings of the same streams differ".into()))
+}
+
+fn refuses_what_is_not_finite(codec: &dyn AttributeCodec) -> Result<Option<String>> {
+    for value in [f32::NAN, f32::INFINITY] {
+        let mut given = scene(20, 1);
+        given.opacity_logits[3] = value;
+        if codec.encode(&given, &context()).is_ok() {
+            return Ok(Some(format!("an opacity of {value} was encoded")));
+        }
+    }
+    Ok(None)
+}
+
+fn survives_damage(codec: &dyn AttributeCodec) -> Result<Option<String>> {
+    let sound = codec.encode(&scene(60, 1), &context())?;
+    let limits = Limits { max_gaussians: 1000, ..Limits::default() };
+    let context = CodecContext { limits, ..context() };
+    let mut tries: Vec<(String, Vec<Stream>)> = vec![("no streams".into(), Vec::new())];
+    for place in 0..sound.len() {
+        let name = &sound[place].name;
+        let mut without = sound.clone();
+        without.remove(place);
+        // A stream may be optional, so its absence may be answered either way.
+        tries.push((format!("'{name}' is missing"), without));
+        let length = sound[place].bytes.len();
+        for k in 0..DAMAGES.min(2 * length) {
+            let mut damaged = sound.clone();
+            let bytes = &mut damaged[place].bytes;
+            let at = (Seed::root(3).index((place * DAMAGES + k) as u64).value() % length as u64) as usize;
+            let what = if k % 3 == 0 {
+                bytes.truncate(at);
+                "is cut short"
+            } else {
+                bytes[at] ^= 1 << (k % 8);
+                "has a flipped bit"
+            };
+            tries.push((format!("'{name}' {what} at {at}"), damaged));
+        }
+        let mut longer = sound.clone();
+        longer[place].bytes.extend([255; 9]);
+        tries.push((format!("'{name}' goes on"), longer));
+    }
+    for (what, streams) in tries {
+        match catch_unwind(AssertUnwindSafe(|| codec.decode(&streams, &context))) {
+            Err(_) => return Ok(Some(format!("it panics where {what}"))),
+            Ok(Err(_)) => {}
+            Ok(Ok(found)) => {
+                if found.validate("decoded", &limits).is_err() {
+                    return Ok(Some(format!("unsound Gaussians came back where {what}")));
+                }
+            }
+        }
+    }
+    Ok(None)
+}
