@@ -24,3 +24,8 @@ pub fn poison(device: &Device) {
     }
     device.sync().expect("the device answers");
 }
+
+/// The snippets of CONTRIBUTING.md, which are compiled with the documentation tests.
+#[cfg(doctest)]
+#[doc = include_str!("../../CONTRIBUTING.md")]
+pub struct Contributing;

@@ -2,6 +2,7 @@
 
 use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _};
+use cc4dgs_core::archive::WeightPrecision;
 use cc4dgs_core::{Error, Event, EventSink, Limits, Recorder, Registry, Scene, Silent, Split};
 use cc4dgs_engine::agreement::agreement;
 use cc4dgs_engine::config::RunConfig;
@@ -206,7 +207,7 @@ fn every_field_trains_resumes_plays_and_is_archived() {
         let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
         assert!(bytes(&whole) == bytes(&parts), "{method}: resuming ends in other bytes");
 
-        let model = load(&whole);
+        let mut model = load(&whole);
         if let Some(field) = &model.field {
             for spec in field.field.attributes() {
                 let own = &model.gaussians.extra[&spec.name];
@@ -217,9 +218,21 @@ fn every_field_trains_resumes_plays_and_is_archived() {
                 );
             }
         }
-        let archive = folder.path().join(format!("{method}.cc4d"));
-        model.save_archive(&archive, "raw", &toml::Table::new(), &registry, &Limits::default(), &Silent).unwrap();
-        let (before, after) = (score(&model, &config).psnr_db, score(&load(&archive), &config).psnr_db);
-        assert!(before.is_finite() && (before - after).abs() < 1e-3, "{method}: {before} dB, {after} from the archive");
+        let before = score(&model, &config).psnr_db;
+        let mut deform = Vec::new();
+        for (precision, allowed) in WeightPrecision::ALL.into_iter().zip([1e-3, 0.05, 0.5]) {
+            let archive = folder.path().join(format!("{method}-{}.cc4d", precision.name()));
+            model.weight_precision = precision;
+            model.save_archive(&archive, "raw", &toml::Table::new(), &registry, &Limits::default(), &Silent).unwrap();
+            let stored = load(&archive);
+            let after = score(&stored, &config).psnr_db;
+            assert!(
+                before.is_finite() && (before - after).abs() < allowed,
+                "{method}: {before} dB, {after} from the archive with {} weights",
+                precision.name()
+            );
+            deform.push(stored.size.deform);
+        }
+        assert!(method == "none" || (deform[1] < deform[0] && deform[2] < deform[1]), "{method}: {deform:?} bytes of weights");
     }
 }

@@ -41,11 +41,11 @@ fn cell(x: &[f32], level: &GridLevel, shape: &GridShape) -> Option<Cell> {
 #[inline(always)]
 fn corner(cell: &Cell, corner: usize, level: &GridLevel, dims: usize) -> (usize, f32) {
     let (mut weight, mut hash, mut index, mut stride) = (1.0f32, 0u32, 0u64, 1u64);
-    for d in 0..dims {
+    for (d, prime) in PRIMES.into_iter().enumerate().take(dims) {
         let upper = corner >> d & 1;
         weight *= if upper == 1 { cell.part[d] } else { 1.0 - cell.part[d] };
         let at = cell.low[d].wrapping_add(upper as u32);
-        hash ^= at.wrapping_mul(PRIMES[d]);
+        hash ^= at.wrapping_mul(prime);
         index += u64::from(at) * stride;
         stride *= u64::from(level.size[d]);
     }

@@ -1,6 +1,6 @@
 //! Kernels for burn's CubeCL backend: one source for wgpu and cuda.
 // Kernels are translated, not run: iterators and joined conditions have no counterpart there.
-#![allow(clippy::needless_range_loop, clippy::collapsible_if, clippy::collapsible_else_if)]
+#![allow(clippy::needless_range_loop, clippy::collapsible_if, clippy::collapsible_else_if, clippy::manual_range_contains)]
 
 mod adam;
 mod field;

@@ -5,16 +5,14 @@ use crate::config::{RenderConfig, RunConfig};
 use crate::train::{CHECKPOINT, Moving};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{
-    Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind, WeightArray, decode_weights, encode_weights,
+    Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind, WeightArray, WeightPrecision, decode_weights,
+    encode_weights,
 };
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{CodecContext, DeformationField, Error, EventSink, FieldContext, HostGaussians, Limits, Registry, Result, Seed, Stream, split_kind};
 use serde::Serialize;
 use std::io::Read;
 use std::path::Path;
-
-/// Name of the stream with the field's weights.
-const FIELD_STREAM: &str = "field.weights";
 
 /// A model, wherever it came from.
 pub struct Model {
@@ -36,6 +34,8 @@ pub struct Model {
     pub provenance: Provenance,
     /// Bytes per share.
     pub size: ModelSize,
+    /// How the field's weights are written to archives.
+    pub weight_precision: WeightPrecision,
 }
 
 /// A field with what is needed to build it again.
@@ -95,6 +95,7 @@ impl Model {
             frame_count,
             provenance: provenance(&config)?,
             size: ModelSize { deform_grid, deform_net, deform, point_cloud, total: deform + point_cloud },
+            weight_precision: WeightPrecision::default(),
         })
     }
     fn from_archive(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
@@ -125,7 +126,9 @@ impl Model {
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
                 let mut field = registry.build_deformer(&section, &entry.context, device)?;
-                let weights = decode_weights(&object, &archive.read_stream(FIELD_STREAM)?, limits)?;
+                let stored = archive.stream_sizes();
+                let precision = WeightPrecision::ALL.into_iter().find(|p| stored.iter().any(|s| s.name == p.stream())).unwrap_or_default();
+                let weights = decode_weights(&object, &archive.read_stream(precision.stream())?, precision, limits)?;
                 load_weights(&object, field.as_mut(), weights, device)?;
                 Some(ModelField { field, section, context: entry.context.clone() })
             }
@@ -162,6 +165,7 @@ impl Model {
             frame_count: manifest.frame_count,
             provenance: manifest.provenance.clone(),
             size,
+            weight_precision: WeightPrecision::default(),
         })
     }
     /// Writes a `.cc4d` archive with the codec `spec` (`name` or `name:profile`) and returns its size in bytes.
@@ -212,7 +216,8 @@ impl Model {
         };
         let mut writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams);
         if let Some(f) = field {
-            writer = writer.add(StreamKind::Field, Stream { name: FIELD_STREAM.into(), bytes: encode_weights(&weights_of(f.field.as_ref())?)? });
+            let bytes = encode_weights(&weights_of(f.field.as_ref())?, self.weight_precision)?;
+            writer = writer.add(StreamKind::Field, Stream { name: self.weight_precision.stream().into(), bytes });
         }
         writer.write_to(path)
     }

@@ -1,6 +1,6 @@
 //! The nouns, the three seams, the registry and the stored form of cc4dgs.
 //!
-//! A plug-in crate depends on this crate alone: implement [`DeformationField`], [`AttributeCodec`] or [`Rasterizer`] and
+//! A plug-in crate depends on this crate alone (burn, inventory, serde and toml are re-exported in the versions it speaks): implement [`DeformationField`], [`AttributeCodec`] or [`Rasterizer`] and
 //! `inventory::submit!` a [`FieldPlugin`], [`CodecPlugin`] or [`RasterizerPlugin`].
 
 mod adapters;
@@ -32,7 +32,6 @@ pub use error::{Error, Result};
 pub use events::{Event, EventSink, Fanout, Recorder, Silent};
 pub use field::{AttributeSpec, DeformationField, FieldContext, FieldPlugin, FieldWork, Parameter, ParameterGroup, Part, SpatialFeatures};
 pub use gaussians::{ExtraAttribute, Gaussians, HostGaussians};
-pub use inventory;
 pub use limits::Limits;
 pub use module_field::ModuleField;
 pub use offsets::Offsets;
@@ -41,3 +40,4 @@ pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, Ren
 pub use registry::{Registry, split_kind, unknown_name};
 pub use scene::{FrameSource, Image8, PointCloud, Scene, Split, View};
 pub use seed::Seed;
+pub use {burn, inventory, serde, toml};

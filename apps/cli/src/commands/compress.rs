@@ -49,7 +49,8 @@ impl From<StreamInfo> for StreamSize {
 
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let events = context.listeners(None)?;
-    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    loaded.model.weight_precision = args.field_weights.into();
     let mut settings = toml::Table::new();
     for assignment in &args.sets {
         config::set(&mut settings, assignment)?;

@@ -19,6 +19,7 @@
 mod bytes;
 mod manifest;
 mod packing;
+mod precision;
 mod read;
 mod weights;
 mod write;
@@ -26,6 +27,7 @@ mod write;
 pub use bytes::ByteReader;
 pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, Manifest, Provenance, RasterizerEntry};
 pub use packing::estimate_stored_len;
+pub use precision::WeightPrecision;
 pub use read::{Archive, StreamInfo};
 pub use weights::{WeightArray, decode_weights, encode_weights};
 pub use write::{ArchiveWriter, write_atomically};

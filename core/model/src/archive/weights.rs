@@ -1,6 +1,6 @@
 //! Weights of a deformation field as one stream of float32.
 
-use super::ByteReader;
+use super::{ByteReader, WeightPrecision};
 use crate::{Error, Limits, Result};
 use std::collections::BTreeSet;
 
@@ -18,8 +18,8 @@ pub struct WeightArray {
     pub values: Vec<f32>,
 }
 
-/// Encodes weights: u32 count; per array u16 + name, u8 rank, u64 dimensions; then all values as little-endian float32.
-pub fn encode_weights(arrays: &[WeightArray]) -> Result<Vec<u8>> {
+/// Encodes weights: u32 count; per array u16 + name, u8 rank, u64 dimensions; then all values, little-endian, as `precision` says.
+pub fn encode_weights(arrays: &[WeightArray], precision: WeightPrecision) -> Result<Vec<u8>> {
     let mut out = (arrays.len() as u32).to_le_bytes().to_vec();
     let mut names = BTreeSet::new();
     for array in arrays {
@@ -42,12 +42,12 @@ pub fn encode_weights(arrays: &[WeightArray]) -> Result<Vec<u8>> {
         out.push(array.shape.len() as u8);
         array.shape.iter().for_each(|&d| out.extend((d as u64).to_le_bytes()));
     }
-    arrays.iter().flat_map(|a| &a.values).for_each(|v| out.extend(v.to_le_bytes()));
+    arrays.iter().try_for_each(|a| precision.write(&a.name, &a.values, &mut out))?;
     Ok(out)
 }
 
 /// Decodes what [`encode_weights`] wrote; `object` names the stream. Shapes must account for every byte, values must be finite.
-pub fn decode_weights(object: &str, bytes: &[u8], limits: &Limits) -> Result<Vec<WeightArray>> {
+pub fn decode_weights(object: &str, bytes: &[u8], precision: WeightPrecision, limits: &Limits) -> Result<Vec<WeightArray>> {
     limits.check_bytes(object, bytes.len() as u64)?;
     let mut reader = ByteReader::new(object, bytes);
     let count = reader.u32()?;
@@ -66,10 +66,10 @@ pub fn decode_weights(object: &str, bytes: &[u8], limits: &Limits) -> Result<Vec
         arrays.push(WeightArray { name, shape, values: Vec::new() });
     }
     for array in &mut arrays {
-        let Some(length) = product(&array.shape).filter(|&n| n <= reader.remaining() / 4) else {
+        let Some(length) = product(&array.shape).filter(|&n| n <= reader.remaining() && precision.bytes(n) <= reader.remaining()) else {
             return Err(reader.error(format!("weights '{}' of shape {:?} do not fit the {} bytes left", array.name, array.shape, reader.remaining())));
         };
-        array.values = reader.f32s(length)?;
+        array.values = precision.read(&mut reader, length)?;
     }
     reader.finish()?;
     Ok(arrays)
@@ -93,28 +93,28 @@ mod tests {
 
     #[test]
     fn weights_round_trip() {
-        let bytes = encode_weights(&arrays()).unwrap();
-        assert_eq!(decode_weights("t", &bytes, &Limits::default()).unwrap(), arrays());
+        let bytes = encode_weights(&arrays(), WeightPrecision::Fp32).unwrap();
+        assert_eq!(decode_weights("t", &bytes, WeightPrecision::Fp32, &Limits::default()).unwrap(), arrays());
     }
 
     #[test]
     fn bad_weights_are_refused_on_both_sides() {
         let mut twice = arrays();
         twice[1].name = twice[0].name.clone();
-        assert!(encode_weights(&twice).is_err());
+        assert!(encode_weights(&twice, WeightPrecision::Fp32).is_err());
         let mut short = arrays();
         short[0].values.pop();
-        assert!(encode_weights(&short).is_err());
+        assert!(encode_weights(&short, WeightPrecision::Fp32).is_err());
         let mut nan = arrays();
         nan[0].values[0] = f32::NAN;
-        assert!(encode_weights(&nan).is_err());
-        let bytes = encode_weights(&arrays()).unwrap();
+        assert!(encode_weights(&nan, WeightPrecision::Fp32).is_err());
+        let bytes = encode_weights(&arrays(), WeightPrecision::Fp32).unwrap();
         for n in 0..bytes.len() {
-            assert!(decode_weights("t", &bytes[..n], &Limits::default()).is_err(), "cut at {n}");
+            assert!(decode_weights("t", &bytes[..n], WeightPrecision::Fp32, &Limits::default()).is_err(), "cut at {n}");
         }
         let mut lying = bytes;
         // The first dimension of the first array.
         lying[4 + 2 + 14 + 1 + 7] = 0xff;
-        assert!(decode_weights("t", &lying, &Limits::default()).is_err());
+        assert!(decode_weights("t", &lying, WeightPrecision::Fp32, &Limits::default()).is_err());
     }
 }

@@ -79,7 +79,9 @@ fn relative_rms(before: &[f32], after: &[f32]) -> f64 {
     let mean = before.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
     let error: f64 = before.iter().zip(after).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
     let variance: f64 = before.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum();
-    if error == 0.0 { 0.0 } else { (error / variance).sqrt() }
+    // A column of one value has no deviation to measure by; its size has to do.
+    let scale = if variance > 0.0 { variance } else { before.iter().map(|&v| f64::from(v).powi(2)).sum() };
+    if error == 0.0 { 0.0 } else { (error / scale).sqrt() }
 }
 
 fn comes_back(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Option<String>> {

@@ -121,6 +121,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         frame_count: SEQUENCE,
         provenance: Provenance::default(),
         size: ModelSize::default(),
+        weight_precision: Default::default(),
     };
     let mut player = Player::new(&model, &context.registry, device)?;
     let mut times: [Vec<f64>; 3] = Default::default();

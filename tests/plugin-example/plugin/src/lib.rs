@@ -1,0 +1,4 @@
+//! A deformer and a codec that cc4dgs knows nothing of.
+
+mod half;
+mod sway;

@@ -1,0 +1,21 @@
+//! The suites that cc4dgs runs on its own plug-ins.
+
+use cc4dgs_core::{Registry, conformance, parse_device, toml::Table};
+use sway as _;
+
+#[test]
+fn the_deformer_conforms() {
+    let registry = Registry::collect().unwrap();
+    for device in ["flex", "ndarray", "wgpu"] {
+        // A machine without a graphics driver still runs the others.
+        let Ok(device) = parse_device(device) else { continue };
+        let findings = conformance::deformer(registry.deformer("sway").unwrap(), &Table::new(), &device);
+        assert!(findings.is_empty(), "{}", findings.join("\n"));
+    }
+}
+
+#[test]
+fn the_codec_conforms() {
+    let findings = conformance::codec(Registry::collect().unwrap().codec("half").unwrap(), "", &Table::new());
+    assert!(findings.is_empty(), "{}", findings.join("\n"));
+}
