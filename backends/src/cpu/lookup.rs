@@ -1,6 +1,6 @@
 //! Interpolated lookups in grids of stored features: dense, or hashed where a level has more vertices than rows (Müller et al. 2022).
 
-use crate::ops::lookup::{GridLevel, GridShape, MAX_DIMS, Outside, PRIMES};
+use crate::ops::lookup::{GridLevel, GridShape, Outside, PRIMES};
 use pulp::Arch;
 use rayon::prelude::*;
 
@@ -9,48 +9,98 @@ const ROWS: usize = 128;
 /// Features a backward task adds up: several tasks share a level where it has many.
 const FEATURES: usize = 8;
 
-/// Where a point lies on a level: its lower corner and how far it is past it, per axis.
-struct Cell {
-    low: [u32; MAX_DIMS],
-    part: [f32; MAX_DIMS],
+/// Where a point lies on a level of `D` axes: per axis, the shares of its lower and upper vertex in weight, hash and index.
+struct Cell<const D: usize> {
+    weight: [[f32; 2]; D],
+    hash: [[u32; 2]; D],
+    index: [[u32; 2]; D],
 }
 
 /// The cell of `x` (in 0..1 per axis), `None` where the grid has nothing.
 #[inline(always)]
-fn cell(x: &[f32], level: &GridLevel, shape: &GridShape) -> Option<Cell> {
-    let mut cell = Cell { low: [0; MAX_DIMS], part: [0.0; MAX_DIMS] };
-    for (d, &raw) in x.iter().enumerate() {
+fn cell<const D: usize>(x: &[f32; D], level: &GridLevel, shape: &GridShape) -> Option<Cell<D>> {
+    let mut cell = Cell { weight: [[0.0; 2]; D], hash: [[0; 2]; D], index: [[0; 2]; D] };
+    let mut stride = 1u32;
+    for d in 0..D {
+        let raw = x[d];
         // Comparisons with NaN are false: it is outside, or at the lower face.
-        let inside = (0.0..=1.0).contains(&raw);
-        if !inside && shape.outside == Outside::Zero {
+        if shape.outside == Outside::Zero && !(0.0..=1.0).contains(&raw) {
             return None;
         }
         let clamped = if raw > 0.0 { raw.min(1.0) } else { 0.0 };
         let position = clamped * level.scale[d] + shape.stagger;
         // A dense level ends with its last vertex; a hashed one has a place for every number.
-        let last = if shape.clamps { (level.size[d] - 2) as f32 } else { f32::MAX };
-        let low = position.floor().min(last);
+        let low = if shape.clamps { position.floor().min((level.size[d] - 2) as f32) } else { position.floor() };
         let part = position - low;
-        cell.low[d] = low as u32;
-        cell.part[d] = if shape.smooth { part * part * (3.0 - 2.0 * part) } else { part };
+        let part = if shape.smooth { part * part * (3.0 - 2.0 * part) } else { part };
+        let vertex = low as u32;
+        cell.weight[d] = [1.0 - part, part];
+        // Products and sums wrap; the index does so on hashed levels only, which do not use it.
+        cell.hash[d] = [vertex.wrapping_mul(PRIMES[d]), (vertex + 1).wrapping_mul(PRIMES[d])];
+        cell.index[d] = [vertex.wrapping_mul(stride), (vertex + 1).wrapping_mul(stride)];
+        stride = stride.wrapping_mul(level.size[d]);
     }
     Some(cell)
 }
 
-/// Row and weight of a corner (bit d set: the upper one along axis d).
+/// Row (within the level) and weight of a corner (bit d set: the upper one along axis d).
 #[inline(always)]
-fn corner(cell: &Cell, corner: usize, level: &GridLevel, dims: usize) -> (usize, f32) {
-    let (mut weight, mut hash, mut index, mut stride) = (1.0f32, 0u32, 0u64, 1u64);
-    for (d, prime) in PRIMES.into_iter().enumerate().take(dims) {
+fn corner<const D: usize>(cell: &Cell<D>, corner: usize, level: &GridLevel) -> (usize, f32) {
+    let (mut weight, mut hash, mut index) = (1.0f32, 0u32, 0u32);
+    for d in 0..D {
         let upper = corner >> d & 1;
-        weight *= if upper == 1 { cell.part[d] } else { 1.0 - cell.part[d] };
-        let at = cell.low[d].wrapping_add(upper as u32);
-        hash ^= at.wrapping_mul(prime);
-        index += u64::from(at) * stride;
-        stride *= u64::from(level.size[d]);
+        weight *= cell.weight[d][upper];
+        hash ^= cell.hash[d][upper];
+        index = index.wrapping_add(cell.index[d][upper]);
     }
-    let row = if level.hashed { u64::from(hash) } else { index } % level.rows as u64;
-    (level.first_row + row as usize, weight)
+    let (raw, rows) = (if level.hashed { hash } else { index }, level.rows as u32);
+    // A division per corner would cost more than the lookup.
+    let row = if raw < rows {
+        raw
+    } else if rows.is_power_of_two() {
+        raw & (rows - 1)
+    } else {
+        raw % rows
+    };
+    (row as usize, weight)
+}
+
+/// Runs `$body` with `$d` the number of axes as a constant.
+macro_rules! with_dims {
+    ($dims:expr, $d:ident => $body:expr) => {
+        match $dims {
+            1 => {
+                const $d: usize = 1;
+                $body
+            }
+            2 => {
+                const $d: usize = 2;
+                $body
+            }
+            3 => {
+                const $d: usize = 3;
+                $body
+            }
+            _ => {
+                const $d: usize = 4;
+                $body
+            }
+        }
+    };
+}
+
+/// Rows of the table and weights of all corners of `points` [M, dims] on one level, each [M, 2^dims]; weight 0 where the grid has nothing. Not what the
+/// operation does, which keeps neither: for comparisons.
+pub fn corners(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64>, Vec<f32>) {
+    fn of<const D: usize>(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64>, Vec<f32>) {
+        let one = |x: &[f32; D]| {
+            let cell = cell(x, level, shape);
+            let at = |c| cell.as_ref().map_or((0, 0.0), |cell| corner(cell, c, level));
+            (0..1 << D).map(at).map(|(row, weight)| ((level.first_row + row) as i64, weight)).collect::<Vec<_>>()
+        };
+        points.as_chunks::<D>().0.iter().flat_map(one).unzip()
+    }
+    with_dims!(shape.dims, D => of::<D>(shape, level, points))
 }
 
 /// Features [M, levels * features] of `points` [M, dims].
@@ -65,22 +115,27 @@ pub fn forward(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f32> {
     out.par_chunks_mut(ROWS * width).zip(points.par_chunks(ROWS * dims)).for_each(|(out, points)| {
         arch.dispatch(
             #[inline(always)]
-            || {
-                // Level by level, so that a task's rows of one table stay near.
-                for (l, level) in shape.levels.iter().enumerate() {
-                    for (row, x) in out.chunks_exact_mut(width).zip(points.chunks_exact(dims)) {
-                        let Some(cell) = cell(x, level, shape) else { continue };
-                        let sum = &mut row[l * f..(l + 1) * f];
-                        for c in 0..1 << dims {
-                            let (at, weight) = corner(&cell, c, level, dims);
-                            add_scaled(sum, &table[at * f..(at + 1) * f], weight);
-                        }
-                    }
-                }
-            },
+            || with_dims!(dims, D => gather::<D>(shape, table, points, width, out)),
         );
     });
     out
+}
+
+#[inline(always)]
+fn gather<const D: usize>(shape: &GridShape, table: &[f32], points: &[f32], width: usize, out: &mut [f32]) {
+    let f = shape.features;
+    // Level by level, so that a task's rows of one table stay near.
+    for (l, level) in shape.levels.iter().enumerate() {
+        let own = &table[level.first_row * f..(level.first_row + level.rows) * f];
+        for (row, x) in out.chunks_exact_mut(width).zip(points.as_chunks::<D>().0) {
+            let Some(cell) = cell(x, level, shape) else { continue };
+            let sum = &mut row[l * f..(l + 1) * f];
+            for c in 0..1 << D {
+                let (at, weight) = corner(&cell, c, level);
+                add_scaled(sum, &own[at * f..(at + 1) * f], weight);
+            }
+        }
+    }
 }
 
 /// The gradient of the table, given that of the features. A task owns some features of one level and visits the points in order, so that nothing is raced for.
@@ -101,7 +156,7 @@ pub fn backward(shape: &GridShape, points: &[f32], grad: &[f32]) -> Vec<f32> {
         tasks.into_par_iter().for_each(|(l, level, own)| {
             arch.dispatch(
                 #[inline(always)]
-                || scatter(shape, l, level, points, grad, width, 0..f, own, f),
+                || with_dims!(shape.dims, D => scatter::<D>(shape, l, level, points, grad, width, 0..f, own, f)),
             );
         });
     } else {
@@ -115,7 +170,7 @@ pub fn backward(shape: &GridShape, points: &[f32], grad: &[f32]) -> Vec<f32> {
                     let stride = range.len();
                     arch.dispatch(
                         #[inline(always)]
-                        || scatter(shape, l, level, points, grad, width, range.clone(), &mut column, stride),
+                        || with_dims!(shape.dims, D => scatter::<D>(shape, l, level, points, grad, width, range.clone(), &mut column, stride)),
                     );
                     (range.start, column)
                 })
@@ -132,7 +187,7 @@ pub fn backward(shape: &GridShape, points: &[f32], grad: &[f32]) -> Vec<f32> {
 }
 
 #[inline(always)]
-fn scatter(
+fn scatter<const D: usize>(
     shape: &GridShape,
     l: usize,
     level: &GridLevel,
@@ -143,14 +198,13 @@ fn scatter(
     out: &mut [f32],
     stride: usize,
 ) {
-    let (dims, f) = (shape.dims, shape.features);
-    for (x, d) in points.chunks_exact(dims).zip(grad.chunks_exact(width)) {
+    let f = shape.features;
+    for (x, d) in points.as_chunks::<D>().0.iter().zip(grad.chunks_exact(width)) {
         let d = &d[l * f + features.start..l * f + features.end];
         let Some(cell) = cell(x, level, shape) else { continue };
-        for c in 0..1 << dims {
-            let (at, weight) = corner(&cell, c, level, dims);
-            let row = (at - level.first_row) * stride;
-            add_scaled(&mut out[row..row + d.len()], d, weight);
+        for c in 0..1 << D {
+            let (at, weight) = corner(&cell, c, level);
+            add_scaled(&mut out[at * stride..at * stride + d.len()], d, weight);
         }
     }
 }

@@ -20,6 +20,8 @@ pub enum BenchWhat {
     Agree(BenchAgree),
     /// The computational field forwards and backwards, against the same field in burn's primitives.
     Field(BenchField),
+    /// Lookups in the hash grids and planes of the baselines, against the same in burn's primitives.
+    Lookup(BenchLookup),
     /// Sorting of growing numbers of pairs.
     Sort(BenchSort),
     /// L1 and SSIM with their gradient on growing pictures.
@@ -151,4 +153,20 @@ pub struct BenchStep {
     /// Also time the Gaussians of this golden scene (raster_*.inputs.f64.safetensors); may be given again.
     #[arg(long, value_name = "FILE")]
     pub scene: Vec<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchLookup {
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Moving Gaussians.
+    #[arg(long, value_name = "N", default_value_t = 40_000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
+    pub gaussians: u32,
+    /// Runs measured, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub repeats: u32,
+    /// Root of the seed tree.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
 }

@@ -63,6 +63,7 @@ pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
             BenchWhat::Frame(args) => bench::frame(&context, args),
             BenchWhat::Agree(args) => bench::agree(&context, args),
             BenchWhat::Field(args) => bench::field(&context, args),
+            BenchWhat::Lookup(args) => bench::lookup(&context, args),
             BenchWhat::Sort(args) => bench::sort(&context, args),
             BenchWhat::Loss(args) => bench::loss(&context, args),
         },

@@ -3,12 +3,14 @@
 mod agree;
 mod field;
 mod frame;
+mod lookup;
 mod parts;
 mod step;
 
 pub use agree::agree;
 pub use field::field;
 pub use frame::frame;
+pub use lookup::lookup;
 pub use parts::{loss, sort};
 pub use step::step;
 
