@@ -3,7 +3,7 @@
 use crate::column::{self, Target};
 use crate::morton;
 use crate::rows::{interleave, load, split, store};
-use crate::streams::{META, Shape, StreamSet};
+use crate::streams::{META, Shape, open};
 use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
 
@@ -25,6 +25,9 @@ sh_dc = 8
 sh_rest = 6
 dynamic_scores = 8
 ";
+
+/// The settings, which are the columns of [`HostGaussians`].
+const COLUMNS: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
 
 /// Bits per component of each attribute.
 #[derive(Clone, Copy, Debug, Deserialize)]
@@ -92,13 +95,8 @@ impl AttributeCodec for Quantize {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let set = StreamSet::new("quantize", streams);
-        let (mut meta, mut escapes) = (set.reader(META)?, set.reader(ESCAPES)?);
-        let version = meta.u8()?;
-        if version != VERSION {
-            return Err(Error::unsupported("quantize streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
-        }
-        let shape = Shape::read(&mut meta, &context.limits)?;
+        let (set, mut meta, shape) = open("quantize", streams, VERSION, &context.limits)?;
+        let mut escapes = set.reader(ESCAPES)?;
         let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
         for (name, width, values) in out.columns_mut() {
             *values = interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count);
@@ -111,8 +109,7 @@ impl AttributeCodec for Quantize {
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {
-        let columns = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
-        let lossy = columns.into_iter().filter(|c| self.bits.of(c) != 32);
+        let lossy = COLUMNS.into_iter().filter(|c| self.bits.of(c) != 32);
         lossy.map(|c| DeclaredLoss { attribute: c.into(), relative_rms: loss(self.bits.of(c)) }).collect()
     }
 }
@@ -124,12 +121,12 @@ fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec
         _ => return Err(unknown_name("profile of codec quantize", profile, ["default", "high"].into_iter())),
     };
     let mut section = toml::Table::new();
-    for column in ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"] {
+    for column in COLUMNS {
         section.insert(column.into(), i64::from(base.of(column)).into());
     }
     config::merge(&mut section, settings);
     let bits: Bits = config::parse_section("codec quantize", &section)?;
-    for column in ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"] {
+    for column in COLUMNS {
         let wanted = bits.of(column);
         if !(4..=16).contains(&wanted) && wanted != 32 {
             return Err(Error::parameter(format!("codec quantize.{column}"), format!("{wanted} bits"), "Choose 4 to 16, or 32 for float32"));

@@ -1,7 +1,7 @@
 //! `raw`: every attribute as float32, bit-exact and in order.
 
-use crate::streams::{META, Shape, StreamSet, from_planes, to_planes};
-use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
+use crate::streams::{META, Shape, from_planes, open, to_planes};
+use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
 
 /// Version of the stored form.
@@ -21,13 +21,7 @@ impl AttributeCodec for Raw {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let set = StreamSet::new("raw", streams);
-        let mut meta = set.reader(META)?;
-        let version = meta.u8()?;
-        if version != VERSION {
-            return Err(Error::unsupported("raw streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
-        }
-        let shape = Shape::read(&mut meta, &context.limits)?;
+        let (set, meta, shape) = open("raw", streams, VERSION, &context.limits)?;
         meta.finish()?;
         let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
         for (name, width, values) in out.columns_mut() {

@@ -26,6 +26,18 @@ impl<'a> StreamSet<'a> {
     }
 }
 
+/// What every decoder reads first: the streams by name, the meta stream behind its version and the shape, and the shape.
+pub(crate) fn open<'a>(codec: &'static str, streams: &'a [Stream], version: u8, limits: &Limits) -> Result<(StreamSet<'a>, ByteReader<'a>, Shape)> {
+    let set = StreamSet::new(codec, streams);
+    let mut meta = set.reader(META)?;
+    let found = meta.u8()?;
+    if found != version {
+        return Err(Error::unsupported(format!("{codec} streams"), format!("version {found} is not {version}"), "Use a release of cc4dgs that knows it"));
+    }
+    let shape = Shape::read(&mut meta, limits)?;
+    Ok((set, meta, shape))
+}
+
 /// Number of Gaussians, degree and plug-in attributes: the part of the meta stream both codecs share.
 pub(crate) struct Shape {
     pub(crate) count: usize,

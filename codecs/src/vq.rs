@@ -5,7 +5,7 @@
 
 use crate::column::{self, Target};
 use crate::rows::{interleave, load, split, store};
-use crate::streams::{META, Shape, StreamSet, from_planes, to_planes};
+use crate::streams::{META, Shape, from_planes, open, to_planes};
 use crate::{kmeans, morton};
 use cc4dgs_core::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, config, inventory, unknown_name,
@@ -109,13 +109,8 @@ impl AttributeCodec for Vq {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let set = StreamSet::new("vq", streams);
-        let (mut meta, mut escapes) = (set.reader(META)?, set.reader(ESCAPES)?);
-        let version = meta.u8()?;
-        if version != VERSION {
-            return Err(Error::unsupported("vq streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
-        }
-        let shape = Shape::read(&mut meta, &context.limits)?;
+        let (set, mut meta, shape) = open("vq", streams, VERSION, &context.limits)?;
+        let mut escapes = set.reader(ESCAPES)?;
         let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
         for (name, width, values) in out.columns_mut() {
             let book_rows = if BOOKS.contains(&name) { meta.u32()? as usize } else { 0 };

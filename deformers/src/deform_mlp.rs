@@ -132,8 +132,7 @@ impl DeformationField for DeformMlp {
         self.parameters.iter_mut().collect()
     }
     fn groups(&self) -> Vec<ParameterGroup> {
-        let (lr_start, lr_end) = (self.settings.lr_start, self.settings.lr_end);
-        vec![ParameterGroup { name: "deform-mlp".into(), lr_start, lr_end, warmup: 0.0, times_extent: false, epsilon: 1e-15, clip_norm: 0.0 }]
+        vec![ParameterGroup::plain("deform-mlp", self.settings.lr_start, self.settings.lr_end)]
     }
 }
 

@@ -163,8 +163,7 @@ impl DeformationField for Embedding {
         self.parameters.iter_mut().collect()
     }
     fn groups(&self) -> Vec<ParameterGroup> {
-        let (lr_start, lr_end) = (self.settings.lr_start, self.settings.lr_end);
-        vec![ParameterGroup { name: "embedding".into(), lr_start, lr_end, warmup: 0.0, times_extent: true, epsilon: 1e-15, clip_norm: 0.0 }]
+        vec![ParameterGroup { times_extent: true, ..ParameterGroup::plain("embedding", self.settings.lr_start, self.settings.lr_end) }]
     }
 }
 

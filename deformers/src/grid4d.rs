@@ -225,17 +225,7 @@ impl DeformationField for Grid4d {
     }
     fn groups(&self) -> Vec<ParameterGroup> {
         let s = &self.settings;
-        [("grid4d net", s.lr_start, s.lr_end), ("grid4d tables", s.lr_grid_start, s.lr_grid_end)]
-            .map(|(name, lr_start, lr_end)| ParameterGroup {
-                name: name.into(),
-                lr_start,
-                lr_end,
-                warmup: 0.0,
-                times_extent: false,
-                epsilon: 1e-15,
-                clip_norm: 0.0,
-            })
-            .to_vec()
+        vec![ParameterGroup::plain("grid4d net", s.lr_start, s.lr_end), ParameterGroup::plain("grid4d tables", s.lr_grid_start, s.lr_grid_end)]
     }
     /// Features at slightly other places shall be alike: squared differences, summed over channels and averaged over centres.
     fn regularizer(&self, means_world: Tensor<2>, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {

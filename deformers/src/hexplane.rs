@@ -179,15 +179,7 @@ impl DeformationField for HexPlane {
     }
     fn groups(&self) -> Vec<ParameterGroup> {
         let s = &self.settings;
-        let group = |name: &str, factor: f64| ParameterGroup {
-            name: name.into(),
-            lr_start: s.lr_start * factor,
-            lr_end: s.lr_end * factor,
-            warmup: 0.0,
-            times_extent: true,
-            epsilon: 1e-15,
-            clip_norm: 0.0,
-        };
+        let group = |name, factor| ParameterGroup { times_extent: true, ..ParameterGroup::plain(name, s.lr_start * factor, s.lr_end * factor) };
         vec![group("hexplane net", 1.0), group("hexplane planes", s.grid_rate)]
     }
     /// Smooth planes, and planes of time near 1 (weights of the published code): squared second differences along a plane's second axis, which is time

@@ -125,8 +125,8 @@ impl DeformationField for Swift4d {
         self.parameters.iter_mut().collect()
     }
     fn groups(&self) -> Vec<ParameterGroup> {
-        let (lr_start, lr_end) = (self.settings.lr_start, self.settings.lr_end);
-        vec![ParameterGroup { name: "swift4d-hash".into(), lr_start, lr_end, warmup: 0.0, times_extent: true, epsilon: 1e-8, clip_norm: 0.0 }]
+        let group = ParameterGroup::plain("swift4d-hash", self.settings.lr_start, self.settings.lr_end);
+        vec![ParameterGroup { times_extent: true, epsilon: 1e-8, ..group }]
     }
 }
 

@@ -105,6 +105,11 @@ fn median(values: &mut [f64]) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
+/// Waits until a device that runs behind has done what it was asked for, so that each part of a step is charged with its own time.
+fn settle(device: &Device) -> Result<()> {
+    device.sync().map_err(|e| cc4dgs_core::Error::backend("device", format!("{e:?}"), "Try another device (--device flex)"))
+}
+
 /// Times `repetitions` whole training steps of `workload` on `device` after a few that are not counted.
 pub fn time_step(workload: &Workload, device: &Device, seed: Seed, repetitions: usize) -> Result<StepTiming> {
     let tracked = device.clone().autodiff();
@@ -137,13 +142,16 @@ pub fn time_step(workload: &Workload, device: &Device, seed: Seed, repetitions: 
         };
         let out = TileRasterizer.render(&splats, camera, &RenderSettings::default())?;
         work = out.stats.work;
+        settle(device)?;
         let rendered = Instant::now();
         let loss = photometric_loss(out.planes, target.clone(), LAMBDA)?;
+        settle(device)?;
         let judged = Instant::now();
         let mut grads = loss.loss.backward();
         let d_matrices = [&means, &scales, &quaternions, &dc].map(|p| p.grad_remove(&mut grads));
         let (d_opacity, d_rest) = (opacity.grad_remove(&mut grads), higher.grad_remove(&mut grads));
         drop((splats, means, scales, quaternions, dc, opacity, higher, loss.terms, grads));
+        settle(device)?;
         let derived = Instant::now();
         let settings = AdamSettings { visible: Some(out.stats.radii.clone()), ..AdamSettings::new(LEARNING_RATE, step as u64 + 1) };
         for (parameter, grad) in matrices.iter_mut().zip(d_matrices) {

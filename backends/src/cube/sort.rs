@@ -16,16 +16,10 @@ const MASK: u32 = (1 << DIGIT) - 1;
 const ROUNDS: u32 = 4;
 const BLOCK: u32 = ROUNDS * UNITS;
 
-/// values[i] becomes the sum of those before it within its cube; `sums` gets the cubes' totals.
-#[cube(launch)]
-fn scan_in_cubes(values: &mut [u32], sums: &mut [u32], count: u32) {
-    let mut running = Shared::<[u32]>::new_slice(UNITS as usize);
-    let at = ABSOLUTE_POS;
+/// Each unit's place in `running` becomes the sum of the values of the units up to it, itself included.
+#[cube]
+fn add_up(running: &mut Shared<[u32]>, value: u32) {
     let unit = UNIT_POS as usize;
-    let mut value = 0u32;
-    if at < count as usize {
-        value = values[at];
-    }
     running[unit] = value;
     sync_cube();
     let mut reach = 1usize;
@@ -39,6 +33,19 @@ fn scan_in_cubes(values: &mut [u32], sums: &mut [u32], count: u32) {
         sync_cube();
         reach *= 2;
     }
+}
+
+/// values[i] becomes the sum of those before it within its cube; `sums` gets the cubes' totals.
+#[cube(launch)]
+fn scan_in_cubes(values: &mut [u32], sums: &mut [u32], count: u32) {
+    let mut running = Shared::<[u32]>::new_slice(UNITS as usize);
+    let at = ABSOLUTE_POS;
+    let unit = UNIT_POS as usize;
+    let mut value = 0u32;
+    if at < count as usize {
+        value = values[at];
+    }
+    add_up(&mut running, value);
     if at < count as usize {
         values[at] = running[unit] - value;
     }
@@ -60,19 +67,7 @@ fn scan_sums(sums: &mut [u32], total: &mut [u32], count: u32) {
         if at < count as usize {
             value = sums[at];
         }
-        running[unit] = value;
-        sync_cube();
-        let mut reach = 1usize;
-        while reach < UNITS as usize {
-            let mut before = 0u32;
-            if unit >= reach {
-                before = running[unit - reach];
-            }
-            sync_cube();
-            running[unit] += before;
-            sync_cube();
-            reach *= 2;
-        }
+        add_up(&mut running, value);
         if at < count as usize {
             sums[at] = carry + running[unit] - value;
         }

@@ -64,6 +64,13 @@ pub struct ParameterGroup {
     pub clip_norm: f64,
 }
 
+impl ParameterGroup {
+    /// Adam from `lr_start` to `lr_end`, with the epsilon of 3DGS and neither warm-up nor clipping.
+    pub fn plain(name: &str, lr_start: f64, lr_end: f64) -> Self {
+        Self { name: name.into(), lr_start, lr_end, warmup: 0.0, times_extent: false, epsilon: 1e-15, clip_norm: 0.0 }
+    }
+}
+
 /// What a call cost, counted rather than timed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FieldWork {

@@ -14,6 +14,8 @@ use cubecl::prelude::*;
 const BLOCK: usize = 4;
 /// Rows a cube may keep, the more the better: weights are read once per tile.
 const TILES: [usize; 2] = [32, 16];
+/// Numbers per layer in a plan.
+const FIELDS: usize = 8;
 /// Stands for "none".
 const NONE: u32 = u32::MAX;
 
@@ -146,7 +148,7 @@ fn run_layers(
     #[comptime] tiles: usize,
 ) {
     let mut kept = Shared::<[f32]>::new_slice(comptime!(tile * stride * tiles));
-    let mut partial = Shared::<[f32]>::new_slice(256usize);
+    let mut partial = Shared::<[f32]>::new_slice(UNITS as usize);
     let unit = UNIT_POS as usize;
     let first = CUBE_POS * tile;
     let rows = rows as usize;
@@ -161,11 +163,11 @@ fn run_layers(
         } else {
             kept[r * stride + i] = x[row * inputs + i];
         }
-        place += 256usize;
+        place += UNITS as usize;
     }
     sync_cube();
     for step in 0..steps as usize {
-        let at = 8 * step;
+        let at = FIELDS * step;
         let (input, output, base, norm) = (plan[at] as usize, plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3]);
         let (relu, source, target, start) = (plan[at + 4], plan[at + 5] as usize, plan[at + 6] as usize, plan[at + 7] as usize);
         let column_blocks = output.div_ceil(4usize);
@@ -221,9 +223,9 @@ fn run_layers(
             }
         }
         sync_cube();
-        if norm != 0xffff_ffffu32 {
+        if norm != NONE {
             // Several units share a row; their sums are added in order.
-            let per_row = comptime!(256 / tile);
+            let per_row = comptime!(UNITS as usize / tile);
             let (r, part) = (unit / per_row, unit % per_row);
             let line = target * (tile * stride) + r * stride;
             let width = output as f32;

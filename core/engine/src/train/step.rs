@@ -29,17 +29,18 @@ impl Context<'_> {
         let leaves = state.set.leaves(&LEARNED);
         let gaussians = state.set.gaussians(&leaves);
         let autodiff = leaves[0].device();
-        let mut features = None;
+        let (mut features, mut canonical) = (None, None);
         if moving > 0
             && let Some(optimizer) = &mut state.field
         {
             optimizer.track();
             // The field is asked about the canonical centres as constants (baselines §10, row 22), which also makes caching exact.
-            let canonical = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
+            let centres = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
             let own: Vec<Tensor<2>> = optimizer.field.attributes().iter().map(|a| rows.select(state.set.leaf(&leaves, &a.name))).collect();
-            let spatial = optimizer.field.spatial_with(canonical, &own)?;
+            let spatial = optimizer.field.spatial_with(centres.clone(), &own)?;
             log.count_field(spatial.work.vertices_decoded, spatial.work.vertices_queried - spatial.work.vertices_decoded, moving as u64, (n - moving) as u64);
             features = Some(spatial.values);
+            canonical = Some(centres);
         }
 
         let degree = match stage {
@@ -85,22 +86,16 @@ impl Context<'_> {
             probes.push((probe, radii, camera));
         }
         let Some(mut loss) = total else { return Ok(()) };
-        if state.smooth
-            && let (Some(optimizer), Some(&view)) = (&state.field, batch.first())
-            && moving > 0
-        {
-            let seed = self.seed.child("smoothness").index(iteration as u64);
-            let means = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
+        if let (Some(optimizer), Some(&view), Some(centres)) = (&state.field, batch.first(), canonical) {
             let time_norm = scene.views[view].time_norm;
-            if let Some(term) = smoothness(optimizer.field.as_ref(), &optimizer.context, means, time_norm, train, progress, seed)? {
-                loss = loss + term;
+            if state.smooth {
+                let seed = self.seed.child("smoothness").index(iteration as u64);
+                let field = optimizer.field.as_ref();
+                if let Some(term) = smoothness(field, &optimizer.context, centres.clone(), time_norm, train, progress, seed)? {
+                    loss = loss + term;
+                }
             }
-        }
-        if moving > 0
-            && let (Some(optimizer), Some(&view)) = (&state.field, batch.first())
-        {
-            let means = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
-            if let Some(term) = optimizer.field.regularizer(means, scene.views[view].time_norm, progress as f32)? {
+            if let Some(term) = optimizer.field.regularizer(centres, time_norm, progress as f32)? {
                 loss = loss + term;
             }
         }

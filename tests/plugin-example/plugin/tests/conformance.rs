@@ -7,8 +7,15 @@ use sway as _;
 fn the_deformer_conforms() {
     let registry = Registry::collect().unwrap();
     for device in ["flex", "ndarray", "wgpu"] {
-        // A machine without a graphics driver still runs the others.
-        let Ok(device) = parse_device(device) else { continue };
+        let device = match parse_device(device) {
+            Ok(device) => device,
+            // A machine without a graphics driver still runs the others; CI says that it has one.
+            Err(e) if std::env::var_os("CC4DGS_REQUIRE_WGPU").is_none() => {
+                eprintln!("{e}: skipped");
+                continue;
+            }
+            Err(e) => panic!("{e}"),
+        };
         let findings = conformance::deformer(registry.deformer("sway").unwrap(), &Table::new(), &device);
         assert!(findings.is_empty(), "{}", findings.join("\n"));
     }

@@ -55,8 +55,10 @@ fn text(report: &StepReport) -> String {
     let mut lines = vec![format!("training step on {}, {} threads, {} repeats", report.device, report.threads, report.repeats)];
     lines.push("workload      picture  Gaussians  median ms   min ms  (render    loss  backward   Adam)   pairs/s  of peak".into());
     lines.extend(report.cases.iter().map(|c| {
+        // Devices that do not read their counters back have no pairs to show.
+        let counted = Some(c).filter(|c| c.pixel_pairs > 0);
         format!(
-            "{:<12} {:>4}x{:<4} {:>9} {:>10.2} {:>8.2}  {:>7.2} {:>7.2} {:>9.2} {:>6.2}  {:>8.2e}  {:>6.1}%",
+            "{:<12} {:>4}x{:<4} {:>9} {:>10.2} {:>8.2}  {:>7.2} {:>7.2} {:>9.2} {:>6.2}  {:>8}  {:>7}",
             c.name,
             c.width,
             c.height,
@@ -67,8 +69,8 @@ fn text(report: &StepReport) -> String {
             c.loss_ms,
             c.backward_ms,
             c.adam_ms,
-            c.pairs_per_s,
-            100.0 * c.peak_share
+            counted.map_or("-".into(), |c| format!("{:.2e}", c.pairs_per_s)),
+            counted.map_or("-".into(), |c| format!("{:.1}%", 100.0 * c.peak_share))
         )
     }));
     lines.join("\n")
