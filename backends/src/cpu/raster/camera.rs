@@ -58,6 +58,8 @@ pub struct CameraConstants {
     pub principal: [f32; 2],
     /// Where x/z and y/z are clamped in the Jacobian: (lower, upper) per axis.
     pub ratio_limits: [[f32; 2]; 2],
+    /// The row of world to camera that gives the depth, unrounded.
+    pub depth_row: [f64; 4],
 }
 
 impl CameraConstants {
@@ -80,7 +82,14 @@ impl CameraConstants {
             focal: focal.map(|v| v as f32),
             principal: principal.map(|v| v as f32),
             ratio_limits: [limits(0), limits(1)],
+            depth_row: m[2],
         }
+    }
+    /// The depth by which Gaussians are sorted: exact, then rounded once. Rounded on the way, two Gaussians within 1e-7 of each other would be blended in
+    /// one order here and in the other there, which shows.
+    pub fn depth(&self, mean: &[f32]) -> f32 {
+        let [x, y, z, t] = self.depth_row;
+        (x * f64::from(mean[0]) + y * f64::from(mean[1]) + z * f64::from(mean[2]) + t) as f32
     }
 }
 

@@ -179,7 +179,6 @@ impl WithSimd for Project<'_, '_> {
                     p.conic[1],
                     p.conic[2] * 0.5,
                     opacity,
-                    p.point[2],
                     half_width,
                     half_height,
                     xy / yy * half_height,
@@ -192,7 +191,7 @@ impl WithSimd for Project<'_, '_> {
                     column.store(row);
                 }
                 for lane in 0..here {
-                    if out[13][lane] != 0.0 {
+                    if out[12][lane] != 0.0 {
                         k.emit(
                             start + lane,
                             &each(
@@ -211,9 +210,9 @@ impl WithSimd for Project<'_, '_> {
 impl ProjectChunk<'_> {
     /// Adds one visible Gaussian.
     #[inline(always)]
-    fn emit(&mut self, offset: usize, v: &[f32; 13]) {
+    fn emit(&mut self, offset: usize, v: &[f32; 12]) {
         // Inria keeps integer radii below 2^31; so do we.
-        let radius = v[12].ceil().min(1e9) as i64;
+        let radius = v[11].ceil().min(1e9) as i64;
         if self.rules.square_tiles && tiles::square([v[0], v[1]], radius, self.settings).iter().any(|axis| axis[0] >= axis[1]) {
             return;
         }
@@ -222,18 +221,19 @@ impl ProjectChunk<'_> {
             let last = ((center + half - 0.5).floor().max(0.0) as usize).min(size - 1) / TILE;
             (last + 1 - first.min(last)) as u64
         };
-        self.tiles += span(v[0], v[7], self.settings.width) * span(v[1], v[8], self.settings.height);
+        self.tiles += span(v[0], v[6], self.settings.width) * span(v[1], v[7], self.settings.height);
+        let index = self.first + offset;
         self.radii[offset] = radius;
         self.slots[self.count] = ScreenSplat {
             center: [v[0], v[1]],
             conic: [v[2], v[3], v[4]],
             opacity: v[5],
             color: [0.0; 3],
-            depth: v[6],
-            half_width: v[7],
-            index: (self.first + offset) as u32,
+            depth: self.camera.depth(&self.splats.means[3 * index..3 * index + 3]),
+            half_width: v[6],
+            index: index as u32,
         };
-        self.footprints[self.count] = Footprint { half_height: v[8], x_of_bottom: v[9], slope: v[10], aspect: v[11] };
+        self.footprints[self.count] = Footprint { half_height: v[7], x_of_bottom: v[8], slope: v[9], aspect: v[10] };
         self.count += 1;
     }
     /// Sets the colour of a slot and moves it to `kept`, or culls it if the colour, before its clamp at zero, is not finite.

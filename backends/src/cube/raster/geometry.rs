@@ -4,7 +4,8 @@ use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
 use crate::cpu::raster::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
 use cubecl::prelude::*;
 
-/// Places in the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size.
+/// Places in the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size,
+/// and the row that gives the depth: four numbers, what float32 cuts off them, and a zero.
 pub const TRANSLATION: usize = 9;
 pub const CENTER: usize = 12;
 pub const FOCAL: usize = 15;
@@ -12,6 +13,9 @@ pub const PRINCIPAL: usize = 17;
 pub const LIMITS: usize = 19;
 pub const NEAR: usize = 23;
 pub const SIZE: usize = 24;
+pub const DEPTH: usize = 26;
+/// Of a float32, the upper half of the significand, so that products of halves are exact.
+const UPPER_HALF: u32 = 0xffff_f000;
 
 /// The camera as the kernels read it.
 pub fn camera_buffer(camera: &CameraConstants, rules: &RuleConstants, width: usize, height: usize) -> Vec<f32> {
@@ -22,6 +26,9 @@ pub fn camera_buffer(camera: &CameraConstants, rules: &RuleConstants, width: usi
     values.extend(camera.principal);
     values.extend(camera.ratio_limits.iter().flatten());
     values.extend([rules.near, width as f32, height as f32]);
+    values.extend(camera.depth_row.map(|v| v as f32));
+    values.extend(camera.depth_row.map(|v| (v - f64::from(v as f32)) as f32));
+    values.push(0.0);
     values
 }
 
@@ -57,6 +64,44 @@ pub struct Projected {
     /// 1 where the ratio was not clamped, else 0.
     pub inside_x: f32,
     pub inside_y: f32,
+}
+
+/// a b as an exact float32 and a small rest, so that it does not matter whether a compiler fuses products with sums.
+#[cube]
+fn exact_product(a: f32, b: f32) -> (f32, f32) {
+    let a_upper = f32::reinterpret(u32::reinterpret(a) & UPPER_HALF);
+    let b_upper = f32::reinterpret(u32::reinterpret(b) & UPPER_HALF);
+    let (a_lower, b_lower) = (a - a_upper, b - b_upper);
+    (a_upper * b_upper, a_upper * b_lower + a_lower * b_upper + a_lower * b_lower)
+}
+
+/// `v`, behind a door no compiler looks through: shaders may be simplified as if sums were exact (Mesa turns (a + b) - a into b).
+#[cube]
+fn rounded(v: f32, zero: u32) -> f32 {
+    f32::reinterpret(u32::reinterpret(v) ^ zero)
+}
+
+/// a + b and what rounding took (Knuth).
+#[cube]
+fn exact_sum(a: f32, b: f32, zero: u32) -> (f32, f32) {
+    let sum = rounded(a + b, zero);
+    let of_b = rounded(sum - a, zero);
+    let of_a = rounded(sum - of_b, zero);
+    (sum, rounded(a - of_a, zero) + rounded(b - of_b, zero))
+}
+
+/// The depth of `mean`, rounded once, as [`CameraConstants::depth`] finds it in float64: about 36 bits before the rounding.
+#[cube]
+pub fn sorting_depth(cam: &[f32], mean: V3) -> f32 {
+    let (x, x_rest) = exact_product(cam[DEPTH], mean.x);
+    let (y, y_rest) = exact_product(cam[DEPTH + 1], mean.y);
+    let (z, z_rest) = exact_product(cam[DEPTH + 2], mean.z);
+    let zero = u32::reinterpret(cam[DEPTH + 8]);
+    let (first, first_rest) = exact_sum(cam[DEPTH + 3], x, zero);
+    let (second, second_rest) = exact_sum(first, y, zero);
+    let (third, third_rest) = exact_sum(second, z, zero);
+    let cut = cam[DEPTH + 4] * mean.x + cam[DEPTH + 5] * mean.y + cam[DEPTH + 6] * mean.z + cam[DEPTH + 7];
+    third + (x_rest + y_rest + z_rest + (first_rest + second_rest + third_rest) + cut)
 }
 
 #[cube]

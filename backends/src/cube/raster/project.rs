@@ -1,6 +1,6 @@
 //! From Gaussians to the visible ones on the screen: activation, projection, culling, colour.
 
-use super::geometry::{CENTER, NEAR, Projected, SIZE, project};
+use super::geometry::{CENTER, NEAR, Projected, SIZE, project, sorting_depth};
 use super::harmonics::basis;
 use super::vector::{V3, V4, add, dot, load3, scale, v3};
 use crate::cpu::raster::TILE;
@@ -163,9 +163,10 @@ pub fn project_gaussians(
         splats[at + 3] = p.conic.y;
         splats[at + 4] = p.conic.z * 0.5;
         splats[at + 5] = opacity;
-        splats[at + 9] = p.point.z;
+        let depth = sorting_depth(cam, mean);
+        splats[at + 9] = depth;
         // Depths are positive, so their bits order like the numbers.
-        keys[KEYS * i] = select(drawn, u32::reinterpret(p.point.z), 0xffff_ffffu32);
+        keys[KEYS * i] = select(drawn, u32::reinterpret(depth), 0xffff_ffffu32);
         keys[KEYS * i + 1] = select(drawn, length_of(columns) * length_of(rows), 0u32);
         keys[KEYS * i + 2] = columns;
         keys[KEYS * i + 3] = rows;

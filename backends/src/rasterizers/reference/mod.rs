@@ -131,8 +131,8 @@ impl ReferenceInput {
 /// Variables of one Gaussian: mean, scales, quaternion, opacity, view matrix.
 const VARIABLES: usize = 27;
 
-/// Renders.
-pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOutput {
+/// The visible Gaussians front to back, and the screen radius of all, 0 where culled.
+pub fn visible(input: &ReferenceInput, settings: &RasterSettings) -> (Vec<Item>, Vec<i64>) {
     let n = input.opacities.len();
     let mut radii = vec![0i64; n];
     let mut items = Vec::new();
@@ -150,8 +150,14 @@ pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOu
     }
     // By depth as float32; equal depths stay in order of index.
     items.sort_by(|a, b| (a.numbers[9] as f32).total_cmp(&(b.numbers[9] as f32)));
+    (items, radii)
+}
+
+/// Renders.
+pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOutput {
+    let (items, radii) = visible(input, settings);
     let picture = blend::blend(&items, settings, input.background);
-    let mut max_weights = vec![0.0; n];
+    let mut max_weights = vec![0.0; radii.len()];
     for (item, weight) in items.iter().zip(&picture.max_weights) {
         max_weights[item.index] = *weight;
     }
