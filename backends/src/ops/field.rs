@@ -1,14 +1,14 @@
-//! Operations of computational deformation fields: grid corners, hash-feature decoders, interpolation and the deformation network.
+//! Operations of computational deformation fields: hash-feature decoders, interpolation and the deformation network.
 
 use crate::cpu::mlp::{mish, relu};
 use crate::cpu::tensor::CpuBackend;
-use crate::cpu::vertex::{index, interpolate};
+use crate::cpu::vertex::interpolate;
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
-use burn::tensor::{Int, Tensor};
+use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
 
@@ -16,17 +16,7 @@ pub use crate::cpu::mlp::mish::MishShape;
 pub use crate::cpu::mlp::relu::ReluShape;
 pub use crate::cpu::vertex::hash::LevelHash;
 pub use crate::cpu::vertex::index::MAX_RESOLUTION;
-
-/// Where a level's grid lies.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GridBox {
-    /// Lower corner, world units.
-    pub min: [f32; 3],
-    /// Upper corner, world units.
-    pub max: [f32; 3],
-    /// Cells per axis.
-    pub resolution: u32,
-}
+pub use crate::ops::corners::{GridBox, VoxelCorners};
 
 /// One level's decoder: hash functions and layer widths (the input width is the number of functions).
 #[derive(Clone, Debug, PartialEq)]
@@ -70,24 +60,8 @@ pub trait FieldOps: Backend {
     fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self>;
 }
 
-/// Finding corners has no gradient: the paper's field is not differentiated with respect to the canonical centres.
-#[backend_extension(Flex, NdArray, Cube)]
-pub trait CornerOps: Backend {
-    /// `(vertices [U,3], corners [8M], weights [8M], slots [8M], starts [U+1])`, see [`VoxelCorners`].
-    #[allow(clippy::type_complexity, reason = "the dispatch macro must see the tuple of tensors")]
-    fn voxel_corners(
-        points: FloatTensor<Self>,
-        grid: GridBox,
-        reuse: bool,
-    ) -> (IntTensor<Self>, IntTensor<Self>, FloatTensor<Self>, IntTensor<Self>, IntTensor<Self>);
-}
-
 fn unsigned<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<u32> {
     B::ints(tensor).into_iter().map(|v| v as u32).collect()
-}
-
-fn signed(values: &[u32]) -> Vec<i64> {
-    values.iter().map(|&v| i64::from(v)).collect()
 }
 
 fn triples<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<[u32; 3]> {
@@ -146,23 +120,6 @@ macro_rules! on_cpu {
                 let out = relu::forward(&shape, &Self::floats(&weights), &Self::floats(&x));
                 let len = out.len();
                 Self::from_floats(out, [len])
-            }
-        }
-        impl CornerOps for $backend {
-            fn voxel_corners(
-                points: FloatTensor<Self>,
-                grid: GridBox,
-                reuse: bool,
-            ) -> (IntTensor<Self>, IntTensor<Self>, FloatTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
-                let found = index::corners(&Self::floats(&points), grid.min, grid.max, grid.resolution, reuse);
-                let (count, slots) = (found.vertices.len(), found.corners.len());
-                (
-                    Self::from_ints(signed(found.vertices.as_flattened()), [count, 3]),
-                    Self::from_ints(signed(&found.corners), [slots]),
-                    Self::from_floats(found.weights, [slots]),
-                    Self::from_ints(signed(&found.slots), [slots]),
-                    Self::from_ints(signed(&found.starts), [count + 1]),
-                )
             }
         }
     };
@@ -263,41 +220,7 @@ impl<B: FieldKernels + FieldOps, C: CheckpointStrategy> FieldOps for Autodiff<B,
     }
 }
 
-/// The grid corners of M points on one level.
-#[derive(Clone, Debug)]
-pub struct VoxelCorners {
-    /// Vertices to decode [U,3], integer coordinates in 0..=resolution.
-    pub vertices: Tensor<2, Int>,
-    /// Per point and corner, the row of its vertex [8M].
-    pub corners: Tensor<1, Int>,
-    /// Per point and corner, its trilinear weight [8M].
-    pub weights: Tensor<1>,
-    /// The (point, corner) slots grouped by vertex [8M].
-    pub slots: Tensor<1, Int>,
-    /// Where each vertex's slots start [U+1].
-    pub starts: Tensor<1, Int>,
-}
-
 impl VoxelCorners {
-    /// Finds the corners of `points` [M,3], world units. Points outside the box are moved to its nearest face. With `reuse`, corners at one
-    /// place share a vertex (paper Section IV-C); without, every corner has its own. No gradient flows to the points.
-    pub fn find(points: Tensor<2>, grid: GridBox, reuse: bool) -> Result<Self> {
-        let [m, width] = points.dims();
-        if width != 3 || m == 0 {
-            return Err(Error::parameter("voxel corners", format!("points have shape [{m},{width}]"), "Give at least one point with three coordinates"));
-        }
-        if !(1..=MAX_RESOLUTION).contains(&grid.resolution) {
-            return Err(Error::parameter("grid resolution", format!("{} cells per axis", grid.resolution), format!("Choose 1 to {MAX_RESOLUTION}")));
-        }
-        let (vertices, corners, weights, slots, starts) = <Dispatch as CornerOps>::voxel_corners(points.inner().into_dispatch(), grid, reuse);
-        Ok(Self {
-            vertices: Tensor::from_dispatch(vertices),
-            corners: Tensor::from_dispatch(corners),
-            weights: Tensor::from_dispatch(weights),
-            slots: Tensor::from_dispatch(slots),
-            starts: Tensor::from_dispatch(starts),
-        })
-    }
     /// Features [U,F] of the vertices: hash signature, then the decoder's network. `weights` is flat in the order of [`crate::cpu::mlp::mish`];
     /// the gradient goes to it alone.
     pub fn decode(&self, weights: Tensor<1>, decoder: &Arc<Decoder>) -> Result<Tensor<2>> {

@@ -58,8 +58,9 @@ impl Formulas<'_> {
     fn voxels(&self, means_world: &Tensor<2>, device: &Device) -> Result<Tensor<2>> {
         let mut levels = Vec::new();
         let m = means_world.dims()[0];
-        for (level, (grid, net)) in self.0.voxels.grids().enumerate() {
-            let corners = VoxelCorners::find(means_world.clone(), grid, true)?;
+        let (grids, nets): (Vec<_>, Vec<_>) = self.0.voxels.grids().unzip();
+        let found = VoxelCorners::find(means_world.clone(), &grids, true)?;
+        for (level, (corners, net)) in found.into_iter().zip(nets).enumerate() {
             let flat: Vec<i64> = corners.vertices.into_data().iter::<i64>().collect();
             let vertices: Vec<[u32; 3]> = flat.as_chunks::<3>().0.iter().map(|v| v.map(|c| c as u32)).collect();
             let mut signatures = vec![0.0; vertices.len() * net.shape.input];

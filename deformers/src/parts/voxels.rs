@@ -134,9 +134,9 @@ impl Voxels {
         let [m, _] = means_world.dims();
         let mut work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
         let mut levels = Vec::with_capacity(self.decoders.len());
-        for ((decoder, parameter), &resolution) in self.decoders.iter().zip(parameters).zip(&self.resolutions) {
-            let grid = GridBox { min: self.box_min, max: self.box_max, resolution };
-            let corners = VoxelCorners::find(means_world.clone(), grid, self.reuse)?;
+        let grids: Vec<GridBox> = self.grids().map(|(grid, _)| grid).collect();
+        let found = VoxelCorners::find(means_world, &grids, self.reuse)?;
+        for ((decoder, parameter), corners) in self.decoders.iter().zip(parameters).zip(found) {
             work.vertices_queried += 8 * m as u64;
             work.vertices_decoded += corners.vertices.dims()[0] as u64;
             let features = corners.decode(parameter.value.clone(), decoder)?;

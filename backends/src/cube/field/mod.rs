@@ -6,7 +6,8 @@ mod network;
 mod program;
 mod voxels;
 
-use crate::ops::field::{CornerOps, Decoder, FieldKernels, FieldOps, GridBox, ReluShape};
+use crate::ops::corners::{CornerOps, CornersBegun, GridBox};
+use crate::ops::field::{Decoder, FieldKernels, FieldOps, ReluShape};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
@@ -49,11 +50,18 @@ impl FieldOps for CubeBackend {
 }
 
 impl CornerOps for CubeBackend {
-    fn voxel_corners(
-        points: FloatTensor<Self>,
+    fn begin_corners(points: FloatTensor<Self>, grid: GridBox, reuse: bool) -> CornersBegun<Self> {
+        voxels::begin(&into_contiguous(points), grid, reuse)
+    }
+    fn list_corners(
+        slots: IntTensor<Self>,
+        vertices: IntTensor<Self>,
+        starts: IntTensor<Self>,
+        _corners: IntTensor<Self>,
         grid: GridBox,
         reuse: bool,
-    ) -> (IntTensor<Self>, IntTensor<Self>, FloatTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
-        voxels::corners(&into_contiguous(points), grid, reuse).into()
+        count: usize,
+    ) -> (IntTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
+        voxels::list(slots, vertices, starts, grid, reuse, count)
     }
 }

@@ -2,8 +2,9 @@
 
 use crate::cube::sort::{exclusive_sums, sort_pairs};
 use crate::cube::tensor::{UNITS, cubes_for, empty, floats, upload};
-use crate::ops::field::GridBox;
+use crate::ops::corners::{CornersBegun, GridBox};
 use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
@@ -112,8 +113,8 @@ fn gather_gradients(grad: &[f32], weights: &[f32], slots: &[i32], starts: &[i32]
     }
 }
 
-/// The corners of `points` [M,3]: vertices [U,3], corners [8M], weights [8M], slots [8M], starts [U+1]. The number of vertices is read back.
-pub fn corners(points: &CubeTensor, grid: GridBox, reuse: bool) -> [CubeTensor; 5] {
+/// The corners of `points` [M,3], grouped by vertex; their number stays on the device.
+pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<CubeBackend> {
     let client = points.client.clone();
     let slots_count = 8 * points.meta.shape()[0];
     let dim = CubeDim::new_1d(UNITS);
@@ -133,28 +134,40 @@ pub fn corners(points: &CubeTensor, grid: GridBox, reuse: bool) -> [CubeTensor; 
         weights.clone().into_buffer_arg(),
         grid.resolution,
     );
+    let unused = || empty(points, [1], DType::I32);
+    if !reuse {
+        let count = upload(points, &[slots_count as i32], DType::I32);
+        return CornersBegun { weights, slots: signed(slots), vertices: signed(keys), starts: unused(), corners: unused(), count };
+    }
     let side = u64::from(grid.resolution) + 1;
-    let (sorted, slots) = if reuse { sort_pairs(keys, slots, slots_count, u64::BITS - (side * side * side).leading_zeros()) } else { (keys, slots) };
+    let (sorted, slots) = sort_pairs(keys, slots, slots_count, u64::BITS - (side * side * side).leading_zeros());
     let heads = empty(points, [slots_count], DType::U32);
-    let vertex_count = if reuse {
-        mark_heads::launch(&client, cubes_for(slots_count), dim, sorted.clone().into_buffer_arg(), heads.clone().into_buffer_arg());
-        let total = exclusive_sums(&heads, slots_count);
-        u32::from_bytes(&client.read_one_unchecked(total.handle.clone())).first().copied().unwrap_or(0) as usize
-    } else {
-        slots_count
-    };
-    let int = |shape: Vec<usize>| empty(points, shape, DType::I32);
-    let (vertices, starts, corners) = (int(vec![vertex_count, 3]), int(vec![vertex_count + 1]), int(vec![slots_count]));
-    let (s, l) = (sorted.into_buffer_arg(), slots.clone().into_buffer_arg());
+    mark_heads::launch(&client, cubes_for(slots_count), dim, sorted.clone().into_buffer_arg(), heads.clone().into_buffer_arg());
+    let count = exclusive_sums(&heads, slots_count);
+    CornersBegun { weights, slots: signed(slots), vertices: signed(sorted), starts: signed(heads), corners: unused(), count: signed(count) }
+}
+
+/// Unsigned numbers below 2^32 as the signed ones that burn's integers are: the same bits.
+fn signed(values: CubeTensor) -> CubeTensor {
+    CubeTensor::new_contiguous(values.client.clone(), values.device.clone(), values.meta.shape().clone(), values.handle.clone(), DType::I32)
+}
+
+/// Vertices [U,3], where their slots start [U+1], and the vertex of every corner [8M].
+pub fn list(slots: CubeTensor, sorted: CubeTensor, before: CubeTensor, grid: GridBox, reuse: bool, count: usize) -> (CubeTensor, CubeTensor, CubeTensor) {
+    let client = slots.client.clone();
+    let dim = CubeDim::new_1d(UNITS);
+    let slots_count = slots.meta.shape().num_elements();
+    let int = |shape: Vec<usize>| empty(&slots, shape, DType::I32);
+    let (vertices, starts, corners) = (int(vec![count, 3]), int(vec![count + 1]), int(vec![slots_count]));
     let (v, st, c) = (vertices.clone().into_buffer_arg(), starts.clone().into_buffer_arg(), corners.clone().into_buffer_arg());
+    let s = sorted.into_buffer_arg();
     if reuse {
-        list_vertices::launch(&client, cubes_for(slots_count), dim, s, l, heads.into_buffer_arg(), v, st, c, grid.resolution, vertex_count as u32);
+        let (l, b) = (slots.into_buffer_arg(), before.into_buffer_arg());
+        list_vertices::launch(&client, cubes_for(slots_count), dim, s, l, b, v, st, c, grid.resolution, count as u32);
     } else {
         list_all::launch(&client, cubes_for(slots_count), dim, s, v, st, c, grid.resolution);
     }
-    // Slots are below 2^31, so their bits are those of signed numbers too.
-    let slots = CubeTensor::new_contiguous(slots.client.clone(), slots.device.clone(), slots.meta.shape().clone(), slots.handle.clone(), DType::I32);
-    [vertices, corners, weights, slots, starts]
+    (vertices, starts, corners)
 }
 
 /// Without reuse every slot has a vertex of its own.
