@@ -6,6 +6,7 @@ pub mod deform_mlp;
 pub mod embedding;
 pub mod grid4d;
 pub mod hexplane;
+pub mod native4d;
 pub mod none;
 pub mod parts;
 pub mod swift4d;

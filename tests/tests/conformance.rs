@@ -16,6 +16,8 @@ fn small(name: &str) -> toml::Table {
         "hexplane" => "resolution = 6\ntime_resolution = 8\nfeatures = 4\nwidth = 16",
         "deform-mlp" => "width = 24\nlayers = 4\nskip = 2\nposition_bands = 3\ntime_bands = 3\ntime_network = true",
         "embedding" => "gaussian_features = 6\ntime_features = 10\ntime_rows = 9\ncoarse_rows = 4\nwidth = 16",
+        // The field is a field over all times: at the start its Gaussians must not be hidden.
+        "native-4d" => "duration = 0.5\nharmonics = 1",
         _ => "",
     };
     config::parse_table("test", text).unwrap()

@@ -5,7 +5,7 @@ use crate::config::GaussianRates;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
 use cc4dgs_core::gaussians::{sh_rest_len, to_vec};
-use cc4dgs_core::{AttributeSpec, ExtraAttribute, Gaussians, HostGaussians, Result};
+use cc4dgs_core::{AttributeSpec, ExtraAttribute, Gaussians, HostGaussians, Result, Seed};
 
 /// Names of the attributes every Gaussian has, in order.
 pub const CORE_COLUMNS: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
@@ -116,9 +116,13 @@ impl GaussianSet {
         found.unwrap_or_else(|| Tensor::zeros([self.len(), 0], &leaves[0].device()))
     }
     /// Adds the attributes of `wanted` that there are not, with their start values and zero moments.
-    pub fn add_attributes(&mut self, wanted: &[AttributeSpec]) {
+    pub fn add_attributes(&mut self, wanted: &[AttributeSpec], seed: Seed) {
         for spec in wanted.iter().filter(|spec| self.column(&spec.name).is_none()).collect::<Vec<_>>() {
-            let value = Tensor::<2>::full([self.len(), spec.width], spec.start, &self.columns[0].value.device());
+            let (count, own) = ((self.len() * spec.width) as u64, seed.child(&spec.name));
+            // 24 bits of the seed, in -1..1.
+            let noise = |k: u64| (own.index(k).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+            let values: Vec<f32> = (0..count).map(|k| if spec.spread == 0.0 { spec.start } else { spec.start + spec.spread * noise(k) }).collect();
+            let value = Tensor::<2>::from_data(TensorData::new(values, [self.len(), spec.width]), &self.columns[0].value.device());
             self.columns.push(Column { name: spec.name.clone(), first_moment: value.zeros_like(), second_moment: value.zeros_like(), value });
         }
     }

@@ -3,7 +3,7 @@
 use crate::model::Model;
 use crate::train::Rows;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_core::{Camera, FieldContext, FieldWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
+use cc4dgs_core::{Camera, FieldWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -11,15 +11,6 @@ use std::time::Instant;
 const LOOK_EVERY: u64 = 16;
 /// Room for pairs over the most seen, so that a little more does not overflow.
 const SPARE: f64 = 1.25;
-
-/// Steps into which the diagonal of the field's box is cut at least: a few thousandths of a pixel each, a hundred times what rounding leaves.
-const STEPS: f32 = 262_144.0;
-
-/// The largest power of two that cuts the box of `context` into [`STEPS`] steps, so that multiplying by it is exact.
-fn spacing(context: &FieldContext) -> f32 {
-    let diagonal = (0..3).map(|k| (context.box_max[k] - context.box_min[k]).powi(2)).sum::<f32>().sqrt();
-    (diagonal / STEPS).clamp(1e-30, 1e30).log2().floor().exp2()
-}
 
 /// Room for (Gaussian, tile) pairs, learned from frames past.
 #[derive(Default)]
@@ -59,9 +50,6 @@ pub struct Player<'a> {
     moving_attributes: Vec<Tensor<2>>,
     rows: Rows,
     moving: usize,
-    /// Moved centres are brought to multiples of this, world units: devices round the field's sums each in their own way, and where two Gaussians lie
-    /// within such a difference of each other's depth, one device would draw the one in front and the other the other.
-    spacing: f32,
     cache: Option<Tensor<2>>,
     settings: RenderSettings,
     pair_room: PairRoom,
@@ -114,7 +102,6 @@ impl<'a> Player<'a> {
             moving_attributes,
             rows,
             moving,
-            spacing: model.field.as_ref().map_or(1.0, |f| spacing(&f.context)),
             cache: None,
             settings: model.render.settings(Some(background)),
             pair_room: PairRoom::default(),
@@ -148,9 +135,7 @@ impl<'a> Player<'a> {
                 spatial.values
             }
         };
-        let mut moved = field.field.deform(features, time_norm)?.apply(&self.gaussians, self.rows.tensor());
-        moved.means = (moved.means * (1.0 / self.spacing)).round() * self.spacing;
-        Ok(moved)
+        Ok(field.field.deform(features, time_norm)?.apply(&self.gaussians, self.rows.tensor()))
     }
     /// Draws one frame.
     pub fn render(&mut self, camera: &Camera, time_norm: f32) -> Result<(RenderOutput, FrameTime)> {

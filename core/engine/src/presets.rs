@@ -14,12 +14,13 @@ const FAMILIES: [(&str, &str, &str); 7] = [
 ];
 
 /// The methods: name, summary, TOML with a table for `all` families, one for each that differs, and one for `cpu` sizes.
-const METHODS: [(&str, &str, &str); 7] = [
+const METHODS: [(&str, &str, &str); 8] = [
     ("swift4d", "Swift4D's joint hash grid", include_str!("../presets/methods/swift4d.toml")),
     ("grid4d", "Grid4D's four hash grids", include_str!("../presets/methods/grid4d.toml")),
     ("hexplane", "4DGS's planes", include_str!("../presets/methods/hexplane.toml")),
     ("embedding", "E-D3DGS's learned vectors", include_str!("../presets/methods/embedding.toml")),
     ("deform-mlp", "Deformable 3DGS's network", include_str!("../presets/methods/deform-mlp.toml")),
+    ("native-4d", "4D-GS's Gaussians of space and time", include_str!("../presets/methods/native-4d.toml")),
     ("cdf-basis", "this project's field, linear in functions of time", include_str!("../presets/methods/cdf-basis.toml")),
     ("none", "no deformation", include_str!("../presets/methods/none.toml")),
 ];

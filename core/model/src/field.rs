@@ -101,8 +101,12 @@ pub struct AttributeSpec {
     pub width: usize,
     /// What every float starts as.
     pub start: f32,
+    /// Floats start evenly spread so far to either side of `start`, by the run's seed.
+    pub spread: f32,
     /// Learning rate (Adam).
     pub lr: f64,
+    /// Whether the rate is multiplied by the extent of the cameras (as that of the positions is).
+    pub times_extent: bool,
 }
 
 /// A deformation field: canonical Gaussians in, offsets at a time out (paper Section IV-B).

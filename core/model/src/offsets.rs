@@ -1,10 +1,13 @@
 //! What a deformation field returns, and the one function that applies it.
 
 use crate::Gaussians;
+use burn::tensor::activation::{log_sigmoid, sigmoid};
 use burn::tensor::{Int, Tensor};
 
 /// Scales that changes would take below this stay there, world units.
 const LEAST_SCALE: f32 = 1e-7;
+/// What is left of 1 beside an opacity is not taken for less than this.
+const LEAST_REST: f32 = 1e-30;
 /// Norms of quaternions are not taken for smaller than this.
 const LEAST_NORM: f32 = 1e-12;
 
@@ -25,6 +28,8 @@ pub struct Offsets {
     pub unit_quaternions: bool,
     /// Change of the opacity logits [M].
     pub opacity_logits: Option<Tensor<1>>,
+    /// Logarithm of a factor of the opacity after its activation, at most 0 [M] (Gaussians that come and go).
+    pub opacity_log_factor: Option<Tensor<1>>,
     /// Change of all spherical-harmonics coefficients, degree 0 first [M, (d+1)^2, 3].
     pub sh: Option<Tensor<3>>,
 }
@@ -51,6 +56,13 @@ impl Offsets {
         });
         moved.quaternions = add(moved.quaternions, quaternions, rows);
         moved.opacity_logits = add(moved.opacity_logits, self.opacity_logits, rows);
+        if let Some(factor) = self.opacity_log_factor {
+            let before = match rows {
+                None => moved.opacity_logits.clone(),
+                Some(rows) => moved.opacity_logits.clone().select(0, rows.clone()),
+            };
+            moved.opacity_logits = add(moved.opacity_logits, Some(faded(before.clone(), factor) - before), rows);
+        }
         if let Some(sh) = self.sh {
             let [m, k, _] = sh.dims();
             let dc = sh.clone().slice([0..m, 0..1, 0..3]).reshape([m, 3]);
@@ -78,9 +90,16 @@ impl Offsets {
         parts.extend(self.scales.clone());
         parts.extend(self.quaternions.clone());
         parts.extend(self.opacity_logits.clone().map(|o| o.unsqueeze_dim(1)));
+        parts.extend(self.opacity_log_factor.clone().map(|o| o.unsqueeze_dim(1)));
         parts.extend(self.sh.clone().map(|s| s.flatten(1, 2)));
         if parts.is_empty() { None } else { Some(Tensor::cat(parts, 1)) }
     }
+}
+
+/// The logit of sigmoid(logit) e^factor. 1 - sigmoid(x) e^f = sigmoid(-x) + sigmoid(x) (1 - e^f) does not cancel.
+fn faded(logits: Tensor<1>, factor: Tensor<1>) -> Tensor<1> {
+    let rest = sigmoid(logits.clone().neg()) + sigmoid(logits.clone()) * factor.clone().exp().neg().add_scalar(1.0);
+    log_sigmoid(logits) + factor - rest.clamp_min(LEAST_REST).log()
 }
 
 fn select(values: &Tensor<2>, rows: Option<&Tensor<1, Int>>) -> Tensor<2> {

@@ -243,7 +243,7 @@ impl Context<'_> {
         let section = &self.job.config.deformer;
         let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
         let field = self.job.registry.build_deformer(section, &context, &self.device)?;
-        state.set.add_attributes(&field.attributes());
+        state.set.add_attributes(&field.attributes(), self.seed.child("attributes"));
         let moves = !field.is_static() && state.moving_rows(&self.device)?.count(state.set.len()) > 0;
         if !moves && !field.is_static() && state.moving != Moving::Nothing {
             let message = "no dynamic score is over train.zeta: the field is skipped".to_string();

@@ -1,0 +1,146 @@
+//! Gaussians of space and time (4D-GS, Yang et al. 2024), as seen at one moment.
+//!
+//! A Gaussian over (x, y, z, t) with covariance S, conditioned on a time s, is a Gaussian over space: its centre moves by S_xt / S_tt (s - t), its covariance
+//! is the Schur complement S_xx - S_xt S_tx / S_tt at all times, and its weight is exp(-(s - t)^2 / 2 S_tt). The map from S to (Schur complement, S_xt / S_tt,
+//! S_tt) is one to one, so nothing is lost by learning those three: an ordinary Gaussian, a velocity and a duration. The published code learns a rotation and
+//! scales in four dimensions instead; the family of models is the same, the paths of the optimizer are not.
+
+use crate::parts::centres::check_time;
+use crate::parts::settings::within;
+use burn::tensor::{Device, Tensor};
+use cc4dgs_core::{
+    AttributeSpec, DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config,
+    inventory,
+};
+use serde::Deserialize;
+use std::f32::consts::TAU;
+
+const SCHEMA: &str = "\
+duration = 0.1414        # standard deviation in time of a new Gaussian, as a share of the sequence (published: sqrt(2) of 10 s)
+hidden_below = 0.05      # of this factor of the opacity a Gaussian is left out
+harmonics = 2            # cosines of time by which colours change (4D spherical harmonics); 0 for colours that stay
+time_lr = 1.6e-5         # Adam on the centre in time, times the extent of the cameras (published: 1.6e-4 of seconds, 10 s)
+duration_lr = 5e-3       # on the logarithm of the duration
+velocity_lr = 1e-3       # on the velocity in world units per sequence, times the extent of the cameras
+color_lr = 1.25e-4       # on the cosines' coefficients
+";
+
+/// Attributes by place.
+const NAMES: [&str; 4] = ["time_center", "log_duration", "velocity", "sh_time"];
+/// Stands for an opacity of nothing: e^-30.
+const HIDDEN: f32 = -30.0;
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    duration: f32,
+    hidden_below: f32,
+    harmonics: usize,
+    time_lr: f64,
+    duration_lr: f64,
+    velocity_lr: f64,
+    color_lr: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { duration: 0.1414, hidden_below: 0.05, harmonics: 2, time_lr: 1.6e-5, duration_lr: 5e-3, velocity_lr: 1e-3, color_lr: 1.25e-4 }
+    }
+}
+
+/// No weights: all that is learned belongs to the Gaussians.
+struct Native4d {
+    settings: Settings,
+    /// Coefficients of the spherical harmonics per channel.
+    basis: usize,
+}
+
+impl Native4d {
+    fn new(settings: Settings, context: &FieldContext) -> Result<Self> {
+        within("harmonics", settings.harmonics, 0, 8)?;
+        let bad = |name: &str, value: f32, remedy: &str| Err(Error::parameter(format!("deformer.{name}"), format!("{value} cannot be used"), remedy));
+        if !(settings.duration > 1e-4 && settings.duration < 1e4) {
+            return bad("duration", settings.duration, "Give a share of the sequence, such as 0.14");
+        }
+        if !(0.0..1.0).contains(&settings.hidden_below) {
+            return bad("hidden_below", settings.hidden_below, "Give a factor from 0 to below 1");
+        }
+        Ok(Self { settings, basis: (context.sh_degree + 1).pow(2) })
+    }
+    /// Columns of the features that belong to each attribute.
+    fn widths(&self) -> [usize; 4] {
+        [1, 1, 3, 3 * self.basis * self.settings.harmonics]
+    }
+}
+
+impl DeformationField for Native4d {
+    fn attributes(&self) -> Vec<AttributeSpec> {
+        let s = &self.settings;
+        // Centres in time lie a tenth beyond either end, as published.
+        let starts = [(0.5, 0.6), (s.duration.ln(), 0.0), (0.0, 0.0), (0.0, 0.0)];
+        let rates = [(s.time_lr, true), (s.duration_lr, false), (s.velocity_lr, true), (s.color_lr, false)];
+        let all = NAMES.into_iter().zip(self.widths()).zip(starts).zip(rates);
+        all.filter(|(((_, width), _), _)| *width > 0)
+            .map(|(((name, width), (start, spread)), (lr, times_extent))| AttributeSpec { name: name.into(), width, start, spread, lr, times_extent })
+            .collect()
+    }
+    /// Gaussians without attributes of their own get what new ones start from, their centres in time at the middle.
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let (m, device) = (means_world.dims()[0], means_world.device());
+        let own: Vec<Tensor<2>> = self.attributes().iter().map(|a| Tensor::full([m, a.width], a.start, &device)).collect();
+        self.spatial_with(means_world, &own)
+    }
+    fn spatial_with(&self, means_world: Tensor<2>, attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
+        let m = means_world.dims()[0];
+        let wanted = self.attributes();
+        if attributes.len() != wanted.len() || attributes.iter().zip(&wanted).any(|(a, spec)| a.dims() != [m, spec.width]) {
+            let names: Vec<&str> = wanted.iter().map(|a| a.name.as_str()).collect();
+            let problem = format!("the Gaussians lack the attributes {}", names.join(", "));
+            return Err(Error::parameter("deformer native-4d", problem, "Load a model that was trained with this field"));
+        }
+        Ok(SpatialFeatures { values: Tensor::cat(attributes.to_vec(), 1), work: FieldWork { gaussians: m as u64, ..FieldWork::default() } })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        check_time(time_norm)?;
+        let [m, _] = features.dims();
+        let part = |at: usize, width: usize| features.clone().narrow(1, at, width);
+        let since = part(0, 1).neg().add_scalar(time_norm);
+        let in_durations = since.clone() / part(1, 1).exp();
+        let factor = in_durations.powi_scalar(2).mul_scalar(-0.5).reshape([m]);
+        let hidden = factor.clone().lower_elem(self.settings.hidden_below.max(f32::MIN_POSITIVE).ln());
+        let sh = (self.settings.harmonics > 0).then(|| {
+            let width = 3 * self.basis;
+            let wave = |n: usize| part(5 + (n - 1) * width, width) * since.clone().mul_scalar(TAU * n as f32).cos();
+            let first = wave(1);
+            (2..=self.settings.harmonics).fold(first, |sum, n| sum + wave(n)).reshape([m, self.basis, 3])
+        });
+        Ok(Offsets { means: Some(part(2, 3) * since.clone()), opacity_log_factor: Some(factor.mask_fill(hidden, HIDDEN)), sh, ..Offsets::default() })
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        Vec::new()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        Vec::new()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        Vec::new()
+    }
+}
+
+fn build(section: &toml::Table, context: &FieldContext, _device: &Device) -> Result<Box<dyn DeformationField>> {
+    Ok(Box::new(Native4d::new(config::parse_section("deformer native-4d", section)?, context)?))
+}
+
+inventory::submit! {
+    FieldPlugin {
+        info: Plugin {
+            name: "native-4d",
+            version: "1",
+            summary: "Gaussians of space and time, conditioned on the moment: a velocity, a duration and colours that change, per Gaussian",
+            paper: "4D-GS (Yang et al. 2024)",
+            schema: SCHEMA,
+            capabilities: &["differentiable", "per-gaussian-attributes"],
+        },
+        build,
+    }
+}
