@@ -175,6 +175,11 @@ impl Form {
     }
 }
 
+/// Bytes per code of the next `count` columns that `meta` describes.
+pub(crate) fn widths(mut meta: ByteReader, count: usize) -> Result<Vec<usize>> {
+    (0..count).map(|_| Ok(Form::read(&mut meta)?.bytes_per_code())).collect()
+}
+
 /// Decodes `count` values of `form` from `reader`. Both sides of the codec call this, so both see the same bits.
 pub(crate) fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &[(u32, f32)]) -> Result<Vec<f32>> {
     if let Form::Exact = form {

@@ -1,6 +1,6 @@
 //! `quantize`: each component of each attribute by itself, in even steps between percentiles. No model, no training; what a cleverer codec must beat.
 
-use crate::column::{self, Target};
+use crate::column::{self, Column, Target};
 use crate::morton;
 use crate::rows::{interleave, load, split, store};
 use crate::streams::{META, Shape, open};
@@ -16,7 +16,7 @@ const TAIL: f64 = 1e-3;
 /// A step is at most so many standard deviations times 2^-bits wide, or more bits are taken: percentiles of long-tailed values lie some ten deviations apart.
 const SPREAD: f64 = 8.0;
 
-const SCHEMA: &str = "\
+pub(crate) const SCHEMA: &str = "\
 means = 16               # bits of a coordinate of a centre; 32 keeps float32 anywhere below
 log_scales = 8
 quaternions = 8
@@ -32,7 +32,7 @@ const COLUMNS: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logit
 /// Bits per component of each attribute.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-struct Bits {
+pub(crate) struct Bits {
     means: u8,
     log_scales: u8,
     quaternions: u8,
@@ -61,6 +61,38 @@ impl Bits {
             _ => self.dynamic_scores,
         }
     }
+    /// A component of the column `name`.
+    pub(crate) fn encode(&self, name: &str, values: &[f32]) -> Column {
+        match self.of(name) {
+            32 => column::encode_exact(values),
+            bits => column::encode(values, Target { bits, mu_law: false, loss: loss(bits), tail: TAIL }),
+        }
+    }
+    pub(crate) fn losses(&self) -> Vec<DeclaredLoss> {
+        let lossy = COLUMNS.into_iter().filter(|c| self.of(c) != 32);
+        lossy.map(|c| DeclaredLoss { attribute: c.into(), relative_rms: loss(self.of(c)) }).collect()
+    }
+    /// The bits of a profile with `settings` on top, for `codec`.
+    pub(crate) fn from_settings(codec: &str, profile: &str, settings: &toml::Table) -> Result<Self> {
+        let base = match profile {
+            "" | "default" => Self::default(),
+            "high" => Self { means: 16, log_scales: 10, quaternions: 10, opacity_logits: 10, sh_dc: 12, sh_rest: 8, dynamic_scores: 12 },
+            _ => return Err(unknown_name(&format!("profile of codec {codec}"), profile, ["default", "high"].into_iter())),
+        };
+        let mut section = toml::Table::new();
+        for column in COLUMNS {
+            section.insert(column.into(), i64::from(base.of(column)).into());
+        }
+        config::merge(&mut section, settings);
+        let bits: Self = config::parse_section(&format!("codec {codec}"), &section)?;
+        for column in COLUMNS {
+            let wanted = bits.of(column);
+            if !(4..=16).contains(&wanted) && wanted != 32 {
+                return Err(Error::parameter(format!("codec {codec}.{column}"), format!("{wanted} bits"), "Choose 4 to 16, or 32 for float32"));
+            }
+        }
+        Ok(bits)
+    }
 }
 
 /// Largest relative error of a column in so many bits; 32 is exact.
@@ -81,11 +113,7 @@ impl AttributeCodec for Quantize {
         Shape::of(&sorted).write(&mut meta)?;
         let mut streams = Vec::new();
         for (name, width, values) in sorted.columns() {
-            let bits = self.bits.of(name);
-            let columns: Vec<_> = split(values, width)
-                .iter()
-                .map(|c| if bits == 32 { column::encode_exact(c) } else { column::encode(c, Target { bits, mu_law: false, loss: loss(bits), tail: TAIL }) })
-                .collect();
+            let columns: Vec<_> = split(values, width).iter().map(|c| self.bits.encode(name, c)).collect();
             streams.push(Stream { name: name.into(), bytes: store(&columns, &mut meta, &mut escapes) });
         }
         streams.extend(Shape::extra_streams(&sorted));
@@ -109,30 +137,12 @@ impl AttributeCodec for Quantize {
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {
-        let lossy = COLUMNS.into_iter().filter(|c| self.bits.of(c) != 32);
-        lossy.map(|c| DeclaredLoss { attribute: c.into(), relative_rms: loss(self.bits.of(c)) }).collect()
+        self.bits.losses()
     }
 }
 
 fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
-    let base = match profile {
-        "" | "default" => Bits::default(),
-        "high" => Bits { means: 16, log_scales: 10, quaternions: 10, opacity_logits: 10, sh_dc: 12, sh_rest: 8, dynamic_scores: 12 },
-        _ => return Err(unknown_name("profile of codec quantize", profile, ["default", "high"].into_iter())),
-    };
-    let mut section = toml::Table::new();
-    for column in COLUMNS {
-        section.insert(column.into(), i64::from(base.of(column)).into());
-    }
-    config::merge(&mut section, settings);
-    let bits: Bits = config::parse_section("codec quantize", &section)?;
-    for column in COLUMNS {
-        let wanted = bits.of(column);
-        if !(4..=16).contains(&wanted) && wanted != 32 {
-            return Err(Error::parameter(format!("codec quantize.{column}"), format!("{wanted} bits"), "Choose 4 to 16, or 32 for float32"));
-        }
-    }
-    Ok(Box::new(Quantize { bits }))
+    Ok(Box::new(Quantize { bits: Bits::from_settings("quantize", profile, settings)? }))
 }
 
 inventory::submit! {

@@ -118,7 +118,14 @@ impl Embedding {
 
 impl DeformationField for Embedding {
     fn attributes(&self) -> Vec<AttributeSpec> {
-        vec![AttributeSpec { name: ATTRIBUTE.into(), width: self.settings.gaussian_features, start: 0.0, spread: 0.0, lr: self.settings.gaussian_lr, times_extent: false }]
+        vec![AttributeSpec {
+            name: ATTRIBUTE.into(),
+            width: self.settings.gaussian_features,
+            start: 0.0,
+            spread: 0.0,
+            lr: self.settings.gaussian_lr,
+            times_extent: false,
+        }]
     }
     /// Gaussians without a vector of their own get zeros, which is what they start as.
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {

@@ -73,7 +73,8 @@ fn native_4d_conditions_gaussians_of_four_dimensions() {
         let mean = DVec4::new(number(7000 + case), number(7100 + case), number(7200 + case), 0.5 + 0.3 * number(7300 + case));
         let (of_time, mixed) = (covariance.w_axis.w, covariance.w_axis.truncate());
         let velocity = mixed / of_time;
-        let own = |values: &[f64]| Tensor::<2>::from_data(TensorData::new(values.iter().map(|&v| v as f32).collect::<Vec<_>>(), [1, values.len()]), &Device::flex());
+        let own =
+            |values: &[f64]| Tensor::<2>::from_data(TensorData::new(values.iter().map(|&v| v as f32).collect::<Vec<_>>(), [1, values.len()]), &Device::flex());
         let attributes = [own(&[mean.w]), own(&[of_time.sqrt().ln()]), own(&velocity.to_array())];
         let features = field.spatial_with(own(&mean.truncate().to_array()), &attributes).unwrap().values;
         let rows = DMat3::from_cols(covariance.x_axis.truncate(), covariance.y_axis.truncate(), covariance.z_axis.truncate());

@@ -119,8 +119,8 @@ pub struct Decompress {
     /// An archive, or a run's folder.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
-    /// The PLY file to write (3DGS layout).
-    #[arg(long, value_name = "F.ply")]
+    /// The file to write: PLY in the layout of 3DGS, or Niantic's SPZ where it ends in .spz.
+    #[arg(long, value_name = "F.ply|F.spz")]
     pub out: PathBuf,
     /// Leave the dynamic scores out, for viewers that insist on the 62 floats of static 3DGS.
     #[arg(long)]

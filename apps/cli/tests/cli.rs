@@ -141,6 +141,14 @@ fn a_scene_goes_through_the_whole_chain() {
     let (model, cloud) = (json_of(&["info", text(&archive), "--json"]), json_of(&["info", text(&ply), "--json"]));
     assert_eq!((&model["kind"], &cloud["kind"]), (&Value::from("archive"), &Value::from("ply")));
     assert_eq!(model["manifest"]["gaussian_count"], cloud["gaussians"]["count"]);
+    let spz = at("cloud.spz");
+    succeed(&["decompress", text(&archive), "--out", text(&spz), "-q"]);
+    let found = json_of(&["info", text(&spz), "--json"]);
+    assert_eq!((&found["kind"], &found["gaussians"]["count"]), (&Value::from("spz"), &cloud["gaussians"]["count"]));
+    // The parts of the storage table add up, and its last row is the file.
+    let mb = |row: usize, key: &str| model["storage"][row][key].as_f64().unwrap();
+    assert!((mb(2, "float32_mb") + mb(3, "float32_mb") - mb(4, "float32_mb")).abs() < 1e-6 && mb(0, "float32_mb") + mb(1, "float32_mb") > 0.0);
+    assert!((mb(4, "stored_mb") * 1e6 - on_disk).abs() < 0.5 && mb(3, "stored_mb") < mb(3, "float32_mb"));
     assert_eq!(json_of(&["info", text(&dir), "--json"])["gaussians"]["count"], cloud["gaussians"]["count"]);
 
     let frames = at("frames");

@@ -3,6 +3,8 @@
 use super::{Context, create_parent, megabytes};
 use crate::args::Decompress;
 use crate::model_source::load_model;
+use cc4dgs_codecs::spz;
+use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Event, EventSink, Result};
 use cc4dgs_engine::play::Player;
 use cc4dgs_engine::ply;
@@ -19,11 +21,17 @@ pub fn run(context: &Context, args: &Decompress) -> Result<()> {
         Some(time) => Player::new(&loaded.model, &context.registry, &loaded.device)?.gaussians_at(time)?.to_host()?,
     };
     create_parent(&args.out)?;
-    ply::write(&args.out, &gaussians, !args.no_dynamic)?;
+    let is_spz = args.out.extension().is_some_and(|e| e.eq_ignore_ascii_case("spz"));
+    if is_spz {
+        write_atomically(&args.out, &spz::to_spz(&gaussians, 8, 8)?)?;
+    } else {
+        ply::write(&args.out, &gaussians, !args.no_dynamic)?;
+    }
     let bytes = std::fs::metadata(&args.out).map_err(|e| Error::io(&args.out, e))?.len();
     events.emit(&Event::Saved { path: args.out.display().to_string(), bytes });
     let report = json!({
-        "ply": args.out,
+        "file": args.out,
+        "format": if is_spz { "spz" } else { "ply" },
         "gaussians": gaussians.len(),
         "sh_degree": gaussians.sh_degree,
         "time": args.time,

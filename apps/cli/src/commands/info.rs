@@ -1,11 +1,15 @@
 //! `cc4dgs info`.
 
 use super::compress::StreamSize;
+use super::storage::{Storage, table};
 use super::{Context, megabytes};
 use crate::args::Info;
-use cc4dgs_core::archive::{Archive, MAGIC};
+use cc4dgs_codecs::spz;
+use cc4dgs_core::archive::{Archive, MAGIC, StreamKind};
+use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::{Error, HostGaussians, Result, Silent, Split, parse_device};
 use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_engine::eval::SizeMb;
 use cc4dgs_engine::model::Model;
 use cc4dgs_engine::ply;
 use cc4dgs_engine::train::CHECKPOINT;
@@ -13,16 +17,22 @@ use serde_json::{Value, json};
 use std::io::Read;
 use std::path::Path;
 
+/// How SPZ files start: they are gzip streams.
+const GZIP: [u8; 2] = [0x1f, 0x8b];
+
 pub fn run(context: &Context, args: &Info) -> Result<()> {
-    let value = describe(context, &args.path)?;
-    context.output.result(&value, || {
-        let mut lines = Vec::new();
-        flatten("", &value, &mut lines);
-        lines.join("\n")
-    })
+    let (mut value, storage) = describe(context, &args.path)?;
+    let rows = storage.map_or(Vec::new(), |s| s.rows());
+    let mut lines = Vec::new();
+    flatten("", &value, &mut lines);
+    if let (false, Value::Object(map)) = (rows.is_empty(), &mut value) {
+        map.insert("storage".into(), plain(&rows)?);
+        lines.extend(table(&rows));
+    }
+    context.output.result(&value, || lines.join("\n"))
 }
 
-fn describe(context: &Context, path: &Path) -> Result<Value> {
+fn describe(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     if path.is_dir() && path.join(CHECKPOINT).is_file() {
         return checkpoint(context, path);
     }
@@ -33,33 +43,55 @@ fn describe(context: &Context, path: &Path) -> Result<Value> {
             return archive(context, path);
         }
         if head.starts_with(b"ply") {
-            return Ok(json!({ "kind": "ply", "path": path, "gaussians": gaussians(&ply::read(path, &context.limits)?)? }));
+            return Ok((json!({ "kind": "ply", "path": path, "gaussians": gaussians(&ply::read(path, &context.limits)?)? }), None));
+        }
+        if head.starts_with(&GZIP) {
+            let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
+            let found = spz::from_spz(&path.display().to_string(), &bytes, &context.limits)?;
+            return Ok((json!({ "kind": "spz", "path": path, "gaussians": gaussians(&found)? }), None));
         }
         // A checkpoint is a safetensors file: a length of eight bytes, of which the upper ones are zero.
         if head.len() == 8 && head[4..] == [0; 4] {
             return checkpoint(context, path);
         }
     }
-    scene(context, path)
+    Ok((scene(context, path)?, None))
 }
 
 /// An archive's directory and manifest; no stream is decoded.
-fn archive(context: &Context, path: &Path) -> Result<Value> {
+fn archive(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     let archive = Archive::open(path, &context.limits)?;
     let manifest = plain(archive.manifest())?;
-    let streams: Vec<StreamSize> = archive.stream_sizes().into_iter().map(StreamSize::from).collect();
-    Ok(json!({ "kind": "archive", "path": path, "size_mb": megabytes(archive.total_bytes()?), "streams": streams, "manifest": manifest }))
+    let stored = archive.stream_sizes();
+    let of_kind = |kind| stored.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();
+    let of = archive.manifest();
+    let (deform_grid, deform_net) = match &of.deformer {
+        None => (0, 0),
+        Some(entry) => {
+            let mut section = entry.settings.clone();
+            section.insert("kind".into(), entry.name.clone().into());
+            context.registry.build_deformer(&section, &entry.context, &parse_device("flex")?)?.size_bytes()
+        }
+    };
+    let total = archive.total_bytes()?;
+    // Plug-ins' own attributes are stored as they are.
+    let extra: u64 = stored.iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
+    let point_cloud = 4 * of.gaussian_count * (15 + 3 * sh_rest_len(of.sh_degree) as u64) + extra;
+    let storage = Storage { deform_grid, deform_net, point_cloud, stored: Some([of_kind(StreamKind::Field), of_kind(StreamKind::Canonical), total]) };
+    let streams: Vec<StreamSize> = stored.into_iter().map(StreamSize::from).collect();
+    Ok((json!({ "kind": "archive", "path": path, "size_mb": megabytes(total), "streams": streams, "manifest": manifest }), Some(storage)))
 }
 
-fn checkpoint(context: &Context, path: &Path) -> Result<Value> {
+fn checkpoint(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     let model = Model::load(path, &context.registry, &parse_device("auto")?, &context.limits, &Silent)?;
     let moving = model.moving.rows(&model.gaussians.dynamic_scores).map_or(model.gaussians.len(), |rows| rows.len());
-    let size: cc4dgs_engine::eval::SizeMb = model.size.into();
+    let size: SizeMb = model.size.into();
+    let storage = Storage { deform_grid: model.size.deform_grid, deform_net: model.size.deform_net, point_cloud: model.size.point_cloud, stored: None };
     let field = match &model.field {
         Some(f) => json!({ "settings": plain(&f.section)?, "context": plain(&f.context)? }),
         None => Value::Null,
     };
-    Ok(json!({
+    let value = json!({
         "kind": "checkpoint",
         "path": path,
         "size_mb": size,
@@ -71,7 +103,8 @@ fn checkpoint(context: &Context, path: &Path) -> Result<Value> {
         "rasterizer": plain(&model.rasterizer)?,
         "render": plain(&model.render)?,
         "provenance": plain(&model.provenance)?,
-    }))
+    });
+    Ok((value, Some(storage)))
 }
 
 fn gaussians(host: &HostGaussians) -> Result<Value> {

@@ -9,6 +9,7 @@ mod eval;
 mod info;
 mod plugins;
 mod render;
+mod storage;
 mod train;
 mod video;
 

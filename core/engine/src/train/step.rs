@@ -120,7 +120,8 @@ impl Context<'_> {
             let shown = visible.clone().greater_elem(0).int().sum().into_scalar::<i64>().max(0) as u64;
             log.count_adam(shown, n as u64 - shown.min(n as u64));
         }
-        let own: BTreeMap<String, f64> = state.field.iter().flat_map(|f| f.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
+        let own: BTreeMap<String, f64> =
+            state.field.iter().flat_map(|f| f.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
         let rate = |name: &str| own.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
         state.set.update(of_columns, rate, visible.as_ref())?;
         if features.is_some()

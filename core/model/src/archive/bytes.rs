@@ -3,6 +3,7 @@
 use crate::{Error, Result};
 
 /// A cursor over hostile bytes: running out is an error that names the object and the place.
+#[derive(Clone, Debug)]
 pub struct ByteReader<'a> {
     object: String,
     bytes: &'a [u8],
@@ -76,6 +77,10 @@ impl<'a> ByteReader<'a> {
             Ok(name) if !name.is_empty() && !name.chars().any(char::is_control) => Ok(name.to_string()),
             _ => Err(self.error(format!("the name at byte {} is not printable text", self.at - length))),
         }
+    }
+    /// All that has not been read.
+    pub fn rest(self) -> &'a [u8] {
+        &self.bytes[self.at..]
     }
     /// Refuses bytes that nobody asked for.
     pub fn finish(self) -> Result<()> {

@@ -1,0 +1,154 @@
+//! `sorted-image`: Gaussians sorted into a square, each component a picture of the square (as gsplat's PNG compression and SOG do), in PNG.
+//!
+//! Steps are those of `quantize`; only the order and the coder differ, so that the two codecs measure what pictures are worth.
+
+use crate::column::{self, Column};
+use crate::grid_sort::{side_of, square_order};
+use crate::morton;
+use crate::quantize::Bits;
+use crate::rows::{interleave, load, split, store};
+use crate::streams::{META, Shape, open};
+use cc4dgs_core::archive::ByteReader;
+use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
+use png::{BitDepth, ColorType, Decoder, Encoder, Filter, Limits as PngLimits};
+use std::io::Cursor;
+
+/// Version of the stored form.
+const VERSION: u8 = 1;
+/// Name of the stream with values beyond the steps.
+const ESCAPES: &str = "escapes";
+
+struct SortedImage {
+    bits: Bits,
+}
+
+/// Bytes of codes as planes of one byte each, the low bytes of all codes before the high ones: a plane of a 16-bit code's high bytes is smooth, one of low
+/// bytes is noise, and mixed they are both noise to a picture coder.
+fn planes(columns: &[Column], count: usize) -> Vec<u8> {
+    let mut out = Vec::new();
+    for column in columns {
+        let width = column.codes.len() / count.max(1);
+        for byte in 0..width {
+            out.extend(column.codes.iter().skip(byte).step_by(width));
+        }
+    }
+    out
+}
+
+/// Undoes [`planes`] for columns of `widths` bytes per code.
+fn codes(planes: &[u8], widths: &[usize], count: usize) -> Vec<u8> {
+    let mut out = Vec::with_capacity(planes.len());
+    let mut at = 0;
+    for &width in widths {
+        for i in 0..count {
+            out.extend((0..width).map(|byte| planes[at + byte * count + i]));
+        }
+        at += width * count;
+    }
+    out
+}
+
+fn to_png(planes: &[u8], count: usize) -> Result<Vec<u8>> {
+    let side = side_of(count);
+    let failed = |e: png::EncodingError| Error::backend("PNG", e.to_string(), "Report this as a defect");
+    let mut picture = Vec::new();
+    for plane in planes.chunks(count.max(1)) {
+        picture.extend(plane);
+        // What is over repeats the last, which costs next to nothing.
+        picture.extend(std::iter::repeat_n(plane[plane.len() - 1], side * side - plane.len()));
+    }
+    let mut out = Vec::new();
+    let mut encoder = Encoder::new(&mut out, side as u32, (picture.len() / side) as u32);
+    encoder.set_color(ColorType::Grayscale);
+    encoder.set_depth(BitDepth::Eight);
+    encoder.set_filter(Filter::Adaptive);
+    encoder.set_compression(png::Compression::High);
+    let mut writer = encoder.write_header().map_err(failed)?;
+    writer.write_image_data(&picture).map_err(failed)?;
+    writer.finish().map_err(failed)?;
+    Ok(out)
+}
+
+/// The planes of a picture that must hold `wanted` of them.
+fn from_png(object: &str, bytes: &[u8], count: usize, wanted: usize) -> Result<Vec<u8>> {
+    let damaged = |problem: String| Error::data(object, problem, "The file is damaged");
+    let side = side_of(count);
+    let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), PngLimits { bytes: (4 * side * side * wanted).max(1 << 20) });
+    decoder.set_transformations(png::Transformations::IDENTITY);
+    let mut reader = decoder.read_info().map_err(|e| damaged(e.to_string()))?;
+    let info = reader.info();
+    let fits =
+        (info.width as usize, info.height as usize) == (side, side * wanted) && info.color_type == ColorType::Grayscale && info.bit_depth == BitDepth::Eight;
+    if !fits {
+        return Err(damaged(format!("a picture of {}x{} where gray {side}x{} is due", info.width, info.height, side * wanted)));
+    }
+    let mut picture = vec![0; side * side * wanted];
+    reader.next_frame(&mut picture).map_err(|e| damaged(e.to_string()))?;
+    Ok(picture.chunks(side * side).flat_map(|plane| &plane[..count]).copied().collect())
+}
+
+impl AttributeCodec for SortedImage {
+    fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        gaussians.validate("Gaussians to encode", &context.limits)?;
+        let order = square_order(gaussians, &morton::order(&gaussians.means), context.seed.child("square"));
+        let sorted = gaussians.select(&order);
+        let count = sorted.len();
+        let (mut meta, mut escapes) = (vec![VERSION], Vec::new());
+        Shape::of(&sorted).write(&mut meta)?;
+        let mut streams = Vec::new();
+        for (name, width, values) in sorted.columns() {
+            let columns: Vec<Column> = split(values, width).iter().map(|c| self.bits.encode(name, c)).collect();
+            store(&columns, &mut meta, &mut escapes);
+            let planes = planes(&columns, count);
+            // Columns of one value have no codes, and pictures have at least one plane.
+            let bytes = if planes.is_empty() { Vec::new() } else { to_png(&planes, count)? };
+            streams.push(Stream { name: name.into(), bytes });
+        }
+        streams.extend(Shape::extra_streams(&sorted));
+        streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
+        streams.insert(0, Stream { name: META.into(), bytes: meta });
+        Ok(streams)
+    }
+
+    fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        let (set, mut meta, shape) = open("sorted-image", streams, VERSION, &context.limits)?;
+        let mut escapes = set.reader(ESCAPES)?;
+        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+        for (name, width, values) in out.columns_mut() {
+            let widths = column::widths(meta.clone(), width)?;
+            let wanted: usize = widths.iter().sum();
+            let picture = set.reader(name)?.rest();
+            let object = format!("sorted-image stream '{name}'");
+            let planes = if wanted * shape.count == 0 { Vec::new() } else { from_png(&object, picture, shape.count, wanted)? };
+            let codes = codes(&planes, &widths, shape.count);
+            *values = interleave(&load(ByteReader::new(object, &codes), shape.count, width, &mut meta, &mut escapes)?, shape.count);
+        }
+        meta.finish()?;
+        escapes.finish()?;
+        shape.read_extra(&set, &mut out)?;
+        out.validate("decoded Gaussians", &context.limits)?;
+        Ok(out)
+    }
+
+    fn losses(&self) -> Vec<DeclaredLoss> {
+        self.bits.losses()
+    }
+}
+
+fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+    Ok(Box::new(SortedImage { bits: Bits::from_settings("sorted-image", profile, settings)? }))
+}
+
+inventory::submit! {
+    CodecPlugin {
+        info: Plugin {
+            name: "sorted-image",
+            version: "1",
+            summary: "Gaussians sorted into a square, every component a PNG picture of it",
+            paper: "Self-Organizing Gaussian Grids (Morgenstern et al. 2024); gsplat's PNG compression",
+            schema: crate::quantize::SCHEMA,
+            capabilities: &["lossy", "reorders", "profiles=default,high"],
+        },
+        build,
+    }
+}
