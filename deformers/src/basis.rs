@@ -12,6 +12,7 @@ use crate::parts::time::{bands_for, encode};
 use crate::parts::voxels::{VoxelSettings, Voxels, parameter};
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::basis::{BasisShape, combine};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
     DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
@@ -62,7 +63,7 @@ struct CdfBasis {
     rates: Rates,
     voxels: Voxels,
     bands: usize,
-    functions: usize,
+    shape: Arc<BasisShape>,
     learned: Option<Arc<ReluShape>>,
     coefficients: Arc<ReluShape>,
     sh_degree: usize,
@@ -102,14 +103,15 @@ impl CdfBasis {
         }
         let heads = outputs.iter().map(|&output| vec![width, output]).collect();
         let coefficients = Arc::new(ReluShape { input: voxels.width(), trunk, heads });
-        Ok(Self { rates, voxels, bands, functions, learned: learned.map(Arc::new), coefficients, sh_degree: context.sh_degree, parameters, settings })
+        let shape = Arc::new(BasisShape { groups: settings.heads.iter().map(|h| (h.width(context.sh_degree), functions)).collect() });
+        Ok(Self { rates, voxels, bands, shape, learned: learned.map(Arc::new), coefficients, sh_degree: context.sh_degree, parameters, settings })
     }
     /// The weights of the parameters from `place` after the decoders to the end, side by side.
     fn weights_after(&self, place: usize) -> Tensor<1> {
         Tensor::cat(self.parameters[self.voxels.levels() + place..].iter().map(|p| p.value.clone()).collect(), 0)
     }
-    /// φ(t) [functions, 1].
-    fn functions_at(&self, time_norm: f32, like: &Device) -> Result<Tensor<2>> {
+    /// φ(t) [functions].
+    fn functions_at(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
         let encoding = encode(time_norm, self.bands);
         let constant = |values: Vec<f32>| {
             let n = values.len();
@@ -119,10 +121,7 @@ impl CdfBasis {
         if let Some(shape) = &self.learned {
             parts.extend(mlp_relu(constant(encoding), self.parameters[self.voxels.levels()].value.clone(), shape)?);
         }
-        Ok(Tensor::cat(parts, 1).transpose())
-    }
-    fn width_of(&self, head: &Head) -> usize {
-        head.width(self.sh_degree)
+        Ok(Tensor::cat(parts, 1).flatten(0, 1))
     }
 }
 
@@ -143,16 +142,12 @@ impl DeformationField for CdfBasis {
         }
         let [m, _] = features.dims();
         let functions = self.functions_at(time_norm, &features.device())?;
+        let combined = if m == 0 { Tensor::zeros([0, self.shape.outputs()], &features.device()) } else { combine(features, functions, &self.shape)? };
         let mut at = 0;
         let outputs = self.settings.heads.iter().map(|head| {
-            let (width, columns) = (self.width_of(head), self.width_of(head) * self.functions);
-            let own = features.clone().narrow(1, at, columns);
-            at += columns;
-            if m == 0 {
-                Tensor::zeros([0, width], &features.device())
-            } else {
-                own.reshape([m * width, self.functions]).matmul(functions.clone()).reshape([m, width])
-            }
+            let width = head.width(self.sh_degree);
+            at += width;
+            combined.clone().narrow(1, at - width, width)
         });
         let outputs = outputs.collect();
         Ok(heads::offsets(&self.settings.heads, outputs, self.sh_degree))

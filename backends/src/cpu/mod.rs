@@ -1,6 +1,7 @@
 //! Plain-slice kernels (rayon and SIMD) that serve every CPU backend.
 
 pub mod adam;
+pub mod basis;
 pub mod lookup;
 pub mod mlp;
 pub mod photometric;

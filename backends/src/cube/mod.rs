@@ -3,6 +3,7 @@
 #![allow(clippy::needless_range_loop, clippy::collapsible_if, clippy::collapsible_else_if, clippy::manual_range_contains)]
 
 mod adam;
+mod basis;
 mod field;
 mod lookup;
 mod photometric;

@@ -1,0 +1,125 @@
+//! Offsets as combinations of shared functions of time: out = C φ, a dot product per number and Gaussian.
+
+use crate::cpu::basis as kernel;
+use crate::cpu::tensor::CpuBackend;
+use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::tensor::Tensor;
+use cc4dgs_core::{Error, Result};
+use std::sync::Arc;
+
+/// What a row of coefficients holds: per output, the coefficients of the first so many functions, one output after the other.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BasisShape {
+    /// (outputs, functions each of them combines), group by group.
+    pub groups: Vec<(usize, usize)>,
+}
+
+impl BasisShape {
+    /// Numbers per Gaussian that come out.
+    pub fn outputs(&self) -> usize {
+        self.groups.iter().map(|g| g.0).sum()
+    }
+    /// Coefficients per Gaussian.
+    pub fn coefficients(&self) -> usize {
+        self.groups.iter().map(|g| g.0 * g.1).sum()
+    }
+    /// The functions that are read.
+    pub fn functions(&self) -> usize {
+        self.groups.iter().map(|g| g.1).max().unwrap_or(0)
+    }
+}
+
+/// The derivative per device.
+pub trait BasisBackward: Backend {
+    /// The gradients of coefficients and functions, those that are wanted.
+    fn combine_backward(
+        coefficients: FloatTensor<Self>,
+        functions: FloatTensor<Self>,
+        shape: &BasisShape,
+        grad: FloatTensor<Self>,
+        wanted: [bool; 2],
+    ) -> [Option<FloatTensor<Self>>; 2];
+}
+
+/// The operation per device.
+#[backend_extension(Flex, NdArray, Cube, Autodiff)]
+pub trait BasisOps: Backend {
+    /// Outputs [M, W] of coefficients [M, C] and functions [F]; differentiable in both.
+    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self>;
+}
+
+impl<B: CpuBackend> BasisBackward for B {
+    fn combine_backward(
+        coefficients: FloatTensor<Self>,
+        functions: FloatTensor<Self>,
+        shape: &BasisShape,
+        grad: FloatTensor<Self>,
+        wanted: [bool; 2],
+    ) -> [Option<FloatTensor<Self>>; 2] {
+        let (grad, rows, count) = (B::floats(&grad), coefficients.shape()[0], functions.shape()[0]);
+        [
+            wanted[0].then(|| B::from_floats(kernel::coefficient_gradient(shape, &B::floats(&functions), &grad), [rows, shape.coefficients()])),
+            wanted[1].then(|| B::from_floats(kernel::function_gradient(shape, &B::floats(&coefficients), &grad, count), [count])),
+        ]
+    }
+}
+
+macro_rules! on_cpu {
+    ($backend:ty) => {
+        impl BasisOps for $backend {
+            fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
+                let out = kernel::combine(&shape, &Self::floats(&coefficients), &Self::floats(&functions));
+                Self::from_floats(out, [coefficients.shape()[0], shape.outputs()])
+            }
+        }
+    };
+}
+on_cpu!(Flex);
+on_cpu!(NdArray);
+
+#[derive(Debug)]
+struct Combine;
+
+impl<B: BasisBackward> Backward<B, 2> for Combine {
+    type State = (FloatTensor<B>, FloatTensor<B>, Arc<BasisShape>);
+
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let parents = ops.parents;
+        let grad = grads.consume::<B>(&ops.node);
+        let (coefficients, functions, shape) = ops.state;
+        let wanted = [parents[0].is_some(), parents[1].is_some()];
+        let found = B::combine_backward(coefficients, functions, &shape, grad, wanted);
+        for (parent, gradient) in parents.into_iter().zip(found) {
+            if let (Some(parent), Some(gradient)) = (parent, gradient) {
+                grads.register::<B>(parent.id, gradient);
+            }
+        }
+    }
+}
+
+impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B, C> {
+    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
+        let ((coefficients, first), (functions, second)) = (coefficients.into_parts(), functions.into_parts());
+        match Combine.prepare::<C>([first, second]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let out = B::combine(coefficients.clone(), functions.clone(), shape.clone());
+                prep.finish((coefficients, functions, shape), out)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::combine(coefficients, functions, shape)),
+        }
+    }
+}
+
+/// Outputs [M, [`BasisShape::outputs`]] of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` [F].
+pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Tensor<2>> {
+    let ([m, width], [count]) = (coefficients.dims(), functions.dims());
+    if m == 0 || width != shape.coefficients() || count < shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
+        let problem = format!("coefficients have shape [{m},{width}], there are {count} functions, {shape:?} is wanted");
+        return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients as the shape says and all functions"));
+    }
+    Ok(Tensor::from_dispatch(<Dispatch as BasisOps>::combine(coefficients.into_dispatch(), functions.into_dispatch(), shape.clone())))
+}
