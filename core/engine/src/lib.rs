@@ -17,3 +17,4 @@ pub mod ply;
 pub mod presets;
 pub mod schedule;
 pub mod train;
+pub mod trajectory;

@@ -1,7 +1,6 @@
 //! Playback: spatial features once, then per frame gate, deform and draw.
 
 use crate::model::Model;
-use crate::train::Rows;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::{Camera, FieldWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
 use serde::Serialize;
@@ -48,7 +47,6 @@ pub struct Player<'a> {
     moving_means: Tensor<2>,
     /// What the field keeps per Gaussian, of those that move.
     moving_attributes: Vec<Tensor<2>>,
-    rows: Rows,
     moving: usize,
     cache: Option<Tensor<2>>,
     settings: RenderSettings,
@@ -84,23 +82,31 @@ pub struct FrameTime {
 impl<'a> Player<'a> {
     /// Uploads the model.
     pub fn new(model: &'a Model, registry: &Registry, device: &Device) -> Result<Self> {
-        let gaussians = Gaussians::from_host(&model.gaussians, device);
+        let n = model.gaussians.len();
         let moves = model.field.as_ref().is_some_and(|f| !f.field.is_static());
-        let rows = if moves { Rows::new(model.moving.rows(&model.gaussians.dynamic_scores), device) } else { Rows::new(Some(Vec::new()), device) };
-        let moving = rows.count(gaussians.len());
+        let rows = if moves { model.moving.rows(&model.gaussians.dynamic_scores) } else { Some(Vec::new()) };
+        let moving = rows.as_ref().map_or(n, Vec::len);
+        // What moves comes first, so that a frame adds to a block of rows instead of gathering and scattering them.
+        let sorted = rows.filter(|_| (1..n).contains(&moving)).map(|rows| {
+            let mut still = vec![true; n];
+            rows.iter().for_each(|&row| still[row] = false);
+            let order: Vec<usize> = rows.into_iter().chain((0..n).filter(|&i| still[i])).collect();
+            model.gaussians.select(&order)
+        });
+        let host = sorted.as_ref().unwrap_or(&model.gaussians);
+        let gaussians = Gaussians::from_host(host, device);
         let background = Tensor::<1>::from_data(TensorData::new(model.background.to_vec(), [3]), device);
         let wanted = model.field.iter().filter(|_| moving > 0).flat_map(|f| f.field.attributes());
         let moving_attributes = wanted
-            .filter_map(|spec| model.gaussians.extra.get(&spec.name))
-            .map(|a| rows.select(Tensor::<2>::from_data(TensorData::new(a.values.clone(), [model.gaussians.len(), a.width]), device)))
+            .filter_map(|spec| host.extra.get(&spec.name))
+            .map(|a| Tensor::<2>::from_data(TensorData::new(a.values[..moving * a.width].to_vec(), [moving, a.width]), device))
             .collect();
         Ok(Self {
             device: device.clone(),
             rasterizer: registry.build_rasterizer(&model.rasterizer)?,
-            moving_means: if moving > 0 { rows.select(gaussians.means.clone()) } else { gaussians.means.clone() },
+            moving_means: if moving > 0 { gaussians.means.clone().narrow(0, 0, moving) } else { gaussians.means.clone() },
             gaussians,
             moving_attributes,
-            rows,
             moving,
             cache: None,
             settings: model.render.settings(Some(background)),
@@ -113,7 +119,7 @@ impl<'a> Player<'a> {
     pub fn moving(&self) -> usize {
         self.moving
     }
-    /// The Gaussians at `time_norm`.
+    /// The Gaussians at `time_norm`, those that move before those that do not.
     pub fn gaussians_at(&mut self, time_norm: f32) -> Result<Gaussians> {
         self.work.frames += 1;
         self.work.deformed += self.moving as u64;
@@ -135,7 +141,7 @@ impl<'a> Player<'a> {
                 spatial.values
             }
         };
-        Ok(field.field.deform(features, time_norm)?.apply(&self.gaussians, self.rows.tensor()))
+        Ok(field.field.deform(features, time_norm)?.apply(&self.gaussians, None))
     }
     /// Draws one frame.
     pub fn render(&mut self, camera: &Camera, time_norm: f32) -> Result<(RenderOutput, FrameTime)> {

@@ -35,14 +35,14 @@ pub struct Offsets {
 }
 
 impl Offsets {
-    /// Applies the offsets to the Gaussians `rows` [M]; `None` means that row i of the offsets belongs to Gaussian i.
+    /// Applies the offsets to the Gaussians `rows` [M]; `None` means that row i of the offsets belongs to Gaussian i, for the first M.
     /// Everything else is returned as it came.
     pub fn apply(self, canonical: &Gaussians, rows: Option<&Tensor<1, Int>>) -> Gaussians {
         let mut moved = canonical.clone();
         moved.means = add(moved.means, self.means, rows);
         moved.log_scales = add(moved.log_scales, self.log_scales, rows);
         if let Some(scales) = self.scales {
-            let before = select(&moved.log_scales, rows);
+            let before = select(&moved.log_scales, rows, scales.dims()[0]);
             let after = (before.clone().exp() + scales).clamp_min(LEAST_SCALE).log();
             moved.log_scales = add(moved.log_scales, Some(after - before), rows);
         }
@@ -50,17 +50,14 @@ impl Offsets {
             if !self.unit_quaternions {
                 return change;
             }
-            let raw = select(&moved.quaternions, rows);
+            let raw = select(&moved.quaternions, rows, change.dims()[0]);
             let norm = raw.clone().powi_scalar(2).sum_dim(1).sqrt().clamp_min(LEAST_NORM);
             raw.clone() / norm - raw + change
         });
         moved.quaternions = add(moved.quaternions, quaternions, rows);
         moved.opacity_logits = add(moved.opacity_logits, self.opacity_logits, rows);
         if let Some(factor) = self.opacity_log_factor {
-            let before = match rows {
-                None => moved.opacity_logits.clone(),
-                Some(rows) => moved.opacity_logits.clone().select(0, rows.clone()),
-            };
+            let before = select(&moved.opacity_logits, rows, factor.dims()[0]);
             moved.opacity_logits = add(moved.opacity_logits, Some(faded(before.clone(), factor) - before), rows);
         }
         if let Some(sh) = self.sh {
@@ -102,17 +99,22 @@ fn faded(logits: Tensor<1>, factor: Tensor<1>) -> Tensor<1> {
     log_sigmoid(logits) + factor - rest.clamp_min(LEAST_REST).log()
 }
 
-fn select(values: &Tensor<2>, rows: Option<&Tensor<1, Int>>) -> Tensor<2> {
+/// The values of the Gaussians `rows`, or of the first `count`.
+fn select<const D: usize>(values: &Tensor<D>, rows: Option<&Tensor<1, Int>>, count: usize) -> Tensor<D> {
     match rows {
-        None => values.clone(),
+        None if count == values.dims()[0] => values.clone(),
+        None => values.clone().narrow(0, 0, count),
         Some(rows) => values.clone().select(0, rows.clone()),
     }
 }
 
 fn add<const D: usize>(base: Tensor<D>, offset: Option<Tensor<D>>, rows: Option<&Tensor<1, Int>>) -> Tensor<D> {
-    match (offset, rows) {
-        (None, _) => base,
-        (Some(offset), None) => base + offset,
-        (Some(offset), Some(rows)) => base.select_assign(0, rows.clone(), offset, burn::tensor::IndexingUpdateOp::Add),
+    let Some(offset) = offset else { return base };
+    let (m, n) = (offset.dims()[0], base.dims()[0]);
+    match rows {
+        Some(rows) => base.select_assign(0, rows.clone(), offset, burn::tensor::IndexingUpdateOp::Add),
+        None if m == n => base + offset,
+        None if m == 0 => base,
+        None => Tensor::cat(vec![base.clone().narrow(0, 0, m) + offset, base.narrow(0, m, n - m)], 0),
     }
 }

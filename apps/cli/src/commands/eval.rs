@@ -5,8 +5,10 @@ use crate::args::Eval;
 use crate::interrupt;
 use crate::model_source::{Loaded, load_model, open_scene};
 use cc4dgs_core::{Event, EventSink, Limits, Result, Scene, Split};
+use cc4dgs_engine::data::procedural::{self, ProceduralScene};
 use cc4dgs_engine::eval::{EvalReport, evaluate};
 use cc4dgs_engine::pictures::{Comparison, SheetOptions, comparison_sheet, write_png};
+use cc4dgs_engine::trajectory::{MotionScore, motion_scores};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -22,6 +24,9 @@ pub struct FullReport {
     pub sheet: Option<PathBuf>,
     #[serde(flatten)]
     pub eval: EvalReport,
+    /// Where the scene's motion is known, how well it is followed, object by object.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub motion: Vec<MotionScore>,
     pub provenance: Provenance,
 }
 
@@ -117,6 +122,17 @@ pub fn measure(
     ] {
         events.emit(&Event::Work { stage: "eval".into(), counter: counter.into(), done, skipped });
     }
+    let motion = match procedural::name_of(Path::new(&scene.name)) {
+        Some(name) => {
+            let mut truth = ProceduralScene::named(name)?;
+            if let Some(camera) = scene.cameras.first() {
+                (truth.width, truth.height) = (camera.width, camera.height);
+            }
+            truth.frames = scene.frame_count;
+            motion_scores(model, &truth, &context.registry, &loaded.device, events)?
+        }
+        None => Vec::new(),
+    };
     let provenance = &model.provenance;
     Ok(FullReport {
         model: model_path.to_path_buf(),
@@ -124,6 +140,7 @@ pub fn measure(
         seconds: began.elapsed().as_secs_f64(),
         sheet: pictures.sheet.clone(),
         eval: report,
+        motion,
         provenance: Provenance {
             version: env!("CARGO_PKG_VERSION"),
             commit: provenance.commit.clone(),
@@ -149,6 +166,13 @@ pub fn text(report: &FullReport) -> String {
             e.frame_ms.mean, e.frame_ms.field, e.frame_ms.raster, e.frame_ms.field_first, e.frame_ms.raster_first
         ),
     ];
+    if !report.motion.is_empty() {
+        lines.push("  cycles  PSNR dB  trajectory error  Gaussians".into());
+    }
+    lines.extend(report.motion.iter().map(|m| {
+        let error = m.trajectory_error.map_or_else(|| "-".to_string(), |e| format!("{e:.3}"));
+        format!("  {:>6} {:>8.2} {error:>17} {:>10}", m.cycles, m.psnr_db, m.gaussians)
+    }));
     if let Some(path) = &report.sheet {
         lines.push(format!("  contact sheet {}", path.display()));
     }

@@ -46,7 +46,7 @@ pub struct ProceduralScene {
 }
 
 /// Names of the built-in scenes: `procedural:NAME`.
-pub const NAMES: [&str; 3] = ["default", "static", "tiny"];
+pub const NAMES: [&str; 4] = ["default", "static", "tiny", "frequencies"];
 
 /// The name of a built-in scene if `path` is `procedural` or `procedural:NAME`.
 pub fn name_of(path: &Path) -> Option<&str> {
@@ -79,6 +79,8 @@ impl ProceduralScene {
             "default" => Ok(full),
             "static" => Ok(Self { frames: 1, ..full }),
             "tiny" => Ok(Self { width: 40, height: 32, train_cameras: 6, test_cameras: 1, frames: 4, supersampling: 2, points: 600, ..full }),
+            // Four samples per cycle of the fastest ball.
+            "frequencies" => Ok(Self { width: 96, height: 96, frames: 65, supersampling: 2, objects: objects::frequencies(), ..full }),
             other => Err(unknown_name("procedural scene", other, NAMES.into_iter())),
         }
     }

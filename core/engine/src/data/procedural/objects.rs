@@ -64,6 +64,15 @@ pub enum Motion {
         /// Full swings over the sequence.
         swings: f64,
     },
+    /// It goes to and fro on a line.
+    Sway {
+        /// The middle of the line.
+        at: DVec3,
+        /// From the middle to an end.
+        reach: DVec3,
+        /// Full cycles over the sequence.
+        cycles: f64,
+    },
 }
 
 impl Motion {
@@ -82,6 +91,7 @@ impl Motion {
                 let rotation = DQuat::from_rotation_y(amplitude_rad * (TAU * swings * time_norm).cos());
                 Pose { rotation, translation: pivot + rotation * DVec3::new(0.0, 0.0, -length) }
             }
+            Self::Sway { at, reach, cycles } => Pose { rotation: DQuat::IDENTITY, translation: at + reach * (TAU * cycles * time_norm).sin() },
         }
     }
     /// Whether it never moves.
@@ -232,6 +242,20 @@ pub(super) fn playground() -> Vec<Object> {
     ]
 }
 
+/// Five balls on a circle over the floor that sway up and down, 1, 2, 4, 8 and 16 times over the sequence.
+pub(super) fn frequencies() -> Vec<Object> {
+    let colors = [[0.80, 0.20, 0.15], [0.15, 0.50, 0.75], [0.20, 0.60, 0.25], [0.75, 0.55, 0.10], [0.55, 0.25, 0.65]];
+    let balls = colors.into_iter().enumerate().map(|(k, color)| {
+        let (s, c) = (TAU * k as f64 / 5.0).sin_cos();
+        Object {
+            shape: Shape::Sphere { radius: 0.26 },
+            material: Material { texture: Texture::Checker(color, [0.95, 0.92, 0.85], 0.18), specular: 0.0 },
+            motion: Motion::Sway { at: DVec3::new(1.05 * c, 1.05 * s, 0.70), reach: DVec3::Z * 0.25, cycles: f64::from(1 << k) },
+        }
+    });
+    playground().into_iter().take(1).chain(balls).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -247,7 +271,7 @@ mod tests {
 
     #[test]
     fn poses_are_rigid_and_invert() {
-        for object in playground() {
+        for object in playground().into_iter().chain(frequencies()) {
             for t in [0.0, 0.3, 1.0] {
                 let (pose, p) = (object.motion.pose(t), DVec3::new(0.3, -0.7, 1.1));
                 assert!((pose.inverse_apply(pose.apply(p)) - p).length() < 1e-12);

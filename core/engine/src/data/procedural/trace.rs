@@ -49,6 +49,16 @@ impl Tracer {
         }
         nearest
     }
+    /// The object at the centre of every pixel, row by row.
+    pub fn objects_seen(&self, camera: &Camera) -> Vec<Option<usize>> {
+        (0..camera.height * camera.width)
+            .into_par_iter()
+            .map(|i| {
+                let (origin, direction) = pixel_ray(camera, f64::from(i % camera.width) + 0.5, f64::from(i / camera.width) + 0.5);
+                self.hit(origin, direction).map(|hit| hit.object)
+            })
+            .collect()
+    }
     /// Colour of a hit seen along `direction`: ambient, Lambert and a mild highlight of one distant light. No shadows, so that what stands still looks still.
     pub fn shade(&self, hit: &Hit, direction: DVec3) -> [f64; 3] {
         let light = DVec3::new(0.4, -0.3, 0.87).normalize();
