@@ -1,9 +1,10 @@
 //! Combinations of shared functions: against sums in float64, forwards and backwards, on every device.
 
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, combine};
-use cc4dgs_core::Seed;
 use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{DeformationField, FieldContext, Gaussians, HostGaussians, Offsets, Registry, Seed, config};
+use cc4dgs_deformers as _;
 use cc4dgs_tests::{devices, poison};
 use std::sync::Arc;
 
@@ -16,30 +17,30 @@ fn values_and_gradients_are_those_of_the_sums() {
     let shapes = [vec![(1, 1)], vec![(3, 30), (3, 30), (4, 30)], vec![(3, 41), (1, 8), (48, 2)], vec![(2, 16), (5, 33)]];
     for (k, groups) in shapes.into_iter().enumerate() {
         let shape = Arc::new(BasisShape { groups });
-        // One function more than any output reads.
-        let (width, columns, count) = (shape.outputs(), shape.coefficients(), shape.functions() + 1);
+        let (width, columns, count) = (shape.outputs(), shape.coefficients(), shape.functions());
         for rows in [1, 7, 300, 1000] {
             let (coefficients, functions, upstream) = (noise(1 + k as u64, rows * columns), noise(20, count), noise(30, rows * width));
             let mut starts = Vec::new();
-            let mut at = 0;
+            let (mut at, mut function) = (0, 0);
             for &(outputs, functions) in &shape.groups {
                 for _ in 0..outputs {
-                    starts.push((at, functions));
+                    starts.push((at, function, functions));
                     at += functions;
                 }
+                function += functions;
             }
             let mut values = vec![0.0f64; rows * width];
             let mut of_coefficients = vec![0.0f64; rows * columns];
             let mut of_functions = vec![0.0f64; count];
             for row in 0..rows {
-                for (o, &(start, n)) in starts.iter().enumerate() {
+                for (o, &(start, function, n)) in starts.iter().enumerate() {
                     let d = f64::from(upstream[row * width + o]);
                     for f in 0..n {
                         let place = row * columns + start + f;
-                        let (c, phi) = (f64::from(coefficients[place]), f64::from(functions[f]));
+                        let (c, phi) = (f64::from(coefficients[place]), f64::from(functions[function + f]));
                         values[row * width + o] += c * phi;
                         of_coefficients[place] = d * phi;
-                        of_functions[f] += d * c;
+                        of_functions[function + f] += d * c;
                     }
                 }
             }
@@ -69,9 +70,90 @@ fn what_does_not_fit_is_an_error() {
     let shape = Arc::new(BasisShape { groups: vec![(3, 4)] });
     for (_, device) in devices() {
         let tensor = |rows: usize, columns: usize| Tensor::<2>::zeros([rows, columns], &device);
-        for (rows, columns, functions) in [(0, 12, 4), (2, 11, 4), (2, 12, 3)] {
+        for (rows, columns, functions) in [(0, 12, 4), (2, 11, 4), (2, 12, 3), (2, 12, 5)] {
             let error = combine(tensor(rows, columns), Tensor::<1>::zeros([functions], &device), &shape).expect_err("it does not fit");
             assert!(error.to_string().contains("functions"), "{error}");
         }
+    }
+}
+
+/// A field some of whose functions do next to nothing in one head, and nothing at all in another.
+#[test]
+fn what_a_scene_does_not_use_is_left_out() {
+    let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
+    let registry = Registry::collect().unwrap();
+    let text = "levels = 2\nresolutions = [3, 6]\nhashes = 16\nhidden = [12]\nfeatures = 5\nwidth = 16\nlearned = 3\ntime_bands = 2";
+    let section = config::parse_table("test", text).unwrap();
+    let plugin = registry.deformer("cdf-basis").unwrap();
+    let mut field = (plugin.build)(&section, &context, &Device::flex()).unwrap();
+    // Functions: 1, t, two bands of two, three learned.
+    let functions = 9;
+    for parameter in field.parameters_mut() {
+        let [head, outputs] = match parameter.name.as_str() {
+            "net.head.means" => [1, 3],
+            "net.head.quaternions" => [2, 4],
+            _ => continue,
+        };
+        let mut values = to_vec(parameter.value.clone(), "weights").unwrap();
+        let columns = outputs * functions;
+        let last = values.len() - 17 * columns;
+        let random = noise(50 + head as u64, values.len());
+        for (k, value) in values[last..].iter_mut().enumerate() {
+            // Centres use the constant, t and the first band; rotations everything; scales stay at zero.
+            let used = head == 2 || k % functions < 4;
+            *value = random[k] * if used { 0.3 } else { 1e-6 };
+        }
+        let len = values.len();
+        parameter.value = Tensor::from_data(TensorData::new(values, [len]), &Device::flex());
+    }
+    let points = Tensor::<2>::from_data(TensorData::new(noise(60, 300), [100, 3]), &Device::flex());
+    let times = [0.0, 0.2, 0.45, 0.7, 1.0];
+    let features = field.spatial(points.clone()).unwrap().values;
+    let simple = field.simplified(features, &times).unwrap().expect("something is unused");
+    assert!(simple.message.contains("means keeps 4 of 9") && simple.message.contains("log_scales does nothing"), "{}", simple.message);
+    let bytes = |f: &dyn DeformationField| f.size_bytes().0 + f.size_bytes().1;
+    assert!(bytes(simple.field.as_ref()) < bytes(field.as_ref()));
+
+    // What the settings build takes the weights, and does the same.
+    let mut again = (plugin.build)(&simple.settings, &context, &Device::flex()).unwrap();
+    for (to, from) in again.parameters_mut().into_iter().zip(simple.field.parameters()) {
+        assert_eq!((&to.name, &to.shape), (&from.name, &from.shape));
+        to.value = from.value.clone();
+    }
+    let offsets = |f: &dyn DeformationField, time: f32| {
+        let found = f.deform(f.spatial(points.clone()).unwrap().values, time).unwrap();
+        let read = |t: Option<Tensor<2>>| t.map(|t| to_vec(t, "offsets").unwrap());
+        (read(found.means), read(found.log_scales), read(found.quaternions))
+    };
+    for time in times {
+        let (before, after, rebuilt) = (offsets(field.as_ref(), time), offsets(simple.field.as_ref(), time), offsets(again.as_ref(), time));
+        assert_eq!(after, rebuilt);
+        assert!(after.1.is_none() && before.1.unwrap().iter().all(|v| *v == 0.0));
+        for (a, b) in [(before.0, after.0), (before.2, after.2)] {
+            let worst = a.unwrap().iter().zip(b.unwrap()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(worst < 1e-4, "at {time}: {worst}");
+        }
+    }
+    for broken in ["means = [3, 1]", "means = []", "means = [9]", "opacity = [0]"] {
+        let section = config::parse_table("test", &format!("{text}\n[kept]\n{broken}")).unwrap();
+        let error = (plugin.build)(&section, &context, &Device::flex()).map(|_| ()).expect_err(broken).to_string();
+        assert!(error.contains("deformer.kept"), "{error}");
+    }
+}
+
+#[test]
+fn rotation_vectors_turn_what_is_there() {
+    for (name, device) in devices() {
+        let mut host = HostGaussians { means: vec![0.0; 6], log_scales: vec![0.0; 6], sh_dc: vec![0.0; 6], ..Default::default() };
+        (host.opacity_logits, host.dynamic_scores) = (vec![0.0; 2], vec![0.0; 2]);
+        // A quarter turn around x, twice as long as a unit quaternion; and one that stays.
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        host.quaternions = vec![2.0 * half, 2.0 * half, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5];
+        let vectors = vec![0.0, 0.0, std::f32::consts::FRAC_PI_2, 0.0, 0.0, 0.0];
+        let offsets = Offsets { rotation_vectors: Some(Tensor::from_data(TensorData::new(vectors, [2, 3]), &device)), ..Default::default() };
+        let moved = offsets.apply(&Gaussians::from_host(&host, &device), None).to_host().unwrap();
+        // z quarter after x quarter: (1, 1, 1, 1) / 2.
+        let wanted = [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5];
+        assert!(moved.quaternions.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-6), "{name}: {:?}", moved.quaternions);
     }
 }

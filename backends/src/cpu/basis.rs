@@ -3,6 +3,7 @@
 use crate::ops::basis::BasisShape;
 use pulp::Arch;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Rows per task.
 const ROWS: usize = 256;
@@ -19,7 +20,7 @@ pub fn combine(shape: &BasisShape, coefficients: &[f32], functions: &[f32]) -> V
             #[inline(always)]
             || {
                 for (out, row) in out.chunks_exact_mut(width).zip(coefficients.chunks_exact(columns)) {
-                    for_each_output(shape, |o, range, count| out[o] = dot(&row[range], &functions[..count]));
+                    for_each_output(shape, |o, range, own| out[o] = dot(&row[range], &functions[own]));
                 }
             },
         );
@@ -27,16 +28,17 @@ pub fn combine(shape: &BasisShape, coefficients: &[f32], functions: &[f32]) -> V
     out
 }
 
-/// Calls with every output, where its coefficients lie, and how many they are.
+/// Calls with every output, where its coefficients lie, and where its functions do.
 #[inline(always)]
-fn for_each_output(shape: &BasisShape, mut each: impl FnMut(usize, std::ops::Range<usize>, usize)) {
-    let (mut output, mut at) = (0, 0);
+fn for_each_output(shape: &BasisShape, mut each: impl FnMut(usize, Range<usize>, Range<usize>)) {
+    let (mut output, mut at, mut function) = (0, 0, 0);
     for &(outputs, count) in &shape.groups {
         for _ in 0..outputs {
-            each(output, at..at + count, count);
+            each(output, at..at + count, function..function + count);
             output += 1;
             at += count;
         }
+        function += count;
     }
 }
 
@@ -73,8 +75,8 @@ pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32])
             #[inline(always)]
             || {
                 for (row, d) in out.chunks_exact_mut(columns).zip(grad.chunks_exact(width)) {
-                    for_each_output(shape, |o, range, count| {
-                        for (c, f) in row[range].iter_mut().zip(&functions[..count]) {
+                    for_each_output(shape, |o, range, own| {
+                        for (c, f) in row[range].iter_mut().zip(&functions[own]) {
                             *c = d[o] * f;
                         }
                     });
@@ -85,9 +87,9 @@ pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32])
     out
 }
 
-/// The gradient [F] of `count` functions. Tasks sum over rows of their own; their sums are added in order.
-pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32], count: usize) -> Vec<f32> {
-    let (width, columns) = (shape.outputs(), shape.coefficients());
+/// The gradient [F] of the functions. Tasks sum over rows of their own; their sums are added in order.
+pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32]) -> Vec<f32> {
+    let (width, columns, count) = (shape.outputs(), shape.coefficients(), shape.functions());
     let arch = Arch::new();
     let tasks: Vec<Vec<f32>> = coefficients
         .par_chunks(ROWS * columns)
@@ -98,8 +100,8 @@ pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32],
                 #[inline(always)]
                 || {
                     for (row, d) in coefficients.chunks_exact(columns).zip(grad.chunks_exact(width)) {
-                        for_each_output(shape, |o, range, count| {
-                            for (s, c) in sums[..count].iter_mut().zip(&row[range]) {
+                        for_each_output(shape, |o, range, own| {
+                            for (s, c) in sums[own].iter_mut().zip(&row[range]) {
                                 *s += d[o] * c;
                             }
                         });

@@ -12,15 +12,19 @@ use std::sync::Arc;
 /// Rows whose share of the functions' gradient one unit adds up.
 const SEGMENT: usize = 128;
 
-/// Per output, where its coefficients start and how many they are.
+/// Numbers per output in a plan.
+const FIELDS: usize = 3;
+
+/// Per output, where its coefficients start, where its functions do, and how many they are.
 fn plan(shape: &BasisShape) -> Vec<u32> {
-    let mut at = 0;
+    let (mut at, mut function) = (0, 0);
     let mut words = Vec::new();
     for &(outputs, count) in &shape.groups {
         for _ in 0..outputs {
-            words.extend([at, count as u32]);
+            words.extend([at, function, count as u32]);
             at += count as u32;
         }
+        function += count as u32;
     }
     words
 }
@@ -30,10 +34,11 @@ fn plan(shape: &BasisShape) -> Vec<u32> {
 fn combine_rows(coefficients: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], width: u32, columns: u32) {
     if ABSOLUTE_POS < out.len() {
         let (row, output) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
-        let from = row * columns as usize + plan[2 * output] as usize;
+        let from = row * columns as usize + plan[FIELDS * output] as usize;
+        let own = plan[FIELDS * output + 1] as usize;
         let mut sum = 0.0f32;
-        for k in 0..plan[2 * output + 1] as usize {
-            sum += coefficients[from + k] * functions[k];
+        for k in 0..plan[FIELDS * output + 2] as usize {
+            sum += coefficients[from + k] * functions[own + k];
         }
         out[ABSOLUTE_POS] = sum;
     }
@@ -44,9 +49,10 @@ fn combine_rows(coefficients: &[f32], functions: &[f32], plan: &[u32], out: &mut
 fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], width: u32, columns: u32) {
     if ABSOLUTE_POS < grad.len() {
         let (row, output) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
-        let from = row * columns as usize + plan[2 * output] as usize;
-        for k in 0..plan[2 * output + 1] as usize {
-            out[from + k] = grad[ABSOLUTE_POS] * functions[k];
+        let from = row * columns as usize + plan[FIELDS * output] as usize;
+        let own = plan[FIELDS * output + 1] as usize;
+        for k in 0..plan[FIELDS * output + 2] as usize {
+            out[from + k] = grad[ABSOLUTE_POS] * functions[own + k];
         }
     }
 }
@@ -61,8 +67,9 @@ fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mu
         let mut sum = 0.0f32;
         for row in start..end {
             for output in 0..width as usize {
-                if k < plan[2 * output + 1] as usize {
-                    sum += grad[row * width as usize + output] * coefficients[row * columns as usize + plan[2 * output] as usize + k];
+                let (first, own, count) = (plan[FIELDS * output] as usize, plan[FIELDS * output + 1] as usize, plan[FIELDS * output + 2] as usize);
+                if k >= own && k < own + count {
+                    sum += grad[row * width as usize + output] * coefficients[row * columns as usize + first + k - own];
                 }
             }
         }

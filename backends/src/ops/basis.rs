@@ -11,7 +11,8 @@ use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
 
-/// What a row of coefficients holds: per output, the coefficients of the first so many functions, one output after the other.
+/// What a row of coefficients holds: per output, the coefficients of its group's functions, one output after the other. The functions of all groups lie one
+/// group after the other too, so that each may have its own.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BasisShape {
     /// (outputs, functions each of them combines), group by group.
@@ -27,9 +28,9 @@ impl BasisShape {
     pub fn coefficients(&self) -> usize {
         self.groups.iter().map(|g| g.0 * g.1).sum()
     }
-    /// The functions that are read.
+    /// Functions of all groups.
     pub fn functions(&self) -> usize {
-        self.groups.iter().map(|g| g.1).max().unwrap_or(0)
+        self.groups.iter().map(|g| g.1).sum()
     }
 }
 
@@ -60,10 +61,10 @@ impl<B: CpuBackend> BasisBackward for B {
         grad: FloatTensor<Self>,
         wanted: [bool; 2],
     ) -> [Option<FloatTensor<Self>>; 2] {
-        let (grad, rows, count) = (B::floats(&grad), coefficients.shape()[0], functions.shape()[0]);
+        let (grad, rows) = (B::floats(&grad), coefficients.shape()[0]);
         [
             wanted[0].then(|| B::from_floats(kernel::coefficient_gradient(shape, &B::floats(&functions), &grad), [rows, shape.coefficients()])),
-            wanted[1].then(|| B::from_floats(kernel::function_gradient(shape, &B::floats(&coefficients), &grad, count), [count])),
+            wanted[1].then(|| B::from_floats(kernel::function_gradient(shape, &B::floats(&coefficients), &grad), [shape.functions()])),
         ]
     }
 }
@@ -117,7 +118,7 @@ impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B
 /// Outputs [M, [`BasisShape::outputs`]] of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` [F].
 pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Tensor<2>> {
     let ([m, width], [count]) = (coefficients.dims(), functions.dims());
-    if m == 0 || width != shape.coefficients() || count < shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
+    if m == 0 || width != shape.coefficients() || count != shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
         let problem = format!("coefficients have shape [{m},{width}], there are {count} functions, {shape:?} is wanted");
         return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients as the shape says and all functions"));
     }

@@ -16,6 +16,13 @@ pub enum Event {
         /// Root seed.
         seed: u64,
     },
+    /// Something was decided that the user did not ask for by name.
+    Note {
+        /// What it is about.
+        object: String,
+        /// What was decided.
+        message: String,
+    },
     /// Something the user should know and nothing has to stop for.
     Warning {
         /// The object it is about.

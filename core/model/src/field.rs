@@ -143,11 +143,26 @@ pub trait DeformationField: Send {
     fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
+    /// After training, a smaller field that does nearly the same: without what this scene does not use. `features` [M,F] are those of all Gaussians that move,
+    /// `times` the normalised times of the frames.
+    fn simplified(&self, _features: Tensor<2>, _times: &[f32]) -> Result<Option<Simplified>> {
+        Ok(None)
+    }
     /// Bytes of the weights as float32, per part: (grid, net).
     fn size_bytes(&self) -> (u64, u64) {
         let sum = |part| self.parameters().iter().filter(|p| p.part == part).map(|p| 4 * p.shape.iter().product::<usize>() as u64).sum();
         (sum(Part::Grid), sum(Part::Net))
     }
+}
+
+/// What [`DeformationField::simplified`] returns.
+pub struct Simplified {
+    /// The smaller field.
+    pub field: Box<dyn DeformationField>,
+    /// The settings that build it, without `kind`.
+    pub settings: toml::Table,
+    /// What was left out, for people.
+    pub message: String,
 }
 
 /// A deformation field in the registry.

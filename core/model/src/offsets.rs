@@ -8,6 +8,8 @@ use burn::tensor::{Int, Tensor};
 const LEAST_SCALE: f32 = 1e-7;
 /// What is left of 1 beside an opacity is not taken for less than this.
 const LEAST_REST: f32 = 1e-30;
+/// Added to squared angles, so that no rotation at all has a derivative.
+const LEAST_SQUARED_ANGLE: f32 = 1e-14;
 /// Norms of quaternions are not taken for smaller than this.
 const LEAST_NORM: f32 = 1e-12;
 
@@ -24,6 +26,8 @@ pub struct Offsets {
     pub scales: Option<Tensor<2>>,
     /// Change of the raw quaternions [M,4].
     pub quaternions: Option<Tensor<2>>,
+    /// Rotations in front of the canonical ones, axis times angle in radians, world axes [M,3]. Unlike sums of quaternions they compose, however far they turn.
+    pub rotation_vectors: Option<Tensor<2>>,
     /// Whether quaternions are normalised before they are changed (Deformable 3DGS, Grid4D).
     pub unit_quaternions: bool,
     /// Change of the opacity logits [M].
@@ -55,6 +59,10 @@ impl Offsets {
             raw.clone() / norm - raw + change
         });
         moved.quaternions = add(moved.quaternions, quaternions, rows);
+        if let Some(vectors) = self.rotation_vectors {
+            let before = select(&moved.quaternions, rows, vectors.dims()[0]);
+            moved.quaternions = add(moved.quaternions, Some(turned(before.clone(), vectors) - before), rows);
+        }
         moved.opacity_logits = add(moved.opacity_logits, self.opacity_logits, rows);
         if let Some(factor) = self.opacity_log_factor {
             let before = select(&moved.opacity_logits, rows, factor.dims()[0]);
@@ -86,11 +94,32 @@ impl Offsets {
         parts.extend(self.log_scales.clone());
         parts.extend(self.scales.clone());
         parts.extend(self.quaternions.clone());
+        parts.extend(self.rotation_vectors.clone());
         parts.extend(self.opacity_logits.clone().map(|o| o.unsqueeze_dim(1)));
         parts.extend(self.opacity_log_factor.clone().map(|o| o.unsqueeze_dim(1)));
         parts.extend(self.sh.clone().map(|s| s.flatten(1, 2)));
         if parts.is_empty() { None } else { Some(Tensor::cat(parts, 1)) }
     }
+}
+
+/// Quaternions [M,4] with the rotations `vectors` [M,3] in front of them; their lengths stay.
+fn turned(quaternions: Tensor<2>, vectors: Tensor<2>) -> Tensor<2> {
+    let angle = (vectors.clone() * vectors.clone()).sum_dim(1).add_scalar(LEAST_SQUARED_ANGLE).sqrt();
+    let half = angle.clone().mul_scalar(0.5);
+    let (w, u) = (half.clone().cos(), vectors * (half.sin() / angle));
+    let column = |t: &Tensor<2>, k: usize| t.clone().narrow(1, k, 1);
+    let [ux, uy, uz] = [0, 1, 2].map(|k| column(&u, k));
+    let [qw, qx, qy, qz] = [0, 1, 2, 3].map(|k| column(&quaternions, k));
+    let product = |a: &Tensor<2>, b: &Tensor<2>| a.clone() * b.clone();
+    Tensor::cat(
+        vec![
+            product(&w, &qw) - product(&ux, &qx) - product(&uy, &qy) - product(&uz, &qz),
+            product(&w, &qx) + product(&ux, &qw) + product(&uy, &qz) - product(&uz, &qy),
+            product(&w, &qy) + product(&uy, &qw) + product(&uz, &qx) - product(&ux, &qz),
+            product(&w, &qz) + product(&uz, &qw) + product(&ux, &qy) - product(&uy, &qx),
+        ],
+        1,
+    )
 }
 
 /// The logit of sigmoid(logit) e^factor. 1 - sigmoid(x) e^f = sigmoid(-x) + sigmoid(x) (1 - e^f) does not cancel.

@@ -80,6 +80,7 @@ impl EventSink for Progress {
         let Ok(mut state) = self.state.lock() else { return };
         match event {
             Event::RunStarted { command, device, seed } => state.say(&format!("{command} on {device}, seed {seed}")),
+            Event::Note { object, message } => state.say(&format!("{object}: {message}")),
             Event::Warning { object, message } => state.say(&format!("warning: {object}: {message}")),
             Event::StageStarted { stage, iterations, gaussians } => {
                 state.say(&format!("stage {stage}: {iterations} iterations from {gaussians} Gaussians"));

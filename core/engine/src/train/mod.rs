@@ -16,7 +16,7 @@ use crate::densify::{Rounds, densify, reset_opacity};
 use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
 use crate::schedule::{Schedule, Stage};
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, parse_device};
 use sampler::{Prefetcher, Sampler};
@@ -189,6 +189,7 @@ impl Context<'_> {
         }
         let prefetcher = Prefetcher::new(self.job.scene.clone());
         let mut log = step::Log::new(stage, length, self.job.config.train.log_every);
+        let resumed_at = state.iteration;
         while state.iteration < length {
             if self.job.stop.load(Ordering::Relaxed) {
                 self.save(state, path)?;
@@ -216,6 +217,9 @@ impl Context<'_> {
             }
         }
         log.finish(events);
+        if stage == Stage::Main && state.iteration > resumed_at {
+            self.simplify(state)?;
+        }
         events.emit(&Event::StageFinished { stage: stage.name().into(), seconds: began.elapsed().as_secs_f64(), gaussians: state.set.len() });
         if stage == Stage::Score {
             let rows = state.moving_rows(&self.device)?.count(state.set.len()) as u64;
@@ -250,6 +254,28 @@ impl Context<'_> {
             self.job.events.emit(&Event::Warning { object: "deformer".into(), message });
         }
         state.field = Some(FieldOptimizer::new(field, section.clone(), context));
+        Ok(())
+    }
+
+    /// Leaves out what the trained field does not use. A run that is resumed when it is done has been here.
+    fn simplify(&self, state: &mut TrainState) -> Result<()> {
+        let rows = state.moving_rows(&self.device)?;
+        if rows.count(state.set.len()) == 0 {
+            return Ok(());
+        }
+        let Some(optimizer) = &mut state.field else { return Ok(()) };
+        let own: Vec<Tensor<2>> = optimizer.field.attributes().iter().filter_map(|a| state.set.column(&a.name)).map(|c| rows.select(c.value.clone())).collect();
+        let spatial = optimizer.field.spatial_with(rows.select(state.set.columns[0].value.clone()), &own)?;
+        let frames = self.job.scene.frame_count.max(2);
+        let times: Vec<f32> = (0..frames).map(|f| f as f32 / (frames - 1) as f32).collect();
+        if let Some(simple) = optimizer.field.simplified(spatial.values, &times)? {
+            let mut section = simple.settings;
+            if let Some(kind) = optimizer.section.get("kind") {
+                section.insert("kind".into(), kind.clone());
+            }
+            self.job.events.emit(&Event::Note { object: "deformer".into(), message: simple.message });
+            *optimizer = FieldOptimizer::new(simple.field, section, optimizer.context.clone());
+        }
         Ok(())
     }
 

@@ -5,19 +5,25 @@
 //! a dot product per offset in place of a network per Gaussian, and motion over many cycles is in reach, which FiLM in front of a trunk hardly learns.
 //! Trajectories as combinations of few shared functions are the idea of DynMF (Kratimenos et al. 2024) and Gaussian-Flow (Lin et al. 2024), which store the
 //! coefficients per Gaussian.
+//!
+//! After training, functions that a head hardly uses are left out, and so are heads: see [`simplify`].
+
+mod simplify;
 
 use crate::parts::heads::{self, Head};
 use crate::parts::settings::{Rates, take, within};
 use crate::parts::time::{bands_for, encode};
 use crate::parts::voxels::{VoxelSettings, Voxels, parameter};
 use crate::parts::weights;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, combine};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
+    config, inventory,
 };
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Settings with their defaults, as shown to users.
@@ -28,10 +34,14 @@ layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
 learned = 16             # functions of time learned by a small network; 0 is none
 heads = ["means", "log_scales", "quaternions"]
+rotation = "additive"    # quaternions change by sums (the paper) | "exponential": by a rotation vector, which composes however far it turns
+unused = 0.01            # after training, functions whose part in a head's offsets is below this share are left out; 0 keeps all
 lr_start = 1e-3          # Adam, log-linear to lr_end over the main stage
 lr_end = 1e-5
 warmup = 0.025           # linear warm-up, as a share of the stage
 clip_norm = 1.0          # gradient-norm clip per group; 0 is off
+# [deformer.kept]        # functions by head, by number; written by training
+# means = [0, 1, 2]
 "#;
 
 /// The most bands that are chosen automatically: 32 cycles per sequence.
@@ -39,6 +49,16 @@ const MOST_BANDS: usize = 6;
 /// Parameter groups by index.
 const GRID: usize = 0;
 const NET: usize = 1;
+
+/// How rotations change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Rotation {
+    /// Four numbers added to the quaternion (paper Section IV-B).
+    Additive,
+    /// Three numbers: the axis times the angle of a rotation in front of the canonical one.
+    Exponential,
+}
 
 /// Settings of what comes after the voxels.
 #[derive(Clone, Debug, Deserialize)]
@@ -49,32 +69,69 @@ struct BasisSettings {
     time_bands: usize,
     learned: usize,
     heads: Vec<Head>,
+    rotation: Rotation,
+    unused: f64,
+    kept: BTreeMap<String, Vec<usize>>,
 }
 
 impl Default for BasisSettings {
     fn default() -> Self {
-        Self { width: None, layers: 2, time_bands: 0, learned: 16, heads: vec![Head::Means, Head::LogScales, Head::Quaternions] }
+        Self {
+            width: None,
+            layers: 2,
+            time_bands: 0,
+            learned: 16,
+            heads: vec![Head::Means, Head::LogScales, Head::Quaternions],
+            rotation: Rotation::Additive,
+            unused: 0.01,
+            kept: BTreeMap::new(),
+        }
+    }
+}
+
+impl BasisSettings {
+    /// Numbers of a head.
+    fn width_of(&self, head: Head, sh_degree: usize) -> usize {
+        if head == Head::Quaternions && self.rotation == Rotation::Exponential { 3 } else { head.width(sh_degree) }
+    }
+    /// The functions of every head, all of `count` unless some were left out.
+    fn functions_of_heads(&self, count: usize) -> Result<Vec<Vec<usize>>> {
+        if let Some(name) = self.kept.keys().find(|name| !self.heads.iter().any(|h| h.name() == name.as_str())) {
+            return Err(Error::parameter(format!("deformer.kept.{name}"), "no head is called so", "Name heads of deformer.heads"));
+        }
+        let of_head = |head: &Head| {
+            let Some(own) = self.kept.get(head.name()) else { return Ok((0..count).collect()) };
+            if own.is_empty() || own.windows(2).any(|w| w[0] >= w[1]) || own.iter().any(|&f| f >= count) {
+                let problem = format!("{own:?} is no ascending list of functions below {count}");
+                return Err(Error::parameter(format!("deformer.kept.{}", head.name()), problem, "Give each function once, or leave the list out"));
+            }
+            Ok(own.clone())
+        };
+        self.heads.iter().map(of_head).collect()
     }
 }
 
 /// The field. Parameters: decoders by level, the functions' network (if any), the coefficients' trunk, one head each.
 struct CdfBasis {
+    section: toml::Table,
+    context: FieldContext,
     settings: BasisSettings,
     rates: Rates,
     voxels: Voxels,
     bands: usize,
+    /// Functions by head.
+    kept: Vec<Vec<usize>>,
     shape: Arc<BasisShape>,
     learned: Option<Arc<ReluShape>>,
     coefficients: Arc<ReluShape>,
-    sh_degree: usize,
     parameters: Vec<Parameter>,
 }
 
 impl CdfBasis {
     fn new(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Self> {
-        let mut section = section.clone();
-        let (voxel_settings, rates): (VoxelSettings, Rates) = (take(&mut section, &VoxelSettings::KEYS)?, take(&mut section, &Rates::KEYS)?);
-        let settings: BasisSettings = config::parse_section("deformer cdf-basis", &section)?;
+        let mut rest = section.clone();
+        let (voxel_settings, rates): (VoxelSettings, Rates) = (take(&mut rest, &VoxelSettings::KEYS)?, take(&mut rest, &Rates::KEYS)?);
+        let settings: BasisSettings = config::parse_section("deformer cdf-basis", &rest)?;
         rates.check()?;
         heads::check(&settings.heads)?;
         let width = settings.width.unwrap_or(voxel_settings.capacity.width());
@@ -83,9 +140,14 @@ impl CdfBasis {
         within("time_bands", settings.time_bands, 0, 24)?;
         within("learned", settings.learned, 0, 256)?;
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
+        if !(0.0..1.0).contains(&settings.unused) {
+            return Err(Error::parameter("deformer.unused", format!("{} is no share", settings.unused), "Give a share from 0 to below 1"));
+        }
         let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
-        // The constant, t, and a sine and a cosine per band.
-        let functions = 2 + 2 * bands + settings.learned;
+        // The constant, t, a sine and a cosine per band, and what is learned.
+        let kept = settings.functions_of_heads(2 + 2 * bands + settings.learned)?;
+        let groups = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
+        let shape = Arc::new(BasisShape { groups });
 
         let (voxels, mut parameters) = Voxels::new(&voxel_settings, context, GRID, device)?;
         let seed = context.seed;
@@ -97,20 +159,20 @@ impl CdfBasis {
         let trunk = vec![width; settings.layers];
         let chain: Vec<usize> = std::iter::once(voxels.width()).chain(trunk.iter().copied()).collect();
         add("net.trunk".into(), weights::chain(seed.child("trunk"), &chain));
-        let outputs: Vec<usize> = settings.heads.iter().map(|h| h.width(context.sh_degree) * functions).collect();
+        let outputs: Vec<usize> = shape.groups.iter().map(|g| g.0 * g.1).collect();
         for (head, &output) in settings.heads.iter().zip(&outputs) {
             add(format!("net.head.{}", head.name()), weights::head(seed.child(head.name()), width, output));
         }
         let heads = outputs.iter().map(|&output| vec![width, output]).collect();
         let coefficients = Arc::new(ReluShape { input: voxels.width(), trunk, heads });
-        let shape = Arc::new(BasisShape { groups: settings.heads.iter().map(|h| (h.width(context.sh_degree), functions)).collect() });
-        Ok(Self { rates, voxels, bands, shape, learned: learned.map(Arc::new), coefficients, sh_degree: context.sh_degree, parameters, settings })
+        let (section, context) = (section.clone(), context.clone());
+        Ok(Self { section, context, rates, voxels, bands, kept, shape, learned: learned.map(Arc::new), coefficients, parameters, settings })
     }
-    /// The weights of the parameters from `place` after the decoders to the end, side by side.
+    /// The weights of the parameter from `place` after the decoders to the end, side by side.
     fn weights_after(&self, place: usize) -> Tensor<1> {
         Tensor::cat(self.parameters[self.voxels.levels() + place..].iter().map(|p| p.value.clone()).collect(), 0)
     }
-    /// φ(t) [functions].
+    /// Every function at a time: φ(t) [functions].
     fn functions_at(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
         let encoding = encode(time_norm, self.bands);
         let constant = |values: Vec<f32>| {
@@ -123,14 +185,21 @@ impl CdfBasis {
         }
         Ok(Tensor::cat(parts, 1).flatten(0, 1))
     }
+    /// φ(t) as the heads read it, each its own, one head after the other.
+    fn functions_by_head(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
+        let all = self.functions_at(time_norm, like)?;
+        let places: Vec<i64> = self.kept.iter().flatten().map(|&f| f as i64).collect();
+        let count = places.len();
+        Ok(all.select(0, Tensor::<1, Int>::from_data(TensorData::new(places, [count]), like)))
+    }
 }
 
 impl DeformationField for CdfBasis {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let [m, _] = means_world.dims();
-        let total: usize = self.coefficients.output_widths().iter().sum();
         if m == 0 {
-            return Ok(SpatialFeatures { values: Tensor::zeros([0, total], &means_world.inner().device()), work: FieldWork::default() });
+            let empty = Tensor::zeros([0, self.shape.coefficients()], &means_world.inner().device());
+            return Ok(SpatialFeatures { values: empty, work: FieldWork::default() });
         }
         let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
         let weights = self.weights_after(usize::from(self.learned.is_some()));
@@ -141,16 +210,23 @@ impl DeformationField for CdfBasis {
             return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
         }
         let [m, _] = features.dims();
-        let functions = self.functions_at(time_norm, &features.device())?;
-        let combined = if m == 0 { Tensor::zeros([0, self.shape.outputs()], &features.device()) } else { combine(features, functions, &self.shape)? };
+        let combined = if m == 0 {
+            Tensor::zeros([0, self.shape.outputs()], &features.device())
+        } else {
+            let functions = self.functions_by_head(time_norm, &features.device())?;
+            combine(features, functions, &self.shape)?
+        };
         let mut at = 0;
-        let outputs = self.settings.heads.iter().map(|head| {
-            let width = head.width(self.sh_degree);
+        let outputs = self.shape.groups.iter().map(|&(width, _)| {
             at += width;
             combined.clone().narrow(1, at - width, width)
         });
         let outputs = outputs.collect();
-        Ok(heads::offsets(&self.settings.heads, outputs, self.sh_degree))
+        let mut offsets = heads::offsets(&self.settings.heads, outputs, self.context.sh_degree);
+        if self.settings.rotation == Rotation::Exponential {
+            offsets.rotation_vectors = offsets.quaternions.take();
+        }
+        Ok(offsets)
     }
     fn parameters(&self) -> Vec<&Parameter> {
         self.parameters.iter().collect()
@@ -161,10 +237,13 @@ impl DeformationField for CdfBasis {
     fn groups(&self) -> Vec<ParameterGroup> {
         vec![self.rates.group("cdf-basis grid"), self.rates.group("cdf-basis net")]
     }
+    fn simplified(&self, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
+        simplify::simplified(self, features, times)
+    }
 }
 
-fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
-    Ok(Box::new(CdfBasis::new(section, context, device)?))
+fn build(settings: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+    Ok(Box::new(CdfBasis::new(settings, context, device)?))
 }
 
 inventory::submit! {
@@ -175,7 +254,7 @@ inventory::submit! {
             summary: "computational field, linear in shared functions of time: a dot product per frame",
             paper: "CC-4DGS, Section IV-B (spatial half); DynMF, Gaussian-Flow (shared temporal functions)",
             schema: SCHEMA,
-            capabilities: &["differentiable", "starts-as-identity", "vertex-reuse", "cached-spatial"],
+            capabilities: &["differentiable", "starts-as-identity", "vertex-reuse", "cached-spatial", "simplifies", "rotation=additive,exponential"],
         },
         build,
     }
