@@ -1,6 +1,5 @@
 //! Temporal-deviation masks: which pixels of a fixed camera see something move (Swift4D; baselines §2.2).
 
-use crate::config::TrainConfig;
 use cc4dgs_core::{Event, EventSink, Result, Scene, Split};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -8,17 +7,17 @@ use std::collections::BTreeMap;
 /// The mask of one fixed camera over the whole sequence.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DynamicMask {
-    /// The training view (the camera's first frame) it is rendered from.
+    /// The view (the camera's first frame) it is rendered from.
     pub view: usize,
     /// 1 where the pixel is dynamic, else 0, row-major [H,W].
     pub mask: Vec<f32>,
 }
 
-/// Masks of every training camera that has at least two frames: the population standard deviation over time, averaged over the channels,
-/// blurred by a 31x31 Gaussian of sigma 5, over `mask_threshold`.
-pub fn dynamic_masks(scene: &Scene, config: &TrainConfig, background: [f32; 3], events: &dyn EventSink) -> Result<Vec<DynamicMask>> {
+/// Masks of every camera of `split` that has at least two frames there: the population standard deviation over time, averaged over the channels,
+/// blurred by a 31x31 Gaussian of sigma 5, over `threshold`.
+pub fn dynamic_masks(scene: &Scene, split: Split, threshold: f32, background: [f32; 3], events: &dyn EventSink) -> Result<Vec<DynamicMask>> {
     let mut views_of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-    for view in scene.split(Split::Train) {
+    for view in scene.split(split) {
         views_of_camera.entry(scene.views[view].camera).or_default().push(view);
     }
     views_of_camera.retain(|_, views| views.len() >= 2);
@@ -46,7 +45,7 @@ pub fn dynamic_masks(scene: &Scene, config: &TrainConfig, background: [f32; 3], 
                 (per_channel.sum::<f64>() / 3.0) as f32
             })
             .collect();
-        let mask = blur(&deviation, w, h).into_iter().map(|v| f32::from(u8::from(v > config.mask_threshold))).collect();
+        let mask = blur(&deviation, w, h).into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
         masks.push(DynamicMask { view: views[0], mask });
         events.emit(&Event::Progress { task: "dynamic masks".into(), done: masks.len() as u64, total });
     }

@@ -159,6 +159,7 @@ pub fn text(report: &FullReport) -> String {
     let mut lines = vec![
         format!("{} on {} ({} pictures)", report.model.display(), e.scene, e.images.len()),
         format!("  PSNR {:.3} dB   SSIM {:.4} (Inria) {:.4} (skimage)   MS-SSIM {ms_ssim}", e.psnr_db, e.ssim, e.ssim_skimage),
+        e.psnr_dynamic_db.map_or_else(String::new, |v| format!("  PSNR {v:.3} dB where something moves")),
         format!("  size {:.4} MB: deform {:.4} MB, point cloud {:.4} MB", e.size_mb.total, e.size_mb.deform, e.size_mb.point_cloud),
         format!("  {} Gaussians, {} of them dynamic", e.gaussians, e.dynamic_gaussians),
         format!(
@@ -166,6 +167,7 @@ pub fn text(report: &FullReport) -> String {
             e.frame_ms.mean, e.frame_ms.field, e.frame_ms.raster, e.frame_ms.field_first, e.frame_ms.raster_first
         ),
     ];
+    lines.retain(|line| !line.is_empty());
     if !report.motion.is_empty() {
         lines.push("  cycles  PSNR dB  trajectory error  Gaussians".into());
     }

@@ -101,7 +101,7 @@ pub fn train(job: &TrainJob) -> Result<TrainReport> {
 
     let moving = decide_moving(job);
     let masks = match moving {
-        Moving::Scored { .. } => dynamic_masks(&job.scene, &config.train, config.background()?, job.events)?,
+        Moving::Scored { .. } => dynamic_masks(&job.scene, Split::Train, config.train.mask_threshold, config.background()?, job.events)?,
         _ => Vec::new(),
     };
     let path = job.out.join(CHECKPOINT);
