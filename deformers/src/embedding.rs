@@ -11,8 +11,8 @@ use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    AttributeSpec, DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
-    inventory,
+    AttributeSpec, DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
+    config, inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -21,6 +21,8 @@ const SCHEMA: &str = r#"gaussian_features = 32   # learned per Gaussian
 time_features = 256      # learned per time
 time_rows = 150          # rows of the table of times (published: 150, Technicolor 25)
 coarse_rows = 30         # what the coarse network sees of it (30; Technicolor 5)
+rows_grow = 0.125        # share of training over which the fine network's rows grow from those of the coarse one to all (10,000 of 80,000 iterations)
+fade_in = 0.0125         # share of training over which changes come in; opacity, colour and scale five such shares later (1,000 of 80,000)
 width = 128
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
 gaussian_lr = 2.5e-3     # Adam on what is learned per Gaussian
@@ -38,6 +40,8 @@ struct Settings {
     time_features: usize,
     time_rows: usize,
     coarse_rows: usize,
+    rows_grow: f32,
+    fade_in: f32,
     width: usize,
     heads: Vec<Head>,
     gaussian_lr: f64,
@@ -52,6 +56,8 @@ impl Default for Settings {
             time_features: 256,
             time_rows: 150,
             coarse_rows: 30,
+            rows_grow: 0.125,
+            fade_in: 0.0125,
             width: 128,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh],
             gaussian_lr: 2.5e-3,
@@ -67,6 +73,8 @@ struct Embedding {
     sh_degree: usize,
     network: Arc<ReluShape>,
     parameters: Vec<Parameter>,
+    /// How far training is.
+    progress: f32,
 }
 
 impl Embedding {
@@ -76,6 +84,11 @@ impl Embedding {
         within("time_rows", settings.time_rows, 2, 100_000)?;
         within("coarse_rows", settings.coarse_rows, 2, settings.time_rows)?;
         within("width", settings.width, 1, 4096)?;
+        for (name, share) in [("rows_grow", settings.rows_grow), ("fade_in", settings.fade_in)] {
+            if !(0.0..=1.0).contains(&share) {
+                return Err(Error::parameter(format!("deformer.{name}"), format!("{share} is no share"), "Give 0 to 1"));
+            }
+        }
         heads::check(&settings.heads)?;
         let (w, input) = (settings.width, settings.gaussian_features + settings.time_features);
         let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
@@ -93,7 +106,7 @@ impl Embedding {
             }
             parameters.push(parameter(format!("net.{name}"), Part::Net, 0, values, device));
         }
-        Ok(Self { sh_degree: context.sh_degree, network: Arc::new(network), parameters, settings })
+        Ok(Self { sh_degree: context.sh_degree, network: Arc::new(network), parameters, settings, progress: 1.0 })
     }
     /// The row [1, F] at a time of the table resized to `rows` rows, corners aligned.
     fn time_row(&self, time_norm: f32, rows: usize) -> Tensor<2> {
@@ -113,6 +126,24 @@ impl Embedding {
         }
         let mixture = Tensor::<2>::from_data(TensorData::new(mixture, [1, s.time_rows]), &table.device());
         mixture.matmul(table)
+    }
+    /// Rows of the table of times that the fine network sees by now.
+    fn fine_rows(&self) -> usize {
+        let s = &self.settings;
+        if self.progress >= s.rows_grow {
+            return s.time_rows;
+        }
+        let part = self.progress / s.rows_grow;
+        (s.coarse_rows + ((s.time_rows - s.coarse_rows) as f32 * part) as usize).clamp(2, s.time_rows)
+    }
+    /// How much of a head's change counts by now. Published are 1,000 iterations, and 1,000 after the first 5,000 for what changes looks.
+    fn share_of(&self, head: Head) -> f32 {
+        let fade = self.settings.fade_in;
+        let begun = match head {
+            Head::Means | Head::Quaternions => 0.0,
+            Head::LogScales | Head::Opacity | Head::Sh => 5.0 * fade,
+        };
+        if fade == 0.0 || self.progress >= begun + fade { 1.0 } else { ((self.progress - begun) / fade).max(0.0) }
     }
 }
 
@@ -138,7 +169,7 @@ impl DeformationField for Embedding {
             [own] if own.dims() == [m, self.settings.gaussian_features] => {
                 Ok(SpatialFeatures { values: own.clone(), work: FieldWork { gaussians: m as u64, ..FieldWork::default() } })
             }
-            _ => Err(cc4dgs_core::Error::parameter(
+            _ => Err(Error::parameter(
                 "deformer embedding",
                 format!("the Gaussians lack the attribute {ATTRIBUTE} of width {}", self.settings.gaussian_features),
                 "Load a model that was trained with this field",
@@ -153,7 +184,7 @@ impl DeformationField for Embedding {
             return Ok(heads::offsets(&self.settings.heads, empty, self.sh_degree));
         }
         let mut outputs: Option<Vec<Tensor<2>>> = None;
-        for (place, rows) in [(1, self.settings.coarse_rows), (2, self.settings.time_rows)] {
+        for (place, rows) in [(1, self.settings.coarse_rows), (2, self.fine_rows())] {
             let input = Tensor::cat(vec![features.clone(), self.time_row(time_norm, rows).repeat_dim(0, m)], 1);
             let own = mlp_relu(input, self.parameters[place].value.clone(), &self.network)?;
             outputs = Some(match outputs {
@@ -161,7 +192,14 @@ impl DeformationField for Embedding {
                 Some(coarse) => coarse.into_iter().zip(own).map(|(a, b)| a + b).collect(),
             });
         }
-        Ok(heads::offsets(&self.settings.heads, outputs.unwrap_or_default(), self.sh_degree))
+        let faded = self.settings.heads.iter().zip(outputs.unwrap_or_default()).map(|(head, out)| match self.share_of(*head) {
+            1.0 => out,
+            share => out.mul_scalar(share),
+        });
+        Ok(heads::offsets(&self.settings.heads, faded.collect(), self.sh_degree))
+    }
+    fn set_progress(&mut self, progress: f32) {
+        self.progress = progress;
     }
     fn parameters(&self) -> Vec<&Parameter> {
         self.parameters.iter().collect()
@@ -176,6 +214,27 @@ impl DeformationField for Embedding {
 
 fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
     Ok(Box::new(Embedding::new(config::parse_section("deformer embedding", section)?, context, device)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Seed;
+
+    #[test]
+    fn rows_grow_and_changes_come_in_with_progress() {
+        let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let settings = Settings { time_rows: 90, coarse_rows: 10, ..Settings::default() };
+        let mut field = Embedding::new(settings, &context, &Device::flex()).unwrap();
+        assert_eq!((field.fine_rows(), field.share_of(Head::Sh)), (90, 1.0), "a field that was never told is trained");
+        for (progress, rows, means, colors) in
+            [(0.0, 10, 0.0, 0.0), (0.00625, 14, 0.5, 0.0), (0.0625, 50, 1.0, 0.0), (0.06875, 54, 1.0, 0.5), (0.5, 90, 1.0, 1.0)]
+        {
+            field.set_progress(progress);
+            assert_eq!(field.fine_rows(), rows, "at {progress}");
+            assert!((field.share_of(Head::Means) - means).abs() < 1e-4 && (field.share_of(Head::Sh) - colors).abs() < 1e-4, "at {progress}");
+        }
+    }
 }
 
 inventory::submit! {

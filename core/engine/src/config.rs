@@ -115,6 +115,8 @@ pub struct TrainConfig {
     pub coarse_frames: String,
     /// Share of the main stage over which frames come in one after another, where the coarse stage saw the first frame only; 0 is all at once.
     pub time_ramp: f64,
+    /// Standard deviation, in frames, of noise on the times the field is asked about; it falls to zero by half of the main stage (Deformable 3DGS: 0.1).
+    pub time_noise: f64,
     /// Highest spherical-harmonics degree.
     pub sh_degree: usize,
     /// Reference iterations between two degrees.
@@ -155,6 +157,7 @@ impl Default for TrainConfig {
             batch: 2,
             coarse_frames: "first".into(),
             time_ramp: 0.0,
+            time_noise: 0.0,
             sh_degree: 3,
             sh_interval: 1000,
             lambda_c: 0.8,
@@ -323,6 +326,9 @@ impl RunConfig {
         }
         if !(0.0..=1.0).contains(&t.time_ramp) {
             return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");
+        }
+        if !(0.0..=10.0).contains(&t.time_noise) {
+            return bad("time_noise", format!("{} frames", t.time_noise), "Give 0 to 10 frames");
         }
         one_of("train.coarse_frames", &t.coarse_frames, &["first", "all"])?;
         one_of("train.dynamic", &t.dynamic, &["auto", "score", "all", "none"])?;

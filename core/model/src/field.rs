@@ -143,6 +143,8 @@ pub trait DeformationField: Send {
     fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
+    /// Tells the field how far the main stage of training is, 0 to 1, before every step. A field that was never told is trained.
+    fn set_progress(&mut self, _progress: f32) {}
     /// After training, a smaller field that does nearly the same: without what this scene does not use. `features` [M,F] are those of all Gaussians that move,
     /// `times` the normalised times of the frames.
     fn simplified(&self, _features: Tensor<2>, _times: &[f32]) -> Result<Option<Simplified>> {

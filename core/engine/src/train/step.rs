@@ -34,6 +34,7 @@ impl Context<'_> {
             && let Some(optimizer) = &mut state.field
         {
             optimizer.track();
+            optimizer.field.set_progress(progress as f32);
             // The field is asked about the canonical centres as constants (baselines §10, row 22), which also makes caching exact.
             let centres = Tensor::<2>::from_inner(rows.select(state.set.columns[0].value.clone()));
             let own: Vec<Tensor<2>> = optimizer.field.attributes().iter().map(|a| rows.select(state.set.leaf(&leaves, &a.name))).collect();
@@ -58,7 +59,9 @@ impl Context<'_> {
         for &view in batch {
             let (camera, time_norm) = (scene.camera(view), scene.views[view].time_norm);
             let moved = match (&features, &state.field) {
-                (Some(features), Some(optimizer)) => optimizer.field.deform(features.clone(), time_norm)?.apply(&gaussians, rows.tensor()),
+                (Some(features), Some(optimizer)) => {
+                    optimizer.field.deform(features.clone(), self.noisy_time(time_norm, progress, iteration, view))?.apply(&gaussians, rows.tensor())
+                }
                 _ => gaussians.clone(),
             };
             let mut splats = Splats::from_gaussians(&moved, degree);
@@ -131,6 +134,19 @@ impl Context<'_> {
         }
         log.step(self.job.events, iteration, state.set.len());
         Ok(())
+    }
+
+    /// `time_norm` with the noise of `train.time_noise`.
+    fn noisy_time(&self, time_norm: f32, progress: f64, iteration: usize, view: usize) -> f32 {
+        let frames = self.job.config.train.time_noise * (1.0 - 2.0 * progress);
+        let intervals = self.job.scene.frame_count.saturating_sub(1);
+        if frames <= 0.0 || intervals == 0 {
+            return time_norm;
+        }
+        let seed = self.seed.child("time noise").index(iteration as u64).index(view as u64);
+        // Twelve uniforms make a normal number, near enough.
+        let normal = (0..12u64).map(|k| (seed.index(k).value() >> 11) as f64 / (1u64 << 53) as f64).sum::<f64>() - 6.0;
+        (f64::from(time_norm) + normal * frames / intervals as f64).clamp(0.0, 1.0) as f32
     }
 
     /// At a quarter and at half of the main stage, when motion has taken shape: measure flicker, and switch smoothness on if the scene needs it.
