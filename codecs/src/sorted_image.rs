@@ -18,6 +18,9 @@ const VERSION: u8 = 1;
 /// Name of the stream with values beyond the steps.
 const ESCAPES: &str = "escapes";
 
+/// The last chunk of every PNG file.
+const END: [u8; 12] = [0, 0, 0, 0, b'I', b'E', b'N', b'D', 0xae, 0x42, 0x60, 0x82];
+
 struct SortedImage {
     bits: Bits,
 }
@@ -73,6 +76,10 @@ fn to_png(planes: &[u8], count: usize) -> Result<Vec<u8>> {
 fn from_png(object: &str, bytes: &[u8], count: usize, wanted: usize) -> Result<Vec<u8>> {
     let damaged = |problem: String| Error::data(object, problem, "The file is damaged");
     let side = side_of(count);
+    // Decoders of pictures are content with less, and with more.
+    if !bytes.ends_with(&END) {
+        return Err(damaged("the picture does not end where it should".into()));
+    }
     let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), PngLimits { bytes: (4 * side * side * wanted).max(1 << 20) });
     decoder.set_transformations(png::Transformations::IDENTITY);
     let mut reader = decoder.read_info().map_err(|e| damaged(e.to_string()))?;
@@ -83,7 +90,7 @@ fn from_png(object: &str, bytes: &[u8], count: usize, wanted: usize) -> Result<V
         return Err(damaged(format!("a picture of {}x{} where gray {side}x{} is due", info.width, info.height, side * wanted)));
     }
     let mut picture = vec![0; side * side * wanted];
-    reader.next_frame(&mut picture).map_err(|e| damaged(e.to_string()))?;
+    reader.next_frame(&mut picture).and_then(|_| reader.finish()).map_err(|e| damaged(e.to_string()))?;
     Ok(picture.chunks(side * side).flat_map(|plane| &plane[..count]).copied().collect())
 }
 

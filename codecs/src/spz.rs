@@ -3,13 +3,14 @@
 //!
 //! SPZ's axes are right, up, back; those of cameras and PLY files here are right, down, forward. Both ways turn half around x.
 
+use crate::column::relative_rms;
 use crate::streams::{META, Shape, open};
 use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Limits, Plugin, Result, Stream, config, inventory, unknown_name,
 };
 use flate2::Compression;
-use flate2::read::GzDecoder;
+use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
 use serde::Deserialize;
 use std::f32::consts::FRAC_1_SQRT_2;
@@ -18,15 +19,19 @@ use std::io::{Read, Write};
 /// "NGSP".
 const MAGIC: u32 = 0x5053_474e;
 const HEADER: usize = 16;
+/// Place of the dynamic scores among the columns, the last.
+const SCORES: usize = 6;
 /// Version of the streams around the file.
 const VERSION: u8 = 1;
 /// The stream that is an SPZ file.
 const FILE: &str = "spz";
-/// The stream of dynamic scores, for which SPZ has no place.
-const SCORES: &str = "dynamic_scores";
+/// The stream of columns that SPZ cannot hold: dynamic scores always, others where it would lose more than is declared.
+const BESIDE: &str = "beside";
 /// Places of fixed-point coordinates after the point, at most.
 const MOST_FRACTION: u8 = 20;
 const LARGEST: f32 = 8_388_607.0;
+/// Bytes of vendors' extensions that are passed over.
+const MOST_EXTENSION: usize = 1 << 24;
 /// What a unit of the degree-0 coefficient becomes in 0..1.
 const COLOR: f32 = 0.15;
 /// Largest value of a small component of a quaternion in version 3.
@@ -147,12 +152,17 @@ pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<HostGauss
         if is_odd(1 + i / 3 % (rest / 3).max(1)) { -value } else { value }
     };
     let sh_rest = take(rest)?.iter().enumerate().map(level).collect();
-    // What follows are extensions of vendors. Reading to the end checks the sum of the gzip stream, within reason.
-    let mut beyond = [0u8; 4096];
-    for _ in 0..1024 {
-        if decoder.read(&mut beyond).map_err(|e| damaged(e.to_string()))? == 0 {
-            break;
+    // What follows are extensions of vendors. Reading to the end checks the sum of the gzip stream.
+    let mut beyond = vec![0u8; 1 << 16];
+    let mut left = MOST_EXTENSION;
+    while left > 0 {
+        match decoder.read(&mut beyond).map_err(|e| damaged(e.to_string()))? {
+            0 => break,
+            more => left = left.saturating_sub(more),
         }
+    }
+    if left == 0 || !decoder.get_ref().is_empty() {
+        return Err(damaged("something follows the Gaussians that is no extension".into()));
     }
     let found = HostGaussians { sh_degree, means, log_scales, quaternions, opacity_logits, sh_dc, sh_rest, dynamic_scores: vec![0.0; n], ..Default::default() };
     found.validate(object, limits)?;
@@ -202,12 +212,23 @@ impl AttributeCodec for Spz {
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let mut meta = vec![VERSION];
         Shape::of(gaussians).write(&mut meta)?;
-        let scores = gaussians.dynamic_scores.iter().flat_map(|v| v.to_le_bytes()).collect();
-        let mut streams = vec![
-            Stream { name: META.into(), bytes: meta },
-            Stream { name: FILE.into(), bytes: to_spz(gaussians, self.sh1_bits, self.sh_rest_bits)? },
-            Stream { name: SCORES.into(), bytes: scores },
-        ];
+        let mut held = gaussians.clone();
+        held.means.iter_mut().for_each(|v| *v = v.clamp(-LARGEST, LARGEST));
+        let file = to_spz(&held, self.sh1_bits, self.sh_rest_bits)?;
+        let found = from_spz("SPZ just written", &file, &context.limits)?;
+        let losses = self.losses();
+        let mut beside = Vec::new();
+        for (place, ((name, _, before), (_, _, after))) in gaussians.columns().into_iter().zip(found.columns()).enumerate() {
+            let allowed = losses.iter().find(|l| l.attribute == name).map_or(0.0, |l| l.relative_rms);
+            // Not within the bounds is also what compares with nothing.
+            let within = relative_rms(before, after) <= allowed;
+            if allowed == 0.0 || !within {
+                beside.push(place as u8);
+                beside.extend(before.iter().flat_map(|v| v.to_le_bytes()));
+            }
+        }
+        let mut streams =
+            vec![Stream { name: META.into(), bytes: meta }, Stream { name: FILE.into(), bytes: file }, Stream { name: BESIDE.into(), bytes: beside }];
         streams.extend(Shape::extra_streams(gaussians));
         Ok(streams)
     }
@@ -219,9 +240,19 @@ impl AttributeCodec for Spz {
         if out.len() != shape.count || out.sh_degree != shape.sh_degree {
             return Err(Error::data("spz stream", format!("{} Gaussians of degree {}", out.len(), out.sh_degree), "The file is damaged"));
         }
-        let mut scores = set.reader(SCORES)?;
-        out.dynamic_scores = scores.f32s(shape.count)?;
-        scores.finish()?;
+        let mut beside = set.reader(BESIDE)?;
+        let mut next = 0;
+        while beside.remaining() > 0 {
+            let place = usize::from(beside.u8()?);
+            let Some((_, width, values)) = out.columns_mut().into_iter().nth(place).filter(|_| place >= next) else {
+                return Err(beside.error(format!("column {place} is unknown or there twice")));
+            };
+            *values = beside.f32s(shape.count * width)?;
+            next = place + 1;
+        }
+        if next != SCORES + 1 {
+            return Err(beside.error("the dynamic scores are missing"));
+        }
         shape.read_extra(&set, &mut out)?;
         out.validate("decoded Gaussians", &context.limits)?;
         Ok(out)
