@@ -32,6 +32,7 @@ const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as of `
 # width = 128            # width of the coefficient network (small: 64; mid: 96)
 layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
+falloff = 1.0            # each band is 2^-falloff as large as the one below: fast motion has to be worth it; 0 treats all alike
 learned = 16             # functions of time learned by a small network; 0 is none
 heads = ["means", "log_scales", "quaternions"]
 rotation = "additive"    # quaternions change by sums (the paper) | "exponential": by a rotation vector, which composes however far it turns
@@ -67,6 +68,7 @@ struct BasisSettings {
     width: Option<usize>,
     layers: usize,
     time_bands: usize,
+    falloff: f32,
     learned: usize,
     heads: Vec<Head>,
     rotation: Rotation,
@@ -80,6 +82,7 @@ impl Default for BasisSettings {
             width: None,
             layers: 2,
             time_bands: 0,
+            falloff: 1.0,
             learned: 16,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions],
             rotation: Rotation::Additive,
@@ -140,6 +143,9 @@ impl CdfBasis {
         within("time_bands", settings.time_bands, 0, 24)?;
         within("learned", settings.learned, 0, 256)?;
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
+        if !(0.0..=4.0).contains(&settings.falloff) {
+            return Err(Error::parameter("deformer.falloff", format!("{} cannot be used", settings.falloff), "Give 0 (none) to 4"));
+        }
         if !(0.0..1.0).contains(&settings.unused) {
             return Err(Error::parameter("deformer.unused", format!("{} is no share", settings.unused), "Give a share from 0 to below 1"));
         }
@@ -174,7 +180,10 @@ impl CdfBasis {
     }
     /// Every function at a time: φ(t) [functions].
     fn functions_at(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
-        let encoding = encode(time_norm, self.bands);
+        let mut encoding = encode(time_norm, self.bands);
+        for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
+            pair.iter_mut().for_each(|v| *v *= (-self.settings.falloff * band as f32).exp2());
+        }
         let constant = |values: Vec<f32>| {
             let n = values.len();
             Tensor::<2>::from_data(TensorData::new(values, [1, n]), like)
