@@ -3,14 +3,12 @@
 use crate::column::{self, Column, Target};
 use crate::morton;
 use crate::rows::{interleave, load, split, store};
-use crate::streams::{META, Shape, open};
+use crate::streams::{ESCAPES, Shape, assemble, close, open};
 use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
 
 /// Version of the stored form.
 const VERSION: u8 = 1;
-/// Name of the stream with values beyond the steps.
-const ESCAPES: &str = "escapes";
 /// Share of the values at either end that may be kept exactly, beside the steps.
 const TAIL: f64 = 1e-3;
 /// A step is at most so many standard deviations times 2^-bits wide, or more bits are taken: percentiles of long-tailed values lie some ten deviations apart.
@@ -116,10 +114,7 @@ impl AttributeCodec for Quantize {
             let columns: Vec<_> = split(values, width).iter().map(|c| self.bits.encode(name, c)).collect();
             streams.push(Stream { name: name.into(), bytes: store(&columns, &mut meta, &mut escapes) });
         }
-        streams.extend(Shape::extra_streams(&sorted));
-        streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
-        streams.insert(0, Stream { name: META.into(), bytes: meta });
-        Ok(streams)
+        Ok(assemble(&sorted, meta, escapes, streams))
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
@@ -129,11 +124,7 @@ impl AttributeCodec for Quantize {
         for (name, width, values) in out.columns_mut() {
             *values = interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count);
         }
-        meta.finish()?;
-        escapes.finish()?;
-        shape.read_extra(&set, &mut out)?;
-        out.validate("decoded Gaussians", &context.limits)?;
-        Ok(out)
+        close(&set, &shape, [meta, escapes], out, &context.limits)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {

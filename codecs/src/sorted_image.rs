@@ -7,7 +7,7 @@ use crate::grid_sort::{side_of, square_order};
 use crate::morton;
 use crate::quantize::Bits;
 use crate::rows::{interleave, load, split, store};
-use crate::streams::{META, Shape, open};
+use crate::streams::{ESCAPES, Shape, assemble, close, open};
 use cc4dgs_core::archive::ByteReader;
 use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
 use png::{BitDepth, ColorType, Decoder, Encoder, Filter, Limits as PngLimits};
@@ -15,8 +15,6 @@ use std::io::Cursor;
 
 /// Version of the stored form.
 const VERSION: u8 = 1;
-/// Name of the stream with values beyond the steps.
-const ESCAPES: &str = "escapes";
 
 /// The last chunk of every PNG file.
 const END: [u8; 12] = [0, 0, 0, 0, b'I', b'E', b'N', b'D', 0xae, 0x42, 0x60, 0x82];
@@ -111,10 +109,7 @@ impl AttributeCodec for SortedImage {
             let bytes = if planes.is_empty() { Vec::new() } else { to_png(&planes, count)? };
             streams.push(Stream { name: name.into(), bytes });
         }
-        streams.extend(Shape::extra_streams(&sorted));
-        streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
-        streams.insert(0, Stream { name: META.into(), bytes: meta });
-        Ok(streams)
+        Ok(assemble(&sorted, meta, escapes, streams))
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
@@ -124,17 +119,18 @@ impl AttributeCodec for SortedImage {
         for (name, width, values) in out.columns_mut() {
             let widths = column::widths(meta.clone(), width)?;
             let wanted: usize = widths.iter().sum();
-            let picture = set.reader(name)?.rest();
+            let picture = set.reader(name)?;
             let object = format!("sorted-image stream '{name}'");
-            let planes = if wanted * shape.count == 0 { Vec::new() } else { from_png(&object, picture, shape.count, wanted)? };
+            let planes = if wanted * shape.count == 0 {
+                picture.finish()?;
+                Vec::new()
+            } else {
+                from_png(&object, picture.rest(), shape.count, wanted)?
+            };
             let codes = codes(&planes, &widths, shape.count);
             *values = interleave(&load(ByteReader::new(object, &codes), shape.count, width, &mut meta, &mut escapes)?, shape.count);
         }
-        meta.finish()?;
-        escapes.finish()?;
-        shape.read_extra(&set, &mut out)?;
-        out.validate("decoded Gaussians", &context.limits)?;
-        Ok(out)
+        close(&set, &shape, [meta, escapes], out, &context.limits)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {

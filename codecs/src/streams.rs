@@ -7,6 +7,9 @@ use cc4dgs_core::{Error, ExtraAttribute, HostGaussians, Limits, Result, Stream};
 /// The stream that says what the others hold.
 pub(crate) const META: &str = "meta";
 
+/// The stream with values beyond the steps.
+pub(crate) const ESCAPES: &str = "escapes";
+
 /// The streams handed to a decoder, by name.
 pub(crate) struct StreamSet<'a> {
     codec: &'static str,
@@ -36,6 +39,25 @@ pub(crate) fn open<'a>(codec: &'static str, streams: &'a [Stream], version: u8, 
     }
     let shape = Shape::read(&mut meta, limits)?;
     Ok((set, meta, shape))
+}
+
+/// All streams of an encoder that keeps `columns` of `gaussians` by name, what they are in `meta` and values beyond their steps in `escapes`.
+pub(crate) fn assemble(gaussians: &HostGaussians, meta: Vec<u8>, escapes: Vec<u8>, columns: Vec<Stream>) -> Vec<Stream> {
+    let mut streams = vec![Stream { name: META.into(), bytes: meta }];
+    streams.extend(columns);
+    streams.extend(Shape::extra_streams(gaussians));
+    streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
+    streams
+}
+
+/// What every decoder of [`assemble`] does last: `read` must have been read to the end; the plug-in attributes follow, and the whole must be sound.
+pub(crate) fn close(set: &StreamSet, shape: &Shape, read: [ByteReader; 2], mut out: HostGaussians, limits: &Limits) -> Result<HostGaussians> {
+    for reader in read {
+        reader.finish()?;
+    }
+    shape.read_extra(set, &mut out)?;
+    out.validate("decoded Gaussians", limits)?;
+    Ok(out)
 }
 
 /// Number of Gaussians, degree and plug-in attributes: the part of the meta stream both codecs share.

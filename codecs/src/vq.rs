@@ -5,7 +5,7 @@
 
 use crate::column::{self, Target};
 use crate::rows::{interleave, load, split, store};
-use crate::streams::{META, Shape, from_planes, open, to_planes};
+use crate::streams::{ESCAPES, Shape, assemble, close, from_planes, open, to_planes};
 use crate::{kmeans, morton};
 use cc4dgs_core::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, config, inventory, unknown_name,
@@ -15,8 +15,6 @@ use serde::Deserialize;
 
 /// Version of the stored form.
 const VERSION: u8 = 1;
-/// Name of the stream with values beyond the steps.
-const ESCAPES: &str = "escapes";
 /// The attributes that get codebooks.
 const BOOKS: [&str; 3] = ["log_scales", "quaternions", "sh_rest"];
 /// What the others may lose, by their bits.
@@ -102,10 +100,7 @@ impl AttributeCodec for Vq {
                 }
             }
         }
-        streams.extend(Shape::extra_streams(&sorted));
-        streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
-        streams.insert(0, Stream { name: META.into(), bytes: meta });
-        Ok(streams)
+        Ok(assemble(&sorted, meta, escapes, streams))
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
@@ -134,11 +129,7 @@ impl AttributeCodec for Vq {
             }
             labels.finish()?;
         }
-        meta.finish()?;
-        escapes.finish()?;
-        shape.read_extra(&set, &mut out)?;
-        out.validate("decoded Gaussians", &context.limits)?;
-        Ok(out)
+        close(&set, &shape, [meta, escapes], out, &context.limits)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {

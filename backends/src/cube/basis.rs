@@ -1,5 +1,6 @@
 //! Combinations of shared functions on the device.
 
+use super::field::add_segments;
 use super::tensor::{UNITS, cubes_for, floats, upload};
 use crate::ops::basis::{BasisBackward, BasisOps, BasisShape};
 use burn::backend::tensor::FloatTensor;
@@ -77,18 +78,6 @@ fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mu
     }
 }
 
-/// out [F]: the segments added in order.
-#[cube(launch)]
-fn add_parts(partial: &[f32], out: &mut [f32], segments: u32) {
-    if ABSOLUTE_POS < out.len() {
-        let mut sum = 0.0f32;
-        for segment in 0..segments as usize {
-            sum += partial[segment * out.len() + ABSOLUTE_POS];
-        }
-        out[ABSOLUTE_POS] = sum;
-    }
-}
-
 impl BasisOps for CubeBackend {
     fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
         let (coefficients, functions) = (into_contiguous(coefficients), into_contiguous(functions));
@@ -130,7 +119,7 @@ impl BasisBackward for CubeBackend {
             let (c, g) = (coefficients.clone().into_buffer_arg(), grad.clone().into_buffer_arg());
             let (p, parts) = (plan.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
             function_parts::launch(&client, cubes_for(segments * count), dim, c, g, p, parts, rows as u32, width, columns, count as u32);
-            add_parts::launch(&client, cubes_for(count), dim, partial.into_buffer_arg(), out.clone().into_buffer_arg(), segments as u32);
+            add_segments::launch(&client, cubes_for(count), dim, partial.into_buffer_arg(), out.clone().into_buffer_arg(), count as u32, segments as u32, 0);
             out
         });
         [of_coefficients, of_functions]

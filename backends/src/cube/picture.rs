@@ -1,12 +1,11 @@
 //! Pictures from 8-bit files.
 
-use super::tensor::{UNITS, cubes_for, empty, floats, upload};
+use super::tensor::{UNITS, cubes_for, empty, floats, signed, upload};
 use crate::ops::picture::PictureOps;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
-use burn_cubecl::tensor::CubeTensor;
 use cc4dgs_core::Image8;
 use cubecl::prelude::*;
 use std::sync::Arc;
@@ -55,7 +54,7 @@ impl PictureOps for CubeBackend {
         let client = planes.client.clone();
         let arguments = (planes.into_buffer_arg(), words.clone().into_buffer_arg());
         pack::launch(&client, cubes_for(pixels), CubeDim::new_1d(UNITS), arguments.0, arguments.1);
-        CubeTensor::new_contiguous(words.client.clone(), words.device.clone(), words.meta.shape().clone(), words.handle.clone(), DType::I32)
+        signed(words)
     }
     fn planes(like: FloatTensor<Self>, picture: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
         let (width, height) = (picture.width as usize, picture.height as usize);

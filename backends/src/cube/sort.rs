@@ -1,6 +1,6 @@
 //! Exclusive sums and a stable radix sort of pairs of words. Ranks are counted, not raced for, so equal inputs give equal outputs.
 
-use super::tensor::{UNITS, cubes_for, empty, spread, upload};
+use super::tensor::{UNITS, cubes_for, empty, signed, spread, upload};
 use crate::ops::sort::SortOps;
 use burn::backend::tensor::IntTensor;
 use burn::tensor::DType;
@@ -220,8 +220,7 @@ impl SortOps for CubeBackend {
             let (k, c, p) = (keys.into_buffer_arg(), cut.clone().into_buffer_arg(), places.clone().into_buffer_arg());
             number::launch(&client, cubes_for(count), CubeDim::new_1d(UNITS), k, c, p, u32::MAX >> (32 - bits));
         }
-        // Places are below 2^31, so their bits are those of signed numbers too.
-        let order = sort_pairs(cut, places, count, bits).1;
-        CubeTensor::new_contiguous(order.client.clone(), order.device.clone(), order.meta.shape().clone(), order.handle.clone(), DType::I32)
+        // Places are below 2^31.
+        signed(sort_pairs(cut, places, count, bits).1)
     }
 }

@@ -45,6 +45,11 @@ pub fn upload<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> 
 
 static BINDING_CAP: AtomicU64 = AtomicU64::new(u64::MAX);
 
+/// Unsigned numbers as the signed ones that burn's integers are: the same bits.
+pub fn signed(values: CubeTensor) -> CubeTensor {
+    CubeTensor::new_contiguous(values.client.clone(), values.device.clone(), values.meta.shape().clone(), values.handle.clone(), DType::I32)
+}
+
 /// Pretends from now on that kernels may read no more than so many bytes of a buffer: for tests, and to see what a smaller adapter would do.
 pub fn cap_bindings(bytes: u64) {
     BINDING_CAP.store(bytes, Ordering::Relaxed);

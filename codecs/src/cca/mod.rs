@@ -21,14 +21,12 @@ mod shard;
 mod train;
 
 use crate::morton;
-use crate::streams::{META, Shape, StreamSet, from_planes, to_planes};
+use crate::streams::{ESCAPES, META, Shape, StreamSet, from_planes, to_planes};
 use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
 pub use profile::{Profile, Settings};
 
 /// Version of the stored form.
 const VERSION: u8 = 1;
-/// The stream of outliers of all quantised columns.
-const ESCAPES: &str = "escapes";
 
 /// The codec with its profile and settings.
 #[derive(Clone, Debug)]

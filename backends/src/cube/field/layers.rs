@@ -138,7 +138,7 @@ fn norm_gradient_parts(dz: &[f32], normalized: &[f32], partial: &mut [f32], rows
 
 /// Adds the segments up, into `gradient` at `at`.
 #[cube(launch)]
-fn add_segments(partial: &[f32], gradient: &mut [f32], width: u32, segments: u32, at: u32) {
+pub fn add_segments(partial: &[f32], gradient: &mut [f32], width: u32, segments: u32, at: u32) {
     if ABSOLUTE_POS < width as usize {
         let mut sum = 0.0f32;
         for segment in 0..segments as usize {

@@ -6,6 +6,8 @@ mod network;
 mod program;
 mod voxels;
 
+pub use layers::add_segments;
+
 use crate::ops::corners::{CornerOps, CornersBegun, GridBox};
 use crate::ops::field::{Decoder, FieldKernels, FieldOps, ReluShape};
 use burn::backend::tensor::{FloatTensor, IntTensor};

@@ -1,7 +1,7 @@
 //! Grid corners of points, which of them are the same, and interpolation between them.
 
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{UNITS, cubes_for, empty, floats, upload};
+use crate::cube::tensor::{UNITS, cubes_for, empty, floats, signed, upload};
 use crate::ops::corners::{CornersBegun, GridBox};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -145,11 +145,6 @@ pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<Cu
     mark_heads::launch(&client, cubes_for(slots_count), dim, sorted.clone().into_buffer_arg(), heads.clone().into_buffer_arg());
     let count = exclusive_sums(&heads, slots_count);
     CornersBegun { weights, slots: signed(slots), vertices: signed(sorted), starts: signed(heads), corners: unused(), count: signed(count) }
-}
-
-/// Unsigned numbers below 2^32 as the signed ones that burn's integers are: the same bits.
-fn signed(values: CubeTensor) -> CubeTensor {
-    CubeTensor::new_contiguous(values.client.clone(), values.device.clone(), values.meta.shape().clone(), values.handle.clone(), DType::I32)
 }
 
 /// Vertices [U,3], where their slots start [U+1], and the vertex of every corner [8M].
