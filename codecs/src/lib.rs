@@ -14,7 +14,6 @@ pub mod cca;
 mod column;
 mod grid_sort;
 pub mod kmeans;
-pub mod morton;
 pub mod mulaw;
 mod quantize;
 mod raw;

@@ -18,3 +18,4 @@ pub mod presets;
 pub mod schedule;
 pub mod train;
 pub mod trajectory;
+pub mod visibility;

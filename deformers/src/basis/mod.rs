@@ -8,20 +8,24 @@
 //!
 //! After training, functions that a head hardly uses are left out, and so are heads: see [`simplify`].
 
+mod functions;
+mod reach;
 mod simplify;
+mod sparsity;
 
 use crate::parts::heads::{self, Head};
 use crate::parts::settings::{Rates, take, within};
-use crate::parts::time::{bands_for, encode};
+use crate::parts::time::bands_for;
 use crate::parts::voxels::{VoxelSettings, Voxels, parameter};
 use crate::parts::weights;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, combine};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
-    config, inventory,
+    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Reach, Result, Simplified,
+    SpatialFeatures, config, inventory,
 };
+use functions::TemporalFunctions;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -33,6 +37,8 @@ const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as of `
 layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
 falloff = 1.0            # each band is 2^-falloff as large as the one below: fast motion has to be worth it; 0 treats all alike
+sparsity = 0.0           # pull of the group lasso on every function of every head (bands: times 2^band); 0 is off
+splines = 0              # cubic B-splines over the sequence beside the bands; none or at least 4
 learned = 16             # functions of time learned by a small network; 0 is none
 heads = ["means", "log_scales", "quaternions"]
 rotation = "additive"    # quaternions change by sums (the paper) | "exponential": by a rotation vector, which composes however far it turns
@@ -69,6 +75,8 @@ struct BasisSettings {
     layers: usize,
     time_bands: usize,
     falloff: f32,
+    sparsity: f32,
+    splines: usize,
     learned: usize,
     heads: Vec<Head>,
     rotation: Rotation,
@@ -83,6 +91,8 @@ impl Default for BasisSettings {
             layers: 2,
             time_bands: 0,
             falloff: 1.0,
+            sparsity: 0.0,
+            splines: 0,
             learned: 16,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions],
             rotation: Rotation::Additive,
@@ -121,11 +131,10 @@ struct CdfBasis {
     settings: BasisSettings,
     rates: Rates,
     voxels: Voxels,
-    bands: usize,
+    functions: TemporalFunctions,
     /// Functions by head.
     kept: Vec<Vec<usize>>,
     shape: Arc<BasisShape>,
-    learned: Option<Arc<ReluShape>>,
     coefficients: Arc<ReluShape>,
     parameters: Vec<Parameter>,
 }
@@ -142,24 +151,31 @@ impl CdfBasis {
         within("layers", settings.layers, 1, 8)?;
         within("time_bands", settings.time_bands, 0, 24)?;
         within("learned", settings.learned, 0, 256)?;
+        within("splines", settings.splines, 0, 1024)?;
+        if (1..4).contains(&settings.splines) {
+            return Err(Error::parameter("deformer.splines", format!("{} are too few for cubic pieces", settings.splines), "Give 0 (none) or at least 4"));
+        }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
         if !(0.0..=4.0).contains(&settings.falloff) {
             return Err(Error::parameter("deformer.falloff", format!("{} cannot be used", settings.falloff), "Give 0 (none) to 4"));
+        }
+        if !(0.0..=1.0).contains(&settings.sparsity) {
+            return Err(Error::parameter("deformer.sparsity", format!("{} cannot be used", settings.sparsity), "Give 0 (off) to 1"));
         }
         if !(0.0..1.0).contains(&settings.unused) {
             return Err(Error::parameter("deformer.unused", format!("{} is no share", settings.unused), "Give a share from 0 to below 1"));
         }
         let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
-        // The constant, t, a sine and a cosine per band, and what is learned.
-        let kept = settings.functions_of_heads(2 + 2 * bands + settings.learned)?;
+        let network = (settings.learned > 0).then(|| Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(bands), width, width, settings.learned])));
+        let functions = TemporalFunctions { bands, falloff: settings.falloff, splines: settings.splines, network };
+        let kept = settings.functions_of_heads(functions.count())?;
         let groups = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let shape = Arc::new(BasisShape { groups });
 
         let (voxels, mut parameters) = Voxels::new(&voxel_settings, context, GRID, device)?;
         let seed = context.seed;
         let mut add = |name: String, values: Vec<f32>| parameters.push(parameter(name, Part::Net, NET, values, device));
-        let learned = (settings.learned > 0).then(|| ReluShape::chain(&[1 + 2 * bands, width, width, settings.learned]));
-        if let Some(shape) = &learned {
+        if let Some(shape) = &functions.network {
             add("net.functions".into(), weights::chain(seed.child("functions"), &weights::widths(shape)));
         }
         let trunk = vec![width; settings.layers];
@@ -172,31 +188,20 @@ impl CdfBasis {
         let heads = outputs.iter().map(|&output| vec![width, output]).collect();
         let coefficients = Arc::new(ReluShape { input: voxels.width(), trunk, heads });
         let (section, context) = (section.clone(), context.clone());
-        Ok(Self { section, context, rates, voxels, bands, kept, shape, learned: learned.map(Arc::new), coefficients, parameters, settings })
+        Ok(Self { section, context, rates, voxels, functions, kept, shape, coefficients, parameters, settings })
     }
     /// The weights of the parameter from `place` after the decoders to the end, side by side.
     fn weights_after(&self, place: usize) -> Tensor<1> {
         Tensor::cat(self.parameters[self.voxels.levels() + place..].iter().map(|p| p.value.clone()).collect(), 0)
     }
-    /// Every function at a time: φ(t) [functions].
-    fn functions_at(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
-        let mut encoding = encode(time_norm, self.bands);
-        for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
-            pair.iter_mut().for_each(|v| *v *= (-self.settings.falloff * band as f32).exp2());
-        }
-        let constant = |values: Vec<f32>| {
-            let n = values.len();
-            Tensor::<2>::from_data(TensorData::new(values, [1, n]), like)
-        };
-        let mut parts = vec![constant(vec![1.0]), constant(encoding.clone())];
-        if let Some(shape) = &self.learned {
-            parts.extend(mlp_relu(constant(encoding), self.parameters[self.voxels.levels()].value.clone(), shape)?);
-        }
-        Ok(Tensor::cat(parts, 1).flatten(0, 1))
+    /// Every function at every time: φ(t) [times, functions].
+    fn functions_at(&self, times_norm: &[f32], like: &Device) -> Result<Tensor<2>> {
+        let weights = self.functions.network.as_ref().map(|_| self.parameters[self.voxels.levels()].value.clone());
+        self.functions.at(times_norm, weights, like)
     }
     /// φ(t) as the heads read it, each its own, one head after the other.
     fn functions_by_head(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
-        let all = self.functions_at(time_norm, like)?;
+        let all: Tensor<1> = self.functions_at(&[time_norm], like)?.flatten(0, 1);
         let places: Vec<i64> = self.kept.iter().flatten().map(|&f| f as i64).collect();
         let count = places.len();
         Ok(all.select(0, Tensor::<1, Int>::from_data(TensorData::new(places, [count]), like)))
@@ -211,7 +216,7 @@ impl DeformationField for CdfBasis {
             return Ok(SpatialFeatures { values: empty, work: FieldWork::default() });
         }
         let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
-        let weights = self.weights_after(usize::from(self.learned.is_some()));
+        let weights = self.weights_after(usize::from(self.functions.network.is_some()));
         Ok(SpatialFeatures { values: Tensor::cat(mlp_relu(voxel, weights, &self.coefficients)?, 1), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
@@ -245,6 +250,12 @@ impl DeformationField for CdfBasis {
     }
     fn groups(&self) -> Vec<ParameterGroup> {
         vec![self.rates.group("cdf-basis grid"), self.rates.group("cdf-basis net")]
+    }
+    fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
+        Ok(if self.settings.sparsity > 0.0 { sparsity::group_lasso(self, self.settings.sparsity) } else { None })
+    }
+    fn reach(&self, features: Tensor<2>) -> Result<Option<Reach>> {
+        reach::reach(self, features).map(Some)
     }
     fn simplified(&self, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
         simplify::simplified(self, features, times)

@@ -1,0 +1,105 @@
+//! The functions of time that all Gaussians share: a constant, t, Fourier bands, cubic B-splines, and a few learned by a small network.
+
+use crate::parts::time::encode;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_core::Result;
+use std::sync::Arc;
+
+/// Which functions there are, in this order: the constant, t, a sine and a cosine per band, the splines, what is learned.
+#[derive(Clone, Debug)]
+pub(super) struct TemporalFunctions {
+    /// Fourier bands of 1, 2, 4… cycles per sequence.
+    pub(super) bands: usize,
+    /// Each band is 2^-falloff as large as the one below.
+    pub(super) falloff: f32,
+    /// Cubic B-splines over the sequence; none or at least four.
+    pub(super) splines: usize,
+    /// The network from time to the learned functions.
+    pub(super) network: Option<Arc<ReluShape>>,
+}
+
+impl TemporalFunctions {
+    /// Inputs of the network: t and the bands.
+    pub(super) fn encoding(bands: usize) -> usize {
+        1 + 2 * bands
+    }
+    fn learned(&self) -> usize {
+        self.network.as_ref().and_then(|n| n.output_widths().first().copied()).unwrap_or(0)
+    }
+    /// How many there are.
+    pub(super) fn count(&self) -> usize {
+        1 + Self::encoding(self.bands) + self.splines + self.learned()
+    }
+    /// What a function costs in [`super::sparsity`]: 1, but 2^l for the l-th band.
+    pub(super) fn prices(&self) -> Vec<f32> {
+        let fourier = (0..self.bands).flat_map(|band| [(band as f32).exp2(); 2]);
+        [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(1.0, self.splines + self.learned())).collect()
+    }
+    /// The largest sizes over the sequence of those that are not learned.
+    pub(super) fn known_maxima(&self) -> Vec<f32> {
+        let fourier = (0..self.bands).flat_map(|band| [(-self.falloff * band as f32).exp2(); 2]);
+        [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(2.0 / 3.0, self.splines)).collect()
+    }
+    /// All of them at some times: φ(t) [times, functions]. `weights` are those of the network.
+    pub(super) fn at(&self, times_norm: &[f32], weights: Option<Tensor<1>>, like: &Device) -> Result<Tensor<2>> {
+        let rows = |of: &dyn Fn(f32) -> Vec<f32>| {
+            let values: Vec<f32> = times_norm.iter().flat_map(|&t| of(t)).collect();
+            let width = values.len() / times_norm.len().max(1);
+            Tensor::<2>::from_data(TensorData::new(values, [times_norm.len(), width]), like)
+        };
+        let plain = |t: f32| [1.0].into_iter().chain(self.encoded(t, self.falloff)).chain(splines_at(t, self.splines)).collect();
+        let mut parts = vec![rows(&plain)];
+        if let (Some(network), Some(weights)) = (&self.network, weights) {
+            // Its input falls off whatever its neighbours do: it is there for smooth functions that are none of theirs.
+            parts.extend(mlp_relu(rows(&|t| self.encoded(t, self.falloff.max(1.0))), weights, network)?);
+        }
+        Ok(Tensor::cat(parts, 1))
+    }
+    fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
+        let mut encoding = encode(time_norm, self.bands);
+        for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
+            pair.iter_mut().for_each(|v| *v *= (-falloff * band as f32).exp2());
+        }
+        encoding
+    }
+}
+
+/// `count` uniform cubic B-splines that cover 0..1; each is not zero over four of the `count` - 3 intervals, and they add up to 1.
+fn splines_at(time_norm: f32, count: usize) -> Vec<f32> {
+    let place = f64::from(time_norm.clamp(0.0, 1.0)) * count.saturating_sub(3) as f64;
+    let spline = |i: usize| {
+        let x = (place - (i as f64 - 1.0)).abs();
+        let value = if x < 1.0 { 2.0 / 3.0 - x * x + x * x * x / 2.0 } else { (2.0 - x).max(0.0).powi(3) / 6.0 };
+        value as f32
+    };
+    (0..count).map(spline).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn splines_add_up_to_one_and_only_four_are_at_work() {
+        for step in 0..=100 {
+            let values = splines_at(step as f32 / 100.0, 9);
+            assert!((values.iter().sum::<f32>() - 1.0).abs() < 1e-6, "{step}: {values:?}");
+            assert!(values.iter().filter(|v| **v > 0.0).count() <= 4);
+            assert!(values.iter().all(|v| *v >= 0.0));
+        }
+        assert!(splines_at(0.5, 0).is_empty());
+    }
+
+    #[test]
+    fn bands_fall_off_by_octaves() {
+        let functions = TemporalFunctions { bands: 3, falloff: 1.0, splines: 4, network: None };
+        let values = functions.at(&[0.2], None, &Device::flex()).unwrap().into_data().to_vec::<f32>().unwrap();
+        assert_eq!(values.len(), functions.count());
+        assert_eq!(functions.prices().len(), functions.count());
+        let angle = std::f32::consts::TAU * 0.2;
+        for (got, want) in values[..8].iter().zip([1.0, 0.2, angle.sin(), angle.cos(), (2.0 * angle).sin() / 2.0, (2.0 * angle).cos() / 2.0]) {
+            assert!((got - want).abs() < 1e-6, "{values:?}");
+        }
+    }
+}

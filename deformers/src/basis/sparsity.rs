@@ -1,0 +1,30 @@
+//! What keeps functions of time out of heads that do not need them: a group lasso over the columns of the heads' last layers.
+//!
+//! All weights of one function in one head form a group. Its pull towards zero is as strong for small weights as for large ones, so that a function whose
+//! motion pictures do not ask for goes to zero for all Gaussians at once, and is left out after training (see [`super::simplify`]). Fourier bands pay in
+//! proportion to their frequency: with free fast bands, each training time is learned by itself.
+
+use super::CdfBasis;
+use burn::tensor::{Tensor, TensorData};
+
+/// Added to squared norms, so that a group of zeros has a derivative.
+const LEAST_SQUARED_NORM: f32 = 1e-12;
+
+/// The sum over heads and functions of price times norm, times `weight`.
+pub(super) fn group_lasso(field: &CdfBasis, weight: f32) -> Option<Tensor<1>> {
+    let prices = field.functions.prices();
+    let width = field.coefficients.trunk.last().copied()?;
+    let first = field.parameters.len() - field.settings.heads.len();
+    let mut total: Option<Tensor<1>> = None;
+    for ((parameter, &(outputs, own)), kept) in field.parameters[first..].iter().zip(&field.shape.groups).zip(&field.kept) {
+        let last = parameter.value.clone().narrow(0, width * (width + 1), (width + 1) * outputs * own).reshape([(width + 1) * outputs, own]);
+        let norms = (last.clone() * last).sum_dim(0).add_scalar(LEAST_SQUARED_NORM).sqrt().flatten(0, 1);
+        let price: Vec<f32> = kept.iter().map(|&f| weight * prices[f]).collect();
+        let term = (norms * Tensor::<1>::from_data(TensorData::new(price, [own]), &parameter.value.device())).sum();
+        total = Some(match total {
+            Some(sum) => sum + term,
+            None => term,
+        });
+    }
+    total
+}
