@@ -134,7 +134,7 @@ fn swap_round(places: &mut [usize], features: &[Feature], around: &[Feature], si
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cc4dgs_core::morton;
+    use crate::morton;
 
     fn cloud(count: usize) -> HostGaussians {
         let mut g = HostGaussians::default();

@@ -14,6 +14,7 @@ pub mod cca;
 mod column;
 mod grid_sort;
 pub mod kmeans;
+pub mod morton;
 pub mod mulaw;
 mod quantize;
 mod raw;

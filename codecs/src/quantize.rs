@@ -1,9 +1,9 @@
 //! `quantize`: each component of each attribute by itself, in even steps between percentiles. No model, no training; what a cleverer codec must beat.
 
 use crate::column::{self, Column, Target};
+use crate::morton;
 use crate::rows::{interleave, load, split, store};
 use crate::streams::{ESCAPES, Shape, assemble, close, open};
-use cc4dgs_core::morton;
 use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
 

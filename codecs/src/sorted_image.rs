@@ -4,11 +4,11 @@
 
 use crate::column::{self, Column};
 use crate::grid_sort::{side_of, square_order};
+use crate::morton;
 use crate::quantize::Bits;
 use crate::rows::{interleave, load, split, store};
 use crate::streams::{ESCAPES, Shape, assemble, close, open};
 use cc4dgs_core::archive::ByteReader;
-use cc4dgs_core::morton;
 use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
 use png::{BitDepth, ColorType, Decoder, Encoder, Filter, Limits as PngLimits};
 use std::io::Cursor;

@@ -4,10 +4,9 @@
 //! steps instead.
 
 use crate::column::{self, Target};
-use crate::kmeans;
 use crate::rows::{interleave, load, split, store};
 use crate::streams::{ESCAPES, Shape, assemble, close, from_planes, open, to_planes};
-use cc4dgs_core::morton;
+use crate::{kmeans, morton};
 use cc4dgs_core::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, config, inventory, unknown_name,
 };

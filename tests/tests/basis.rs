@@ -1,7 +1,7 @@
 //! Combinations of shared functions: against sums in float64, forwards and backwards, on every device.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_backends::ops::basis::{BasisShape, combine};
+use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DeformationField, FieldContext, Gaussians, HostGaussians, Offsets, Registry, Seed, config};
 use cc4dgs_deformers as _;
@@ -50,13 +50,15 @@ fn values_and_gradients_are_those_of_the_sums() {
                 let c = Tensor::<2>::from_data(TensorData::new(coefficients.clone(), [rows, columns]), &device).require_grad();
                 let f = Tensor::<1>::from_data(TensorData::new(functions.clone(), [count]), &device).require_grad();
                 let u = Tensor::<2>::from_data(TensorData::new(upstream.clone(), [rows, width]), &device);
-                let out = combine(c.clone(), f.clone(), &shape).unwrap();
+                let out = Tensor::cat(combine(c.clone(), f.clone(), &shape).unwrap(), 1);
+                let packed = Tensor::cat(combine(by_columns(c.clone()), f.clone(), &shape).unwrap(), 1);
                 let gradients = (out.clone() * u).sum().backward();
                 let close = |what: &str, found: Vec<f32>, wanted: &[f64]| {
                     let size = wanted.iter().fold(1.0f64, |a, v| a.max(v.abs()));
                     let worst = found.iter().zip(wanted).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max);
                     assert!(found.len() == wanted.len() && worst <= 2e-5 * size, "{name}, {shape:?}, {rows} rows, {what}: {worst} of {size}");
                 };
+                close("values by columns", to_vec(packed.inner(), "values").unwrap(), &values);
                 close("values", to_vec(out.inner(), "values").unwrap(), &values);
                 close("coefficients", to_vec(c.grad(&gradients).unwrap(), "gradient").unwrap(), &of_coefficients);
                 close("functions", to_vec(f.grad(&gradients).unwrap(), "gradient").unwrap(), &of_functions);

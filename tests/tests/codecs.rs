@@ -1,8 +1,8 @@
 //! Conformance of every registered codec: what comes back is what its declared losses allow, the bytes are the same every time, hostile
 //! streams end in errors.
 
+use cc4dgs_codecs::morton;
 use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::morton;
 use cc4dgs_core::{AttributeCodec, CodecContext, ExtraAttribute, HostGaussians, Limits, Recorder, Registry, Seed, Silent, Stream};
 use proptest::prelude::*;
 use rand::Rng;

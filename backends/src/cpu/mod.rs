@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod basis;
+pub mod heads;
 pub mod lookup;
 pub mod mlp;
 pub mod photometric;

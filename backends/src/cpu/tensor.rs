@@ -11,6 +11,8 @@ use std::borrow::Cow;
 pub trait CpuBackend: Backend {
     /// The elements, row-major; borrowed when the tensor is contiguous.
     fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]>;
+    /// The elements of a matrix column by column, if that is how they lie in memory (the view that transposing a row-major matrix makes).
+    fn columns(tensor: &FloatTensor<Self>) -> Option<&[f32]>;
     /// The integer elements, row-major.
     fn ints(tensor: &IntTensor<Self>) -> Vec<i64>;
     /// Changes the elements in place when nobody else holds them, in a copy otherwise.
@@ -27,6 +29,12 @@ impl CpuBackend for Flex {
             Some(slice) => Cow::Borrowed(slice),
             None => Cow::Owned(tensor.to_contiguous().storage::<f32>().to_vec()),
         }
+    }
+    fn columns(tensor: &FloatTensor<Self>) -> Option<&[f32]> {
+        let layout = tensor.layout();
+        let (&[rows, columns], &[1, apart]) = (&layout.shape()[..], layout.strides()) else { return None };
+        let from = layout.start_offset();
+        (apart == rows as isize).then(|| tensor.storage::<f32>().get(from..from + rows * columns)).flatten()
     }
     fn ints(tensor: &IntTensor<Self>) -> Vec<i64> {
         let tensor = tensor.to_contiguous();
@@ -60,6 +68,11 @@ impl CpuBackend for NdArray {
             Some(slice) => Cow::Borrowed(slice),
             None => Cow::Owned(view.iter().copied().collect()),
         }
+    }
+    fn columns(tensor: &FloatTensor<Self>) -> Option<&[f32]> {
+        let NdArrayTensor::F32(storage) = tensor else { return None };
+        let view = storage.view();
+        (view.ndim() == 2).then(|| view.reversed_axes().to_slice()).flatten()
     }
     fn ints(tensor: &IntTensor<Self>) -> Vec<i64> {
         match tensor {

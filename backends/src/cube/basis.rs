@@ -14,46 +14,68 @@ use std::sync::Arc;
 const SEGMENT: usize = 128;
 
 /// Numbers per output in a plan.
-const FIELDS: usize = 3;
+const FIELDS: usize = 6;
 
-/// Per output, where its coefficients start, where its functions do, and how many they are.
+/// Per output, where its coefficients start, where its functions do, how many they are, the outputs of the heads before its own, those of its own, and its
+/// place among them.
 fn plan(shape: &BasisShape) -> Vec<u32> {
-    let (mut at, mut function) = (0, 0);
+    let (mut at, mut function, mut before) = (0, 0, 0);
     let mut words = Vec::new();
     for &(outputs, count) in &shape.groups {
-        for _ in 0..outputs {
-            words.extend([at, function, count as u32]);
+        for place in 0..outputs as u32 {
+            words.extend([at, function, count as u32, before, outputs as u32, place]);
             at += count as u32;
         }
         function += count as u32;
+        before += outputs as u32;
     }
     words
 }
 
-/// out [M, W].
+/// Where an output of a row lies: head after head, each [rows, outputs].
+#[cube]
+fn place(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
+    (plan[FIELDS * output + 3] * rows) as usize + row * plan[FIELDS * output + 4] as usize + plan[FIELDS * output + 5] as usize
+}
+
+/// out, head after head. Neighbouring units take neighbouring coefficients: of one row, or of one column.
 #[cube(launch)]
-fn combine_rows(coefficients: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], width: u32, columns: u32) {
+fn combine_outputs(
+    coefficients: &[f32],
+    functions: &[f32],
+    plan: &[u32],
+    out: &mut [f32],
+    rows: u32,
+    width: u32,
+    row_stride: u32,
+    column_stride: u32,
+    #[comptime] by_columns: bool,
+) {
     if ABSOLUTE_POS < out.len() {
-        let (row, output) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
-        let from = row * columns as usize + plan[FIELDS * output] as usize;
+        let per_run = if by_columns { rows as usize } else { width as usize };
+        let (run, within) = (ABSOLUTE_POS / per_run, ABSOLUTE_POS % per_run);
+        let row = if by_columns { within } else { run };
+        let output = if by_columns { run } else { within };
+        let from = row * row_stride as usize + plan[FIELDS * output] as usize * column_stride as usize;
         let own = plan[FIELDS * output + 1] as usize;
         let mut sum = 0.0f32;
         for k in 0..plan[FIELDS * output + 2] as usize {
-            sum += coefficients[from + k] * functions[own + k];
+            sum += coefficients[from + k * column_stride as usize] * functions[own + k];
         }
-        out[ABSOLUTE_POS] = sum;
+        out[place(plan, output, row, rows)] = sum;
     }
 }
 
 /// out [M, C].
 #[cube(launch)]
-fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], width: u32, columns: u32) {
+fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], rows: u32, width: u32, columns: u32) {
     if ABSOLUTE_POS < grad.len() {
         let (row, output) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
         let from = row * columns as usize + plan[FIELDS * output] as usize;
         let own = plan[FIELDS * output + 1] as usize;
+        let upstream = grad[place(plan, output, row, rows)];
         for k in 0..plan[FIELDS * output + 2] as usize {
-            out[from + k] = grad[ABSOLUTE_POS] * functions[own + k];
+            out[from + k] = upstream * functions[own + k];
         }
     }
 }
@@ -70,7 +92,7 @@ fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mu
             for output in 0..width as usize {
                 let (first, own, count) = (plan[FIELDS * output] as usize, plan[FIELDS * output + 1] as usize, plan[FIELDS * output + 2] as usize);
                 if k >= own && k < own + count {
-                    sum += grad[row * width as usize + output] * coefficients[row * columns as usize + first + k - own];
+                    sum += grad[place(plan, output, row, rows)] * coefficients[row * columns as usize + first + k - own];
                 }
             }
         }
@@ -80,14 +102,17 @@ fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mu
 
 impl BasisOps for CubeBackend {
     fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
-        let (coefficients, functions) = (into_contiguous(coefficients), into_contiguous(functions));
+        let functions = into_contiguous(functions);
         let rows = coefficients.meta.shape()[0];
-        let out = floats(&coefficients, [rows, shape.outputs()]);
+        let by_columns = coefficients.meta.strides()[..] == [1, rows] && shape.coefficients() > 1;
+        let coefficients = if by_columns { coefficients } else { into_contiguous(coefficients) };
+        let (row_stride, column_stride) = if by_columns { (1, rows as u32) } else { (shape.coefficients() as u32, 1) };
+        let out = floats(&coefficients, [rows * shape.outputs()]);
         let client = coefficients.client.clone();
         let plan = upload(&coefficients, &plan(&shape), DType::U32);
-        let (width, columns) = (shape.outputs() as u32, shape.coefficients() as u32);
+        let (cubes, dim) = (cubes_for(rows * shape.outputs()), CubeDim::new_1d(UNITS));
         let (c, f, p, o) = (coefficients.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
-        combine_rows::launch(&client, cubes_for(rows * shape.outputs()), CubeDim::new_1d(UNITS), c, f, p, o, width, columns);
+        combine_outputs::launch(&client, cubes, dim, c, f, p, o, rows as u32, shape.outputs() as u32, row_stride, column_stride, by_columns);
         out
     }
 }
@@ -110,7 +135,7 @@ impl BasisBackward for CubeBackend {
             let out = floats(&grad, [rows, shape.coefficients()]);
             let (g, f) = (grad.clone().into_buffer_arg(), functions.clone().into_buffer_arg());
             let (p, o) = (plan.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-            spread_gradient::launch(&client, cubes_for(rows * shape.outputs()), dim, g, f, p, o, width, columns);
+            spread_gradient::launch(&client, cubes_for(rows * shape.outputs()), dim, g, f, p, o, rows as u32, width, columns);
             out
         });
         let of_functions = wanted[1].then(|| {

@@ -1,6 +1,7 @@
 //! Offsets as combinations of shared functions of time: out = C φ, a dot product per number and Gaussian.
 
-use crate::cpu::basis as kernel;
+use super::field::split_heads;
+use crate::cpu::basis::{self as kernel, Coefficients};
 use crate::cpu::tensor::CpuBackend;
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
@@ -20,6 +21,10 @@ pub struct BasisShape {
 }
 
 impl BasisShape {
+    /// Outputs of every group.
+    pub fn widths(&self) -> Vec<usize> {
+        self.groups.iter().map(|g| g.0).collect()
+    }
     /// Numbers per Gaussian that come out.
     pub fn outputs(&self) -> usize {
         self.groups.iter().map(|g| g.0).sum()
@@ -49,7 +54,7 @@ pub trait BasisBackward: Backend {
 /// The operation per device.
 #[backend_extension(Flex, NdArray, Cube, Autodiff)]
 pub trait BasisOps: Backend {
-    /// Outputs [M, W] of coefficients [M, C] and functions [F]; differentiable in both.
+    /// Flat outputs, head after head, each [M, outputs], of coefficients [M, C] and functions [F]; differentiable in both.
     fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self>;
 }
 
@@ -73,8 +78,13 @@ macro_rules! on_cpu {
     ($backend:ty) => {
         impl BasisOps for $backend {
             fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
-                let out = kernel::combine(&shape, &Self::floats(&coefficients), &Self::floats(&functions));
-                Self::from_floats(out, [coefficients.shape()[0], shape.outputs()])
+                let (rows, functions) = (coefficients.shape()[0], Self::floats(&functions));
+                let out = match Self::columns(&coefficients) {
+                    Some(columns) => kernel::combine(&shape, rows, &Coefficients::Columns(columns), &functions),
+                    None => kernel::combine(&shape, rows, &Coefficients::Rows(&Self::floats(&coefficients)), &functions),
+                };
+                let len = out.len();
+                Self::from_floats(out, [len])
             }
         }
     };
@@ -115,12 +125,21 @@ impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B
     }
 }
 
-/// Outputs [M, [`BasisShape::outputs`]] of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` [F].
-pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Tensor<2>> {
+/// One output [M, width] per group of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` [F].
+/// Coefficients that lie [`by_columns`] are read faster; the gradient wants them row by row.
+pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Vec<Tensor<2>>> {
     let ([m, width], [count]) = (coefficients.dims(), functions.dims());
     if m == 0 || width != shape.coefficients() || count != shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
         let problem = format!("coefficients have shape [{m},{width}], there are {count} functions, {shape:?} is wanted");
         return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients as the shape says and all functions"));
     }
-    Ok(Tensor::from_dispatch(<Dispatch as BasisOps>::combine(coefficients.into_dispatch(), functions.into_dispatch(), shape.clone())))
+    let flat = Tensor::from_dispatch(<Dispatch as BasisOps>::combine(coefficients.into_dispatch(), functions.into_dispatch(), shape.clone()));
+    Ok(split_heads(&flat, m, &shape.widths()))
+}
+
+/// The same matrix [M, C], kept column by column in memory.
+pub fn by_columns(matrix: Tensor<2>) -> Tensor<2> {
+    let [m, c] = matrix.dims();
+    // Flattening a transposed view is what makes its elements move.
+    matrix.transpose().reshape([m * c]).reshape([c, m]).transpose()
 }

@@ -250,18 +250,20 @@ pub fn mlp_relu(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Res
     }
     check_weights("network", weights.dims()[0], shape.parameter_count())?;
     let flat: Tensor<1> = Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone()));
-    let widths = shape.output_widths();
-    if let [only] = widths.as_slice() {
-        return Ok(vec![flat.reshape([m, *only])]);
+    Ok(split_heads(&flat, m, &shape.output_widths()))
+}
+
+/// The heads [rows, width] of a flat array that holds one after the other.
+pub(super) fn split_heads(flat: &Tensor<1>, rows: usize, widths: &[usize]) -> Vec<Tensor<2>> {
+    if let [only] = widths {
+        return vec![flat.clone().reshape([rows, *only])];
     }
     let mut at = 0;
-    Ok(widths
-        .iter()
-        .map(|&width| {
-            at += m * width;
-            flat.clone().narrow(0, at - m * width, m * width).reshape([m, width])
-        })
-        .collect())
+    let head = |&width: &usize| {
+        at += rows * width;
+        flat.clone().narrow(0, at - rows * width, rows * width).reshape([rows, width])
+    };
+    widths.iter().map(head).collect()
 }
 
 fn check_weights(object: &str, got: usize, want: usize) -> Result<()> {

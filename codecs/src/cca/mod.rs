@@ -20,8 +20,8 @@ mod profile;
 mod shard;
 mod train;
 
+use crate::morton;
 use crate::streams::{ESCAPES, META, Shape, StreamSet, from_planes, to_planes};
-use cc4dgs_core::morton;
 use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
 pub use profile::{Profile, Settings};
 

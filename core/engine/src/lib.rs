@@ -18,4 +18,3 @@ pub mod presets;
 pub mod schedule;
 pub mod train;
 pub mod trajectory;
-pub mod visibility;

@@ -1,10 +1,8 @@
-//! Playback: spatial features once, then per frame gate, cull, deform and draw.
+//! Playback: spatial features once, then per frame gate, deform and draw.
 
 use crate::model::Model;
-use crate::visibility::MotionBounds;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, FieldWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats, morton};
+use cc4dgs_core::{Camera, FieldWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -12,8 +10,6 @@ use std::time::Instant;
 const LOOK_EVERY: u64 = 16;
 /// Room for pairs over the most seen, so that a little more does not overflow.
 const SPARE: f64 = 1.25;
-/// Above this share of moving Gaussians that may be seen, all are deformed: leaving out the rest costs copies.
-const ALL_FROM: f64 = 0.75;
 
 /// Room for (Gaussian, tile) pairs, learned from frames past.
 #[derive(Default)]
@@ -42,12 +38,6 @@ impl PairRoom {
     }
 }
 
-/// `rows` in the order of a curve through their `means` [N,3], so that neighbours share blocks of [`MotionBounds`].
-fn along_curve(means: &[f32], rows: Vec<usize>) -> impl Iterator<Item = usize> {
-    let own: Vec<f32> = rows.iter().flat_map(|&row| means[3 * row..3 * row + 3].iter().copied()).collect();
-    morton::order(&own).into_iter().map(move |i| rows[i])
-}
-
 /// Plays one model on one device.
 pub struct Player<'a> {
     model: &'a Model,
@@ -59,8 +49,6 @@ pub struct Player<'a> {
     moving_attributes: Vec<Tensor<2>>,
     moving: usize,
     cache: Option<Tensor<2>>,
-    /// Where those of `cache` can be, if the field says.
-    bounds: Option<MotionBounds>,
     settings: RenderSettings,
     pair_room: PairRoom,
     /// Work of the field since the start.
@@ -76,8 +64,6 @@ pub struct PlayWork {
     pub deformed: u64,
     /// Static Gaussians the field was spared.
     pub static_skipped: u64,
-    /// Moving Gaussians the field was spared because no moment brings them into the picture.
-    pub unseen_skipped: u64,
     /// Spatial passes of the field.
     pub spatial: FieldWork,
     /// Frames whose spatial pass came from the cache.
@@ -98,13 +84,13 @@ impl<'a> Player<'a> {
     pub fn new(model: &'a Model, registry: &Registry, device: &Device) -> Result<Self> {
         let n = model.gaussians.len();
         let moves = model.field.as_ref().is_some_and(|f| !f.field.is_static());
-        let rows = if moves { model.moving.rows(&model.gaussians.dynamic_scores).unwrap_or_else(|| (0..n).collect()) } else { Vec::new() };
-        let moving = rows.len();
+        let rows = if moves { model.moving.rows(&model.gaussians.dynamic_scores) } else { Some(Vec::new()) };
+        let moving = rows.as_ref().map_or(n, Vec::len);
         // What moves comes first, so that a frame adds to a block of rows instead of gathering and scattering them.
-        let sorted = (moving > 0).then(|| {
+        let sorted = rows.filter(|_| (1..n).contains(&moving)).map(|rows| {
             let mut still = vec![true; n];
             rows.iter().for_each(|&row| still[row] = false);
-            let order: Vec<usize> = along_curve(&model.gaussians.means, rows).chain((0..n).filter(|&i| still[i])).collect();
+            let order: Vec<usize> = rows.into_iter().chain((0..n).filter(|&i| still[i])).collect();
             model.gaussians.select(&order)
         });
         let host = sorted.as_ref().unwrap_or(&model.gaussians);
@@ -123,7 +109,6 @@ impl<'a> Player<'a> {
             moving_attributes,
             moving,
             cache: None,
-            bounds: None,
             settings: model.render.settings(Some(background)),
             pair_room: PairRoom::default(),
             work: PlayWork::default(),
@@ -136,11 +121,8 @@ impl<'a> Player<'a> {
     }
     /// The Gaussians at `time_norm`, those that move before those that do not.
     pub fn gaussians_at(&mut self, time_norm: f32) -> Result<Gaussians> {
-        self.gaussians_seen(None, time_norm)
-    }
-    /// As [`Player::gaussians_at`], but Gaussians that `camera` cannot see at any time stay where they are.
-    fn gaussians_seen(&mut self, camera: Option<&Camera>, time_norm: f32) -> Result<Gaussians> {
         self.work.frames += 1;
+        self.work.deformed += self.moving as u64;
         self.work.static_skipped += (self.gaussians.len() - self.moving) as u64;
         let Some(field) = self.model.field.as_ref().filter(|_| self.moving > 0) else { return Ok(self.gaussians.clone()) };
         let features = match &self.cache {
@@ -153,44 +135,19 @@ impl<'a> Player<'a> {
                 self.work.spatial.gaussians += spatial.work.gaussians;
                 self.work.spatial.vertices_queried += spatial.work.vertices_queried;
                 self.work.spatial.vertices_decoded += spatial.work.vertices_decoded;
+                let features = field.field.packed(spatial.values);
                 if field.field.caches_spatial() {
-                    self.cache = Some(spatial.values.clone());
-                    self.bounds = self.bounds_of(spatial.values.clone())?;
+                    self.cache = Some(features.clone());
                 }
-                spatial.values
+                features
             }
         };
-        let runs = self.bounds.as_ref().zip(camera).map(|(bounds, camera)| bounds.runs(camera)).unwrap_or_default();
-        let seen: usize = runs.iter().filter(|(seen, _)| *seen).map(|(_, rows)| rows).sum();
-        if runs.is_empty() || seen as f64 > ALL_FROM * self.moving as f64 {
-            self.work.deformed += self.moving as u64;
-            return Ok(field.field.deform(features, time_norm)?.apply(&self.gaussians, None));
-        }
-        self.work.deformed += seen as u64;
-        self.work.unseen_skipped += (self.moving - seen) as u64;
-        if seen == 0 {
-            return Ok(self.gaussians.clone());
-        }
-        let mut at = 0;
-        let parts = runs.iter().filter_map(|&(seen, rows)| {
-            at += rows;
-            seen.then(|| features.clone().narrow(0, at - rows, rows))
-        });
-        Ok(field.field.deform(Tensor::cat(parts.collect(), 0), time_norm)?.spread(&runs).apply(&self.gaussians, None))
-    }
-    /// Where the moving Gaussians of `features` can be.
-    fn bounds_of(&self, features: Tensor<2>) -> Result<Option<MotionBounds>> {
-        let Some(field) = &self.model.field else { return Ok(None) };
-        let Some(reach) = field.field.reach(features)? else { return Ok(None) };
-        let log_scales = self.gaussians.log_scales.clone().narrow(0, 0, self.moving);
-        let [displacements, growths] = [(reach.displacements, "displacements"), (reach.growths, "growths")].map(|(t, name)| to_vec(t, name));
-        let means = to_vec(self.moving_means.clone(), "means")?;
-        Ok(Some(MotionBounds::new(&means, &to_vec(log_scales, "log-scales")?, &displacements?, &growths?)))
+        Ok(field.field.deform(features, time_norm)?.apply(&self.gaussians, None))
     }
     /// Draws one frame.
     pub fn render(&mut self, camera: &Camera, time_norm: f32) -> Result<(RenderOutput, FrameTime)> {
         let began = Instant::now();
-        let gaussians = self.gaussians_seen(Some(camera), time_norm)?;
+        let gaussians = self.gaussians_at(time_norm)?;
         self.sync()?;
         let field_ms = began.elapsed().as_secs_f64() * 1000.0;
         let began = Instant::now();
@@ -202,7 +159,7 @@ impl<'a> Player<'a> {
     /// Draws one frame without waiting for the device: nothing is read back but, every 16 frames, the number of (Gaussian, tile) pairs, by which room for
     /// them is made. If a frame has suddenly more than a quarter over the most seen, its farthest Gaussians are left out until the next look.
     pub fn play(&mut self, camera: &Camera, time_norm: f32) -> Result<RenderOutput> {
-        let gaussians = self.gaussians_seen(Some(camera), time_norm)?;
+        let gaussians = self.gaussians_at(time_norm)?;
         let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
         let settings = RenderSettings { pair_room: self.pair_room.room, ..self.settings.clone() };
         let output = self.rasterizer.render(&splats, camera, &settings)?;

@@ -125,6 +125,10 @@ pub trait DeformationField: Send {
     }
     /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F].
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
+    /// The same features as [`DeformationField::deform`] reads them fastest. Playback asks for this once per spatial pass.
+    fn packed(&self, features: Tensor<2>) -> Tensor<2> {
+        features
+    }
     /// The weights, in a fixed order.
     fn parameters(&self) -> Vec<&Parameter>;
     /// The weights for the optimizer and for loading, in the same order.
@@ -150,25 +154,11 @@ pub trait DeformationField: Send {
     fn simplified(&self, _features: Tensor<2>, _times: &[f32]) -> Result<Option<Simplified>> {
         Ok(None)
     }
-    /// How far the field can take the Gaussians of `features` [M,F], whatever the time in 0..1: playback does not ask about those that no moment brings into
-    /// the picture. `None` means that this is not known.
-    fn reach(&self, _features: Tensor<2>) -> Result<Option<Reach>> {
-        Ok(None)
-    }
     /// Bytes of the weights as float32, per part: (grid, net).
     fn size_bytes(&self) -> (u64, u64) {
         let sum = |part| self.parameters().iter().filter(|p| p.part == part).map(|p| 4 * p.shape.iter().product::<usize>() as u64).sum();
         (sum(Part::Grid), sum(Part::Net))
     }
-}
-
-/// Bounds of what a field does to M Gaussians.
-#[derive(Clone, Debug)]
-pub struct Reach {
-    /// Largest displacement of the centres, world units [M].
-    pub displacements: Tensor<1>,
-    /// Largest growth of any log-scale, at least 0 [M].
-    pub growths: Tensor<1>,
 }
 
 /// What [`DeformationField::simplified`] returns.

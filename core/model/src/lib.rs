@@ -17,7 +17,6 @@ pub mod gaussians;
 mod limits;
 pub mod metrics;
 mod module_field;
-pub mod morton;
 mod offsets;
 mod plugin;
 mod raster;
@@ -31,7 +30,7 @@ pub use codec::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Stream}
 pub use device::{DEVICE_NAMES, parse_device};
 pub use error::{Error, Result};
 pub use events::{Event, EventSink, Fanout, Recorder, Silent};
-pub use field::{AttributeSpec, DeformationField, FieldContext, FieldPlugin, FieldWork, Parameter, ParameterGroup, Part, Reach, Simplified, SpatialFeatures};
+pub use field::{AttributeSpec, DeformationField, FieldContext, FieldPlugin, FieldWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures};
 pub use gaussians::{ExtraAttribute, Gaussians, HostGaussians};
 pub use limits::Limits;
 pub use module_field::ModuleField;

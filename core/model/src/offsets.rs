@@ -87,21 +87,6 @@ impl Offsets {
         }
         moved
     }
-    /// Offsets for more rows: `runs` of rows in order are told as `(present, rows)`, and those that are not present do not move. The rows of `self` are those
-    /// of the present runs.
-    pub fn spread(self, runs: &[(bool, usize)]) -> Self {
-        Self {
-            means: self.means.map(|t| spread(t, runs)),
-            log_scales: self.log_scales.map(|t| spread(t, runs)),
-            scales: self.scales.map(|t| spread(t, runs)),
-            quaternions: self.quaternions.map(|t| spread(t, runs)),
-            rotation_vectors: self.rotation_vectors.map(|t| spread(t, runs)),
-            unit_quaternions: self.unit_quaternions,
-            opacity_logits: self.opacity_logits.map(|t| spread(t, runs)),
-            opacity_log_factor: self.opacity_log_factor.map(|t| spread(t, runs)),
-            sh: self.sh.map(|t| spread(t, runs)),
-        }
-    }
     /// All heads side by side as one matrix [M, total width], for regularisers; `None` when every head is off.
     pub fn concatenated(&self) -> Option<Tensor<2>> {
         let mut parts: Vec<Tensor<2>> = Vec::new();
@@ -141,21 +126,6 @@ fn turned(quaternions: Tensor<2>, vectors: Tensor<2>) -> Tensor<2> {
 fn faded(logits: Tensor<1>, factor: Tensor<1>) -> Tensor<1> {
     let rest = sigmoid(logits.clone().neg()) + sigmoid(logits.clone()) * factor.clone().exp().neg().add_scalar(1.0);
     log_sigmoid(logits) + factor - rest.clamp_min(LEAST_REST).log()
-}
-
-/// Rows of zeros between the rows of `values`, see [`Offsets::spread`].
-fn spread<const D: usize>(values: Tensor<D>, runs: &[(bool, usize)]) -> Tensor<D> {
-    let mut at = 0;
-    let parts = runs.iter().map(|&(present, rows)| {
-        if present {
-            at += rows;
-            return values.clone().narrow(0, at - rows, rows);
-        }
-        let mut shape = values.dims();
-        shape[0] = rows;
-        Tensor::zeros(shape, &values.device())
-    });
-    Tensor::cat(parts.collect(), 0)
 }
 
 /// The values of the Gaussians `rows`, or of the first `count`.

@@ -11,8 +11,6 @@ use std::sync::Arc;
 pub(super) struct TemporalFunctions {
     /// Fourier bands of 1, 2, 4… cycles per sequence.
     pub(super) bands: usize,
-    /// Each band is 2^-falloff as large as the one below.
-    pub(super) falloff: f32,
     /// Cubic B-splines over the sequence; none or at least four.
     pub(super) splines: usize,
     /// The network from time to the learned functions.
@@ -36,11 +34,6 @@ impl TemporalFunctions {
         let fourier = (0..self.bands).flat_map(|band| [(band as f32).exp2(); 2]);
         [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(1.0, self.splines + self.learned())).collect()
     }
-    /// The largest sizes over the sequence of those that are not learned.
-    pub(super) fn known_maxima(&self) -> Vec<f32> {
-        let fourier = (0..self.bands).flat_map(|band| [(-self.falloff * band as f32).exp2(); 2]);
-        [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(2.0 / 3.0, self.splines)).collect()
-    }
     /// All of them at some times: φ(t) [times, functions]. `weights` are those of the network.
     pub(super) fn at(&self, times_norm: &[f32], weights: Option<Tensor<1>>, like: &Device) -> Result<Tensor<2>> {
         let rows = |of: &dyn Fn(f32) -> Vec<f32>| {
@@ -48,18 +41,18 @@ impl TemporalFunctions {
             let width = values.len() / times_norm.len().max(1);
             Tensor::<2>::from_data(TensorData::new(values, [times_norm.len(), width]), like)
         };
-        let plain = |t: f32| [1.0].into_iter().chain(self.encoded(t, self.falloff)).chain(splines_at(t, self.splines)).collect();
+        let plain = |t: f32| [1.0].into_iter().chain(encode(t, self.bands)).chain(splines_at(t, self.splines)).collect();
         let mut parts = vec![rows(&plain)];
         if let (Some(network), Some(weights)) = (&self.network, weights) {
-            // Its input falls off whatever its neighbours do: it is there for smooth functions that are none of theirs.
-            parts.extend(mlp_relu(rows(&|t| self.encoded(t, self.falloff.max(1.0))), weights, network)?);
+            parts.extend(mlp_relu(rows(&|t| self.smooth_encoding(t)), weights, network)?);
         }
         Ok(Tensor::cat(parts, 1))
     }
-    fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
+    /// t and the bands, each half as large as the one below: what the network learns is smooth first, so that it does not learn each training time by itself.
+    fn smooth_encoding(&self, time_norm: f32) -> Vec<f32> {
         let mut encoding = encode(time_norm, self.bands);
         for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
-            pair.iter_mut().for_each(|v| *v *= (-falloff * band as f32).exp2());
+            pair.iter_mut().for_each(|v| *v *= (-(band as f32)).exp2());
         }
         encoding
     }
@@ -92,14 +85,17 @@ mod tests {
     }
 
     #[test]
-    fn bands_fall_off_by_octaves() {
-        let functions = TemporalFunctions { bands: 3, falloff: 1.0, splines: 4, network: None };
+    fn the_network_sees_bands_that_fall_off_by_octaves() {
+        let functions = TemporalFunctions { bands: 3, splines: 4, network: None };
         let values = functions.at(&[0.2], None, &Device::flex()).unwrap().into_data().to_vec::<f32>().unwrap();
         assert_eq!(values.len(), functions.count());
         assert_eq!(functions.prices().len(), functions.count());
         let angle = std::f32::consts::TAU * 0.2;
-        for (got, want) in values[..8].iter().zip([1.0, 0.2, angle.sin(), angle.cos(), (2.0 * angle).sin() / 2.0, (2.0 * angle).cos() / 2.0]) {
-            assert!((got - want).abs() < 1e-6, "{values:?}");
+        let bands = [0.2, angle.sin(), angle.cos(), (2.0 * angle).sin(), (2.0 * angle).cos()];
+        let smooth = functions.smooth_encoding(0.2);
+        for (k, want) in bands.into_iter().enumerate() {
+            assert!((values[k + 1] - want).abs() < 1e-6, "{values:?}");
+            assert!((smooth[k] - want / if k > 2 { 2.0 } else { 1.0 }).abs() < 1e-6, "{smooth:?}");
         }
     }
 }

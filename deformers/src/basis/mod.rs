@@ -9,7 +9,6 @@
 //! After training, functions that a head hardly uses are left out, and so are heads: see [`simplify`].
 
 mod functions;
-mod reach;
 mod simplify;
 mod sparsity;
 
@@ -19,11 +18,11 @@ use crate::parts::time::bands_for;
 use crate::parts::voxels::{VoxelSettings, Voxels, parameter};
 use crate::parts::weights;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_backends::ops::basis::{BasisShape, combine};
+use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Reach, Result, Simplified,
-    SpatialFeatures, config, inventory,
+    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
+    config, inventory,
 };
 use functions::TemporalFunctions;
 use serde::{Deserialize, Serialize};
@@ -36,8 +35,7 @@ const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as of `
 # width = 128            # width of the coefficient network (small: 64; mid: 96)
 layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
-falloff = 1.0            # each band is 2^-falloff as large as the one below: fast motion has to be worth it; 0 treats all alike
-sparsity = 0.0           # pull of the group lasso on every function of every head (bands: times 2^band); 0 is off
+sparsity = 1e-4          # pull of a group lasso on every function of every head (Fourier bands: times their frequency); 0 is off
 splines = 0              # cubic B-splines over the sequence beside the bands; none or at least 4
 learned = 16             # functions of time learned by a small network; 0 is none
 heads = ["means", "log_scales", "quaternions"]
@@ -74,7 +72,6 @@ struct BasisSettings {
     width: Option<usize>,
     layers: usize,
     time_bands: usize,
-    falloff: f32,
     sparsity: f32,
     splines: usize,
     learned: usize,
@@ -90,8 +87,7 @@ impl Default for BasisSettings {
             width: None,
             layers: 2,
             time_bands: 0,
-            falloff: 1.0,
-            sparsity: 0.0,
+            sparsity: 1e-4,
             splines: 0,
             learned: 16,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions],
@@ -156,9 +152,6 @@ impl CdfBasis {
             return Err(Error::parameter("deformer.splines", format!("{} are too few for cubic pieces", settings.splines), "Give 0 (none) or at least 4"));
         }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
-        if !(0.0..=4.0).contains(&settings.falloff) {
-            return Err(Error::parameter("deformer.falloff", format!("{} cannot be used", settings.falloff), "Give 0 (none) to 4"));
-        }
         if !(0.0..=1.0).contains(&settings.sparsity) {
             return Err(Error::parameter("deformer.sparsity", format!("{} cannot be used", settings.sparsity), "Give 0 (off) to 1"));
         }
@@ -167,7 +160,7 @@ impl CdfBasis {
         }
         let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
         let network = (settings.learned > 0).then(|| Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(bands), width, width, settings.learned])));
-        let functions = TemporalFunctions { bands, falloff: settings.falloff, splines: settings.splines, network };
+        let functions = TemporalFunctions { bands, splines: settings.splines, network };
         let kept = settings.functions_of_heads(functions.count())?;
         let groups = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let shape = Arc::new(BasisShape { groups });
@@ -193,6 +186,11 @@ impl CdfBasis {
     /// The weights of the parameter from `place` after the decoders to the end, side by side.
     fn weights_after(&self, place: usize) -> Tensor<1> {
         Tensor::cat(self.parameters[self.voxels.levels() + place..].iter().map(|p| p.value.clone()).collect(), 0)
+    }
+    /// What one is in a head: half the diagonal of the box for centres, else 1.
+    fn scale_of(&self, head: Head) -> f64 {
+        let side = |k: usize| f64::from(self.context.box_max[k]) - f64::from(self.context.box_min[k]);
+        if head == Head::Means { 0.5 * (0..3).map(|k| side(k).powi(2)).sum::<f64>().sqrt() } else { 1.0 }
     }
     /// Every function at every time: φ(t) [times, functions].
     fn functions_at(&self, times_norm: &[f32], like: &Device) -> Result<Tensor<2>> {
@@ -224,23 +222,20 @@ impl DeformationField for CdfBasis {
             return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
         }
         let [m, _] = features.dims();
-        let combined = if m == 0 {
-            Tensor::zeros([0, self.shape.outputs()], &features.device())
+        let outputs = if m == 0 {
+            self.shape.widths().into_iter().map(|width| Tensor::zeros([0, width], &features.device())).collect()
         } else {
             let functions = self.functions_by_head(time_norm, &features.device())?;
             combine(features, functions, &self.shape)?
         };
-        let mut at = 0;
-        let outputs = self.shape.groups.iter().map(|&(width, _)| {
-            at += width;
-            combined.clone().narrow(1, at - width, width)
-        });
-        let outputs = outputs.collect();
         let mut offsets = heads::offsets(&self.settings.heads, outputs, self.context.sh_degree);
         if self.settings.rotation == Rotation::Exponential {
             offsets.rotation_vectors = offsets.quaternions.take();
         }
         Ok(offsets)
+    }
+    fn packed(&self, features: Tensor<2>) -> Tensor<2> {
+        by_columns(features)
     }
     fn parameters(&self) -> Vec<&Parameter> {
         self.parameters.iter().collect()
@@ -253,9 +248,6 @@ impl DeformationField for CdfBasis {
     }
     fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(if self.settings.sparsity > 0.0 { sparsity::group_lasso(self, self.settings.sparsity) } else { None })
-    }
-    fn reach(&self, features: Tensor<2>) -> Result<Option<Reach>> {
-        reach::reach(self, features).map(Some)
     }
     fn simplified(&self, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
         simplify::simplified(self, features, times)
@@ -270,7 +262,7 @@ inventory::submit! {
     FieldPlugin {
         info: Plugin {
             name: "cdf-basis",
-            version: "1",
+            version: "2",
             summary: "computational field, linear in shared functions of time: a dot product per frame",
             paper: "CC-4DGS, Section IV-B (spatial half); DynMF, Gaussian-Flow (shared temporal functions)",
             schema: SCHEMA,

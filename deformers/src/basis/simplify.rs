@@ -10,7 +10,7 @@ use burn::tensor::Tensor;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DeformationField, Error, Parameter, Part, Result, Simplified};
 
-/// Offsets of a head below this root-mean-square are those of a head that does nothing: shares of the box's diagonal for centres, else plain numbers.
+/// Offsets of a head below this root-mean-square are those of a head that does nothing: shares of the box's half diagonal for centres, else plain numbers.
 fn negligible(head: Head) -> f64 {
     match head {
         Head::Means => 1e-6,
@@ -41,7 +41,6 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
     let flat: Vec<f32> = functions.concat();
     let of_functions = mean_squares(&flat, count);
 
-    let diagonal = (0..3).map(|k| f64::from(field.context.box_max[k] - field.context.box_min[k]).powi(2)).sum::<f64>().sqrt();
     let (mut plans, mut lines) = (Vec::new(), Vec::new());
     let (mut column, mut first) = (0, 0);
     for (&head, &(width, own)) in field.settings.heads.iter().zip(&field.shape.groups) {
@@ -49,7 +48,7 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
         let part = |f: usize| (0..width).map(|o| strength[column + o * own + f]).sum::<f64>() / width as f64 * of_functions[first + f];
         let parts: Vec<f64> = (0..own).map(part).collect();
         let whole = combined_square(&values, columns, column, width, own, &functions, first);
-        let scale = if head == Head::Means { diagonal } else { 1.0 };
+        let scale = field.scale_of(head);
         let kept = if whole.sqrt() < negligible(head) * scale { Vec::new() } else { keep(&parts, whole * field.settings.unused.powi(2)) };
         if kept.is_empty() {
             lines.push(format!("{} does nothing and is left out", head.name()));

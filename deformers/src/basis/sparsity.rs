@@ -10,13 +10,20 @@ use burn::tensor::{Tensor, TensorData};
 /// Added to squared norms, so that a group of zeros has a derivative.
 const LEAST_SQUARED_NORM: f32 = 1e-12;
 
-/// The sum over heads and functions of price times norm, times `weight`.
+/// Half diagonals are not taken for shorter than this, world units.
+const LEAST_SCALE: f32 = 1e-6;
+
+/// The sum over heads and functions of price times norm, times `weight`. Norms of centres count in half diagonals of the box, so that a scene's unit does not
+/// matter.
 pub(super) fn group_lasso(field: &CdfBasis, weight: f32) -> Option<Tensor<1>> {
     let prices = field.functions.prices();
     let width = field.coefficients.trunk.last().copied()?;
     let first = field.parameters.len() - field.settings.heads.len();
     let mut total: Option<Tensor<1>> = None;
-    for ((parameter, &(outputs, own)), kept) in field.parameters[first..].iter().zip(&field.shape.groups).zip(&field.kept) {
+    let heads = field.settings.heads.iter().zip(&field.shape.groups).zip(&field.kept);
+    for (parameter, ((&head, &(outputs, own)), kept)) in field.parameters[first..].iter().zip(heads) {
+        // A box without extent has nothing to move in; its price stays finite.
+        let weight = weight / (field.scale_of(head) as f32).max(LEAST_SCALE);
         let last = parameter.value.clone().narrow(0, width * (width + 1), (width + 1) * outputs * own).reshape([(width + 1) * outputs, own]);
         let norms = (last.clone() * last).sum_dim(0).add_scalar(LEAST_SQUARED_NORM).sqrt().flatten(0, 1);
         let price: Vec<f32> = kept.iter().map(|&f| weight * prices[f]).collect();

@@ -116,7 +116,7 @@ pub fn measure(
         write_png(path, &comparison_sheet(&comparisons, &SheetOptions { title, ..Default::default() })?)?;
     }
     for (counter, done, skipped) in [
-        ("Gaussians deformed", report.work.deformed, report.work.static_skipped + report.work.unseen_skipped),
+        ("Gaussians deformed", report.work.deformed, report.work.static_skipped),
         ("spatial passes of the field", report.work.frames - report.work.spatial_cached, report.work.spatial_cached),
         ("vertices decoded", report.work.spatial.vertices_decoded, report.work.spatial.vertices_queried - report.work.spatial.vertices_decoded),
     ] {

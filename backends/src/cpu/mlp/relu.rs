@@ -6,6 +6,7 @@
 
 use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, transposed};
 use super::{blocks_per_run, sum_in_order};
+use crate::cpu::heads::row_blocks;
 use crate::cpu::scratch::{Scratch, scratch};
 use pulp::Arch;
 use rayon::prelude::*;
@@ -129,17 +130,7 @@ pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
     if out.is_empty() {
         return out;
     }
-    // Per block, its part of every output.
-    let mut parts: Vec<Vec<&mut [f32]>> = (0..count.div_ceil(BLOCK)).map(|_| Vec::with_capacity(widths.len())).collect();
-    let mut rest = out.as_mut_slice();
-    for &width in &widths {
-        let (head, tail) = rest.split_at_mut(count * width);
-        rest = tail;
-        for (part, rows) in parts.iter_mut().zip(head.chunks_mut(BLOCK * width)) {
-            part.push(rows);
-        }
-    }
-    parts.into_par_iter().zip(x.par_chunks(BLOCK * shape.input)).for_each(|(mut outs, x)| {
+    row_blocks(&mut out, &widths, count, BLOCK).into_par_iter().zip(x.par_chunks(BLOCK * shape.input)).for_each(|(mut outs, x)| {
         let count = x.len() / shape.input;
         let mut outputs: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
         block_forward(&layers, weights, x, count, &mut outputs);

@@ -1,4 +1,4 @@
-//! Morton (Z-curve) order of points. The order of Gaussians carries no meaning, so codecs and players are free to put neighbours next to each other.
+//! Morton (Z-curve) order of points. The order of Gaussians carries no meaning, so codecs are free to put neighbours next to each other.
 
 use rayon::prelude::*;
 

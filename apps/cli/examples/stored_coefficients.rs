@@ -1,0 +1,92 @@
+//! Would storing the coefficients of `cdf-basis` per Gaussian be smaller than storing the networks that compute them?
+//!
+//! Coefficients are rounded to steps proportional to their head's, and every column is charged its entropy: of its values, or of the differences between
+//! neighbours along the Morton curve, whichever is less. The picture is scored with the rounded ones.
+//!
+//! `cargo run --release --example stored_coefficients -- MODEL SCENE [VIEWS]`
+
+#![allow(clippy::print_stdout)] // its output is what it is for
+
+use cc4dgs::core::burn::tensor::{Tensor, TensorData};
+use cc4dgs::core::gaussians::to_vec;
+use cc4dgs::core::{DeformationField, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, Split, config, parse_device};
+use cc4dgs::engine::{data, eval::evaluate, model::Model};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+
+/// A field whose spatial features were rounded.
+struct Rounded {
+    inner: Box<dyn DeformationField>,
+    /// Steps as a share of the root-mean-square of all features.
+    step: f32,
+    /// Bits of all features.
+    bits: Arc<Mutex<f64>>,
+}
+
+impl DeformationField for Rounded {
+    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+        let (device, [m, _]) = (means_world.device(), means_world.dims());
+        let order = cc4dgs::codecs::morton::order(&to_vec(means_world.clone(), "means")?);
+        let spatial = self.inner.spatial(means_world)?;
+        let mut values = to_vec(spatial.values, "features")?;
+        let columns = values.len() / m.max(1);
+        let rms = (values.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / values.len().max(1) as f64).sqrt();
+        let step = self.step * rms as f32;
+        let mut bits = 0.0;
+        for c in 0..columns {
+            let column: Vec<i64> = order.iter().map(|&row| (values[row * columns + c] / step).round() as i64).collect();
+            let differences = column.iter().scan(0, |last, &v| Some(v - std::mem::replace(last, v))).collect::<Vec<_>>();
+            bits += entropy(&column).min(entropy(&differences));
+        }
+        values.iter_mut().for_each(|v| *v = (*v / step).round() * step);
+        *self.bits.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = bits;
+        Ok(SpatialFeatures { values: Tensor::from_data(TensorData::new(values, [m, columns]), &device), work: spatial.work })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        self.inner.deform(features, time_norm)
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.inner.parameters()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.inner.parameters_mut()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        self.inner.groups()
+    }
+}
+
+/// Bits of `values` by the frequencies of their symbols.
+fn entropy(values: &[i64]) -> f64 {
+    let mut counts: HashMap<i64, u64> = HashMap::new();
+    values.iter().for_each(|v| *counts.entry(*v).or_default() += 1);
+    let n = values.len() as f64;
+    counts.values().map(|&c| -(c as f64) * (c as f64 / n).log2()).sum()
+}
+
+fn main() -> Result<()> {
+    let mut args = std::env::args().skip(1);
+    let (model, scene) = (args.next().unwrap_or_default(), args.next().unwrap_or_default());
+    let views = args.next().and_then(|v| v.parse().ok()).unwrap_or(20);
+    let (registry, limits, device) = (Registry::collect()?, Limits::default(), parse_device("flex")?);
+    let load = || Model::load(model.as_ref(), &registry, &device, &limits, &Silent);
+    let plain = load()?;
+    let section = plain.provenance.config.get("scene").and_then(|s| s.as_table()).cloned().unwrap_or_default();
+    let options: data::SceneOptions = config::parse_section("scene", &section)?;
+    let scene = data::open(scene.as_ref(), &options, &limits)?;
+    let score = |model: &Model| evaluate(model, &scene, Split::Test, views, &registry, &device, &Silent, &mut |_, _, _, _| Ok(()));
+    let before = score(&plain)?;
+    println!("{} moving Gaussians, field {} bytes as float32, {:.3} dB", before.dynamic_gaussians, plain.size.deform, before.psnr_db);
+    for step in [0.02, 0.05, 0.1, 0.2, 0.5, 1.0] {
+        let mut model = load()?;
+        let bits = Arc::new(Mutex::new(0.0));
+        if let Some(own) = model.field.take() {
+            let field = Box::new(Rounded { inner: own.field, step, bits: bits.clone() });
+            model.field = Some(cc4dgs::engine::model::ModelField { field, ..own });
+        }
+        let report = score(&model)?;
+        let bytes = *bits.lock().unwrap_or_else(std::sync::PoisonError::into_inner) / 8.0;
+        println!("step {step}: {:.3} dB, {bytes:.0} bytes, {:.1} per Gaussian", report.psnr_db, bytes / report.dynamic_gaussians.max(1) as f64);
+    }
+    Ok(())
+}
