@@ -143,6 +143,46 @@ fn what_a_scene_does_not_use_is_left_out() {
     }
 }
 
+/// The pull on functions against its definition: prices times norms, and its slope, on every device.
+#[test]
+fn the_lasso_pulls_every_function_by_its_price() {
+    let context = FieldContext { box_min: [-1.0, -2.0, 0.0], box_max: [1.0, 2.0, 4.0], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
+    let text = "levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 2\ntime_bands = 3\nsparsity = 0.01\nheads = [\"means\", \"quaternions\"]";
+    let section = config::parse_table("test", text).unwrap();
+    let registry = Registry::collect().unwrap();
+    let prices = [1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 4.0, 4.0, 1.0, 1.0];
+    for (name, device) in devices() {
+        let device = device.autodiff();
+        let mut field = (registry.deformer("cdf-basis").unwrap().build)(&section, &context, &device).unwrap();
+        for (k, parameter) in field.parameters_mut().into_iter().enumerate() {
+            let len = parameter.value.dims()[0];
+            parameter.value = Tensor::from_data(TensorData::new(noise(70 + k as u64, len), [len]), &device).require_grad();
+        }
+        let centres = Tensor::<2>::zeros([1, 3], &device);
+        let term = field.regularizer(centres, 0.5, 0.5).unwrap().expect("a term");
+        let gradients = term.clone().backward();
+        let mut wanted = 0.0;
+        for (head, outputs, unit) in [("net.head.means", 3, 3.0), ("net.head.quaternions", 4, 1.0)] {
+            let parameter = field.parameters().into_iter().find(|p| p.name == head).unwrap();
+            let (values, gradient) = (to_vec(parameter.value.clone(), "w").unwrap(), to_vec(parameter.value.grad(&gradients).unwrap(), "g").unwrap());
+            let first = 6 * 7;
+            assert!(gradient[..first].iter().all(|g| *g == 0.0), "{name}: {head}: hidden layers are not pulled");
+            for (f, price) in prices.iter().enumerate() {
+                let group = |values: &[f32]| -> Vec<f64> {
+                    values[first..].chunks_exact(outputs * prices.len()).flat_map(|row| (0..outputs).map(|o| f64::from(row[o * prices.len() + f]))).collect()
+                };
+                let (weights, slopes) = (group(&values), group(&gradient));
+                let norm = weights.iter().map(|w| w * w).sum::<f64>().sqrt();
+                wanted += 0.01 / unit * price * norm;
+                for (w, slope) in weights.iter().zip(slopes) {
+                    assert!((slope - 0.01 / unit * price * w / norm).abs() < 1e-7, "{name}: {head} function {f}");
+                }
+            }
+        }
+        assert!((f64::from(to_vec(term, "term").unwrap()[0]) - wanted).abs() < 1e-5 * wanted, "{name}");
+    }
+}
+
 #[test]
 fn rotation_vectors_turn_what_is_there() {
     for (name, device) in devices() {

@@ -9,6 +9,8 @@ use burn::tensor::{Device, Tensor, TensorData};
 const SLOPE_TOLERANCE: f64 = 0.05;
 /// Step along the gradient's direction: short enough to cross few kinks of ReLU, long enough to stand out from rounding.
 const STEP: f64 = 5e-4;
+/// Largest difference of offsets from packed features, as a share of the largest offset: sums may run in another order.
+const PACKED_TOLERANCE: f32 = 1e-5;
 /// Size of the random changes that wake heads which start at zero.
 const SHAKE: f32 = 0.1;
 /// Centres of the suite.
@@ -16,18 +18,19 @@ const CENTRES: usize = 48;
 
 /// Holds a deformation field to its promises on `device`: unknown settings are refused; equal seeds give equal weights; offsets have their shapes, are
 /// finite and repeat bit for bit; a field that declares `starts-as-identity` moves nothing at first; a static one never does; gradients of all weights
-/// agree with finite differences; weights survive being copied to a fresh field, bit for bit; empty, single and non-finite centres are answered.
+/// agree with finite differences; packed features give the same offsets; weights survive being copied to a fresh field, bit for bit; empty, single and non-finite centres are answered.
 ///
 /// `settings` is the `[deformer]` section without `kind`; small sizes make the suite quick.
 pub fn deformer<'a>(plugin: &'a FieldPlugin, settings: &'a toml::Table, device: &'a Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
-    let checks: [(&str, Check<'a>); 7] = [
+    let checks: [(&str, Check<'a>); 8] = [
         ("settings", Suite::refuses_unknown_settings),
         ("seeds", Suite::equal_seeds_equal_weights),
         ("start", Suite::starts_as_declared),
         ("shapes", Suite::offsets_are_sound),
         ("gradients", Suite::gradients_are_slopes),
         ("weights", Suite::weights_carry_everything),
+        ("packed", Suite::packing_changes_nothing),
         ("odd inputs", Suite::odd_inputs_are_answered),
     ];
     checks
@@ -180,6 +183,19 @@ impl Suite<'_> {
             }
         }
         Ok(None)
+    }
+    fn packing_changes_nothing(&self) -> Result<Option<String>> {
+        let field = self.shaken(self.device)?;
+        let features = field.spatial(self.centres(CENTRES, self.device))?.values;
+        let packed = field.packed(features.clone());
+        if packed.dims() != features.dims() {
+            return Ok(Some(format!("packed features have shape {:?} in place of {:?}", packed.dims(), features.dims())));
+        }
+        let read = |features| field.deform(features, 0.37)?.concatenated().map_or(Ok(Vec::new()), |t| to_vec(t, "offsets"));
+        let (plain, packed) = (read(features)?, read(packed)?);
+        let size = plain.iter().fold(0.0f32, |most, v| most.max(v.abs()));
+        let worst = plain.iter().zip(&packed).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        Ok((worst > PACKED_TOLERANCE * size).then(|| format!("packed features change offsets of up to {size} by {worst}")))
     }
     fn weights_carry_everything(&self) -> Result<Option<String>> {
         let (field, mut copy) = (self.shaken(self.device)?, self.field(self.device)?);
