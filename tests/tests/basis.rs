@@ -147,7 +147,7 @@ fn what_a_scene_does_not_use_is_left_out() {
 #[test]
 fn the_lasso_pulls_every_function_by_its_price() {
     let context = FieldContext { box_min: [-1.0, -2.0, 0.0], box_max: [1.0, 2.0, 4.0], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
-    let text = "levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 2\ntime_bands = 3\nsparsity = 0.01\nheads = [\"means\", \"quaternions\"]";
+    let text = "levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 2\ntime_bands = 3\nsparsity = 0.01\nfalloff = 0.0\nheads = [\"means\", \"quaternions\"]";
     let section = config::parse_table("test", text).unwrap();
     let registry = Registry::collect().unwrap();
     let prices = [1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 4.0, 4.0, 1.0, 1.0];

@@ -3,8 +3,8 @@
 //! Outputs lie head after head, each [M, outputs].
 
 use super::heads::row_blocks;
+use crate::cpu::simd::vectorized;
 use crate::ops::basis::BasisShape;
-use pulp::Arch;
 use rayon::prelude::*;
 
 /// Rows per task.
@@ -46,10 +46,9 @@ fn heads(shape: &BasisShape) -> Vec<Head> {
 pub fn combine(shape: &BasisShape, rows: usize, coefficients: &Coefficients, functions: &[f32]) -> Vec<f32> {
     let (heads, widths) = (heads(shape), shape.widths());
     let mut out = vec![0.0f32; rows * shape.outputs()];
-    let arch = Arch::new();
     row_blocks(&mut out, &widths, rows, ROWS).into_par_iter().enumerate().for_each(|(block, mut out)| {
         let first = block * ROWS;
-        arch.dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for head in &heads {
@@ -118,9 +117,8 @@ pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32])
     let (heads, columns) = (heads(shape), shape.coefficients());
     let rows = grad.len() / shape.outputs();
     let mut out = vec![0.0f32; rows * columns];
-    let arch = Arch::new();
     out.par_chunks_mut(ROWS * columns).enumerate().for_each(|(block, out)| {
-        arch.dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 let mut at = 0;
@@ -144,13 +142,12 @@ pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32])
 pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32]) -> Vec<f32> {
     let (heads, columns) = (heads(shape), shape.coefficients());
     let rows = grad.len() / shape.outputs();
-    let arch = Arch::new();
     let tasks: Vec<Vec<f32>> = coefficients
         .par_chunks(ROWS * columns)
         .enumerate()
         .map(|(block, coefficients)| {
             let mut sums = vec![0.0f32; shape.functions()];
-            arch.dispatch(
+            vectorized(
                 #[inline(always)]
                 || {
                     let mut at = 0;

@@ -1,7 +1,7 @@
 //! Interpolated lookups in grids of stored features: dense, or hashed where a level has more vertices than rows (Müller et al. 2022).
 
+use crate::cpu::simd::vectorized;
 use crate::ops::lookup::{GridLevel, GridShape, Outside, PRIMES};
-use pulp::Arch;
 use rayon::prelude::*;
 
 /// Points per task.
@@ -111,9 +111,8 @@ pub fn forward(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f32> {
     if out.is_empty() {
         return out;
     }
-    let arch = Arch::new();
     out.par_chunks_mut(ROWS * width).zip(points.par_chunks(ROWS * dims)).for_each(|(out, points)| {
-        arch.dispatch(
+        vectorized(
             #[inline(always)]
             || with_dims!(dims, D => gather::<D>(shape, table, points, width, out)),
         );
@@ -150,11 +149,10 @@ pub fn backward(shape: &GridShape, points: &[f32], grad: &[f32]) -> Vec<f32> {
         tasks.push((l, level, own));
         rest = later;
     }
-    let arch = Arch::new();
     let parts = f.div_ceil(FEATURES);
     if tasks.len() >= rayon::current_num_threads() || parts == 1 {
         tasks.into_par_iter().for_each(|(l, level, own)| {
-            arch.dispatch(
+            vectorized(
                 #[inline(always)]
                 || with_dims!(shape.dims, D => scatter::<D>(shape, l, level, points, grad, width, 0..f, own, f)),
             );
@@ -168,7 +166,7 @@ pub fn backward(shape: &GridShape, points: &[f32], grad: &[f32]) -> Vec<f32> {
                     let range = p * FEATURES..((p + 1) * FEATURES).min(f);
                     let mut column = vec![0.0f32; level.rows * range.len()];
                     let stride = range.len();
-                    arch.dispatch(
+                    vectorized(
                         #[inline(always)]
                         || with_dims!(shape.dims, D => scatter::<D>(shape, l, level, points, grad, width, range.clone(), &mut column, stride)),
                     );

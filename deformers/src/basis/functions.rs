@@ -6,11 +6,16 @@ use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::Result;
 use std::sync::Arc;
 
+/// Falloff of the bands that the network sees: what it learns is smooth first, so that it does not learn each training time by itself.
+const NETWORK_FALLOFF: f32 = 1.0;
+
 /// Which functions there are, in this order: the constant, t, a sine and a cosine per band, the splines, what is learned.
 #[derive(Clone, Debug)]
 pub(super) struct TemporalFunctions {
     /// Fourier bands of 1, 2, 4… cycles per sequence.
     pub(super) bands: usize,
+    /// Each band is 2^-falloff as large as the one below.
+    pub(super) falloff: f32,
     /// Cubic B-splines over the sequence; none or at least four.
     pub(super) splines: usize,
     /// The network from time to the learned functions.
@@ -29,9 +34,9 @@ impl TemporalFunctions {
     pub(super) fn count(&self) -> usize {
         1 + Self::encoding(self.bands) + self.splines + self.learned()
     }
-    /// What a function costs in [`super::sparsity`]: 1, but 2^l for the l-th band.
+    /// What a function costs in [`super::sparsity`]: 1, but the l-th band 2^l times its size, as motion through it is fast.
     pub(super) fn prices(&self) -> Vec<f32> {
-        let fourier = (0..self.bands).flat_map(|band| [(band as f32).exp2(); 2]);
+        let fourier = (0..self.bands).flat_map(|band| [(band as f32 * (1.0 - self.falloff)).exp2(); 2]);
         [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(1.0, self.splines + self.learned())).collect()
     }
     /// All of them at some times: φ(t) [times, functions]. `weights` are those of the network.
@@ -41,18 +46,18 @@ impl TemporalFunctions {
             let width = values.len() / times_norm.len().max(1);
             Tensor::<2>::from_data(TensorData::new(values, [times_norm.len(), width]), like)
         };
-        let plain = |t: f32| [1.0].into_iter().chain(encode(t, self.bands)).chain(splines_at(t, self.splines)).collect();
+        let plain = |t: f32| [1.0].into_iter().chain(self.encoded(t, self.falloff)).chain(splines_at(t, self.splines)).collect();
         let mut parts = vec![rows(&plain)];
         if let (Some(network), Some(weights)) = (&self.network, weights) {
-            parts.extend(mlp_relu(rows(&|t| self.smooth_encoding(t)), weights, network)?);
+            parts.extend(mlp_relu(rows(&|t| self.encoded(t, NETWORK_FALLOFF)), weights, network)?);
         }
         Ok(Tensor::cat(parts, 1))
     }
-    /// t and the bands, each half as large as the one below: what the network learns is smooth first, so that it does not learn each training time by itself.
-    fn smooth_encoding(&self, time_norm: f32) -> Vec<f32> {
+    /// t and the bands, each 2^-falloff as large as the one below.
+    fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
         let mut encoding = encode(time_norm, self.bands);
         for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
-            pair.iter_mut().for_each(|v| *v *= (-(band as f32)).exp2());
+            pair.iter_mut().for_each(|v| *v *= (-falloff * band as f32).exp2());
         }
         encoding
     }
@@ -85,17 +90,18 @@ mod tests {
     }
 
     #[test]
-    fn the_network_sees_bands_that_fall_off_by_octaves() {
-        let functions = TemporalFunctions { bands: 3, splines: 4, network: None };
+    fn bands_fall_off_by_octaves() {
+        let functions = TemporalFunctions { bands: 3, falloff: 0.5, splines: 4, network: None };
         let values = functions.at(&[0.2], None, &Device::flex()).unwrap().into_data().to_vec::<f32>().unwrap();
         assert_eq!(values.len(), functions.count());
         assert_eq!(functions.prices().len(), functions.count());
         let angle = std::f32::consts::TAU * 0.2;
         let bands = [0.2, angle.sin(), angle.cos(), (2.0 * angle).sin(), (2.0 * angle).cos()];
-        let smooth = functions.smooth_encoding(0.2);
+        let smooth = functions.encoded(0.2, NETWORK_FALLOFF);
         for (k, want) in bands.into_iter().enumerate() {
-            assert!((values[k + 1] - want).abs() < 1e-6, "{values:?}");
-            assert!((smooth[k] - want / if k > 2 { 2.0 } else { 1.0 }).abs() < 1e-6, "{smooth:?}");
+            let octave = if k > 2 { 2.0f32 } else { 1.0 };
+            assert!((values[k + 1] - want / octave.sqrt()).abs() < 1e-6, "{values:?}");
+            assert!((smooth[k] - want / octave).abs() < 1e-6, "{smooth:?}");
         }
     }
 }

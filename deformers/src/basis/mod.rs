@@ -35,7 +35,8 @@ const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as of `
 # width = 128            # width of the coefficient network (small: 64; mid: 96)
 layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
-sparsity = 1e-4          # pull of a group lasso on every function of every head (Fourier bands: times their frequency); 0 is off
+falloff = 1.0            # each band is 2^-falloff as large as the one below: fast motion is learned later; 0 treats all alike
+sparsity = 1e-4          # pull of a group lasso on every function of every head (Fourier bands: times their speed); 0 is off
 splines = 0              # cubic B-splines over the sequence beside the bands; none or at least 4
 learned = 16             # functions of time learned by a small network; 0 is none
 heads = ["means", "log_scales", "quaternions"]
@@ -72,6 +73,7 @@ struct BasisSettings {
     width: Option<usize>,
     layers: usize,
     time_bands: usize,
+    falloff: f32,
     sparsity: f32,
     splines: usize,
     learned: usize,
@@ -87,6 +89,7 @@ impl Default for BasisSettings {
             width: None,
             layers: 2,
             time_bands: 0,
+            falloff: 1.0,
             sparsity: 1e-4,
             splines: 0,
             learned: 16,
@@ -152,6 +155,9 @@ impl CdfBasis {
             return Err(Error::parameter("deformer.splines", format!("{} are too few for cubic pieces", settings.splines), "Give 0 (none) or at least 4"));
         }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
+        if !(0.0..=4.0).contains(&settings.falloff) {
+            return Err(Error::parameter("deformer.falloff", format!("{} cannot be used", settings.falloff), "Give 0 (none) to 4"));
+        }
         if !(0.0..=1.0).contains(&settings.sparsity) {
             return Err(Error::parameter("deformer.sparsity", format!("{} cannot be used", settings.sparsity), "Give 0 (off) to 1"));
         }
@@ -160,7 +166,7 @@ impl CdfBasis {
         }
         let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
         let network = (settings.learned > 0).then(|| Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(bands), width, width, settings.learned])));
-        let functions = TemporalFunctions { bands, splines: settings.splines, network };
+        let functions = TemporalFunctions { bands, falloff: settings.falloff, splines: settings.splines, network };
         let kept = settings.functions_of_heads(functions.count())?;
         let groups = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let shape = Arc::new(BasisShape { groups });

@@ -80,10 +80,11 @@ pub fn normalize_rows(z: &mut [f32], n: usize, inverse_std: &mut [f32], work: &m
             *v -= mean;
             *w = *v * *v;
         }
-        *inverse = 1.0 / (row_sum(work) / n as f32 + LAYER_NORM_EPSILON).sqrt();
+        let scale = 1.0 / (row_sum(work) / n as f32 + LAYER_NORM_EPSILON).sqrt();
         for v in row.iter_mut() {
-            *v *= *inverse;
+            *v *= scale;
         }
+        *inverse = scale;
     }
 }
 
@@ -93,8 +94,8 @@ pub fn affine_mish_rows(out: &mut [f32], normalized: &[f32], gain: &[f32], shift
     let n = gain.len();
     let shift = &shift[..n];
     for (out, x) in out.chunks_exact_mut(n).zip(normalized.chunks_exact(n)) {
-        for i in 0..n {
-            out[i] = mish(x[i] * gain[i] + shift[i]);
+        for (((out, x), gain), shift) in out.iter_mut().zip(x).zip(gain).zip(shift) {
+            *out = mish(x * gain + shift);
         }
     }
 }
@@ -112,8 +113,8 @@ pub fn affine_mish_backward(
 ) {
     let n = gain.len();
     for (g, x) in grad.chunks_exact_mut(n).zip(normalized.chunks_exact(n)) {
-        for i in 0..n {
-            g[i] *= mish_derivative(x[i] * gain[i] + shift[i]);
+        for (((g, x), gain), shift) in g.iter_mut().zip(x).zip(gain).zip(shift) {
+            *g *= mish_derivative(x * gain + shift);
         }
     }
     layer_norm_backward(grad, normalized, inverse_std, gain, (grad_gain, grad_shift), work);
@@ -132,17 +133,20 @@ pub fn layer_norm_backward(
     let n = gain.len();
     let (grad_gain, grad_shift) = (&mut grad_gain[..n], &mut grad_shift[..n]);
     let work = &mut work[..n];
-    for ((g, x), inverse) in grad.chunks_exact_mut(n).zip(normalized.chunks_exact(n)).zip(inverse_std) {
-        for i in 0..n {
-            grad_gain[i] += g[i] * x[i];
-            grad_shift[i] += g[i];
-            g[i] *= gain[i];
-            work[i] = g[i] * x[i];
+    // Scales are copied and arrays walked together: what might be written through another name, or be out of bounds, is not vectorised.
+    for ((g, x), &inverse) in grad.chunks_exact_mut(n).zip(normalized.chunks_exact(n)).zip(inverse_std) {
+        for (((g, x), grad_gain), grad_shift) in g.iter().zip(x).zip(grad_gain.iter_mut()).zip(grad_shift.iter_mut()) {
+            *grad_gain += g * x;
+            *grad_shift += g;
+        }
+        for (((g, x), gain), work) in g.iter_mut().zip(x).zip(gain).zip(work.iter_mut()) {
+            *g *= gain;
+            *work = *g * x;
         }
         let mean = row_sum(g) / n as f32;
         let projection = row_sum(work) / n as f32;
-        for i in 0..n {
-            g[i] = *inverse * (g[i] - mean - x[i] * projection);
+        for (g, x) in g.iter_mut().zip(x) {
+            *g = inverse * (*g - mean - x * projection);
         }
     }
 }

@@ -8,7 +8,7 @@ use super::activation::{affine_mish_backward, affine_mish_rows, normalize_rows};
 use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, transposed};
 use super::{blocks_per_run, sum_in_order};
 use crate::cpu::scratch::{Scratch, scratch};
-use pulp::Arch;
+use crate::cpu::simd::vectorized;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -95,7 +95,6 @@ impl Block {
         let width = layers[0].input;
         rows(first, &mut self.input[..count * width]);
         self.input[count * width..].fill(0.0);
-        let arch = Arch::new();
         let mut input: &[f32] = &self.input;
         let mut hidden = self.hidden.iter_mut();
         for layer in layers {
@@ -105,7 +104,7 @@ impl Block {
                 (Some(gain), Some(shift), Some((normalized, inverse_std, activated))) => {
                     fill_rows(normalized, b);
                     matmul(normalized, input, w, size, true);
-                    arch.dispatch(
+                    vectorized(
                         #[inline(always)]
                         || {
                             normalize_rows(normalized, layer.output, inverse_std, &mut self.work);
@@ -176,7 +175,6 @@ pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSour
 
 /// `g[0]` holds the gradient of the block's output and ends as that of its input (if wanted); `total` is added to.
 fn block_backward(layers: &[MishLayer], weights: &[f32], back: &[Vec<f32>], block: &mut Block, g: &mut [Scratch; 2], total: &mut [f32], wants_input: bool) {
-    let arch = Arch::new();
     for (i, layer) in layers.iter().enumerate().rev() {
         let len = BLOCK * layer.output;
         if let (Some(gain), Some(shift)) = (&layer.gain, &layer.shift) {
@@ -184,14 +182,14 @@ fn block_backward(layers: &[MishLayer], weights: &[f32], back: &[Vec<f32>], bloc
             let affine = (&weights[gain.clone()], &weights[shift.clone()]);
             // Gain and shift are neighbours in the flat array.
             let (grad_gain, grad_shift) = total[gain.start..shift.end].split_at_mut(layer.output);
-            arch.dispatch(
+            vectorized(
                 #[inline(always)]
                 || affine_mish_backward(&mut g[0][..len], normalized, inverse_std, affine, (grad_gain, grad_shift), &mut block.work),
             );
         }
         let input: &[f32] = if i == 0 { &block.input } else { &block.hidden[i - 1].2 };
         add_transposed_matmul(&mut total[layer.weight.clone()], input, &g[0], (BLOCK, layer.input, layer.output));
-        arch.dispatch(
+        vectorized(
             #[inline(always)]
             || add_column_sums(&mut total[layer.bias.clone()], &g[0][..len]),
         );

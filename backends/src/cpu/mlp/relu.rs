@@ -8,7 +8,7 @@ use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, t
 use super::{blocks_per_run, sum_in_order};
 use crate::cpu::heads::row_blocks;
 use crate::cpu::scratch::{Scratch, scratch};
-use pulp::Arch;
+use crate::cpu::simd::vectorized;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -105,7 +105,6 @@ fn relu_backward(grad: &mut [f32], output: &[f32]) {
 
 /// The outputs of all layers for one block of `x` [count, input].
 fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, outputs: &mut [Scratch]) {
-    let arch = Arch::new();
     for (i, layer) in layers.iter().enumerate() {
         let (before, rest) = outputs.split_at_mut(i);
         let out = &mut rest[0][..count * layer.output];
@@ -113,7 +112,7 @@ fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, out
         fill_rows(out, &weights[layer.bias.clone()]);
         matmul(out, input, &weights[layer.weight.clone()], (count, layer.input, layer.output), true);
         if layer.relu {
-            arch.dispatch(
+            vectorized(
                 #[inline(always)]
                 || relu(out),
             );
@@ -198,19 +197,18 @@ fn block_backward(
     total: &mut [f32],
     grad_x: &mut [f32],
 ) {
-    let arch = Arch::new();
     for (i, layer) in layers.iter().enumerate().rev() {
         let (before, rest) = grads.split_at_mut(i);
         let own = &mut rest[0][..rows * layer.output];
         if layer.relu {
-            arch.dispatch(
+            vectorized(
                 #[inline(always)]
                 || relu_backward(own, &outputs[i]),
             );
         }
         let input: &[f32] = layer.parent.map_or(x, |p| &outputs[p]);
         add_transposed_matmul(&mut total[layer.weight.clone()], input, own, (rows, layer.input, layer.output));
-        arch.dispatch(
+        vectorized(
             #[inline(always)]
             || add_column_sums(&mut total[layer.bias.clone()], own),
         );

@@ -2,8 +2,8 @@
 //!
 //! The constants come from a seed by SplitMix64 and are never stored.
 
+use crate::cpu::simd::vectorized;
 use cc4dgs_core::Seed;
-use pulp::Arch;
 
 /// The Mersenne prime 2^31 - 1.
 pub const P: u64 = (1 << 31) - 1;
@@ -66,7 +66,7 @@ impl LevelHash {
     }
     /// The signatures [n, k] of `vertices` [n]; entries of a vertex must be below 2^31.
     pub fn signatures(&self, vertices: &[[u32; 3]], out: &mut [f32]) {
-        Arch::new().dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for (vertex, row) in vertices.iter().zip(out.chunks_exact_mut(self.len().max(1))) {

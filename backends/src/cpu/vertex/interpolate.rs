@@ -1,6 +1,6 @@
 //! Trilinear interpolation of vertex features, and its adjoint as a gather in a fixed order.
 
-use pulp::Arch;
+use crate::cpu::simd::vectorized;
 use rayon::prelude::*;
 
 /// Points or vertices per task.
@@ -12,10 +12,9 @@ pub fn forward(features: &[f32], f: usize, corners: &[u32], weights: &[f32]) -> 
     if out.is_empty() {
         return out;
     }
-    let arch = Arch::new();
     let chunks = out.par_chunks_mut(ROWS * f).zip(corners.par_chunks(8 * ROWS)).zip(weights.par_chunks(8 * ROWS));
     chunks.for_each(|((out, corners), weights)| {
-        arch.dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for ((row, corners), weights) in out.chunks_exact_mut(f).zip(corners.chunks_exact(8)).zip(weights.chunks_exact(8)) {
@@ -35,9 +34,8 @@ pub fn backward(grad: &[f32], f: usize, weights: &[f32], slots: &[u32], starts: 
     if out.is_empty() {
         return out;
     }
-    let arch = Arch::new();
     out.par_chunks_mut(ROWS * f).enumerate().for_each(|(task, out)| {
-        arch.dispatch(
+        vectorized(
             #[inline(always)]
             || {
                 for (i, row) in out.chunks_exact_mut(f).enumerate() {
