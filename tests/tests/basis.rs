@@ -20,38 +20,34 @@ fn values_and_gradients_are_those_of_the_sums() {
         let (width, columns, count) = (shape.outputs(), shape.coefficients(), shape.functions());
         for rows in [1, 7, 300, 1000] {
             let (coefficients, functions, upstream) = (noise(1 + k as u64, rows * columns), noise(20, count), noise(30, rows * width));
-            let mut starts = Vec::new();
-            let (mut at, mut function) = (0, 0);
-            for &(outputs, functions) in &shape.groups {
-                for _ in 0..outputs {
-                    starts.push((at, function, functions));
-                    at += functions;
-                }
-                function += functions;
-            }
             let mut values = vec![0.0f64; rows * width];
             let mut of_coefficients = vec![0.0f64; rows * columns];
             let mut of_functions = vec![0.0f64; count];
-            for row in 0..rows {
-                for (o, &(start, function, n)) in starts.iter().enumerate() {
-                    let d = f64::from(upstream[row * width + o]);
-                    for f in 0..n {
-                        let place = row * columns + start + f;
-                        let (c, phi) = (f64::from(coefficients[place]), f64::from(functions[function + f]));
-                        values[row * width + o] += c * phi;
+            // Head after head: outputs [rows, outputs] and coefficients [rows, outputs, functions] in the order of memory.
+            let (mut output, mut place, mut function) = (0, 0, 0);
+            for &(outputs, functions_of_head) in &shape.groups {
+                for _ in 0..rows * outputs {
+                    let d = f64::from(upstream[output]);
+                    for f in function..function + functions_of_head {
+                        let (c, phi) = (f64::from(coefficients[place]), f64::from(functions[f]));
+                        values[output] += c * phi;
                         of_coefficients[place] = d * phi;
-                        of_functions[function + f] += d * c;
+                        of_functions[f] += d * c;
+                        place += 1;
                     }
+                    output += 1;
                 }
+                function += functions_of_head;
             }
             for (name, device) in devices() {
                 poison(&device);
                 let device = device.autodiff();
                 let c = Tensor::<2>::from_data(TensorData::new(coefficients.clone(), [rows, columns]), &device).require_grad();
                 let f = Tensor::<1>::from_data(TensorData::new(functions.clone(), [count]), &device).require_grad();
-                let u = Tensor::<2>::from_data(TensorData::new(upstream.clone(), [rows, width]), &device);
-                let out = Tensor::cat(combine(c.clone(), f.clone(), &shape).unwrap(), 1);
-                let packed = Tensor::cat(combine(by_columns(c.clone()), f.clone(), &shape).unwrap(), 1);
+                let u = Tensor::<1>::from_data(TensorData::new(upstream.clone(), [rows * width]), &device);
+                let flat = |heads: Vec<Tensor<2>>| Tensor::cat(heads.into_iter().map(|h| h.flatten::<1>(0, 1)).collect(), 0);
+                let out = flat(combine(c.clone(), f.clone(), &shape).unwrap());
+                let packed = flat(combine(by_columns(c.clone(), &shape), f.clone(), &shape).unwrap());
                 let gradients = (out.clone() * u).sum().backward();
                 let close = |what: &str, found: Vec<f32>, wanted: &[f64]| {
                     let size = wanted.iter().fold(1.0f64, |a, v| a.max(v.abs()));

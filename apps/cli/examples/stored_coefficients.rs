@@ -28,7 +28,8 @@ impl DeformationField for Rounded {
         let (device, [m, _]) = (means_world.device(), means_world.dims());
         let order = cc4dgs::codecs::morton::order(&to_vec(means_world.clone(), "means")?);
         let spatial = self.inner.spatial(means_world)?;
-        let mut values = to_vec(spatial.values, "features")?;
+        // Packed features are a Gaussian per row and a coefficient per column, wherever they lie.
+        let mut values = to_vec(self.inner.packed(spatial.values), "features")?;
         let columns = values.len() / m.max(1);
         let rms = (values.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / values.len().max(1) as f64).sqrt();
         let step = self.step * rms as f32;
@@ -39,8 +40,9 @@ impl DeformationField for Rounded {
             bits += entropy(&column).min(entropy(&differences));
         }
         values.iter_mut().for_each(|v| *v = (*v / step).round() * step);
+        let by_columns: Vec<f32> = (0..columns).flat_map(|c| values.iter().skip(c).step_by(columns).copied()).collect();
         *self.bits.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = bits;
-        Ok(SpatialFeatures { values: Tensor::from_data(TensorData::new(values, [m, columns]), &device), work: spatial.work })
+        Ok(SpatialFeatures { values: Tensor::<2>::from_data(TensorData::new(by_columns, [columns, m]), &device).transpose(), work: spatial.work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         self.inner.deform(features, time_norm)

@@ -1,6 +1,6 @@
 //! Combinations of shared functions on the CPU. A frame reads every coefficient once, so memory sets the pace.
 //!
-//! Outputs lie head after head, each [M, outputs].
+//! Outputs lie head after head, each [M, outputs]; so do coefficients and their gradient, each [M, outputs x functions], as networks write them.
 
 use super::heads::row_blocks;
 use crate::cpu::simd::vectorized;
@@ -16,8 +16,8 @@ const LANES: usize = 64;
 
 /// How coefficients [M, C] lie in memory.
 pub enum Coefficients<'a> {
-    /// Row by row, as networks write them.
-    Rows(&'a [f32]),
+    /// Head after head, each row by row.
+    Heads(&'a [f32]),
     /// Column by column, as playback keeps them: neighbouring Gaussians fill the lanes of a register, and nothing is added across lanes.
     Columns(&'a [f32]),
 }
@@ -29,6 +29,13 @@ struct Head {
     count: usize,
     column: usize,
     function: usize,
+}
+
+impl Head {
+    /// Coefficients per row.
+    fn width(&self) -> usize {
+        self.outputs * self.count
+    }
 }
 
 fn heads(shape: &BasisShape) -> Vec<Head> {
@@ -54,7 +61,7 @@ pub fn combine(shape: &BasisShape, rows: usize, coefficients: &Coefficients, fun
                 for head in &heads {
                     let functions = &functions[head.function..][..head.count];
                     match coefficients {
-                        Coefficients::Rows(values) => by_rows(out[head.index], head, &values[first * shape.coefficients()..], shape.coefficients(), functions),
+                        Coefficients::Heads(values) => by_rows(out[head.index], &values[head.column * rows + first * head.width()..], functions),
                         Coefficients::Columns(values) => by_columns(out[head.index], head, values, (first, rows), functions),
                     }
                 }
@@ -64,12 +71,11 @@ pub fn combine(shape: &BasisShape, rows: usize, coefficients: &Coefficients, fun
     out
 }
 
+/// Outputs in order and their coefficients in order: one dot product after the other.
 #[inline(always)]
-fn by_rows(out: &mut [f32], head: &Head, values: &[f32], columns: usize, functions: &[f32]) {
-    for (out, row) in out.chunks_exact_mut(head.outputs).zip(values.chunks_exact(columns)) {
-        for (out, own) in out.iter_mut().zip(row[head.column..].chunks_exact(head.count)) {
-            *out = dot(own, functions);
-        }
+fn by_rows(out: &mut [f32], values: &[f32], functions: &[f32]) {
+    for (out, own) in out.iter_mut().zip(values.chunks_exact(functions.len())) {
+        *out = dot(own, functions);
     }
 }
 
@@ -112,63 +118,58 @@ fn by_columns(out: &mut [f32], head: &Head, values: &[f32], (first, rows): (usiz
     }
 }
 
-/// The gradient [M, C], row by row, of the coefficients: every output's, times the functions.
+/// The gradient of the coefficients, head after head: every output's, times the functions.
 pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32]) -> Vec<f32> {
-    let (heads, columns) = (heads(shape), shape.coefficients());
     let rows = grad.len() / shape.outputs();
-    let mut out = vec![0.0f32; rows * columns];
-    out.par_chunks_mut(ROWS * columns).enumerate().for_each(|(block, out)| {
-        vectorized(
-            #[inline(always)]
-            || {
-                let mut at = 0;
-                for head in &heads {
-                    let grad = &grad[at + block * ROWS * head.outputs..];
-                    let functions = &functions[head.function..][..head.count];
-                    for (row, d) in out.chunks_exact_mut(columns).zip(grad.chunks_exact(head.outputs)) {
-                        for (own, d) in row[head.column..].chunks_exact_mut(head.count).zip(d) {
-                            own.iter_mut().zip(functions).for_each(|(c, f)| *c = d * f);
-                        }
-                    }
-                    at += rows * head.outputs;
-                }
-            },
-        );
-    });
-    out
-}
-
-/// The gradient [F] of the functions, from coefficients row by row. Tasks sum over rows of their own; their sums are added in order.
-pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32]) -> Vec<f32> {
-    let (heads, columns) = (heads(shape), shape.coefficients());
-    let rows = grad.len() / shape.outputs();
-    let tasks: Vec<Vec<f32>> = coefficients
-        .par_chunks(ROWS * columns)
-        .enumerate()
-        .map(|(block, coefficients)| {
-            let mut sums = vec![0.0f32; shape.functions()];
+    let mut out = vec![0.0f32; rows * shape.coefficients()];
+    let (mut rest, mut at) = (out.as_mut_slice(), 0);
+    for head in heads(shape) {
+        let (own, later) = rest.split_at_mut(rows * head.width());
+        rest = later;
+        let grad = &grad[at..at + rows * head.outputs];
+        at += grad.len();
+        let functions = &functions[head.function..][..head.count];
+        own.par_chunks_mut(ROWS * head.width()).zip(grad.par_chunks(ROWS * head.outputs)).for_each(|(out, grad)| {
             vectorized(
                 #[inline(always)]
                 || {
-                    let mut at = 0;
-                    for head in &heads {
-                        let grad = &grad[at + block * ROWS * head.outputs..];
-                        let sums = &mut sums[head.function..][..head.count];
-                        for (row, d) in coefficients.chunks_exact(columns).zip(grad.chunks_exact(head.outputs)) {
-                            for (own, d) in row[head.column..].chunks_exact(head.count).zip(d) {
-                                sums.iter_mut().zip(own).for_each(|(s, c)| *s += d * c);
-                            }
-                        }
-                        at += rows * head.outputs;
+                    for (own, d) in out.chunks_exact_mut(functions.len()).zip(grad) {
+                        own.iter_mut().zip(functions).for_each(|(c, f)| *c = d * f);
+                    }
+                },
+            );
+        });
+    }
+    out
+}
+
+/// The gradient [F] of the functions. Tasks sum over rows of their own; their sums are added in order.
+pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32]) -> Vec<f32> {
+    let rows = grad.len() / shape.outputs();
+    let mut out = Vec::with_capacity(shape.functions());
+    let mut at = 0;
+    for head in heads(shape) {
+        let coefficients = &coefficients[head.column * rows..][..rows * head.width()];
+        let grad = &grad[at..at + rows * head.outputs];
+        at += grad.len();
+        let task = |(coefficients, grad): (&[f32], &[f32])| {
+            let mut sums = vec![0.0f32; head.count];
+            vectorized(
+                #[inline(always)]
+                || {
+                    for (own, d) in coefficients.chunks_exact(head.count).zip(grad) {
+                        sums.iter_mut().zip(own).for_each(|(s, c)| *s += d * c);
                     }
                 },
             );
             sums
-        })
-        .collect();
-    let mut out = vec![0.0f64; shape.functions()];
-    for task in tasks {
-        out.iter_mut().zip(task).for_each(|(o, s)| *o += f64::from(s));
+        };
+        let tasks: Vec<Vec<f32>> = coefficients.par_chunks(ROWS * head.width()).zip(grad.par_chunks(ROWS * head.outputs)).map(task).collect();
+        let mut total = vec![0.0f64; head.count];
+        for task in tasks {
+            total.iter_mut().zip(task).for_each(|(t, s)| *t += f64::from(s));
+        }
+        out.extend(total.into_iter().map(|v| v as f32));
     }
-    out.into_iter().map(|v| v as f32).collect()
+    out
 }

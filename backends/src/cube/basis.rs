@@ -38,40 +38,38 @@ fn place(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
     (plan[FIELDS * output + 3] * rows) as usize + row * plan[FIELDS * output + 4] as usize + plan[FIELDS * output + 5] as usize
 }
 
+/// Where the coefficients of an output of a row start: head after head, each [rows, outputs x functions].
+#[cube]
+fn first_coefficient(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
+    let (at, count, within) = (plan[FIELDS * output], plan[FIELDS * output + 2], plan[FIELDS * output + 5]);
+    ((at - within * count) * rows + within * count) as usize + row * (plan[FIELDS * output + 4] * count) as usize
+}
+
 /// out, head after head. Neighbouring units take neighbouring coefficients: of one row, or of one column.
 #[cube(launch)]
-fn combine_outputs(
-    coefficients: &[f32],
-    functions: &[f32],
-    plan: &[u32],
-    out: &mut [f32],
-    rows: u32,
-    width: u32,
-    row_stride: u32,
-    column_stride: u32,
-    #[comptime] by_columns: bool,
-) {
+fn combine_outputs(coefficients: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], rows: u32, width: u32, #[comptime] by_columns: bool) {
     if ABSOLUTE_POS < out.len() {
         let per_run = if by_columns { rows as usize } else { width as usize };
         let (run, within) = (ABSOLUTE_POS / per_run, ABSOLUTE_POS % per_run);
         let row = if by_columns { within } else { run };
         let output = if by_columns { run } else { within };
-        let from = row * row_stride as usize + plan[FIELDS * output] as usize * column_stride as usize;
+        let from = if by_columns { plan[FIELDS * output] as usize * rows as usize + row } else { first_coefficient(plan, output, row, rows) };
+        let step = if by_columns { rows as usize } else { (1usize).runtime() };
         let own = plan[FIELDS * output + 1] as usize;
         let mut sum = 0.0f32;
         for k in 0..plan[FIELDS * output + 2] as usize {
-            sum += coefficients[from + k * column_stride as usize] * functions[own + k];
+            sum += coefficients[from + k * step] * functions[own + k];
         }
         out[place(plan, output, row, rows)] = sum;
     }
 }
 
-/// out [M, C].
+/// out, as coefficients lie.
 #[cube(launch)]
-fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], rows: u32, width: u32, columns: u32) {
+fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], rows: u32, width: u32) {
     if ABSOLUTE_POS < grad.len() {
         let (row, output) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
-        let from = row * columns as usize + plan[FIELDS * output] as usize;
+        let from = first_coefficient(plan, output, row, rows);
         let own = plan[FIELDS * output + 1] as usize;
         let upstream = grad[place(plan, output, row, rows)];
         for k in 0..plan[FIELDS * output + 2] as usize {
@@ -82,7 +80,7 @@ fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32
 
 /// partial [segments, F].
 #[cube(launch)]
-fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mut [f32], rows: u32, width: u32, columns: u32, functions: u32) {
+fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mut [f32], rows: u32, width: u32, functions: u32) {
     if ABSOLUTE_POS < partial.len() {
         let (segment, k) = (ABSOLUTE_POS / functions as usize, ABSOLUTE_POS % functions as usize);
         let start = segment * SEGMENT;
@@ -90,9 +88,9 @@ fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mu
         let mut sum = 0.0f32;
         for row in start..end {
             for output in 0..width as usize {
-                let (first, own, count) = (plan[FIELDS * output] as usize, plan[FIELDS * output + 1] as usize, plan[FIELDS * output + 2] as usize);
+                let (own, count) = (plan[FIELDS * output + 1] as usize, plan[FIELDS * output + 2] as usize);
                 if k >= own && k < own + count {
-                    sum += grad[place(plan, output, row, rows)] * coefficients[row * columns as usize + first + k - own];
+                    sum += grad[place(plan, output, row, rows)] * coefficients[first_coefficient(plan, output, row, rows) + k - own];
                 }
             }
         }
@@ -106,13 +104,12 @@ impl BasisOps for CubeBackend {
         let rows = coefficients.meta.shape()[0];
         let by_columns = coefficients.meta.strides()[..] == [1, rows] && shape.coefficients() > 1;
         let coefficients = if by_columns { coefficients } else { into_contiguous(coefficients) };
-        let (row_stride, column_stride) = if by_columns { (1, rows as u32) } else { (shape.coefficients() as u32, 1) };
         let out = floats(&coefficients, [rows * shape.outputs()]);
         let client = coefficients.client.clone();
         let plan = upload(&coefficients, &plan(&shape), DType::U32);
         let (cubes, dim) = (cubes_for(rows * shape.outputs()), CubeDim::new_1d(UNITS));
         let (c, f, p, o) = (coefficients.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
-        combine_outputs::launch(&client, cubes, dim, c, f, p, o, rows as u32, shape.outputs() as u32, row_stride, column_stride, by_columns);
+        combine_outputs::launch(&client, cubes, dim, c, f, p, o, rows as u32, shape.outputs() as u32, by_columns);
         out
     }
 }
@@ -130,12 +127,12 @@ impl BasisBackward for CubeBackend {
         let client = coefficients.client.clone();
         let dim = CubeDim::new_1d(UNITS);
         let plan = upload(&coefficients, &plan(shape), DType::U32);
-        let (width, columns) = (shape.outputs() as u32, shape.coefficients() as u32);
+        let width = shape.outputs() as u32;
         let of_coefficients = wanted[0].then(|| {
             let out = floats(&grad, [rows, shape.coefficients()]);
             let (g, f) = (grad.clone().into_buffer_arg(), functions.clone().into_buffer_arg());
             let (p, o) = (plan.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-            spread_gradient::launch(&client, cubes_for(rows * shape.outputs()), dim, g, f, p, o, rows as u32, width, columns);
+            spread_gradient::launch(&client, cubes_for(rows * shape.outputs()), dim, g, f, p, o, rows as u32, width);
             out
         });
         let of_functions = wanted[1].then(|| {
@@ -143,7 +140,7 @@ impl BasisBackward for CubeBackend {
             let (partial, out) = (floats(&grad, [segments, count]), floats(&grad, [count]));
             let (c, g) = (coefficients.clone().into_buffer_arg(), grad.clone().into_buffer_arg());
             let (p, parts) = (plan.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
-            function_parts::launch(&client, cubes_for(segments * count), dim, c, g, p, parts, rows as u32, width, columns, count as u32);
+            function_parts::launch(&client, cubes_for(segments * count), dim, c, g, p, parts, rows as u32, width, count as u32);
             add_segments::launch(&client, cubes_for(count), dim, partial.into_buffer_arg(), out.clone().into_buffer_arg(), count as u32, segments as u32, 0);
             out
         });

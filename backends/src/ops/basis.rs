@@ -12,8 +12,8 @@ use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
 
-/// What a row of coefficients holds: per output, the coefficients of its group's functions, one output after the other. The functions of all groups lie one
-/// group after the other too, so that each may have its own.
+/// What coefficients hold: per group (a head), row and output, those of the group's functions. Groups lie one after the other, and so do the functions of all
+/// groups, so that each may have its own.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BasisShape {
     /// (outputs, functions each of them combines), group by group.
@@ -81,7 +81,7 @@ macro_rules! on_cpu {
                 let (rows, functions) = (coefficients.shape()[0], Self::floats(&functions));
                 let out = match Self::columns(&coefficients) {
                     Some(columns) => kernel::combine(&shape, rows, &Coefficients::Columns(columns), &functions),
-                    None => kernel::combine(&shape, rows, &Coefficients::Rows(&Self::floats(&coefficients)), &functions),
+                    None => kernel::combine(&shape, rows, &Coefficients::Heads(&Self::floats(&coefficients)), &functions),
                 };
                 let len = out.len();
                 Self::from_floats(out, [len])
@@ -126,7 +126,9 @@ impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B
 }
 
 /// One output [M, width] per group of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` [F].
-/// Coefficients that lie [`by_columns`] are read faster; the gradient wants them row by row.
+///
+/// In memory coefficients lie group after group, each [M, width x functions], as [`super::field::mlp_relu_flat`] leaves them; those that lie [`by_columns`] are
+/// read faster, but have no gradient.
 pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Vec<Tensor<2>>> {
     let ([m, width], [count]) = (coefficients.dims(), functions.dims());
     if m == 0 || width != shape.coefficients() || count != shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
@@ -137,9 +139,15 @@ pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisS
     Ok(split_heads(&flat, m, &shape.widths()))
 }
 
-/// The same matrix [M, C], kept column by column in memory.
-pub fn by_columns(matrix: Tensor<2>) -> Tensor<2> {
-    let [m, c] = matrix.dims();
+/// The same coefficients [M, C] column by column in memory, for playback.
+pub fn by_columns(coefficients: Tensor<2>, shape: &BasisShape) -> Tensor<2> {
+    let [m, c] = coefficients.dims();
+    if m == 0 {
+        return coefficients;
+    }
+    let widths: Vec<usize> = shape.groups.iter().map(|g| g.0 * g.1).collect();
+    let heads = split_heads(&coefficients.reshape([m * c]), m, &widths);
     // Flattening a transposed view is what makes its elements move.
-    matrix.transpose().reshape([m * c]).reshape([c, m]).transpose()
+    let columns = heads.into_iter().zip(widths).map(|(head, width)| head.transpose().reshape([m * width])).collect();
+    Tensor::cat(columns, 0).reshape([c, m]).transpose()
 }

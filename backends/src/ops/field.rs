@@ -244,13 +244,18 @@ impl VoxelCorners {
 /// Runs a trunk-and-heads ReLU network over `x` [M,in]; one output [M,width] per head (or the trunk's). `weights` is flat in the order of
 /// [`crate::cpu::mlp::relu`].
 pub fn mlp_relu(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Result<Vec<Tensor<2>>> {
+    let [m, _] = x.dims();
+    Ok(split_heads(&mlp_relu_flat(x, weights, shape)?, m, &shape.output_widths()))
+}
+
+/// As [`mlp_relu`], with the outputs as they lie in memory: head after head.
+pub fn mlp_relu_flat(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Result<Tensor<1>> {
     let [m, width] = x.dims();
     if !shape.is_sound() || width != shape.input || m == 0 {
         return Err(Error::parameter("network", format!("input [{m},{width}] for layers {shape:?}"), "Give at least one row and widths that fit"));
     }
     check_weights("network", weights.dims()[0], shape.parameter_count())?;
-    let flat: Tensor<1> = Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone()));
-    Ok(split_heads(&flat, m, &shape.output_widths()))
+    Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone())))
 }
 
 /// The heads [rows, width] of a flat array that holds one after the other.

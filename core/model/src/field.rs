@@ -85,7 +85,7 @@ pub struct FieldWork {
 /// Time-invariant features of M Gaussians and what they cost.
 #[derive(Clone, Debug)]
 pub struct SpatialFeatures {
-    /// Features [M, F].
+    /// Features [M, F]. Only the field itself reads them; what lies where is its own affair.
     pub values: Tensor<2>,
     /// The work done for them.
     pub work: FieldWork,

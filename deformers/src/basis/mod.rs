@@ -19,7 +19,7 @@ use crate::parts::voxels::{VoxelSettings, Voxels, parameter};
 use crate::parts::weights;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
-use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu_flat};
 use cc4dgs_core::{
     DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
     config, inventory,
@@ -221,7 +221,8 @@ impl DeformationField for CdfBasis {
         }
         let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
         let weights = self.weights_after(usize::from(self.functions.network.is_some()));
-        Ok(SpatialFeatures { values: Tensor::cat(mlp_relu(voxel, weights, &self.coefficients)?, 1), work })
+        let flat = mlp_relu_flat(voxel, weights, &self.coefficients)?;
+        Ok(SpatialFeatures { values: flat.reshape([m, self.shape.coefficients()]), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         if !time_norm.is_finite() {
@@ -241,7 +242,7 @@ impl DeformationField for CdfBasis {
         Ok(offsets)
     }
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
-        by_columns(features)
+        by_columns(features, &self.shape)
     }
     fn parameters(&self) -> Vec<&Parameter> {
         self.parameters.iter().collect()

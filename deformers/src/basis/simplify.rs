@@ -26,13 +26,12 @@ struct Plan {
 }
 
 pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
-    let [m, columns] = features.dims();
+    let [m, _] = features.dims();
     if field.settings.unused == 0.0 || m == 0 || times.is_empty() {
         return Ok(None);
     }
     let device = features.device();
     let values = to_vec(features.inner(), "coefficients")?;
-    let strength = mean_squares(&values, columns);
     let mut functions = Vec::with_capacity(times.len());
     for &time in times {
         functions.push(to_vec(field.functions_by_head(time, &device)?.inner(), "functions")?);
@@ -44,10 +43,12 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
     let (mut plans, mut lines) = (Vec::new(), Vec::new());
     let (mut column, mut first) = (0, 0);
     for (&head, &(width, own)) in field.settings.heads.iter().zip(&field.shape.groups) {
+        let coefficients = &values[m * column..m * (column + width * own)];
         // Mean square over Gaussians, outputs and times of c φ, function by function.
-        let part = |f: usize| (0..width).map(|o| strength[column + o * own + f]).sum::<f64>() / width as f64 * of_functions[first + f];
+        let strength = mean_squares(coefficients, own);
+        let part = |f: usize| strength[f] * of_functions[first + f];
         let parts: Vec<f64> = (0..own).map(part).collect();
-        let whole = combined_square(&values, columns, column, width, own, &functions, first);
+        let whole = combined_square(coefficients, (width, own), &functions, first);
         let scale = field.scale_of(head);
         let kept = if whole.sqrt() < negligible(head) * scale { Vec::new() } else { keep(&parts, whole * field.settings.unused.powi(2)) };
         if kept.is_empty() {
@@ -80,17 +81,14 @@ fn mean_squares(values: &[f32], columns: usize) -> Vec<f64> {
 }
 
 /// The mean square of a head's offsets, over at most a thousand Gaussians.
-fn combined_square(values: &[f32], columns: usize, column: usize, width: usize, own: usize, functions: &[Vec<f32>], first: usize) -> f64 {
-    let rows = values.len() / columns;
+fn combined_square(coefficients: &[f32], (width, own): (usize, usize), functions: &[Vec<f32>], first: usize) -> f64 {
+    let rows = coefficients.len() / (width * own);
     let (mut sum, mut terms) = (0.0, 0u64);
-    for row in (0..rows).step_by(rows.div_ceil(1000)) {
-        for o in 0..width {
-            let from = row * columns + column + o * own;
-            for phi in functions {
-                let offset: f64 = values[from..from + own].iter().zip(&phi[first..first + own]).map(|(c, f)| f64::from(c * f)).sum();
-                sum += offset * offset;
-                terms += 1;
-            }
+    for coefficients in coefficients.chunks_exact(width * own).step_by(rows.div_ceil(1000)).flat_map(|row| row.chunks_exact(own)) {
+        for phi in functions {
+            let offset: f64 = coefficients.iter().zip(&phi[first..first + own]).map(|(c, f)| f64::from(c * f)).sum();
+            sum += offset * offset;
+            terms += 1;
         }
     }
     sum / terms.max(1) as f64
