@@ -63,6 +63,8 @@ pub struct ImageScore {
     pub psnr_dynamic_db: Option<f64>,
     /// Structural similarity, Inria's convention.
     pub ssim: f64,
+    /// The same over windows centred on pixels that see something move.
+    pub ssim_dynamic: Option<f64>,
     /// Milliseconds.
     pub field_ms: f64,
     /// Milliseconds.
@@ -82,6 +84,8 @@ pub struct EvalReport {
     pub psnr_dynamic_db: Option<f64>,
     /// Mean over images, Inria's convention.
     pub ssim: f64,
+    /// Mean over the images that have it, of the windows centred on pixels that see something move.
+    pub ssim_dynamic: Option<f64>,
     /// Mean over images, skimage's Gaussian convention.
     pub ssim_skimage: f64,
     /// Mean over images; absent where a picture is too small for five scales.
@@ -140,6 +144,7 @@ pub fn evaluate(
         .map(|m| (scene.views[m.view].camera, m.mask.iter().map(|v| *v > 0.0).collect()))
         .collect();
     let ssim_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit));
+    let ssim_dynamic_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit).masked());
     let skimage_metric = metric(Metric::ssim(SsimConvention::Skimage, Rounding::EightBit));
     let ms_ssim_metric = metric(Metric::ms_ssim(Rounding::EightBit));
     for (done, &view) in views.iter().enumerate() {
@@ -155,7 +160,8 @@ pub fn evaluate(
         let mask = masks.get(&scene.views[view].camera);
         let shape = [3, camera.height as usize, camera.width as usize];
         let planes = |picture: &Image8| picture.to_planes(model.background);
-        let psnr_dynamic_db = mask.map(|mask| dynamic_metric.score(&planes(&truth), &planes(&render), shape, Some(mask))).transpose()?;
+        let masked = |metric: &Metric| mask.map(|mask| metric.score(&planes(&truth), &planes(&render), shape, Some(mask))).transpose();
+        let (psnr_dynamic_db, ssim_dynamic) = (masked(&dynamic_metric)?, masked(&ssim_dynamic_metric)?);
         let score = ImageScore {
             view,
             camera: camera.name.clone(),
@@ -163,6 +169,7 @@ pub fn evaluate(
             psnr_db: psnr_metric.score_images(&truth, &render)?,
             psnr_dynamic_db,
             ssim: ssim_metric.score_images(&truth, &render)?,
+            ssim_dynamic,
             field_ms: time.field_ms,
             raster_ms: time.raster_ms,
         };
@@ -186,6 +193,7 @@ pub fn evaluate(
         psnr_db: images.iter().map(|i| i.psnr_db).sum::<f64>() / n,
         psnr_dynamic_db: mean(images.iter().filter_map(|i| i.psnr_dynamic_db)),
         ssim: images.iter().map(|i| i.ssim).sum::<f64>() / n,
+        ssim_dynamic: mean(images.iter().filter_map(|i| i.ssim_dynamic)),
         ssim_skimage: skimage / n,
         ms_ssim: ms_ssim.map(|s| s / n),
         size_mb: model.size.into(),
@@ -198,6 +206,7 @@ pub fn evaluate(
             ("psnr_db", psnr_metric),
             ("psnr_dynamic_db", dynamic_metric),
             ("ssim", ssim_metric),
+            ("ssim_dynamic", ssim_dynamic_metric),
             ("ssim_skimage", skimage_metric),
             ("ms_ssim", ms_ssim_metric),
         ]),

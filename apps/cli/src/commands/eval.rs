@@ -159,7 +159,9 @@ pub fn text(report: &FullReport) -> String {
     let mut lines = vec![
         format!("{} on {} ({} pictures)", report.model.display(), e.scene, e.images.len()),
         format!("  PSNR {:.3} dB   SSIM {:.4} (Inria) {:.4} (skimage)   MS-SSIM {ms_ssim}", e.psnr_db, e.ssim, e.ssim_skimage),
-        e.psnr_dynamic_db.map_or_else(String::new, |v| format!("  PSNR {v:.3} dB where something moves")),
+        e.psnr_dynamic_db
+            .zip(e.ssim_dynamic)
+            .map_or_else(String::new, |(psnr, ssim)| format!("  PSNR {psnr:.3} dB   SSIM {ssim:.4} (Inria) where something moves")),
         format!("  size {:.4} MB: deform {:.4} MB, point cloud {:.4} MB", e.size_mb.total, e.size_mb.deform, e.size_mb.point_cloud),
         format!("  {} Gaussians, {} of them dynamic", e.gaussians, e.dynamic_gaussians),
         format!(
