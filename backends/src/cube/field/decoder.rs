@@ -69,23 +69,30 @@ fn mish_derivative(x: f32) -> f32 {
     t + x * select(x < 20.0, slope, 0.0f32)
 }
 
+/// Mean and inverse deviation of a row of y [_, n].
+#[cube]
+fn statistics(y: &[f32], row: usize, n: usize) -> (f32, f32) {
+    let width = n as f32;
+    let mut mean = 0.0f32;
+    for i in 0..n {
+        mean += y[row * n + i];
+    }
+    mean /= width;
+    let mut variance = 0.0f32;
+    for i in 0..n {
+        let d = y[row * n + i] - mean;
+        variance += d * d;
+    }
+    (mean, 1.0 / (variance / width + EPSILON).sqrt())
+}
+
 /// Rows of y become mish(gain (y - mean) / deviation + shift), in `out`.
 #[cube(launch)]
 fn norm_mish(y: &[f32], weights: &[f32], out: &mut [f32], rows: u32, width: u32, gain: u32) {
     let row = ABSOLUTE_POS;
     if row < rows as usize {
         let n = width as usize;
-        let mut mean = 0.0f32;
-        for i in 0..n {
-            mean += y[row * n + i];
-        }
-        mean /= width as f32;
-        let mut variance = 0.0f32;
-        for i in 0..n {
-            let d = y[row * n + i] - mean;
-            variance += d * d;
-        }
-        let inverse = 1.0 / (variance / width as f32 + EPSILON).sqrt();
+        let (mean, inverse) = statistics(y, row, n);
         for i in 0..n {
             let z = (y[row * n + i] - mean) * inverse * weights[gain as usize + i] + weights[gain as usize + n + i];
             out[row * n + i] = mish(z);
@@ -99,17 +106,7 @@ fn norm_mish_backward(y: &mut [f32], weights: &[f32], d: &mut [f32], dz: &mut [f
     let row = ABSOLUTE_POS;
     if row < rows as usize {
         let n = width as usize;
-        let mut mean = 0.0f32;
-        for i in 0..n {
-            mean += y[row * n + i];
-        }
-        mean /= width as f32;
-        let mut variance = 0.0f32;
-        for i in 0..n {
-            let e = y[row * n + i] - mean;
-            variance += e * e;
-        }
-        let inverse = 1.0 / (variance / width as f32 + EPSILON).sqrt();
+        let (mean, inverse) = statistics(&*y, row, n);
         let mut sum = 0.0f32;
         let mut along = 0.0f32;
         for i in 0..n {
