@@ -16,6 +16,8 @@ pub enum BenchWhat {
     Step(BenchStep),
     /// Playback of a room with people as large as published scenes: field and rasterizer, frame by frame.
     Frame(BenchFrame),
+    /// Playback of a trained model through the cameras of a dataset: field and rasterizer, frame by frame.
+    Play(BenchPlay),
     /// The same model on several devices: how far their pictures differ.
     Agree(BenchAgree),
     /// The computational field forwards and backwards, against the same field in burn's primitives.
@@ -77,6 +79,28 @@ pub struct BenchLoss {
     /// Root of the seed tree.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchPlay {
+    /// A run's folder, a checkpoint or an archive.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The dataset whose views are drawn, or `procedural`.
+    #[arg(long, value_name = "PATH")]
+    pub scene: PathBuf,
+    /// Which views.
+    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
+    pub split: SplitArg,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Frames measured, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub frames: u32,
+    /// Override a scene option, such as scene.width=0 for the pictures' own size; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
 }
 
 #[derive(Debug, Args)]

@@ -62,6 +62,7 @@ pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
         Command::Bench(args) => match &args.what {
             BenchWhat::Step(args) => bench::step(&context, args),
             BenchWhat::Frame(args) => bench::frame(&context, args),
+            BenchWhat::Play(args) => bench::play(&context, args),
             BenchWhat::Agree(args) => bench::agree(&context, args),
             BenchWhat::Field(args) => bench::field(&context, args),
             BenchWhat::Lookup(args) => bench::lookup(&context, args),

@@ -1,6 +1,6 @@
 //! Playback of a room with people: field and rasterizer, frame by frame, and the field's own costs.
 
-use super::{Spread, rooms};
+use super::{Playback, Spread, WARM_UP, rooms, time_playback};
 use crate::args::BenchFrame;
 use crate::commands::Context;
 use crate::interrupt;
@@ -12,14 +12,12 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Event, EventSink, FieldContext, Result, Seed, config, parse_device};
 use cc4dgs_engine::config::{RenderConfig, RunConfig};
 use cc4dgs_engine::model::{Model, ModelField, ModelSize};
-use cc4dgs_engine::play::{PlayWork, Player};
+use cc4dgs_engine::play::Player;
 use cc4dgs_engine::train::Moving;
 use serde::Serialize;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-/// Frames drawn before the clock counts: caches fill and kernels compile.
-const WARM_UP: usize = 2;
 /// Frames of the sequence the rooms stand for.
 const SEQUENCE: usize = 300;
 
@@ -41,19 +39,8 @@ struct FrameCase {
     height: u32,
     gaussians: usize,
     dynamic_gaussians: usize,
-    /// Field and rasterizer of the first frame, milliseconds; kernels are compiled and caches are empty.
-    first_field_ms: f64,
-    first_raster_ms: f64,
-    field: Spread,
-    raster: Spread,
-    frame: Spread,
-    /// Frames drawn one after another without waiting in between, per frame.
-    playback_ms: f64,
-    frames_per_s: f64,
-    visible: u64,
-    tile_pairs: u64,
-    pixel_pairs: u64,
-    work: PlayWork,
+    #[serde(flatten)]
+    playback: Playback,
     /// Spatial pass, offsets at one time, and both with the gradient of all weights.
     field_spatial: Spread,
     field_forward_backward: Spread,
@@ -124,48 +111,14 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         weight_precision: Default::default(),
     };
     let mut player = Player::new(&model, &context.registry, device)?;
-    let mut times: [Vec<f64>; 3] = Default::default();
-    let (mut first, mut counts) = ((0.0, 0.0), cc4dgs_core::RenderWork::default());
-    for frame in 0..WARM_UP + args.frames as usize {
-        let (output, time) = player.render(&camera, frame as f32 / SEQUENCE as f32)?;
-        counts = output.stats.work;
-        if frame == 0 {
-            first = (time.field_ms, time.raster_ms);
-        }
-        if frame >= WARM_UP {
-            for (list, ms) in times.iter_mut().zip([time.field_ms, time.raster_ms, time.field_ms + time.raster_ms]) {
-                list.push(ms);
-            }
-        }
-    }
-    let [field, raster, frame] = times.map(Spread::of);
-    let mut play = |frames: usize| -> Result<f64> {
-        let began = Instant::now();
-        for frame in 0..frames {
-            player.play(&camera, frame as f32 / SEQUENCE as f32)?;
-        }
-        player.sync()?;
-        Ok(began.elapsed().as_secs_f64() * 1e3 / frames as f64)
-    };
-    play(WARM_UP)?;
-    let playback_ms = play(args.frames as usize)?;
+    let playback = time_playback(&mut player, args.frames as usize, |frame| (&camera, frame as f32 / SEQUENCE as f32))?;
     Ok(FrameCase {
         name: case.name.to_string(),
         width: camera.width,
         height: camera.height,
         gaussians: n,
         dynamic_gaussians: player.moving(),
-        first_field_ms: first.0,
-        first_raster_ms: first.1,
-        field,
-        raster,
-        playback_ms,
-        frames_per_s: if playback_ms > 0.0 { 1000.0 / playback_ms } else { 0.0 },
-        frame,
-        visible: counts.visible,
-        tile_pairs: counts.tile_pairs,
-        pixel_pairs: counts.pixel_pairs,
-        work: player.work,
+        playback,
         field_spatial,
         field_forward_backward,
     })
@@ -218,11 +171,11 @@ fn text(report: &FrameReport) -> String {
             c.height,
             c.gaussians,
             c.dynamic_gaussians,
-            c.field.median_ms,
-            c.raster.median_ms,
-            c.playback_ms,
-            c.frames_per_s,
-            c.first_field_ms + c.first_raster_ms,
+            c.playback.field.median_ms,
+            c.playback.raster.median_ms,
+            c.playback.playback_ms,
+            c.playback.frames_per_s,
+            c.playback.first_field_ms + c.playback.first_raster_ms,
             c.field_spatial.median_ms,
             c.field_forward_backward.median_ms
         )

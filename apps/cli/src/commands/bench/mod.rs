@@ -5,6 +5,7 @@ mod field;
 mod frame;
 mod lookup;
 mod parts;
+mod play;
 mod step;
 
 pub use agree::agree;
@@ -12,10 +13,12 @@ pub use field::field;
 pub use frame::frame;
 pub use lookup::lookup;
 pub use parts::{loss, sort};
+pub use play::play;
 pub use step::step;
 
 use cc4dgs_backends::bench::{ROOM_CASES, RoomCase, shrunk};
-use cc4dgs_core::{Result, unknown_name};
+use cc4dgs_core::{Camera, RenderWork, Result, unknown_name};
+use cc4dgs_engine::play::{PlayWork, Player};
 use std::time::Instant;
 
 /// Runs that are not counted: caches fill and kernels compile.
@@ -61,6 +64,69 @@ impl Spread {
         let at = |share: f64| times.get((share * times.len() as f64) as usize).or(times.last()).copied().unwrap_or(0.0);
         Self { median_ms: at(0.5), min_ms: at(0.0), p90_ms: at(0.9) }
     }
+}
+
+/// How fast a model plays.
+#[derive(serde::Serialize)]
+pub struct Playback {
+    /// Field and rasterizer of the first frame, milliseconds; kernels are compiled and caches are empty.
+    first_field_ms: f64,
+    first_raster_ms: f64,
+    field: Spread,
+    raster: Spread,
+    frame: Spread,
+    /// Frames drawn one after another without waiting in between, per frame.
+    playback_ms: f64,
+    frames_per_s: f64,
+    visible: u64,
+    tile_pairs: u64,
+    pixel_pairs: u64,
+    work: PlayWork,
+}
+
+/// Times `frames` frames after some that are not counted, waiting after the field and after the picture; and as many without waiting. `moment` is the camera and
+/// the time of a frame.
+pub fn time_playback<'c>(player: &mut Player, frames: usize, moment: impl Fn(usize) -> (&'c Camera, f32)) -> Result<Playback> {
+    let mut times: [Vec<f64>; 3] = Default::default();
+    let (mut first, mut counts) = ((0.0, 0.0), RenderWork::default());
+    for frame in 0..WARM_UP + frames {
+        let (camera, time_norm) = moment(frame);
+        let (output, time) = player.render(camera, time_norm)?;
+        counts = output.stats.work;
+        if frame == 0 {
+            first = (time.field_ms, time.raster_ms);
+        }
+        if frame >= WARM_UP {
+            for (list, ms) in times.iter_mut().zip([time.field_ms, time.raster_ms, time.field_ms + time.raster_ms]) {
+                list.push(ms);
+            }
+        }
+    }
+    let [field, raster, frame] = times.map(Spread::of);
+    let mut play = |frames: usize| -> Result<f64> {
+        let began = Instant::now();
+        for frame in 0..frames {
+            let (camera, time_norm) = moment(frame);
+            player.play(camera, time_norm)?;
+        }
+        player.sync()?;
+        Ok(began.elapsed().as_secs_f64() * 1e3 / frames as f64)
+    };
+    play(WARM_UP)?;
+    let playback_ms = play(frames)?;
+    Ok(Playback {
+        first_field_ms: first.0,
+        first_raster_ms: first.1,
+        field,
+        raster,
+        frame,
+        playback_ms,
+        frames_per_s: if playback_ms > 0.0 { 1000.0 / playback_ms } else { 0.0 },
+        visible: counts.visible,
+        tile_pairs: counts.tile_pairs,
+        pixel_pairs: counts.pixel_pairs,
+        work: player.work,
+    })
 }
 
 #[cfg(test)]

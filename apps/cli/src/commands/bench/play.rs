@@ -1,0 +1,73 @@
+//! Playback of a trained model, as long as it takes to know its pace.
+
+use super::{Playback, time_playback};
+use crate::args::BenchPlay;
+use crate::commands::Context;
+use crate::model_source::{load_model, open_scene};
+use cc4dgs_core::{Camera, Error, Result};
+use cc4dgs_engine::play::Player;
+use serde::Serialize;
+
+#[derive(Serialize)]
+struct PlayReport<'a> {
+    version: &'static str,
+    model: String,
+    scene: String,
+    device: &'a str,
+    threads: usize,
+    width: u32,
+    height: u32,
+    gaussians: usize,
+    dynamic_gaussians: usize,
+    #[serde(flatten)]
+    playback: Playback,
+}
+
+/// Plays the views of a dataset's split with a trained model, over and over.
+pub fn play(context: &Context, args: &BenchPlay) -> Result<()> {
+    let events = context.listeners(None)?;
+    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let scene = open_scene(&args.scene, &loaded.model, &args.sets, &context.limits)?;
+    let moments: Vec<(Camera, f32)> = scene.split(args.split.into()).into_iter().map(|v| (scene.camera(v).clone(), scene.views[v].time_norm)).collect();
+    let Some((camera, _)) = moments.first() else {
+        return Err(Error::parameter("--split", format!("{} has no view of this split", scene.name), "Play the other split"));
+    };
+    let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?;
+    let playback = time_playback(&mut player, args.frames as usize, |frame| {
+        let (camera, time_norm) = &moments[frame % moments.len()];
+        (camera, *time_norm)
+    })?;
+    let report = PlayReport {
+        version: env!("CARGO_PKG_VERSION"),
+        model: args.model.display().to_string(),
+        scene: scene.name.clone(),
+        device: &loaded.device_name,
+        threads: rayon::current_num_threads(),
+        width: camera.width,
+        height: camera.height,
+        gaussians: loaded.model.gaussians.len(),
+        dynamic_gaussians: player.moving(),
+        playback,
+    };
+    context.output.result(&report, || text(&report))
+}
+
+fn text(report: &PlayReport) -> String {
+    let p = &report.playback;
+    format!(
+        "{} on {}, {}, {} threads: {}x{}, {} Gaussians, {} of them moving\n  {:.1} frames/s without waiting; field {:.3} ms + rasterizer {:.2} ms (medians, waited for); first frame {:.1} + {:.1} ms",
+        report.model,
+        report.scene,
+        report.device,
+        report.threads,
+        report.width,
+        report.height,
+        report.gaussians,
+        report.dynamic_gaussians,
+        p.frames_per_s,
+        p.field.median_ms,
+        p.raster.median_ms,
+        p.first_field_ms,
+        p.first_raster_ms
+    )
+}
