@@ -138,6 +138,11 @@ fn a_scene_goes_through_the_whole_chain() {
     assert!((plain["psnr_db"].as_f64().unwrap() - number("/psnr_db")).abs() < 0.5);
 
     succeed(&["decompress", text(&archive), "--out", text(&ply), "-q"]);
+    let played = json_of(&["bench", "play", text(&archive), "--scene", "procedural:tiny", "--device", "flex", "--frames", "5", "-q", "--json"]);
+    assert!(played["frames_per_s"].as_f64().unwrap() > 0.0 && played["field"]["median_ms"].as_f64().unwrap() > 0.0, "{played}");
+    // Two frames of warming up and five of measuring, waited for, and the same without waiting.
+    assert_eq!(played["work"]["frames"], 14);
+
     let (model, cloud) = (json_of(&["info", text(&archive), "--json"]), json_of(&["info", text(&ply), "--json"]));
     assert_eq!((&model["kind"], &cloud["kind"]), (&Value::from("archive"), &Value::from("ply")));
     assert_eq!(model["manifest"]["gaussian_count"], cloud["gaussians"]["count"]);
