@@ -1,6 +1,6 @@
 //! Would storing the coefficients of `cdf-basis` per Gaussian be smaller than storing the networks that compute them?
 //!
-//! Coefficients are rounded to steps proportional to their head's, and every column is charged its entropy: of its values, or of the differences between
+//! Coefficients are rounded to steps that are a share of the root-mean-square of them all, and every column is charged its entropy: of its values, or of the differences between
 //! neighbours along the Morton curve, whichever is less. The picture is scored with the rounded ones.
 //!
 //! `cargo run --release --example stored_coefficients -- MODEL SCENE [VIEWS]`

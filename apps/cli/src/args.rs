@@ -173,20 +173,27 @@ pub struct Render {
     pub device: String,
 }
 
+/// A trained model and the views of a dataset that it draws.
 #[derive(Debug, Args)]
-pub struct Eval {
+pub struct ModelViews {
     /// A run's folder, a checkpoint or an archive.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
-    /// The dataset to measure against.
+    /// The dataset, or `procedural`.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// Which side of the split.
+    /// Which side of its split.
     #[arg(long, value_enum, default_value_t = SplitArg::Test)]
     pub split: SplitArg,
-    /// Scene options over those the model was trained with, such as scene.width=800; may be given several times.
+    /// Scene options over those the model was trained with, such as scene.width=800 (0 is the pictures' own size); may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+pub struct Eval {
+    #[command(flatten)]
+    pub views: ModelViews,
     /// Measure at most so many pictures, evenly spread; 0 measures all.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub max_views: usize,

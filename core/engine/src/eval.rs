@@ -159,8 +159,8 @@ pub fn evaluate(
         ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);
         let mask = masks.get(&scene.views[view].camera);
         let shape = [3, camera.height as usize, camera.width as usize];
-        let planes = |picture: &Image8| picture.to_planes(model.background);
-        let masked = |metric: &Metric| mask.map(|mask| metric.score(&planes(&truth), &planes(&render), shape, Some(mask))).transpose();
+        let planes = mask.map(|mask| ([&truth, &render].map(|picture| picture.to_planes(model.background)), mask));
+        let masked = |metric: &Metric| planes.as_ref().map(|([a, b], mask)| metric.score(a, b, shape, Some(mask))).transpose();
         let (psnr_dynamic_db, ssim_dynamic) = (masked(&dynamic_metric)?, masked(&ssim_dynamic_metric)?);
         let score = ImageScore {
             view,

@@ -1,6 +1,6 @@
 //! The options of `cc4dgs bench`.
 
-use super::SplitArg;
+use super::ModelViews;
 use clap::{Args, Subcommand};
 use std::path::PathBuf;
 
@@ -83,46 +83,26 @@ pub struct BenchLoss {
 
 #[derive(Debug, Args)]
 pub struct BenchPlay {
-    /// A run's folder, a checkpoint or an archive.
-    #[arg(value_name = "MODEL")]
-    pub model: PathBuf,
-    /// The dataset whose views are drawn, or `procedural`.
-    #[arg(long, value_name = "PATH")]
-    pub scene: PathBuf,
-    /// Which views.
-    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
-    pub split: SplitArg,
+    #[command(flatten)]
+    pub views: ModelViews,
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
     /// Frames measured, after warming up.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub frames: u32,
-    /// Override a scene option, such as scene.width=0 for the pictures' own size; may be given several times.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    pub sets: Vec<String>,
 }
 
 #[derive(Debug, Args)]
 pub struct BenchAgree {
-    /// A run's folder, a checkpoint or an archive.
-    #[arg(value_name = "MODEL")]
-    pub model: PathBuf,
-    /// The dataset whose views are drawn, or `procedural`.
-    #[arg(long, value_name = "PATH")]
-    pub scene: PathBuf,
-    /// Which views.
-    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
-    pub split: SplitArg,
+    #[command(flatten)]
+    pub views: ModelViews,
     /// Devices, or DEVICE/RASTERIZER where it is not to be the model's rasterizer; all are compared with the first.
     #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "flex,ndarray,wgpu")]
     pub devices: Vec<String>,
     /// Draw at most this many views, evenly spread; 0 is all.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub max_views: usize,
-    /// Override a scene option, such as scene.downscale=2; may be given several times.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    pub sets: Vec<String>,
 }
 
 #[derive(Debug, Args)]

@@ -51,12 +51,12 @@ pub struct Pictures {
 
 pub fn run(context: &Context, args: &Eval) -> Result<()> {
     let events = context.listeners(None)?;
-    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_scene(&args.scene, &loaded.model, &args.sets, &context.limits)?;
-    let split = args.split.into();
-    let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.model, split, context.output.json_file()));
+    let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
+    let scene = open_scene(&args.views.scene, &loaded.model, &args.views.sets, &context.limits)?;
+    let split = args.views.split.into();
+    let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_file()));
     let pictures = Pictures { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };
-    let report = measure(context, &args.model, &loaded, &scene, split, args.max_views, &pictures, &events)?;
+    let report = measure(context, &args.views.model, &loaded, &scene, split, args.max_views, &pictures, &events)?;
     context.output.result(&report, || text(&report))
 }
 

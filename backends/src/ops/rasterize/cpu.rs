@@ -8,24 +8,22 @@ use crate::rasterizers::reference::{self, ReferenceInput};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Flex, NdArray, TensorMetadata};
 use cc4dgs_core::RenderWork;
+use std::borrow::Cow;
 use std::sync::Mutex;
 
-fn background_of<B: CpuBackend>(tensor: &FloatTensor<B>) -> [f32; 3] {
-    let values = B::floats(tensor);
-    std::array::from_fn(|k| values.get(k).copied().unwrap_or(0.0))
+/// The inputs as slices.
+fn arrays<B: CpuBackend>(inputs: &SavedInputs<B>) -> [Cow<'_, [f32]>; 7] {
+    std::array::from_fn(|k| B::floats(&inputs[k]))
+}
+
+fn splats<'a>([means, scales, quaternions, opacities, colors, sh_rest, background]: &'a [Cow<'_, [f32]>; 7]) -> SplatArrays<'a> {
+    let background = std::array::from_fn(|k| background.get(k).copied().unwrap_or(0.0));
+    SplatArrays { means, scales, quaternions, opacities, colors, sh_rest, background }
 }
 
 fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSettings, method: Method) -> Rasterized<B> {
-    let [means, scales, quaternions, opacities, colors, sh_rest] = std::array::from_fn(|k| B::floats(&inputs[k]));
-    let splats = SplatArrays {
-        means: &means,
-        scales: &scales,
-        quaternions: &quaternions,
-        opacities: &opacities,
-        colors: &colors,
-        sh_rest: &sh_rest,
-        background: background_of::<B>(&inputs[6]),
-    };
+    let arrays = arrays::<B>(inputs);
+    let splats = splats(&arrays);
     if method == Method::Reference {
         return reference_forward::<B>(&splats, settings);
     }
@@ -99,16 +97,8 @@ impl<B: CpuBackend> RasterBackward for B {
         wanted: [bool; PARENTS],
     ) -> [Option<FloatTensor<Self>>; PARENTS] {
         let shapes: [_; 7] = std::array::from_fn(|k| inputs[k].shape());
-        let [means, scales, quaternions, opacities, colors, sh_rest] = std::array::from_fn(|k| B::floats(&inputs[k]));
-        let splats = SplatArrays {
-            means: &means,
-            scales: &scales,
-            quaternions: &quaternions,
-            opacities: &opacities,
-            colors: &colors,
-            sh_rest: &sh_rest,
-            background: background_of::<B>(&inputs[6]),
-        };
+        let arrays = arrays::<B>(&inputs);
+        let splats = splats(&arrays);
         let [w_means, w_scales, w_quaternions, w_opacities, w_colors, w_rest, w_screen, w_camera, w_background] = wanted;
         let request = GradientRequest {
             means: w_means,

@@ -21,7 +21,7 @@ pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
     let mut models = Vec::new();
     for name in &args.devices {
         let (device, rasterizer) = name.split_once('/').map_or((name.as_str(), None), |(device, rasterizer)| (device, Some(rasterizer)));
-        let mut loaded = load_model(&args.model, device, &context.registry, &context.limits, &events)?;
+        let mut loaded = load_model(&args.views.model, device, &context.registry, &context.limits, &events)?;
         if let Some(rasterizer) = rasterizer {
             loaded.model.rasterizer = toml::Table::from_iter([("kind".to_string(), toml::Value::from(rasterizer))]);
             loaded.device_name = name.clone();
@@ -31,12 +31,12 @@ pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
     let Some((_, _, first)) = models.first() else {
         return Err(Error::parameter("--devices", "none is named", "Give at least two, such as flex,wgpu"));
     };
-    let scene = open_scene(&args.scene, first, &args.sets, &context.limits)?;
-    let views = scene.split(args.split.into());
+    let scene = open_scene(&args.views.scene, first, &args.views.sets, &context.limits)?;
+    let views = scene.split(args.views.split.into());
     let wanted = if args.max_views == 0 { views.len() } else { args.max_views };
     let views: Vec<usize> = evenly(views.len(), wanted).into_iter().map(|i| views[i]).collect();
     let devices = agreement(&models, &scene, &views, &context.registry, &events)?;
-    let report = AgreeReport { version: env!("CARGO_PKG_VERSION"), model: args.model.display().to_string(), scene: scene.name.clone(), devices };
+    let report = AgreeReport { version: env!("CARGO_PKG_VERSION"), model: args.views.model.display().to_string(), scene: scene.name.clone(), devices };
     context.output.result(&report, || text(&report))
 }
 

@@ -26,9 +26,9 @@ struct PlayReport<'a> {
 /// Plays the views of a dataset's split with a trained model, over and over.
 pub fn play(context: &Context, args: &BenchPlay) -> Result<()> {
     let events = context.listeners(None)?;
-    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_scene(&args.scene, &loaded.model, &args.sets, &context.limits)?;
-    let moments: Vec<(Camera, f32)> = scene.split(args.split.into()).into_iter().map(|v| (scene.camera(v).clone(), scene.views[v].time_norm)).collect();
+    let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
+    let scene = open_scene(&args.views.scene, &loaded.model, &args.views.sets, &context.limits)?;
+    let moments: Vec<(Camera, f32)> = scene.split(args.views.split.into()).into_iter().map(|v| (scene.camera(v).clone(), scene.views[v].time_norm)).collect();
     let Some((camera, _)) = moments.first() else {
         return Err(Error::parameter("--split", format!("{} has no view of this split", scene.name), "Play the other split"));
     };
@@ -39,7 +39,7 @@ pub fn play(context: &Context, args: &BenchPlay) -> Result<()> {
     })?;
     let report = PlayReport {
         version: env!("CARGO_PKG_VERSION"),
-        model: args.model.display().to_string(),
+        model: args.views.model.display().to_string(),
         scene: scene.name.clone(),
         device: &loaded.device_name,
         threads: rayon::current_num_threads(),
