@@ -141,7 +141,17 @@ impl BasisBackward for CubeBackend {
             let (c, g) = (coefficients.clone().into_buffer_arg(), grad.clone().into_buffer_arg());
             let (p, parts) = (plan.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
             function_parts::launch(&client, cubes_for(segments * count), dim, c, g, p, parts, rows as u32, width, count as u32);
-            add_segments::launch(&client, cubes_for(count), dim, partial.into_buffer_arg(), out.clone().into_buffer_arg(), count as u32, segments as u32, 0);
+            add_segments::launch(
+                &client,
+                cubes_for(count),
+                dim,
+                partial.into_buffer_arg(),
+                out.clone().into_buffer_arg(),
+                count as u32,
+                segments as u32,
+                0,
+                false,
+            );
             out
         });
         [of_coefficients, of_functions]

@@ -1,7 +1,10 @@
 //! Hash signatures and the decoders behind them (Linear, LayerNorm, Mish per hidden layer), one row per vertex.
 
+use super::gradients::{self, Rows};
 use super::layers::{self, Dense};
-use super::program::{Input, Place, Program, Step};
+use super::program::{Input, Program, Step, Target, mish, mish_derivative, parts, scales};
+use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
+use crate::cpu::mlp::mish::MishLayer;
 use crate::cpu::vertex::hash::LevelHash;
 use crate::cube::tensor::{UNITS, cubes_for, floats, upload};
 use crate::ops::field::{Decoder, MishShape};
@@ -11,8 +14,6 @@ use cubecl::prelude::*;
 
 /// 2^31 - 1.
 const P: u32 = 0x7fff_ffff;
-/// Added to variances.
-pub const EPSILON: f32 = 1e-5;
 
 /// Congruent to `v` modulo P: 2^31 = 1 there.
 #[cube]
@@ -29,13 +30,14 @@ fn product(a: u32, x: u32) -> u32 {
     fold(fold(((high & 0x7fffu32) << 16) + (high >> 15)) + low)
 }
 
-/// Number `k` of the signature of a vertex of `vertices` [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold A's three rows [k] each, then b [k].
+/// Number `k` of the signature of a vertex of `vertices` [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold from `at` on A's three rows [k] each,
+/// then b [k].
 #[cube]
-pub fn signature(vertices: &[i32], constants: &[u32], vertex: usize, k: usize, hashes: usize, modulus: u32, scale: f32) -> f32 {
-    let mut sum = constants[3 * hashes + k];
+pub fn signature(vertices: &[i32], constants: &[u32], at: usize, vertex: usize, k: usize, hashes: usize, modulus: u32, scale: f32) -> f32 {
+    let mut sum = constants[at + 3 * hashes + k];
     #[unroll]
     for d in 0..3usize {
-        sum = fold(sum + product(constants[d * hashes + k], vertices[3 * vertex + d] as u32));
+        sum = fold(sum + product(constants[at + d * hashes + k], vertices[3 * vertex + d] as u32));
     }
     let residue = select(sum >= P, sum - P, sum);
     (residue % modulus) as f32 * scale - 1.0
@@ -46,27 +48,8 @@ pub fn signature(vertices: &[i32], constants: &[u32], vertex: usize, k: usize, h
 fn signatures(vertices: &[i32], constants: &[u32], out: &mut [f32], hashes: u32, modulus: u32, scale: f32) {
     if ABSOLUTE_POS < out.len() {
         let h = hashes as usize;
-        out[ABSOLUTE_POS] = signature(vertices, constants, ABSOLUTE_POS / h, ABSOLUTE_POS % h, h, modulus, scale);
+        out[ABSOLUTE_POS] = signature(vertices, constants, 0usize, ABSOLUTE_POS / h, ABSOLUTE_POS % h, h, modulus, scale);
     }
-}
-
-/// e^x - 1 cannot cancel here: with w = e^x, tanh(ln(1 + w)) = (w^2 + 2 w) / (w^2 + 2 w + 2).
-#[cube]
-pub fn mish(x: f32) -> f32 {
-    // Beyond 20 the factor is 1 to float32.
-    let w = select(x < 20.0, x, 20.0f32).exp();
-    let n = w * (w + 2.0);
-    x * (n / (n + 2.0))
-}
-
-#[cube]
-fn mish_derivative(x: f32) -> f32 {
-    let w = select(x < 20.0, x, 20.0f32).exp();
-    let n = w * (w + 2.0);
-    let t = n / (n + 2.0);
-    // d tanh(softplus) = (1 - t^2) sigmoid; 1 - t^2 = 4 (n + 1) / (n + 2)^2.
-    let slope = 4.0 * (n + 1.0) / ((n + 2.0) * (n + 2.0)) * (w / (1.0 + w));
-    t + x * select(x < 20.0, slope, 0.0f32)
 }
 
 /// Mean and inverse deviation of a row of y [_, n].
@@ -150,7 +133,7 @@ fn run(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, rows: usi
     let mut before_norm = Vec::new();
     let mut output = inputs[0].clone();
     for layer in decoder.shape.layers() {
-        let l = Dense { input: layer.input, output: layer.output, at: layer.weight.start };
+        let l = dense(&layer);
         let y = floats(weights, [rows, layer.output]);
         layers::forward(&inputs[inputs.len() - 1], weights, &y, rows, l, 0, false);
         match layer.gain {
@@ -167,31 +150,115 @@ fn run(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, rows: usi
     Pass { inputs, before_norm, output }
 }
 
+fn dense(layer: &MishLayer) -> Dense {
+    Dense { input: layer.input, output: layer.output, at: layer.weight.start }
+}
+
+fn multiply(layer: &MishLayer, target: Target) -> Step {
+    let (input, output, weights) = (layer.input, layer.output, layer.weight.start);
+    Step::Multiply { source: 0, target, input, output, weights, bias: Some(layer.bias.start), relu: false, add: false }
+}
+
 /// Features [U, F] of `vertices` [U,3].
 pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -> CubeTensor {
     let rows = vertices.meta.shape()[0];
+    let mut steps = Vec::new();
+    for layer in decoder.shape.layers() {
+        match &layer.gain {
+            Some(gain) => {
+                let norm = Step::Norm { tile: 0, width: layer.output, gain: gain.start, keep: None };
+                steps.extend([multiply(&layer, Target::Tile(0)), norm]);
+            }
+            None => steps.push(multiply(&layer, Target::Out(0))),
+        }
+    }
+    let program = Program(steps);
+    let Some(layout) = program.layout_on(weights, decoder.hash.len(), rows) else { return run(weights, vertices, decoder, rows).output };
     let out = floats(weights, [rows, decoder.shape.output]);
-    let layers = decoder.shape.layers().into_iter().map(|layer| Step {
-        input: layer.input,
-        output: layer.output,
-        weights: layer.weight.start,
-        norm: layer.gain.as_ref().map(|gain| gain.start),
-        relu: false,
-        source: Place::First,
-        target: if layer.gain.is_some() { Place::First } else { Place::Output(0) },
-    });
-    let done = Program(layers.collect()).run(&Input::Signatures(vertices, &decoder.hash), weights, &out, rows);
-    if done { out } else { run(weights, vertices, decoder, rows).output }
+    program.run(layout, Input::Signatures(vertices, &decoder.hash), weights, weights, &out, &(0..rows));
+    out
+}
+
+/// Where a layer's input, normalised values, and gradients before Mish and before the norm are kept.
+#[derive(Clone, Copy, Default)]
+struct Kept {
+    input: usize,
+    normal: usize,
+    before_mish: usize,
+    before_norm: usize,
+}
+
+/// There and back again for so many rows: the steps, what they keep where, and the floats that takes.
+fn there_and_back(layers: &[MishLayer], rows: usize) -> (Program, Vec<Kept>, usize) {
+    let mut end = 0;
+    let mut take = |floats: usize| {
+        end += floats;
+        end - floats
+    };
+    let transposed = layers.last().map_or(0, |l| l.bias.end);
+    let (mut steps, mut back, mut kept) = (Vec::new(), Vec::new(), Vec::new());
+    for (i, layer) in layers.iter().enumerate() {
+        let mut own = Kept { input: take(rows * layer.input), ..Kept::default() };
+        steps.push(Step::Keep { tile: 0, width: layer.input, at: own.input });
+        let width = layer.output;
+        if i > 0 {
+            // Backwards, this comes before what the layer in front does.
+            let (weights, target) = (transposed + layer.weight.start, Target::Tile(0));
+            back.push(Step::Multiply { source: 0, target, input: width, output: layer.input, weights, bias: None, relu: false, add: false });
+        }
+        match &layer.gain {
+            Some(gain) => {
+                let scale = take(scales(rows));
+                own = Kept { normal: take(rows * width), before_mish: take(rows * width), before_norm: take(rows * width), ..own };
+                let keep = [own.normal, scale];
+                steps.extend([multiply(layer, Target::Tile(0)), Step::Norm { tile: 0, width, gain: gain.start, keep: Some(keep) }]);
+                back.push(Step::NormBack { tile: 0, width, gain: gain.start, kept: keep, before: own.before_mish, after: own.before_norm });
+            }
+            None => back.push(Step::Load { tile: 0, columns: 0..width, width, at: 0 }),
+        }
+        kept.push(own);
+    }
+    steps.extend(back.into_iter().rev());
+    (Program(steps), kept, end)
 }
 
 /// The gradient of the flat weights from that of the features. Activations are computed again rather than kept.
-pub fn backward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, grad: CubeTensor) -> CubeTensor {
+pub fn backward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, grad: &CubeTensor) -> CubeTensor {
     let rows = vertices.meta.shape()[0];
     let count = MishShape::parameter_count(&decoder.shape);
     if rows == 0 {
         return upload(weights, &vec![0.0f32; count], DType::F32);
     }
+    let layers = decoder.shape.layers();
+    let Some(layout) = there_and_back(&layers, rows).0.layout_on(weights, decoder.hash.len(), rows) else {
+        return layer_by_layer(weights, vertices, decoder, grad.clone(), rows);
+    };
     let gradient = floats(weights, [count]);
+    let all: Vec<Dense> = layers.iter().map(dense).collect();
+    let both = gradients::with_transposed(weights, &all);
+    for part in parts(weights, rows, there_and_back(&layers, 16).2.div_ceil(16)) {
+        let (program, kept, floats_kept) = there_and_back(&layers, part.len());
+        let buffer = &floats(weights, [floats_kept]);
+        program.run(layout, Input::Signatures(vertices, &decoder.hash), &both, grad, buffer, &part);
+        let (n, add) = (part.len(), part.start > 0);
+        let own = |at| Rows { buffer, at };
+        for ((layer, &l), kept) in layers.iter().zip(&all).zip(kept) {
+            let dy = match &layer.gain {
+                Some(gain) => {
+                    gradients::of_norm(own(kept.before_mish), own(kept.normal), &gradient, n, l.output, gain.start, add);
+                    own(kept.before_norm)
+                }
+                None => Rows { buffer: grad, at: part.start * l.output },
+            };
+            gradients::of_layer(own(kept.input), dy, &gradient, n, l, add);
+        }
+    }
+    gradient
+}
+
+/// As [`backward`], for networks that are too wide for a program.
+fn layer_by_layer(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, grad: CubeTensor, rows: usize) -> CubeTensor {
+    let gradient = floats(weights, [MishShape::parameter_count(&decoder.shape)]);
     let pass = run(weights, vertices, decoder, rows);
     let client = weights.client.clone();
     let mut d = grad;
@@ -211,10 +278,10 @@ pub fn backward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, 
                 layer.output as u32,
                 gain.start as u32,
             );
-            layers::backward_norm(&dz, &pass.before_norm[i], &gradient, rows, layer.output, gain.start);
+            gradients::of_norm(Rows::whole(&dz), Rows::whole(&pass.before_norm[i]), &gradient, rows, layer.output, gain.start, false);
         }
-        let l = Dense { input: layer.input, output: layer.output, at: layer.weight.start };
-        layers::backward_weights(&pass.inputs[i], &d, &gradient, rows, l);
+        let l = dense(layer);
+        gradients::of_layer(Rows::whole(&pass.inputs[i]), Rows::whole(&d), &gradient, rows, l, false);
         if i > 0 {
             let dx = floats(weights, [rows, layer.input]);
             layers::backward_input(&d, weights, &dx, rows, l, false);

@@ -1,7 +1,5 @@
-//! Linear layers forwards and backwards. Weights lie in one flat buffer, W [in, out] row-major and then b [out], at an offset.
-//!
-//! A unit computes one column of several rows, so that a weight is read once for all of them. Sums over rows are taken per segment and then over the
-//! segments, in order.
+//! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W [in, out] row-major and then b [out], at
+//! an offset. A unit computes one column of several rows, so that a weight is read once for all of them.
 
 use crate::cube::tensor::{UNITS, cubes_for, floats};
 use burn_cubecl::tensor::CubeTensor;
@@ -9,8 +7,6 @@ use cubecl::prelude::*;
 
 /// Rows a unit computes.
 const ROWS: usize = 8;
-/// Parts into which sums over rows are cut.
-const SEGMENTS: usize = 32;
 
 /// Sizes of a layer and where its weights start.
 #[derive(Clone, Copy, Debug)]
@@ -31,7 +27,7 @@ fn linear(x: &[f32], weights: &[f32], y: &mut [f32], rows: u32, input: u32, outp
         let bias = weights[at + input * output + column];
         #[unroll]
         for r in 0..8usize {
-            sums[r] = bias;
+            sums[r] = 0.0f32;
         }
         for i in 0..input {
             let w = weights[at + i * output + column];
@@ -39,13 +35,13 @@ fn linear(x: &[f32], weights: &[f32], y: &mut [f32], rows: u32, input: u32, outp
             for r in 0..8usize {
                 // Rows beyond the last repeat it; they are not written.
                 let row = select(first + r < rows as usize, first + r, rows as usize - 1);
-                sums[r] += x[row * input + i] * w;
+                sums[r] = fma(x[row * input + i], w, sums[r]);
             }
         }
         #[unroll]
         for r in 0..8usize {
             if first + r < rows as usize {
-                let mut value = sums[r];
+                let mut value = sums[r] + bias;
                 if comptime!(relu) {
                     value = select(value > 0.0, value, 0.0f32);
                 }
@@ -72,7 +68,7 @@ fn linear_backward_input(dy: &[f32], weights: &[f32], dx: &mut [f32], rows: u32,
             #[unroll]
             for r in 0..8usize {
                 let row = select(first + r < rows as usize, first + r, rows as usize - 1);
-                sums[r] += dy[row * output + o] * w;
+                sums[r] = fma(dy[row * output + o], w, sums[r]);
             }
         }
         #[unroll]
@@ -89,65 +85,6 @@ fn linear_backward_input(dy: &[f32], weights: &[f32], dx: &mut [f32], rows: u32,
     }
 }
 
-/// Per segment of rows: x^T dy, and below it the sums of dy: partial [segments, (in + 1) out].
-#[cube(launch)]
-fn weight_gradient_parts(x: &[f32], dy: &[f32], partial: &mut [f32], rows: u32, input: u32, output: u32, segment: u32) {
-    let (input, output) = (input as usize, output as usize);
-    let width = (input + 1) * output;
-    if ABSOLUTE_POS < partial.len() {
-        let part = ABSOLUTE_POS / width;
-        let i = ABSOLUTE_POS % width / output;
-        let o = ABSOLUTE_POS % output;
-        let start = part * segment as usize;
-        let wanted = start + segment as usize;
-        let end = select(wanted < rows as usize, wanted, rows as usize);
-        let mut sum = 0.0f32;
-        for row in start..end {
-            let mut factor = 1.0f32;
-            if i < input {
-                factor = x[row * input + i];
-            }
-            sum += factor * dy[row * output + o];
-        }
-        partial[ABSOLUTE_POS] = sum;
-    }
-}
-
-/// Sums over rows per segment of dz times the normalised values, then of dz alone: partial [segments, 2 out].
-#[cube(launch)]
-fn norm_gradient_parts(dz: &[f32], normalized: &[f32], partial: &mut [f32], rows: u32, output: u32, segment: u32) {
-    let output = output as usize;
-    if ABSOLUTE_POS < partial.len() {
-        let part = ABSOLUTE_POS / (2 * output);
-        let which = ABSOLUTE_POS % (2 * output) / output;
-        let o = ABSOLUTE_POS % output;
-        let start = part * segment as usize;
-        let wanted = start + segment as usize;
-        let end = select(wanted < rows as usize, wanted, rows as usize);
-        let mut sum = 0.0f32;
-        for row in start..end {
-            let mut factor = 1.0f32;
-            if which == 0 {
-                factor = normalized[row * output + o];
-            }
-            sum += factor * dz[row * output + o];
-        }
-        partial[ABSOLUTE_POS] = sum;
-    }
-}
-
-/// Adds the segments up, into `gradient` at `at`.
-#[cube(launch)]
-pub fn add_segments(partial: &[f32], gradient: &mut [f32], width: u32, segments: u32, at: u32) {
-    if ABSOLUTE_POS < width as usize {
-        let mut sum = 0.0f32;
-        for segment in 0..segments as usize {
-            sum += partial[segment * width as usize + ABSOLUTE_POS];
-        }
-        gradient[at as usize + ABSOLUTE_POS] = sum;
-    }
-}
-
 /// dy becomes 0 where the output of a ReLU is.
 #[cube(launch)]
 fn cut_where_off(dy: &mut [f32], y: &[f32]) {
@@ -156,11 +93,10 @@ fn cut_where_off(dy: &mut [f32], y: &[f32]) {
     }
 }
 
-/// Copies a stretch of `from`.
 #[cube(launch)]
-fn copy_from(from: &[f32], to: &mut [f32], at: u32) {
-    if ABSOLUTE_POS < to.len() {
-        to[ABSOLUTE_POS] = from[at as usize + ABSOLUTE_POS];
+fn copy_stretch(from: &[f32], to: &mut [f32], from_at: u32, to_at: u32, count: u32) {
+    if ABSOLUTE_POS < count as usize {
+        to[to_at as usize + ABSOLUTE_POS] = from[from_at as usize + ABSOLUTE_POS];
     }
 }
 
@@ -184,45 +120,22 @@ pub fn backward_input(dy: &CubeTensor, weights: &CubeTensor, dx: &CubeTensor, ro
     linear_backward_input::launch(&client, cubes_for(units), dim(), g, w, d, rows as u32, l.input as u32, l.output as u32, l.at as u32, accumulate);
 }
 
-/// Gradient of W and b of layer `l`, into `gradient` where the weights lie.
-pub fn backward_weights(x: &CubeTensor, dy: &CubeTensor, gradient: &CubeTensor, rows: usize, l: Dense) {
-    let client = x.client.clone();
-    let width = (l.input + 1) * l.output;
-    let (segments, segment) = segments_of(rows);
-    let partial = floats(x, [segments * width]);
-    let (a, g, p) = (x.clone().into_buffer_arg(), dy.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
-    weight_gradient_parts::launch(&client, cubes_for(segments * width), dim(), a, g, p, rows as u32, l.input as u32, l.output as u32, segment as u32);
-    let (p, to) = (partial.into_buffer_arg(), gradient.clone().into_buffer_arg());
-    add_segments::launch(&client, cubes_for(width), dim(), p, to, width as u32, segments as u32, l.at as u32);
-}
-
-/// Gradient of gain and shift [out] each, which follow the bias, into `gradient` at `at`.
-pub fn backward_norm(dz: &CubeTensor, normalized: &CubeTensor, gradient: &CubeTensor, rows: usize, output: usize, at: usize) {
-    let client = dz.client.clone();
-    let (segments, segment) = segments_of(rows);
-    let partial = floats(dz, [segments * 2 * output]);
-    let (g, x, p) = (dz.clone().into_buffer_arg(), normalized.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
-    norm_gradient_parts::launch(&client, cubes_for(segments * 2 * output), dim(), g, x, p, rows as u32, output as u32, segment as u32);
-    let (p, to) = (partial.into_buffer_arg(), gradient.clone().into_buffer_arg());
-    add_segments::launch(&client, cubes_for(2 * output), dim(), p, to, 2 * output as u32, segments as u32, at as u32);
-}
-
 /// dy where a ReLU let something through.
 pub fn backward_relu(dy: &CubeTensor, y: &CubeTensor, count: usize) {
     let client = dy.client.clone();
     cut_where_off::launch(&client, cubes_for(count), dim(), dy.clone().into_buffer_arg(), y.clone().into_buffer_arg());
 }
 
+/// Copies `count` values of `from` at one place to another place of `to`.
+pub fn copy(from: &CubeTensor, to: &CubeTensor, from_at: usize, to_at: usize, count: usize) {
+    let client = from.client.clone();
+    let (a, b) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
+    copy_stretch::launch(&client, cubes_for(count), dim(), a, b, from_at as u32, to_at as u32, count as u32);
+}
+
 /// The stretch of `from` at `at` as a buffer of its own [count].
 pub fn stretch(from: &CubeTensor, at: usize, count: usize) -> CubeTensor {
     let out = floats(from, [count]);
-    let client = from.client.clone();
-    copy_from::launch(&client, cubes_for(count), dim(), from.clone().into_buffer_arg(), out.clone().into_buffer_arg(), at as u32);
+    copy(from, &out, at, 0, count);
     out
-}
-
-/// How many segments, and of how many rows.
-fn segments_of(rows: usize) -> (usize, usize) {
-    let segment = rows.div_ceil(SEGMENTS).max(1);
-    (rows.div_ceil(segment).max(1), segment)
 }

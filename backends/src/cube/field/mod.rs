@@ -1,12 +1,13 @@
 //! The computational deformation field on the device.
 
 mod decoder;
+mod gradients;
 mod layers;
 mod network;
 mod program;
 mod voxels;
 
-pub use layers::add_segments;
+pub use gradients::add_segments;
 
 use crate::ops::corners::{CornerOps, CornersBegun, GridBox};
 use crate::ops::field::{Decoder, FieldKernels, FieldOps, ReluShape};
@@ -17,7 +18,7 @@ use std::sync::Arc;
 
 impl FieldKernels for CubeBackend {
     fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
-        decoder::backward(&into_contiguous(weights), &into_contiguous(vertices), &decoder, into_contiguous(grad))
+        decoder::backward(&into_contiguous(weights), &into_contiguous(vertices), &decoder, &into_contiguous(grad))
     }
     fn trilinear_backward(grad: FloatTensor<Self>, weights: FloatTensor<Self>, slots: IntTensor<Self>, starts: IntTensor<Self>) -> FloatTensor<Self> {
         voxels::interpolate_backward(into_contiguous(grad), into_contiguous(weights), into_contiguous(slots), into_contiguous(starts))

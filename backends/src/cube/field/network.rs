@@ -1,11 +1,16 @@
 //! Trunk and heads of Linear + ReLU layers.
 
+use super::gradients::{self, Rows};
 use super::layers::{self, Dense};
-use super::program::{Input, Place, Program, Step};
-use crate::cpu::mlp::relu::ReluShape;
+use super::program::{Input, Program, Step, Target, parts};
+use crate::cpu::mlp::relu::{Layer, ReluShape};
 use crate::cube::tensor::{floats, upload};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
+
+fn dense(layer: &Layer) -> Dense {
+    Dense { input: layer.input, output: layer.output, at: layer.weight.start }
+}
 
 /// The outputs of all layers; those that leave the network lie in the flat result at the given place instead.
 fn run(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, rows: usize) -> (Vec<CubeTensor>, CubeTensor) {
@@ -14,44 +19,163 @@ fn run(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, rows: usize) -> 
     let mut outputs: Vec<CubeTensor> = Vec::new();
     for layer in shape.layers() {
         let input = layer.parent.map_or(x, |p| &outputs[p]).clone();
-        let l = Dense { input: layer.input, output: layer.output, at: layer.weight.start };
         let (y, at) = match layer.slot {
             Some(slot) => (flat.clone(), rows * widths[..slot].iter().sum::<usize>()),
             None => (floats(x, [rows, layer.output]), 0),
         };
-        layers::forward(&input, weights, &y, rows, l, at, layer.relu);
+        layers::forward(&input, weights, &y, rows, dense(&layer), at, layer.relu);
         outputs.push(y);
     }
     (outputs, flat)
 }
 
+/// Trunk and heads as steps: the trunk works in one tile, heads in another, because each of them reads what the trunk ends with.
+struct Tree {
+    layers: Vec<Layer>,
+    /// Where each layer's output starts among the flat outputs, if it is one.
+    slots: Vec<Option<usize>>,
+    trunk: usize,
+    weights: usize,
+}
+
+const TRUNK: usize = 0;
+const HEAD: usize = 1;
+/// For gradients of outputs that are wider than a tile and come in pieces.
+const PIECE: usize = 2;
+
+impl Tree {
+    fn new(shape: &ReluShape, rows: usize) -> Self {
+        let (layers, widths) = (shape.layers(), shape.output_widths());
+        let slots = layers.iter().map(|l| l.slot.map(|slot| rows * widths[..slot].iter().sum::<usize>())).collect();
+        Self { layers, slots, trunk: shape.trunk.len(), weights: shape.parameter_count() }
+    }
+    fn tile(&self, layer: usize) -> usize {
+        if layer < self.trunk { TRUNK } else { HEAD }
+    }
+    fn forward(&self, i: usize, target: Target) -> Step {
+        let l = &self.layers[i];
+        let source = l.parent.map_or(TRUNK, |p| self.tile(p));
+        Step::Multiply { source, target, input: l.input, output: l.output, weights: l.weight.start, bias: Some(l.bias.start), relu: l.relu, add: false }
+    }
+    /// From the gradient of layer `i`'s output, of which the source tile holds some columns, to that of its input.
+    fn backward(&self, i: usize, source: usize, columns: std::ops::Range<usize>, target: Target, add: bool) -> Step {
+        let l = &self.layers[i];
+        let weights = self.weights + l.weight.start + columns.start * l.input;
+        Step::Multiply { source, target, input: columns.len(), output: l.input, weights, bias: None, relu: false, add }
+    }
+    /// The widest row that stays on the chip: outputs leave it and come in pieces.
+    fn widest_inside(&self) -> usize {
+        self.layers.iter().map(|l| l.input).max().unwrap_or(1)
+    }
+}
+
 /// Flat outputs, head after head.
 pub fn forward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape) -> CubeTensor {
     let rows = x.meta.shape()[0];
-    let widths = shape.output_widths();
-    let flat = floats(x, [rows * widths.iter().sum::<usize>()]);
-    let mut steps: Vec<Step> = Vec::new();
-    for (i, layer) in shape.layers().into_iter().enumerate() {
-        let target = match layer.slot {
-            Some(slot) => Place::Output(rows * widths[..slot].iter().sum::<usize>()),
-            // The trunk's last values are read by every head, so heads work in the other tile.
-            None if i < shape.trunk.len() => Place::First,
-            None => Place::Second,
-        };
-        let source = layer.parent.map_or(Place::First, |parent| steps[parent].target);
-        steps.push(Step { input: layer.input, output: layer.output, weights: layer.weight.start, norm: None, relu: layer.relu, source, target });
-    }
-    if Program(steps).run(&Input::Rows(x), weights, &flat, rows) { flat } else { run(x, weights, shape, rows).1 }
+    let tree = Tree::new(shape, rows);
+    let step = |i: usize| tree.forward(i, tree.slots[i].map_or(Target::Tile(tree.tile(i)), Target::Out));
+    let program = Program((0..tree.layers.len()).map(step).collect());
+    let Some(layout) = program.layout_on(x, shape.input, rows) else { return run(x, weights, shape, rows).1 };
+    let flat = floats(x, [rows * shape.output_widths().iter().sum::<usize>()]);
+    program.run(layout, Input::Rows(x, shape.input), weights, weights, &flat, &(0..rows));
+    flat
 }
 
-/// Gradients of the input, if wanted, and of the flat weights from that of the flat outputs.
+/// Where a layer's output and the gradient before its ReLU are kept.
+#[derive(Clone, Copy, Default)]
+struct Kept {
+    output: usize,
+    gradient: usize,
+}
+
+/// There and back again for `rows` of the rows: the steps, what they keep where, the place of the input's gradient, and the floats all that takes.
+fn there_and_back(tree: &Tree, rows: usize, wants_input: bool) -> (Program, Vec<Kept>, usize, usize) {
+    let mut end = 0;
+    let mut take = |floats: usize| {
+        end += floats;
+        end - floats
+    };
+    let mut steps = Vec::new();
+    let mut kept = vec![Kept::default(); tree.layers.len()];
+    for (i, layer) in tree.layers.iter().enumerate() {
+        // Outputs are not needed again, unless a ReLU made them.
+        if layer.slot.is_none() || layer.relu {
+            let (tile, width) = (tree.tile(i), layer.output);
+            kept[i] = Kept { output: take(rows * width), gradient: take(rows * width) };
+            steps.extend([tree.forward(i, Target::Tile(tile)), Step::Keep { tile, width, at: kept[i].output }]);
+        }
+    }
+    let of_input = take(if wants_input { rows * tree.layers.first().map_or(0, |l| l.input) } else { 0 });
+    // Whether the trunk's tile holds a gradient yet, to which further heads add.
+    let mut begun = false;
+    for (i, layer) in tree.layers.iter().enumerate().rev() {
+        let (tile, width) = (tree.tile(i), layer.output);
+        let to = layer.parent.map_or(TRUNK, |p| tree.tile(p));
+        let leaves = layer.parent.is_none() && !wants_input;
+        let add = to == TRUNK && i >= tree.trunk && begun;
+        begun |= to == TRUNK && i >= tree.trunk;
+        let target = if layer.parent.is_none() && i < tree.trunk { Target::Out(of_input) } else { Target::Tile(to) };
+        if let (Some(at), false) = (tree.slots[i], layer.relu) {
+            let most = tree.widest_inside();
+            let source = if width > most && to == HEAD { PIECE } else { HEAD };
+            for start in (0..if leaves { 0 } else { width }).step_by(most) {
+                let columns = start..(start + most).min(width);
+                steps.push(Step::Load { tile: source, columns: columns.clone(), width, at });
+                steps.push(tree.backward(i, source, columns, target, add || start > 0));
+            }
+            continue;
+        }
+        if let Some(at) = tree.slots[i] {
+            steps.push(Step::Load { tile, columns: 0..width, width, at });
+        }
+        steps.extend([Step::Cut { tile, width, at: kept[i].output }, Step::Keep { tile, width, at: kept[i].gradient }]);
+        if !leaves {
+            steps.push(tree.backward(i, tile, 0..width, target, add));
+        }
+    }
+    if wants_input && tree.trunk == 0 {
+        steps.push(Step::Keep { tile: TRUNK, width: tree.layers.first().map_or(0, |l| l.input), at: of_input });
+    }
+    (Program(steps), kept, of_input, end)
+}
+
+/// Gradients of the input, if wanted, and of the flat weights from that of the flat outputs. Activations are computed again rather than kept.
 pub fn backward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad: &CubeTensor, wants_input: bool) -> (Option<CubeTensor>, CubeTensor) {
     let rows = x.meta.shape()[0];
-    let count = shape.parameter_count();
+    let of_input = wants_input.then(|| floats(x, x.meta.shape().clone()));
     if rows == 0 {
-        return (wants_input.then(|| floats(x, x.meta.shape().clone())), upload(weights, &vec![0.0f32; count], DType::F32));
+        return (of_input, upload(weights, &vec![0.0f32; shape.parameter_count()], DType::F32));
     }
-    let gradient = floats(weights, [count]);
+    let tree = Tree::new(shape, rows);
+    let Some(layout) = there_and_back(&tree, rows, wants_input).0.layout_on(x, shape.input, rows) else {
+        return layer_by_layer(x, weights, shape, grad, wants_input);
+    };
+    let gradient = floats(weights, [tree.weights]);
+    let all: Vec<Dense> = tree.layers.iter().map(dense).collect();
+    let both = gradients::with_transposed(weights, &all);
+    for part in parts(x, rows, there_and_back(&tree, 16, wants_input).3.div_ceil(16)) {
+        let (program, kept, input_at, floats_kept) = there_and_back(&tree, part.len(), wants_input);
+        let buffer = &floats(x, [floats_kept]);
+        program.run(layout, Input::Rows(x, shape.input), &both, grad, buffer, &part);
+        for (i, (layer, &l)) in tree.layers.iter().zip(&all).enumerate() {
+            let input = layer.parent.map_or(Rows { buffer: x, at: part.start * l.input }, |p| Rows { buffer, at: kept[p].output });
+            let dy = match tree.slots[i] {
+                Some(at) if !layer.relu => Rows { buffer: grad, at: at + part.start * l.output },
+                _ => Rows { buffer, at: kept[i].gradient },
+            };
+            gradients::of_layer(input, dy, &gradient, part.len(), l, part.start > 0);
+        }
+        if let Some(of_input) = &of_input {
+            layers::copy(buffer, of_input, input_at, part.start * shape.input, part.len() * shape.input);
+        }
+    }
+    (of_input, gradient)
+}
+
+/// As [`backward`], for networks that are too wide for a program.
+fn layer_by_layer(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad: &CubeTensor, wants_input: bool) -> (Option<CubeTensor>, CubeTensor) {
+    let rows = x.meta.shape()[0];
+    let gradient = floats(weights, [shape.parameter_count()]);
     let (outputs, flat) = run(x, weights, shape, rows);
     let widths = shape.output_widths();
     let all = shape.layers();
@@ -75,8 +199,8 @@ pub fn backward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad: &
         // A layer whose output nobody reads has no gradient, and no such layer exists: every chain ends in an output.
         let Some(d) = d else { continue };
         let input = layer.parent.map_or(x, |p| &outputs[p]);
-        let l = Dense { input: layer.input, output: layer.output, at: layer.weight.start };
-        layers::backward_weights(input, &d, &gradient, rows, l);
+        let l = dense(layer);
+        gradients::of_layer(Rows::whole(input), Rows::whole(&d), &gradient, rows, l, false);
         let target = match layer.parent {
             Some(parent) => &mut of_output[parent],
             None if wants_input => &mut of_input,

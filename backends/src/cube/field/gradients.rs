@@ -1,0 +1,264 @@
+//! Gradients of weights: sums over all rows, taken per segment of rows and then over the segments, in order.
+
+use super::layers::Dense;
+use crate::cube::tensor::{UNITS, binding_bytes, cubes_for, floats, spread};
+use burn_cubecl::tensor::CubeTensor;
+use cubecl::prelude::*;
+
+/// Units of a cube along either side of a matrix.
+const SIDE: usize = 16;
+/// Rows in shared memory at a time.
+const CHUNK: usize = 8;
+/// The fewest rows of a segment, and the most segments.
+const LEAST_ROWS: usize = 64;
+const MOST_SEGMENTS: usize = 256;
+
+/// A matrix [rows, width] inside a buffer: where it starts.
+#[derive(Clone, Copy)]
+pub struct Rows<'a> {
+    pub buffer: &'a CubeTensor,
+    pub at: usize,
+}
+
+impl<'a> Rows<'a> {
+    /// All of a buffer.
+    pub fn whole(buffer: &'a CubeTensor) -> Self {
+        Self { buffer, at: 0 }
+    }
+}
+
+/// Per segment of rows: x^T dy, and below it the sums of dy: partial [segments, (in + 1) out]. A unit computes `down` rows and `over` columns, 16 apart.
+#[cube(launch_unchecked)]
+fn outer_parts(
+    x: &[f32],
+    dy: &[f32],
+    partial: &mut [f32],
+    x_at: u32,
+    dy_at: u32,
+    rows: u32,
+    input: u32,
+    output: u32,
+    segment: u32,
+    segments: u32,
+    #[comptime] down: usize,
+    #[comptime] over: usize,
+) {
+    let mut xs = Shared::<[f32]>::new_slice(comptime!(CHUNK * SIDE * down));
+    let mut ds = Shared::<[f32]>::new_slice(comptime!(CHUNK * SIDE * over));
+    let (tile_down, tile_over) = (comptime!(SIDE * down), comptime!(SIDE * over));
+    let (input, output) = (input as usize, output as usize);
+    let (cubes_down, cubes_over) = (input.div_ceil(tile_down), output.div_ceil(tile_over));
+    let part = CUBE_POS / (cubes_down * cubes_over);
+    let first_i = CUBE_POS / cubes_over % cubes_down * tile_down;
+    let first_o = CUBE_POS % cubes_over * tile_over;
+    let unit = UNIT_POS as usize;
+    let (ui, uo) = (unit / SIDE, unit % SIDE);
+    let start = part * segment as usize;
+    let end = select(start + (segment as usize) < rows as usize, start + segment as usize, rows as usize);
+    let mut sums = Array::<f32>::new(comptime!(down * over));
+    let mut totals = Array::<f32>::new(over);
+    #[unroll]
+    for k in 0..comptime!(down * over) {
+        sums[k] = 0.0f32;
+    }
+    #[unroll]
+    for b in 0..over {
+        totals[b] = 0.0f32;
+    }
+    let mut row = start;
+    while row < end {
+        #[unroll]
+        for k in 0..comptime!(CHUNK * down * SIDE / UNITS as usize + 1) {
+            let place = unit + k * UNITS as usize;
+            if place < comptime!(CHUNK * SIDE * down) {
+                let (r, i) = (row + place / tile_down, first_i + place % tile_down);
+                let mut value = 0.0f32;
+                if r < end && i < input {
+                    value = x[x_at as usize + r * input + i];
+                }
+                xs[place] = value;
+            }
+        }
+        #[unroll]
+        for k in 0..comptime!(CHUNK * over * SIDE / UNITS as usize + 1) {
+            let place = unit + k * UNITS as usize;
+            if place < comptime!(CHUNK * SIDE * over) {
+                let (r, o) = (row + place / tile_over, first_o + place % tile_over);
+                let mut value = 0.0f32;
+                if r < end && o < output {
+                    value = dy[dy_at as usize + r * output + o];
+                }
+                ds[place] = value;
+            }
+        }
+        sync_cube();
+        for r in 0..CHUNK {
+            let mut ours = Array::<f32>::new(over);
+            #[unroll]
+            for b in 0..over {
+                ours[b] = ds[r * tile_over + uo + SIDE * b];
+                totals[b] += ours[b];
+            }
+            #[unroll]
+            for a in 0..down {
+                let value = xs[r * tile_down + ui + SIDE * a];
+                #[unroll]
+                for b in 0..over {
+                    sums[a * over + b] = fma(value, ours[b], sums[a * over + b]);
+                }
+            }
+        }
+        sync_cube();
+        row += CHUNK;
+    }
+    if part < segments as usize {
+        let to = part * ((input + 1) * output);
+        #[unroll]
+        for b in 0..over {
+            let o = first_o + uo + SIDE * b;
+            if o < output {
+                #[unroll]
+                for a in 0..down {
+                    let i = first_i + ui + SIDE * a;
+                    if i < input {
+                        partial[to + i * output + o] = sums[a * over + b];
+                    }
+                }
+                if ui == 0 && first_i == 0 {
+                    partial[to + input * output + o] = totals[b];
+                }
+            }
+        }
+    }
+}
+
+/// Sums over rows per segment of dz times the normalised values, then of dz alone: partial [segments, 2 out].
+#[cube(launch_unchecked)]
+fn norm_parts(dz: &[f32], normalized: &[f32], partial: &mut [f32], dz_at: u32, normalized_at: u32, rows: u32, output: u32, segment: u32) {
+    let output = output as usize;
+    if ABSOLUTE_POS < partial.len() {
+        let part = ABSOLUTE_POS / (2 * output);
+        let which = ABSOLUTE_POS % (2 * output) / output;
+        let o = ABSOLUTE_POS % output;
+        let start = part * segment as usize;
+        let end = select(start + (segment as usize) < rows as usize, start + segment as usize, rows as usize);
+        let mut sum = 0.0f32;
+        for row in start..end {
+            let mut factor = 1.0f32;
+            if which == 0 {
+                factor = normalized[normalized_at as usize + row * output + o];
+            }
+            sum += factor * dz[dz_at as usize + row * output + o];
+        }
+        partial[ABSOLUTE_POS] = sum;
+    }
+}
+
+/// Adds the segments up, into `gradient` at `at`, on top of what is there if `add`.
+#[cube(launch)]
+pub fn add_segments(partial: &[f32], gradient: &mut [f32], width: u32, segments: u32, at: u32, #[comptime] add: bool) {
+    if ABSOLUTE_POS < width as usize {
+        let mut sum = 0.0f32;
+        for segment in 0..segments as usize {
+            sum += partial[segment * width as usize + ABSOLUTE_POS];
+        }
+        if comptime!(add) {
+            sum += gradient[at as usize + ABSOLUTE_POS];
+        }
+        gradient[at as usize + ABSOLUTE_POS] = sum;
+    }
+}
+
+/// The weights, and behind them each matrix transposed at its own place: plan [layers, 3] holds place, inputs and outputs.
+#[cube(launch)]
+fn append_transposed(weights: &[f32], plan: &[u32], both: &mut [f32], layers: u32) {
+    let count = both.len() / 2;
+    if ABSOLUTE_POS < both.len() {
+        if ABSOLUTE_POS < count {
+            both[ABSOLUTE_POS] = weights[ABSOLUTE_POS];
+        } else {
+            let place = ABSOLUTE_POS - count;
+            let mut value = 0.0f32;
+            for layer in 0..layers as usize {
+                let (at, input, output) = (plan[3 * layer] as usize, plan[3 * layer + 1] as usize, plan[3 * layer + 2] as usize);
+                if place >= at && place < at + input * output {
+                    let (o, i) = ((place - at) / input, (place - at) % input);
+                    value = weights[at + i * output + o];
+                }
+            }
+            both[ABSOLUTE_POS] = value;
+        }
+    }
+}
+
+fn dim() -> CubeDim {
+    CubeDim::new_1d(UNITS)
+}
+
+/// How many segments, and of how many rows, for partial sums of `width` floats.
+fn segments_of(like: &CubeTensor, rows: usize, width: usize) -> (usize, usize) {
+    let most = (binding_bytes(&like.client) / (4 * width.max(1)) as u64).clamp(1, MOST_SEGMENTS as u64) as usize;
+    let segment = rows.div_ceil(most).max(LEAST_ROWS).next_multiple_of(CHUNK);
+    (rows.div_ceil(segment).max(1), segment)
+}
+
+/// 1, 2, 4 or 8 columns (or rows) per unit for so many.
+fn per_unit(width: usize) -> usize {
+    width.div_ceil(SIDE).next_power_of_two().min(8)
+}
+
+/// Gradient of W and b of layer `l` over `rows` rows, into `gradient` where the weights lie.
+pub fn of_layer(x: Rows, dy: Rows, gradient: &CubeTensor, rows: usize, l: Dense, add: bool) {
+    let client = gradient.client.clone();
+    let width = (l.input + 1) * l.output;
+    let (segments, segment) = segments_of(gradient, rows, width);
+    let partial = floats(gradient, [segments * width]);
+    let (down, over) = (per_unit(l.input), per_unit(l.output));
+    // SAFETY: every index is compared with the sizes of the two matrices and of the sums.
+    unsafe {
+        outer_parts::launch_unchecked(
+            &client,
+            spread(segments * l.input.div_ceil(SIDE * down) * l.output.div_ceil(SIDE * over)),
+            dim(),
+            x.buffer.clone().into_buffer_arg(),
+            dy.buffer.clone().into_buffer_arg(),
+            partial.clone().into_buffer_arg(),
+            x.at as u32,
+            dy.at as u32,
+            rows as u32,
+            l.input as u32,
+            l.output as u32,
+            segment as u32,
+            segments as u32,
+            down,
+            over,
+        )
+    };
+    let (p, to) = (partial.into_buffer_arg(), gradient.clone().into_buffer_arg());
+    add_segments::launch(&client, cubes_for(width), dim(), p, to, width as u32, segments as u32, l.at as u32, add);
+}
+
+/// Gradient of gain and shift [width] each, which follow each other, into `gradient` at `at`.
+pub fn of_norm(dz: Rows, normalized: Rows, gradient: &CubeTensor, rows: usize, width: usize, at: usize, add: bool) {
+    let client = gradient.client.clone();
+    let (segments, segment) = segments_of(gradient, rows, 2 * width);
+    let partial = floats(gradient, [segments * 2 * width]);
+    let (g, x, p) = (dz.buffer.clone().into_buffer_arg(), normalized.buffer.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
+    let units = cubes_for(segments * 2 * width);
+    // SAFETY: units beyond the sums do nothing, rows end at `rows`.
+    unsafe { norm_parts::launch_unchecked(&client, units, dim(), g, x, p, dz.at as u32, normalized.at as u32, rows as u32, width as u32, segment as u32) };
+    let (p, to) = (partial.into_buffer_arg(), gradient.clone().into_buffer_arg());
+    add_segments::launch(&client, cubes_for(2 * width), dim(), p, to, 2 * width as u32, segments as u32, at as u32, add);
+}
+
+/// The weights, and behind them those of `layers` transposed.
+pub fn with_transposed(weights: &CubeTensor, layers: &[Dense]) -> CubeTensor {
+    let count = weights.meta.shape().num_elements();
+    let both = floats(weights, [2 * count]);
+    let plan: Vec<u32> = layers.iter().flat_map(|l| [l.at as u32, l.input as u32, l.output as u32]).collect();
+    let plan = crate::cube::tensor::upload(weights, &plan, burn::tensor::DType::U32);
+    let client = weights.client.clone();
+    let (w, p, b) = (weights.clone().into_buffer_arg(), plan.into_buffer_arg(), both.clone().into_buffer_arg());
+    append_transposed::launch(&client, cubes_for(2 * count), dim(), w, p, b, layers.len() as u32);
+    both
+}

@@ -1,0 +1,232 @@
+//! Small networks in one launch, forwards and backwards. A cube keeps a tile of rows in shared memory and takes it through a list of steps, so that
+//! activations leave the chip only where a gradient of weights will want them; the steps are numbers, so that one kernel serves decoders (behind their hash
+//! signatures) and deformation networks alike. Widths that do not fit the shared memory go layer by layer instead ([`super::layers`]).
+
+mod steps;
+
+pub use steps::{mish, mish_derivative};
+
+use crate::cpu::vertex::hash::LevelHash;
+use crate::cube::tensor::{binding_bytes, spread, upload};
+use burn::tensor::DType;
+use burn_cubecl::tensor::CubeTensor;
+use cubecl::prelude::*;
+use std::ops::Range;
+use steps::{ACCUMULATE, BLOCK, CUT, KEEP, LOAD, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, PARTS, RELU};
+
+/// Rows a cube may keep, the more the better: weights are read once per tile.
+const TILES: [usize; 3] = [64, 32, 16];
+/// The most units of a cube that every adapter allows.
+const MOST_UNITS: usize = 256;
+/// Cubes that keep a card busy; for fewer rows, smaller tiles are taken.
+const ENOUGH_CUBES: usize = 64;
+
+/// Where a layer writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Target {
+    /// A tile.
+    Tile(usize),
+    /// The result, row by row from this element on.
+    Out(usize),
+}
+
+/// One thing done to a tile. Places are elements of the result, where rows of the given width follow each other.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Step {
+    /// The tile becomes these columns of rows of `width` values, given from outside from element `at` on.
+    Load { tile: usize, columns: Range<usize>, width: usize, at: usize },
+    /// x W (+ b): W [input, output] and b [output] are places among the weights. With `add`, on top of what the target tile holds.
+    Multiply { source: usize, target: Target, input: usize, output: usize, weights: usize, bias: Option<usize>, relu: bool, add: bool },
+    /// The tile is written to the result.
+    Keep { tile: usize, width: usize, at: usize },
+    /// Zero where the kept output of a ReLU is.
+    Cut { tile: usize, width: usize, at: usize },
+    /// LayerNorm and Mish; gain and shift follow each other among the weights. Normalised values and scales are kept for the way back if wanted.
+    Norm { tile: usize, width: usize, gain: usize, keep: Option<[usize; 2]> },
+    /// The way back: takes the gradient of the output to that of the input, and keeps it (`after`) and that of the value before Mish (`before`).
+    NormBack { tile: usize, width: usize, gain: usize, kept: [usize; 2], before: usize, after: usize },
+}
+
+impl Step {
+    fn tiles_and_width(&self) -> (usize, usize) {
+        match *self {
+            Self::Multiply { source, target: Target::Tile(t), input, output, .. } => (source.max(t), input.max(output)),
+            Self::Multiply { source, input, .. } => (source, input),
+            Self::Load { tile, ref columns, .. } => (tile, columns.len()),
+            Self::Keep { tile, width, .. } | Self::Cut { tile, width, .. } | Self::Norm { tile, width, .. } | Self::NormBack { tile, width, .. } => {
+                (tile, width)
+            }
+        }
+    }
+    fn encode(&self) -> [usize; steps::FIELDS] {
+        let none = NONE as usize;
+        match *self {
+            Self::Load { tile, ref columns, width, at } => [LOAD as usize, tile, columns.start, columns.len(), width, at, 0, 0, 0],
+            Self::Multiply { source, target, input, output, weights, bias, relu, add } => {
+                let (target, at) = match target {
+                    Target::Tile(t) => (t, 0),
+                    Target::Out(at) => (OUTSIDE, at),
+                };
+                let flags = if relu { RELU } else { 0 } + if add { ACCUMULATE } else { 0 };
+                [MULTIPLY as usize, source, target, input, output, weights, bias.unwrap_or(none), at, flags as usize]
+            }
+            Self::Keep { tile, width, at } => [KEEP as usize, tile, width, at, 0, 0, 0, 0, 0],
+            Self::Cut { tile, width, at } => [CUT as usize, tile, width, at, 0, 0, 0, 0, 0],
+            Self::Norm { tile, width, gain, keep } => {
+                let [normal, scale] = keep.unwrap_or([none; 2]);
+                [NORM as usize, tile, width, gain, normal, scale, 0, 0, 0]
+            }
+            Self::NormBack { tile, width, gain, kept: [normal, scale], before, after } => {
+                [NORM_BACK as usize, tile, width, gain, normal, scale, before, after, 0]
+            }
+        }
+    }
+}
+
+/// What the first tile starts with.
+#[derive(Clone, Copy)]
+pub enum Input<'a> {
+    /// Rows [_, in].
+    Rows(&'a CubeTensor, usize),
+    /// Signatures of vertices [_, 3].
+    Signatures(&'a CubeTensor, &'a LevelHash),
+}
+
+impl Input<'_> {
+    fn width(&self) -> usize {
+        match self {
+            Self::Rows(_, width) => *width,
+            Self::Signatures(_, hash) => hash.len(),
+        }
+    }
+}
+
+/// How a program is cut for a device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Layout {
+    tile: usize,
+    stride: usize,
+    tiles: usize,
+    /// Units per row of the tile.
+    per_row: usize,
+}
+
+/// The places that the scales of [`Step::Norm`] take for so many rows, whatever the layout: each unit keeps its own.
+pub fn scales(rows: usize) -> usize {
+    // Units per row times rows, of whole tiles of the largest kind.
+    rows.next_multiple_of(TILES[0]) * PARTS
+}
+
+/// 0..`rows` in parts for which `floats_per_row` fit a buffer of moderate size. Parts start at multiples of 64 rows.
+pub fn parts(like: &CubeTensor, rows: usize, floats_per_row: usize) -> Vec<Range<usize>> {
+    const MODERATE: u64 = 256 << 20;
+    let fit = binding_bytes(&like.client).min(MODERATE) / (4 * floats_per_row.max(1)) as u64;
+    let step = (fit as usize / 64 * 64).max(64);
+    (0..rows).step_by(step).map(|first| first..(first + step).min(rows)).collect()
+}
+
+/// Steps in order.
+#[derive(Clone, Debug, Default)]
+pub struct Program(pub Vec<Step>);
+
+impl Program {
+    /// How to run it with inputs so wide on so many rows, given the bytes of shared memory; `None` where not even the smallest tile fits.
+    pub fn layout(&self, input: usize, rows: usize, shared_bytes: usize) -> Option<Layout> {
+        let sizes = || self.0.iter().map(Step::tiles_and_width);
+        let tiles = 1 + sizes().map(|(tile, _)| tile).max().unwrap_or(0);
+        // One more than the widest row: neighbouring blocks of rows then lie in different banks.
+        let stride = 1 + sizes().map(|(_, width)| width).max().unwrap_or(0).max(input);
+        let in_place = self.0.iter().map(|s| match s {
+            Step::Multiply { source, target: Target::Tile(t), output, .. } if source == t => *output,
+            _ => 0,
+        });
+        let widest = in_place.max().unwrap_or(0);
+        // A layer that overwrites its own tile must be done in one go: as many blocks as units.
+        let per_row = widest.div_ceil(BLOCK * BLOCK).max(2).next_power_of_two();
+        let fits = |tile: &usize| 4 * tile * (stride * tiles + PARTS) <= shared_bytes && per_row <= PARTS && tile * per_row <= MOST_UNITS;
+        let least = TILES[TILES.len() - 1];
+        let tile = TILES.into_iter().filter(fits).find(|&tile| tile == least || rows >= tile * ENOUGH_CUBES)?;
+        Some(Layout { tile, stride, tiles, per_row })
+    }
+    /// The layout on the device of `like`.
+    pub fn layout_on(&self, like: &CubeTensor, input: usize, rows: usize) -> Option<Layout> {
+        self.layout(input, rows, like.client.properties().hardware.max_shared_memory_size)
+    }
+    /// Runs all steps on these rows of the inputs; `given` is what [`Step::Load`] reads. Places in `out` count from the first of these rows, those in `given` from
+    /// row 0.
+    pub fn run(&self, layout: Layout, input: Input, weights: &CubeTensor, given: &CubeTensor, out: &CubeTensor, rows: &Range<usize>) {
+        if rows.is_empty() {
+            return;
+        }
+        let client = weights.client.clone();
+        let mut plan: Vec<u32> = self.0.iter().flat_map(|step| step.encode().map(|v| v as u32)).collect();
+        let constants = plan.len();
+        let (x, vertices, modulus) = match input {
+            Input::Rows(x, _) => (x.clone(), None, 2),
+            Input::Signatures(vertices, hash) => {
+                plan.extend(hash.constants());
+                // What is not read still needs a binding of its kind.
+                (weights.clone(), Some(vertices.clone()), hash.modulus())
+            }
+        };
+        let hashed = vertices.is_some();
+        let plan = upload(weights, &plan, DType::U32);
+        let vertices = vertices.unwrap_or_else(|| crate::cube::tensor::signed(plan.clone()));
+        let Layout { tile, stride, tiles, per_row } = layout;
+        // SAFETY: rows beyond the last are neither read nor written; columns and places are inside because weights, inputs and result have the sizes that
+        // the steps were made for, which the operations check.
+        unsafe {
+            steps::run_steps::launch_unchecked(
+                &client,
+                spread(rows.len().div_ceil(tile)),
+                CubeDim::new_1d((tile * per_row) as u32),
+                x.into_buffer_arg(),
+                vertices.into_buffer_arg(),
+                plan.into_buffer_arg(),
+                weights.clone().into_buffer_arg(),
+                given.clone().into_buffer_arg(),
+                out.clone().into_buffer_arg(),
+                rows.start as u32,
+                rows.len() as u32,
+                self.0.len() as u32,
+                input.width() as u32,
+                constants as u32,
+                modulus,
+                2.0 / (modulus - 1) as f32,
+                hashed,
+                tile,
+                stride,
+                tiles,
+                per_row,
+            )
+        };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn multiply(source: usize, target: Target, input: usize, output: usize) -> Step {
+        Step::Multiply { source, target, input, output, weights: 0, bias: None, relu: false, add: false }
+    }
+
+    #[test]
+    fn tiles_shrink_with_shared_memory_and_rows() {
+        let program = Program(vec![multiply(0, Target::Tile(0), 128, 128), multiply(0, Target::Out(0), 128, 32)]);
+        let tile = |rows, bytes| program.layout(128, rows, bytes).map(|l| l.tile);
+        assert_eq!(tile(1 << 20, 49_152), Some(64));
+        assert_eq!(tile(1 << 20, 32_768), Some(32));
+        assert_eq!(tile(1 << 20, 16_384), Some(16));
+        assert_eq!(tile(1 << 20, 8_192), None);
+        assert_eq!(tile(1, 49_152), Some(16));
+    }
+
+    #[test]
+    fn a_layer_over_its_own_tile_is_done_in_one_go() {
+        let units = |width| Program(vec![multiply(0, Target::Tile(0), width, width)]).layout(width, 16, 1 << 20).map(|l| l.tile * l.per_row);
+        assert_eq!((units(16), units(128), units(129), units(1024), units(1025)), (Some(32), Some(32), Some(64), Some(256), None));
+        // A result outside may be as wide as it likes.
+        assert!(Program(vec![multiply(0, Target::Out(0), 16, 4000)]).layout(16, 16, 16_384).is_some());
+    }
+}

@@ -1,0 +1,113 @@
+//! Networks of every shape against layers written in burn's primitives, forwards and backwards, on every device: trunks, heads, outputs wider than a tile,
+//! layers too wide for one, and rows that are worked on in parts.
+
+use burn::tensor::activation::relu;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_tests::{devices, poison};
+use std::sync::Arc;
+
+fn numbers(n: usize, step: f32) -> Vec<f32> {
+    (0..n).map(|i| (i as f32 * step).sin() * 0.4).collect()
+}
+
+fn tensor<const D: usize>(values: Vec<f32>, dims: [usize; D], device: &Device) -> Tensor<D> {
+    Tensor::from_data(TensorData::new(values, dims), device)
+}
+
+fn values<const D: usize>(t: &Tensor<D>) -> Vec<f32> {
+    t.clone().into_data().try_to_vec::<f32>().expect("float32")
+}
+
+/// The same network, layer by layer.
+fn plain(x: &Tensor<2>, weights: &Tensor<1>, shape: &ReluShape) -> Vec<Tensor<2>> {
+    let mut at = 0;
+    let mut linear = |x: Tensor<2>, output: usize| {
+        let input = x.dims()[1];
+        let w = weights.clone().narrow(0, at, input * output).reshape([input, output]);
+        let b = weights.clone().narrow(0, at + input * output, output).reshape([1, output]);
+        at += (input + 1) * output;
+        x.matmul(w) + b
+    };
+    let trunk = shape.trunk.iter().fold(x.clone(), |x, &width| relu(linear(x, width)));
+    if shape.heads.is_empty() {
+        return vec![trunk];
+    }
+    let head = |widths: &Vec<usize>| {
+        let last = widths.len() - 1;
+        widths.iter().enumerate().fold(trunk.clone(), |x, (i, &width)| if i < last { relu(linear(x, width)) } else { linear(x, width) })
+    };
+    shape.heads.iter().map(head).collect()
+}
+
+fn distance(got: &[f32], want: &[f32]) -> f64 {
+    assert_eq!(got.len(), want.len());
+    let difference: f64 = got.iter().zip(want).map(|(g, w)| f64::from(g - w).powi(2)).sum();
+    (difference / want.iter().map(|w| f64::from(*w).powi(2)).sum::<f64>().max(1e-30)).sqrt()
+}
+
+/// Outputs and the gradients of input (if wanted) and weights, for a loss that weighs every output differently.
+fn run(rows: usize, shape: &ReluShape, wants_input: bool, device: &Device, fused: bool) -> Vec<Vec<f32>> {
+    let device = device.clone().autodiff();
+    let x = tensor(numbers(rows * shape.input, 0.37), [rows, shape.input], &device);
+    let x = if wants_input { x.require_grad() } else { x };
+    let count = shape.parameter_count();
+    let weights = tensor(numbers(count, 0.91), [count], &device).require_grad();
+    let outputs = if fused { mlp_relu(x.clone(), weights.clone(), &Arc::new(shape.clone())).expect("outputs") } else { plain(&x, &weights, shape) };
+    let weighed = outputs.iter().map(|o| (o.clone() * tensor(numbers(o.dims().iter().product(), 0.53), o.dims(), &device)).sum());
+    let loss = weighed.reduce(|a, b| a + b).expect("an output");
+    let mut grads = loss.backward();
+    let mut all: Vec<Vec<f32>> = outputs.iter().map(values).collect();
+    all.push(values(&weights.grad_remove(&mut grads).expect("a gradient of the weights")));
+    if wants_input {
+        all.push(values(&x.grad_remove(&mut grads).expect("a gradient of the input")));
+    }
+    all
+}
+
+#[test]
+fn networks_of_every_shape_are_those_of_their_layers() {
+    let shape =
+        |input: usize, trunk: &[usize], heads: &[&[usize]]| ReluShape { input, trunk: trunk.to_vec(), heads: heads.iter().map(|h| h.to_vec()).collect() };
+    let shapes = [
+        shape(1, &[], &[&[1]]),
+        shape(5, &[7], &[]),
+        shape(9, &[16, 12, 20], &[]),
+        shape(17, &[], &[&[24, 3], &[11]]),
+        shape(20, &[33, 24], &[&[24, 3], &[24, 16, 5], &[48]]),
+        // Outputs wider than what stays on the chip, behind a hidden layer and straight behind the trunk.
+        shape(12, &[16], &[&[16, 150], &[90]]),
+        shape(130, &[130], &[&[130, 4]]),
+        // Too wide for shared memory anywhere.
+        shape(3, &[1100], &[&[2]]),
+    ];
+    for (name, device) in devices() {
+        for shape in &shapes {
+            for rows in [1, 70, 1100] {
+                // Wide layers are checked on few rows.
+                if rows > 70 && shape.parameter_count() > 20_000 {
+                    continue;
+                }
+                for wants_input in [false, true] {
+                    poison(&device);
+                    let got = run(rows, shape, wants_input, &device, true);
+                    let want = run(rows, shape, wants_input, &Device::flex(), false);
+                    for (i, (got, want)) in got.iter().zip(&want).enumerate() {
+                        let d = distance(got, want);
+                        assert!(d < 2e-5, "{name}: {shape:?} on {rows} rows (input gradient {wants_input}), result {i} differs by {d:.2e}");
+                    }
+                }
+            }
+        }
+    }
+    // With less to bind at once, rows go in parts.
+    let shape = &shapes[4];
+    let whole: Vec<_> = devices().into_iter().map(|(name, device)| (name, run(1100, shape, true, &device, true), device)).collect();
+    cc4dgs_backends::cap_bindings(1 << 16);
+    for (name, whole, device) in whole {
+        for (whole, parts) in whole.iter().zip(run(1100, shape, true, &device, true)) {
+            let d = distance(&parts, whole);
+            assert!(d < 2e-6, "{name}: in parts, results differ by {d:.2e}");
+        }
+    }
+}
