@@ -88,20 +88,27 @@ fn add_sums(values: &mut [u32], sums: &[u32], count: u32) {
     }
 }
 
-/// Replaces each of the first `count` values by the sum of those before it; returns the sum of all [1].
-pub fn exclusive_sums(values: &CubeTensor, count: usize) -> CubeTensor {
+/// Replaces each of the first `count` values (at least one) by the sum of those before it within its cube; returns the sums before each cube [cubes] and that
+/// of all [1].
+fn sums_in_two(values: &CubeTensor, count: usize) -> (CubeTensor, CubeTensor) {
     let client = values.client.clone();
-    let total = upload(values, &[0u32], DType::U32);
-    if count == 0 {
-        return total;
-    }
     let cubes = count.div_ceil(UNITS as usize);
-    let sums = empty(values, [cubes], DType::U32);
+    let (sums, total) = (empty(values, [cubes], DType::U32), empty(values, [1], DType::U32));
     let dim = CubeDim::new_1d(UNITS);
     scan_in_cubes::launch(&client, cubes_for(count), dim, values.clone().into_buffer_arg(), sums.clone().into_buffer_arg(), count as u32);
     scan_sums::launch(&client, CubeCount::Static(1, 1, 1), dim, sums.clone().into_buffer_arg(), total.clone().into_buffer_arg(), cubes as u32);
-    if cubes > 1 {
-        add_sums::launch(&client, cubes_for(count), dim, values.clone().into_buffer_arg(), sums.into_buffer_arg(), count as u32);
+    (sums, total)
+}
+
+/// Replaces each of the first `count` values by the sum of those before it; returns the sum of all [1].
+pub fn exclusive_sums(values: &CubeTensor, count: usize) -> CubeTensor {
+    if count == 0 {
+        return upload(values, &[0u32], DType::U32);
+    }
+    let (sums, total) = sums_in_two(values, count);
+    if count > UNITS as usize {
+        let (v, s) = (values.clone().into_buffer_arg(), sums.into_buffer_arg());
+        add_sums::launch(&values.client, cubes_for(count), CubeDim::new_1d(UNITS), v, s, count as u32);
     }
     total
 }
@@ -126,43 +133,67 @@ fn count_digits(keys: &[u32], counts: &mut [u32], count: u32, blocks: u32, shift
     }
 }
 
-/// Moves every item behind those with a smaller digit and the earlier ones with its own.
+/// Words that hold a bit per unit.
+const WORDS: usize = (UNITS / 32) as usize;
+
+/// Moves every item behind those with a smaller digit and the earlier ones with its own. Each round the units of a cube set their bit in the words of their
+/// digit; the bits before their own are their rank, in whatever order they were set.
 #[cube(launch)]
-fn place_by_digit(keys: &[u32], values: &[u32], starts: &[u32], keys_out: &mut [u32], values_out: &mut [u32], count: u32, blocks: u32, shift: u32) {
+fn place_by_digit(
+    keys: &[u32],
+    values: &[u32],
+    starts: &[u32],
+    sums: &[u32],
+    keys_out: &mut [u32],
+    values_out: &mut [u32],
+    count: u32,
+    blocks: u32,
+    shift: u32,
+) {
     let mut next = Shared::<[u32]>::new_slice(UNITS as usize);
-    let mut digits = Shared::<[u32]>::new_slice(UNITS as usize);
+    let users = Shared::<[Atomic<u32>]>::new_slice(comptime!(UNITS as usize * WORDS));
     let unit = UNIT_POS as usize;
     let block = CUBE_POS as u32;
     if block < blocks {
-        next[unit] = starts[(UNIT_POS * blocks + block) as usize];
+        let own = (UNIT_POS * blocks + block) as usize;
+        next[unit] = starts[own] + sums[own / UNITS as usize];
     }
+    #[unroll]
+    for word in 0..WORDS {
+        users[unit * WORDS + word].store(0u32);
+    }
+    sync_cube();
     for round in 0..ROUNDS {
         let at = block * BLOCK + round * UNITS + UNIT_POS;
+        let (own_word, own_bit) = (unit / 32, UNIT_POS % 32);
         let mut key = 0u32;
-        // No item has this digit.
-        let mut digit = UNITS.runtime();
+        let mut digit = 0usize;
         if at < count {
             key = keys[at as usize];
-            digit = (key >> shift) & MASK;
+            digit = ((key >> shift) & MASK) as usize;
+            users[digit * WORDS + own_word].fetch_or(1u32 << own_bit);
         }
-        digits[unit] = digit;
         sync_cube();
-        let mut rank = 0u32;
-        let mut later = 0u32;
-        for other in 0..UNITS {
-            let same = select(digits[other as usize] == digit, 1u32, 0u32);
-            rank += select(other < UNIT_POS, same, 0u32);
-            later += select(other > UNIT_POS, same, 0u32);
-        }
         if at < count {
-            let place = (next[digit as usize] + rank) as usize;
+            let mut rank = (users[digit * WORDS + own_word].load() & ((1u32 << own_bit) - 1u32)).count_ones();
+            #[unroll]
+            for word in 0..WORDS {
+                let set = users[digit * WORDS + word].load().count_ones();
+                rank += select(word < own_word, set, 0u32);
+            }
+            let place = (next[digit] + rank) as usize;
             keys_out[place] = key;
             values_out[place] = values[at as usize];
         }
         sync_cube();
-        if at < count && later == 0 {
-            next[digit as usize] += rank + 1;
+        // Each unit looks after the digit of its own number.
+        let mut used = 0u32;
+        #[unroll]
+        for word in 0..WORDS {
+            used += users[unit * WORDS + word].load().count_ones();
+            users[unit * WORDS + word].store(0u32);
         }
+        next[unit] += used;
         sync_cube();
     }
 }
@@ -181,7 +212,7 @@ pub fn sort_pairs(keys: CubeTensor, values: CubeTensor, count: usize, bits: u32)
         let shift = pass * DIGIT;
         let (count32, blocks32) = (count as u32, blocks as u32);
         count_digits::launch(&client, spread(blocks), dim, keys.clone().into_buffer_arg(), counts.clone().into_buffer_arg(), count32, blocks32, shift);
-        exclusive_sums(&counts, blocks << DIGIT);
+        let (sums, _) = sums_in_two(&counts, blocks << DIGIT);
         let (keys_out, values_out) = (empty(&keys, [count], DType::U32), empty(&keys, [count], DType::U32));
         place_by_digit::launch(
             &client,
@@ -190,6 +221,7 @@ pub fn sort_pairs(keys: CubeTensor, values: CubeTensor, count: usize, bits: u32)
             keys.into_buffer_arg(),
             values.into_buffer_arg(),
             counts.clone().into_buffer_arg(),
+            sums.into_buffer_arg(),
             keys_out.clone().into_buffer_arg(),
             values_out.clone().into_buffer_arg(),
             count32,
