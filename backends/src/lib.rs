@@ -6,4 +6,4 @@ mod cube;
 pub mod ops;
 pub mod rasterizers;
 
-pub use cube::cap_bindings;
+pub use cube::{cap_bindings, cap_shared_memory};

@@ -4,6 +4,7 @@
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_backends::{cap_bindings, cap_shared_memory};
 use cc4dgs_tests::{devices, poison};
 use std::sync::Arc;
 
@@ -103,11 +104,17 @@ fn networks_of_every_shape_are_those_of_their_layers() {
     // With less to bind at once, rows go in parts.
     let shape = &shapes[4];
     let whole: Vec<_> = devices().into_iter().map(|(name, device)| (name, run(1100, shape, true, &device, true), device)).collect();
-    cc4dgs_backends::cap_bindings(1 << 16);
-    for (name, whole, device) in whole {
-        for (whole, parts) in whole.iter().zip(run(1100, shape, true, &device, true)) {
-            let d = distance(&parts, whole);
-            assert!(d < 2e-6, "{name}: in parts, results differ by {d:.2e}");
+    // With less shared memory, tiles are smaller, or there are none.
+    type Cap = (&'static str, fn(u64), u64);
+    let caps: [Cap; 3] = [("bindings", cap_bindings, 1 << 16), ("shared memory", cap_shared_memory, 16 << 10), ("shared memory", cap_shared_memory, 2 << 10)];
+    for (what, cap, bytes) in caps {
+        cap(bytes);
+        for (name, whole, device) in &whole {
+            for (whole, capped) in whole.iter().zip(run(1100, shape, true, device, true)) {
+                let d = distance(&capped, whole);
+                assert!(d < 2e-6, "{name}: with {bytes} bytes of {what}, results differ by {d:.2e}");
+            }
         }
+        cap(u64::MAX);
     }
 }

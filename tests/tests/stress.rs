@@ -3,9 +3,9 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::random_gaussians;
-use cc4dgs_backends::cap_bindings;
 use cc4dgs_backends::rasterizers::reference::ReferenceRasterizer;
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
+use cc4dgs_backends::{cap_bindings, cap_shared_memory};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Camera, Gaussians, HostGaussians, Rasterizer, RenderSettings, Rules, Seed, Splats};
 use cc4dgs_tests::{devices, poison};
@@ -162,11 +162,12 @@ fn near_ties_of_depth_are_drawn_in_one_order() {
     }
 }
 
-/// Adapters may let a kernel read as little as 128 MiB of a buffer. Here it is 1 MiB, so that 10,000 Gaussians do what a million would.
+/// Adapters may let a kernel read as little as 128 MiB of a buffer (here it is 1 MiB, so that 10,000 Gaussians do what a million would), and share as little as
+/// 16 KiB on the chip.
 #[test]
-fn small_bindings_change_nothing_or_are_an_error() {
+fn small_adapters_change_nothing_or_are_an_error() {
     let case = |count| Case {
-        name: "small bindings",
+        name: "small adapter",
         gaussians: changed(count, 11, |g| g.log_scales.fill(-4.5)),
         size: (64, 48),
         rules: Rules::Gsplat099,
@@ -182,6 +183,17 @@ fn small_bindings_change_nothing_or_are_an_error() {
         let refused = TileRasterizer.render(&Splats::from_gaussians(&many, 3), &camera, &RenderSettings::default());
         cap_bindings(u64::MAX);
         assert!(whole == parts, "{name}: pictures or gradients differ");
+        cap_shared_memory(16 << 10);
+        let (picture, gradients) = draw(&TileRasterizer, &case(10_000), &device, &upstream);
+        cap_shared_memory(u64::MAX);
+        assert!(whole.0 == picture, "{name}: pictures differ with less shared memory");
+        for (k, (whole, small)) in whole.1.iter().zip(&gradients).enumerate() {
+            let scale = whole.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+            // Sums over the pixels of a tile are cut elsewhere.
+            let worst = whole.iter().zip(small).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            // Round Gaussians have no gradient of rotation but rounding.
+            assert!(worst < 1e-5 * scale + 1e-7, "{name}: gradient {k} differs by {worst:e} of {scale:e} with less shared memory");
+        }
         let message = refused.map(|_| ()).expect_err("20,000 Gaussians need more").to_string();
         assert!(message.contains("20000") && message.contains("Gaussians"), "{message}");
     }

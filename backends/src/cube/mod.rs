@@ -12,4 +12,4 @@ mod raster;
 mod sort;
 pub(crate) mod tensor;
 
-pub use tensor::cap_bindings;
+pub use tensor::{cap_bindings, cap_shared_memory};

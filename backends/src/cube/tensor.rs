@@ -44,6 +44,7 @@ pub fn upload<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> 
 }
 
 static BINDING_CAP: AtomicU64 = AtomicU64::new(u64::MAX);
+static SHARED_CAP: AtomicU64 = AtomicU64::new(u64::MAX);
 
 /// Unsigned numbers as the signed ones that burn's integers are: the same bits.
 pub fn signed(values: CubeTensor) -> CubeTensor {
@@ -53,6 +54,16 @@ pub fn signed(values: CubeTensor) -> CubeTensor {
 /// Pretends from now on that kernels may read no more than so many bytes of a buffer: for tests, and to see what a smaller adapter would do.
 pub fn cap_bindings(bytes: u64) {
     BINDING_CAP.store(bytes, Ordering::Relaxed);
+}
+
+/// Pretends from now on that cubes may share no more than so many bytes of memory on the chip; every adapter allows 16 KiB.
+pub fn cap_shared_memory(bytes: u64) {
+    SHARED_CAP.store(bytes, Ordering::Relaxed);
+}
+
+/// The most bytes a cube may share.
+pub fn shared_bytes(client: &Client) -> usize {
+    (client.properties().hardware.max_shared_memory_size as u64).min(SHARED_CAP.load(Ordering::Relaxed)) as usize
 }
 
 /// The most bytes of one buffer that a kernel may read.

@@ -5,7 +5,7 @@ use super::gradient::{self, GEOMETRY, SCREEN};
 use super::{DIM, Lists, read_floats, rest_width};
 use crate::cpu::raster::camera::{CameraSums, RuleConstants};
 use crate::cpu::raster::{RECORD, RasterSettings, TILE, TILE_PIXELS};
-use crate::cube::tensor::{cubes_for, floats, row_blocks, rows_of, spread, upload};
+use crate::cube::tensor::{cubes_for, floats, row_blocks, rows_of, shared_bytes, spread, upload};
 use crate::ops::rasterize::{PARENTS, Saved, SavedInputs};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -51,6 +51,7 @@ pub fn backward(
             tiles_x as u32,
             rules.alpha_max,
             rules.pass_capped,
+            blend::backward_batch(shared_bytes(&client)),
         );
     }
     let (screen, geometry) = (floats(&means, [n, SCREEN]), floats(&means, [n, GEOMETRY]));

@@ -7,7 +7,7 @@ mod steps;
 pub use steps::{mish, mish_derivative};
 
 use crate::cpu::vertex::hash::LevelHash;
-use crate::cube::tensor::{binding_bytes, spread, upload};
+use crate::cube::tensor::{binding_bytes, shared_bytes, spread, upload};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
@@ -150,7 +150,7 @@ impl Program {
     }
     /// The layout on the device of `like`.
     pub fn layout_on(&self, like: &CubeTensor, input: usize, rows: usize) -> Option<Layout> {
-        self.layout(input, rows, like.client.properties().hardware.max_shared_memory_size)
+        self.layout(input, rows, shared_bytes(&like.client))
     }
     /// Runs all steps on these rows of the inputs; `given` is what [`Step::Load`] reads. Places in `out` count from the first of these rows, those in `given` from
     /// row 0.
