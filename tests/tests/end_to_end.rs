@@ -160,6 +160,17 @@ fn static_gaussians_cost_no_field_time() {
     assert!(still > 0 && report.dynamic_gaussians > 0, "{report:?}");
     assert_eq!((player.work.deformed, player.work.static_skipped), (report.dynamic_gaussians as u64, still));
     assert_eq!(player.work.spatial.gaussians, report.dynamic_gaussians as u64);
+    // A frame is written over the one before it, unless somebody kept that; either way it is what it would have been as the first.
+    let registry = Registry::collect().unwrap();
+    for (name, device) in cc4dgs_tests::devices() {
+        let model = Model::load(folder.path(), &registry, &device, &Limits::default(), &Silent).unwrap();
+        let fresh = |time| Player::new(&model, &registry, &device).unwrap().gaussians_at(time).unwrap().to_host().unwrap();
+        let mut player = Player::new(&model, &registry, &device).unwrap();
+        let kept = player.gaussians_at(0.2).unwrap();
+        assert!(player.gaussians_at(0.9).unwrap().to_host().unwrap() == fresh(0.9), "{name}: a frame depends on the one before it");
+        assert!(player.gaussians_at(0.4).unwrap().to_host().unwrap() == fresh(0.4), "{name}: a frame depends on the ones before it");
+        assert!(kept.to_host().unwrap() == fresh(0.2), "{name}: a frame that was kept has changed");
+    }
 }
 
 #[test]

@@ -43,8 +43,10 @@ pub struct Player<'a> {
     model: &'a Model,
     device: Device,
     rasterizer: Box<dyn Rasterizer>,
-    gaussians: Gaussians,
-    moving_means: Tensor<2>,
+    /// All Gaussians; those that move, which come first, as they were at the last frame.
+    frame: Gaussians,
+    /// Those that move, as they are without a field.
+    moving_gaussians: Gaussians,
     /// What the field keeps per Gaussian, of those that move.
     moving_attributes: Vec<Tensor<2>>,
     moving: usize,
@@ -94,7 +96,9 @@ impl<'a> Player<'a> {
             model.gaussians.select(&order)
         });
         let host = sorted.as_ref().unwrap_or(&model.gaussians);
-        let gaussians = Gaussians::from_host(host, device);
+        let frame = Gaussians::from_host(host, device);
+        let moving_gaussians =
+            if (1..n).contains(&moving) { Gaussians::from_host(&host.select(&(0..moving).collect::<Vec<_>>()), device) } else { frame.clone() };
         let background = Tensor::<1>::from_data(TensorData::new(model.background.to_vec(), [3]), device);
         let wanted = model.field.iter().filter(|_| moving > 0).flat_map(|f| f.field.attributes());
         let moving_attributes = wanted
@@ -104,8 +108,8 @@ impl<'a> Player<'a> {
         Ok(Self {
             device: device.clone(),
             rasterizer: registry.build_rasterizer(&model.rasterizer)?,
-            moving_means: if moving > 0 { gaussians.means.clone().narrow(0, 0, moving) } else { gaussians.means.clone() },
-            gaussians,
+            frame,
+            moving_gaussians,
             moving_attributes,
             moving,
             cache: None,
@@ -123,15 +127,15 @@ impl<'a> Player<'a> {
     pub fn gaussians_at(&mut self, time_norm: f32) -> Result<Gaussians> {
         self.work.frames += 1;
         self.work.deformed += self.moving as u64;
-        self.work.static_skipped += (self.gaussians.len() - self.moving) as u64;
-        let Some(field) = self.model.field.as_ref().filter(|_| self.moving > 0) else { return Ok(self.gaussians.clone()) };
+        self.work.static_skipped += (self.frame.len() - self.moving) as u64;
+        let Some(field) = self.model.field.as_ref().filter(|_| self.moving > 0) else { return Ok(self.frame.clone()) };
         let features = match &self.cache {
             Some(features) => {
                 self.work.spatial_cached += 1;
                 features.clone()
             }
             None => {
-                let spatial = field.field.spatial_with(self.moving_means.clone(), &self.moving_attributes)?;
+                let spatial = field.field.spatial_with(self.moving_gaussians.means.clone(), &self.moving_attributes)?;
                 self.work.spatial.gaussians += spatial.work.gaussians;
                 self.work.spatial.vertices_queried += spatial.work.vertices_queried;
                 self.work.spatial.vertices_decoded += spatial.work.vertices_decoded;
@@ -142,7 +146,12 @@ impl<'a> Player<'a> {
                 features
             }
         };
-        Ok(field.field.deform(features, time_norm)?.apply(&self.gaussians, None))
+        let offsets = field.field.deform(features, time_norm)?;
+        // Nobody else holds the frame while it is written, unless a caller kept the last one, which then stays as it is.
+        let nothing = self.moving_gaussians.clone();
+        let frame = std::mem::replace(&mut self.frame, nothing);
+        self.frame = offsets.apply_over(&self.moving_gaussians, frame);
+        Ok(self.frame.clone())
     }
     /// Draws one frame.
     pub fn render(&mut self, camera: &Camera, time_norm: f32) -> Result<(RenderOutput, FrameTime)> {

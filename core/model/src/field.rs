@@ -123,7 +123,7 @@ pub trait DeformationField: Send {
     fn spatial_with(&self, means_world: Tensor<2>, _attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
         self.spatial(means_world)
     }
-    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F].
+    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F]; the same heads at every time.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
     /// The same features as [`DeformationField::deform`] reads them fastest. Playback asks for this once per spatial pass.
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {

@@ -87,6 +87,33 @@ impl Offsets {
         }
         moved
     }
+    /// Applies the offsets to `moving` [M] and writes the results over the first M Gaussians of `frame` [N >= M]: in place where nobody else holds them, and
+    /// without touching what no head changes or the Gaussians behind.
+    pub fn apply_over(self, moving: &Gaussians, mut frame: Gaussians) -> Gaussians {
+        let means = self.means.is_some();
+        let scales = self.log_scales.is_some() || self.scales.is_some();
+        let rotations = self.quaternions.is_some() || self.rotation_vectors.is_some();
+        let opacities = self.opacity_logits.is_some() || self.opacity_log_factor.is_some();
+        let colors = self.sh.is_some();
+        let moved = self.apply(moving, None);
+        if means {
+            frame.means = over(frame.means, moved.means);
+        }
+        if scales {
+            frame.log_scales = over(frame.log_scales, moved.log_scales);
+        }
+        if rotations {
+            frame.quaternions = over(frame.quaternions, moved.quaternions);
+        }
+        if opacities {
+            frame.opacity_logits = over(frame.opacity_logits, moved.opacity_logits);
+        }
+        if colors {
+            frame.sh_dc = over(frame.sh_dc, moved.sh_dc);
+            frame.sh_rest = over(frame.sh_rest, moved.sh_rest);
+        }
+        frame
+    }
     /// All heads side by side as one matrix [M, total width], for regularisers; `None` when every head is off.
     pub fn concatenated(&self) -> Option<Tensor<2>> {
         let mut parts: Vec<Tensor<2>> = Vec::new();
@@ -135,6 +162,17 @@ fn select<const D: usize>(values: &Tensor<D>, rows: Option<&Tensor<1, Int>>, cou
         None => values.clone().narrow(0, 0, count),
         Some(rows) => values.clone().select(0, rows.clone()),
     }
+}
+
+/// `base` [N,…] with its first rows replaced by `first` [M,…].
+fn over<const D: usize>(base: Tensor<D>, first: Tensor<D>) -> Tensor<D> {
+    let (dims, len) = (base.dims(), first.dims().iter().product::<usize>());
+    if len == 0 || first.dims() == dims {
+        return if len == 0 { base } else { first };
+    }
+    // One stretch of memory, whatever the shape.
+    let flat = base.reshape([dims.iter().product::<usize>()]);
+    flat.slice_assign([0..len], first.reshape([len])).reshape(dims)
 }
 
 fn add<const D: usize>(base: Tensor<D>, offset: Option<Tensor<D>>, rows: Option<&Tensor<1, Int>>) -> Tensor<D> {

@@ -16,8 +16,8 @@ const SHAKE: f32 = 0.1;
 /// Centres of the suite.
 const CENTRES: usize = 48;
 
-/// Holds a deformation field to its promises on `device`: unknown settings are refused; equal seeds give equal weights; offsets have their shapes, are
-/// finite and repeat bit for bit; a field that declares `starts-as-identity` moves nothing at first; a static one never does; gradients of all weights
+/// Holds a deformation field to its promises on `device`: unknown settings are refused; equal seeds give equal weights; offsets have their shapes, the same
+/// heads at every time, are finite and repeat bit for bit; a field that declares `starts-as-identity` moves nothing at first; a static one never does; gradients of all weights
 /// agree with finite differences; packed features give the same offsets; weights survive being copied to a fresh field, bit for bit; empty, single and non-finite centres are answered.
 ///
 /// `settings` is the `[deformer]` section without `kind`; small sizes make the suite quick.
@@ -137,6 +137,9 @@ impl Suite<'_> {
             return Ok(first.iter().any(|v| *v != 0.0).then(|| "a static field moves Gaussians".into()));
         }
         let later = self.values(&field, CENTRES, 0.81, self.device)?;
+        if later.len() != first.len() {
+            return Ok(Some("heads come and go with time".into()));
+        }
         Ok(match (first.iter().chain(&later).all(|v| v.is_finite()), first == later) {
             (false, _) => Some("offsets are not finite".into()),
             (true, true) => Some("offsets do not depend on time".into()),
