@@ -34,25 +34,28 @@ pub fn backward(
     let rules = RuleConstants::new(settings);
     let records = floats(&means, [lists.pairs, RECORD]);
     if lists.pairs > 0 {
-        blend::blend_tiles_backward::launch(
-            &client,
-            spread(tiles_x * height.div_ceil(TILE)),
-            CubeDim::new_1d(TILE_PIXELS as u32),
-            lists.splats.clone().into_buffer_arg(),
-            lists.gaussian_of_pair.clone().into_buffer_arg(),
-            lists.sorted.clone().into_buffer_arg(),
-            lists.tile_starts.clone().into_buffer_arg(),
-            background.clone().into_buffer_arg(),
-            lists.state.clone().into_buffer_arg(),
-            upstream.clone().into_buffer_arg(),
-            records.clone().into_buffer_arg(),
-            width as u32,
-            height as u32,
-            tiles_x as u32,
-            rules.alpha_max,
-            rules.pass_capped,
-            blend::backward_batch(shared_bytes(&client)),
-        );
+        // SAFETY: pixels are compared with the size of the picture; everything else is indexed by the lists that the forward pass made.
+        unsafe {
+            blend::blend_tiles_backward::launch_unchecked(
+                &client,
+                spread(tiles_x * height.div_ceil(TILE)),
+                CubeDim::new_1d(TILE_PIXELS as u32),
+                lists.splats.clone().into_buffer_arg(),
+                lists.gaussian_of_pair.clone().into_buffer_arg(),
+                lists.sorted.clone().into_buffer_arg(),
+                lists.tile_starts.clone().into_buffer_arg(),
+                background.clone().into_buffer_arg(),
+                lists.state.clone().into_buffer_arg(),
+                upstream.clone().into_buffer_arg(),
+                records.clone().into_buffer_arg(),
+                width as u32,
+                height as u32,
+                tiles_x as u32,
+                rules.alpha_max,
+                rules.pass_capped,
+                blend::backward_batch(shared_bytes(&client)),
+            )
+        };
     }
     let (screen, geometry) = (floats(&means, [n, SCREEN]), floats(&means, [n, GEOMETRY]));
     let d_colors = floats(&means, [n, 3]);

@@ -34,7 +34,7 @@ fn full_alpha(drawn: &Shared<[f32]>, at: usize, dx: f32, dy: f32) -> f32 {
 }
 
 /// Planes [5,H,W]; per pixel the transmittance left and the place in the list where it stopped, as bits [2,H,W]; largest weights [N] if wanted.
-#[cube(launch)]
+#[cube(launch_unchecked)]
 pub fn blend_tiles(
     splats: &[f32],
     gaussian_of_pair: &[u32],
@@ -139,7 +139,7 @@ pub fn blend_tiles(
 
 /// Gradient records of all pairs: centre (2), A, B, C, opacity, colour (3), depth. With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i
 /// the part of the loss behind it, d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i).
-#[cube(launch)]
+#[cube(launch_unchecked)]
 pub fn blend_tiles_backward(
     splats: &[f32],
     gaussian_of_pair: &[u32],

@@ -150,24 +150,27 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
     let planes = floats(&means, [5, height, width]);
     let state = floats(&means, [2, height, width]);
     let weights = if settings.max_weights && n > 0 { upload(&means, &vec![0.0f32; n], DType::F32) } else { upload(&means, &[0.0f32], DType::F32) };
-    blend::blend_tiles::launch(
-        &client,
-        spread(tiles),
-        CubeDim::new_1d(TILE_PIXELS as u32),
-        splats.clone().into_buffer_arg(),
-        gaussian_of_pair.clone().into_buffer_arg(),
-        sorted.clone().into_buffer_arg(),
-        tile_starts.clone().into_buffer_arg(),
-        background.into_buffer_arg(),
-        planes.clone().into_buffer_arg(),
-        state.clone().into_buffer_arg(),
-        weights.clone().into_buffer_arg(),
-        width as u32,
-        height as u32,
-        tiles_x as u32,
-        rules.alpha_max,
-        settings.max_weights && n > 0,
-    );
+    // SAFETY: tiles and pixels are compared with the sizes of their buffers; pairs and Gaussians come from lists made above, which name none beyond the last.
+    unsafe {
+        blend::blend_tiles::launch_unchecked(
+            &client,
+            spread(tiles),
+            CubeDim::new_1d(TILE_PIXELS as u32),
+            splats.clone().into_buffer_arg(),
+            gaussian_of_pair.clone().into_buffer_arg(),
+            sorted.clone().into_buffer_arg(),
+            tile_starts.clone().into_buffer_arg(),
+            background.into_buffer_arg(),
+            planes.clone().into_buffer_arg(),
+            state.clone().into_buffer_arg(),
+            weights.clone().into_buffer_arg(),
+            width as u32,
+            height as u32,
+            tiles_x as u32,
+            rules.alpha_max,
+            settings.max_weights && n > 0,
+        )
+    };
     let max_weights = if settings.max_weights && n > 0 { weights } else { floats(&means, [0]) };
     let saved = Lists { cam, splats, keys, gaussian_of_pair, start_of_gaussian, sorted, tile_starts, state, pairs };
     // Visible Gaussians and pixels are not counted here: that would need another read-back.
