@@ -172,7 +172,7 @@ fn over<const D: usize>(base: Tensor<D>, first: Tensor<D>) -> Tensor<D> {
     }
     // One stretch of memory, whatever the shape.
     let flat = base.reshape([dims.iter().product::<usize>()]);
-    flat.slice_assign([0..len], first.reshape([len])).reshape(dims)
+    flat.slice_assign(burn::tensor::s![0..len], first.reshape([len])).reshape(dims)
 }
 
 fn add<const D: usize>(base: Tensor<D>, offset: Option<Tensor<D>>, rows: Option<&Tensor<1, Int>>) -> Tensor<D> {
