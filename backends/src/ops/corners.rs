@@ -1,7 +1,7 @@
 //! The grid vertices around points, found once per step and level.
 //!
-//! How many distinct vertices there are is known to the device only, and buffers want to know it. So finding them has two halves, and one read-back between
-//! them serves all levels.
+//! How many distinct vertices there are is known to the device only, and buffers want to know it. So finding them has two halves: between them, one read-back
+//! serves all levels; or there is room for as many as there can be, and nobody waits.
 
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::index::{self, MAX_RESOLUTION};
@@ -43,7 +43,7 @@ pub struct CornersBegun<B: Backend> {
 pub trait CornerOps: Backend {
     /// Finds and groups the corners of points [M,3].
     fn begin_corners(points: FloatTensor<Self>, grid: GridBox, reuse: bool) -> CornersBegun<Self>;
-    /// `(vertices [U,3], starts [U+1], corners [8M])`, see [`VoxelCorners`].
+    /// `(vertices [U,3], starts [U+1], corners [8M])`, see [`VoxelCorners`], with room for `room` vertices where their number is not known.
     fn list_corners(
         slots: IntTensor<Self>,
         vertices: IntTensor<Self>,
@@ -51,7 +51,7 @@ pub trait CornerOps: Backend {
         corners: IntTensor<Self>,
         grid: GridBox,
         reuse: bool,
-        count: usize,
+        room: usize,
     ) -> (IntTensor<Self>, IntTensor<Self>, IntTensor<Self>);
 }
 
@@ -82,7 +82,7 @@ macro_rules! on_cpu {
                 corners: IntTensor<Self>,
                 _grid: GridBox,
                 _reuse: bool,
-                _count: usize,
+                _room: usize,
             ) -> (IntTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
                 (vertices, starts, corners)
             }
@@ -95,7 +95,7 @@ on_cpu!(NdArray);
 /// The grid corners of M points on one level.
 #[derive(Clone, Debug)]
 pub struct VoxelCorners {
-    /// Vertices to decode [U,3], integer coordinates in 0..=resolution.
+    /// Vertices to decode [U,3], integer coordinates in 0..=resolution; -1 in rows behind the last, where they were not counted.
     pub vertices: Tensor<2, Int>,
     /// Per point and corner, the row of its vertex [8M].
     pub corners: Tensor<1, Int>,
@@ -109,8 +109,9 @@ pub struct VoxelCorners {
 
 impl VoxelCorners {
     /// Finds the corners of `points` [M,3], world units, on every one of `grids`. Points outside a box are moved to its nearest face. With `reuse`, corners
-    /// at one place share a vertex (paper Section IV-C); without, every corner has its own. No gradient flows to the points. The device is waited for once.
-    pub fn find(points: Tensor<2>, grids: &[GridBox], reuse: bool) -> Result<Vec<Self>> {
+    /// at one place share a vertex (paper Section IV-C); without, every corner has its own. No gradient flows to the points. With `counted`, the device is waited
+    /// for once, and U is the number of vertices; without, U may be more on devices that would have to be waited for.
+    pub fn find(points: Tensor<2>, grids: &[GridBox], reuse: bool, counted: bool) -> Result<Vec<Self>> {
         let [m, width] = points.dims();
         if width != 3 || m == 0 {
             return Err(Error::parameter("voxel corners", format!("points have shape [{m},{width}]"), "Give at least one point with three coordinates"));
@@ -124,11 +125,16 @@ impl VoxelCorners {
         let points = points.inner();
         let begun: Vec<CornersBegun<Dispatch>> =
             grids.iter().map(|&grid| <Dispatch as CornerOps>::begin_corners(points.clone().into_dispatch(), grid, reuse)).collect();
-        let counts = Tensor::cat(begun.iter().map(|b| Tensor::<1, Int>::from_dispatch(b.count.clone())).collect(), 0);
-        let counts = counts.try_into_data().map_err(|e| Error::backend("voxel corners", format!("{e:?}"), "Try another device (--device flex)"))?;
-        let listed = begun.into_iter().zip(grids).zip(counts.iter::<i64>()).map(|((b, &grid), count)| {
-            let (vertices, starts, corners) =
-                <Dispatch as CornerOps>::list_corners(b.slots.clone(), b.vertices, b.starts, b.corners, grid, reuse, count.max(0) as usize);
+        let room: Vec<usize> = if counted {
+            let counts = Tensor::cat(begun.iter().map(|b| Tensor::<1, Int>::from_dispatch(b.count.clone())).collect(), 0);
+            let counts = counts.try_into_data().map_err(|e| Error::backend("voxel corners", format!("{e:?}"), "Try another device (--device flex)"))?;
+            counts.iter::<i64>().map(|count| count.max(0) as usize).collect()
+        } else {
+            let vertices = |grid: &GridBox| (grid.resolution as usize + 1).saturating_pow(3);
+            grids.iter().map(|grid| if reuse { vertices(grid).min(8 * m) } else { 8 * m }).collect()
+        };
+        let listed = begun.into_iter().zip(grids).zip(room).map(|((b, &grid), room)| {
+            let (vertices, starts, corners) = <Dispatch as CornerOps>::list_corners(b.slots.clone(), b.vertices, b.starts, b.corners, grid, reuse, room);
             Self {
                 vertices: Tensor::from_dispatch(vertices),
                 corners: Tensor::from_dispatch(corners),

@@ -78,7 +78,7 @@ pub struct FieldWork {
     pub gaussians: u64,
     /// Corner queries before reuse.
     pub vertices_queried: u64,
-    /// Vertices actually decoded.
+    /// Vertices actually decoded; in training on a GPU, where nobody waits for their number, the most there can have been.
     pub vertices_decoded: u64,
 }
 

@@ -59,7 +59,7 @@ impl Formulas<'_> {
         let mut levels = Vec::new();
         let m = means_world.dims()[0];
         let (grids, nets): (Vec<_>, Vec<_>) = self.0.voxels.grids().unzip();
-        let found = VoxelCorners::find(means_world.clone(), &grids, true)?;
+        let found = VoxelCorners::find(means_world.clone(), &grids, true, true)?;
         for (level, (corners, net)) in found.into_iter().zip(nets).enumerate() {
             let flat: Vec<i64> = corners.vertices.into_data().iter::<i64>().collect();
             let vertices: Vec<[u32; 3]> = flat.as_chunks::<3>().0.iter().map(|v| v.map(|c| c as u32)).collect();

@@ -135,7 +135,9 @@ impl Voxels {
         let mut work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
         let mut levels = Vec::with_capacity(self.decoders.len());
         let grids: Vec<GridBox> = self.grids().map(|(grid, _)| grid).collect();
-        let found = VoxelCorners::find(means_world, &grids, self.reuse)?;
+        // Training does not wait for a number that nothing but a report would need.
+        let counted = !parameters.iter().any(|p| p.value.is_require_grad());
+        let found = VoxelCorners::find(means_world, &grids, self.reuse, counted)?;
         for ((decoder, parameter), corners) in self.decoders.iter().zip(parameters).zip(found) {
             work.vertices_queried += 8 * m as u64;
             work.vertices_decoded += corners.vertices.dims()[0] as u64;

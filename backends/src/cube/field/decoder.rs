@@ -1,6 +1,6 @@
 //! Hash signatures and the decoders behind them (Linear, LayerNorm, Mish per hidden layer), one row per vertex.
 
-use super::gradients::{self, Rows};
+use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
 use super::program::{Input, Program, Step, Target, mish, mish_derivative, parts, scales};
 use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
@@ -240,17 +240,17 @@ pub fn backward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, 
         let (program, kept, floats_kept) = there_and_back(&layers, part.len());
         let buffer = &floats(weights, [floats_kept]);
         program.run(layout, Input::Signatures(vertices, &decoder.hash), &both, grad, buffer, &part);
-        let (n, add) = (part.len(), part.start > 0);
+        let sums = Sums { gradient: &gradient, rows: part.len(), add: part.start > 0, listed: Some((vertices, part.start)) };
         let own = |at| Rows { buffer, at };
         for ((layer, &l), kept) in layers.iter().zip(&all).zip(kept) {
             let dy = match &layer.gain {
                 Some(gain) => {
-                    gradients::of_norm(own(kept.before_mish), own(kept.normal), &gradient, n, l.output, gain.start, add);
+                    sums.of_norm(own(kept.before_mish), own(kept.normal), l.output, gain.start);
                     own(kept.before_norm)
                 }
                 None => Rows { buffer: grad, at: part.start * l.output },
             };
-            gradients::of_layer(own(kept.input), dy, &gradient, n, l, add);
+            sums.of_layer(own(kept.input), dy, l);
         }
     }
     gradient
@@ -261,6 +261,8 @@ fn layer_by_layer(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder
     let gradient = floats(weights, [MishShape::parameter_count(&decoder.shape)]);
     let pass = run(weights, vertices, decoder, rows);
     let client = weights.client.clone();
+    // Every row is computed, whether it holds a vertex or not; no gradient comes to those that do not.
+    let sums = Sums { gradient: &gradient, rows, add: false, listed: None };
     let mut d = grad;
     for (i, layer) in decoder.shape.layers().iter().enumerate().rev() {
         if let Some(gain) = &layer.gain {
@@ -278,10 +280,10 @@ fn layer_by_layer(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder
                 layer.output as u32,
                 gain.start as u32,
             );
-            gradients::of_norm(Rows::whole(&dz), Rows::whole(&pass.before_norm[i]), &gradient, rows, layer.output, gain.start, false);
+            sums.of_norm(Rows::whole(&dz), Rows::whole(&pass.before_norm[i]), layer.output, gain.start);
         }
         let l = dense(layer);
-        gradients::of_layer(Rows::whole(&pass.inputs[i]), Rows::whole(&d), &gradient, rows, l, false);
+        sums.of_layer(Rows::whole(&pass.inputs[i]), Rows::whole(&d), l);
         if i > 0 {
             let dx = floats(weights, [rows, layer.input]);
             layers::backward_input(&d, weights, &dx, rows, l, false);

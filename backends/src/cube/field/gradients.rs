@@ -1,7 +1,9 @@
 //! Gradients of weights: sums over all rows, taken per segment of rows and then over the segments, in order.
 
 use super::layers::Dense;
-use crate::cube::tensor::{UNITS, binding_bytes, cubes_for, floats, spread};
+use super::program::is_vertex;
+use crate::cube::tensor::{UNITS, binding_bytes, cubes_for, floats, signed, spread, upload};
+use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
@@ -27,14 +29,32 @@ impl<'a> Rows<'a> {
     }
 }
 
+/// The end of start..end, or the first row in it that holds no vertex (they come last): rows behind it were not computed.
+#[cube]
+fn end_of_vertices(vertices: &[i32], first: usize, start: usize, end: usize) -> usize {
+    let mut low = start;
+    let mut high = end;
+    while low < high {
+        let middle = (low + high) / 2;
+        if is_vertex(vertices, first + middle) {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    low
+}
+
 /// Per segment of rows: x^T dy, and below it the sums of dy: partial [segments, (in + 1) out]. A unit computes `down` rows and `over` columns, 16 apart.
 #[cube(launch_unchecked)]
 fn outer_parts(
     x: &[f32],
     dy: &[f32],
+    vertices: &[i32],
     partial: &mut [f32],
     x_at: u32,
     dy_at: u32,
+    first: u32,
     rows: u32,
     input: u32,
     output: u32,
@@ -42,6 +62,7 @@ fn outer_parts(
     segments: u32,
     #[comptime] down: usize,
     #[comptime] over: usize,
+    #[comptime] listed: bool,
 ) {
     let mut xs = Shared::<[f32]>::new_slice(comptime!(CHUNK * SIDE * down));
     let mut ds = Shared::<[f32]>::new_slice(comptime!(CHUNK * SIDE * over));
@@ -54,7 +75,10 @@ fn outer_parts(
     let unit = UNIT_POS as usize;
     let (ui, uo) = (unit / SIDE, unit % SIDE);
     let start = part * segment as usize;
-    let end = select(start + (segment as usize) < rows as usize, start + segment as usize, rows as usize);
+    let mut end = select(start + (segment as usize) < rows as usize, start + segment as usize, rows as usize);
+    if comptime!(listed) {
+        end = end_of_vertices(vertices, first as usize, start, end);
+    }
     let mut sums = Array::<f32>::new(comptime!(down * over));
     let mut totals = Array::<f32>::new(over);
     #[unroll]
@@ -134,14 +158,29 @@ fn outer_parts(
 
 /// Sums over rows per segment of dz times the normalised values, then of dz alone: partial [segments, 2 out].
 #[cube(launch_unchecked)]
-fn norm_parts(dz: &[f32], normalized: &[f32], partial: &mut [f32], dz_at: u32, normalized_at: u32, rows: u32, output: u32, segment: u32) {
+fn norm_parts(
+    dz: &[f32],
+    normalized: &[f32],
+    vertices: &[i32],
+    partial: &mut [f32],
+    dz_at: u32,
+    normalized_at: u32,
+    first: u32,
+    rows: u32,
+    output: u32,
+    segment: u32,
+    #[comptime] listed: bool,
+) {
     let output = output as usize;
     if ABSOLUTE_POS < partial.len() {
         let part = ABSOLUTE_POS / (2 * output);
         let which = ABSOLUTE_POS % (2 * output) / output;
         let o = ABSOLUTE_POS % output;
         let start = part * segment as usize;
-        let end = select(start + (segment as usize) < rows as usize, start + segment as usize, rows as usize);
+        let mut end = select(start + (segment as usize) < rows as usize, start + segment as usize, rows as usize);
+        if comptime!(listed) {
+            end = end_of_vertices(vertices, first as usize, start, end);
+        }
         let mut sum = 0.0f32;
         for row in start..end {
             let mut factor = 1.0f32;
@@ -207,48 +246,86 @@ fn per_unit(width: usize) -> usize {
     width.div_ceil(SIDE).next_power_of_two().min(8)
 }
 
-/// Gradient of W and b of layer `l` over `rows` rows, into `gradient` where the weights lie.
-pub fn of_layer(x: Rows, dy: Rows, gradient: &CubeTensor, rows: usize, l: Dense, add: bool) {
-    let client = gradient.client.clone();
-    let width = (l.input + 1) * l.output;
-    let (segments, segment) = segments_of(gradient, rows, width);
-    let partial = floats(gradient, [segments * width]);
-    let (down, over) = (per_unit(l.input), per_unit(l.output));
-    // SAFETY: every index is compared with the sizes of the two matrices and of the sums.
-    unsafe {
-        outer_parts::launch_unchecked(
-            &client,
-            spread(segments * l.input.div_ceil(SIDE * down) * l.output.div_ceil(SIDE * over)),
-            dim(),
-            x.buffer.clone().into_buffer_arg(),
-            dy.buffer.clone().into_buffer_arg(),
-            partial.clone().into_buffer_arg(),
-            x.at as u32,
-            dy.at as u32,
-            rows as u32,
-            l.input as u32,
-            l.output as u32,
-            segment as u32,
-            segments as u32,
-            down,
-            over,
-        )
-    };
-    let (p, to) = (partial.into_buffer_arg(), gradient.clone().into_buffer_arg());
-    add_segments::launch(&client, cubes_for(width), dim(), p, to, width as u32, segments as u32, l.at as u32, add);
+/// Sums over rows that go into one flat gradient.
+#[derive(Clone, Copy)]
+pub struct Sums<'a> {
+    /// Where the weights lie, their gradients go.
+    pub gradient: &'a CubeTensor,
+    /// The rows summed over.
+    pub rows: usize,
+    /// Whether they come on top of what is there.
+    pub add: bool,
+    /// The vertices of all rows [_,3] and which of them is that of row 0, where rows may hold none.
+    pub listed: Option<(&'a CubeTensor, usize)>,
 }
 
-/// Gradient of gain and shift [width] each, which follow each other, into `gradient` at `at`.
-pub fn of_norm(dz: Rows, normalized: Rows, gradient: &CubeTensor, rows: usize, width: usize, at: usize, add: bool) {
-    let client = gradient.client.clone();
-    let (segments, segment) = segments_of(gradient, rows, 2 * width);
-    let partial = floats(gradient, [segments * 2 * width]);
-    let (g, x, p) = (dz.buffer.clone().into_buffer_arg(), normalized.buffer.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
-    let units = cubes_for(segments * 2 * width);
-    // SAFETY: units beyond the sums do nothing, rows end at `rows`.
-    unsafe { norm_parts::launch_unchecked(&client, units, dim(), g, x, p, dz.at as u32, normalized.at as u32, rows as u32, width as u32, segment as u32) };
-    let (p, to) = (partial.into_buffer_arg(), gradient.clone().into_buffer_arg());
-    add_segments::launch(&client, cubes_for(2 * width), dim(), p, to, 2 * width as u32, segments as u32, at as u32, add);
+impl Sums<'_> {
+    /// The vertices to look at, or anything of their kind, and which is the first.
+    fn vertices(&self) -> (CubeTensor, u32) {
+        self.listed.map_or_else(|| (signed(self.gradient.clone()), 0), |(vertices, first)| (vertices.clone(), first as u32))
+    }
+    fn finish(&self, partial: CubeTensor, width: usize, segments: usize, at: usize) {
+        let (p, to) = (partial.into_buffer_arg(), self.gradient.clone().into_buffer_arg());
+        add_segments::launch(&self.gradient.client, cubes_for(width), dim(), p, to, width as u32, segments as u32, at as u32, self.add);
+    }
+    /// Gradient of W and b of layer `l` from its input and the gradient of its output.
+    pub fn of_layer(&self, x: Rows, dy: Rows, l: Dense) {
+        let width = (l.input + 1) * l.output;
+        let (segments, segment) = segments_of(self.gradient, self.rows, width);
+        let partial = floats(self.gradient, [segments * width]);
+        let (down, over) = (per_unit(l.input), per_unit(l.output));
+        let (vertices, first) = self.vertices();
+        // SAFETY: every index is compared with the sizes of the two matrices and of the sums.
+        unsafe {
+            outer_parts::launch_unchecked(
+                &self.gradient.client,
+                spread(segments * l.input.div_ceil(SIDE * down) * l.output.div_ceil(SIDE * over)),
+                dim(),
+                x.buffer.clone().into_buffer_arg(),
+                dy.buffer.clone().into_buffer_arg(),
+                vertices.into_buffer_arg(),
+                partial.clone().into_buffer_arg(),
+                x.at as u32,
+                dy.at as u32,
+                first,
+                self.rows as u32,
+                l.input as u32,
+                l.output as u32,
+                segment as u32,
+                segments as u32,
+                down,
+                over,
+                self.listed.is_some(),
+            )
+        };
+        self.finish(partial, width, segments, l.at);
+    }
+    /// Gradient of gain and shift [width] each, which follow each other from `at` on, from the gradient before Mish and the normalised values.
+    pub fn of_norm(&self, dz: Rows, normalized: Rows, width: usize, at: usize) {
+        let (segments, segment) = segments_of(self.gradient, self.rows, 2 * width);
+        let partial = floats(self.gradient, [segments * 2 * width]);
+        let (vertices, first) = self.vertices();
+        // SAFETY: units beyond the sums do nothing, rows end at `rows`.
+        unsafe {
+            norm_parts::launch_unchecked(
+                &self.gradient.client,
+                cubes_for(segments * 2 * width),
+                dim(),
+                dz.buffer.clone().into_buffer_arg(),
+                normalized.buffer.clone().into_buffer_arg(),
+                vertices.into_buffer_arg(),
+                partial.clone().into_buffer_arg(),
+                dz.at as u32,
+                normalized.at as u32,
+                first,
+                self.rows as u32,
+                width as u32,
+                segment as u32,
+                self.listed.is_some(),
+            )
+        };
+        self.finish(partial, 2 * width, segments, at);
+    }
 }
 
 /// The weights, and behind them those of `layers` transposed.
@@ -256,7 +333,7 @@ pub fn with_transposed(weights: &CubeTensor, layers: &[Dense]) -> CubeTensor {
     let count = weights.meta.shape().num_elements();
     let both = floats(weights, [2 * count]);
     let plan: Vec<u32> = layers.iter().flat_map(|l| [l.at as u32, l.input as u32, l.output as u32]).collect();
-    let plan = crate::cube::tensor::upload(weights, &plan, burn::tensor::DType::U32);
+    let plan = upload(weights, &plan, DType::U32);
     let client = weights.client.clone();
     let (w, p, b) = (weights.clone().into_buffer_arg(), plan.into_buffer_arg(), both.clone().into_buffer_arg());
     append_transposed::launch(&client, cubes_for(2 * count), dim(), w, p, b, layers.len() as u32);

@@ -63,8 +63,8 @@ impl CornerOps for CubeBackend {
         _corners: IntTensor<Self>,
         grid: GridBox,
         reuse: bool,
-        count: usize,
+        room: usize,
     ) -> (IntTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
-        voxels::list(slots, vertices, starts, grid, reuse, count)
+        voxels::list(slots, vertices, starts, grid, reuse, room)
     }
 }

@@ -1,6 +1,6 @@
 //! Trunk and heads of Linear + ReLU layers.
 
-use super::gradients::{self, Rows};
+use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
 use super::program::{Input, Program, Step, Target, parts};
 use crate::cpu::mlp::relu::{Layer, ReluShape};
@@ -157,13 +157,14 @@ pub fn backward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad: &
         let (program, kept, input_at, floats_kept) = there_and_back(&tree, part.len(), wants_input);
         let buffer = &floats(x, [floats_kept]);
         program.run(layout, Input::Rows(x, shape.input), &both, grad, buffer, &part);
+        let sums = Sums { gradient: &gradient, rows: part.len(), add: part.start > 0, listed: None };
         for (i, (layer, &l)) in tree.layers.iter().zip(&all).enumerate() {
             let input = layer.parent.map_or(Rows { buffer: x, at: part.start * l.input }, |p| Rows { buffer, at: kept[p].output });
             let dy = match tree.slots[i] {
                 Some(at) if !layer.relu => Rows { buffer: grad, at: at + part.start * l.output },
                 _ => Rows { buffer, at: kept[i].gradient },
             };
-            gradients::of_layer(input, dy, &gradient, part.len(), l, part.start > 0);
+            sums.of_layer(input, dy, l);
         }
         if let Some(of_input) = &of_input {
             layers::copy(buffer, of_input, input_at, part.start * shape.input, part.len() * shape.input);
@@ -179,6 +180,7 @@ fn layer_by_layer(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad:
     let (outputs, flat) = run(x, weights, shape, rows);
     let widths = shape.output_widths();
     let all = shape.layers();
+    let sums = Sums { gradient: &gradient, rows, add: false, listed: None };
     // d of each layer's output, once a child has added to it.
     let mut of_output: Vec<Option<CubeTensor>> = vec![None; all.len()];
     let mut of_input: Option<CubeTensor> = None;
@@ -200,7 +202,7 @@ fn layer_by_layer(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad:
         let Some(d) = d else { continue };
         let input = layer.parent.map_or(x, |p| &outputs[p]);
         let l = dense(layer);
-        gradients::of_layer(Rows::whole(input), Rows::whole(&d), &gradient, rows, l, false);
+        sums.of_layer(Rows::whole(input), Rows::whole(&d), l);
         let target = match layer.parent {
             Some(parent) => &mut of_output[parent],
             None if wants_input => &mut of_input,

@@ -51,18 +51,10 @@ fn mark_heads(sorted: &[u32], heads: &mut [u32]) {
     }
 }
 
-/// Vertices, where their slots start, and the vertex of every slot, from the sorted keys and the number of heads before each.
+/// Vertices, where their slots start, and the vertex of every slot, from the sorted keys and the number of heads before each. Behind the last vertex there are
+/// -1 and no slots.
 #[cube(launch)]
-fn list_vertices(
-    sorted: &[u32],
-    slots: &[u32],
-    before: &[u32],
-    vertices: &mut [i32],
-    starts: &mut [i32],
-    corners: &mut [i32],
-    resolution: u32,
-    vertex_count: u32,
-) {
+fn list_vertices(sorted: &[u32], slots: &[u32], before: &[u32], vertices: &mut [i32], starts: &mut [i32], corners: &mut [i32], resolution: u32, room: u32) {
     let at = ABSOLUTE_POS;
     if at < sorted.len() {
         let key = sorted[at];
@@ -80,8 +72,19 @@ fn list_vertices(
             starts[vertex as usize] = at as i32;
         }
         corners[slots[at] as usize] = vertex as i32;
-        if at == 0 {
-            starts[vertex_count as usize] = sorted.len() as i32;
+    }
+    let last = sorted.len() - 1;
+    let mut found = before[last] + 1;
+    if last > 0 {
+        found = before[last] + select(sorted[last] != sorted[last - 1], 1u32, 0u32);
+    }
+    if at >= found as usize && at <= room as usize {
+        starts[at] = sorted.len() as i32;
+        if at < room as usize {
+            #[unroll]
+            for d in 0..3usize {
+                vertices[3 * at + d] = -1i32;
+            }
         }
     }
 }
@@ -147,18 +150,18 @@ pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<Cu
     CornersBegun { weights, slots: signed(slots), vertices: signed(sorted), starts: signed(heads), corners: unused(), count: signed(count) }
 }
 
-/// Vertices [U,3], where their slots start [U+1], and the vertex of every corner [8M].
-pub fn list(slots: CubeTensor, sorted: CubeTensor, before: CubeTensor, grid: GridBox, reuse: bool, count: usize) -> (CubeTensor, CubeTensor, CubeTensor) {
+/// Vertices [U,3], where their slots start [U+1], and the vertex of every corner [8M], with room for U of them.
+pub fn list(slots: CubeTensor, sorted: CubeTensor, before: CubeTensor, grid: GridBox, reuse: bool, room: usize) -> (CubeTensor, CubeTensor, CubeTensor) {
     let client = slots.client.clone();
     let dim = CubeDim::new_1d(UNITS);
     let slots_count = slots.meta.shape().num_elements();
     let int = |shape: Vec<usize>| empty(&slots, shape, DType::I32);
-    let (vertices, starts, corners) = (int(vec![count, 3]), int(vec![count + 1]), int(vec![slots_count]));
+    let (vertices, starts, corners) = (int(vec![room, 3]), int(vec![room + 1]), int(vec![slots_count]));
     let (v, st, c) = (vertices.clone().into_buffer_arg(), starts.clone().into_buffer_arg(), corners.clone().into_buffer_arg());
     let s = sorted.into_buffer_arg();
     if reuse {
         let (l, b) = (slots.into_buffer_arg(), before.into_buffer_arg());
-        list_vertices::launch(&client, cubes_for(slots_count), dim, s, l, b, v, st, c, grid.resolution, count as u32);
+        list_vertices::launch(&client, cubes_for(slots_count.max(room + 1)), dim, s, l, b, v, st, c, grid.resolution, room as u32);
     } else {
         list_all::launch(&client, cubes_for(slots_count), dim, s, v, st, c, grid.resolution);
     }

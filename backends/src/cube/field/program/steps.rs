@@ -44,6 +44,12 @@ pub fn mish_derivative(x: f32) -> f32 {
     t + x * select(x < 20.0, slope, 0.0f32)
 }
 
+/// Whether a row of `vertices` [U,3] holds one; those that do not come last.
+#[cube]
+pub fn is_vertex(vertices: &[i32], row: usize) -> bool {
+    vertices[3 * row] >= 0
+}
+
 /// See [`super::Program::run`].
 #[cube(launch_unchecked)]
 pub fn run_steps(
@@ -71,7 +77,13 @@ pub fn run_steps(
     let mut partial = Shared::<[f32]>::new_slice(comptime!(PARTS * tile));
     let (first, count, start) = (CUBE_POS * tile, count as usize, start as usize);
     let inputs = inputs as usize;
-    let mut place = UNIT_POS as usize;
+    let mut steps = steps as usize;
+    if comptime!(hashed) {
+        // Behind the last vertex there is nothing to do.
+        let row = start + select(first < count, first, count - 1);
+        steps = select(first < count && is_vertex(vertices, row), steps, 0);
+    }
+    let mut place = select(steps > 0, UNIT_POS as usize, tile * inputs);
     while place < tile * inputs {
         let (r, i) = (place / inputs, place % inputs);
         // Rows beyond the last repeat it; they are not written.
@@ -84,7 +96,7 @@ pub fn run_steps(
         place += units;
     }
     sync_cube();
-    for step in 0..steps as usize {
+    for step in 0..steps {
         let at = FIELDS * step;
         let what = plan[at];
         if what == MULTIPLY {
