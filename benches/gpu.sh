@@ -26,6 +26,7 @@ done
 repeats=$((frames < 10 ? frames : 10))
 [ $# = 0 ] || { echo "option $1 lacks a value" >&2; exit 2; }
 [ -x "$bin" ] || { echo "$bin is not there; name a built cc4dgs with --bin" >&2; exit 2; }
+bin=$(realpath "$bin")
 mkdir -p "$out"
 export XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-${TMPDIR:-/tmp}}"
 
@@ -46,6 +47,22 @@ step() {
     fi
 }
 
+# kernels NAME COMMAND…: the same with every kernel timed by itself (CubeCL's profile, which waits after each), as JSON: launches and milliseconds per kernel.
+kernels() {
+    local name=$1 folder
+    shift
+    folder=$(mktemp -d)
+    printf '[profiling]\nlogger = { level = "full", file = "%s/log" }\n' "$folder" >"$folder/cubecl.toml"
+    echo "== $name"
+    (cd "$folder" && timeout --signal=INT --kill-after=30 "$limit" "$bin" "$@" >/dev/null 2>>log.err) || { echo "   FAILED or out of time"; failed=1; }
+    grep -aoE '^\| [0-9.]+(ns|µs|ms|s) \| [A-Za-z0-9_:]+' "$folder/log" |
+        sed -E 's/^\| ([0-9.]+)(ns|µs|ms|s) \| .*::([A-Za-z0-9_]+):?$/\3 \1 \2/; s/ ns$/ 0.000001/; s/ µs$/ 0.001/; s/ ms$/ 1/; s/ s$/ 1000/' |
+        awk 'NF == 3 { print $1, $2 * $3 }' | sort -k1,1 -k2,2g |
+        awk 'function flush() { if (n) printf "%s  {\"kernel\": \"%s\", \"launches\": %d, \"min_ms\": %g, \"median_ms\": %g, \"sum_ms\": %g}", (any++ ? ",\n" : ""), name, n, v[1], v[int((n + 1) / 2)], sum }
+             BEGIN { print "[" } { if ($1 != name) { flush(); name = $1; n = 0; sum = 0 } v[++n] = $2; sum += $2 } END { flush(); print "\n]" }' >"$out/$name.json"
+    rm -rf "$folder"
+}
+
 step doctor 60 doctor
 step step "$limit" bench step --device "$device" --repeats "$repeats"
 step frame "$limit" bench frame --device "$device" --scale "$scale" --frames "$frames"
@@ -54,6 +71,9 @@ step train-step "$limit" bench step --device "$device" --case n3dv --scale "$sca
 step field "$limit" bench field --device "$device" --gaussians "$(awk "BEGIN { n = int(40000 * $scale); print (n > 1 ? n : 1) }")" --repeats "$repeats"
 step loss "$limit" bench loss --device "$device" --megapixels "$(awk "BEGIN { print 1.4 * $scale \",\" 2.2 * $scale }")"
 step sort "$limit" bench sort --device "$device" --pairs "$(awk "BEGIN { print int(1000000 * $scale) \",\" int(4000000 * $scale) }")"
+kernels kernels-frame bench frame --device "$device" --case n3dv --scale "$scale" --frames "$frames"
+kernels kernels-step bench step --device "$device" --case n3dv --scale "$scale" --repeats "$repeats"
+kernels kernels-field bench field --device "$device" --gaussians "$(awk "BEGIN { n = int(40000 * $scale); print (n > 1 ? n : 1) }")" --repeats "$repeats"
 step growth "$limit" bench frame --device "$device" --growth --scale "$scale" --frames "$frames"
 
 if [ -n "$data" ] && [ "$minutes" != 0 ]; then

@@ -92,6 +92,10 @@ macro_rules! on_cpu {
 on_cpu!(Flex);
 on_cpu!(NdArray);
 
+/// The most vertices of a level that room is made for without counting them: with 32 features each, what every adapter binds. For more of them, waiting costs
+/// little beside decoding.
+const MOST_UNCOUNTED: usize = 1 << 20;
+
 /// The grid corners of M points on one level.
 #[derive(Clone, Debug)]
 pub struct VoxelCorners {
@@ -110,7 +114,7 @@ pub struct VoxelCorners {
 impl VoxelCorners {
     /// Finds the corners of `points` [M,3], world units, on every one of `grids`. Points outside a box are moved to its nearest face. With `reuse`, corners
     /// at one place share a vertex (paper Section IV-C); without, every corner has its own. No gradient flows to the points. With `counted`, the device is waited
-    /// for once, and U is the number of vertices; without, U may be more on devices that would have to be waited for.
+    /// for once, and U is the number of vertices; without, U may be more on devices that would have to be waited for, up to a million.
     pub fn find(points: Tensor<2>, grids: &[GridBox], reuse: bool, counted: bool) -> Result<Vec<Self>> {
         let [m, width] = points.dims();
         if width != 3 || m == 0 {
@@ -125,13 +129,14 @@ impl VoxelCorners {
         let points = points.inner();
         let begun: Vec<CornersBegun<Dispatch>> =
             grids.iter().map(|&grid| <Dispatch as CornerOps>::begin_corners(points.clone().into_dispatch(), grid, reuse)).collect();
-        let room: Vec<usize> = if counted {
+        let vertices = |grid: &GridBox| if reuse { (grid.resolution as usize + 1).saturating_pow(3).min(8 * m) } else { 8 * m };
+        let room: Vec<usize> = grids.iter().map(vertices).collect();
+        let room = if counted || room.iter().any(|&vertices| vertices > MOST_UNCOUNTED) {
             let counts = Tensor::cat(begun.iter().map(|b| Tensor::<1, Int>::from_dispatch(b.count.clone())).collect(), 0);
             let counts = counts.try_into_data().map_err(|e| Error::backend("voxel corners", format!("{e:?}"), "Try another device (--device flex)"))?;
             counts.iter::<i64>().map(|count| count.max(0) as usize).collect()
         } else {
-            let vertices = |grid: &GridBox| (grid.resolution as usize + 1).saturating_pow(3);
-            grids.iter().map(|grid| if reuse { vertices(grid).min(8 * m) } else { 8 * m }).collect()
+            room
         };
         let listed = begun.into_iter().zip(grids).zip(room).map(|((b, &grid), room)| {
             let (vertices, starts, corners) = <Dispatch as CornerOps>::list_corners(b.slots.clone(), b.vertices, b.starts, b.corners, grid, reuse, room);

@@ -1,8 +1,9 @@
 //! Hash signatures and the decoders behind them (Linear, LayerNorm, Mish per hidden layer), one row per vertex.
 
+use super::activation::{mish, mish_derivative};
 use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
-use super::program::{Input, Program, Step, Target, mish, mish_derivative, parts, scales};
+use super::program::{Input, Program, Step, Target, parts, scales};
 use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
 use crate::cpu::mlp::mish::MishLayer;
 use crate::cpu::vertex::hash::LevelHash;

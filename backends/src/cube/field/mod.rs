@@ -1,5 +1,6 @@
 //! The computational deformation field on the device.
 
+mod activation;
 mod decoder;
 mod gradients;
 mod layers;

@@ -17,7 +17,7 @@ fn find_corners(points: &[f32], grid: &[f32], keys: &mut [u32], slots: &mut [u32
         let corner = (slot % 8) as u32;
         let side = resolution + 1;
         let mut key = 0u32;
-        let mut weight = 1.0f32;
+        let mut parts = Array::<f32>::new(3usize);
         #[unroll]
         for step in 0..3usize {
             // The last axis is the most significant.
@@ -30,12 +30,13 @@ fn find_corners(points: &[f32], grid: &[f32], keys: &mut [u32], slots: &mut [u32
             let cell = select(floor < resolution, floor, resolution - 1);
             let part = at - cell as f32;
             let offset = (corner >> (d as u32)) & 1u32;
-            weight *= select(offset == 1, part, 1.0 - part);
+            parts[d] = select(offset == 1, part, 1.0 - part);
             key = key * side + cell + offset;
         }
         keys[slot] = key;
         slots[slot] = slot as u32;
-        weights[slot] = weight;
+        // In the order of the CPU.
+        weights[slot] = parts[0] * parts[1] * parts[2];
     }
 }
 

@@ -4,7 +4,7 @@
 
 mod steps;
 
-pub use steps::{is_vertex, mish, mish_derivative};
+pub use steps::is_vertex;
 
 use crate::cpu::vertex::hash::LevelHash;
 use crate::cube::tensor::{binding_bytes, shared_bytes, spread, upload};

@@ -1,6 +1,7 @@
 //! The kernel behind [`super::Program`]: what each step does to the tiles of one cube.
 
 use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
+use crate::cube::field::activation::{mish, mish_derivative};
 use crate::cube::field::decoder::signature;
 use cubecl::prelude::*;
 
@@ -9,7 +10,7 @@ pub const FIELDS: usize = 9;
 /// Stands for "none".
 pub const NONE: u32 = u32::MAX;
 /// Stands for the result where a tile is named.
-pub const OUTSIDE: usize = 2;
+pub const OUTSIDE: usize = 3;
 /// Rows and columns a unit computes: 64 sums for 16 loads.
 pub const BLOCK: usize = 8;
 
@@ -23,26 +24,6 @@ pub const NORM_BACK: u32 = 5;
 /// Flags of a multiplication.
 pub const RELU: u32 = 1;
 pub const ACCUMULATE: u32 = 2;
-
-/// e^x - 1 cannot cancel here: with w = e^x, tanh(ln(1 + w)) = (w^2 + 2 w) / (w^2 + 2 w + 2).
-#[cube]
-pub fn mish(x: f32) -> f32 {
-    // Beyond 20 the factor is 1 to float32.
-    let w = select(x < 20.0, x, 20.0f32).exp();
-    let n = w * (w + 2.0);
-    x * (n / (n + 2.0))
-}
-
-/// Derivative of [`mish`].
-#[cube]
-pub fn mish_derivative(x: f32) -> f32 {
-    let w = select(x < 20.0, x, 20.0f32).exp();
-    let n = w * (w + 2.0);
-    let t = n / (n + 2.0);
-    // d tanh(softplus) = (1 - t^2) sigmoid; 1 - t^2 = 4 (n + 1) / (n + 2)^2.
-    let slope = 4.0 * (n + 1.0) / ((n + 2.0) * (n + 2.0)) * (w / (1.0 + w));
-    t + x * select(x < 20.0, slope, 0.0f32)
-}
 
 /// Whether a row of `vertices` [U,3] holds one; those that do not come last.
 #[cube]
