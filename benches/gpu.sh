@@ -55,9 +55,10 @@ kernels() {
     printf '[profiling]\nlogger = { level = "full", file = "%s/log" }\n' "$folder" >"$folder/cubecl.toml"
     echo "== $name"
     (cd "$folder" && timeout --signal=INT --kill-after=30 "$limit" "$bin" "$@" >/dev/null 2>>log.err) || { echo "   FAILED or out of time"; failed=1; }
-    grep -aoE '^\| [0-9.]+(ns|µs|ms|s) \| [A-Za-z0-9_:]+' "$folder/log" |
-        sed -E 's/^\| ([0-9.]+)(ns|µs|ms|s) \| .*::([A-Za-z0-9_]+):?$/\3 \1 \2/; s/ ns$/ 0.000001/; s/ µs$/ 0.001/; s/ ms$/ 1/; s/ s$/ 1000/' |
-        awk 'NF == 3 { print $1, $2 * $3 }' | sort -k1,1 -k2,2g |
+    grep -aoE '^\| [0-9.]+[^ ]*s +\| [A-Za-z0-9_:]+' "$folder/log" |
+        sed -E 's/^\| ([0-9.]+)([^ ]*s) +\| .*::([A-Za-z0-9_]+):?$/\3 \1 \2/' |
+        # What is none of the others are microseconds, in whatever spelling.
+        awk 'NF == 3 { print $1, $2 * ($3 == "s" ? 1000 : $3 == "ms" ? 1 : $3 == "ns" ? 0.000001 : 0.001) }' | sort -k1,1 -k2,2g |
         awk 'function flush() { if (n) printf "%s  {\"kernel\": \"%s\", \"launches\": %d, \"min_ms\": %g, \"median_ms\": %g, \"sum_ms\": %g}", (any++ ? ",\n" : ""), name, n, v[1], v[int((n + 1) / 2)], sum }
              BEGIN { print "[" } { if ($1 != name) { flush(); name = $1; n = 0; sum = 0 } v[++n] = $2; sum += $2 } END { flush(); print "\n]" }' >"$out/$name.json"
     rm -rf "$folder"
