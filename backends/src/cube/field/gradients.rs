@@ -45,6 +45,22 @@ fn end_of_vertices(vertices: &[i32], first: usize, start: usize, end: usize) -> 
     low
 }
 
+/// Brings the next rows of a matrix [_, width] on the chip, `per` times 16 of its columns; zeros where it ends.
+#[cube]
+fn bring(from: &[f32], at: usize, to: &mut Shared<[f32]>, row: usize, end: usize, first: usize, width: usize, #[comptime] per: usize) {
+    let side = comptime!(SIDE * per);
+    let mut place = UNIT_POS as usize;
+    while place < comptime!(CHUNK * SIDE * per) {
+        let (r, i) = (row + place / side, first + place % side);
+        let mut value = 0.0f32;
+        if r < end && i < width {
+            value = from[at + r * width + i];
+        }
+        to[place] = value;
+        place += UNITS as usize;
+    }
+}
+
 /// Per segment of rows: x^T dy, and below it the sums of dy: partial [segments, (in + 1) out]. A unit computes `down` rows and `over` columns, 16 apart.
 #[cube(launch_unchecked)]
 fn outer_parts(
@@ -91,30 +107,8 @@ fn outer_parts(
     }
     let mut row = start;
     while row < end {
-        #[unroll]
-        for k in 0..comptime!(CHUNK * down * SIDE / UNITS as usize + 1) {
-            let place = unit + k * UNITS as usize;
-            if place < comptime!(CHUNK * SIDE * down) {
-                let (r, i) = (row + place / tile_down, first_i + place % tile_down);
-                let mut value = 0.0f32;
-                if r < end && i < input {
-                    value = x[x_at as usize + r * input + i];
-                }
-                xs[place] = value;
-            }
-        }
-        #[unroll]
-        for k in 0..comptime!(CHUNK * over * SIDE / UNITS as usize + 1) {
-            let place = unit + k * UNITS as usize;
-            if place < comptime!(CHUNK * SIDE * over) {
-                let (r, o) = (row + place / tile_over, first_o + place % tile_over);
-                let mut value = 0.0f32;
-                if r < end && o < output {
-                    value = dy[dy_at as usize + r * output + o];
-                }
-                ds[place] = value;
-            }
-        }
+        bring(x, x_at as usize, &mut xs, row, end, first_i, input, down);
+        bring(dy, dy_at as usize, &mut ds, row, end, first_o, output, over);
         sync_cube();
         for r in 0..CHUNK {
             let mut ours = Array::<f32>::new(over);

@@ -237,8 +237,9 @@ fn check_device(device: &Device, method: Method) -> Result<()> {
 pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method) -> Result<RenderOutput> {
     let device = inputs.means.device();
     check_device(&device, method)?;
-    // A stand-in for what is absent; never read.
-    let absent = || Tensor::<1>::zeros([3], &device);
+    // Stand-ins for what is absent: probes are never read, no background is black.
+    let absent = || Tensor::<1>::empty([3], &device);
+    let black = || Tensor::<1>::zeros([3], &device);
     let wants_weights = settings.max_weights;
     let out = <Dispatch as RasterOps>::rasterize(
         inputs.means.into_dispatch(),
@@ -249,7 +250,7 @@ pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method)
         inputs.sh_rest.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
         inputs.screen_probe.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
         inputs.camera_probe.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
-        inputs.background.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
+        inputs.background.map_or_else(|| black().into_dispatch(), Tensor::into_dispatch),
         settings,
         method,
     );
