@@ -28,6 +28,7 @@ repeats=$((frames < 10 ? frames : 10))
 [ -x "$bin" ] || { echo "$bin is not there; name a built cc4dgs with --bin" >&2; exit 2; }
 bin=$(realpath "$bin")
 mkdir -p "$out"
+out=$(realpath "$out")
 export XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-${TMPDIR:-/tmp}}"
 
 failed=0
@@ -47,14 +48,17 @@ step() {
     fi
 }
 
-# kernels NAME COMMAND…: the same with every kernel timed by itself (CubeCL's profile, which waits after each), as JSON: launches and milliseconds per kernel.
+# kernels NAME COMMAND…: the same with every kernel timed by itself (CubeCL's profile, read from the working folder, waits after each); the JSON is launches and
+# milliseconds per kernel. Whole times are not comparable with those of other steps.
 kernels() {
     local name=$1 folder
     shift
     folder=$(mktemp -d)
     printf '[profiling]\nlogger = { level = "full", file = "%s/log" }\n' "$folder" >"$folder/cubecl.toml"
-    echo "== $name"
-    (cd "$folder" && timeout --signal=INT --kill-after=30 "$limit" "$bin" "$@" >/dev/null 2>>log.err) || { echo "   FAILED or out of time"; failed=1; }
+    pushd "$folder" >/dev/null
+    step "$name" "$limit" "$@"
+    popd >/dev/null
+    [ -f "$folder/log" ] || { rm -rf "$folder"; return; }
     grep -aoE '^\| [0-9.]+[^ ]*s +\| [A-Za-z0-9_:]+' "$folder/log" |
         sed -E 's/^\| ([0-9.]+)([^ ]*s) +\| .*::([A-Za-z0-9_]+):?$/\3 \1 \2/' |
         # What is none of the others are microseconds, in whatever spelling.
@@ -65,16 +69,17 @@ kernels() {
 }
 
 step doctor 60 doctor
+moving=$(awk "BEGIN { n = int(40000 * $scale); print (n > 1 ? n : 1) }")
 step step "$limit" bench step --device "$device" --repeats "$repeats"
 step frame "$limit" bench frame --device "$device" --scale "$scale" --frames "$frames"
 step frame-basis "$limit" bench frame --device "$device" --scale "$scale" --frames "$frames" --set deformer.kind=cdf-basis
 step train-step "$limit" bench step --device "$device" --case n3dv --scale "$scale" --repeats "$repeats"
-step field "$limit" bench field --device "$device" --gaussians "$(awk "BEGIN { n = int(40000 * $scale); print (n > 1 ? n : 1) }")" --repeats "$repeats"
+step field "$limit" bench field --device "$device" --gaussians "$moving" --repeats "$repeats"
 step loss "$limit" bench loss --device "$device" --megapixels "$(awk "BEGIN { print 1.4 * $scale \",\" 2.2 * $scale }")"
 step sort "$limit" bench sort --device "$device" --pairs "$(awk "BEGIN { print int(1000000 * $scale) \",\" int(4000000 * $scale) }")"
 kernels kernels-frame bench frame --device "$device" --case n3dv --scale "$scale" --frames "$frames"
 kernels kernels-step bench step --device "$device" --case n3dv --scale "$scale" --repeats "$repeats"
-kernels kernels-field bench field --device "$device" --gaussians "$(awk "BEGIN { n = int(40000 * $scale); print (n > 1 ? n : 1) }")" --repeats "$repeats"
+kernels kernels-field bench field --device "$device" --gaussians "$moving" --repeats "$repeats"
 step growth "$limit" bench frame --device "$device" --growth --scale "$scale" --frames "$frames"
 
 if [ -n "$data" ] && [ "$minutes" != 0 ]; then

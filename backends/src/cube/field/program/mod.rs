@@ -102,13 +102,20 @@ impl Input<'_> {
 }
 
 /// How a program is cut for a device.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Layout {
     tile: usize,
     stride: usize,
     tiles: usize,
     /// Units per row of the tile.
     per_row: usize,
+}
+
+impl Layout {
+    /// Units of a cube.
+    fn units(&self) -> usize {
+        self.tile * self.per_row
+    }
 }
 
 /// The places that the scales of [`Step::Norm`] take for so many rows, whatever the layout: each unit keeps its own.
@@ -172,14 +179,13 @@ impl Program {
         let hashed = vertices.is_some();
         let plan = upload(weights, &plan, DType::U32);
         let vertices = vertices.unwrap_or_else(|| crate::cube::tensor::signed(plan.clone()));
-        let Layout { tile, stride, tiles, per_row } = layout;
         // SAFETY: rows beyond the last are neither read nor written; columns and places are inside because weights, inputs and result have the sizes that
         // the steps were made for, which the operations check.
         unsafe {
             steps::run_steps::launch_unchecked(
                 &client,
-                spread(rows.len().div_ceil(tile)),
-                CubeDim::new_1d((tile * per_row) as u32),
+                spread(rows.len().div_ceil(layout.tile)),
+                CubeDim::new_1d(layout.units() as u32),
                 x.into_buffer_arg(),
                 vertices.into_buffer_arg(),
                 plan.into_buffer_arg(),
@@ -194,10 +200,7 @@ impl Program {
                 modulus,
                 2.0 / (modulus - 1) as f32,
                 hashed,
-                tile,
-                stride,
-                tiles,
-                per_row,
+                layout,
             )
         };
     }
@@ -224,7 +227,7 @@ mod tests {
 
     #[test]
     fn a_layer_over_its_own_tile_is_done_in_one_go() {
-        let units = |width| Program(vec![multiply(0, Target::Tile(0), width, width)]).layout(width, 16, 1 << 20).map(|l| l.tile * l.per_row);
+        let units = |width| Program(vec![multiply(0, Target::Tile(0), width, width)]).layout(width, 16, 1 << 20).map(|l| l.units());
         assert_eq!((units(16), units(128), units(129), units(1024), units(1025)), (Some(32), Some(32), Some(64), Some(256), None));
         // A result outside may be as wide as it likes.
         assert!(Program(vec![multiply(0, Target::Out(0), 16, 4000)]).layout(16, 16, 16_384).is_some());

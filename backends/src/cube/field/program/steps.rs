@@ -1,5 +1,6 @@
 //! The kernel behind [`super::Program`]: what each step does to the tiles of one cube.
 
+use super::Layout;
 use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
 use crate::cube::field::activation::{mish, mish_derivative};
 use crate::cube::field::decoder::signature;
@@ -48,14 +49,11 @@ pub fn run_steps(
     modulus: u32,
     scale: f32,
     #[comptime] hashed: bool,
-    #[comptime] tile: usize,
-    #[comptime] stride: usize,
-    #[comptime] tiles: usize,
-    #[comptime] per_row: usize,
+    #[comptime] layout: Layout,
 ) {
-    let units = comptime!(tile * per_row);
-    let mut kept = Shared::<[f32]>::new_slice(comptime!(tile * stride * tiles));
-    let mut partial = Shared::<[f32]>::new_slice(comptime!(PARTS * tile));
+    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
+    let mut kept = Shared::<[f32]>::new_slice(comptime!(layout.tile * layout.stride * layout.tiles));
+    let mut partial = Shared::<[f32]>::new_slice(comptime!(PARTS * layout.tile));
     let (first, count, start) = (CUBE_POS * tile, count as usize, start as usize);
     let inputs = inputs as usize;
     let mut steps = steps as usize;
@@ -74,24 +72,24 @@ pub fn run_steps(
         } else {
             kept[r * stride + i] = x[row * inputs + i];
         }
-        place += units;
+        place += comptime!(layout.units());
     }
     sync_cube();
     for step in 0..steps {
         let at = FIELDS * step;
         let what = plan[at];
         if what == MULTIPLY {
-            multiply(&mut kept, weights, plan, out, at, first, count, tile, stride, per_row);
+            multiply(&mut kept, weights, plan, out, at, first, count, layout);
         } else if what == LOAD {
-            load(&mut kept, given, plan, at, first, count, start, tile, stride, per_row);
+            load(&mut kept, given, plan, at, first, count, start, layout);
         } else if what == KEEP {
-            keep(&mut kept, plan, out, at, first, count, tile, stride, per_row);
+            keep(&mut kept, plan, out, at, first, count, layout);
         } else if what == CUT {
-            cut(&mut kept, plan, &*out, at, first, count, tile, stride, per_row);
+            cut(&mut kept, plan, &*out, at, first, count, layout);
         } else if what == NORM {
-            norm(&mut kept, &mut partial, weights, plan, out, at, first, count, tile, stride, per_row);
+            norm(&mut kept, &mut partial, weights, plan, out, at, first, count, layout);
         } else {
-            norm_back(&mut kept, &mut partial, weights, plan, out, at, first, count, tile, stride, per_row);
+            norm_back(&mut kept, &mut partial, weights, plan, out, at, first, count, layout);
         }
         sync_cube();
     }
@@ -99,23 +97,13 @@ pub fn run_steps(
 
 /// A unit computes a block of rows and, `across` apart, a few columns, so that neighbouring units read neighbouring weights.
 #[cube]
-fn multiply(
-    kept: &mut Shared<[f32]>,
-    weights: &[f32],
-    plan: &[u32],
-    out: &mut [f32],
-    at: usize,
-    first: usize,
-    count: usize,
-    #[comptime] tile: usize,
-    #[comptime] stride: usize,
-    #[comptime] per_row: usize,
-) {
+fn multiply(kept: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
     let (source, target, input, output) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize, plan[at + 4] as usize);
     let (matrix, bias, place, flags) = (plan[at + 5] as usize, plan[at + 6], plan[at + 7] as usize, plan[at + 8]);
-    let units = comptime!(tile * per_row);
+    let units = comptime!(layout.units());
     let across = output.div_ceil(BLOCK);
-    let blocks = across * comptime!(tile / BLOCK);
+    let blocks = across * comptime!(layout.tile / BLOCK);
     for pass in 0..blocks.div_ceil(units) {
         let block = pass * units + UNIT_POS as usize;
         let active = block < blocks;
@@ -180,18 +168,8 @@ fn multiply(
 }
 
 #[cube]
-fn load(
-    kept: &mut Shared<[f32]>,
-    given: &[f32],
-    plan: &[u32],
-    at: usize,
-    first: usize,
-    count: usize,
-    start: usize,
-    #[comptime] tile: usize,
-    #[comptime] stride: usize,
-    #[comptime] per_row: usize,
-) {
+fn load(kept: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first: usize, count: usize, start: usize, #[comptime] layout: Layout) {
+    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
     let (target, column, taken, width, from) =
         (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize, plan[at + 4] as usize, plan[at + 5] as usize);
     let mut place = UNIT_POS as usize;
@@ -202,23 +180,14 @@ fn load(
             value = given[from + (start + first + r) * width + column + i];
         }
         kept[target * (tile * stride) + r * stride + i] = value;
-        place += comptime!(tile * per_row);
+        place += comptime!(layout.units());
     }
 }
 
 /// What a unit keeps here is what it reads in [`cut`]: no other unit's writes have to arrive.
 #[cube]
-fn keep(
-    kept: &mut Shared<[f32]>,
-    plan: &[u32],
-    out: &mut [f32],
-    at: usize,
-    first: usize,
-    count: usize,
-    #[comptime] tile: usize,
-    #[comptime] stride: usize,
-    #[comptime] per_row: usize,
-) {
+fn keep(kept: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
     let (source, width, to) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize);
     let mut place = UNIT_POS as usize;
     while place < tile * width {
@@ -226,22 +195,13 @@ fn keep(
         if first + r < count {
             out[to + (first + r) * width + i] = kept[source * (tile * stride) + r * stride + i];
         }
-        place += comptime!(tile * per_row);
+        place += comptime!(layout.units());
     }
 }
 
 #[cube]
-fn cut(
-    kept: &mut Shared<[f32]>,
-    plan: &[u32],
-    out: &[f32],
-    at: usize,
-    first: usize,
-    count: usize,
-    #[comptime] tile: usize,
-    #[comptime] stride: usize,
-    #[comptime] per_row: usize,
-) {
+fn cut(kept: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
     let (target, width, from) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize);
     let mut place = UNIT_POS as usize;
     while place < tile * width {
@@ -251,7 +211,7 @@ fn cut(
                 kept[target * (tile * stride) + r * stride + i] = 0.0f32;
             }
         }
-        place += comptime!(tile * per_row);
+        place += comptime!(layout.units());
     }
 }
 
@@ -286,10 +246,9 @@ fn norm(
     at: usize,
     first: usize,
     count: usize,
-    #[comptime] tile: usize,
-    #[comptime] stride: usize,
-    #[comptime] per_row: usize,
+    #[comptime] layout: Layout,
 ) {
+    let (tile, stride, per_row) = (comptime!(layout.tile), comptime!(layout.stride), comptime!(layout.per_row));
     let (target, width, gain, normals, scales) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize, plan[at + 4], plan[at + 5]);
     let (r, part) = (UNIT_POS as usize / per_row, UNIT_POS as usize % per_row);
     let line = target * (tile * stride) + r * stride;
@@ -318,7 +277,7 @@ fn norm(
     let inverse = 1.0 / (variance + EPSILON).sqrt();
     let keeps = normals != NONE && first + r < count;
     if keeps {
-        out[scales as usize + CUBE_POS * comptime!(tile * per_row) + UNIT_POS as usize] = inverse;
+        out[scales as usize + CUBE_POS * comptime!(layout.units()) + UNIT_POS as usize] = inverse;
     }
     let mut i = part;
     while i < width {
@@ -341,10 +300,9 @@ fn norm_back(
     at: usize,
     first: usize,
     count: usize,
-    #[comptime] tile: usize,
-    #[comptime] stride: usize,
-    #[comptime] per_row: usize,
+    #[comptime] layout: Layout,
 ) {
+    let (tile, stride, per_row) = (comptime!(layout.tile), comptime!(layout.stride), comptime!(layout.per_row));
     let (target, width, gain) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize);
     let (normals, scales, before, after) = (plan[at + 4] as usize, plan[at + 5] as usize, plan[at + 6] as usize, plan[at + 7] as usize);
     let (r, part) = (UNIT_POS as usize / per_row, UNIT_POS as usize % per_row);
@@ -374,7 +332,7 @@ fn norm_back(
     let sum = row_sum(partial, &sums, per_row) / width as f32;
     let along = row_sum(partial, &along, per_row) / width as f32;
     if real {
-        let inverse = out[scales + CUBE_POS * comptime!(tile * per_row) + UNIT_POS as usize];
+        let inverse = out[scales + CUBE_POS * comptime!(layout.units()) + UNIT_POS as usize];
         let mut i = part;
         while i < width {
             let d = inverse * (kept[line + i] * weights[gain + i] - sum - out[normals + row + i] * along);
