@@ -9,7 +9,8 @@ use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
+    inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -68,7 +69,7 @@ fn encode(x: Tensor<2>, bands: usize) -> Tensor<2> {
 }
 
 impl DeformMlp {
-    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+    fn new(settings: Settings, context: &DeformerContext, device: &Device) -> Result<Self> {
         within("width", settings.width, 1, 4096)?;
         within("layers", settings.layers, 2, 32)?;
         within("skip", settings.skip, 1, settings.layers - 1)?;
@@ -102,9 +103,9 @@ fn only(outputs: Vec<Tensor<2>>) -> Result<Tensor<2>> {
     outputs.into_iter().next().ok_or_else(|| Error::backend("deformer deform-mlp", "a network returned no output", "Report this as a defect"))
 }
 
-impl DeformationField for DeformMlp {
+impl Deformer for DeformMlp {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-        let work = FieldWork { gaussians: means_world.dims()[0] as u64, ..FieldWork::default() };
+        let work = DeformerWork { gaussians: means_world.dims()[0] as u64, ..DeformerWork::default() };
         Ok(SpatialFeatures { values: encode(finite(means_world), self.settings.position_bands), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
@@ -136,12 +137,12 @@ impl DeformationField for DeformMlp {
     }
 }
 
-fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     Ok(Box::new(DeformMlp::new(config::parse_section("deformer deform-mlp", section)?, context, device)?))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "deform-mlp",
             version: "1",

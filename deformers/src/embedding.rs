@@ -11,7 +11,7 @@ use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    AttributeSpec, DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
     config, inventory,
 };
 use serde::Deserialize;
@@ -78,7 +78,7 @@ struct Embedding {
 }
 
 impl Embedding {
-    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+    fn new(settings: Settings, context: &DeformerContext, device: &Device) -> Result<Self> {
         within("gaussian_features", settings.gaussian_features, 1, 1024)?;
         within("time_features", settings.time_features, 1, 4096)?;
         within("time_rows", settings.time_rows, 2, 100_000)?;
@@ -147,7 +147,7 @@ impl Embedding {
     }
 }
 
-impl DeformationField for Embedding {
+impl Deformer for Embedding {
     fn attributes(&self) -> Vec<AttributeSpec> {
         vec![AttributeSpec {
             name: ATTRIBUTE.into(),
@@ -167,7 +167,7 @@ impl DeformationField for Embedding {
         let [m, _] = means_world.dims();
         match attributes {
             [own] if own.dims() == [m, self.settings.gaussian_features] => {
-                Ok(SpatialFeatures { values: own.clone(), work: FieldWork { gaussians: m as u64, ..FieldWork::default() } })
+                Ok(SpatialFeatures { values: own.clone(), work: DeformerWork { gaussians: m as u64, ..DeformerWork::default() } })
             }
             _ => Err(Error::parameter(
                 "deformer embedding",
@@ -212,7 +212,7 @@ impl DeformationField for Embedding {
     }
 }
 
-fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     Ok(Box::new(Embedding::new(config::parse_section("deformer embedding", section)?, context, device)?))
 }
 
@@ -223,7 +223,7 @@ mod tests {
 
     #[test]
     fn rows_grow_and_changes_come_in_with_progress() {
-        let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
         let settings = Settings { time_rows: 90, coarse_rows: 10, ..Settings::default() };
         let mut field = Embedding::new(settings, &context, &Device::flex()).unwrap();
         assert_eq!((field.fine_rows(), field.share_of(Head::Sh)), (90, 1.0), "a field that was never told is trained");
@@ -238,7 +238,7 @@ mod tests {
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "embedding",
             version: "1",

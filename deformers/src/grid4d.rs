@@ -12,7 +12,8 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
+    inventory,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -107,7 +108,7 @@ fn grid(levels: usize, features: usize, base: [u32; 3], last: [u32; 3], log2_row
 /// Parameters: four tables, attention layer, temporal layer, what follows them.
 struct Grid4d {
     settings: Settings,
-    context: FieldContext,
+    context: DeformerContext,
     space: Arc<GridShape>,
     time: Arc<GridShape>,
     attention: Arc<ReluShape>,
@@ -117,7 +118,7 @@ struct Grid4d {
 }
 
 impl Grid4d {
-    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+    fn new(settings: Settings, context: &DeformerContext, device: &Device) -> Result<Self> {
         let s = &settings;
         within("log2_rows", s.log2_rows as usize, 4, 24)?;
         within("space_levels", s.space_levels, 1, 64)?;
@@ -187,10 +188,10 @@ fn rotate(q: Tensor<2>, x: Tensor<2>) -> Tensor<2> {
     x + Tensor::cat(turn.collect(), 1)
 }
 
-impl DeformationField for Grid4d {
+impl Deformer for Grid4d {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let m = means_world.dims()[0];
-        let work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        let work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
         if m == 0 {
             return Ok(SpatialFeatures { values: Tensor::zeros([0, 6 + self.settings.width], &means_world.device()), work });
         }
@@ -244,12 +245,12 @@ impl DeformationField for Grid4d {
     }
 }
 
-fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     Ok(Box::new(Grid4d::new(config::parse_section("deformer grid4d", section)?, context, device)?))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "grid4d",
             version: "1",

@@ -11,7 +11,7 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
-    DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -80,14 +80,14 @@ impl Default for Settings {
 /// Parameters: six planes (all resolutions of each), the network.
 struct HexPlane {
     settings: Settings,
-    context: FieldContext,
+    context: DeformerContext,
     planes: Vec<Arc<GridShape>>,
     network: Arc<ReluShape>,
     parameters: Vec<Parameter>,
 }
 
 impl HexPlane {
-    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+    fn new(settings: Settings, context: &DeformerContext, device: &Device) -> Result<Self> {
         within("resolution", settings.resolution as usize, 2, 4096)?;
         within("time_resolution", settings.time_resolution as usize, 2, 100_000)?;
         within("multires", settings.multires.len(), 1, 8)?;
@@ -141,10 +141,10 @@ impl HexPlane {
     }
 }
 
-impl DeformationField for HexPlane {
+impl Deformer for HexPlane {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let m = means_world.dims()[0];
-        let work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        let work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
         let position = in_box(means_world, &self.context);
         if m == 0 {
             return Ok(SpatialFeatures { values: Tensor::zeros([0, 3 + self.network.input], &position.device()), work });
@@ -213,12 +213,12 @@ impl DeformationField for HexPlane {
     }
 }
 
-fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     Ok(Box::new(HexPlane::new(config::parse_section("deformer hexplane", section)?, context, device)?))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "hexplane",
             version: "1",

@@ -9,7 +9,7 @@ use crate::parts::centres::check_time;
 use crate::parts::settings::within;
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    AttributeSpec, DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config,
     inventory,
 };
 use serde::Deserialize;
@@ -56,7 +56,7 @@ struct Native4d {
 }
 
 impl Native4d {
-    fn new(settings: Settings, context: &FieldContext) -> Result<Self> {
+    fn new(settings: Settings, context: &DeformerContext) -> Result<Self> {
         within("harmonics", settings.harmonics, 0, 8)?;
         let bad = |name: &str, value: f32, remedy: &str| Err(Error::parameter(format!("deformer.{name}"), format!("{value} cannot be used"), remedy));
         if !(settings.duration > 1e-4 && settings.duration < 1e4) {
@@ -73,7 +73,7 @@ impl Native4d {
     }
 }
 
-impl DeformationField for Native4d {
+impl Deformer for Native4d {
     fn attributes(&self) -> Vec<AttributeSpec> {
         let s = &self.settings;
         // Centres in time lie a tenth beyond either end, as published.
@@ -98,7 +98,7 @@ impl DeformationField for Native4d {
             let problem = format!("the Gaussians lack the attributes {}", names.join(", "));
             return Err(Error::parameter("deformer native-4d", problem, "Load a model that was trained with this field"));
         }
-        Ok(SpatialFeatures { values: Tensor::cat(attributes.to_vec(), 1), work: FieldWork { gaussians: m as u64, ..FieldWork::default() } })
+        Ok(SpatialFeatures { values: Tensor::cat(attributes.to_vec(), 1), work: DeformerWork { gaussians: m as u64, ..DeformerWork::default() } })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         check_time(time_norm)?;
@@ -127,12 +127,12 @@ impl DeformationField for Native4d {
     }
 }
 
-fn build(section: &toml::Table, context: &FieldContext, _device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(section: &toml::Table, context: &DeformerContext, _device: &Device) -> Result<Box<dyn Deformer>> {
     Ok(Box::new(Native4d::new(config::parse_section("deformer native-4d", section)?, context)?))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "native-4d",
             version: "1",

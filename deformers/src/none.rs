@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config, inventory,
 };
 use serde::Deserialize;
 
@@ -12,10 +12,10 @@ struct NoDeformation;
 #[serde(deny_unknown_fields)]
 struct NoSettings {}
 
-impl DeformationField for NoDeformation {
+impl Deformer for NoDeformation {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let [m, _] = means_world.dims();
-        let work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        let work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
         Ok(SpatialFeatures { values: Tensor::zeros([m, 1], &means_world.inner().device()), work })
     }
     fn deform(&self, _features: Tensor<2>, _time_norm: f32) -> Result<Offsets> {
@@ -35,13 +35,13 @@ impl DeformationField for NoDeformation {
     }
 }
 
-fn build(settings: &toml::Table, _context: &FieldContext, _device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(settings: &toml::Table, _context: &DeformerContext, _device: &Device) -> Result<Box<dyn Deformer>> {
     config::parse_section::<NoSettings>("deformer none", settings)?;
     Ok(Box::new(NoDeformation))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "none",
             version: "1",

@@ -12,7 +12,7 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
-    DeformationField, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -55,14 +55,14 @@ impl Default for Settings {
 /// Parameters: table, encoder, one per head.
 struct Swift4d {
     settings: Settings,
-    context: FieldContext,
+    context: DeformerContext,
     grid: Arc<GridShape>,
     network: Arc<ReluShape>,
     parameters: Vec<Parameter>,
 }
 
 impl Swift4d {
-    fn new(settings: Settings, context: &FieldContext, device: &Device) -> Result<Self> {
+    fn new(settings: Settings, context: &DeformerContext, device: &Device) -> Result<Self> {
         within("log2_rows", settings.log2_rows as usize, 4, 24)?;
         within("levels", settings.levels, 1, 20)?;
         within("features", settings.features, 1, 16)?;
@@ -94,9 +94,9 @@ impl Swift4d {
     }
 }
 
-impl DeformationField for Swift4d {
+impl Deformer for Swift4d {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-        let work = FieldWork { gaussians: means_world.dims()[0] as u64, ..FieldWork::default() };
+        let work = DeformerWork { gaussians: means_world.dims()[0] as u64, ..DeformerWork::default() };
         // Space and time share one table, so nothing but the normalised position is time-invariant.
         Ok(SpatialFeatures { values: in_box(means_world, &self.context), work })
     }
@@ -130,12 +130,12 @@ impl DeformationField for Swift4d {
     }
 }
 
-fn build(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     Ok(Box::new(Swift4d::new(config::parse_section("deformer swift4d-hash", section)?, context, device)?))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "swift4d-hash",
             version: "1",

@@ -9,21 +9,21 @@
 
 use cc4dgs::core::burn::tensor::{Tensor, TensorData};
 use cc4dgs::core::gaussians::to_vec;
-use cc4dgs::core::{DeformationField, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, Split, config, parse_device};
+use cc4dgs::core::{Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, Split, config, parse_device};
 use cc4dgs::engine::{data, eval::evaluate, model::Model};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
 /// A field whose spatial features were rounded.
 struct Rounded {
-    inner: Box<dyn DeformationField>,
+    inner: Box<dyn Deformer>,
     /// Steps as a share of the root-mean-square of all features.
     step: f32,
     /// Bits of all features.
     bits: Arc<Mutex<f64>>,
 }
 
-impl DeformationField for Rounded {
+impl Deformer for Rounded {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let (device, [m, _]) = (means_world.device(), means_world.dims());
         let order = cc4dgs::codecs::morton::order(&to_vec(means_world.clone(), "means")?);
@@ -84,7 +84,7 @@ fn main() -> Result<()> {
         let bits = Arc::new(Mutex::new(0.0));
         if let Some(own) = model.field.take() {
             let field = Box::new(Rounded { inner: own.field, step, bits: bits.clone() });
-            model.field = Some(cc4dgs::engine::model::ModelField { field, ..own });
+            model.field = Some(cc4dgs::engine::model::ModelDeformer { field, ..own });
         }
         let report = score(&model)?;
         let bytes = *bits.lock().unwrap_or_else(std::sync::PoisonError::into_inner) / 8.0;

@@ -8,7 +8,7 @@ use crate::train::{FieldOptimizer, Moving, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformationField, Error, FieldContext, HostGaussians, Limits, Registry, Result, config};
+use cc4dgs_core::{Deformer, DeformerContext, Error, HostGaussians, Limits, Registry, Result, config};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -35,7 +35,7 @@ struct Header {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct FieldHeader {
     section: toml::Table,
-    context: FieldContext,
+    context: DeformerContext,
     step: u64,
 }
 
@@ -66,7 +66,7 @@ impl Checkpoint {
         host_gaussians(self.header.sh_degree, self.columns.iter().map(|c| Ok((c.name.clone(), c.width, c.arrays[0].clone()))))
     }
     /// The field with its section and context, if the main stage had begun.
-    pub fn into_field(self) -> Option<(Box<dyn DeformationField>, toml::Table, FieldContext)> {
+    pub fn into_field(self) -> Option<(Box<dyn Deformer>, toml::Table, DeformerContext)> {
         self.field.map(|f| (f.field, f.section, f.context))
     }
     /// The state to go on from. Refuses a configuration other than the one the run was started with.

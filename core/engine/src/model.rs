@@ -9,7 +9,7 @@ use cc4dgs_core::archive::{
     encode_weights,
 };
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{CodecContext, DeformationField, Error, EventSink, FieldContext, HostGaussians, Limits, Registry, Result, Seed, Stream, split_kind};
+use cc4dgs_core::{CodecContext, Deformer, DeformerContext, Error, EventSink, HostGaussians, Limits, Registry, Result, Seed, Stream, split_kind};
 use serde::Serialize;
 use std::io::Read;
 use std::path::Path;
@@ -19,7 +19,7 @@ pub struct Model {
     /// The canonical Gaussians.
     pub gaussians: HostGaussians,
     /// The deformation field, absent from static models.
-    pub field: Option<ModelField>,
+    pub field: Option<ModelDeformer>,
     /// What may move.
     pub moving: Moving,
     /// How it wants to be drawn.
@@ -39,13 +39,13 @@ pub struct Model {
 }
 
 /// A field with what is needed to build it again.
-pub struct ModelField {
+pub struct ModelDeformer {
     /// The field.
-    pub field: Box<dyn DeformationField>,
+    pub field: Box<dyn Deformer>,
     /// Its `[deformer]` section.
     pub section: toml::Table,
     /// What it was built with.
-    pub context: FieldContext,
+    pub context: DeformerContext,
 }
 
 /// Sizes in bytes. For an archive these are bytes on disk, headers included in `total`; for a checkpoint the float32 size of what playback needs.
@@ -79,7 +79,7 @@ impl Model {
         let stored = checkpoint::load(path, registry, device, limits)?;
         let config = stored.config().clone();
         let (gaussians, moving, frame_count) = (stored.gaussians()?, stored.moving(), stored.frame_count());
-        let field = stored.into_field().map(|(field, section, context)| ModelField { field, section, context });
+        let field = stored.into_field().map(|(field, section, context)| ModelDeformer { field, section, context });
         let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
         let floats: usize =
             gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
@@ -130,7 +130,7 @@ impl Model {
                 let precision = WeightPrecision::ALL.into_iter().find(|p| stored.iter().any(|s| s.name == p.stream())).unwrap_or_default();
                 let weights = decode_weights(&object, &archive.read_stream(precision.stream())?, precision, limits)?;
                 load_weights(&object, field.as_mut(), weights, device)?;
-                Some(ModelField { field, section, context: entry.context.clone() })
+                Some(ModelDeformer { field, section, context: entry.context.clone() })
             }
         };
         let moving = match manifest.extra.get("moving") {
@@ -234,7 +234,7 @@ fn check_version(object: &str, kind: &str, name: &str, stored: &str, known: &str
     Err(Error::unsupported(format!("{object}: {kind} {name}"), format!("version {stored} of its stored form"), format!("This program reads version {known}")))
 }
 
-fn weights_of(field: &dyn DeformationField) -> Result<Vec<WeightArray>> {
+fn weights_of(field: &dyn Deformer) -> Result<Vec<WeightArray>> {
     field
         .parameters()
         .into_iter()
@@ -242,7 +242,7 @@ fn weights_of(field: &dyn DeformationField) -> Result<Vec<WeightArray>> {
         .collect()
 }
 
-fn load_weights(object: &str, field: &mut dyn DeformationField, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
+fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
     let wanted: Vec<(String, Vec<usize>)> = field.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect();
     let found: Vec<(String, Vec<usize>)> = weights.iter().map(|w| (w.name.clone(), w.shape.clone())).collect();
     if wanted != found {

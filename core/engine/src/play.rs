@@ -2,7 +2,7 @@
 
 use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_core::{Camera, FieldWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
+use cc4dgs_core::{Camera, DeformerWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -67,7 +67,7 @@ pub struct PlayWork {
     /// Static Gaussians the field was spared.
     pub static_skipped: u64,
     /// Spatial passes of the field.
-    pub spatial: FieldWork,
+    pub spatial: DeformerWork,
     /// Frames whose spatial pass came from the cache.
     pub spatial_cached: u64,
 }

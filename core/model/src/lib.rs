@@ -1,7 +1,7 @@
 //! The nouns, the three seams, the registry and the stored form of cc4dgs.
 //!
-//! A plug-in crate depends on this crate alone (burn, inventory, serde and toml are re-exported in the versions it speaks): implement [`DeformationField`], [`AttributeCodec`] or [`Rasterizer`] and
-//! `inventory::submit!` a [`FieldPlugin`], [`CodecPlugin`] or [`RasterizerPlugin`].
+//! A plug-in crate depends on this crate alone (burn, inventory, serde and toml are re-exported in the versions it speaks): implement [`Deformer`], [`AttributeCodec`] or [`Rasterizer`] and
+//! `inventory::submit!` a [`DeformerPlugin`], [`CodecPlugin`] or [`RasterizerPlugin`].
 
 mod adapters;
 pub mod archive;
@@ -9,14 +9,14 @@ mod camera;
 mod codec;
 pub mod config;
 pub mod conformance;
+mod deformer;
 mod device;
 mod error;
 mod events;
-mod field;
 pub mod gaussians;
 mod limits;
 pub mod metrics;
-mod module_field;
+mod module_deformer;
 mod offsets;
 mod plugin;
 mod raster;
@@ -27,13 +27,13 @@ mod seed;
 pub use adapters::{Adapter, AdapterKind, adapters, auto_device};
 pub use camera::Camera;
 pub use codec::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Stream};
+pub use deformer::{AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures};
 pub use device::{DEVICE_NAMES, parse_device};
 pub use error::{Error, Result};
 pub use events::{Event, EventSink, Fanout, Recorder, Silent};
-pub use field::{AttributeSpec, DeformationField, FieldContext, FieldPlugin, FieldWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures};
 pub use gaussians::{ExtraAttribute, Gaussians, HostGaussians};
 pub use limits::Limits;
-pub use module_field::ModuleField;
+pub use module_deformer::ModuleDeformer;
 pub use offsets::Offsets;
 pub use plugin::Plugin;
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, Rules, SplatColors, Splats};

@@ -1,13 +1,13 @@
 //! All plug-ins that are linked in, collected once into a value. A name taken twice and a name unknown are errors.
 
 use crate::plugin::Plugin;
-use crate::{AttributeCodec, CodecPlugin, DeformationField, Error, FieldContext, FieldPlugin, Rasterizer, RasterizerPlugin, Result};
+use crate::{AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, Error, Rasterizer, RasterizerPlugin, Result};
 use burn::tensor::Device;
 use std::collections::BTreeMap;
 
 /// The linked plug-ins by kind and name.
 pub struct Registry {
-    deformers: BTreeMap<&'static str, &'static FieldPlugin>,
+    deformers: BTreeMap<&'static str, &'static DeformerPlugin>,
     codecs: BTreeMap<&'static str, &'static CodecPlugin>,
     rasterizers: BTreeMap<&'static str, &'static RasterizerPlugin>,
 }
@@ -42,7 +42,7 @@ impl Registry {
     /// Collects everything linked into this program.
     pub fn collect() -> Result<Self> {
         Ok(Self {
-            deformers: collect("deformer", inventory::iter::<FieldPlugin>.into_iter(), |p: &FieldPlugin| p.info.name)?,
+            deformers: collect("deformer", inventory::iter::<DeformerPlugin>.into_iter(), |p: &DeformerPlugin| p.info.name)?,
             codecs: collect("codec", inventory::iter::<CodecPlugin>.into_iter(), |p: &CodecPlugin| p.info.name)?,
             rasterizers: collect("rasterizer", inventory::iter::<RasterizerPlugin>.into_iter(), |p: &RasterizerPlugin| p.info.name)?,
         })
@@ -55,7 +55,7 @@ impl Registry {
         codecs.chain(deformers).chain(rasterizers).collect()
     }
     /// Facts of one deformer.
-    pub fn deformer(&self, name: &str) -> Result<&'static FieldPlugin> {
+    pub fn deformer(&self, name: &str) -> Result<&'static DeformerPlugin> {
         find("deformer", name, &self.deformers)
     }
     /// Facts of one codec.
@@ -67,7 +67,7 @@ impl Registry {
         find("rasterizer", name, &self.rasterizers)
     }
     /// Builds the deformer of a `[deformer]` section (`kind` and its settings).
-    pub fn build_deformer(&self, section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+    pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
         let (kind, settings) = split_kind("deformer", section)?;
         (self.deformer(&kind)?.build)(&settings, context, device)
     }

@@ -21,7 +21,7 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu_flat};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
     config, inventory,
 };
 use functions::TemporalFunctions;
@@ -126,7 +126,7 @@ impl BasisSettings {
 /// The field. Parameters: decoders by level, the functions' network (if any), the coefficients' trunk, one head each.
 struct CdfBasis {
     section: toml::Table,
-    context: FieldContext,
+    context: DeformerContext,
     settings: BasisSettings,
     rates: Rates,
     voxels: Voxels,
@@ -139,7 +139,7 @@ struct CdfBasis {
 }
 
 impl CdfBasis {
-    fn new(section: &toml::Table, context: &FieldContext, device: &Device) -> Result<Self> {
+    fn new(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Self> {
         let mut rest = section.clone();
         let (voxel_settings, rates): (VoxelSettings, Rates) = (take(&mut rest, &VoxelSettings::KEYS)?, take(&mut rest, &Rates::KEYS)?);
         let settings: BasisSettings = config::parse_section("deformer cdf-basis", &rest)?;
@@ -212,12 +212,12 @@ impl CdfBasis {
     }
 }
 
-impl DeformationField for CdfBasis {
+impl Deformer for CdfBasis {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let [m, _] = means_world.dims();
         if m == 0 {
             let empty = Tensor::zeros([0, self.shape.coefficients()], &means_world.inner().device());
-            return Ok(SpatialFeatures { values: empty, work: FieldWork::default() });
+            return Ok(SpatialFeatures { values: empty, work: DeformerWork::default() });
         }
         let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
         let weights = self.weights_after(usize::from(self.functions.network.is_some()));
@@ -261,12 +261,12 @@ impl DeformationField for CdfBasis {
     }
 }
 
-fn build(settings: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(settings: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     Ok(Box::new(CdfBasis::new(settings, context, device)?))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "cdf-basis",
             version: "2",

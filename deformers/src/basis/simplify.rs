@@ -8,7 +8,7 @@ use crate::parts::heads::Head;
 use crate::parts::voxels::parameter;
 use burn::tensor::Tensor;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformationField, Error, Parameter, Part, Result, Simplified};
+use cc4dgs_core::{Deformer, Error, Parameter, Part, Result, Simplified};
 
 /// Offsets of a head below this root-mean-square are those of a head that does nothing: shares of the box's half diagonal for centres, else plain numbers.
 fn negligible(head: Head) -> f64 {

@@ -5,7 +5,7 @@ use crate::parts::settings::{Rates, take, within};
 use crate::parts::time::bands_for;
 use crate::parts::voxels::{VoxelSettings, VoxelSizes};
 use cc4dgs_backends::ops::field::ReluShape;
-use cc4dgs_core::{FieldContext, Result, config};
+use cc4dgs_core::{DeformerContext, Result, config};
 use serde::{Deserialize, Deserializer};
 
 /// Settings with their defaults, as shown to users.
@@ -137,7 +137,7 @@ impl Sizes {
 
 impl CdfConfig {
     /// Settles all sizes for the scene in `context`, refusing what cannot work.
-    pub fn sizes(&self, context: &FieldContext) -> Result<Sizes> {
+    pub fn sizes(&self, context: &DeformerContext) -> Result<Sizes> {
         let voxels = self.voxels.sizes()?;
         let network = &self.network;
         let width = network.width.unwrap_or(self.voxels.capacity.width());

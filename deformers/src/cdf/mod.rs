@@ -18,7 +18,7 @@ use crate::parts::{heads, time, weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
     config as toml_config, inventory,
 };
 use std::sync::Arc;
@@ -43,7 +43,7 @@ pub struct Cdf {
 
 impl Cdf {
     /// A fresh field for the scene of `context`, weights on `device`.
-    pub fn new(config: CdfConfig, context: &FieldContext, device: &Device) -> Result<Self> {
+    pub fn new(config: CdfConfig, context: &DeformerContext, device: &Device) -> Result<Self> {
         let sizes = config.sizes(context)?;
         let seed = context.seed;
         let (voxels, mut parameters) = Voxels::new(&config.voxels, context, GRID, device)?;
@@ -116,11 +116,11 @@ fn single(outputs: Vec<Tensor<2>>) -> Result<Tensor<2>> {
     outputs.into_iter().next().ok_or_else(|| Error::backend("deformer cdf", "a network returned no output", "Report this as a defect"))
 }
 
-impl DeformationField for Cdf {
+impl Deformer for Cdf {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let [m, _] = means_world.dims();
         if m == 0 {
-            return Ok(SpatialFeatures { values: Tensor::zeros([0, self.sizes.width], &means_world.inner().device()), work: FieldWork::default() });
+            return Ok(SpatialFeatures { values: Tensor::zeros([0, self.sizes.width], &means_world.inner().device()), work: DeformerWork::default() });
         }
         let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
         let (rows, w) = (self.voxels.width(), self.sizes.width);
@@ -169,13 +169,13 @@ impl DeformationField for Cdf {
     }
 }
 
-fn build(settings: &toml::Table, context: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(settings: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     let config: CdfConfig = toml_config::parse_section("deformer cdf", settings)?;
     Ok(Box::new(Cdf::new(config, context, device)?))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "cdf",
             version: "1",

@@ -1,7 +1,7 @@
 //! Canonical centres and times as fields take them in.
 
 use burn::tensor::{Tensor, TensorData};
-use cc4dgs_core::{Error, FieldContext, Result};
+use cc4dgs_core::{DeformerContext, Error, Result};
 
 /// World units beyond which a centre is a mistake; what is no number becomes 0.
 const FAR: f32 = 1e6;
@@ -13,7 +13,7 @@ pub fn finite(means_world: Tensor<2>) -> Tensor<2> {
 }
 
 /// `means_world` [M,3] in 0..1 inside the field's box. What is no number stays none: lookups know what to do with it.
-pub fn in_box(means_world: Tensor<2>, context: &FieldContext) -> Tensor<2> {
+pub fn in_box(means_world: Tensor<2>, context: &DeformerContext) -> Tensor<2> {
     let device = means_world.device();
     let row = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, [1, 3]), &device);
     let inverse: Vec<f32> = context.box_max.iter().zip(&context.box_min).map(|(high, low)| if high > low { 1.0 / (high - low) } else { 0.0 }).collect();

@@ -5,7 +5,7 @@ use super::settings::{Capacity, within};
 use super::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{Decoder, GridBox, LevelHash, MAX_RESOLUTION, MishShape, VoxelCorners};
-use cc4dgs_core::{Error, FieldContext, FieldWork, Parameter, Part, Result};
+use cc4dgs_core::{DeformerContext, DeformerWork, Error, Parameter, Part, Result};
 use serde::Deserialize;
 use std::sync::Arc;
 
@@ -98,7 +98,7 @@ pub struct Voxels {
 
 impl Voxels {
     /// A grid for the scene of `context` and the fresh weights of its decoders, one parameter per level in optimizer group `group`.
-    pub fn new(settings: &VoxelSettings, context: &FieldContext, group: usize, device: &Device) -> Result<(Self, Vec<Parameter>)> {
+    pub fn new(settings: &VoxelSettings, context: &DeformerContext, group: usize, device: &Device) -> Result<(Self, Vec<Parameter>)> {
         if context.box_min.iter().chain(&context.box_max).any(|v| !v.is_finite()) {
             return Err(Error::parameter("deformer box", format!("{:?} to {:?}", context.box_min, context.box_max), "Give finite corners"));
         }
@@ -130,9 +130,9 @@ impl Voxels {
         self.width
     }
     /// f_voxel [M, width] of `means_world` [M,3] (M > 0) by the decoders of `parameters` (the first [`Voxels::levels`]), and what it cost.
-    pub fn features(&self, parameters: &[Parameter], means_world: Tensor<2>) -> Result<(Tensor<2>, FieldWork)> {
+    pub fn features(&self, parameters: &[Parameter], means_world: Tensor<2>) -> Result<(Tensor<2>, DeformerWork)> {
         let [m, _] = means_world.dims();
-        let mut work = FieldWork { gaussians: m as u64, ..FieldWork::default() };
+        let mut work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
         let mut levels = Vec::with_capacity(self.decoders.len());
         let grids: Vec<GridBox> = self.grids().map(|(grid, _)| grid).collect();
         // Training does not wait for a number that nothing but a report would need.

@@ -3,7 +3,7 @@
 use super::Context;
 use crate::args::Train;
 use crate::interrupt;
-use cc4dgs_core::{FieldContext, Result, Scene, Seed, parse_device};
+use cc4dgs_core::{DeformerContext, Result, Scene, Seed, parse_device};
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::data;
 use cc4dgs_engine::train::{CONFIG, TrainJob, TrainReport, train};
@@ -64,7 +64,7 @@ fn check_plugins(context: &Context, config: &RunConfig) -> Result<()> {
     let device = parse_device(&config.device)?;
     context.registry.build_rasterizer(&config.rasterizer)?;
     let seed = Seed::root(config.seed).child("check");
-    let field = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: config.train.sh_degree, seed };
+    let field = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: config.train.sh_degree, seed };
     context.registry.build_deformer(&config.deformer, &field, &device)?;
     Ok(())
 }

@@ -3,16 +3,16 @@
 use crate::columns::log_linear;
 use burn::tensor::{Gradients, Tensor};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
-use cc4dgs_core::{DeformationField, FieldContext, Result};
+use cc4dgs_core::{Deformer, DeformerContext, Result};
 
 /// A field with everything its optimizer keeps.
 pub struct FieldOptimizer {
     /// The field.
-    pub field: Box<dyn DeformationField>,
+    pub field: Box<dyn Deformer>,
     /// Its `[deformer]` section.
     pub section: toml::Table,
     /// What it was built with.
-    pub context: FieldContext,
+    pub context: DeformerContext,
     /// First and second moments, in the order of the parameters.
     pub moments: Vec<[Tensor<1>; 2]>,
     /// Steps taken.
@@ -21,7 +21,7 @@ pub struct FieldOptimizer {
 
 impl FieldOptimizer {
     /// Zero moments.
-    pub fn new(field: Box<dyn DeformationField>, section: toml::Table, context: FieldContext) -> Self {
+    pub fn new(field: Box<dyn Deformer>, section: toml::Table, context: DeformerContext) -> Self {
         let moments = field.parameters().iter().map(|p| [p.value.zeros_like(), p.value.zeros_like()]).collect();
         Self { field, section, context, moments, step: 0 }
     }

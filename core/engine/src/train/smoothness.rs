@@ -4,12 +4,12 @@ use super::state::Rows;
 use crate::config::TrainConfig;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformationField, FieldContext, Result, Seed};
+use cc4dgs_core::{Deformer, DeformerContext, Result, Seed};
 use rand::Rng;
 
 /// Flicker of the field's motion: rms of its second difference from frame to frame over the rms of its deviation from the mean.
 /// A straight or slowly curving path is near 0, white noise is sqrt(6). Sampled at up to 33 consecutive frames and 2,048 Gaussians.
-pub fn flicker(field: &dyn DeformationField, means_world: Tensor<2>, frame_count: usize) -> Result<f32> {
+pub fn flicker(field: &dyn Deformer, means_world: Tensor<2>, frame_count: usize) -> Result<f32> {
     let n = means_world.dims()[0];
     let frames = frame_count.min(33);
     if n == 0 || frames < 4 {
@@ -34,8 +34,8 @@ pub fn flicker(field: &dyn DeformationField, means_world: Tensor<2>, frame_count
 /// The smoothness term on a random quarter of the moving Gaussians: mean over them of |d - d'|^2 for a perturbation of position and time by
 /// up to `smooth_delta` of the box and the sequence. The weight ramps linearly to `lambda_r` at the end of the stage.
 pub fn smoothness(
-    field: &dyn DeformationField,
-    context: &FieldContext,
+    field: &dyn Deformer,
+    context: &DeformerContext,
     means_world: Tensor<2>,
     time_norm: f32,
     config: &TrainConfig,
@@ -72,14 +72,14 @@ pub fn smoothness(
 mod tests {
     use super::*;
     use burn::tensor::Device;
-    use cc4dgs_core::{FieldWork, Offsets, Parameter, ParameterGroup, SpatialFeatures};
+    use cc4dgs_core::{DeformerWork, Offsets, Parameter, ParameterGroup, SpatialFeatures};
 
     /// Moves everything along x by a function of time, scaled by the canonical x.
     struct Along(fn(f32) -> f32);
 
-    impl DeformationField for Along {
+    impl Deformer for Along {
         fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-            Ok(SpatialFeatures { values: means_world, work: FieldWork::default() })
+            Ok(SpatialFeatures { values: means_world, work: DeformerWork::default() })
         }
         fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
             Ok(Offsets { means: Some(features.mul_scalar(self.0(time_norm))), ..Offsets::default() })
@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn the_weight_ramps_and_a_constant_field_costs_nothing() {
-        let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 30, sh_degree: 0, seed: Seed::root(1) };
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 30, sh_degree: 0, seed: Seed::root(1) };
         let config = TrainConfig { smooth_delta: 0.1, ..TrainConfig::default() };
         let term = |path: fn(f32) -> f32, progress: f64| {
             let term = smoothness(&Along(path), &context, means(), 0.5, &config, progress, Seed::root(3)).unwrap().unwrap();

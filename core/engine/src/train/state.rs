@@ -6,7 +6,7 @@ use crate::densify::ScreenStats;
 use crate::schedule::Stage;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{FieldContext, HostGaussians, Result, Seed};
+use cc4dgs_core::{DeformerContext, HostGaussians, Result, Seed};
 use serde::{Deserialize, Serialize};
 
 /// Which Gaussians the field may move.
@@ -138,7 +138,7 @@ impl TrainState {
         self.rows = None;
     }
     /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres, padded by 5 % (baselines §10, row 3).
-    pub fn field_context(&mut self, frame_count: usize, seed: Seed) -> Result<FieldContext> {
+    pub fn field_context(&mut self, frame_count: usize, seed: Seed) -> Result<DeformerContext> {
         let host = self.set.host_gaussians()?;
         let mut rows = self.moving.rows(&host.dynamic_scores).unwrap_or_default();
         if rows.is_empty() {
@@ -154,6 +154,6 @@ impl TrainState {
             let pad = (0.05 * (high - low)).max(1e-4 * (1.0 + low.abs().max(high.abs())));
             (box_min[k], box_max[k]) = (low - pad, high + pad);
         }
-        Ok(FieldContext { box_min, box_max, frame_count, sh_degree: self.set.sh_degree, seed })
+        Ok(DeformerContext { box_min, box_max, frame_count, sh_degree: self.set.sh_degree, seed })
     }
 }

@@ -1,7 +1,7 @@
 //! What an archive says of itself.
 
 use crate::raster::Rules;
-use crate::{Error, FieldContext, Limits, Result};
+use crate::{DeformerContext, Error, Limits, Result};
 use serde::{Deserialize, Serialize};
 
 /// The archive version this build writes and reads.
@@ -30,7 +30,7 @@ pub struct DeformerEntry {
     /// The settings it was built with, without `kind`.
     pub settings: toml::Table,
     /// What it was told of the scene.
-    pub context: FieldContext,
+    pub context: DeformerContext,
 }
 
 /// How the model wants to be drawn.

@@ -2,7 +2,7 @@
 
 use super::{matrix, uniform};
 use crate::gaussians::to_vec;
-use crate::{DeformationField, Error, FieldContext, FieldPlugin, Offsets, Result, Seed};
+use crate::{Deformer, DeformerContext, DeformerPlugin, Error, Offsets, Result, Seed};
 use burn::tensor::{Device, Tensor, TensorData};
 
 /// Largest relative difference between a slope by finite differences and the gradient along itself.
@@ -21,7 +21,7 @@ const CENTRES: usize = 48;
 /// agree with finite differences; packed features give the same offsets; weights survive being copied to a fresh field, bit for bit; empty, single and non-finite centres are answered.
 ///
 /// `settings` is the `[deformer]` section without `kind`; small sizes make the suite quick.
-pub fn deformer<'a>(plugin: &'a FieldPlugin, settings: &'a toml::Table, device: &'a Device) -> Vec<String> {
+pub fn deformer<'a>(plugin: &'a DeformerPlugin, settings: &'a toml::Table, device: &'a Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
     let checks: [(&str, Check<'a>); 8] = [
         ("settings", Suite::refuses_unknown_settings),
@@ -44,18 +44,18 @@ pub fn deformer<'a>(plugin: &'a FieldPlugin, settings: &'a toml::Table, device: 
 }
 
 struct Suite<'a> {
-    plugin: &'a FieldPlugin,
+    plugin: &'a DeformerPlugin,
     settings: &'a toml::Table,
     device: &'a Device,
 }
 
-type Field = Box<dyn DeformationField>;
+type Field = Box<dyn Deformer>;
 /// One check: what it found, if anything.
 type Check<'a> = fn(&Suite<'a>) -> Result<Option<String>>;
 
 impl Suite<'_> {
-    fn context(&self) -> FieldContext {
-        FieldContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.5, 2.0], frame_count: 20, sh_degree: 2, seed: Seed::root(11).child("conformance") }
+    fn context(&self) -> DeformerContext {
+        DeformerContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.5, 2.0], frame_count: 20, sh_degree: 2, seed: Seed::root(11).child("conformance") }
     }
     fn field(&self, device: &Device) -> Result<Field> {
         (self.plugin.build)(self.settings, &self.context(), device)

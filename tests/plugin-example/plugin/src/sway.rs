@@ -3,7 +3,7 @@
 use cc4dgs_core::burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::serde::{self, Deserialize};
 use cc4dgs_core::{
-    DeformationField, Error, FieldContext, FieldPlugin, FieldWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
+    Deformer, Error, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
     inventory, toml,
 };
 
@@ -27,14 +27,14 @@ struct Sway {
     parameters: Vec<Parameter>,
 }
 
-impl DeformationField for Sway {
+impl Deformer for Sway {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
         let m = means_world.dims()[0];
         // What is no number stays where it is.
         let odd = means_world.clone().is_nan();
         let centres = means_world.mask_fill(odd, 0.0).clamp(-1e4, 1e4);
         let one = Tensor::ones([m, 1], &centres.device());
-        Ok(SpatialFeatures { values: Tensor::cat(vec![centres, one], 1), work: FieldWork { gaussians: m as u64, ..Default::default() } })
+        Ok(SpatialFeatures { values: Tensor::cat(vec![centres, one], 1), work: DeformerWork { gaussians: m as u64, ..Default::default() } })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         if !time_norm.is_finite() {
@@ -62,14 +62,14 @@ impl DeformationField for Sway {
     }
 }
 
-fn build(section: &toml::Table, _: &FieldContext, device: &Device) -> Result<Box<dyn DeformationField>> {
+fn build(section: &toml::Table, _: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
     let settings: Settings = config::parse_section("deformer sway", section)?;
     let weights = Parameter { name: "weights".into(), part: Part::Net, shape: vec![4, 9], value: Tensor::zeros([36], device), group: 0 };
     Ok(Box::new(Sway { settings, parameters: vec![weights] }))
 }
 
 inventory::submit! {
-    FieldPlugin {
+    DeformerPlugin {
         info: Plugin {
             name: "sway",
             version: "1",

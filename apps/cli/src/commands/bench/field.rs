@@ -6,7 +6,7 @@ use crate::commands::Context;
 use crate::model_source::resolved_device;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformationField, Error, FieldContext, FieldWork, Result, Seed, config, parse_device};
+use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, config, parse_device};
 use cc4dgs_deformers::cdf::{Cdf, CdfConfig, Formulas};
 use rand::Rng;
 use serde::Serialize;
@@ -24,7 +24,7 @@ struct FieldReport<'a> {
     seed: u64,
     gaussians: usize,
     /// Vertices asked for and decoded.
-    work: FieldWork,
+    work: DeformerWork,
     parameters: usize,
     /// Spatial features.
     spatial: Spread,
@@ -48,7 +48,7 @@ pub fn field(context: &Context, args: &BenchField) -> Result<()> {
     for assignment in &args.set {
         config::set(&mut table, assignment)?;
     }
-    let scene = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(args.seed).child("field") };
+    let scene = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(args.seed).child("field") };
     let mut field = Cdf::new(config::parse_section::<CdfConfig>("deformer cdf", &table)?, &scene, &device)?;
     stir(&mut field, Seed::root(args.seed).child("weights"), &device)?;
     let means_world = blobs(args.gaussians as usize, Seed::root(args.seed).child("points"), &device);

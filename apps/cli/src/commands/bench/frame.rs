@@ -9,9 +9,9 @@ use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::bench::{RoomCase, growth, room, shrunk};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Event, EventSink, FieldContext, Result, Seed, config, parse_device};
+use cc4dgs_core::{DeformerContext, Event, EventSink, Result, Seed, config, parse_device};
 use cc4dgs_engine::config::{RenderConfig, RunConfig};
-use cc4dgs_engine::model::{Model, ModelField, ModelSize};
+use cc4dgs_engine::model::{Model, ModelDeformer, ModelSize};
 use cc4dgs_engine::play::Player;
 use cc4dgs_engine::train::Moving;
 use serde::Serialize;
@@ -85,7 +85,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
     let moving = Moving::Scored { zeta: 0.0 };
     let rows = moving.rows(&workload.gaussians.dynamic_scores).unwrap_or_default();
     let axis = |k: usize, from: f32, pick: fn(f32, f32) -> f32| rows.iter().map(|&i| workload.gaussians.means[3 * i + k]).fold(from, pick);
-    let field_context = FieldContext {
+    let field_context = DeformerContext {
         box_min: std::array::from_fn(|k| if rows.is_empty() { 0.0 } else { axis(k, f32::INFINITY, f32::min) }),
         box_max: std::array::from_fn(|k| if rows.is_empty() { 1.0 } else { axis(k, f32::NEG_INFINITY, f32::max) }),
         frame_count: SEQUENCE,
@@ -100,7 +100,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
     let (n, camera) = (workload.gaussians.len(), workload.camera);
     let model = Model {
         gaussians: workload.gaussians,
-        field: Some(ModelField { field, section: config.deformer.clone(), context: field_context }),
+        field: Some(ModelDeformer { field, section: config.deformer.clone(), context: field_context }),
         moving,
         render: RenderConfig::default(),
         background: [0.0; 3],
@@ -125,7 +125,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
 }
 
 /// The spatial pass alone, and a pass forwards and backwards through the whole field.
-fn time_field(field: &mut dyn cc4dgs_core::DeformationField, means_world: Tensor<2>, repeats: u32) -> Result<(Spread, Spread)> {
+fn time_field(field: &mut dyn cc4dgs_core::Deformer, means_world: Tensor<2>, repeats: u32) -> Result<(Spread, Spread)> {
     if field.is_static() || means_world.dims()[0] == 0 {
         return Ok((Spread::of(Vec::new()), Spread::of(Vec::new())));
     }

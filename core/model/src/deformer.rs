@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 /// What a field must know of its scene before its weights mean anything. Stored in checkpoints and archives.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FieldContext {
+pub struct DeformerContext {
     /// Lower corner of the box the field covers, world units.
     pub box_min: [f32; 3],
     /// Upper corner of the box the field covers, world units.
@@ -41,7 +41,7 @@ pub struct Parameter {
     pub shape: Vec<usize>,
     /// The weights, flat [product of shape].
     pub value: Tensor<1>,
-    /// Index into [`DeformationField::groups`].
+    /// Index into [`Deformer::groups`].
     pub group: usize,
 }
 
@@ -73,7 +73,7 @@ impl ParameterGroup {
 
 /// What a call cost, counted rather than timed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct FieldWork {
+pub struct DeformerWork {
     /// Gaussians asked about.
     pub gaussians: u64,
     /// Corner queries before reuse.
@@ -88,7 +88,7 @@ pub struct SpatialFeatures {
     /// Features [M, F]. Only the field itself reads them; what lies where is its own affair.
     pub values: Tensor<2>,
     /// The work done for them.
-    pub work: FieldWork,
+    pub work: DeformerWork,
 }
 
 /// A number or vector that a field keeps per Gaussian, learned beside its weights. It lives among the Gaussians' extra attributes: it grows and is pruned with
@@ -112,20 +112,20 @@ pub struct AttributeSpec {
 /// A deformation field: canonical Gaussians in, offsets at a time out (paper Section IV-B).
 ///
 /// The time-invariant half is a call of its own so that playback can cache it; training recomputes it every step.
-pub trait DeformationField: Send {
+pub trait Deformer: Send {
     /// Features of the canonical centres `means_world` [M,3]; no gradient flows to the centres.
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures>;
-    /// What the field keeps per Gaussian; see [`DeformationField::spatial_with`].
+    /// What the field keeps per Gaussian; see [`Deformer::spatial_with`].
     fn attributes(&self) -> Vec<AttributeSpec> {
         Vec::new()
     }
-    /// As [`DeformationField::spatial`], for a field with [`DeformationField::attributes`]: their values [M,width], in that order, through which gradients flow.
+    /// As [`Deformer::spatial`], for a field with [`Deformer::attributes`]: their values [M,width], in that order, through which gradients flow.
     fn spatial_with(&self, means_world: Tensor<2>, _attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
         self.spatial(means_world)
     }
     /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F]; the same heads at every time.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
-    /// The same features as [`DeformationField::deform`] reads them fastest. Playback asks for this once per spatial pass.
+    /// The same features as [`Deformer::deform`] reads them fastest. Playback asks for this once per spatial pass.
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
         features
     }
@@ -161,10 +161,10 @@ pub trait DeformationField: Send {
     }
 }
 
-/// What [`DeformationField::simplified`] returns.
+/// What [`Deformer::simplified`] returns.
 pub struct Simplified {
     /// The smaller field.
-    pub field: Box<dyn DeformationField>,
+    pub field: Box<dyn Deformer>,
     /// The settings that build it, without `kind`.
     pub settings: toml::Table,
     /// What was left out, for people.
@@ -172,10 +172,10 @@ pub struct Simplified {
 }
 
 /// A deformation field in the registry.
-pub struct FieldPlugin {
+pub struct DeformerPlugin {
     /// Facts for people, tables and checks.
     pub info: Plugin,
     /// Builds a fresh field. The table is the `[deformer]` section without `kind`; unknown keys are errors.
-    pub build: fn(&toml::Table, &FieldContext, &Device) -> Result<Box<dyn DeformationField>>,
+    pub build: fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>,
 }
-inventory::collect!(FieldPlugin);
+inventory::collect!(DeformerPlugin);

@@ -1,6 +1,6 @@
 //! The options all readers share: frames, held-out cameras, sizes, missing and misfit pictures.
 
-use crate::common::*;
+use super::common::*;
 use cc4dgs_core::{Limits, Split};
 use cc4dgs_engine::data::{Background, CameraRef, SceneOptions, open};
 

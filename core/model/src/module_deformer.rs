@@ -3,14 +3,14 @@
 //! burn's `Module` is not object safe and owns its weights; a field is a trait object whose weights the optimizer replaces. This adapter keeps the weights
 //! flat and hands a module made of the current ones to the author's functions, so that a new field is its layers, its two functions and a registration.
 
-use crate::{DeformationField, FieldWork, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures};
+use crate::{Deformer, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
-/// A [`DeformationField`] made of a module `M`: `spatial(module, means_world [M,3])` gives features [M,F], `deform(module, features, time_norm)` offsets.
+/// A [`Deformer`] made of a module `M`: `spatial(module, means_world [M,3])` gives features [M,F], `deform(module, features, time_norm)` offsets.
 ///
 /// Both functions see the weights of the current step; gradients flow through them. Register it like any field: `build` returns it in a box.
-pub struct ModuleField<M, S, D> {
+pub struct ModuleDeformer<M, S, D> {
     module: M,
     spatial: S,
     deform: D,
@@ -19,7 +19,7 @@ pub struct ModuleField<M, S, D> {
     cached: bool,
 }
 
-impl<M, S, D> ModuleField<M, S, D>
+impl<M, S, D> ModuleDeformer<M, S, D>
 where
     M: Module,
     S: Fn(&M, Tensor<2>) -> Result<Tensor<2>> + Send,
@@ -57,14 +57,14 @@ where
     }
 }
 
-impl<M, S, D> DeformationField for ModuleField<M, S, D>
+impl<M, S, D> Deformer for ModuleDeformer<M, S, D>
 where
     M: Module,
     S: Fn(&M, Tensor<2>) -> Result<Tensor<2>> + Send,
     D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
 {
     fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-        let work = FieldWork { gaussians: means_world.dims()[0] as u64, ..FieldWork::default() };
+        let work = DeformerWork { gaussians: means_world.dims()[0] as u64, ..DeformerWork::default() };
         Ok(SpatialFeatures { values: (self.spatial)(&self.current(), means_world)?, work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
@@ -135,14 +135,14 @@ mod tests {
         velocity: Param<Tensor<2>>,
     }
 
-    fn field(device: &Device) -> impl DeformationField {
+    fn field(device: &Device) -> impl Deformer {
         let param = |rows: usize, value: f32| Param::from_tensor(Tensor::<2>::full([rows, 3], value, device));
         let module = Drift { table: param(3, 0.5), velocity: param(3, 2.0) };
         let group =
             |name: &str| ParameterGroup { name: name.into(), lr_start: 1e-3, lr_end: 1e-3, warmup: 0.0, times_extent: false, epsilon: 1e-15, clip_norm: 0.0 };
         let spatial = |m: &Drift, means: Tensor<2>| Ok(means.matmul(m.table.val()));
         let deform = |m: &Drift, features: Tensor<2>, t: f32| Ok(Offsets { means: Some(features.matmul(m.velocity.val()) * t), ..Offsets::default() });
-        ModuleField::new(module, group("net"), spatial, deform).with_grid("table", Some(group("grid")))
+        ModuleDeformer::new(module, group("net"), spatial, deform).with_grid("table", Some(group("grid")))
     }
 
     #[test]

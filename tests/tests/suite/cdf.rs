@@ -2,13 +2,13 @@
 //! burn primitives.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::{DeformationField, FieldContext, Offsets, Registry, Seed};
+use cc4dgs_core::{Deformer, DeformerContext, Offsets, Registry, Seed};
 use cc4dgs_deformers::cdf::{Cdf, CdfConfig, Formulas};
 use cc4dgs_tests::devices;
 use rand::{Rng, SeedableRng};
 
-fn context(frames: usize) -> FieldContext {
-    FieldContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.5, 2.0], frame_count: frames, sh_degree: 3, seed: Seed::root(11).child("field") }
+fn context(frames: usize) -> DeformerContext {
+    DeformerContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.5, 2.0], frame_count: frames, sh_degree: 3, seed: Seed::root(11).child("field") }
 }
 
 fn config(text: &str) -> CdfConfig {
@@ -38,7 +38,7 @@ fn centres(n: usize) -> Vec<f32> {
 }
 
 /// Replaces every weight by a random one of the same order, so that no head is zero.
-fn shake(field: &mut dyn DeformationField, device: &Device) {
+fn shake(field: &mut dyn Deformer, device: &Device) {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(9);
     for p in field.parameters_mut() {
         let moved: Vec<f32> = values(p.value.clone()).iter().map(|v| v + random.random_range(-0.15f32..0.15)).collect();
@@ -48,7 +48,7 @@ fn shake(field: &mut dyn DeformationField, device: &Device) {
     }
 }
 
-fn evaluate(field: &dyn DeformationField, points: &[f32], time: f32, device: &Device) -> (Vec<f32>, Offsets) {
+fn evaluate(field: &dyn Deformer, points: &[f32], time: f32, device: &Device) -> (Vec<f32>, Offsets) {
     let spatial = field.spatial(matrix(points.to_vec(), 3, device)).expect("features").values;
     let offsets = field.deform(spatial.clone(), time).expect("offsets");
     (values(spatial), offsets)
@@ -209,7 +209,7 @@ fn points_outside_the_box_take_the_face() {
 fn seeds_decide_the_weights() {
     let device = Device::flex();
     let all = |seed: u64| {
-        let field = Cdf::new(config(TINY), &FieldContext { seed: Seed::root(seed), ..context(300) }, &device).expect("a field");
+        let field = Cdf::new(config(TINY), &DeformerContext { seed: Seed::root(seed), ..context(300) }, &device).expect("a field");
         field.parameters().iter().map(|p| values(p.value.clone())).collect::<Vec<_>>()
     };
     assert_eq!(all(1), all(1));

@@ -1,12 +1,10 @@
 //! Spherical harmonics, rotations, covariances and projection against the golden numbers: the vector kernels in float32, the reference in float64.
 
-mod raster_fixtures;
-
+use crate::raster_fixtures::{Fixture, largest_difference, narrow, relative_l2, settings, widen};
 use cc4dgs_backends::cpu::raster::check::{ProjectionUpstream, harmonics, projection, rotations};
 use cc4dgs_backends::rasterizers::reference::gaussian::{Gaussian, covariance, project};
 use cc4dgs_backends::rasterizers::reference::harmonics::basis;
 use cc4dgs_backends::rasterizers::reference::real::{Dual, Real};
-use raster_fixtures::{Fixture, largest_difference, narrow, relative_l2, settings, widen};
 
 fn assert_close(what: &str, error: f64, tolerance: f64) {
     assert!(error <= tolerance, "{what}: error {error:.3e} over {tolerance:.0e}");

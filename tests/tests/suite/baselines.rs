@@ -2,13 +2,13 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{FieldContext, Registry, Seed, config};
+use cc4dgs_core::{DeformerContext, Registry, Seed, config};
 use cc4dgs_deformers as _;
 use glam::{DMat3, DMat4, DVec3, DVec4};
 
 /// Bytes (grid, net) as float32 of a field built for 300 frames of Gaussians of degree 3.
 fn size(kind: &str, settings: &str) -> (u64, u64) {
-    let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(1) };
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(1) };
     let section = config::parse_table("test", settings).unwrap();
     let registry = Registry::collect().unwrap();
     (registry.deformer(kind).unwrap().build)(&section, &context, &Device::flex()).unwrap().size_bytes()
@@ -52,7 +52,7 @@ fn embedding_takes_1_17_megabytes() {
 /// for a rotation in four dimensions: seven numbers with two norms among them, where a quaternion and a velocity say the same in seven.
 #[test]
 fn native_4d_takes_160_floats_per_gaussian() {
-    let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(1) };
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(1) };
     let registry = Registry::collect().unwrap();
     let field = (registry.deformer("native-4d").unwrap().build)(&toml::Table::new(), &context, &Device::flex()).unwrap();
     assert_eq!(field.attributes().iter().map(|a| a.width).sum::<usize>() + 59, 160);
@@ -62,7 +62,7 @@ fn native_4d_takes_160_floats_per_gaussian() {
 /// A Gaussian over space and time is the product of what native-4d makes of it at a moment: a weight and a Gaussian over space.
 #[test]
 fn native_4d_conditions_gaussians_of_four_dimensions() {
-    let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 0, seed: Seed::root(1) };
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 0, seed: Seed::root(1) };
     let registry = Registry::collect().unwrap();
     let section = config::parse_table("test", "harmonics = 0\nhidden_below = 0").unwrap();
     let field = (registry.deformer("native-4d").unwrap().build)(&section, &context, &Device::flex()).unwrap();

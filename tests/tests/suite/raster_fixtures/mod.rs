@@ -1,5 +1,4 @@
 //! Reads the golden fixtures of the rasterizer.
-#![allow(dead_code)] // Each test program uses its own part.
 
 use cc4dgs_backends::cpu::raster::RasterSettings;
 use cc4dgs_core::{ParameterSpace, Rules};

@@ -1,6 +1,6 @@
 //! The built-in scene and the points made from pictures, against the known truth.
 
-use crate::common::*;
+use super::common::*;
 use cc4dgs_core::{Limits, Scene, Seed, Split};
 use cc4dgs_engine::data::init::photo_points;
 use cc4dgs_engine::data::procedural::{NAMES, ProceduralScene, build};

@@ -1,5 +1,4 @@
 //! The sort behind tile lists and shared vertices, on every device.
-#![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::ops::sort::sort_order;

@@ -1,6 +1,6 @@
 //! The real scenes, where they are present.
 
-use crate::common::*;
+use super::common::*;
 use cc4dgs_core::{Limits, Seed, Split};
 use cc4dgs_engine::data::init::photo_points;
 use cc4dgs_engine::data::{SceneOptions, open};

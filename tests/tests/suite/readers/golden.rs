@@ -1,6 +1,6 @@
 //! The instant-ngp fox scene: its lens, its size and its gaps, as `golden/fox.json` states them, on pictures of a fortieth of the size.
 
-use crate::common::*;
+use super::common::*;
 use cc4dgs_core::Split;
 use cc4dgs_engine::data::distortion::Distortion;
 use std::path::{Path, PathBuf};

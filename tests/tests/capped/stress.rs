@@ -1,5 +1,4 @@
 //! Scenes at the edges of what a rasterizer meets, on every device and in poisoned memory, against the float64 reference.
-#![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::random_gaussians;
@@ -176,6 +175,7 @@ fn small_adapters_change_nothing_or_are_an_error() {
     let upstream = noise(Seed::root(91), 5 * 64 * 48);
     for (name, device) in devices().into_iter().filter(|(name, _)| *name == "wgpu") {
         let whole = draw(&TileRasterizer, &case(10_000), &device, &upstream);
+        let _held = crate::LIMITS.lock().unwrap();
         cap_bindings(1 << 20);
         let parts = draw(&TileRasterizer, &case(10_000), &device, &upstream);
         let many = Gaussians::from_host(&case(20_000).gaussians, &device);

@@ -1,6 +1,6 @@
 //! Every format on a tiny scene: poses come back, splits and times follow the convention of the dataset.
 
-use crate::common::*;
+use super::common::*;
 use cc4dgs_core::{Limits, Split};
 use cc4dgs_engine::data::{SceneOptions, open, readers};
 

@@ -1,5 +1,4 @@
 //! The rasterizers against each other, against finite differences, and at the edges.
-#![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::{STANDARD_CASES, StepCase, random_gaussians, step_camera};

@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformationField, FieldContext, Gaussians, HostGaussians, Offsets, Registry, Seed, config};
+use cc4dgs_core::{Deformer, DeformerContext, Gaussians, HostGaussians, Offsets, Registry, Seed, config};
 use cc4dgs_deformers as _;
 use cc4dgs_tests::{devices, poison};
 use std::sync::Arc;
@@ -78,7 +78,7 @@ fn what_does_not_fit_is_an_error() {
 /// A field some of whose functions do next to nothing in one head, and nothing at all in another.
 #[test]
 fn what_a_scene_does_not_use_is_left_out() {
-    let context = FieldContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
     let registry = Registry::collect().unwrap();
     let text = "levels = 2\nresolutions = [3, 6]\nhashes = 16\nhidden = [12]\nfeatures = 5\nwidth = 16\nlearned = 3\ntime_bands = 2";
     let section = config::parse_table("test", text).unwrap();
@@ -109,7 +109,7 @@ fn what_a_scene_does_not_use_is_left_out() {
     let features = field.spatial(points.clone()).unwrap().values;
     let simple = field.simplified(features, &times).unwrap().expect("something is unused");
     assert!(simple.message.contains("means keeps 4 of 9") && simple.message.contains("log_scales does nothing"), "{}", simple.message);
-    let bytes = |f: &dyn DeformationField| f.size_bytes().0 + f.size_bytes().1;
+    let bytes = |f: &dyn Deformer| f.size_bytes().0 + f.size_bytes().1;
     assert!(bytes(simple.field.as_ref()) < bytes(field.as_ref()));
 
     // What the settings build takes the weights, and does the same.
@@ -118,7 +118,7 @@ fn what_a_scene_does_not_use_is_left_out() {
         assert_eq!((&to.name, &to.shape), (&from.name, &from.shape));
         to.value = from.value.clone();
     }
-    let offsets = |f: &dyn DeformationField, time: f32| {
+    let offsets = |f: &dyn Deformer, time: f32| {
         let found = f.deform(f.spatial(points.clone()).unwrap().values, time).unwrap();
         let read = |t: Option<Tensor<2>>| t.map(|t| to_vec(t, "offsets").unwrap());
         (read(found.means), read(found.log_scales), read(found.quaternions))
@@ -142,7 +142,7 @@ fn what_a_scene_does_not_use_is_left_out() {
 /// The pull on functions against its definition: prices times norms, and its slope, on every device.
 #[test]
 fn the_lasso_pulls_every_function_by_its_price() {
-    let context = FieldContext { box_min: [-1.0, -2.0, 0.0], box_max: [1.0, 2.0, 4.0], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
+    let context = DeformerContext { box_min: [-1.0, -2.0, 0.0], box_max: [1.0, 2.0, 4.0], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
     let text = "levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 2\ntime_bands = 3\nsparsity = 0.01\nfalloff = 0.0\nheads = [\"means\", \"quaternions\"]";
     let section = config::parse_table("test", text).unwrap();
     let registry = Registry::collect().unwrap();

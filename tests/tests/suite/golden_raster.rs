@@ -1,14 +1,11 @@
 //! The rasterizers against the golden renders: images, and gradients of every input, for both rule sets and both CPU devices.
-#![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
-mod raster_fixtures;
-
+use crate::raster_fixtures::{Scene, narrow, relative_l2, scenes, widen};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::cpu::raster::{self, SplatArrays};
 use cc4dgs_backends::rasterizers::reference::{self, ReferenceInput};
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::{Camera, ParameterSpace, Rasterizer, RenderSettings, SplatColors, Splats};
-use raster_fixtures::{Scene, narrow, relative_l2, scenes, widen};
 
 /// Collects what is out of tolerance, so that one run shows everything.
 #[derive(Default)]

@@ -106,6 +106,7 @@ fn networks_of_every_shape_are_those_of_their_layers() {
     let whole: Vec<_> = devices().into_iter().map(|(name, device)| (name, run(1100, shape, true, &device, true), device)).collect();
     // With less shared memory, tiles are smaller, or there are none.
     type Cap = (&'static str, fn(u64), u64);
+    let _held = crate::LIMITS.lock().unwrap();
     let caps: [Cap; 3] = [("bindings", cap_bindings, 1 << 16), ("shared memory", cap_shared_memory, 16 << 10), ("shared memory", cap_shared_memory, 2 << 10)];
     for (what, cap, bytes) in caps {
         cap(bytes);

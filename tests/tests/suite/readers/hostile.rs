@@ -1,6 +1,6 @@
 //! Bytes that lie: an error or a sound result, never a panic and never memory for a claim.
 
-use crate::common::*;
+use super::common::*;
 use cc4dgs_core::{Limits, Result, Scene};
 use cc4dgs_engine::data::npy::read_npy;
 use proptest::prelude::*;

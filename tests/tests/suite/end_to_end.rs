@@ -131,7 +131,7 @@ fn cache_and_reuse_change_the_work_and_not_the_picture() {
         for (to, from) in rebuilt.parameters_mut().into_iter().zip(field.field.parameters()) {
             to.value = from.value.clone();
         }
-        model.field = Some(cc4dgs_engine::model::ModelField { field: rebuilt, section, context: field.context });
+        model.field = Some(cc4dgs_engine::model::ModelDeformer { field: rebuilt, section, context: field.context });
         let mut player = Player::new(&model, &registry, &Device::flex()).unwrap();
         let frames: Vec<Vec<f32>> =
             [0.0, 0.3, 0.9].iter().map(|&t| player.render(camera, t).unwrap().0.planes.into_data().try_to_vec::<f32>().unwrap()).collect();

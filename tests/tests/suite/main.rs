@@ -1,0 +1,22 @@
+//! All suites of the workspace in one program, so that burn is linked once. `cargo test --release --workspace --test suite NAME` runs a part.
+#![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
+#![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests: a failed helper is a failed test, and skipped ones say so")]
+
+mod baselines;
+mod basis;
+mod cdf;
+mod codecs;
+mod conformance;
+mod end_to_end;
+mod golden_codec;
+mod golden_geometry;
+mod golden_metrics;
+mod golden_raster;
+mod golden_training;
+mod hostile_archive;
+mod lookup;
+mod picture;
+mod raster;
+mod raster_fixtures;
+mod readers;
+mod sort;
