@@ -49,4 +49,4 @@ pub struct CodecPlugin {
     /// Builds the codec. The string is the profile after the colon of `name:profile` (empty: the default one); the table holds its settings.
     pub build: fn(&str, &toml::Table) -> Result<Box<dyn AttributeCodec>>,
 }
-inventory::collect!(CodecPlugin);
+crate::plugin_kind!(CodecPlugin, "codec");

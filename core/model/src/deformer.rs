@@ -178,4 +178,4 @@ pub struct DeformerPlugin {
     /// Builds a fresh field. The table is the `[deformer]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>,
 }
-inventory::collect!(DeformerPlugin);
+crate::plugin_kind!(DeformerPlugin, "deformer");

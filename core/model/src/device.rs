@@ -2,7 +2,7 @@
 
 use crate::adapters::{adapters, auto_device};
 use crate::error::{Error, Result};
-use crate::registry::unknown_name;
+use crate::plugin::unknown_name;
 use burn::tensor::{Device, DeviceKind, Tensor};
 use std::collections::BTreeMap;
 use std::sync::Mutex;

@@ -1,6 +1,8 @@
-//! What every plug-in says of itself.
+//! What every plug-in says of itself, and how the linked ones of a kind are found by name.
 
+use crate::{Error, Result};
 use serde::Serialize;
+use std::collections::BTreeMap;
 
 /// Facts of one registry entry.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -17,4 +19,94 @@ pub struct Plugin {
     pub schema: &'static str,
     /// What it can do: `differentiable`, `static-only`, `profiles=…`.
     pub capabilities: &'static [&'static str],
+}
+
+/// A kind of plug-in: what `inventory::submit!` takes.
+pub trait PluginEntry: Sized + Sync + 'static {
+    /// The kind's name: of its section in configurations, its method of the registry, its folder.
+    const KIND: &'static str;
+    /// Facts of this entry.
+    fn info(&self) -> &Plugin;
+    /// All entries that are linked into this program, in no particular order.
+    fn linked() -> Vec<&'static Self>;
+}
+
+/// Implements [`PluginEntry`] for a plug-in struct with a field `info`, and makes it collectable.
+#[macro_export]
+macro_rules! plugin_kind {
+    ($plugin:ty, $kind:literal) => {
+        $crate::inventory::collect!($plugin);
+        impl $crate::PluginEntry for $plugin {
+            const KIND: &'static str = $kind;
+            fn info(&self) -> &$crate::Plugin {
+                &self.info
+            }
+            fn linked() -> Vec<&'static Self> {
+                $crate::inventory::iter::<$plugin>.into_iter().collect()
+            }
+        }
+    };
+}
+
+/// The linked plug-ins of one kind by name.
+pub struct Entries<P: 'static>(BTreeMap<&'static str, &'static P>);
+
+impl<P: PluginEntry> Entries<P> {
+    /// Collects them. A name taken twice is an error.
+    pub fn collect() -> Result<Self> {
+        let mut map = BTreeMap::new();
+        for plugin in P::linked() {
+            let name = plugin.info().name;
+            if map.insert(name, plugin).is_some() {
+                return Err(Error::parameter(format!("{} {name}", P::KIND), "two plug-ins registered this name", "Rename one of them or link only one"));
+            }
+        }
+        Ok(Self(map))
+    }
+    /// The entry called `name`. An unknown name is an error that lists the nearest known ones.
+    pub fn get(&self, name: &str) -> Result<&'static P> {
+        self.0.get(name).copied().ok_or_else(|| unknown_name(P::KIND, name, self.0.keys().copied()))
+    }
+    /// All entries, sorted by name.
+    pub fn iter(&self) -> impl Iterator<Item = &'static P> + '_ {
+        self.0.values().copied()
+    }
+    /// (kind, facts) of all entries, sorted by name.
+    pub fn facts(&self) -> impl Iterator<Item = (&'static str, &'static Plugin)> + '_ {
+        self.iter().map(|p| (P::KIND, p.info()))
+    }
+}
+
+/// An error about `name` that lists the nearest of `known`.
+pub fn unknown_name<'a>(kind: &str, name: &str, known: impl Iterator<Item = &'a str>) -> Error {
+    let mut known: Vec<&str> = known.collect();
+    known.sort_by(|a, b| strsim::jaro_winkler(b, name).total_cmp(&strsim::jaro_winkler(a, name)).then(a.cmp(b)));
+    // Jaro-Winkler misses swapped letters in short names, edit distance misses long names that share only their beginning.
+    let few_edits = |k: &str| strsim::damerau_levenshtein(k, name) <= (name.chars().count() / 3).min(2);
+    let near: Vec<&str> = known.iter().copied().filter(|k| strsim::jaro_winkler(k, name) > 0.75 || few_edits(k)).take(3).collect();
+    let remedy =
+        if near.is_empty() { format!("Known: {}", known.join(", ")) } else { format!("Did you mean {}? Known: {}", near.join(" or "), known.join(", ")) };
+    Error::parameter(format!("{kind} '{name}'"), "no such name", remedy)
+}
+
+/// Splits a plug-in section into its `kind` and the rest.
+pub fn split_kind(object: &str, section: &toml::Table) -> Result<(String, toml::Table)> {
+    let mut settings = section.clone();
+    match settings.remove("kind") {
+        Some(toml::Value::String(kind)) => Ok((kind, settings)),
+        Some(other) => Err(Error::parameter(format!("{object}.kind"), format!("{other} is not a string"), "Write the plug-in's name in quotes")),
+        None => Err(Error::parameter(format!("{object}.kind"), "missing", "Name a plug-in; `cc4dgs plugins` lists them")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::unknown_name;
+
+    #[test]
+    fn unknown_names_list_near_matches() {
+        let message = unknown_name("deformer", "cfd", ["cdf", "none", "swift4d-hash"].into_iter()).to_string();
+        assert!(message.contains("Did you mean cdf"), "{message}");
+        assert!(message.contains("swift4d-hash"), "{message}");
+    }
 }

@@ -169,4 +169,4 @@ pub struct RasterizerPlugin {
     /// Builds the rasterizer from the `[rasterizer]` section without `kind`.
     pub build: fn(&toml::Table) -> Result<Box<dyn Rasterizer>>,
 }
-inventory::collect!(RasterizerPlugin);
+crate::plugin_kind!(RasterizerPlugin, "rasterizer");
