@@ -2,7 +2,7 @@
 
 use super::packing::{Encoding, unpack};
 use super::{ByteReader, FORMAT_VERSION, MAGIC, Manifest, PREFIX_BYTES, StreamKind};
-use crate::{Error, Limits, Result, Stream, registry};
+use crate::{Error, Limits, Result, Stream, unknown_name};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -138,7 +138,7 @@ impl Archive {
     pub fn read_stream(&self, name: &str) -> Result<Vec<u8>> {
         match self.entries.iter().find(|e| e.info.name == name) {
             Some(entry) => self.read_entry(entry),
-            None => Err(registry::unknown_name(&format!("{}: stream", self.object), name, self.entries.iter().map(|e| e.info.name.as_str()))),
+            None => Err(unknown_name(&format!("{}: stream", self.object), name, self.entries.iter().map(|e| e.info.name.as_str()))),
         }
     }
     /// Reads all streams of `kind`, in file order.
