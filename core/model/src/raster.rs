@@ -1,9 +1,11 @@
 //! The third seam: rasterizers.
 
+use crate::gaussians::to_vec;
 use crate::plugin::Plugin;
-use crate::{Camera, Gaussians, Result};
-use burn::tensor::{Int, Tensor};
+use crate::{Camera, Error, Gaussians, Image8, Result};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// Which reference implementation's rules decide the corner cases of projection and blending.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -160,6 +162,23 @@ pub struct RenderWork {
 pub trait Rasterizer: Send + Sync {
     /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn.
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput>;
+    /// Planes [3,H,W] in 0..1 of an 8-bit image on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
+    fn upload(&self, image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
+        let shape = [3, image.height as usize, image.width as usize];
+        Tensor::from_data(TensorData::new(image.to_planes(background), shape), device)
+    }
+    /// The 8-bit RGB image of planes [C,H,W] of which the first three are red, green and blue; the same rule as [`Image8::from_planes`].
+    fn download(&self, planes: Tensor<3>) -> Result<Image8> {
+        let [channels, height, width] = planes.dims();
+        if channels < 3 || height == 0 || width == 0 {
+            return Err(Error::parameter(
+                "image",
+                format!("planes have shape [{channels},{height},{width}]"),
+                "Give red, green and blue of at least one pixel",
+            ));
+        }
+        Ok(Image8::from_planes(&to_vec(planes.narrow(0, 0, 3), "planes")?, width as u32, height as u32))
+    }
 }
 
 /// A rasterizer in the registry.
