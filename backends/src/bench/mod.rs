@@ -138,6 +138,7 @@ pub fn time_step(workload: &Workload, device: &Device, seed: Seed, repetitions: 
             colors: cc4dgs_core::SplatColors::Sh { dc: dc.clone(), rest: higher.clone(), degree },
             space: cc4dgs_core::ParameterSpace::Raw,
             screen_probe: Some(Tensor::zeros([n, 2], &tracked).require_grad()),
+            absolute_screen_probe: None,
             camera_probe: None,
         };
         let out = TileRasterizer.render(&splats, camera, &RenderSettings::default())?;

@@ -1,8 +1,7 @@
 //! The fused Adam step on the device: one sweep decides which rows move, a second one moves them.
 
 use super::tensor::{UNITS, cubes_for, is_finite, owned, upload};
-use crate::cpu::adam::AdamScalars;
-use crate::ops::adam::AdamOps;
+use crate::ops::adam::{AdamOps, AdamScalars};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;

@@ -3,11 +3,12 @@
 use super::field::split_heads;
 use crate::cpu::basis::{self as kernel, Coefficients};
 use crate::cpu::tensor::CpuBackend;
+use crate::ops::autodiff::{differentiate, record};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
@@ -74,23 +75,17 @@ impl<B: CpuBackend> BasisBackward for B {
     }
 }
 
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl BasisOps for $backend {
-            fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
-                let (rows, functions) = (coefficients.shape()[0], Self::floats(&functions));
-                let out = match Self::columns(&coefficients) {
-                    Some(columns) => kernel::combine(&shape, rows, &Coefficients::Columns(columns), &functions),
-                    None => kernel::combine(&shape, rows, &Coefficients::Heads(&Self::floats(&coefficients)), &functions),
-                };
-                let len = out.len();
-                Self::from_floats(out, [len])
-            }
-        }
-    };
+impl<B: CpuBackend> BasisOps for B {
+    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
+        let (rows, functions) = (coefficients.shape()[0], Self::floats(&functions));
+        let out = match Self::columns(&coefficients) {
+            Some(columns) => kernel::combine(&shape, rows, &Coefficients::Columns(columns), &functions),
+            None => kernel::combine(&shape, rows, &Coefficients::Heads(&Self::floats(&coefficients)), &functions),
+        };
+        let len = out.len();
+        Self::from_floats(out, [len])
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
 #[derive(Debug)]
 struct Combine;
@@ -99,29 +94,18 @@ impl<B: BasisBackward> Backward<B, 2> for Combine {
     type State = (FloatTensor<B>, FloatTensor<B>, Arc<BasisShape>);
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let parents = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (coefficients, functions, shape) = ops.state;
-        let wanted = [parents[0].is_some(), parents[1].is_some()];
-        let found = B::combine_backward(coefficients, functions, &shape, grad, wanted);
-        for (parent, gradient) in parents.into_iter().zip(found) {
-            if let (Some(parent), Some(gradient)) = (parent, gradient) {
-                grads.register::<B>(parent.id, gradient);
-            }
-        }
+        differentiate::<B, _, 2>(ops, grads, |(coefficients, functions, shape), upstream, wanted| {
+            B::combine_backward(coefficients, functions, &shape, upstream, wanted)
+        });
     }
 }
 
 impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B, C> {
     fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
         let ((coefficients, first), (functions, second)) = (coefficients.into_parts(), functions.into_parts());
-        match Combine.prepare::<C>([first, second]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::combine(coefficients.clone(), functions.clone(), shape.clone());
-                prep.finish((coefficients, functions, shape), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::combine(coefficients, functions, shape)),
-        }
+        record::<B, C, _, 2>(Combine, [first, second], |_| {
+            (B::combine(coefficients.clone(), functions.clone(), shape.clone()), (coefficients, functions, shape))
+        })
     }
 }
 

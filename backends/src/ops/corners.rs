@@ -6,7 +6,7 @@
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::index::{self, MAX_RESOLUTION};
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Backend, Dispatch, ExtensionType, Flex, NdArray, backend_extension};
+use burn::backend::{Backend, Dispatch, ExtensionType, backend_extension};
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, Result};
 
@@ -59,38 +59,32 @@ fn signed(values: &[u32]) -> Vec<i64> {
     values.iter().map(|&v| i64::from(v)).collect()
 }
 
-/// A CPU needs no halves: the first does everything.
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl CornerOps for $backend {
-            fn begin_corners(points: FloatTensor<Self>, grid: GridBox, reuse: bool) -> CornersBegun<Self> {
-                let found = index::corners(&Self::floats(&points), grid.min, grid.max, grid.resolution, reuse);
-                let (count, slots) = (found.vertices.len(), found.corners.len());
-                CornersBegun {
-                    weights: Self::from_floats(found.weights, [slots]),
-                    slots: Self::from_ints(signed(&found.slots), [slots]),
-                    vertices: Self::from_ints(signed(found.vertices.as_flattened()), [count, 3]),
-                    starts: Self::from_ints(signed(&found.starts), [count + 1]),
-                    corners: Self::from_ints(signed(&found.corners), [slots]),
-                    count: Self::from_ints(vec![count as i64], [1]),
-                }
-            }
-            fn list_corners(
-                _slots: IntTensor<Self>,
-                vertices: IntTensor<Self>,
-                starts: IntTensor<Self>,
-                corners: IntTensor<Self>,
-                _grid: GridBox,
-                _reuse: bool,
-                _room: usize,
-            ) -> (IntTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
-                (vertices, starts, corners)
-            }
+/// A CPU needs no second half: the first does everything.
+impl<B: CpuBackend> CornerOps for B {
+    fn begin_corners(points: FloatTensor<Self>, grid: GridBox, reuse: bool) -> CornersBegun<Self> {
+        let found = index::corners(&Self::floats(&points), grid.min, grid.max, grid.resolution, reuse);
+        let (count, slots) = (found.vertices.len(), found.corners.len());
+        CornersBegun {
+            weights: Self::from_floats(found.weights, [slots]),
+            slots: Self::from_ints(signed(&found.slots), [slots]),
+            vertices: Self::from_ints(signed(found.vertices.as_flattened()), [count, 3]),
+            starts: Self::from_ints(signed(&found.starts), [count + 1]),
+            corners: Self::from_ints(signed(&found.corners), [slots]),
+            count: Self::from_ints(vec![count as i64], [1]),
         }
-    };
+    }
+    fn list_corners(
+        _slots: IntTensor<Self>,
+        vertices: IntTensor<Self>,
+        starts: IntTensor<Self>,
+        corners: IntTensor<Self>,
+        _grid: GridBox,
+        _reuse: bool,
+        _room: usize,
+    ) -> (IntTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
+        (vertices, starts, corners)
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
 /// The most vertices of a level that room is made for without counting them: with 32 features each, what every adapter binds. For more of them, waiting costs
 /// little beside decoding.

@@ -3,20 +3,20 @@
 use crate::cpu::mlp::{mish, relu};
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::interpolate;
+use crate::ops::autodiff::{differentiate, record};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
 
-pub use crate::cpu::mlp::mish::MishShape;
-pub use crate::cpu::mlp::relu::ReluShape;
-pub use crate::cpu::vertex::hash::LevelHash;
 pub use crate::cpu::vertex::index::MAX_RESOLUTION;
 pub use crate::ops::corners::{GridBox, VoxelCorners};
+pub use crate::ops::hash::LevelHash;
+pub use crate::ops::networks::{MishShape, ReluShape};
 
 /// One level's decoder: hash functions and layer widths (the input width is the number of functions).
 #[derive(Clone, Debug, PartialEq)]
@@ -94,38 +94,32 @@ impl<B: CpuBackend> FieldKernels for B {
     }
 }
 
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl FieldOps for $backend {
-            fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
-                let vertices = triples::<Self>(&vertices);
-                let width = decoder.hash.len().max(1);
-                let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
-                let out = mish::forward(&decoder.shape, &Self::floats(&weights), vertices.len(), &rows);
-                Self::from_floats(out, [vertices.len(), decoder.shape.output])
-            }
-            fn trilinear(
-                features: FloatTensor<Self>,
-                corners: IntTensor<Self>,
-                weights: FloatTensor<Self>,
-                _slots: IntTensor<Self>,
-                _starts: IntTensor<Self>,
-            ) -> FloatTensor<Self> {
-                let f = features.shape()[1];
-                let corners = unsigned::<Self>(&corners);
-                let out = interpolate::forward(&Self::floats(&features), f, &corners, &Self::floats(&weights));
-                Self::from_floats(out, [corners.len() / 8, f])
-            }
-            fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
-                let out = relu::forward(&shape, &Self::floats(&weights), &Self::floats(&x));
-                let len = out.len();
-                Self::from_floats(out, [len])
-            }
-        }
-    };
+impl<B: CpuBackend> FieldOps for B {
+    fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
+        let vertices = triples::<Self>(&vertices);
+        let width = decoder.hash.len().max(1);
+        let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
+        let out = mish::forward(&decoder.shape, &Self::floats(&weights), vertices.len(), &rows);
+        Self::from_floats(out, [vertices.len(), decoder.shape.output])
+    }
+    fn trilinear(
+        features: FloatTensor<Self>,
+        corners: IntTensor<Self>,
+        weights: FloatTensor<Self>,
+        _slots: IntTensor<Self>,
+        _starts: IntTensor<Self>,
+    ) -> FloatTensor<Self> {
+        let f = features.shape()[1];
+        let corners = unsigned::<Self>(&corners);
+        let out = interpolate::forward(&Self::floats(&features), f, &corners, &Self::floats(&weights));
+        Self::from_floats(out, [corners.len() / 8, f])
+    }
+    fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
+        let out = relu::forward(&shape, &Self::floats(&weights), &Self::floats(&x));
+        let len = out.len();
+        Self::from_floats(out, [len])
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
 #[derive(Debug)]
 struct Decode;
@@ -134,12 +128,9 @@ impl<B: FieldKernels> Backward<B, 1> for Decode {
     type State = (FloatTensor<B>, IntTensor<B>, Arc<Decoder>);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [parent] = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (weights, vertices, decoder) = ops.state;
-        if let Some(parent) = parent {
-            grads.register::<B>(parent.id, B::decode_backward(weights, vertices, decoder, grad));
-        }
+        differentiate::<B, _, 1>(ops, grads, |(weights, vertices, decoder), upstream, [wanted]| {
+            [wanted.then(|| B::decode_backward(weights, vertices, decoder, upstream))]
+        });
     }
 }
 
@@ -150,12 +141,9 @@ impl<B: FieldKernels> Backward<B, 1> for Interpolate {
     type State = (FloatTensor<B>, IntTensor<B>, IntTensor<B>);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [parent] = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (weights, slots, starts) = ops.state;
-        if let Some(parent) = parent {
-            grads.register::<B>(parent.id, B::trilinear_backward(grad, weights, slots, starts));
-        }
+        differentiate::<B, _, 1>(ops, grads, |(weights, slots, starts), upstream, [wanted]| {
+            [wanted.then(|| B::trilinear_backward(upstream, weights, slots, starts))]
+        });
     }
 }
 
@@ -166,29 +154,17 @@ impl<B: FieldKernels> Backward<B, 2> for Network {
     type State = (FloatTensor<B>, FloatTensor<B>, Arc<ReluShape>);
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [input, parameters] = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (x, weights, shape) = ops.state;
-        let (grad_x, grad_weights) = B::network_backward(x, weights, shape, grad, input.is_some());
-        if let (Some(input), Some(grad_x)) = (input, grad_x) {
-            grads.register::<B>(input.id, grad_x);
-        }
-        if let Some(parameters) = parameters {
-            grads.register::<B>(parameters.id, grad_weights);
-        }
+        differentiate::<B, _, 2>(ops, grads, |(x, weights, shape), upstream, [wants_input, _]| {
+            let (of_input, of_weights) = B::network_backward(x, weights, shape, upstream, wants_input);
+            [of_input, Some(of_weights)]
+        });
     }
 }
 
 impl<B: FieldKernels + FieldOps, C: CheckpointStrategy> FieldOps for Autodiff<B, C> {
     fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
-        let (weights, node) = weights.into_parts();
-        match Decode.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::decode(weights.clone(), vertices.clone(), decoder.clone());
-                prep.finish((weights, vertices, decoder), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::decode(weights, vertices, decoder)),
-        }
+        let (weights, parent) = weights.into_parts();
+        record::<B, C, _, 1>(Decode, [parent], |_| (B::decode(weights.clone(), vertices.clone(), decoder.clone()), (weights, vertices, decoder)))
     }
     fn trilinear(
         features: FloatTensor<Self>,
@@ -197,26 +173,15 @@ impl<B: FieldKernels + FieldOps, C: CheckpointStrategy> FieldOps for Autodiff<B,
         slots: IntTensor<Self>,
         starts: IntTensor<Self>,
     ) -> FloatTensor<Self> {
-        let (features, node) = features.into_parts();
+        let (features, parent) = features.into_parts();
         let weights = weights.into_primitive();
-        match Interpolate.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::trilinear(features, corners, weights.clone(), slots.clone(), starts.clone());
-                prep.finish((weights, slots, starts), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::trilinear(features, corners, weights, slots, starts)),
-        }
+        record::<B, C, _, 1>(Interpolate, [parent], |_| {
+            (B::trilinear(features, corners, weights.clone(), slots.clone(), starts.clone()), (weights, slots, starts))
+        })
     }
     fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
-        let (x, input) = x.into_parts();
-        let (weights, parameters) = weights.into_parts();
-        match Network.prepare::<C>([input, parameters]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::network(x.clone(), weights.clone(), shape.clone());
-                prep.finish((x, weights, shape), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::network(x, weights, shape)),
-        }
+        let ((x, of_input), (weights, of_weights)) = (x.into_parts(), weights.into_parts());
+        record::<B, C, _, 2>(Network, [of_input, of_weights], |_| (B::network(x.clone(), weights.clone(), shape.clone()), (x, weights, shape)))
     }
 }
 

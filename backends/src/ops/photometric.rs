@@ -2,11 +2,12 @@
 
 use crate::cpu::photometric as kernel;
 use crate::cpu::tensor::CpuBackend;
+use crate::ops::autodiff::{differentiate, record, record_beside};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 
@@ -68,21 +69,15 @@ impl<B: CpuBackend> PhotometricKernels for B {
     }
 }
 
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl PhotometricOps for $backend {
-            fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>) {
-                let (loss, terms, _) = Self::photometric_pass(planes, target, lambda_c, false);
-                (loss, terms)
-            }
-            fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self> {
-                Self::bce_pass(planes, mask, false).0
-            }
-        }
-    };
+impl<B: CpuBackend> PhotometricOps for B {
+    fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>) {
+        let (loss, terms, _) = Self::photometric_pass(planes, target, lambda_c, false);
+        (loss, terms)
+    }
+    fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self> {
+        Self::bce_pass(planes, mask, false).0
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
 /// Backward of a scalar loss whose gradient was computed with it: the state is that gradient.
 #[derive(Debug)]
@@ -92,39 +87,24 @@ impl<B: PhotometricKernels> Backward<B, 1> for KnownGradient {
     type State = FloatTensor<B>;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [parent] = ops.parents;
-        let upstream = grads.consume::<B>(&ops.node);
-        if let Some(parent) = parent {
-            grads.register::<B>(parent.id, B::scale_by(ops.state, upstream));
-        }
+        differentiate::<B, _, 1>(ops, grads, |gradient, upstream, [wanted]| [wanted.then(|| B::scale_by(gradient, upstream))]);
     }
 }
 
 impl<B: PhotometricKernels + PhotometricOps, C: CheckpointStrategy> PhotometricOps for Autodiff<B, C> {
     fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>) {
-        let (planes, node) = planes.into_parts();
+        let (planes, parent) = planes.into_parts();
         let target = target.into_primitive();
-        match KnownGradient.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let (loss, terms, gradient) = B::photometric_pass(planes, target, lambda_c, true);
-                (prep.finish(gradient, loss), Self::from_inner(terms))
-            }
-            OpsKind::UnTracked(prep) => {
-                let (loss, terms) = B::photometric(planes, target, lambda_c);
-                (prep.finish(loss), Self::from_inner(terms))
-            }
-        }
+        let (loss, terms) = record_beside::<B, C, _, _, 1>(KnownGradient, [parent], |tracked| {
+            let (loss, terms, gradient) = B::photometric_pass(planes, target, lambda_c, tracked);
+            (loss, gradient, terms)
+        });
+        (loss, Self::from_inner(terms))
     }
     fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self> {
-        let (planes, node) = planes.into_parts();
+        let (planes, parent) = planes.into_parts();
         let mask = mask.into_primitive();
-        match KnownGradient.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let (loss, gradient) = B::bce_pass(planes, mask, true);
-                prep.finish(gradient, loss)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::bce_with_logits(planes, mask)),
-        }
+        record::<B, C, _, 1>(KnownGradient, [parent], |tracked| B::bce_pass(planes, mask, tracked))
     }
 }
 

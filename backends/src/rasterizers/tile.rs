@@ -22,6 +22,7 @@ pub(crate) fn raster_inputs(splats: &Splats, settings: &RenderSettings) -> Raste
         colors,
         sh_rest,
         screen_probe: splats.screen_probe.clone(),
+        absolute_screen_probe: splats.absolute_screen_probe.clone(),
         camera_probe: splats.camera_probe.clone(),
         background: settings.background.clone(),
     }

@@ -63,6 +63,9 @@ pub struct Splats {
     pub space: ParameterSpace,
     /// A tensor of zeros [N,2] whose gradient becomes d loss / d projected centre in pixels (densification reads it).
     pub screen_probe: Option<Tensor<2>>,
+    /// A tensor of zeros [N,2] whose gradient becomes, per axis, the sum over pixels of the absolute value of each pixel's share in the gradient of
+    /// `screen_probe` (AbsGS, Ye et al. 2024). Computed only where it is given.
+    pub absolute_screen_probe: Option<Tensor<2>>,
     /// A tensor of zeros [4,4] whose gradient becomes d loss / d world_to_camera.
     pub camera_probe: Option<Tensor<2>>,
 }
@@ -78,6 +81,7 @@ impl Splats {
             colors: SplatColors::Sh { dc: gaussians.sh_dc.clone(), rest: gaussians.sh_rest.clone(), degree: sh_degree.min(gaussians.sh_degree) },
             space: ParameterSpace::Raw,
             screen_probe: None,
+            absolute_screen_probe: None,
             camera_probe: None,
         }
     }
@@ -96,14 +100,14 @@ pub struct RenderSettings {
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
-    /// Room for so many (Gaussian, tile) pairs, for playback on devices that would otherwise wait for the count of every frame. What does not fit is not
-    /// drawn, farthest Gaussians first; [`RenderStats::pair_count`] tells afterwards. Not for gradients. `None` makes room for all.
-    pub pair_room: Option<usize>,
+    /// Capacity in (Gaussian, tile) pairs, for playback on devices that would otherwise wait for the count of every frame. Pairs beyond it are not drawn,
+    /// farthest Gaussians first; [`RenderStats::pair_count`] tells afterwards. Not for gradients. `None` allocates for all.
+    pub pair_capacity: Option<usize>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false, pair_room: None }
+        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false, pair_capacity: None }
     }
 }
 

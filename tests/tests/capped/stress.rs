@@ -205,9 +205,9 @@ fn room_for_pairs_changes_nothing_unless_it_is_too_small() {
     let camera = Camera::look_at("stress", (80, 48), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
     for (name, device) in devices() {
         let g = Gaussians::from_host(&gaussians, &device);
-        let draw = |pair_room| {
+        let draw = |pair_capacity| {
             poison(&device);
-            let settings = RenderSettings { pair_room, ..Default::default() };
+            let settings = RenderSettings { pair_capacity, ..Default::default() };
             let out = TileRasterizer.render(&Splats::from_gaussians(&g, 3), &camera, &settings).unwrap();
             (to_vec(out.planes, "planes").unwrap(), out.stats.pair_count.unwrap().into_scalar::<i64>() as usize)
         };

@@ -3,6 +3,7 @@
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::cpu::mlp::{activation, mish};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
+use cc4dgs_backends::ops::field::MishShape;
 use cc4dgs_backends::ops::photometric::{bce_with_logits_loss, photometric_loss};
 use cc4dgs_tests::devices;
 use std::collections::HashMap;
@@ -175,7 +176,7 @@ fn golden_nn_activations() {
 #[test]
 fn golden_nn_mlp() {
     let fixture = golden("nn");
-    let shape = mish::MishShape { input: 11, hidden: vec![16, 16], output: 5 };
+    let shape = MishShape { input: 11, hidden: vec![16, 16], output: 5 };
     // The fixture keeps W as [out, in]; the kernel as [in, out].
     let transposed = |name: &str| {
         let (shape, data) = &fixture[name];

@@ -2,7 +2,8 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::{STANDARD_CASES, StepCase, random_gaussians, step_camera};
-use cc4dgs_backends::cpu::raster::{self, GradientRequest, Gradients, RasterSettings, SplatArrays};
+use cc4dgs_backends::cpu::raster::{self, Gradients, SplatArrays};
+use cc4dgs_backends::ops::rasterize::{GradientRequest, RasterSettings};
 use cc4dgs_backends::rasterizers::reference::{self, ReferenceInput, ReferenceRasterizer};
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::{Camera, Error, Gaussians, HostGaussians, ParameterSpace, Rasterizer, Registry, RenderSettings, Rules, Seed, SplatColors, Splats};
@@ -14,9 +15,10 @@ const EVERYTHING: GradientRequest = GradientRequest {
     opacities: true,
     colors: true,
     sh_rest: true,
-    screen: true,
-    camera: true,
     background: true,
+    screen: true,
+    absolute_screen: true,
+    camera: true,
 };
 
 fn arrays<'a>(g: &'a HostGaussians, background: [f32; 3]) -> SplatArrays<'a> {
@@ -46,7 +48,8 @@ fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> 
         space: ParameterSpace::Raw,
         sh_degree: Some(degree),
         max_weights: true,
-        pair_room: None,
+        absolute_centers: false,
+        pair_capacity: None,
     }
 }
 
@@ -72,8 +75,11 @@ fn relative(a: &[f32], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum::<f64>().sqrt() / norm.max(1e-12)
 }
 
-fn columns(g: &Gradients) -> [&Vec<f32>; 9] {
-    [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.colors, &g.sh_rest, &g.screen, &g.camera, &g.background]
+/// The names of [`columns`].
+const NAMES: [&str; 10] = ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "background", "screen", "absolute screen", "camera"];
+
+fn columns(g: &Gradients) -> [&Vec<f32>; 10] {
+    [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.colors, &g.sh_rest, &g.background, &g.screen, &g.absolute_screen, &g.camera]
 }
 
 #[test]
@@ -109,9 +115,19 @@ fn tile_agrees_with_the_reference() {
         let got = raster::backward(&splats, &settings, &mut tile.workspace, &upstream, &EVERYTHING);
         let upstream: Vec<f64> = upstream.iter().map(|&v| f64::from(v)).collect();
         let want = reference::backward(&wide, &settings, &exact.items, &upstream);
-        let wanted = [&want.means, &want.scales, &want.quaternions, &want.opacities, &want.colors, &want.sh_rest, &want.screen, &want.camera, &want.background];
-        let names = ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "screen", "camera", "background"];
-        for ((name, got), want) in names.into_iter().zip(columns(&got)).zip(wanted) {
+        let wanted = [
+            &want.means,
+            &want.scales,
+            &want.quaternions,
+            &want.opacities,
+            &want.colors,
+            &want.sh_rest,
+            &want.background,
+            &want.screen,
+            &want.absolute_screen,
+            &want.camera,
+        ];
+        for ((name, got), want) in NAMES.into_iter().zip(columns(&got)).zip(wanted) {
             let error = relative(got, want);
             assert!(error < 2e-4, "{rules:?} {name}: {error:.2e}");
         }
@@ -243,7 +259,7 @@ fn bytes_do_not_depend_on_threads() {
 }
 
 #[test]
-fn hostile_gaussians_never_reach_the_picture() {
+fn hostile_gaussians_never_reach_the_image() {
     let camera = step_camera(&StepCase { width: 40, height: 24, gaussians: 64 });
     let clean = scene(64, Seed::root(21));
     let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30, -1e30, 3e38, 1e-40, 100.0];
@@ -260,9 +276,7 @@ fn hostile_gaussians_never_reach_the_picture() {
                 assert!(out.planes.iter().all(|v| v.is_finite()), "{value} in column {column}");
                 let upstream = vec![1e-3; out.planes.len()];
                 let gradients = raster::backward(&splats, &s, &mut out.workspace, &upstream, &EVERYTHING);
-                for (name, values) in
-                    ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "screen", "camera", "background"].iter().zip(columns(&gradients))
-                {
+                for (name, values) in NAMES.iter().zip(columns(&gradients)) {
                     assert!(values.iter().all(|v| !v.is_nan()), "{value} in column {column}: gradient of {name}");
                 }
                 if value.is_nan() {
@@ -321,16 +335,16 @@ fn direct_colours_are_blended_as_they_are() {
     let colors = Tensor::<2>::from_data(TensorData::new(noise(Seed::root(42), 150), [50, 3]), &device).require_grad();
     let mut splats = Splats::from_gaussians(&g, 3);
     splats.colors = SplatColors::Direct(colors.clone());
-    let mut pictures = Vec::new();
+    let mut images = Vec::new();
     let mut gradients = Vec::new();
     for rasterizer in [&TileRasterizer as &dyn Rasterizer, &ReferenceRasterizer] {
         let out = rasterizer.render(&splats, &camera, &RenderSettings::default()).unwrap();
         let grads = out.planes.clone().sum().backward();
-        pictures.push(out.planes.into_data().try_to_vec::<f32>().unwrap());
+        images.push(out.planes.into_data().try_to_vec::<f32>().unwrap());
         gradients.push(colors.grad(&grads).unwrap().into_data().try_to_vec::<f32>().unwrap());
     }
-    assert!(pictures[0].iter().any(|&v| v < -1e-3), "nothing negative was drawn");
-    for both in [pictures, gradients] {
+    assert!(images[0].iter().any(|&v| v < -1e-3), "nothing negative was drawn");
+    for both in [images, gradients] {
         let wide: Vec<f64> = both[1].iter().map(|&v| f64::from(v)).collect();
         assert!(relative(&both[0], &wide) < 1e-4);
     }
@@ -369,4 +383,58 @@ fn too_many_pairs_are_an_error() {
     let splats = Splats::from_gaussians(&Gaussians::from_host(&g, &Device::flex()), 3);
     let error = TileRasterizer.render(&splats, &camera, &RenderSettings::default()).unwrap_err();
     assert!(matches!(error, Error::Limit { .. }), "{error}");
+}
+
+/// Signed and absolute gradients of the projected centres [N,2], and all other gradients, for random weights of the planes.
+fn screen_gradients(rasterizer: &dyn Rasterizer, device: &Device, host: &HostGaussians, camera: &Camera, absolute: bool) -> [Vec<f32>; 3] {
+    let tracked = device.clone().autodiff();
+    let n = host.opacity_logits.len();
+    let probe = || Tensor::<2>::zeros([n, 2], &tracked).require_grad();
+    let (signed, asked) = (probe(), probe());
+    let mut splats = Splats::from_gaussians(&Gaussians::from_host(host, &tracked), 3);
+    splats.means = splats.means.require_grad();
+    splats.screen_probe = Some(signed.clone());
+    splats.absolute_screen_probe = absolute.then(|| asked.clone());
+    let out = rasterizer.render(&splats, camera, &RenderSettings::default()).unwrap();
+    let shape = out.planes.dims();
+    let weights = Tensor::<3>::from_data(TensorData::new(noise(Seed::root(72), shape.iter().product()), shape), &tracked);
+    let grads = (out.planes * weights).sum().backward();
+    let list = |t: Option<Tensor<2>>| t.map_or(Vec::new(), |t| t.into_data().try_to_vec::<f32>().unwrap());
+    [list(signed.grad(&grads)), list(if absolute { asked.grad(&grads) } else { None }), list(splats.means.grad(&grads))]
+}
+
+#[test]
+fn absolute_screen_gradients_agree_with_the_reference() {
+    let camera = step_camera(&StepCase { width: 53, height: 37, gaussians: 120 });
+    let host = scene(120, Seed::root(71));
+    let [signed, truth, _] = screen_gradients(&ReferenceRasterizer, &Device::flex(), &host, &camera, true);
+    let wide: Vec<f64> = truth.iter().map(|&v| f64::from(v)).collect();
+    let total = |values: &[f32]| values.iter().map(|v| f64::from(v.abs())).sum::<f64>();
+    assert!(total(&truth) > 2.0 * total(&signed), "the pixels of a Gaussian pull in different directions");
+    for (name, device) in cc4dgs_tests::devices() {
+        let [signed, absolute, means] = screen_gradients(&TileRasterizer, &device, &host, &camera, true);
+        let error = relative(&absolute, &wide);
+        assert!(error < 1e-3, "{name}: {error:.2e}");
+        for (s, a) in signed.iter().zip(&absolute) {
+            assert!(s.abs() <= a * (1.0 + 1e-4) + 1e-6, "{name}: absolute gradient {a} below the signed {s}");
+        }
+        // Asking changes nothing else.
+        let [same_signed, none, same_means] = screen_gradients(&TileRasterizer, &device, &host, &camera, false);
+        assert!(same_signed == signed && same_means == means && none.is_empty(), "{name}: asking for absolute gradients changes others");
+    }
+}
+
+#[test]
+fn a_gaussian_of_one_pixel_has_equal_signed_and_absolute_gradients() {
+    let camera = Camera::look_at("pixel", (1, 1), 0.2, [0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
+    let mut host = scene(6, Seed::root(73));
+    host.means.iter_mut().for_each(|m| *m *= 0.02);
+    let all = cc4dgs_tests::devices().into_iter().map(|(name, device)| (name, device, &TileRasterizer as &dyn Rasterizer));
+    for (name, device, rasterizer) in all.chain([("reference", Device::flex(), &ReferenceRasterizer as &dyn Rasterizer)]) {
+        let [signed, absolute, _] = screen_gradients(rasterizer, &device, &host, &camera, true);
+        assert!(absolute.iter().any(|a| *a > 1e-4), "{name}: nothing was drawn");
+        for (s, a) in signed.iter().zip(&absolute) {
+            assert!((s.abs() - a).abs() <= 1e-4 * a + 1e-7, "{name}: {a} where |{s}| is expected");
+        }
+    }
 }

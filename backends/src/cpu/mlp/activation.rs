@@ -1,5 +1,7 @@
 //! Mish and LayerNorm over rows, forward and backward, in loops that vectorise.
 
+use crate::ops::networks::LAYER_NORM_EPSILON;
+
 /// e^x for |x| <= 87, branch-free; relative error below 2e-7.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
@@ -44,9 +46,6 @@ pub fn mish_derivative(x: f32) -> f32 {
     // sech^2(softplus) * sigmoid = 4 e (e + 1) / (n + 2)^2.
     n * inverse + x * (4.0 * e * (e + 1.0) * inverse) * inverse
 }
-
-/// Added to the variance under the root.
-pub const LAYER_NORM_EPSILON: f32 = 1e-5;
 
 /// Sum of one row in a fixed order that vectorises.
 #[inline(always)]

@@ -9,69 +9,11 @@ use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, t
 use super::{blocks_per_run, sum_in_order};
 use crate::cpu::scratch::{Scratch, scratch};
 use crate::cpu::simd::vectorized;
+use crate::ops::networks::{MishLayer, MishShape};
 use rayon::prelude::*;
-use std::ops::Range;
 
 /// Rows per block.
 pub const BLOCK: usize = 128;
-
-/// Layer widths: input, hidden layers, output.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct MishShape {
-    /// Input width.
-    pub input: usize,
-    /// Widths of the hidden layers.
-    pub hidden: Vec<usize>,
-    /// Output width.
-    pub output: usize,
-}
-
-/// Where the arrays of one layer lie in the flat weights.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct MishLayer {
-    /// Input width.
-    pub input: usize,
-    /// Output width.
-    pub output: usize,
-    /// W [input, output].
-    pub weight: Range<usize>,
-    /// b [output].
-    pub bias: Range<usize>,
-    /// LayerNorm gain [output]; `None` for the output layer, which has no norm and no activation.
-    pub gain: Option<Range<usize>>,
-    /// LayerNorm shift [output].
-    pub shift: Option<Range<usize>>,
-}
-
-impl MishShape {
-    /// The layers in order.
-    pub fn layers(&self) -> Vec<MishLayer> {
-        let mut at = 0;
-        let mut take = |n: usize| {
-            at += n;
-            at - n..at
-        };
-        let widths: Vec<usize> = self.hidden.iter().copied().chain([self.output]).collect();
-        let mut input = self.input;
-        let mut layers = Vec::with_capacity(widths.len());
-        for (i, &output) in widths.iter().enumerate() {
-            let hidden = i < self.hidden.len();
-            let (weight, bias) = (take(input * output), take(output));
-            let gain = hidden.then(|| take(output));
-            let shift = hidden.then(|| take(output));
-            layers.push(MishLayer { input, output, weight, bias, gain, shift });
-            input = output;
-        }
-        layers
-    }
-    /// The number of weights.
-    pub fn parameter_count(&self) -> usize {
-        self.layers().last().map_or(0, |l| l.bias.end)
-    }
-    fn widest(&self) -> usize {
-        self.hidden.iter().copied().chain([self.input, self.output]).max().unwrap_or(0)
-    }
-}
 
 /// Writes the input rows of a block: the first row's index and the rows to fill.
 pub type RowSource<'a> = dyn Fn(usize, &mut [f32]) + Sync + 'a;

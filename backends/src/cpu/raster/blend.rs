@@ -49,10 +49,10 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
     run_tasks(tiles, |position| {
         let tile = order[position] as usize;
         let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
-        let places = starts[tile] as usize..starts[tile + 1] as usize;
-        // SAFETY: a place in the list belongs to one tile.
-        let weights: &mut [f32] = if settings.max_weights { unsafe { weights.slice(places.start, places.len()) } } else { &mut [] };
-        let list = &list[places];
+        let entries = starts[tile] as usize..starts[tile + 1] as usize;
+        // SAFETY: an entry of the list belongs to one tile.
+        let weights: &mut [f32] = if settings.max_weights { unsafe { weights.slice(entries.start, entries.len()) } } else { &mut [] };
+        let list = &list[entries];
         // SAFETY: every tile has its own part of these.
         let (transmittance, stop_at) = unsafe { (transmittance.slice(tile * TILE_PIXELS, TILE_PIXELS), stop_at.slice(tile * TILE_PIXELS, TILE_PIXELS)) };
         let mut state = TileState::new(origin, settings, stop_at);
@@ -97,7 +97,7 @@ pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
     let mut out = vec![0.0f32; n];
     for (rank, splat) in workspace.ranked.iter().enumerate() {
         let pairs = workspace.pair_start[rank] as usize..workspace.pair_start[rank + 1] as usize;
-        let weights = workspace.place_of_pair[pairs].iter().map(|&place| workspace.pair_weights[place as usize]);
+        let weights = workspace.list_index_of_pair[pairs].iter().map(|&index| workspace.pair_weights[index as usize]);
         out[splat.index as usize] = weights.fold(0.0, f32::max);
     }
     out

@@ -74,7 +74,7 @@ pub struct Buffers {
     /// First pair of every rank, and the end.
     pub pair_start: Vec<u32>,
     /// Position in `list` of every pair.
-    pub place_of_pair: Vec<u32>,
+    pub list_index_of_pair: Vec<u32>,
     /// Pairs per binning task.
     pub pairs: Vec<Vec<Pair>>,
     /// Entries per binning task and tile.
@@ -95,6 +95,8 @@ pub struct Buffers {
     pub stop_at: Vec<u32>,
     /// Gradient records by position in `list`.
     pub records: Vec<[f32; RECORD]>,
+    /// Sums of absolute gradients of the centre (x, y) by position in `list`, when asked for.
+    pub absolute: Vec<[f32; 2]>,
     /// Largest weight by position in `list`, when asked for.
     pub pair_weights: Vec<f32>,
 }
@@ -106,6 +108,7 @@ impl Buffers {
             + 16 * (self.footprints.capacity() + self.order.capacity())
             + 12 * self.list.capacity()
             + 4 * RECORD * self.records.capacity()
+            + 8 * self.absolute.capacity()
             + 8 * self.final_transmittance.capacity()
             + pairs
     }
@@ -125,16 +128,26 @@ impl Workspace {
     /// Asks for the records that [`Workspace::summed_record`] will read.
     #[inline(always)]
     pub fn prefetch_records(&self, rank: usize) {
-        for &place in &self.place_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
-            prefetch(&self.records, place as usize);
+        for &index in &self.list_index_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            prefetch(&self.records, index as usize);
         }
     }
     /// The sum of the records of the Gaussian at `rank`, in the order of its tiles.
     #[inline(always)]
     pub fn summed_record(&self, rank: usize) -> [f32; RECORD] {
         let mut sum = [0.0f32; RECORD];
-        for &place in &self.place_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
-            for (a, b) in sum.iter_mut().zip(&self.records[place as usize]) {
+        for &index in &self.list_index_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            for (a, b) in sum.iter_mut().zip(&self.records[index as usize]) {
+                *a += b;
+            }
+        }
+        sum
+    }
+    /// As [`Workspace::summed_record`], for the absolute gradients of the centre.
+    pub fn summed_absolute(&self, rank: usize) -> [f32; 2] {
+        let mut sum = [0.0f32; 2];
+        for &index in &self.list_index_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            for (a, b) in sum.iter_mut().zip(self.absolute[index as usize]) {
                 *a += b;
             }
         }

@@ -3,8 +3,8 @@
 use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
 use super::program::{Input, Program, Step, Target, parts};
-use crate::cpu::mlp::relu::{Layer, ReluShape};
 use crate::cube::tensor::{floats, upload};
+use crate::ops::networks::{Layer, ReluShape};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 

@@ -1,7 +1,7 @@
 //! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per unit.
 
 use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
-use crate::cpu::raster::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
+use crate::ops::rasterize::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
 use cubecl::prelude::*;
 
 /// Places in the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size,

@@ -5,8 +5,8 @@ use super::{Context, TrainState};
 use crate::columns::gaussian_rate;
 use crate::schedule::Stage;
 use burn::tensor::{Int, Tensor, TensorData};
+use cc4dgs_backends::ops::image::image_planes;
 use cc4dgs_backends::ops::photometric::photometric_loss;
-use cc4dgs_backends::ops::picture::picture_planes;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, EventSink, RenderSettings, Result, Splats};
 use std::collections::BTreeMap;
@@ -68,7 +68,7 @@ impl Context<'_> {
             let probe = Tensor::<2>::zeros([n, 2], &autodiff).require_grad();
             splats.screen_probe = Some(probe.clone());
             let output = self.rasterizer.render(&splats, camera, &settings)?;
-            let target = Tensor::<3>::from_inner(picture_planes(&scene.frame(view)?, background_rgb, &self.device));
+            let target = Tensor::<3>::from_inner(image_planes(&scene.frame(view)?, background_rgb, &self.device));
             let photometric = photometric_loss(output.planes, target, train.lambda_c)?;
             if read {
                 log.psnr(photometric.numbers()?.psnr_db());

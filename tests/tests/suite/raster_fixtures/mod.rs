@@ -1,6 +1,6 @@
 //! Reads the golden fixtures of the rasterizer.
 
-use cc4dgs_backends::cpu::raster::RasterSettings;
+use cc4dgs_backends::ops::rasterize::RasterSettings;
 use cc4dgs_core::{ParameterSpace, Rules};
 use safetensors::{Dtype, SafeTensors};
 use std::path::{Path, PathBuf};
@@ -94,7 +94,8 @@ pub fn settings(width: usize, height: usize, k: &[f64], view: &[f64]) -> RasterS
         space: ParameterSpace::Activated,
         sh_degree: None,
         max_weights: false,
-        pair_room: None,
+        absolute_centers: false,
+        pair_capacity: None,
     }
 }
 

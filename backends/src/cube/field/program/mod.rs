@@ -6,8 +6,8 @@ mod steps;
 
 pub use steps::is_vertex;
 
-use crate::cpu::vertex::hash::LevelHash;
 use crate::cube::tensor::{binding_bytes, shared_bytes, spread, upload};
+use crate::ops::hash::LevelHash;
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;

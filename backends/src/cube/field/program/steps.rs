@@ -1,9 +1,9 @@
 //! The kernel behind [`super::Program`]: what each step does to the tiles of one cube.
 
 use super::Layout;
-use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
 use crate::cube::field::activation::{mish, mish_derivative};
 use crate::cube::field::decoder::signature;
+use crate::ops::networks::LAYER_NORM_EPSILON as EPSILON;
 use cubecl::prelude::*;
 
 /// Numbers per step in a plan.
