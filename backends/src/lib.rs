@@ -41,6 +41,7 @@ pub mod cpu {
 
 /// Kernels for burn's CubeCL backend: one source for wgpu and CUDA.
 // Kernels are translated, not run: iterators and joined conditions have no counterpart there.
+#[cfg(feature = "cube")]
 #[allow(clippy::needless_range_loop, clippy::collapsible_if, clippy::collapsible_else_if, clippy::manual_range_contains)]
 mod cube {
     mod adam;
@@ -56,4 +57,5 @@ mod cube {
     pub use tensor::{cap_bindings, cap_shared_memory};
 }
 
+#[cfg(feature = "cube")]
 pub use cube::{cap_bindings, cap_shared_memory};

@@ -3,7 +3,7 @@
 use super::activation::{mish, mish_derivative};
 use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
-use super::program::{Input, Program, Step, Target, parts, scales};
+use super::program::{Input, Program, SavedNorm, Step, Target, parts, scales};
 use crate::cube::tensor::{UNITS, cubes_for, floats, upload};
 use crate::ops::field::Decoder;
 use crate::ops::hash::LevelHash;
@@ -166,7 +166,7 @@ pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -
     for layer in decoder.shape.layers() {
         match &layer.gain {
             Some(gain) => {
-                let norm = Step::Norm { tile: 0, width: layer.output, gain: gain.start, keep: None };
+                let norm = Step::Norm { tile: 0, width: layer.output, gain: gain.start, save: None };
                 steps.extend([multiply(&layer, Target::Tile(0)), norm]);
             }
             None => steps.push(multiply(&layer, Target::Out(0))),
@@ -199,7 +199,7 @@ fn there_and_back(layers: &[MishLayer], rows: usize) -> (Program, Vec<Kept>, usi
     let (mut steps, mut back, mut kept) = (Vec::new(), Vec::new(), Vec::new());
     for (i, layer) in layers.iter().enumerate() {
         let mut own = Kept { input: take(rows * layer.input), ..Kept::default() };
-        steps.push(Step::Keep { tile: 0, width: layer.input, at: own.input });
+        steps.push(Step::Save { tile: 0, width: layer.input, at: own.input });
         let width = layer.output;
         if i > 0 {
             // Backwards, this comes before what the layer in front does.
@@ -210,9 +210,9 @@ fn there_and_back(layers: &[MishLayer], rows: usize) -> (Program, Vec<Kept>, usi
             Some(gain) => {
                 let scale = take(scales(rows));
                 own = Kept { normal: take(rows * width), before_mish: take(rows * width), before_norm: take(rows * width), ..own };
-                let keep = [own.normal, scale];
-                steps.extend([multiply(layer, Target::Tile(0)), Step::Norm { tile: 0, width, gain: gain.start, keep: Some(keep) }]);
-                back.push(Step::NormBack { tile: 0, width, gain: gain.start, kept: keep, before: own.before_mish, after: own.before_norm });
+                let saved = SavedNorm { normal: own.normal, scale };
+                steps.extend([multiply(layer, Target::Tile(0)), Step::Norm { tile: 0, width, gain: gain.start, save: Some(saved) }]);
+                back.push(Step::NormBack { tile: 0, width, gain: gain.start, saved, before: own.before_mish, after: own.before_norm });
             }
             None => back.push(Step::Load { tile: 0, columns: 0..width, width, at: 0 }),
         }

@@ -102,7 +102,7 @@ fn there_and_back(tree: &Tree, rows: usize, wants_input: bool) -> (Program, Vec<
         if layer.slot.is_none() || layer.relu {
             let (tile, width) = (tree.tile(i), layer.output);
             kept[i] = Kept { output: take(rows * width), gradient: take(rows * width) };
-            steps.extend([tree.forward(i, Target::Tile(tile)), Step::Keep { tile, width, at: kept[i].output }]);
+            steps.extend([tree.forward(i, Target::Tile(tile)), Step::Save { tile, width, at: kept[i].output }]);
         }
     }
     let of_input = take(if wants_input { rows * tree.layers.first().map_or(0, |l| l.input) } else { 0 });
@@ -128,13 +128,13 @@ fn there_and_back(tree: &Tree, rows: usize, wants_input: bool) -> (Program, Vec<
         if let Some(at) = tree.slots[i] {
             steps.push(Step::Load { tile, columns: 0..width, width, at });
         }
-        steps.extend([Step::Cut { tile, width, at: kept[i].output }, Step::Keep { tile, width, at: kept[i].gradient }]);
+        steps.extend([Step::Mask { tile, width, at: kept[i].output }, Step::Save { tile, width, at: kept[i].gradient }]);
         if !leaves {
             steps.push(tree.backward(i, tile, 0..width, target, add));
         }
     }
     if wants_input && tree.trunk == 0 {
-        steps.push(Step::Keep { tile: TRUNK, width: tree.layers.first().map_or(0, |l| l.input), at: of_input });
+        steps.push(Step::Save { tile: TRUNK, width: tree.layers.first().map_or(0, |l| l.input), at: of_input });
     }
     (Program(steps), kept, of_input, end)
 }

@@ -156,7 +156,7 @@ pub struct RasterGradients<B: Backend> {
 }
 
 /// Rasterization per device.
-#[backend_extension(Flex, NdArray, Cube, Autodiff)]
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait RasterOps: Backend {
     /// Renders Gaussians.
     fn rasterize(
@@ -207,7 +207,9 @@ pub struct RasterInputs {
 fn check_device(device: &Device, method: Method) -> Result<()> {
     match device.clone().without_autodiff().as_dispatch() {
         DispatchDevice::Flex(_) | DispatchDevice::NdArray(_) => Ok(()),
+        #[cfg(feature = "cube")]
         DispatchDevice::Cube(_) if method == Method::Tiles => Ok(()),
+        #[cfg(feature = "cube")]
         DispatchDevice::Cube(_) => Err(Error::unsupported(
             format!("rasterizer reference on {device:?}"),
             "it computes in float64, on the host",
