@@ -125,7 +125,7 @@ fn one_channel(image: &[f32], target: &[f32], width: usize, (l1_scale, ssim_scal
 
     let zeros = vec![0.0f32; 4 * stride];
     let with_gradient = gradient.is_some();
-    // Without a gradient the second sweep writes no field; a float per row keeps the zip below alive.
+    // Without a gradient the second sweep writes no field; one float per row, because the zip below ends with its shortest part.
     let width_out = if with_gradient { 3 * stride } else { 1 };
     let mut derivatives = scratch(rows * width_out);
     derivatives.par_chunks_mut(ROWS * width_out).zip(row_terms.par_chunks_mut(ROWS)).enumerate().for_each(|(task, (out, terms))| {
@@ -195,7 +195,7 @@ impl WithSimd for FirstRow<'_> {
             absolute += d.max(-d);
             squared = d.fma(d, squared);
         }
-        // A NaN must reach the loss, and `max` may drop it; the square keeps it.
+        // A NaN must reach the loss, and `max` may drop it; the square does not.
         let squared = squared.sum();
         self.terms[0] = if squared.is_nan() { f64::NAN } else { f64::from(absolute.sum()) };
         self.terms[2] = f64::from(squared);
@@ -209,7 +209,7 @@ impl WithSimd for FirstRow<'_> {
     }
 }
 
-/// Vertical blur, the SSIM of the row and, if asked for, the horizontally blurred derivatives of SSIM with respect to
+/// Vertical blur, the SSIM of the row and, for the gradient, the horizontally blurred derivatives of SSIM with respect to
 /// E[x], E[x^2] and E[xy].
 struct SecondRow<'a> {
     taps: [&'a [f32]; 11],

@@ -1,6 +1,6 @@
 //! The order of many keys.
 
-/// The places of `keys` (all below `bound`) in ascending order, equal keys in their own: a radix sort over as many 11-bit digits as `bound` needs.
+/// The indices of `keys` (all below `bound`) in ascending order, equal keys in their original order: a radix sort over as many 11-bit digits as `bound` needs.
 pub fn stable_order(keys: &[u32], bound: u64) -> Vec<u32> {
     const BITS: u32 = 11;
     let mut places: Vec<u32> = (0..keys.len() as u32).collect();

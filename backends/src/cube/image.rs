@@ -1,6 +1,6 @@
 //! 8-bit images to planes and back.
 
-use super::tensor::{UNITS, cubes_for, empty, floats, signed, upload};
+use super::tensor::{THREADS, empty, floats, signed, upload, workgroups_for};
 use crate::ops::image::ImageOps;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
@@ -53,7 +53,7 @@ impl ImageOps for CubeBackend {
         let words = empty(&planes, [pixels], DType::U32);
         let client = planes.client.clone();
         let arguments = (planes.into_buffer_arg(), words.clone().into_buffer_arg());
-        pack::launch(&client, cubes_for(pixels), CubeDim::new_1d(UNITS), arguments.0, arguments.1);
+        pack::launch(&client, workgroups_for(pixels), CubeDim::new_1d(THREADS), arguments.0, arguments.1);
         signed(words)
     }
     fn planes(like: FloatTensor<Self>, image: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
@@ -65,8 +65,8 @@ impl ImageOps for CubeBackend {
         let pixels = width * height;
         unpack::launch(
             &client,
-            cubes_for(3 * pixels),
-            CubeDim::new_1d(UNITS),
+            workgroups_for(3 * pixels),
+            CubeDim::new_1d(THREADS),
             w,
             b,
             planes.clone().into_buffer_arg(),

@@ -59,7 +59,7 @@ pub struct AdamStep<const D: usize> {
     pub m: Tensor<D>,
     /// Second moment.
     pub v: Tensor<D>,
-    /// How many wanted rows were left alone because their gradient was not finite [1]; reading it is up to the caller.
+    /// Rows that were skipped because their gradient was not finite [1], on the device.
     pub skipped_rows: Tensor<1, Int>,
 }
 
@@ -127,7 +127,7 @@ impl<B: CpuBackend> AdamOps for B {
     }
 }
 
-/// One Adam step, p -= lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps), in place when the caller hands over its only reference.
+/// One Adam step, p -= lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps), in place when the tensors have no other owner.
 /// Results carry no autodiff association; rows (dimension 0) with a gradient that is not finite are skipped and counted.
 pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, grad: Tensor<D>, settings: &AdamSettings) -> Result<AdamStep<D>> {
     let shape = param.dims();

@@ -8,7 +8,7 @@ use burn::backend::{Autodiff, Backend};
 
 /// Runs `compute` and, if any of `parents` needs a gradient, puts its output into the graph with `derivative` behind it.
 ///
-/// `compute` learns whether a gradient will be wanted, and returns the output and what the derivative needs.
+/// `compute` gets whether a gradient will be needed, and returns the output and what the derivative needs.
 pub(super) fn record<B, C, D, const N: usize>(
     derivative: D,
     parents: [NodeGuard; N],

@@ -13,8 +13,8 @@ use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
 
-/// What coefficients hold: per group (a head), row and output, those of the group's functions. Groups lie one after the other, and so do the functions of all
-/// groups, so that each may have its own.
+/// The layout of coefficients: group by group (a group is a head), then row by row, then per output those of the group's functions. The functions of all
+/// groups follow each other too, so that each group may have its own.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BasisShape {
     /// (outputs, functions each of them combines), group by group.
@@ -26,7 +26,7 @@ impl BasisShape {
     pub fn widths(&self) -> Vec<usize> {
         self.groups.iter().map(|g| g.0).collect()
     }
-    /// Numbers per Gaussian that come out.
+    /// Outputs per Gaussian, all groups.
     pub fn outputs(&self) -> usize {
         self.groups.iter().map(|g| g.0).sum()
     }
@@ -42,7 +42,7 @@ impl BasisShape {
 
 /// The derivative per device.
 pub trait BasisBackward: Backend {
-    /// The gradients of coefficients and functions, those that are wanted.
+    /// The gradients of coefficients and functions, as far as `wanted`.
     fn combine_backward(
         coefficients: FloatTensor<Self>,
         functions: FloatTensor<Self>,
@@ -111,13 +111,13 @@ impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B
 
 /// One output [M, width] per group of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` [F].
 ///
-/// In memory coefficients lie group after group, each [M, width x functions], as [`super::field::mlp_relu_flat`] leaves them; those that lie [`by_columns`] are
-/// read faster, but have no gradient.
+/// In memory, coefficients are stored group after group, each [M, width x functions], as [`super::field::mlp_relu_flat`] returns them. Stored
+/// [`by_columns`] they are read faster, but have no gradient.
 pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Vec<Tensor<2>>> {
     let ([m, width], [count]) = (coefficients.dims(), functions.dims());
     if m == 0 || width != shape.coefficients() || count != shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
-        let problem = format!("coefficients have shape [{m},{width}], there are {count} functions, {shape:?} is wanted");
-        return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients as the shape says and all functions"));
+        let problem = format!("coefficients have shape [{m},{width}], there are {count} functions, {shape:?} is expected");
+        return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients and functions as the shape says"));
     }
     let flat = Tensor::from_dispatch(<Dispatch as BasisOps>::combine(coefficients.into_dispatch(), functions.into_dispatch(), shape.clone()));
     Ok(split_heads(&flat, m, &shape.widths()))
@@ -131,7 +131,7 @@ pub fn by_columns(coefficients: Tensor<2>, shape: &BasisShape) -> Tensor<2> {
     }
     let widths: Vec<usize> = shape.groups.iter().map(|g| g.0 * g.1).collect();
     let heads = split_heads(&coefficients.reshape([m * c]), m, &widths);
-    // Flattening a transposed view is what makes its elements move.
+    // Flattening a transposed view moves its elements.
     let columns = heads.into_iter().zip(widths).map(|(head, width)| head.transpose().reshape([m * width])).collect();
     Tensor::cat(columns, 0).reshape([c, m]).transpose()
 }

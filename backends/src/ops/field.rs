@@ -27,13 +27,13 @@ pub struct Decoder {
     pub shape: MishShape,
 }
 
-/// What one device computes.
+/// The derivatives per device.
 pub trait FieldKernels: Backend {
     /// The gradient of the decoder's weights.
     fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self>;
     /// The gradient [U, F] of the features.
     fn trilinear_backward(grad: FloatTensor<Self>, weights: FloatTensor<Self>, slots: IntTensor<Self>, starts: IntTensor<Self>) -> FloatTensor<Self>;
-    /// The gradients of input (when wanted) and weights.
+    /// The gradients of the input (if `wants_input`) and the weights.
     fn network_backward(
         x: FloatTensor<Self>,
         weights: FloatTensor<Self>,
@@ -213,7 +213,7 @@ pub fn mlp_relu(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Res
     Ok(split_heads(&mlp_relu_flat(x, weights, shape)?, m, &shape.output_widths()))
 }
 
-/// As [`mlp_relu`], with the outputs as they lie in memory: head after head.
+/// As [`mlp_relu`], with the outputs in one flat tensor, head after head.
 pub fn mlp_relu_flat(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Result<Tensor<1>> {
     let [m, width] = x.dims();
     if !shape.is_sound() || width != shape.input || m == 0 {

@@ -1,4 +1,4 @@
-//! Shapes of the small networks: layer widths, and where each layer's weights lie in one flat array.
+//! Shapes of the small networks: layer widths, and the ranges of each layer's weights in one flat array.
 
 use std::ops::Range;
 
@@ -16,7 +16,7 @@ pub struct ReluShape {
     pub heads: Vec<Vec<usize>>,
 }
 
-/// One layer: its place in the tree and in the flat weights.
+/// One layer: its position in the tree and in the flat weights.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Layer {
     /// The layer whose output it reads; `None` is the network's input.
@@ -90,7 +90,7 @@ pub struct MishShape {
     pub output: usize,
 }
 
-/// Where the arrays of one layer lie in the flat weights.
+/// The ranges of one layer's arrays in the flat weights.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MishLayer {
     /// Input width.

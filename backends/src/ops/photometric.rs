@@ -11,16 +11,16 @@ use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, TensorMetadata
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 
-/// What one device computes.
+/// The passes per device.
 pub trait PhotometricKernels: Backend {
-    /// `(loss [1], terms [l1, ssim, mse], gradient)`; the gradient has the shape of `planes`, or is empty when not wanted.
+    /// `(loss [1], terms [l1, ssim, mse], gradient)`; the gradient has the shape of `planes`, or is empty without `gradient`.
     fn photometric_pass(
         planes: FloatTensor<Self>,
         target: FloatTensor<Self>,
         lambda_c: f32,
         gradient: bool,
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
-    /// `(loss [1], gradient)` of the first plane of `planes` as logits; the gradient has the shape of `planes`, or is empty when not wanted.
+    /// `(loss [1], gradient)` of the first plane of `planes` as logits; the gradient has the shape of `planes`, or is empty without `gradient`.
     fn bce_pass(planes: FloatTensor<Self>, mask: FloatTensor<Self>, gradient: bool) -> (FloatTensor<Self>, FloatTensor<Self>);
     /// `gradient` times the number in `upstream` [1].
     fn scale_by(gradient: FloatTensor<Self>, upstream: FloatTensor<Self>) -> FloatTensor<Self>;
@@ -113,7 +113,7 @@ impl<B: PhotometricKernels + PhotometricOps, C: CheckpointStrategy> PhotometricO
 pub struct PhotometricLoss {
     /// lambda_c * L1 + (1 - lambda_c) * (1 - SSIM) [1]; carries the gradient to the planes.
     pub loss: Tensor<1>,
-    /// Mean absolute difference, mean SSIM, mean squared difference [3]; no gradient, and no read-back until asked for.
+    /// Mean absolute difference, mean SSIM, mean squared difference [3]; no gradient; on the device until [`PhotometricLoss::numbers`] reads them.
     pub terms: Tensor<1>,
 }
 
@@ -145,7 +145,7 @@ impl PhotometricLoss {
     }
 }
 
-/// The loss of 3DGS and of the paper's Section IV-E: lambda_c * L1 + (1 - lambda_c) * (1 - SSIM), SSIM with an 11x11 Gaussian window
+/// The loss of 3DGS and of CC-4DGS (Section IV-E): lambda_c * L1 + (1 - lambda_c) * (1 - SSIM), SSIM with an 11x11 Gaussian window
 /// of sigma 1.5 and zero padding. Reads the first three of `planes` [C>=3,H,W]; the gradient of the others is zero. `target` is [3,H,W].
 pub fn photometric_loss(planes: Tensor<3>, target: Tensor<3>, lambda_c: f32) -> Result<PhotometricLoss> {
     let ([c, h, w], [tc, th, tw]) = (planes.dims(), target.dims());

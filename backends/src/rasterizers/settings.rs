@@ -1,4 +1,4 @@
-//! Inputs of a render, checked and brought to the form of the operation.
+//! Checks the inputs of a render and converts them to the form of the operation.
 
 use crate::ops::rasterize::RasterSettings;
 use cc4dgs_core::{Camera, Error, RenderSettings, Result, SplatColors, Splats};

@@ -1,4 +1,4 @@
-//! The third seam: rasterizers.
+//! Rasterizers: the trait, its inputs and outputs.
 
 use crate::plugin::Plugin;
 use crate::{Camera, Gaussians, Result};
@@ -9,16 +9,16 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Rules {
-    /// gsplat 1.6: near 0.01, 3.33 sigma per axis, alpha cap 0.99 whose gradient is cut.
+    /// gsplat 1.6: near 0.01, 3.33 sigma per axis, alpha cap 0.99 without gradient beyond the cap.
     #[default]
     Gsplat099,
     /// gsplat up to 1.5.3: as above with the cap at 0.999.
     Gsplat0999,
-    /// Inria: near 0.2, square of 3 sigma of the major axis, alpha cap 0.99 whose gradient passes.
+    /// Inria: near 0.2, square of 3 sigma of the major axis, alpha cap 0.99 that the gradient ignores.
     Inria,
 }
 
-/// Whether the parameters of [`Splats`] still want their activations.
+/// Whether the parameters of [`Splats`] are raw or activated.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ParameterSpace {
     /// Log-scales and opacity logits, as stored and optimised.
@@ -59,7 +59,7 @@ pub struct Splats {
     pub opacities: Tensor<1>,
     /// Colours.
     pub colors: SplatColors,
-    /// What the numbers are.
+    /// Raw or activated.
     pub space: ParameterSpace,
     /// A tensor of zeros [N,2] whose gradient becomes d loss / d projected centre in pixels (densification reads it).
     pub screen_probe: Option<Tensor<2>>,
@@ -141,15 +141,15 @@ impl RenderOutput {
 pub struct RenderStats {
     /// Screen radius in pixels; 0 where the Gaussian was culled [N].
     pub radii: Tensor<1, Int>,
-    /// Largest blending weight of each Gaussian over the image [N], when asked for.
+    /// Largest blending weight of each Gaussian over the image [N], if [`RenderSettings::max_weights`] is set.
     pub max_weights: Option<Tensor<1>>,
-    /// (Gaussian, tile) pairs there were [1], still on the device; `None` where a rasterizer has no such thing.
+    /// Number of (Gaussian, tile) pairs [1], still on the device; `None` if a rasterizer has no tiles.
     pub pair_count: Option<Tensor<1, Int>>,
     /// Counts of work done.
     pub work: RenderWork,
 }
 
-/// Work counted during one render. Zero where a device does not read its counters back.
+/// Work counted during one render. Zero on devices that do not read their counters back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RenderWork {
     /// Gaussians that survived culling.

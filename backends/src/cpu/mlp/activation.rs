@@ -9,7 +9,7 @@ pub fn exp(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0;
     let shifted = x * std::f32::consts::LOG2_E + ROUND;
     let n = shifted - ROUND;
-    // ln 2 in two parts, so that the remainder keeps its bits.
+    // ln 2 in two parts, so that the remainder is exact.
     let r = (x - n * 0.693_359_4) + n * 2.121_944_4e-4;
     let mut p = 1.987_569_1e-4;
     p = p * r + 1.398_199_9e-3;
@@ -69,7 +69,7 @@ fn row_sum(row: &[f32]) -> f32 {
     lanes[0] + rest
 }
 
-/// Normalises each row of `z` [rows, n] to zero mean and unit (biased) variance in place; `inverse_std` [rows] keeps the scales.
+/// Normalises each row of `z` [rows, n] to zero mean and unit (biased) variance in place; `inverse_std` [rows] receives the scales.
 #[inline(always)]
 pub fn normalize_rows(z: &mut [f32], n: usize, inverse_std: &mut [f32], work: &mut [f32]) {
     let work = &mut work[..n];

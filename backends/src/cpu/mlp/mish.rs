@@ -1,4 +1,4 @@
-//! The hash-feature decoder's network: (Linear, LayerNorm, Mish) for each hidden layer, then Linear (paper Section IV-B).
+//! The hash-feature decoder's network: (Linear, LayerNorm, Mish) for each hidden layer, then Linear (CC-4DGS, Section IV-B).
 //!
 //! Weights are one flat array. Per hidden layer: W [in, out] row-major (y = x W + b), b [out], LayerNorm gain [out], shift [out]; then W and b
 //! of the output layer. Rows are processed in blocks of a fixed, padded size, so that the result of a row does not depend on which rows
@@ -80,7 +80,7 @@ pub fn forward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSourc
 }
 
 /// The gradient of the weights given `grad` [rows, output], and, if `input_grad` [rows, input] is given, the gradient of the inputs.
-/// Activations are computed again rather than kept: at these widths that is cheaper than writing them out and reading them back.
+/// Activations are recomputed instead of saved: at these widths that is cheaper than writing and reading them.
 pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource, grad: &[f32], input_grad: Option<&mut [f32]>) -> Vec<f32> {
     let layers = shape.layers();
     if count == 0 {
@@ -115,7 +115,7 @@ pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSour
     sum_in_order(parts)
 }
 
-/// `g[0]` holds the gradient of the block's output and ends as that of its input (if wanted); `total` is added to.
+/// `g[0]` holds the gradient of the block's output and ends as that of its input (if requested); `total` is added to.
 fn block_backward(layers: &[MishLayer], weights: &[f32], back: &[Vec<f32>], block: &mut Block, g: &mut [Scratch; 2], total: &mut [f32], wants_input: bool) {
     for (i, layer) in layers.iter().enumerate().rev() {
         let len = BLOCK * layer.output;

@@ -1,5 +1,5 @@
 //! A trunk of Linear + ReLU layers that feeds any number of heads, each Linear (ReLU, Linear)* with no activation at its end
-//! (paper Section IV-B: the deformation network). A plain network is a trunk without heads or one head without a trunk.
+//! (CC-4DGS, Section IV-B: the deformation network). A plain network is a trunk without heads or one head without a trunk.
 //!
 //! Weights are one flat array: per layer W [in, out] row-major (y = x W + b), then b [out]; the trunk first, then head by head.
 //! The outputs are one flat array too, head after head, each [rows, width]; without heads, the trunk's output.
@@ -69,7 +69,7 @@ pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
 }
 
 /// The gradients `(x [rows, input], weights)` given that of the flat outputs; the first is empty unless `wants_input`.
-/// Activations are computed again rather than kept.
+/// Activations are recomputed instead of saved.
 pub fn backward(shape: &ReluShape, weights: &[f32], x: &[f32], grad: &[f32], wants_input: bool) -> (Vec<f32>, Vec<f32>) {
     let layers = shape.layers();
     let count = x.len() / shape.input.max(1);

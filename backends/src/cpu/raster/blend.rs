@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Sigma up to which the exponential is evaluated; alpha is far below 1/255 beyond.
 pub const SIGMA_MAX: f32 = 87.0;
-/// How many list entries ahead Gaussians are asked for.
+/// Prefetch distance in list entries.
 pub const AHEAD: usize = 6;
 /// Planes of the output.
 const PLANES: usize = 5;
@@ -24,7 +24,7 @@ pub fn column_centers(origin_x: usize) -> [f32; TILE] {
     std::array::from_fn(|x| (origin_x + x) as f32 + 0.5)
 }
 
-/// Blends every tile into `planes` [5,H,W] and keeps what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
+/// Blends every tile into `planes` [5,H,W] and saves what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
 pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, planes: &mut [f32]) -> u64 {
     let tiles_x = settings.width.div_ceil(TILE);
     let tiles = tiles_x * settings.height.div_ceil(TILE);
@@ -105,7 +105,7 @@ pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
 
 /// Running numbers of one tile.
 struct TileState<'a> {
-    /// Transmittance so far; NaN where the pixel has stopped or lies outside the image.
+    /// Transmittance so far; NaN where the pixel has stopped or is outside the image.
     running: TilePlane,
     /// Transmittance of stopped pixels.
     stopped: TilePlane,

@@ -11,7 +11,7 @@ use cc4dgs_core::ParameterSpace;
 use pulp::{Simd, WithSimd};
 use std::mem::MaybeUninit;
 
-/// Gradients as asked for; the others are empty.
+/// The gradients in a [`GradientRequest`]; the others are empty.
 #[derive(Clone, Debug, Default)]
 pub struct Gradients {
     /// [N,3]
@@ -198,7 +198,7 @@ impl WithSimd for GradientChunk<'_> {
                     screen[RECORD + c][lane] = if clamps && splat.color[c] <= 0.0 { 0.0 } else { 1.0 };
                 }
             }
-            // The records of the next group lie all over the lists: ask for them now.
+            // The records of the next group are scattered over the lists: prefetch them.
             for slot in start + here..self.count.min(start + here + S::F32_LANES) {
                 self.workspace.prefetch_records(self.workspace.rank_of_slot[self.first + slot] as usize);
             }
@@ -334,7 +334,7 @@ impl GradientChunk<'_> {
             offset,
         )
     }
-    /// Writes columns to the rows of the Gaussians `indices` of output `which`, if that is wanted.
+    /// Writes columns to the rows of the Gaussians `indices` of output `which`, if it was requested.
     #[inline(always)]
     fn scatter<S: Simd, const WIDTH: usize>(&mut self, which: usize, indices: &[usize], columns: &[Lanes<S>; WIDTH]) {
         if self.out[which].is_empty() {

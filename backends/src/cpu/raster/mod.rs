@@ -87,7 +87,7 @@ pub struct Forward {
     pub planes: Vec<f32>,
     /// Screen radius in pixels, 0 where culled [N].
     pub radii: Vec<i64>,
-    /// Largest blending weight [N]; empty unless asked for.
+    /// Largest blending weight [N]; empty unless the settings ask for it.
     pub max_weights: Vec<f32>,
     /// Counts of work.
     pub work: RenderWork,

@@ -11,7 +11,7 @@ use pulp::{Simd, WithSimd};
 
 /// Binning tasks. The lists do not depend on it.
 const TASKS: usize = 8;
-/// How far ahead data is asked for.
+/// Prefetch distance.
 const AHEAD: usize = 8;
 /// Bits of a digit of the radix sort.
 const DIGIT: u32 = 12;

@@ -26,7 +26,7 @@ impl LevelHash {
             let sum = u64::from(ax[i]) * u64::from(x) + u64::from(ay[i]) * u64::from(y) + u64::from(az[i]) * u64::from(z) + u64::from(b[i]);
             let sum = fold(fold(sum));
             let residue = if sum >= P { sum - P } else { sum };
-            // The multiplied quotient is the true one or one less.
+            // The quotient by multiplication is the exact one or one less.
             let remainder = residue - ((residue * self.reciprocal) >> 32) * modulus;
             let hash = if remainder >= modulus { remainder - modulus } else { remainder };
             row[i] = hash as u32 as i32 as f32 * scale - 1.0;

@@ -3,7 +3,7 @@
 use super::blend;
 use super::gradient::{self, AT_OFFSET, GEOMETRY, OF_CAMERA, OF_MEAN, OF_OPACITY, OF_QUATERNION, OF_SCALES, SCREEN};
 use super::{DIM, Lists, read_floats, rest_width};
-use crate::cube::tensor::{cubes_for, floats, row_blocks, rows_of, shared_bytes, spread, upload};
+use crate::cube::tensor::{floats, row_blocks, rows_of, shared_bytes, spread, upload, workgroups_for};
 use crate::ops::rasterize::camera::{CameraSums, RuleConstants};
 use crate::ops::rasterize::{AT_X, GradientRequest, RasterGradients, RasterSettings, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
@@ -77,7 +77,7 @@ pub fn backward(
     if n > 0 {
         gradient::sum_records::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             records.clone().into_buffer_arg(),
             lists.start_of_gaussian.clone().into_buffer_arg(),
@@ -90,7 +90,7 @@ pub fn backward(
         for rows in row_blocks(&client, n, width) {
             gradient::color_backward::launch(
                 &client,
-                cubes_for(rows.len()),
+                workgroups_for(rows.len()),
                 DIM(),
                 means.clone().into_buffer_arg(),
                 rows_of(&sh_rest, &rows, width).into_buffer_arg(),
@@ -109,7 +109,7 @@ pub fn backward(
         }
         gradient::geometry_backward::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             means.clone().into_buffer_arg(),
             scales.into_buffer_arg(),
@@ -130,7 +130,7 @@ pub fn backward(
         if count > 0 {
             let width = (count / n) as u32;
             let (from, to) = (from.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-            gradient::take_columns::launch(&client, cubes_for(count), DIM(), from, to, stride as u32, first as u32, width);
+            gradient::take_columns::launch(&client, workgroups_for(count), DIM(), from, to, stride as u32, first as u32, width);
         }
         out
     };
@@ -162,7 +162,7 @@ pub fn backward(
         if n > 0 {
             let (records, starts) = (records.clone().into_buffer_arg(), lists.start_of_gaussian.clone().into_buffer_arg());
             let (keys, to) = (lists.keys.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-            gradient::sum_absolute::launch(&client, cubes_for(n), DIM(), records, starts, keys, to, stride);
+            gradient::sum_absolute::launch(&client, workgroups_for(n), DIM(), records, starts, keys, to, stride);
         }
         out
     };

@@ -1,18 +1,19 @@
-//! Front-to-back blending, a unit per pixel and a cube per tile, and its back-to-front derivative. What a tile draws is brought on the chip a batch at a time.
+//! Front-to-back blending, a thread per pixel and a workgroup per tile, and its back-to-front derivative. The Gaussians of a tile are loaded into shared memory
+//! a batch at a time.
 
 use crate::ops::rasterize::camera::{ALPHA_MIN, TRANSMITTANCE_STOP};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, TILE, TILE_PIXELS};
 use cubecl::prelude::*;
 
 const SIDE: u32 = TILE as u32;
-/// Gaussians brought on the chip at a time, forwards.
+/// Gaussians per batch, forwards.
 const BATCH: usize = 64;
-/// The same backwards, where pixels leave what they found for those who add it up: the more the better, as far as shared memory goes.
+/// Gaussians per batch, backwards. Each pixel stores two numbers per Gaussian in shared memory, so the batch is as large as that memory allows.
 const BATCHES: [usize; 3] = [16, 8, 4];
-/// One more than the pixels of a tile, so that columns of sums lie in different banks.
+/// One more than the pixels of a tile, so that columns of sums are in different banks.
 const COLUMN: usize = TILE_PIXELS + 1;
 
-/// Floats that the backward pass shares for a batch of so many Gaussians: what pixels found (later sums), and the gradient of the image.
+/// Floats of shared memory for what the pixels found of a batch of so many Gaussians, later for their sums.
 const fn found_floats(batch: usize) -> usize {
     let (found, sums) = (2 * batch * TILE_PIXELS, RECORD * COLUMN);
     if found > sums { found } else { sums }
@@ -32,7 +33,7 @@ fn full_alpha(drawn: &Shared<[f32]>, at: usize, dx: f32, dy: f32) -> f32 {
     select(sigma >= 0.0 && alpha >= ALPHA_MIN, alpha, 0.0f32)
 }
 
-/// Planes [5,H,W]; per pixel the transmittance left and the place in the list where it stopped, as bits [2,H,W]; largest weights [N] if wanted.
+/// Planes [5,H,W]; per pixel the transmittance left and the list index at which it stopped, as bits [2,H,W]; largest weights [N] if asked for.
 #[cube(launch_unchecked)]
 pub fn blend_tiles(
     splats: &[f32],
@@ -52,7 +53,7 @@ pub fn blend_tiles(
     let mut drawn = Shared::<[f32]>::new_slice(comptime!(RECORD * BATCH));
     let mut gaussians = Shared::<[u32]>::new_slice(BATCH);
     let finished = Shared::<[Atomic<u32>]>::new_slice(1usize);
-    let unit = UNIT_POS as usize;
+    let thread = UNIT_POS as usize;
     let tile = CUBE_POS as u32;
     let x = tile % tiles_x * SIDE + UNIT_POS % SIDE;
     let y = tile / tiles_x * SIDE + UNIT_POS / SIDE;
@@ -71,7 +72,7 @@ pub fn blend_tiles(
     let mut blue = 0.0f32;
     let mut depth = 0.0f32;
     let mut running = inside;
-    if unit == 0 {
+    if thread == 0 {
         finished[0].store(0u32);
     }
     sync_cube();
@@ -83,10 +84,10 @@ pub fn blend_tiles(
     while first < end && done < TILE_PIXELS as u32 {
         let count = select(end - first < BATCH as u32, end - first, BATCH as u32);
         if UNIT_POS < count {
-            gaussians[unit] = gaussian_of_pair[sorted[first as usize + unit] as usize];
+            gaussians[thread] = gaussian_of_pair[sorted[first as usize + thread] as usize];
         }
         sync_cube();
-        let mut k = unit;
+        let mut k = thread;
         while k < RECORD * count as usize {
             drawn[k] = splats[RECORD * gaussians[k / RECORD] as usize + k % RECORD];
             k += TILE_PIXELS;
@@ -142,7 +143,7 @@ pub const fn record_floats(absolute: bool) -> usize {
 }
 
 /// Gradient records of all pairs, [`record_floats`] each, which [`super::gradient::sum_records`] turns into gradients. With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i
-/// the part of the loss behind it, d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i).
+/// the part of the loss that lies behind it, d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i).
 #[cube(launch_unchecked)]
 pub fn blend_tiles_backward(
     splats: &[f32],
@@ -167,7 +168,7 @@ pub fn blend_tiles_backward(
     let mut of_image = Shared::<[f32]>::new_slice(comptime!(4 * TILE_PIXELS));
     let mut drawn = Shared::<[f32]>::new_slice(comptime!(RECORD * batch));
     let mut pairs = Shared::<[u32]>::new_slice(batch);
-    let unit = UNIT_POS as usize;
+    let thread = UNIT_POS as usize;
     let tile = CUBE_POS as u32;
     let x = tile % tiles_x * SIDE + UNIT_POS % SIDE;
     let y = tile / tiles_x * SIDE + UNIT_POS / SIDE;
@@ -190,17 +191,17 @@ pub fn blend_tiles_backward(
         g_depth = upstream[at + 4 * pixels];
         behind = left * (background[0] * g_red + background[1] * g_green + background[2] * g_blue - upstream[at + 3 * pixels]);
     }
-    of_image[unit] = g_red;
-    of_image[unit + TILE_PIXELS] = g_green;
-    of_image[unit + 2 * TILE_PIXELS] = g_blue;
-    of_image[unit + 3 * TILE_PIXELS] = g_depth;
+    of_image[thread] = g_red;
+    of_image[thread + TILE_PIXELS] = g_green;
+    of_image[thread + 2 * TILE_PIXELS] = g_blue;
+    of_image[thread + 3 * TILE_PIXELS] = g_depth;
     let mut start = 0u32;
     let mut end = 0u32;
     if (tile as usize) + 1 < starts.len() {
         start = starts[tile as usize];
         end = starts[tile as usize + 1];
     }
-    // Behind the last Gaussian that any pixel of the tile shows, there is nothing to derive.
+    // Gaussians behind the last one that any pixel of the tile shows have no gradient.
     let deepest = Shared::<[Atomic<u32>]>::new_slice(1usize);
     if UNIT_POS == 0 {
         deepest[0].store(start);
@@ -210,24 +211,24 @@ pub fn blend_tiles_backward(
     sync_cube();
     let mut i = deepest[0].load();
     let unseen = (end - i) as usize * width_of_record;
-    let mut k = unit;
+    let mut k = thread;
     while k < unseen {
         records[width_of_record * sorted[i as usize + k / width_of_record] as usize + k % width_of_record] = 0.0;
         k += TILE_PIXELS;
     }
-    // The Gaussian of the batch and the pixels a unit adds up; they share a column of the tile.
+    // Each thread sums some pixels of one Gaussian of the batch; they share a column of the tile.
     let groups = comptime!(TILE_PIXELS / batch);
-    let (own, group) = (unit / groups, unit % groups);
+    let (own, group) = (thread / groups, thread % groups);
     let (column, top) = ((tile % tiles_x * SIDE) as f32 + (group % TILE) as f32 + 0.5, (tile / tiles_x * SIDE) as f32 + 0.5);
     while i > start {
         let count = select(i - start < batch as u32, i - start, batch as u32);
         let first = i - count;
         if UNIT_POS < count {
-            pairs[unit] = sorted[first as usize + unit];
+            pairs[thread] = sorted[first as usize + thread];
         }
         sync_cube();
-        if unit < RECORD * count as usize {
-            drawn[unit] = splats[RECORD * gaussian_of_pair[pairs[unit / RECORD] as usize] as usize + unit % RECORD];
+        if thread < RECORD * count as usize {
+            drawn[thread] = splats[RECORD * gaussian_of_pair[pairs[thread / RECORD] as usize] as usize + thread % RECORD];
         }
         sync_cube();
         for step in 0..count {
@@ -253,8 +254,8 @@ pub fn blend_tiles_backward(
                     }
                 }
             }
-            found[g * TILE_PIXELS + unit] = v;
-            found[(batch + g) * TILE_PIXELS + unit] = weight;
+            found[g * TILE_PIXELS + thread] = v;
+            found[(batch + g) * TILE_PIXELS + thread] = weight;
         }
         sync_cube();
         // Moments of v give everything about the shape.
@@ -296,11 +297,11 @@ pub fn blend_tiles_backward(
         sync_cube();
         #[unroll]
         for k in 0..RECORD {
-            found[k * COLUMN + unit] = sums[k];
+            found[k * COLUMN + thread] = sums[k];
         }
         sync_cube();
-        if unit < RECORD * count as usize {
-            let (g, k) = (unit / RECORD, unit % RECORD);
+        if thread < RECORD * count as usize {
+            let (g, k) = (thread / RECORD, thread % RECORD);
             let mut sum = 0.0f32;
             for part in 0..groups {
                 sum += found[k * COLUMN + g * groups + part];
@@ -309,11 +310,11 @@ pub fn blend_tiles_backward(
         }
         if comptime!(absolute) {
             sync_cube();
-            found[unit] = absolute_x;
-            found[COLUMN + unit] = absolute_y;
+            found[thread] = absolute_x;
+            found[COLUMN + thread] = absolute_y;
             sync_cube();
-            if unit < 2 * count as usize {
-                let (g, k) = (unit / 2, unit % 2);
+            if thread < 2 * count as usize {
+                let (g, k) = (thread / 2, thread % 2);
                 let mut sum = 0.0f32;
                 for part in 0..groups {
                     sum += found[k * COLUMN + g * groups + part];

@@ -7,7 +7,7 @@ use super::lists;
 use super::project::{self, KEYS};
 use super::{DIM, Lists, read_words, rest_width, words};
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{binding_bytes, cubes_for, empty, floats, row_blocks, rows_of, spread, upload};
+use crate::cube::tensor::{binding_bytes, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for};
 use crate::ops::rasterize::camera::{CameraConstants, RuleConstants};
 use crate::ops::rasterize::{MAX_TILE_PAIRS, RECORD, RasterSettings, Rasterized, Refusal, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
@@ -49,7 +49,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     if n > 0 {
         project::project_gaussians::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             means.clone().into_buffer_arg(),
             scales.into_buffer_arg(),
@@ -67,7 +67,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
         for rows in row_blocks(&client, n, width) {
             project::color_gaussians::launch(
                 &client,
-                cubes_for(rows.len()),
+                workgroups_for(rows.len()),
                 DIM(),
                 means.clone().into_buffer_arg(),
                 colors.clone().into_buffer_arg(),
@@ -93,7 +93,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     if n > 0 {
         lists::depth_keys::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             keys.clone().into_buffer_arg(),
             depth.clone().into_buffer_arg(),
@@ -102,7 +102,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
         order = sort_pairs(depth, index, n, 32).1;
         lists::counts_by_rank::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             keys.clone().into_buffer_arg(),
             order.clone().into_buffer_arg(),
@@ -126,7 +126,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     if pairs > 0 {
         lists::emit_pairs::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             keys.clone().into_buffer_arg(),
             order.into_buffer_arg(),
@@ -140,11 +140,11 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
         if settings.pair_capacity.is_some() {
             // What no Gaussian filled goes behind the last tile.
             let (tile, own) = (tile_of_pair.clone().into_buffer_arg(), pair.clone().into_buffer_arg());
-            lists::fill_unused::launch(&client, cubes_for(pairs), DIM(), tile, own, total.clone().into_buffer_arg(), tiles as u32);
+            lists::fill_unused::launch(&client, workgroups_for(pairs), DIM(), tile, own, total.clone().into_buffer_arg(), tiles as u32);
         }
         (sorted_tiles, sorted) = sort_pairs(tile_of_pair, pair, pairs, usize::BITS - tiles.leading_zeros());
     }
-    lists::tile_starts::launch(&client, cubes_for(pairs + 1), DIM(), sorted_tiles.into_buffer_arg(), tile_starts.clone().into_buffer_arg(), pairs as u32);
+    lists::tile_starts::launch(&client, workgroups_for(pairs + 1), DIM(), sorted_tiles.into_buffer_arg(), tile_starts.clone().into_buffer_arg(), pairs as u32);
     let planes = floats(&means, [5, height, width]);
     let state = floats(&means, [2, height, width]);
     let weights = if settings.max_weights && n > 0 { upload(&means, &vec![0.0f32; n], DType::F32) } else { upload(&means, &[0.0f32], DType::F32) };

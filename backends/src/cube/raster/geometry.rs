@@ -1,11 +1,11 @@
-//! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per unit.
+//! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per thread.
 
 use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
 use crate::ops::rasterize::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
 use cubecl::prelude::*;
 
-/// Places in the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size,
-/// and the row that gives the depth: four numbers, what float32 cuts off them, and a zero.
+/// Indices into the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size,
+/// and the row that gives the depth: four numbers, their float32 rounding errors, and a zero.
 pub const TRANSLATION: usize = 9;
 pub const CENTER: usize = 12;
 pub const FOCAL: usize = 15;
@@ -14,7 +14,7 @@ pub const LIMITS: usize = 19;
 pub const NEAR: usize = 23;
 pub const SIZE: usize = 24;
 pub const DEPTH: usize = 26;
-/// Of a float32, the upper half of the significand, so that products of halves are exact.
+/// Mask of the upper half of a float32's significand; products of halves are exact.
 const UPPER_HALF: u32 = 0xffff_f000;
 
 /// The camera as the kernels read it.
@@ -66,7 +66,7 @@ pub struct Projected {
     pub inside_y: f32,
 }
 
-/// a b as an exact float32 and a small rest, so that it does not matter whether a compiler fuses products with sums.
+/// a b as an exact float32 and a small remainder, so that the result does not depend on whether a compiler fuses products with sums.
 #[cube]
 fn exact_product(a: f32, b: f32) -> (f32, f32) {
     let a_upper = f32::reinterpret(u32::reinterpret(a) & UPPER_HALF);
@@ -75,13 +75,13 @@ fn exact_product(a: f32, b: f32) -> (f32, f32) {
     (a_upper * b_upper, a_upper * b_lower + a_lower * b_upper + a_lower * b_lower)
 }
 
-/// `v`, behind a door no compiler looks through: shaders may be simplified as if sums were exact (Mesa turns (a + b) - a into b).
+/// `v`, behind an optimisation barrier, because some shader compilers simplify (a + b) - a to b (Mesa). `zero` is 0, but not known to the compiler.
 #[cube]
 fn rounded(v: f32, zero: u32) -> f32 {
     f32::reinterpret(u32::reinterpret(v) ^ zero)
 }
 
-/// a + b and what rounding took (Knuth).
+/// a + b and its rounding error (Knuth).
 #[cube]
 fn exact_sum(a: f32, b: f32, zero: u32) -> (f32, f32) {
     let sum = rounded(a + b, zero);
@@ -178,7 +178,7 @@ pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
     }
 }
 
-/// What flows out of a [`Projected`].
+/// Gradients of the inputs of [`project`].
 #[derive(CubeType, Clone, Copy)]
 pub struct GeometryGradient {
     pub mean: V3,

@@ -14,7 +14,7 @@ mod lists;
 mod project;
 mod vector;
 
-use super::tensor::{UNITS, empty};
+use super::tensor::{THREADS, empty};
 use crate::ops::rasterize::{GradientRequest, Method, Probes, RasterBackward, RasterGradients, RasterOps, RasterSettings, Rasterized, Saved, SplatTensors};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
@@ -36,13 +36,13 @@ struct Lists {
     pairs: usize,
 }
 
-const DIM: fn() -> CubeDim = || CubeDim::new_1d(UNITS);
+const DIM: fn() -> CubeDim = || CubeDim::new_1d(THREADS);
 
 fn words(like: &CubeTensor, count: usize) -> CubeTensor {
     empty(like, [count], DType::U32)
 }
 
-/// The numbers of a buffer of words, read back.
+/// Reads a buffer of words back.
 fn read_words(tensor: &CubeTensor) -> Vec<u32> {
     u32::from_bytes(&tensor.client.read_one_unchecked(tensor.handle.clone())).to_vec()
 }

@@ -177,7 +177,7 @@ pub fn project_gaussians(
         keys[key + KEY_TILES] = select(drawn, length_of(columns) * length_of(rows), 0u32);
         keys[key + KEY_COLUMNS] = columns;
         keys[key + KEY_ROWS] = rows;
-        // Inria keeps integer radii below 2^31; so do we.
+        // Integer radii stay below 2^31, as in Inria's code.
         radii[i] = select(drawn, select(radius < 1e9, radius, 1e9f32) as i32, 0i32);
     }
 }

@@ -25,7 +25,7 @@ pub enum Method {
     Reference,
 }
 
-/// What a device keeps between the forward and the backward pass. Only the device that made it can read it.
+/// What a device saves between the forward and the backward pass. Only the device that made it can read it.
 #[derive(Clone)]
 pub struct Saved(Arc<dyn Any + Send + Sync>);
 
@@ -46,21 +46,21 @@ impl fmt::Debug for Saved {
     }
 }
 
-/// Why a device does not draw.
+/// Why a device refuses to draw.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// More (Gaussian, tile) pairs than there may be.
+    /// More (Gaussian, tile) pairs than the limit.
     Pairs {
-        /// Pairs there are.
+        /// Number of pairs.
         found: u64,
-        /// Pairs there may be.
+        /// Upper bound on pairs.
         limit: u64,
     },
-    /// An array of so many Gaussians is larger than a kernel of the device may read.
+    /// An array with a row per Gaussian is larger than a kernel of the device may read.
     Gaussians {
-        /// Gaussians there are.
+        /// Number of Gaussians.
         found: u64,
-        /// Gaussians that fit.
+        /// Upper bound on Gaussians.
         limit: u64,
     },
 }
@@ -69,13 +69,13 @@ impl Refusal {
     fn error(self) -> Error {
         match self {
             Self::Pairs { found, limit } => {
-                Error::limit("render", found, limit, "The value counts (Gaussian, tile) pairs: prune huge Gaussians or render a smaller image")
+                Error::limit("render", found, limit, "The value counts (Gaussian, tile) pairs. Prune huge Gaussians or render a smaller image")
             }
             Self::Gaussians { found, limit } => Error::limit(
                 "render",
                 found,
                 limit,
-                "The value counts Gaussians; the limit is what the adapter lets a kernel read at once. Use a device with larger bindings (cc4dgs doctor), or fewer Gaussians",
+                "The value counts Gaussians; the limit follows from the largest binding of the adapter. Use a device with larger bindings (`cc4dgs doctor` lists them), or fewer Gaussians",
             ),
         }
     }
@@ -179,7 +179,7 @@ pub trait RasterBackward: Backend {
     ) -> RasterGradients<Self>;
 }
 
-/// The tensors of one render; what is absent is a constant without gradient.
+/// The tensors of one render; absent ones are constants without gradient.
 pub struct RasterInputs {
     /// Centres in world units [N,3].
     pub means: Tensor<2>,
@@ -203,7 +203,7 @@ pub struct RasterInputs {
     pub background: Option<Tensor<1>>,
 }
 
-/// Refuses a device that lacks the operation.
+/// An error for a device without the operation.
 fn check_device(device: &Device, method: Method) -> Result<()> {
     match device.clone().without_autodiff().as_dispatch() {
         DispatchDevice::Flex(_) | DispatchDevice::NdArray(_) => Ok(()),
@@ -212,7 +212,7 @@ fn check_device(device: &Device, method: Method) -> Result<()> {
         #[cfg(feature = "cube")]
         DispatchDevice::Cube(_) => Err(Error::unsupported(
             format!("rasterizer reference on {device:?}"),
-            "it computes in float64, on the host",
+            "it computes in float64 on the processor",
             "Use --device flex, or the rasterizer tile",
         )),
         _ => Err(Error::unsupported(format!("rasterize on {device:?}"), "this device has no rasterizer yet", "Use --device flex or ndarray")),
