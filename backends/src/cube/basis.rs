@@ -125,9 +125,9 @@ impl BasisOps for CubeBackend {
         let out = floats(&coefficients, [rows * shape.outputs()]);
         let client = coefficients.client.clone();
         let plan = upload(&coefficients, &plan(&shape), DType::U32);
-        let (cubes, dim) = (workgroups_for(rows * shape.outputs()), CubeDim::new_1d(THREADS));
+        let (count, dim) = (workgroups_for(rows * shape.outputs()), CubeDim::new_1d(THREADS));
         let (c, f, p, o) = (coefficients.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
-        combine_outputs::launch(&client, cubes, dim, c, f, p, o, rows as u32, shape.outputs() as u32, by_columns);
+        combine_outputs::launch(&client, count, dim, c, f, p, o, rows as u32, shape.outputs() as u32, by_columns);
         out
     }
 }

@@ -141,12 +141,12 @@ fn ssim_and_derivatives(
 
 /// Adds up the terms of all workgroups, in order, with compensation for rounding (Kahan); numbers = [loss, l1, ssim, mse].
 #[cube(launch)]
-fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], cubes: u32, scale: f32, lambda_c: f32) {
+fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], workgroups: u32, scale: f32, lambda_c: f32) {
     let mut means = Shared::<[f32]>::new_slice(3usize);
     if UNIT_POS < 3 {
         let mut sum = 0.0f32;
         let mut lost = 0.0f32;
-        for k in 0..cubes {
+        for k in 0..workgroups {
             let value = partial[(k * 3 + UNIT_POS) as usize] - lost;
             let next = sum + value;
             lost = (next - sum) - value;
@@ -245,11 +245,11 @@ fn bce_terms(logits: &[f32], mask: &[f32], grad: &mut [f32], partial: &mut [f32]
 }
 
 #[cube(launch)]
-fn finish_mean(partial: &[f32], mean: &mut [f32], cubes: u32, scale: f32) {
+fn finish_mean(partial: &[f32], mean: &mut [f32], workgroups: u32, scale: f32) {
     if UNIT_POS == 0 {
         let mut sum = 0.0f32;
         let mut lost = 0.0f32;
-        for k in 0..cubes as usize {
+        for k in 0..workgroups as usize {
             let value = partial[k] - lost;
             let next = sum + value;
             lost = (next - sum) - value;
@@ -288,8 +288,8 @@ impl PhotometricKernels for CubeBackend {
         let args = || (planes.clone().into_buffer_arg(), target.clone().into_buffer_arg(), taps.clone().into_buffer_arg());
         let (x, y, w) = args();
         blur_moments_in_rows::launch(&client, workgroups_for(3 * pixels), dim, x, y, w, moments.clone().into_buffer_arg(), width as u32, pixels as u32);
-        let cubes = (3 * pixels).div_ceil(THREADS as usize);
-        let partial = floats(&planes, [3 * cubes]);
+        let workgroups = (3 * pixels).div_ceil(THREADS as usize);
+        let partial = floats(&planes, [3 * workgroups]);
         let derivatives = floats(&planes, [if gradient { 3 * DERIVATIVES as usize * pixels } else { 1 }]);
         let (x, y, w) = args();
         ssim_and_derivatives::launch(
@@ -315,7 +315,7 @@ impl PhotometricKernels for CubeBackend {
             partial.into_buffer_arg(),
             loss.clone().into_buffer_arg(),
             terms.clone().into_buffer_arg(),
-            cubes as u32,
+            workgroups as u32,
             scale,
             lambda_c,
         );
@@ -361,9 +361,9 @@ impl PhotometricKernels for CubeBackend {
             return (upload(&planes, &[0.0f32], DType::F32), floats(&planes, shape));
         }
         let items = if gradient { shape.num_elements() } else { pixels };
-        let cubes = items.div_ceil(THREADS as usize);
+        let workgroups = items.div_ceil(THREADS as usize);
         let grad = floats(&planes, if gradient { shape } else { [1].into() });
-        let (partial, loss) = (floats(&planes, [cubes]), floats(&planes, [1]));
+        let (partial, loss) = (floats(&planes, [workgroups]), floats(&planes, [1]));
         let scale = 1.0 / pixels as f32;
         let count = workgroups_for(items);
         bce_terms::launch(
@@ -378,7 +378,7 @@ impl PhotometricKernels for CubeBackend {
             gradient,
         );
         let one = CubeCount::Static(1, 1, 1);
-        finish_mean::launch(&client, one, CubeDim::new_1d(32), partial.into_buffer_arg(), loss.clone().into_buffer_arg(), cubes as u32, scale);
+        finish_mean::launch(&client, one, CubeDim::new_1d(32), partial.into_buffer_arg(), loss.clone().into_buffer_arg(), workgroups as u32, scale);
         (loss, grad)
     }
     fn scale_by(gradient: FloatTensor<Self>, upstream: FloatTensor<Self>) -> FloatTensor<Self> {

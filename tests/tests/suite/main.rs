@@ -18,5 +18,6 @@ mod image;
 mod lookup;
 mod raster;
 mod raster_fixtures;
+mod raster_probes;
 mod readers;
 mod sort;

@@ -109,8 +109,8 @@ fn gather_gradients(grad: &[f32], weights: &[f32], slots: &[i32], starts: &[i32]
     if ABSOLUTE_POS < out.len() {
         let (vertex, f) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
         let mut sum = 0.0f32;
-        for place in starts[vertex] as u32..starts[vertex + 1] as u32 {
-            let slot = slots[place as usize] as usize;
+        for index in starts[vertex] as u32..starts[vertex + 1] as u32 {
+            let slot = slots[index as usize] as usize;
             sum += weights[slot] * grad[slot / 8 * width as usize + f];
         }
         out[ABSOLUTE_POS] = sum;

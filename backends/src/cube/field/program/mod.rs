@@ -2,6 +2,7 @@
 //! activations are written to global memory only where the gradient of weights needs them. The steps are data, so that one kernel serves decoders (behind their
 //! hash signatures) and deformation networks alike. Widths that do not fit the shared memory go layer by layer instead ([`super::layers`]).
 
+mod fields;
 mod steps;
 
 pub use steps::is_vertex;
@@ -11,8 +12,9 @@ use crate::ops::hash::LevelHash;
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
+use fields::{FIELDS, Fields, LOAD, MASK, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, SAVE};
 use std::ops::Range;
-use steps::{BLOCK, Fields, MASK, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, PARTS, SAVE};
+use steps::{BLOCK, PARTS};
 
 /// Rows per workgroup, the more the better: weights are read once per tile.
 const TILES: [usize; 3] = [64, 32, 16];
@@ -67,10 +69,10 @@ impl Step {
             }
         }
     }
-    fn encode(&self) -> [u32; steps::FIELDS] {
+    fn encode(&self) -> [u32; FIELDS] {
         let fields = match *self {
             Self::Load { tile, ref columns, width, at } => {
-                Fields { kind: steps::LOAD, tile, width: columns.len(), at, column: columns.start, stride: width, ..Fields::default() }
+                Fields { kind: LOAD, tile, width: columns.len(), at, column: columns.start, stride: width, ..Fields::default() }
             }
             Self::Multiply { source, target, input, output, weights, bias, relu, add } => {
                 let (target, at) = match target {
