@@ -9,8 +9,10 @@ use glam::{DMat4, DQuat, DVec3};
 
 /// Steps of finite differences in pixels. Short ones drown in rounding where long ones cross a threshold, and the other way round.
 const PIXEL_STEPS: [f64; 3] = [1e-3, 3e-3, 1e-2];
-/// The same for a pose: world units and radians.
-const POSE_STEPS: [f64; 3] = [3e-4, 1e-3, 3e-3];
+/// The same for a pose: world units and radians. A pose moves all Gaussians at once, so thresholds are near and steps are short.
+const POSE_STEPS: [f64; 3] = [2e-5, 5e-5, 1.5e-4];
+/// Gaussians that the camera of a moving pose sees.
+const POSE_COUNT: usize = 4;
 /// Largest difference between a gradient and a finite difference, as a share of the absolute gradient.
 const TOLERANCE: f64 = 0.05;
 
@@ -137,7 +139,7 @@ impl Suite<'_> {
     }
     /// Moving the camera along the gradient of its pose changes the loss by as much as its norm says.
     pub(super) fn camera_probe_is_a_slope(&self) -> Result<Option<String>> {
-        let (host, camera) = (cloud(COUNT), camera());
+        let (host, camera) = (cloud(POSE_COUNT), camera());
         let probed = match self.probed(&host, &camera)? {
             Ok(probed) => probed,
             Err(finding) => return Ok(Some(finding)),
