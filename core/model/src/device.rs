@@ -45,8 +45,22 @@ fn cuda_device() -> Result<Device> {
 use adapter::wgpu_device;
 
 #[cfg(not(feature = "wgpu"))]
-fn wgpu_device(index: usize) -> Result<Device> {
-    Err(Error::unsupported(format!("device wgpu:{index}"), "this build has no wgpu backend", "Build with the feature `wgpu`, or use --device flex"))
+fn wgpu_device(_: usize) -> Result<Device> {
+    Err(Error::unsupported("device wgpu", "this build has no wgpu backend", "Build with the feature `wgpu`, or use --device flex"))
+}
+
+#[cfg(all(test, not(feature = "wgpu")))]
+mod tests {
+    use super::parse_device;
+
+    #[test]
+    fn a_build_for_processors_says_so() {
+        for name in ["wgpu", "wgpu:1"] {
+            let message = parse_device(name).map(|_| ()).expect_err("no wgpu here").to_string();
+            assert!(message.contains("this build has no wgpu backend"), "{message}");
+        }
+        assert!(parse_device("auto").is_ok());
+    }
 }
 
 #[cfg(feature = "wgpu")]

@@ -162,7 +162,8 @@ pub struct RenderWork {
 
 /// Draws Gaussians, differentiably.
 pub trait Rasterizer: Send + Sync {
-    /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn.
+    /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn. Every tensor of `splats` that tracks gradients receives one in the
+    /// backward pass, the probes included; no probe may change the planes or another gradient.
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput>;
 }
 

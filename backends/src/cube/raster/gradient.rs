@@ -227,7 +227,7 @@ pub fn take_columns(from: &[f32], to: &mut [f32], stride: u32, first: u32, width
     }
 }
 
-/// Sums of columns over rows, in order, and of products over pixels: one thread per result, for few results.
+/// Sums of columns over rows, in order: one thread per column, for few columns.
 #[cube(launch)]
 pub fn sum_rows(from: &[f32], to: &mut [f32], rows: u32, stride: u32, first: u32) {
     if ABSOLUTE_POS < to.len() {
