@@ -1,6 +1,6 @@
 //! Combinations of shared functions on the CPU. A frame reads every coefficient once, so memory bandwidth is the limit.
 //!
-//! Outputs are stored head after head, each [M, outputs]; so are coefficients and their gradient, each [M, outputs x functions], as networks write them.
+//! Outputs are stored head after head, each `[M, outputs]`; so are coefficients and their gradient, each `[M, outputs x functions]`, as networks write them.
 
 use super::heads::row_blocks;
 use crate::cpu::simd::vectorized;
@@ -14,7 +14,7 @@ const PARTS: usize = 4;
 /// Rows whose sums are in registers at a time.
 const LANES: usize = 64;
 
-/// How coefficients [M, C] are stored.
+/// How coefficients `[M, C]` are stored.
 pub enum Coefficients<'a> {
     /// Head after head, each row by row.
     Heads(&'a [f32]),
@@ -143,7 +143,7 @@ pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32])
     out
 }
 
-/// The gradient [F] of the functions. Tasks sum over rows of their own; their sums are added in order.
+/// The gradient `[F]` of the functions. Tasks sum over rows of their own; their sums are added in order.
 pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32]) -> Vec<f32> {
     let rows = grad.len() / shape.outputs();
     let mut out = Vec::with_capacity(shape.functions());

@@ -89,7 +89,7 @@ macro_rules! with_dims {
     };
 }
 
-/// Rows of the table and weights of all corners of `points` [M, dims] on one level, each [M, 2^dims]; weight 0 outside the grid. For
+/// Rows of the table and weights of all corners of `points` `[M, dims]` on one level, each `[M, 2^dims]`; weight 0 outside the grid. For
 /// comparisons: the operation stores neither.
 pub fn corners(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64>, Vec<f32>) {
     fn of<const D: usize>(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64>, Vec<f32>) {
@@ -103,7 +103,7 @@ pub fn corners(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64
     with_dims!(shape.dims, D => of::<D>(shape, level, points))
 }
 
-/// Features [M, levels * features] of `points` [M, dims].
+/// Features `[M, levels * features]` of `points` `[M, dims]`.
 pub fn forward(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f32> {
     let (dims, f) = (shape.dims, shape.features);
     let width = shape.levels.len() * f;

@@ -78,7 +78,7 @@ fn copy_padded(to: &mut [f32], row: &[f32]) {
     to[row.len()..].fill(0.0);
 }
 
-/// The loss terms of `image` against `target`, both planar [channels, height, width]. With `gradient` [channels, height, width],
+/// The loss terms of `image` against `target`, both planar `[channels, height, width]`. With `gradient` `[channels, height, width]`,
 /// writes d(lambda_c * l1 + (1 - lambda_c) * (1 - ssim)) / d image there; the derivative of |0| is 0.
 pub fn photometric(
     image: &[f32],
@@ -210,7 +210,7 @@ impl WithSimd for FirstRow<'_> {
 }
 
 /// Vertical blur, the SSIM of the row and, for the gradient, the horizontally blurred derivatives of SSIM with respect to
-/// E[x], E[x^2] and E[xy].
+/// `E[x]`, `E[x^2]` and `E[xy]`.
 struct SecondRow<'a> {
     taps: [&'a [f32]; 11],
     width: usize,
@@ -262,7 +262,7 @@ impl WithSimd for SecondRow<'_> {
     }
 }
 
-/// SSIM from the local moments E[x], E[y], E[x^2 + y^2], E[xy], and its derivatives with respect to E[x], E[x^2], E[xy].
+/// SSIM from the local moments `E[x]`, `E[y]`, `E[x^2 + y^2]`, `E[xy]`, and its derivatives with respect to `E[x]`, `E[x^2]`, `E[xy]`.
 #[inline(always)]
 fn similarity<S: Simd>(mu_x: Lanes<S>, mu_y: Lanes<S>, squares: Lanes<S>, products: Lanes<S>) -> (Lanes<S>, [Lanes<S>; 3]) {
     let mu_product = mu_x * mu_y;

@@ -9,7 +9,7 @@ use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// moves[row] is 1 where the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite.
+/// moves`[row]` is 1 where the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite.
 #[cube(launch)]
 fn rows_that_move(grad: &[f32], visible: &[i32], moves: &mut [u32], skipped: &mut [Atomic<i32>], width: u32, #[comptime] masked: bool) {
     let row = ABSOLUTE_POS;

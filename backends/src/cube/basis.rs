@@ -50,13 +50,13 @@ fn plan(shape: &BasisShape) -> Vec<u32> {
     words
 }
 
-/// The index of an output of a row: head after head, each [rows, outputs].
+/// The index of an output of a row: head after head, each `[rows, outputs]`.
 #[cube]
 fn output_index(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
     (plan[FIELDS * output + BEFORE] * rows) as usize + row * plan[FIELDS * output + OUTPUTS] as usize + plan[FIELDS * output + INDEX] as usize
 }
 
-/// The index of the first coefficient of an output of a row: head after head, each [rows, outputs x functions].
+/// The index of the first coefficient of an output of a row: head after head, each `[rows, outputs x functions]`.
 #[cube]
 fn first_coefficient(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
     let (at, count, within) = (plan[FIELDS * output + COEFFICIENT], plan[FIELDS * output + COUNT], plan[FIELDS * output + INDEX]);
@@ -96,7 +96,7 @@ fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32
     }
 }
 
-/// partial [segments, F].
+/// partial `[segments, F]`.
 #[cube(launch)]
 fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mut [f32], rows: u32, width: u32, functions: u32) {
     if ABSOLUTE_POS < partial.len() {

@@ -16,7 +16,7 @@ fn byte(words: &[u32], at: usize) -> f32 {
     ((words[at / 4] >> ((at % 4) as u32 * 8)) & 255u32) as f32 / 255.0
 }
 
-/// planes [3,H,W] of interleaved bytes.
+/// planes `[3,H,W]` of interleaved bytes.
 #[cube(launch)]
 fn unpack(words: &[u32], background: &[f32], planes: &mut [f32], pixels: u32, #[comptime] channels: usize) {
     let (pixel, plane) = (ABSOLUTE_POS % pixels as usize, ABSOLUTE_POS / pixels as usize);
@@ -36,7 +36,7 @@ fn rounded(value: f32) -> u32 {
     (select(low < 1.0, low, 1.0f32) * 255.0 + 0.5) as u32
 }
 
-/// words [H W] of planes [C,H,W].
+/// words `[H W]` of planes `[C,H,W]`.
 #[cube(launch)]
 fn pack(planes: &[f32], words: &mut [u32]) {
     let pixels = words.len();

@@ -101,7 +101,7 @@ fn corner(points: &[f32], levels: &[u32], point: usize, level: usize, corner: u3
     (levels[at + FIRST_ROW] + row, weight)
 }
 
-/// out [M, levels * features], a thread per number.
+/// out `[M, levels * features]`, a thread per number.
 #[cube(launch)]
 fn look_up(table: &[f32], points: &[f32], levels: &[u32], out: &mut [f32], features: u32, level_count: u32, #[comptime] rules: Rules) {
     if ABSOLUTE_POS < out.len() {

@@ -62,7 +62,7 @@ fn blur_moments_in_rows(x: &[f32], y: &[f32], taps: &[f32], moments: &mut [f32],
     }
 }
 
-/// Vertical blur of the moments; the terms of the loss per workgroup (l1, ssim, mse); d ssim / d (mean x, mean x^2, mean xy) as derivatives [3,3,H,W].
+/// Vertical blur of the moments; the terms of the loss per workgroup (l1, ssim, mse); d ssim / d (mean x, mean x^2, mean xy) as derivatives `[3,3,H,W]`.
 #[cube(launch)]
 fn ssim_and_derivatives(
     x: &[f32],
@@ -139,7 +139,7 @@ fn ssim_and_derivatives(
     }
 }
 
-/// Adds up the terms of all workgroups, in order, with compensation for rounding (Kahan); numbers = [loss, l1, ssim, mse].
+/// Adds up the terms of all workgroups, in order, with compensation for rounding (Kahan); numbers = `[loss, l1, ssim, mse]`.
 #[cube(launch)]
 fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], workgroups: u32, scale: f32, lambda_c: f32) {
     let mut means = Shared::<[f32]>::new_slice(3usize);
@@ -161,7 +161,7 @@ fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], workgroups
     }
 }
 
-/// Horizontal blur of the derivatives [9,H,W].
+/// Horizontal blur of the derivatives `[9,H,W]`.
 #[cube(launch)]
 fn blur_derivatives_in_rows(from: &[f32], taps: &[f32], to: &mut [f32], width: u32) {
     let at = ABSOLUTE_POS as u32;
@@ -178,7 +178,7 @@ fn blur_derivatives_in_rows(from: &[f32], taps: &[f32], to: &mut [f32], width: u
     }
 }
 
-/// Vertical blur of the derivatives and the gradient of the loss [C,H,W]; planes beyond the third get 0.
+/// Vertical blur of the derivatives and the gradient of the loss `[C,H,W]`; planes beyond the third get 0.
 #[cube(launch)]
 fn gradient_of_planes(x: &[f32], y: &[f32], taps: &[f32], derivatives: &[f32], grad: &mut [f32], width: u32, pixels: u32, l1_scale: f32, ssim_scale: f32) {
     let at = ABSOLUTE_POS as u32;

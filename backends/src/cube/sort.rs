@@ -16,7 +16,7 @@ const MASK: u32 = (1 << DIGIT) - 1;
 const ROUNDS: u32 = 4;
 const BLOCK: u32 = ROUNDS * THREADS;
 
-/// Inclusive prefix sum over the threads of a workgroup: running[thread] becomes the sum of the values of all threads up to it.
+/// Inclusive prefix sum over the threads of a workgroup: running`[thread]` becomes the sum of the values of all threads up to it.
 #[cube]
 fn add_up(running: &mut Shared<[u32]>, value: u32) {
     let thread = UNIT_POS as usize;
@@ -35,7 +35,7 @@ fn add_up(running: &mut Shared<[u32]>, value: u32) {
     }
 }
 
-/// values[i] becomes the sum of those before it within its workgroup; `sums` gets the workgroups' totals.
+/// values`[i]` becomes the sum of those before it within its workgroup; `sums` gets the workgroups' totals.
 #[cube(launch)]
 fn scan_in_workgroups(values: &mut [u32], sums: &mut [u32], count: u32) {
     let mut running = Shared::<[u32]>::new_slice(THREADS as usize);
@@ -89,7 +89,7 @@ fn add_sums(values: &mut [u32], sums: &[u32], count: u32) {
 }
 
 /// Replaces each of the first `count` values (at least one) by the sum of those before it within its workgroup; returns the sums before each workgroup and
-/// the sum of all [1].
+/// the sum of all `[1]`.
 fn sums_in_two(values: &CubeTensor, count: usize) -> (CubeTensor, CubeTensor) {
     let client = values.client.clone();
     let workgroups = count.div_ceil(THREADS as usize);
@@ -100,7 +100,7 @@ fn sums_in_two(values: &CubeTensor, count: usize) -> (CubeTensor, CubeTensor) {
     (sums, total)
 }
 
-/// Replaces each of the first `count` values by the sum of those before it; returns the sum of all [1].
+/// Replaces each of the first `count` values by the sum of those before it; returns the sum of all `[1]`.
 pub fn exclusive_sums(values: &CubeTensor, count: usize) -> CubeTensor {
     if count == 0 {
         return upload(values, &[0u32], DType::U32);
@@ -198,7 +198,7 @@ fn move_by_digit(
     }
 }
 
-/// `keys` and `values` [count] in ascending order of the lowest `bits` of the keys; equal keys keep their order.
+/// `keys` and `values` `[count]` in ascending order of the lowest `bits` of the keys; equal keys keep their order.
 pub fn sort_pairs(keys: CubeTensor, values: CubeTensor, count: usize, bits: u32) -> (CubeTensor, CubeTensor) {
     let (mut keys, mut values) = (keys, values);
     if count < 2 {

@@ -59,7 +59,7 @@ pub struct AdamStep<const D: usize> {
     pub m: Tensor<D>,
     /// Second moment.
     pub v: Tensor<D>,
-    /// Rows that were skipped because their gradient was not finite [1], on the device.
+    /// Rows that were skipped because their gradient was not finite `[1]`, on the device.
     pub skipped_rows: Tensor<1, Int>,
 }
 

@@ -55,7 +55,7 @@ pub trait BasisBackward: Backend {
 /// The operation per device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait BasisOps: Backend {
-    /// Flat outputs, head after head, each [M, outputs], of coefficients [M, C] and functions [F]; differentiable in both.
+    /// Flat outputs, head after head, each `[M, outputs]`, of coefficients `[M, C]` and functions `[F]`; differentiable in both.
     fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self>;
 }
 
@@ -109,9 +109,9 @@ impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B
     }
 }
 
-/// One output [M, width] per group of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` [F].
+/// One output `[M, width]` per group of `coefficients` [M, [`BasisShape::coefficients`]] at the moment at which the functions are `functions` `[F]`.
 ///
-/// In memory, coefficients are stored group after group, each [M, width x functions], as [`super::field::mlp_relu_flat`] returns them. Stored
+/// In memory, coefficients are stored group after group, each `[M, width x functions]`, as [`super::field::mlp_relu_flat`] returns them. Stored
 /// [`by_columns`] they are read faster, but have no gradient.
 pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Vec<Tensor<2>>> {
     let ([m, width], [count]) = (coefficients.dims(), functions.dims());
@@ -123,7 +123,7 @@ pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisS
     Ok(split_heads(&flat, m, &shape.widths()))
 }
 
-/// The same coefficients [M, C] column by column in memory, for playback.
+/// The same coefficients `[M, C]` column by column in memory, for playback.
 pub fn by_columns(coefficients: Tensor<2>, shape: &BasisShape) -> Tensor<2> {
     let [m, c] = coefficients.dims();
     if m == 0 {

@@ -24,24 +24,24 @@ pub struct GridBox {
 /// What the first half leaves for the second.
 #[derive(Clone, Debug, ExtensionType)]
 pub struct CornersBegun<B: Backend> {
-    /// Trilinear weights [8M].
+    /// Trilinear weights `[8M]`.
     pub weights: FloatTensor<B>,
-    /// The (point, corner) slots grouped by vertex [8M].
+    /// The (point, corner) slots grouped by vertex `[8M]`.
     pub slots: IntTensor<B>,
-    /// Vertices [U,3] where they are listed already; keys of the slots' vertices in order [8M] elsewhere.
+    /// Vertices `[U,3]` where they are listed already; keys of the slots' vertices in order `[8M]` elsewhere.
     pub vertices: IntTensor<B>,
-    /// Where each vertex's slots start [U+1]; elsewhere how many vertices come before each slot [8M].
+    /// Where each vertex's slots start `[U+1]`; elsewhere how many vertices come before each slot `[8M]`.
     pub starts: IntTensor<B>,
-    /// The vertex of each corner [8M]; elsewhere nothing of use.
+    /// The vertex of each corner `[8M]`; elsewhere nothing of use.
     pub corners: IntTensor<B>,
-    /// The number of vertices U [1].
+    /// The number of vertices U `[1]`.
     pub count: IntTensor<B>,
 }
 
 /// Finding corners has no gradient: the field of CC-4DGS is not differentiated with respect to the canonical centres.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
 pub trait CornerOps: Backend {
-    /// Finds and groups the corners of points [M,3].
+    /// Finds and groups the corners of points `[M,3]`.
     fn begin_corners(points: FloatTensor<Self>, grid: GridBox, reuse: bool) -> CornersBegun<Self>;
     /// `(vertices [U,3], starts [U+1], corners [8M])`, see [`VoxelCorners`], with a capacity of `capacity` vertices where their number is not known.
     fn list_corners(
@@ -93,20 +93,20 @@ const MOST_UNCOUNTED: usize = 1 << 20;
 /// The grid corners of M points on one level.
 #[derive(Clone, Debug)]
 pub struct VoxelCorners {
-    /// Vertices to decode [U,3], integer coordinates in 0..=resolution; -1 in rows past the last vertex, where they were not counted.
+    /// Vertices to decode `[U,3]`, integer coordinates in 0..=resolution; -1 in rows past the last vertex, where they were not counted.
     pub vertices: Tensor<2, Int>,
-    /// Per point and corner, the row of its vertex [8M].
+    /// Per point and corner, the row of its vertex `[8M]`.
     pub corners: Tensor<1, Int>,
-    /// Per point and corner, its trilinear weight [8M].
+    /// Per point and corner, its trilinear weight `[8M]`.
     pub weights: Tensor<1>,
-    /// The (point, corner) slots grouped by vertex [8M].
+    /// The (point, corner) slots grouped by vertex `[8M]`.
     pub slots: Tensor<1, Int>,
-    /// Where each vertex's slots start [U+1].
+    /// Where each vertex's slots start `[U+1]`.
     pub starts: Tensor<1, Int>,
 }
 
 impl VoxelCorners {
-    /// Finds the corners of `points` [M,3], world units, on every one of `grids`. Points outside a box are moved to its nearest face. With `reuse`, corners
+    /// Finds the corners of `points` `[M,3]`, world units, on every one of `grids`. Points outside a box are moved to its nearest face. With `reuse`, corners
     /// at the same position share a vertex (CC-4DGS, Section IV-C); without, every corner has its own. No gradient flows to the points. With `counted`, the
     /// counts are read back once and U is the number of vertices; without, U may be larger on devices with memory of their own, up to a million.
     pub fn find(points: Tensor<2>, grids: &[GridBox], reuse: bool, counted: bool) -> Result<Vec<Self>> {

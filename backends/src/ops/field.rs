@@ -31,7 +31,7 @@ pub struct Decoder {
 pub trait FieldKernels: Backend {
     /// The gradient of the decoder's weights.
     fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self>;
-    /// The gradient [U, F] of the features.
+    /// The gradient `[U, F]` of the features.
     fn trilinear_backward(grad: FloatTensor<Self>, weights: FloatTensor<Self>, slots: IntTensor<Self>, starts: IntTensor<Self>) -> FloatTensor<Self>;
     /// The gradients of the input (if `wants_input`) and the weights.
     fn network_backward(
@@ -46,9 +46,9 @@ pub trait FieldKernels: Backend {
 /// The differentiable operations of this module per device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait FieldOps: Backend {
-    /// Features [U, F] of vertices [U, 3]; differentiable in the weights.
+    /// Features `[U, F]` of vertices `[U, 3]`; differentiable in the weights.
     fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self>;
-    /// Interpolated features [M, F]; differentiable in the features.
+    /// Interpolated features `[M, F]`; differentiable in the features.
     fn trilinear(
         features: FloatTensor<Self>,
         corners: IntTensor<Self>,
@@ -56,7 +56,7 @@ pub trait FieldOps: Backend {
         slots: IntTensor<Self>,
         starts: IntTensor<Self>,
     ) -> FloatTensor<Self>;
-    /// Flat outputs of the network for x [M, in]; differentiable in both.
+    /// Flat outputs of the network for x `[M, in]`; differentiable in both.
     fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self>;
 }
 
@@ -186,7 +186,7 @@ impl<B: FieldKernels + FieldOps, C: CheckpointStrategy> FieldOps for Autodiff<B,
 }
 
 impl VoxelCorners {
-    /// Features [U,F] of the vertices: hash signature, then the decoder's network. `weights` is flat in the order of [`crate::cpu::mlp::mish`];
+    /// Features `[U,F]` of the vertices: hash signature, then the decoder's network. `weights` is flat in the order of [`crate::cpu::mlp::mish`];
     /// the gradient goes to it alone.
     pub fn decode(&self, weights: Tensor<1>, decoder: &Arc<Decoder>) -> Result<Tensor<2>> {
         check_weights("decoder", weights.dims()[0], decoder.shape.parameter_count())?;
@@ -195,7 +195,7 @@ impl VoxelCorners {
         }
         Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::decode(weights.into_dispatch(), self.vertices.clone().into_dispatch(), decoder.clone())))
     }
-    /// Trilinear interpolation of vertex `features` [U,F] at the points [M,F].
+    /// Trilinear interpolation of vertex `features` `[U,F]` at the points `[M,F]`.
     pub fn interpolate(&self, features: Tensor<2>) -> Result<Tensor<2>> {
         let ([u, _], [vertices, _]) = (features.dims(), self.vertices.dims());
         if u != vertices {
@@ -206,7 +206,7 @@ impl VoxelCorners {
     }
 }
 
-/// Runs a trunk-and-heads ReLU network over `x` [M,in]; one output [M,width] per head (or the trunk's). `weights` is flat in the order of
+/// Runs a trunk-and-heads ReLU network over `x` `[M,in]`; one output `[M,width]` per head (or the trunk's). `weights` is flat in the order of
 /// [`crate::cpu::mlp::relu`].
 pub fn mlp_relu(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Result<Vec<Tensor<2>>> {
     let [m, _] = x.dims();
@@ -223,7 +223,7 @@ pub fn mlp_relu_flat(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -
     Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone())))
 }
 
-/// The heads [rows, width] of a flat array that holds one after the other.
+/// The heads `[rows, width]` of a flat array that holds one after the other.
 pub(super) fn split_heads(flat: &Tensor<1>, rows: usize, widths: &[usize]) -> Vec<Tensor<2>> {
     if let [only] = widths {
         return vec![flat.clone().reshape([rows, *only])];

@@ -10,9 +10,9 @@ pub const P: u64 = (1 << 31) - 1;
 /// The hash functions of one level.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LevelHash {
-    /// Columns of A [3][k], each entry in 1..P.
+    /// Columns of A [3]`[k]`, each entry in 1..P.
     pub(crate) a: [Vec<u32>; 3],
-    /// b [k], each entry in 0..P.
+    /// b `[k]`, each entry in 0..P.
     pub(crate) b: Vec<u32>,
     /// m.
     pub(crate) modulus: u32,
@@ -51,7 +51,7 @@ impl LevelHash {
     pub fn len(&self) -> usize {
         self.b.len()
     }
-    /// A's three rows [k] each, then b [k]: the constants as other devices read them.
+    /// A's three rows `[k]` each, then b [k]: the constants as other devices read them.
     pub(crate) fn constants(&self) -> Vec<u32> {
         self.a.iter().chain([&self.b]).flatten().copied().collect()
     }

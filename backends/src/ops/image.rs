@@ -10,9 +10,9 @@ use std::sync::Arc;
 /// The operation per device; `like` only says which.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
 pub trait ImageOps: Backend {
-    /// Planes [3,H,W] of an image, alpha composited over a background.
+    /// Planes `[3,H,W]` of an image, alpha composited over a background.
     fn planes(like: FloatTensor<Self>, image: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self>;
-    /// Red, green and blue of planes [C,H,W] (C > 2) as words [H W] of four bytes, red lowest, the highest 255.
+    /// Red, green and blue of planes `[C,H,W]` (C > 2) as words `[H W]` of four bytes, red lowest, the highest 255.
     fn words(planes: FloatTensor<Self>) -> IntTensor<Self>;
 }
 
@@ -28,13 +28,13 @@ impl<B: CpuBackend> ImageOps for B {
     }
 }
 
-/// Planes [3,H,W] in 0..1 of `image` on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
+/// Planes `[3,H,W]` in 0..1 of `image` on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
 pub fn image_planes(image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
     let like = Tensor::<1>::zeros([1], &device.clone().without_autodiff());
     Tensor::from_dispatch(<Dispatch as ImageOps>::planes(like.into_dispatch(), image.clone(), background))
 }
 
-/// The 8-bit RGB image of planes [C,H,W] (red, green and blue first). Values are rounded on the device, so that a quarter of the bytes is read back; the same
+/// The 8-bit RGB image of planes `[C,H,W]` (red, green and blue first). Values are rounded on the device, so that a quarter of the bytes is read back; the same
 /// rule as [`Image8::from_planes`].
 pub fn read_image(planes: Tensor<3>) -> Result<Image8> {
     let [channels, height, width] = planes.dims();

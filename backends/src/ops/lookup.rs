@@ -100,7 +100,7 @@ pub trait LookupBackward: Backend {
 /// The operation per device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait LookupOps: Backend {
-    /// Features [M, width] of points [M, dims]; differentiable in the flat table.
+    /// Features `[M, width]` of points `[M, dims]`; differentiable in the flat table.
     fn lookup(table: FloatTensor<Self>, points: FloatTensor<Self>, shape: Arc<GridShape>) -> FloatTensor<Self>;
 }
 
@@ -137,7 +137,7 @@ impl<B: LookupBackward + LookupOps, C: CheckpointStrategy> LookupOps for Autodif
     }
 }
 
-/// Features [M, width] of `points` [M, dims] (in 0..1 inside the grid) from a flat `table` of [`GridShape::parameter_count`] weights.
+/// Features `[M, width]` of `points` `[M, dims]` (in 0..1 inside the grid) from a flat `table` of [`GridShape::parameter_count`] weights.
 pub fn lookup(table: Tensor<1>, points: Tensor<2>, shape: &Arc<GridShape>) -> Result<Tensor<2>> {
     let [m, dims] = points.dims();
     let bad = |problem: String, remedy: &str| Err(Error::parameter("grid lookup", problem, remedy));

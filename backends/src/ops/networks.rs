@@ -97,13 +97,13 @@ pub struct MishLayer {
     pub input: usize,
     /// Output width.
     pub output: usize,
-    /// W [input, output].
+    /// W `[input, output]`.
     pub weight: Range<usize>,
-    /// b [output].
+    /// b `[output]`.
     pub bias: Range<usize>,
-    /// LayerNorm gain [output]; `None` for the output layer, which has no norm and no activation.
+    /// LayerNorm gain `[output]`; `None` for the output layer, which has no norm and no activation.
     pub gain: Option<Range<usize>>,
-    /// LayerNorm shift [output].
+    /// LayerNorm shift `[output]`.
     pub shift: Option<Range<usize>>,
 }
 

@@ -22,16 +22,16 @@ pub trait PhotometricKernels: Backend {
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
     /// `(loss [1], gradient)` of the first plane of `planes` as logits; the gradient has the shape of `planes`, or is empty without `gradient`.
     fn bce_pass(planes: FloatTensor<Self>, mask: FloatTensor<Self>, gradient: bool) -> (FloatTensor<Self>, FloatTensor<Self>);
-    /// `gradient` times the number in `upstream` [1].
+    /// `gradient` times the number in `upstream` `[1]`.
     fn scale_by(gradient: FloatTensor<Self>, upstream: FloatTensor<Self>) -> FloatTensor<Self>;
 }
 
 /// The operations of this module per device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait PhotometricOps: Backend {
-    /// Loss [1] and terms [3] (l1, ssim, mse; without gradient) of the first three of `planes` [C,H,W] against `target` [3,H,W].
+    /// Loss `[1]` and terms `[3]` (l1, ssim, mse; without gradient) of the first three of `planes` `[C,H,W]` against `target` `[3,H,W]`.
     fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>);
-    /// Mean binary cross-entropy [1] of the first of `planes` [C,H,W] as logits against `mask` [H,W].
+    /// Mean binary cross-entropy `[1]` of the first of `planes` `[C,H,W]` as logits against `mask` `[H,W]`.
     fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self>;
 }
 
@@ -111,9 +111,9 @@ impl<B: PhotometricKernels + PhotometricOps, C: CheckpointStrategy> PhotometricO
 /// A photometric loss and what it is made of.
 #[derive(Clone, Debug)]
 pub struct PhotometricLoss {
-    /// lambda_c * L1 + (1 - lambda_c) * (1 - SSIM) [1]; carries the gradient to the planes.
+    /// lambda_c * L1 + (1 - lambda_c) * (1 - SSIM) `[1]`; carries the gradient to the planes.
     pub loss: Tensor<1>,
-    /// Mean absolute difference, mean SSIM, mean squared difference [3]; no gradient; on the device until [`PhotometricLoss::numbers`] reads them.
+    /// Mean absolute difference, mean SSIM, mean squared difference `[3]`; no gradient; on the device until [`PhotometricLoss::numbers`] reads them.
     pub terms: Tensor<1>,
 }
 
@@ -146,7 +146,7 @@ impl PhotometricLoss {
 }
 
 /// The loss of 3DGS and of CC-4DGS (Section IV-E): lambda_c * L1 + (1 - lambda_c) * (1 - SSIM), SSIM with an 11x11 Gaussian window
-/// of sigma 1.5 and zero padding. Reads the first three of `planes` [C>=3,H,W]; the gradient of the others is zero. `target` is [3,H,W].
+/// of sigma 1.5 and zero padding. Reads the first three of `planes` [C>=3,H,W]; the gradient of the others is zero. `target` is `[3,H,W]`.
 pub fn photometric_loss(planes: Tensor<3>, target: Tensor<3>, lambda_c: f32) -> Result<PhotometricLoss> {
     let ([c, h, w], [tc, th, tw]) = (planes.dims(), target.dims());
     if c < 3 || [tc, th, tw] != [3, h, w] {
@@ -163,7 +163,7 @@ pub fn photometric_loss(planes: Tensor<3>, target: Tensor<3>, lambda_c: f32) -> 
     Ok(PhotometricLoss { loss: Tensor::from_dispatch(loss), terms: Tensor::<1>::from_dispatch(terms).inner() })
 }
 
-/// Mean binary cross-entropy of the first of `planes` [C>=1,H,W] as logits against `mask` [H,W] in 0..1: the score stage's loss. The gradient of
+/// Mean binary cross-entropy of the first of `planes` [C>=1,H,W] as logits against `mask` `[H,W]` in 0..1: the score stage's loss. The gradient of
 /// the other planes is zero.
 pub fn bce_with_logits_loss(planes: Tensor<3>, mask: Tensor<2>) -> Result<Tensor<1>> {
     let ([c, h, w], [mh, mw]) = (planes.dims(), mask.dims());

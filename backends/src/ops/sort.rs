@@ -10,7 +10,7 @@ use cc4dgs_core::{Error, Result};
 /// The operation per device.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
 pub trait SortOps: Backend {
-    /// Indices of `keys` [N] in ascending order of their lowest `bits` bits.
+    /// Indices of `keys` `[N]` in ascending order of their lowest `bits` bits.
     fn order(keys: IntTensor<Self>, bits: u32) -> IntTensor<Self>;
 }
 
@@ -24,7 +24,7 @@ impl<B: CpuBackend> SortOps for B {
     }
 }
 
-/// The indices of `keys` [N] in ascending order of their lowest `bits` bits (1 to 32), equal ones in their own order. Keys are taken as unsigned 32-bit numbers.
+/// The indices of `keys` `[N]` in ascending order of their lowest `bits` bits (1 to 32), equal ones in their own order. Keys are taken as unsigned 32-bit numbers.
 pub fn sort_order(keys: Tensor<1, Int>, bits: u32) -> Result<Tensor<1, Int>> {
     if !(1..=32).contains(&bits) {
         return Err(Error::parameter("sort", format!("{bits} bits"), "Choose 1 to 32"));

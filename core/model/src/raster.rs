@@ -35,38 +35,38 @@ pub enum ParameterSpace {
 pub enum SplatColors {
     /// Spherical harmonics seen from the camera: max(0, SH(direction) + 0.5).
     Sh {
-        /// Degree 0 [N,3].
+        /// Degree 0 `[N,3]`.
         dc: Tensor<2>,
-        /// Degree 1 and up [N,K,3]; K may exceed what `degree` uses.
+        /// Degree 1 and up `[N,K,3]`; K may exceed what `degree` uses.
         rest: Tensor<3>,
         /// The degree evaluated now.
         degree: usize,
     },
-    /// Three numbers blended as they are [N,3] (dynamic scores, labels).
+    /// Three numbers blended as they are `[N,3]` (dynamic scores, labels).
     Direct(Tensor<2>),
 }
 
 /// Inputs of one render. Any tensor may carry a gradient.
 #[derive(Clone, Debug)]
 pub struct Splats {
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: Tensor<2>,
-    /// Log-scales, or scales when `space` is activated [N,3].
+    /// Log-scales, or scales when `space` is activated `[N,3]`.
     pub scales: Tensor<2>,
-    /// Quaternions (w,x,y,z), normalised by the rasterizer [N,4].
+    /// Quaternions (w,x,y,z), normalised by the rasterizer `[N,4]`.
     pub quaternions: Tensor<2>,
-    /// Opacity logits, or opacities when `space` is activated [N].
+    /// Opacity logits, or opacities when `space` is activated `[N]`.
     pub opacities: Tensor<1>,
     /// Colours.
     pub colors: SplatColors,
     /// Raw or activated.
     pub space: ParameterSpace,
-    /// A tensor of zeros [N,2] whose gradient becomes d loss / d projected centre in pixels (densification reads it).
+    /// A tensor of zeros `[N,2]` whose gradient becomes d loss / d projected centre in pixels (densification reads it).
     pub screen_probe: Option<Tensor<2>>,
-    /// A tensor of zeros [N,2] whose gradient becomes, per axis, the sum over pixels of the absolute value of each pixel's share in the gradient of
+    /// A tensor of zeros `[N,2]` whose gradient becomes, per axis, the sum over pixels of the absolute value of each pixel's share in the gradient of
     /// `screen_probe` (AbsGS, Ye et al. 2024). Computed only where it is given.
     pub absolute_screen_probe: Option<Tensor<2>>,
-    /// A tensor of zeros [4,4] whose gradient becomes d loss / d world_to_camera.
+    /// A tensor of zeros `[4,4]` whose gradient becomes d loss / d world_to_camera.
     pub camera_probe: Option<Tensor<2>>,
 }
 
@@ -96,7 +96,7 @@ pub struct RenderSettings {
     pub antialiased: bool,
     /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
     pub near: Option<f32>,
-    /// Colour behind everything, linear RGB in 0..1 [3]; may carry a gradient. `None` is black.
+    /// Colour behind everything, linear RGB in 0..1 `[3]`; may carry a gradient. `None` is black.
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
@@ -122,15 +122,15 @@ pub struct RenderOutput {
 }
 
 impl RenderOutput {
-    /// Red, green, blue [3,H,W].
+    /// Red, green, blue `[3,H,W]`.
     pub fn image(&self) -> Tensor<3> {
         self.planes.clone().narrow(0, 0, 3)
     }
-    /// Coverage [1,H,W].
+    /// Coverage `[1,H,W]`.
     pub fn alpha(&self) -> Tensor<3> {
         self.planes.clone().narrow(0, 3, 1)
     }
-    /// Accumulated depth in world units [1,H,W].
+    /// Accumulated depth in world units `[1,H,W]`.
     pub fn depth(&self) -> Tensor<3> {
         self.planes.clone().narrow(0, 4, 1)
     }
@@ -139,11 +139,11 @@ impl RenderOutput {
 /// Statistics of one render.
 #[derive(Clone, Debug)]
 pub struct RenderStats {
-    /// Screen radius in pixels; 0 where the Gaussian was culled [N].
+    /// Screen radius in pixels; 0 where the Gaussian was culled `[N]`.
     pub radii: Tensor<1, Int>,
-    /// Largest blending weight of each Gaussian over the image [N], if [`RenderSettings::max_weights`] is set.
+    /// Largest blending weight of each Gaussian over the image `[N]`, if [`RenderSettings::max_weights`] is set.
     pub max_weights: Option<Tensor<1>>,
-    /// Number of (Gaussian, tile) pairs [1], still on the device; `None` if a rasterizer has no tiles.
+    /// Number of (Gaussian, tile) pairs `[1]`, still on the device; `None` if a rasterizer has no tiles.
     pub pair_count: Option<Tensor<1, Int>>,
     /// Counts of work done.
     pub work: RenderWork,

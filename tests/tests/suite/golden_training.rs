@@ -41,7 +41,7 @@ fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
     t.into_data().try_to_vec::<f32>().expect("float32")
 }
 
-/// [H, W, C] of a fixture to planes [C, H, W].
+/// `[H, W, C]` of a fixture to planes `[C, H, W]`.
 fn planes(fixture: &Fixture, name: &str) -> ([usize; 3], Vec<f64>) {
     let (shape, data) = &fixture[name];
     let (h, w, c) = (shape[0], shape[1], shape[2]);

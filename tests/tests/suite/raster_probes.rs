@@ -7,7 +7,7 @@ use cc4dgs_backends::rasterizers::reference::ReferenceRasterizer;
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::{Camera, Gaussians, HostGaussians, Rasterizer, RenderSettings, Seed, Splats};
 
-/// Signed and absolute gradients of the projected centres [N,2], and all other gradients, for random weights of the planes.
+/// Signed and absolute gradients of the projected centres `[N,2]`, and all other gradients, for random weights of the planes.
 fn screen_gradients(rasterizer: &dyn Rasterizer, device: &Device, host: &HostGaussians, camera: &Camera, absolute: bool) -> [Vec<f32>; 3] {
     let tracked = device.clone().autodiff();
     let n = host.opacity_logits.len();

@@ -69,7 +69,7 @@ fn row_sum(row: &[f32]) -> f32 {
     lanes[0] + rest
 }
 
-/// Normalises each row of `z` [rows, n] to zero mean and unit (biased) variance in place; `inverse_std` [rows] receives the scales.
+/// Normalises each row of `z` `[rows, n]` to zero mean and unit (biased) variance in place; `inverse_std` `[rows]` receives the scales.
 #[inline(always)]
 pub fn normalize_rows(z: &mut [f32], n: usize, inverse_std: &mut [f32], work: &mut [f32]) {
     let work = &mut work[..n];
@@ -99,8 +99,8 @@ pub fn affine_mish_rows(out: &mut [f32], normalized: &[f32], gain: &[f32], shift
     }
 }
 
-/// Backward of [`normalize_rows`] and [`affine_mish_rows`] together. `grad` [rows, n] holds d loss / d out and becomes
-/// d loss / d (input of the normalisation); `grad_gain` and `grad_shift` [n] are added to.
+/// Backward of [`normalize_rows`] and [`affine_mish_rows`] together. `grad` `[rows, n]` holds d loss / d out and becomes
+/// d loss / d (input of the normalisation); `grad_gain` and `grad_shift` `[n]` are added to.
 #[inline(always)]
 pub fn affine_mish_backward(
     grad: &mut [f32],
@@ -119,7 +119,7 @@ pub fn affine_mish_backward(
     layer_norm_backward(grad, normalized, inverse_std, gain, (grad_gain, grad_shift), work);
 }
 
-/// Backward of LayerNorm: `grad` [rows, n] holds d loss / d (normalized * gain + shift) and becomes d loss / d input.
+/// Backward of LayerNorm: `grad` `[rows, n]` holds d loss / d (normalized * gain + shift) and becomes d loss / d input.
 #[inline(always)]
 pub fn layer_norm_backward(
     grad: &mut [f32],

@@ -1,6 +1,6 @@
 //! The hash-feature decoder's network: (Linear, LayerNorm, Mish) for each hidden layer, then Linear (CC-4DGS, Section IV-B).
 //!
-//! Weights are one flat array. Per hidden layer: W [in, out] row-major (y = x W + b), b [out], LayerNorm gain [out], shift [out]; then W and b
+//! Weights are one flat array. Per hidden layer: W `[in, out]` row-major (y = x W + b), b `[out]`, LayerNorm gain `[out]`, shift `[out]`; then W and b
 //! of the output layer. Rows are processed in blocks of a fixed, padded size, so that the result of a row does not depend on which rows
 //! it is computed with.
 
@@ -64,7 +64,7 @@ impl Block {
     }
 }
 
-/// The outputs [rows, output] of the network for `count` rows.
+/// The outputs `[rows, output]` of the network for `count` rows.
 pub fn forward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource) -> Vec<f32> {
     let layers = shape.layers();
     let mut out = vec![0.0f32; count * shape.output];
@@ -79,7 +79,7 @@ pub fn forward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSourc
     out
 }
 
-/// The gradient of the weights given `grad` [rows, output], and, if `input_grad` [rows, input] is given, the gradient of the inputs.
+/// The gradient of the weights given `grad` `[rows, output]`, and, if `input_grad` `[rows, input]` is given, the gradient of the inputs.
 /// Activations are recomputed instead of saved: at these widths that is cheaper than writing and reading them.
 pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource, grad: &[f32], input_grad: Option<&mut [f32]>) -> Vec<f32> {
     let layers = shape.layers();

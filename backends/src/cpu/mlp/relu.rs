@@ -1,8 +1,8 @@
 //! A trunk of Linear + ReLU layers that feeds any number of heads, each Linear (ReLU, Linear)* with no activation at its end
 //! (CC-4DGS, Section IV-B: the deformation network). A plain network is a trunk without heads or one head without a trunk.
 //!
-//! Weights are one flat array: per layer W [in, out] row-major (y = x W + b), then b [out]; the trunk first, then head by head.
-//! The outputs are one flat array too, head after head, each [rows, width]; without heads, the trunk's output.
+//! Weights are one flat array: per layer W `[in, out]` row-major (y = x W + b), then b `[out]`; the trunk first, then head by head.
+//! The outputs are one flat array too, head after head, each `[rows, width]`; without heads, the trunk's output.
 
 use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, transposed};
 use super::{blocks_per_run, sum_in_order};
@@ -29,7 +29,7 @@ fn relu_backward(grad: &mut [f32], output: &[f32]) {
     }
 }
 
-/// The outputs of all layers for one block of `x` [count, input].
+/// The outputs of all layers for one block of `x` `[count, input]`.
 fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, outputs: &mut [Scratch]) {
     for (i, layer) in layers.iter().enumerate() {
         let (before, rest) = outputs.split_at_mut(i);
@@ -46,7 +46,7 @@ fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, out
     }
 }
 
-/// The flat outputs for `x` [rows, input].
+/// The flat outputs for `x` `[rows, input]`.
 pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
     let layers = shape.layers();
     let count = x.len() / shape.input.max(1);

@@ -24,7 +24,7 @@ pub fn column_centers(origin_x: usize) -> [f32; TILE] {
     std::array::from_fn(|x| (origin_x + x) as f32 + 0.5)
 }
 
-/// Blends every tile into `planes` [5,H,W] and saves what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
+/// Blends every tile into `planes` `[5,H,W]` and saves what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
 pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, planes: &mut [f32]) -> u64 {
     let tiles_x = settings.width.div_ceil(TILE);
     let tiles = tiles_x * settings.height.div_ceil(TILE);

@@ -12,7 +12,7 @@ use super::{RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
 use crate::cpu::simd::{Lanes, dispatch, each, prefetch};
 use pulp::{Simd, WithSimd};
 
-/// Fills the gradient records of all pairs from `upstream` [5,H,W]; with `absolute`, also the sums of absolute gradients of the centres.
+/// Fills the gradient records of all pairs from `upstream` `[5,H,W]`; with `absolute`, also the sums of absolute gradients of the centres.
 pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32], absolute: bool) {
     let rules = RuleConstants::new(settings);
     let tiles_x = settings.width.div_ceil(TILE);

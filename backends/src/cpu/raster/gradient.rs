@@ -14,25 +14,25 @@ use std::mem::MaybeUninit;
 /// The gradients in a [`GradientRequest`]; the others are empty.
 #[derive(Clone, Debug, Default)]
 pub struct Gradients {
-    /// [N,3]
+    /// `[N,3]`
     pub means: Vec<f32>,
-    /// [N,3]
+    /// `[N,3]`
     pub scales: Vec<f32>,
-    /// [N,4]
+    /// `[N,4]`
     pub quaternions: Vec<f32>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<f32>,
-    /// [N,3]
+    /// `[N,3]`
     pub colors: Vec<f32>,
-    /// [N,K,3]
+    /// `[N,K,3]`
     pub sh_rest: Vec<f32>,
-    /// [N,2]
+    /// `[N,2]`
     pub screen: Vec<f32>,
-    /// [N,2]
+    /// `[N,2]`
     pub absolute_screen: Vec<f32>,
-    /// [4,4]
+    /// `[4,4]`
     pub camera: Vec<f32>,
-    /// [3]
+    /// `[3]`
     pub background: Vec<f32>,
 }
 

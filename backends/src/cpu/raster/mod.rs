@@ -29,17 +29,17 @@ use cc4dgs_core::RenderWork;
 /// The arrays of N Gaussians, row-major.
 #[derive(Clone, Copy, Debug)]
 pub struct SplatArrays<'a> {
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: &'a [f32],
-    /// Log-scales or scales [N,3].
+    /// Log-scales or scales `[N,3]`.
     pub scales: &'a [f32],
-    /// Raw quaternions (w,x,y,z) [N,4].
+    /// Raw quaternions (w,x,y,z) `[N,4]`.
     pub quaternions: &'a [f32],
-    /// Logits or opacities [N].
+    /// Logits or opacities `[N]`.
     pub opacities: &'a [f32],
-    /// Degree-0 coefficients, or colours [N,3].
+    /// Degree-0 coefficients, or colours `[N,3]`.
     pub colors: &'a [f32],
-    /// Higher coefficients [N,K,3].
+    /// Higher coefficients `[N,K,3]`.
     pub sh_rest: &'a [f32],
     /// Colour behind everything.
     pub background: [f32; 3],
@@ -85,9 +85,9 @@ pub struct ScreenSplat {
 pub struct Forward {
     /// Planes [5,H,W]: red, green, blue, alpha, depth.
     pub planes: Vec<f32>,
-    /// Screen radius in pixels, 0 where culled [N].
+    /// Screen radius in pixels, 0 where culled `[N]`.
     pub radii: Vec<i64>,
-    /// Largest blending weight [N]; empty unless the settings ask for it.
+    /// Largest blending weight `[N]`; empty unless the settings ask for it.
     pub max_weights: Vec<f32>,
     /// Counts of work.
     pub work: RenderWork,
@@ -121,7 +121,7 @@ fn forward_in_pool(splats: &SplatArrays, settings: &RasterSettings) -> Result<Fo
     Ok(Forward { planes, radii, max_weights, work, workspace })
 }
 
-/// Gradients of a render from d loss / d planes [5,H,W].
+/// Gradients of a render from d loss / d planes `[5,H,W]`.
 pub fn backward(splats: &SplatArrays, settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32], request: &GradientRequest) -> Gradients {
     let mut result = None;
     rayon::scope(|_| {

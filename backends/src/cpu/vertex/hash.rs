@@ -4,7 +4,7 @@ use crate::cpu::simd::vectorized;
 use crate::ops::hash::{LevelHash, P};
 
 impl LevelHash {
-    /// The signatures [n, k] of `vertices` [n]; entries of a vertex must be below 2^31.
+    /// The signatures `[n, k]` of `vertices` `[n]`; entries of a vertex must be below 2^31.
     pub fn signatures(&self, vertices: &[[u32; 3]], out: &mut [f32]) {
         vectorized(
             #[inline(always)]

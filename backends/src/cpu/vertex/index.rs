@@ -9,19 +9,19 @@ pub const MAX_RESOLUTION: u32 = 1600;
 /// The corners of all points on one level.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Corners {
-    /// The vertices to decode [U], each (x, y, z) in 0..=resolution; sorted and distinct with reuse, one per corner without.
+    /// The vertices to decode `[U]`, each (x, y, z) in 0..=resolution; sorted and distinct with reuse, one per corner without.
     pub vertices: Vec<[u32; 3]>,
-    /// Per point and corner, the index of its vertex [8 M].
+    /// Per point and corner, the index of its vertex `[8 M]`.
     pub corners: Vec<u32>,
-    /// Per point and corner, its trilinear weight [8 M].
+    /// Per point and corner, its trilinear weight `[8 M]`.
     pub weights: Vec<f32>,
-    /// All (point, corner) slots grouped by vertex, ascending within each [8 M].
+    /// All (point, corner) slots grouped by vertex, ascending within each `[8 M]`.
     pub slots: Vec<u32>,
-    /// Where the slots of each vertex start [U + 1].
+    /// Where the slots of each vertex start `[U + 1]`.
     pub starts: Vec<u32>,
 }
 
-/// Locates `points` [M, 3] on a grid of `resolution` cells per axis over the box. Points outside are moved to its nearest face, NaN to its
+/// Locates `points` `[M, 3]` on a grid of `resolution` cells per axis over the box. Points outside are moved to its nearest face, NaN to its
 /// lower face. Corner c of a cell has offsets (c & 1, c >> 1 & 1, c >> 2).
 pub fn corners(points: &[f32], box_min: [f32; 3], box_max: [f32; 3], resolution: u32, reuse: bool) -> Corners {
     let resolution = resolution.clamp(1, MAX_RESOLUTION);

@@ -30,8 +30,8 @@ fn product(a: u32, x: u32) -> u32 {
     fold(fold(((high & 0x7fffu32) << 16) + (high >> 15)) + low)
 }
 
-/// Entry `k` of the signature of a vertex of `vertices` [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold from `at` on A's three rows [k] each,
-/// then b [k].
+/// Entry `k` of the signature of a vertex of `vertices` [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold from `at` on A's three rows `[k]` each,
+/// then b `[k]`.
 #[cube]
 pub fn signature(vertices: &[i32], constants: &[u32], at: usize, vertex: usize, k: usize, hashes: usize, modulus: u32, scale: f32) -> f32 {
     let mut sum = constants[at + 3 * hashes + k];
@@ -43,7 +43,7 @@ pub fn signature(vertices: &[i32], constants: &[u32], at: usize, vertex: usize, 
     (residue % modulus) as f32 * scale - 1.0
 }
 
-/// Signatures [U,k] of vertices [U,3].
+/// Signatures `[U,k]` of vertices `[U,3]`.
 #[cube(launch)]
 fn signatures(vertices: &[i32], constants: &[u32], out: &mut [f32], hashes: u32, modulus: u32, scale: f32) {
     if ABSOLUTE_POS < out.len() {
@@ -52,7 +52,7 @@ fn signatures(vertices: &[i32], constants: &[u32], out: &mut [f32], hashes: u32,
     }
 }
 
-/// Mean and inverse deviation of a row of y [_, n].
+/// Mean and inverse deviation of a row of y `[_, n]`.
 #[cube]
 fn statistics(y: &[f32], row: usize, n: usize) -> (f32, f32) {
     let width = n as f32;
@@ -159,7 +159,7 @@ fn multiply(layer: &MishLayer, target: Target) -> Step {
     Step::Multiply { source: 0, target, input, output, weights, bias: Some(layer.bias.start), relu: false, add: false }
 }
 
-/// Features [U, F] of `vertices` [U,3].
+/// Features `[U, F]` of `vertices` `[U,3]`.
 pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -> CubeTensor {
     let rows = vertices.meta.shape()[0];
     let mut steps = Vec::new();

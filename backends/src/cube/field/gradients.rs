@@ -15,7 +15,7 @@ const CHUNK: usize = 8;
 const LEAST_ROWS: usize = 64;
 const MOST_SEGMENTS: usize = 256;
 
-/// A matrix [rows, width] inside a buffer: where it starts.
+/// A matrix `[rows, width]` inside a buffer: where it starts.
 #[derive(Clone, Copy)]
 pub struct Rows<'a> {
     pub buffer: &'a CubeTensor,
@@ -45,7 +45,7 @@ fn end_of_vertices(vertices: &[i32], first: usize, start: usize, end: usize) -> 
     low
 }
 
-/// Loads the next rows of a matrix [_, width] into shared memory, `per` times 16 of its columns; zeros where it ends.
+/// Loads the next rows of a matrix `[_, width]` into shared memory, `per` times 16 of its columns; zeros where it ends.
 #[cube]
 fn load_rows(from: &[f32], at: usize, to: &mut Shared<[f32]>, row: usize, end: usize, first: usize, width: usize, #[comptime] per: usize) {
     let side = comptime!(SIDE * per);
@@ -61,7 +61,7 @@ fn load_rows(from: &[f32], at: usize, to: &mut Shared<[f32]>, row: usize, end: u
     }
 }
 
-/// Per segment of rows: x^T dy, and below it the sums of dy: partial [segments, (in + 1) out]. A thread computes `down` rows and `over` columns, 16 apart.
+/// Per segment of rows: x^T dy, and below it the sums of dy: partial `[segments, (in + 1) out]`. A thread computes `down` rows and `over` columns, 16 apart.
 #[cube(launch_unchecked)]
 fn outer_parts(
     x: &[f32],
@@ -150,7 +150,7 @@ fn outer_parts(
     }
 }
 
-/// Sums over rows per segment of dz times the normalised values, then of dz alone: partial [segments, 2 out].
+/// Sums over rows per segment of dz times the normalised values, then of dz alone: partial `[segments, 2 out]`.
 #[cube(launch_unchecked)]
 fn norm_parts(
     dz: &[f32],
@@ -202,7 +202,7 @@ pub fn add_segments(partial: &[f32], gradient: &mut [f32], width: u32, segments:
     }
 }
 
-/// The weights, then each matrix transposed at its own index: plan [layers, 3] holds index, inputs and outputs.
+/// The weights, then each matrix transposed at its own index: plan `[layers, 3]` holds index, inputs and outputs.
 #[cube(launch)]
 fn append_transposed(weights: &[f32], plan: &[u32], both: &mut [f32], layers: u32) {
     let count = both.len() / 2;
@@ -249,7 +249,7 @@ pub struct Sums<'a> {
     pub rows: usize,
     /// Whether they are added to what is there.
     pub add: bool,
-    /// The vertices of all rows [_,3] and which of them is that of row 0, where rows may hold none.
+    /// The vertices of all rows `[_,3]` and which of them is that of row 0, where rows may hold none.
     pub listed: Option<(&'a CubeTensor, usize)>,
 }
 
@@ -294,7 +294,7 @@ impl Sums<'_> {
         };
         self.finish(partial, width, segments, l.at);
     }
-    /// Gradient of gain and shift [width] each, which follow each other from `at` on, from the gradient before Mish and the normalised values.
+    /// Gradient of gain and shift `[width]` each, which follow each other from `at` on, from the gradient before Mish and the normalised values.
     pub fn of_norm(&self, dz: Rows, normalized: Rows, width: usize, at: usize) {
         let (segments, segment) = segments_of(self.gradient, self.rows, 2 * width);
         let partial = floats(self.gradient, [segments * 2 * width]);

@@ -1,4 +1,4 @@
-//! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W [in, out] row-major and then b [out], at
+//! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W `[in, out]` row-major and then b `[out]`, at
 //! an offset. A thread computes one column of several rows, so that a weight is read once for all of them.
 
 use crate::cube::tensor::{THREADS, floats, workgroups_for};
@@ -16,7 +16,7 @@ pub struct Dense {
     pub at: usize,
 }
 
-/// y [rows, out] at `y_at`: x W + b, with a ReLU if `relu`.
+/// y `[rows, out]` at `y_at`: x W + b, with a ReLU if `relu`.
 #[cube(launch)]
 fn linear(x: &[f32], weights: &[f32], y: &mut [f32], rows: u32, input: u32, output: u32, at: u32, y_at: u32, #[comptime] relu: bool) {
     let (input, output, at) = (input as usize, output as usize, at as usize);
@@ -51,7 +51,7 @@ fn linear(x: &[f32], weights: &[f32], y: &mut [f32], rows: u32, input: u32, outp
     }
 }
 
-/// dx [rows, in] (+)= dy W^T.
+/// dx `[rows, in]` (+)= dy W^T.
 #[cube(launch)]
 fn linear_backward_input(dy: &[f32], weights: &[f32], dx: &mut [f32], rows: u32, input: u32, output: u32, at: u32, #[comptime] accumulate: bool) {
     let (input, output, at) = (input as usize, output as usize, at as usize);
@@ -104,7 +104,7 @@ fn dim() -> CubeDim {
     CubeDim::new_1d(THREADS)
 }
 
-/// Layer `l` on `x` [rows, in] into `y` at `y_at`.
+/// Layer `l` on `x` `[rows, in]` into `y` at `y_at`.
 pub fn forward(x: &CubeTensor, weights: &CubeTensor, y: &CubeTensor, rows: usize, l: Dense, y_at: usize, relu: bool) {
     let client = x.client.clone();
     let threads = rows.div_ceil(ROWS) * l.output;
@@ -133,7 +133,7 @@ pub fn copy(from: &CubeTensor, to: &CubeTensor, from_at: usize, to_at: usize, co
     copy_stretch::launch(&client, workgroups_for(count), dim(), a, b, from_at as u32, to_at as u32, count as u32);
 }
 
-/// The stretch of `from` at `at` as a buffer of its own [count].
+/// The stretch of `from` at `at` as a buffer of its own `[count]`.
 pub fn stretch(from: &CubeTensor, at: usize, count: usize) -> CubeTensor {
     let out = floats(from, [count]);
     copy(from, &out, at, 0, count);

@@ -8,7 +8,7 @@ use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// Keys of the vertices and trilinear weights of all (point, corner) slots [8M]; corner c lies at offsets (c & 1, c >> 1 & 1, c >> 2).
+/// Keys of the vertices and trilinear weights of all (point, corner) slots `[8M]`; corner c lies at offsets (c & 1, c >> 1 & 1, c >> 2).
 #[cube(launch)]
 fn find_corners(points: &[f32], grid: &[f32], keys: &mut [u32], slots: &mut [u32], weights: &mut [f32], resolution: u32) {
     let slot = ABSOLUTE_POS;
@@ -103,7 +103,7 @@ fn interpolate_corners(features: &[f32], corners: &[i32], weights: &[f32], out: 
     }
 }
 
-/// Gradient [U,F] of the features: each vertex visits its slots in order, so nothing is scattered.
+/// Gradient `[U,F]` of the features: each vertex visits its slots in order, so nothing is scattered.
 #[cube(launch)]
 fn gather_gradients(grad: &[f32], weights: &[f32], slots: &[i32], starts: &[i32], out: &mut [f32], width: u32) {
     if ABSOLUTE_POS < out.len() {
@@ -117,7 +117,7 @@ fn gather_gradients(grad: &[f32], weights: &[f32], slots: &[i32], starts: &[i32]
     }
 }
 
-/// The corners of `points` [M,3], grouped by vertex; their number stays on the device.
+/// The corners of `points` `[M,3]`, grouped by vertex; their number stays on the device.
 pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<CubeBackend> {
     let client = points.client.clone();
     let slots_count = 8 * points.meta.shape()[0];
@@ -151,7 +151,7 @@ pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<Cu
     CornersBegun { weights, slots: signed(slots), vertices: signed(sorted), starts: signed(heads), corners: unused(), count: signed(count) }
 }
 
-/// Vertices [U,3], where their slots start [U+1], and the vertex of every corner [8M], with a capacity of U.
+/// Vertices `[U,3]`, where their slots start `[U+1]`, and the vertex of every corner `[8M]`, with a capacity of U.
 pub fn list(slots: CubeTensor, sorted: CubeTensor, before: CubeTensor, grid: GridBox, reuse: bool, capacity: usize) -> (CubeTensor, CubeTensor, CubeTensor) {
     let client = slots.client.clone();
     let dim = CubeDim::new_1d(THREADS);
@@ -186,7 +186,7 @@ fn list_all(keys: &[u32], vertices: &mut [i32], starts: &mut [i32], corners: &mu
     }
 }
 
-/// Interpolated features [M,F].
+/// Interpolated features `[M,F]`.
 pub fn interpolate(features: CubeTensor, corners: CubeTensor, weights: CubeTensor) -> CubeTensor {
     let width = features.meta.shape()[1];
     let points = corners.meta.shape().num_elements() / 8;
@@ -197,7 +197,7 @@ pub fn interpolate(features: CubeTensor, corners: CubeTensor, weights: CubeTenso
     out
 }
 
-/// Gradient [U,F] of the features.
+/// Gradient `[U,F]` of the features.
 pub fn interpolate_backward(grad: CubeTensor, weights: CubeTensor, slots: CubeTensor, starts: CubeTensor) -> CubeTensor {
     let width = grad.meta.shape()[1];
     let vertices = starts.meta.shape().num_elements().saturating_sub(1);

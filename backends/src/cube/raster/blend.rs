@@ -33,7 +33,7 @@ fn full_alpha(drawn: &Shared<[f32]>, at: usize, dx: f32, dy: f32) -> f32 {
     select(sigma >= 0.0 && alpha >= ALPHA_MIN, alpha, 0.0f32)
 }
 
-/// Planes [5,H,W]; per pixel the transmittance left and the list index at which it stopped, as bits [2,H,W]; largest weights [N] if asked for.
+/// Planes `[5,H,W]`; per pixel the transmittance left and the list index at which it stopped, as bits `[2,H,W]`; largest weights `[N]` if asked for.
 #[cube(launch_unchecked)]
 pub fn blend_tiles(
     splats: &[f32],

@@ -25,7 +25,7 @@ pub const OF_OPACITY: usize = 10;
 /// First of twelve columns of the camera: rotation by rows, translation.
 pub const OF_CAMERA: usize = 11;
 
-/// Adds up the records of each Gaussian, `stride` floats each, in the order of its tiles, and turns moments into gradients: screen [N,13].
+/// Adds up the records of each Gaussian, `stride` floats each, in the order of its tiles, and turns moments into gradients: screen `[N,13]`.
 #[cube(launch)]
 pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], splats: &[f32], screen: &mut [f32], #[comptime] stride: usize) {
     let i = ABSOLUTE_POS;
@@ -67,7 +67,7 @@ pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], spl
     }
 }
 
-/// The absolute gradients of the centres [N,2], from the end of records of `stride` floats, in the order of each Gaussian's tiles.
+/// The absolute gradients of the centres `[N,2]`, from the end of records of `stride` floats, in the order of each Gaussian's tiles.
 #[cube(launch)]
 pub fn sum_absolute(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], out: &mut [f32], #[comptime] stride: usize) {
     let i = ABSOLUTE_POS;
@@ -84,7 +84,7 @@ pub fn sum_absolute(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], ou
     }
 }
 
-/// Gradients of the degree-0 coefficients (or colours) [N,3] and of the higher ones [N,K,3], for `count` Gaussians from `first` on, whose higher coefficients
+/// Gradients of the degree-0 coefficients (or colours) `[N,3]` and of the higher ones `[N,K,3]`, for `count` Gaussians from `first` on, whose higher coefficients
 /// `sh_rest` and `d_rest` hold; that of the offset goes to the screen gradients.
 #[cube(launch)]
 pub fn color_backward(
@@ -158,7 +158,7 @@ pub fn color_backward(
     }
 }
 
-/// Gradients of centre, scales, quaternion, opacity and camera from those on the screen: [N,23].
+/// Gradients of centre, scales, quaternion, opacity and camera from those on the screen: `[N,23]`.
 #[cube(launch)]
 pub fn geometry_backward(
     means: &[f32],

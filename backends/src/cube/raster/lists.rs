@@ -63,7 +63,7 @@ pub fn fill_unused(tile_of_pair: &mut [u32], pair: &mut [u32], total: &[u32], ti
     }
 }
 
-/// starts[tile] is the first of the sorted pairs of a tile; starts[tiles] their number.
+/// starts`[tile]` is the first of the sorted pairs of a tile; starts`[tiles]` their number.
 #[cube(launch)]
 pub fn tile_starts(tile_of_pair: &[u32], starts: &mut [u32], pairs: u32) {
     let tiles = starts.len() as u32 - 1;

@@ -102,7 +102,7 @@ fn all_finite(mean: V3, s: V3, q: V4, opacity: f32, p: Projected) -> bool {
         && is_finite(p.center_y)
 }
 
-/// Screen records [N,10] without colour, sorting keys [N,4], radii [N].
+/// Screen records `[N,10]` without colour, sorting keys `[N,4]`, radii `[N]`.
 #[cube(launch)]
 pub fn project_gaussians(
     means: &[f32],

@@ -84,15 +84,15 @@ impl Refusal {
 /// What the forward pass of a device returns.
 #[derive(ExtensionType)]
 pub struct Rasterized<B: Backend> {
-    /// Red, green, blue, alpha, depth [5,H,W].
+    /// Red, green, blue, alpha, depth `[5,H,W]`.
     pub planes: FloatTensor<B>,
-    /// Screen radii in pixels [N].
+    /// Screen radii in pixels `[N]`.
     pub radii: IntTensor<B>,
-    /// Largest blending weights [N]; [0] unless asked for.
+    /// Largest blending weights `[N]`; `[0]` unless asked for.
     pub max_weights: FloatTensor<B>,
     /// Counts of work.
     pub work: RenderWork,
-    /// Pairs of Gaussians and tiles [1].
+    /// Pairs of Gaussians and tiles `[1]`.
     pub pair_count: IntTensor<B>,
     /// Why nothing was drawn, if so; the planes are empty then.
     pub refused: Option<Refusal>,
@@ -103,55 +103,55 @@ pub struct Rasterized<B: Backend> {
 /// The Gaussians of one render, and what is behind them. Every field is a differentiable input.
 #[derive(Clone, Debug, ExtensionType)]
 pub struct SplatTensors<B: Backend> {
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: FloatTensor<B>,
-    /// Log-scales or scales [N,3].
+    /// Log-scales or scales `[N,3]`.
     pub scales: FloatTensor<B>,
-    /// Raw quaternions (w,x,y,z) [N,4].
+    /// Raw quaternions (w,x,y,z) `[N,4]`.
     pub quaternions: FloatTensor<B>,
-    /// Logits or opacities [N].
+    /// Logits or opacities `[N]`.
     pub opacities: FloatTensor<B>,
-    /// Degree-0 coefficients, or colours [N,3].
+    /// Degree-0 coefficients, or colours `[N,3]`.
     pub colors: FloatTensor<B>,
-    /// Higher coefficients [N,K,3].
+    /// Higher coefficients `[N,K,3]`.
     pub sh_rest: FloatTensor<B>,
-    /// Colour behind everything [3].
+    /// Colour behind everything `[3]`.
     pub background: FloatTensor<B>,
 }
 
 /// Inputs that are never read: they are there to receive gradients.
 #[derive(Clone, Debug, ExtensionType)]
 pub struct Probes<B: Backend> {
-    /// Receives d loss / d projected centre [N,2].
+    /// Receives d loss / d projected centre `[N,2]`.
     pub screen: FloatTensor<B>,
-    /// Receives the sums over pixels of the absolute values of what adds up to the gradient of `screen` [N,2].
+    /// Receives the sums over pixels of the absolute values of what adds up to the gradient of `screen` `[N,2]`.
     pub absolute_screen: FloatTensor<B>,
-    /// Receives d loss / d world_to_camera [4,4].
+    /// Receives d loss / d world_to_camera `[4,4]`.
     pub camera: FloatTensor<B>,
 }
 
 /// Gradients of [`SplatTensors`] and [`Probes`], shaped like them; those asked for.
 #[derive(Clone, Debug, Default)]
 pub struct RasterGradients<B: Backend> {
-    /// [N,3]
+    /// `[N,3]`
     pub means: Option<FloatTensor<B>>,
-    /// [N,3]
+    /// `[N,3]`
     pub scales: Option<FloatTensor<B>>,
-    /// [N,4]
+    /// `[N,4]`
     pub quaternions: Option<FloatTensor<B>>,
-    /// [N]
+    /// `[N]`
     pub opacities: Option<FloatTensor<B>>,
-    /// [N,3]
+    /// `[N,3]`
     pub colors: Option<FloatTensor<B>>,
-    /// [N,K,3]
+    /// `[N,K,3]`
     pub sh_rest: Option<FloatTensor<B>>,
-    /// [3]
+    /// `[3]`
     pub background: Option<FloatTensor<B>>,
-    /// [N,2]
+    /// `[N,2]`
     pub screen: Option<FloatTensor<B>>,
-    /// [N,2]
+    /// `[N,2]`
     pub absolute_screen: Option<FloatTensor<B>>,
-    /// [4,4]
+    /// `[4,4]`
     pub camera: Option<FloatTensor<B>>,
 }
 
@@ -169,7 +169,7 @@ pub trait RasterOps: Backend {
 
 /// The derivative per device.
 pub trait RasterBackward: Backend {
-    /// Gradients for `upstream` = d loss / d planes [5,H,W]; only those in `request`.
+    /// Gradients for `upstream` = d loss / d planes `[5,H,W]`; only those in `request`.
     fn rasterize_backward(
         splats: SplatTensors<Self>,
         settings: &RasterSettings,
@@ -181,25 +181,25 @@ pub trait RasterBackward: Backend {
 
 /// The tensors of one render; absent ones are constants without gradient.
 pub struct RasterInputs {
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: Tensor<2>,
-    /// Log-scales or scales [N,3].
+    /// Log-scales or scales `[N,3]`.
     pub scales: Tensor<2>,
-    /// Raw quaternions (w,x,y,z) [N,4].
+    /// Raw quaternions (w,x,y,z) `[N,4]`.
     pub quaternions: Tensor<2>,
-    /// Logits or opacities [N].
+    /// Logits or opacities `[N]`.
     pub opacities: Tensor<1>,
-    /// Degree-0 coefficients, or colours [N,3].
+    /// Degree-0 coefficients, or colours `[N,3]`.
     pub colors: Tensor<2>,
-    /// Higher coefficients [N,K,3].
+    /// Higher coefficients `[N,K,3]`.
     pub sh_rest: Option<Tensor<3>>,
-    /// Receives d loss / d projected centre [N,2].
+    /// Receives d loss / d projected centre `[N,2]`.
     pub screen_probe: Option<Tensor<2>>,
-    /// Receives the sums over pixels of the absolute values of what adds up to the gradient of `screen_probe` [N,2].
+    /// Receives the sums over pixels of the absolute values of what adds up to the gradient of `screen_probe` `[N,2]`.
     pub absolute_screen_probe: Option<Tensor<2>>,
-    /// Receives d loss / d world_to_camera [4,4].
+    /// Receives d loss / d world_to_camera `[4,4]`.
     pub camera_probe: Option<Tensor<2>>,
-    /// Colour behind everything [3]; black if absent.
+    /// Colour behind everything `[3]`; black if absent.
     pub background: Option<Tensor<1>>,
 }
 

@@ -59,7 +59,7 @@ fn touches(items: &[Item], settings: &RasterSettings, column: usize, row: usize)
 
 /// The image and what was counted.
 pub struct Blended {
-    /// Red, green, blue, alpha, depth [5,H,W].
+    /// Red, green, blue, alpha, depth `[5,H,W]`.
     pub planes: Vec<f64>,
     /// Largest weight per item.
     pub max_weights: Vec<f64>,
@@ -104,7 +104,7 @@ pub struct BlendGradients {
     pub background: [f64; 3],
 }
 
-/// Gradients for `upstream` [5,H,W].
+/// Gradients for `upstream` `[5,H,W]`.
 pub fn blend_backward(items: &[Item], settings: &RasterSettings, background: [f64; 3], upstream: &[f64]) -> BlendGradients {
     let rules = RuleConstants::new(settings);
     let plane = settings.width * settings.height;

@@ -20,17 +20,17 @@ use real::{Dual, Real};
 /// The arrays of N Gaussians in float64, row-major, as in [`crate::cpu::raster::SplatArrays`].
 #[derive(Clone, Debug, Default)]
 pub struct ReferenceInput {
-    /// [N,3]
+    /// `[N,3]`
     pub means: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub scales: Vec<f64>,
-    /// [N,4]
+    /// `[N,4]`
     pub quaternions: Vec<f64>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub colors: Vec<f64>,
-    /// [N,K,3]
+    /// `[N,K,3]`
     pub sh_rest: Vec<f64>,
     /// Colour behind everything.
     pub background: [f64; 3],
@@ -39,11 +39,11 @@ pub struct ReferenceInput {
 /// What a forward pass returns.
 #[derive(Clone, Debug)]
 pub struct ReferenceOutput {
-    /// Red, green, blue, alpha, depth [5,H,W].
+    /// Red, green, blue, alpha, depth `[5,H,W]`.
     pub planes: Vec<f64>,
-    /// Screen radius, the larger of the two axes; 0 where culled [N].
+    /// Screen radius, the larger of the two axes; 0 where culled `[N]`.
     pub radii: Vec<i64>,
-    /// Largest blending weight [N].
+    /// Largest blending weight `[N]`.
     pub max_weights: Vec<f64>,
     /// Visible Gaussians, front to back.
     pub items: Vec<Item>,
@@ -54,25 +54,25 @@ pub struct ReferenceOutput {
 /// Gradients of everything.
 #[derive(Clone, Debug)]
 pub struct ReferenceGradients {
-    /// [N,3]
+    /// `[N,3]`
     pub means: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub scales: Vec<f64>,
-    /// [N,4]
+    /// `[N,4]`
     pub quaternions: Vec<f64>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub colors: Vec<f64>,
-    /// [N,K,3]
+    /// `[N,K,3]`
     pub sh_rest: Vec<f64>,
-    /// [N,2]
+    /// `[N,2]`
     pub screen: Vec<f64>,
-    /// [N,2]
+    /// `[N,2]`
     pub absolute_screen: Vec<f64>,
-    /// [4,4]
+    /// `[4,4]`
     pub camera: Vec<f64>,
-    /// [3]
+    /// `[3]`
     pub background: Vec<f64>,
     /// Of the screen quantities, by item: centre, conic, opacity, colour, depth.
     pub items: Vec<[f64; RECORD]>,
@@ -165,7 +165,7 @@ pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOu
     ReferenceOutput { planes: image.planes, radii, max_weights, items, pairs: image.pairs }
 }
 
-/// Gradients for `upstream` [5,H,W] at the visible `items` of the forward pass.
+/// Gradients for `upstream` `[5,H,W]` at the visible `items` of the forward pass.
 pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item], upstream: &[f64]) -> ReferenceGradients {
     let n = input.opacities.len();
     let blended = blend::blend_backward(items, settings, input.background, upstream);

@@ -37,7 +37,7 @@ pub enum Target {
 pub enum Step {
     /// The tile becomes these columns of rows of `width` values of the buffer `given`, from element `at` on.
     Load { tile: usize, columns: Range<usize>, width: usize, at: usize },
-    /// x W (+ b): `weights` and `bias` are the indices of W [input, output] and b [output]. With `add`, on top of what the target tile holds.
+    /// x W (+ b): `weights` and `bias` are the indices of W `[input, output]` and b `[output]`. With `add`, on top of what the target tile holds.
     Multiply { source: usize, target: Target, input: usize, output: usize, weights: usize, bias: Option<usize>, relu: bool, add: bool },
     /// The tile is written to the output buffer: a saved activation.
     Save { tile: usize, width: usize, at: usize },
@@ -110,9 +110,9 @@ impl Step {
 /// What the first tile starts with.
 #[derive(Clone, Copy)]
 pub enum Input<'a> {
-    /// Rows [_, in].
+    /// Rows `[_, in]`.
     Rows(&'a CubeTensor, usize),
-    /// Signatures of vertices [_, 3].
+    /// Signatures of vertices `[_, 3]`.
     Signatures(&'a CubeTensor, &'a LevelHash),
 }
 

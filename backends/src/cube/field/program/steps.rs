@@ -13,7 +13,7 @@ use cubecl::prelude::*;
 /// Rows and columns a thread computes: 64 sums for 16 loads.
 pub const BLOCK: usize = 8;
 
-/// Whether a row of `vertices` [U,3] holds one; rows without a vertex come last.
+/// Whether a row of `vertices` `[U,3]` holds one; rows without a vertex come last.
 #[cube]
 pub fn is_vertex(vertices: &[i32], row: usize) -> bool {
     vertices[3 * row] >= 0

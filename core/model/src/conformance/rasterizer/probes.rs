@@ -18,11 +18,11 @@ const TOLERANCE: f64 = 0.05;
 
 /// The gradients that the probes received.
 struct Probed {
-    /// [N,2]
+    /// `[N,2]`
     screen: Vec<f32>,
-    /// [N,2]
+    /// `[N,2]`
     absolute: Vec<f32>,
-    /// [4,4]
+    /// `[4,4]`
     camera: Vec<f32>,
 }
 
