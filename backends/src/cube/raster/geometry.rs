@@ -4,16 +4,26 @@ use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
 use crate::ops::rasterize::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
 use cubecl::prelude::*;
 
-/// Indices into the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size,
-/// and the row that gives the depth: four numbers, their float32 rounding errors, and a zero.
+/// Index of the translation in the camera buffer, which starts with the rotation by rows.
 pub const TRANSLATION: usize = 9;
+/// Index of the camera centre.
 pub const CENTER: usize = 12;
+/// Index of the two focal lengths.
 pub const FOCAL: usize = 15;
+/// Index of the principal point.
 pub const PRINCIPAL: usize = 17;
+/// Index of the limits of x/z (2) and y/z (2).
 pub const LIMITS: usize = 19;
+/// Index of the near plane.
 pub const NEAR: usize = 23;
+/// Index of width and height.
 pub const SIZE: usize = 24;
-pub const DEPTH: usize = 26;
+/// Index of the four numbers of the row that gives the depth.
+const DEPTH: usize = 26;
+/// Index of the rounding errors of these in float32.
+const DEPTH_REST: usize = 30;
+/// Index of a zero that compilers do not know, see [`rounded`].
+const ZERO: usize = 34;
 /// Mask of the upper half of a float32's significand; products of halves are exact.
 const UPPER_HALF: u32 = 0xffff_f000;
 
@@ -96,12 +106,12 @@ pub fn sorting_depth(cam: &[f32], mean: V3) -> f32 {
     let (x, x_rest) = exact_product(cam[DEPTH], mean.x);
     let (y, y_rest) = exact_product(cam[DEPTH + 1], mean.y);
     let (z, z_rest) = exact_product(cam[DEPTH + 2], mean.z);
-    let zero = u32::reinterpret(cam[DEPTH + 8]);
+    let zero = u32::reinterpret(cam[ZERO]);
     let (first, first_rest) = exact_sum(cam[DEPTH + 3], x, zero);
     let (second, second_rest) = exact_sum(first, y, zero);
     let (third, third_rest) = exact_sum(second, z, zero);
-    let cut = cam[DEPTH + 4] * mean.x + cam[DEPTH + 5] * mean.y + cam[DEPTH + 6] * mean.z + cam[DEPTH + 7];
-    third + (x_rest + y_rest + z_rest + (first_rest + second_rest + third_rest) + cut)
+    let rest = cam[DEPTH_REST] * mean.x + cam[DEPTH_REST + 1] * mean.y + cam[DEPTH_REST + 2] * mean.z + cam[DEPTH_REST + 3];
+    third + (x_rest + y_rest + z_rest + (first_rest + second_rest + third_rest) + rest)
 }
 
 #[cube]
