@@ -170,7 +170,7 @@ impl<'a> Player<'a> {
     pub fn play(&mut self, camera: &Camera, time_norm: f32) -> Result<RenderOutput> {
         let gaussians = self.gaussians_at(time_norm)?;
         let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
-        let settings = RenderSettings { pair_room: self.pair_room.room, ..self.settings.clone() };
+        let settings = RenderSettings { pair_capacity: self.pair_room.room, ..self.settings.clone() };
         let output = self.rasterizer.render(&splats, camera, &settings)?;
         if let Some(count) = &output.stats.pair_count {
             self.pair_room.note(count.clone());

@@ -20,6 +20,7 @@ struct Spatial {
 /// A rendered view whose statistics wait for the backward pass.
 struct Rendered<'a> {
     screen_probe: Option<Tensor<2>>,
+    absolute_screen_probe: Option<Tensor<2>>,
     radii: Tensor<1, Int>,
     max_weights: Option<Tensor<1>>,
     camera: &'a Camera,
@@ -72,8 +73,9 @@ impl Context<'_> {
             };
             let mut splats = Splats::from_gaussians(&drawn, schedule.sh_degree);
             let probe = |wanted| statistics.contains(&wanted).then(|| Tensor::<2>::zeros([n, 2], &autodiff).require_grad());
-            let screen_probe = probe(Statistic::ScreenGradient);
+            let (screen_probe, absolute_screen_probe) = (probe(Statistic::ScreenGradient), probe(Statistic::AbsoluteScreenGradient));
             splats.screen_probe = screen_probe.clone();
+            splats.absolute_screen_probe = absolute_screen_probe.clone();
             let output = self.rasterizer.render(&splats, camera, &settings)?;
             let planes = state.appearance.apply(output.planes, self.training_camera.get(&scene.views[view].camera).copied())?;
             let target = Tensor::<3>::from_inner(self.rasterizer.upload(&scene.frame(view)?, background_rgb, &self.device));
@@ -91,7 +93,7 @@ impl Context<'_> {
                 Some(other) => other.max_pair(radii.clone()),
                 None => radii.clone(),
             });
-            rendered.push(Rendered { screen_probe, radii, max_weights: output.stats.max_weights, camera });
+            rendered.push(Rendered { screen_probe, absolute_screen_probe, radii, max_weights: output.stats.max_weights, camera });
         }
         let Some(mut loss) = total else { return Ok(()) };
         if let (Some(deformer), Some(&view), Some(spatial)) = (&state.deformer, batch.first(), &spatial) {
@@ -114,10 +116,11 @@ impl Context<'_> {
         }
 
         let gradients = loss.backward();
-        for Rendered { screen_probe, radii, max_weights, camera } in rendered {
-            let screen_gradient = screen_probe.and_then(|probe| probe.grad(&gradients));
+        for Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera } in rendered {
+            let gradient_of = |probe: Option<Tensor<2>>| probe.and_then(|probe| probe.grad(&gradients));
+            let (screen_gradient, absolute_screen_gradient) = (gradient_of(screen_probe), gradient_of(absolute_screen_probe));
             let size = (camera.width, camera.height);
-            state.density.observe(&ViewStatistics { radii, screen_gradient, absolute_screen_gradient: None, max_weights, size, views: batch.len() })?;
+            state.density.observe(&ViewStatistics { radii, screen_gradient, absolute_screen_gradient, max_weights, size, views: batch.len() })?;
         }
         let of_gaussians = leaves.gradients(&gradients);
         let deformed = spatial.is_some();
