@@ -174,7 +174,7 @@ pub fn host_gaussians(sh_degree: usize, columns: impl Iterator<Item = Result<(St
                 }
             }
         } else {
-            host.extra.insert(name, ExtraAttribute { width, values });
+            host.extra.insert(name, ExtraAttribute::exact(width, values));
         }
     }
     Ok(host)

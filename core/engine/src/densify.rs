@@ -204,7 +204,7 @@ mod tests {
     fn set_of(n: usize) -> GaussianSet {
         let positions = (0..n).map(|i| [i as f32, 0.0, 0.0]).collect();
         let mut host = from_points(&PointCloud { positions, colors: vec![[0.5; 3]; n] }, 1, 0.5);
-        host.extra.insert("label".into(), cc4dgs_core::ExtraAttribute { width: 1, values: (0..n).map(|i| i as f32).collect() });
+        host.extra.insert("label".into(), cc4dgs_core::ExtraAttribute::exact(1, (0..n).map(|i| i as f32).collect()));
         GaussianSet::new(&host, &Device::flex())
     }
 

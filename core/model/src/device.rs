@@ -1,8 +1,8 @@
 //! Devices by name.
 
 use crate::adapters::{adapters, auto_device};
-use crate::error::{Error, Result};
-use crate::plugin::unknown_name;
+use crate::unknown_name;
+use crate::{Error, Result};
 use burn::tensor::{Device, DeviceKind, Tensor};
 use std::collections::BTreeMap;
 use std::sync::Mutex;

@@ -3,9 +3,8 @@
 //!
 //! `tests/bad` holds a corpus of them, made by the functions below. `CC4DGS_WRITE_BAD=1` writes it anew after the format changed.
 
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamKind, write_atomically};
-use cc4dgs_core::{Error, HostGaussians, Limits, Result, Stream};
-use cc4dgs_engine::ply;
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, FORMAT_VERSION, Manifest, StreamKind, write_atomically};
+use cc4dgs_core::{Error, HostGaussians, Limits, Result, Stream, ply};
 use proptest::prelude::*;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::PathBuf;
@@ -131,7 +130,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
     let mut header_claim = sound();
     header_claim[12..16].copy_from_slice(&u32::MAX.to_le_bytes());
     let trailing = [sound(), b"more".to_vec()].concat();
-    let json = serde_json::to_string(&Manifest { format_version: 1, ..manifest() }).unwrap();
+    let json = serde_json::to_string(&Manifest { format_version: FORMAT_VERSION, ..manifest() }).unwrap();
     let deep = json.replace("\"extra\":{}", &format!("\"extra\":{{\"a\":{}{}}}", "[".repeat(500), "]".repeat(500)));
     let huge = json.replace("\"gaussian_count\":3", "\"gaussian_count\":18446744073709551615");
     let infinite = json.replace("\"dynamic_threshold\":0.0", "\"dynamic_threshold\":1e200");
