@@ -157,7 +157,7 @@ impl Projection {
     fn part(&self, key: &str, camera: usize, width: usize) -> Vec<f64> {
         self.fixture.get(key)[camera * self.n * width..(camera + 1) * self.n * width].to_vec()
     }
-    fn settings(&self, camera: usize) -> cc4dgs_backends::cpu::raster::RasterSettings {
+    fn settings(&self, camera: usize) -> cc4dgs_backends::ops::rasterize::RasterSettings {
         let k = &self.fixture.get("in.Ks")[9 * camera..9 * camera + 9];
         settings(160, 120, k, &self.fixture.get("in.viewmats")[16 * camera..16 * camera + 16])
     }
@@ -187,7 +187,7 @@ fn tolerance(noise: &serde_json::Value, loss: &str, array: &str, category: &str)
 #[test]
 fn golden_projection_kernel() {
     let p = Projection::open();
-    let facts = std::fs::read_to_string(crate::raster_fixtures::folder().join("projection.json")).unwrap();
+    let facts = std::fs::read_to_string(super::raster_fixtures::folder().join("projection.json")).unwrap();
     let facts: serde_json::Value = serde_json::from_str(&facts).unwrap();
     let names: Vec<String> = facts["categories"].as_array().unwrap().iter().map(|v| v.as_str().unwrap().to_string()).collect();
     let category = p.fixture.get("in.category");
