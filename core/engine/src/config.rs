@@ -1,9 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
-use crate::data::SceneOptions;
-use crate::presets;
 use burn::tensor::Tensor;
-use cc4dgs_core::{Error, Limits, RenderSettings, Result, Rules, Scene, config, unknown_name};
+use cc4dgs_core::{Error, Limits, Registry, RenderSettings, Result, Rules, Scene, SceneOptions, config, unknown_name};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -264,10 +262,6 @@ impl Default for DensifyConfig {
 }
 
 impl RunConfig {
-    /// Names and summaries of the presets; see [`presets::methods`] for what may follow them.
-    pub fn presets() -> Vec<(&'static str, &'static str)> {
-        presets::families()
-    }
     /// Layers a preset, a TOML file and `key=value` overrides, in that order, and reads the result strictly.
     pub fn resolve(preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
         let mut table = toml::Table::new();
@@ -280,7 +274,7 @@ impl RunConfig {
         };
         let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
         if let Some(name) = preset.map(str::to_string).or(named) {
-            table = presets::table(&name)?;
+            table = Registry::collect()?.preset(&name)?;
         }
         config::merge(&mut table, &from_file);
         for assignment in sets {
@@ -357,10 +351,12 @@ fn one_of(object: &str, value: &str, known: &[&str]) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::PresetRole;
 
     #[test]
     fn every_preset_parses_and_round_trips() {
-        for (name, _) in RunConfig::presets() {
+        for plugin in Registry::collect().unwrap().presets().filter(|p| p.role != PresetRole::Method) {
+            let name = plugin.info.name;
             let config = RunConfig::resolve(Some(name), None, &["train.iterations=7".into()]).unwrap();
             assert_eq!(config.train.iterations, 7);
             let text = config.to_toml().unwrap();

@@ -42,6 +42,18 @@ pub struct Image8 {
 }
 
 impl Image8 {
+    /// Refuses an image without pixels, with other than 3 or 4 channels, or with another number of bytes than its size wants; `object` names it in the error.
+    pub fn validate(&self, object: &str) -> Result<()> {
+        let bytes = u64::from(self.width).saturating_mul(u64::from(self.height)).saturating_mul(u64::from(self.channels));
+        if bytes == 0 || !(3..=4).contains(&self.channels) || self.data.len() as u64 != bytes {
+            return Err(Error::data(
+                object,
+                format!("{} bytes for {}x{} pixels of {} channels", self.data.len(), self.width, self.height, self.channels),
+                "An image has 3 or 4 bytes per pixel; correct what made it",
+            ));
+        }
+        Ok(())
+    }
     /// Linear planes [3,H,W] in 0..1, alpha composited over `background`.
     pub fn to_planes(&self, background: [f32; 3]) -> Vec<f32> {
         let pixels = (self.width * self.height) as usize;

@@ -48,7 +48,7 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let loaded = load_model(&args.out, &config.device, &context.registry, &context.limits, &events)?;
     let packed = compress::compress(context, &loaded.model, CODEC, &toml::Table::new(), &archive, &events)?;
 
-    let scene = open_scene(scene_path, &loaded.model, &[], &context.limits)?;
+    let scene = open_scene(scene_path, &loaded.model, &[], &context.registry, &context.limits)?;
     let plain = Pictures::default();
     let before = measure(context, &args.out, &loaded, &scene, Split::Test, 0, &plain, &events)?;
     let pictures = Pictures { sheet: Some(args.out.join("sheet.png")), sheet_rows: 6, renders: None };
