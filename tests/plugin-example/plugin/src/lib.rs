@@ -1,4 +1,6 @@
-//! A deformer and a codec that cc4dgs knows nothing of.
+//! A deformer, a codec, a reader and presets that cc4dgs knows nothing of.
 
 mod half;
+mod preset;
+mod rig;
 mod sway;
