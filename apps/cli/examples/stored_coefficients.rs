@@ -10,7 +10,7 @@
 use cc4dgs::core::burn::tensor::{Tensor, TensorData};
 use cc4dgs::core::gaussians::to_vec;
 use cc4dgs::core::{
-    Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, config, parse_device,
+    Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, SceneOptions, Silent, SpatialFeatures, SpatialInput, Split, config, parse_device,
 };
 use cc4dgs::engine::{data, eval::evaluate, model::Model};
 use std::collections::HashMap;
@@ -77,8 +77,8 @@ fn main() -> Result<()> {
     let load = || Model::load(model.as_ref(), &registry, &device, &limits, &Silent);
     let plain = load()?;
     let section = plain.provenance.config.get("scene").and_then(|s| s.as_table()).cloned().unwrap_or_default();
-    let options: data::SceneOptions = config::parse_section("scene", &section)?;
-    let scene = data::open(scene.as_ref(), &options, &limits)?;
+    let options: SceneOptions = config::parse_section("scene", &section)?;
+    let scene = data::open(scene.as_ref(), &options, &registry, &limits)?;
     let score = |model: &Model| evaluate(model, &scene, Split::Test, views, &registry, &device, &Silent, &mut |_, _, _, _| Ok(()));
     let before = score(&plain)?;
     println!("{} moving Gaussians, field {} bytes as float32, {:.3} dB", before.dynamic_gaussians, plain.size.deform, before.psnr_db);

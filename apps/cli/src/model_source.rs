@@ -1,7 +1,7 @@
 //! Finding what a command works on: models and the scenes they are measured against.
 
-use cc4dgs_core::{EventSink, Limits, Registry, Result, Scene, auto_device, config, parse_device};
-use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_core::{EventSink, Limits, Registry, Result, Scene, SceneOptions, auto_device, config, parse_device};
+use cc4dgs_engine::data;
 use cc4dgs_engine::model::Model;
 use std::path::Path;
 
@@ -26,8 +26,8 @@ pub fn resolved_device(name: &str) -> Result<&str> {
 }
 
 /// Opens the dataset at `path` as the model was trained on it, with `--set scene.key=value` laid over.
-pub fn open_scene(path: &Path, model: &Model, sets: &[String], limits: &Limits) -> Result<Scene> {
-    data::open(path, &scene_options(&model.provenance.config, sets)?, limits)
+pub fn open_scene(path: &Path, model: &Model, sets: &[String], registry: &Registry, limits: &Limits) -> Result<Scene> {
+    data::open(path, &scene_options(&model.provenance.config, sets)?, registry, limits)
 }
 
 fn scene_options(stored: &toml::Table, sets: &[String]) -> Result<SceneOptions> {

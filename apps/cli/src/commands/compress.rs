@@ -56,7 +56,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     }
     // A name that nobody knows is told before the scene is read.
     context.registry.weight_codec(&args.field_weights)?;
-    let scene = args.scene.as_ref().map(|path| open_scene(path, &loaded.model, &[], &context.limits)).transpose()?;
+    let scene = args.scene.as_ref().map(|path| open_scene(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?;
     let options = ArchiveOptions {
         codec: &args.codec,
         settings: &settings,

@@ -89,7 +89,7 @@ fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) 
         let time = |i: usize| if frames > 1 { i as f32 / (frames - 1) as f32 } else { 0.0 };
         return Ok(cameras.into_iter().enumerate().map(|(i, camera)| (camera, time(i))).collect());
     };
-    let scene = open_scene(path, model, &args.sets, &context.limits)?;
+    let scene = open_scene(path, model, &args.sets, &context.registry, &context.limits)?;
     let views = scene.split(args.split.into());
     if views.is_empty() {
         return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));

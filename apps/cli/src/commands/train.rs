@@ -51,7 +51,7 @@ pub fn resolve(context: &Context, preset: Option<&str>, file: Option<&Path>, set
 pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out: &Path, resume: bool) -> Result<(String, TrainReport)> {
     let stop = interrupt::stop_flag()?;
     check_plugins(context, config)?;
-    let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &config.limits)?);
+    let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &context.registry, &config.limits)?);
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;
     let job = TrainJob { config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop };
