@@ -283,9 +283,7 @@ impl RunConfig {
             table = presets::table(&name)?;
         }
         config::merge(&mut table, &from_file);
-        for assignment in sets {
-            config::set(&mut table, assignment)?;
-        }
+        config::set_all(&mut table, sets)?;
         let resolved: Self = config::parse_section("configuration", &table)?;
         resolved.validate()?;
         Ok(resolved)

@@ -1,10 +1,9 @@
-//! How well a model follows motion that is known: trajectories of its Gaussians against the true ones, and pictures where the motion is, object by object.
+//! Trajectory error on a synthetic scene with known motion: trajectories of its Gaussians against the true ones, and images where the motion is, object by object.
 
 use crate::data::procedural::{Motion, ProceduralScene, Shape};
 use crate::model::Model;
 use crate::play::Player;
 use burn::tensor::Device;
-use cc4dgs_backends::ops::picture::read_picture;
 use cc4dgs_core::{Event, EventSink, HostGaussians, Registry, Result, Split};
 use glam::DVec3;
 use serde::Serialize;
@@ -46,7 +45,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
     if balls.is_empty() {
         return Ok(Vec::new());
     }
-    let mut player = Player::new(model, registry, device)?;
+    let mut player = Player::new(model, registry, device)?.on(Some(scene.background));
     let first = player.gaussians_at(0.0)?.to_host()?;
     let owned: Vec<Vec<usize>> = balls.iter().map(|&(object, _, radius)| on_ball(scene, object, radius, &first)).collect();
     let cameras: Vec<_> = scene.cameras().into_iter().filter(|(_, split)| *split == Split::Test).map(|(camera, _)| camera).collect();
@@ -66,7 +65,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
             }
         }
         for (camera, masks) in cameras.iter().zip(&masks) {
-            let found = read_picture(player.render(camera, time as f32)?.0.planes)?;
+            let found = player.frame(camera, time as f32)?;
             let truth = scene.render(camera, time);
             for (mask, sum) in masks.iter().zip(&mut errors) {
                 for (pixel, _) in mask.iter().enumerate().filter(|(_, covered)| **covered) {

@@ -2,7 +2,7 @@
 
 use super::{Context, create_parent, megabytes};
 use crate::args::Compress;
-use crate::model_source::load_model;
+use crate::models::load_model;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
 use cc4dgs_core::{Event, EventSink, Result, config};
 use cc4dgs_engine::eval::SizeMb;
@@ -52,9 +52,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     loaded.model.weight_precision = args.field_weights.into();
     let mut settings = toml::Table::new();
-    for assignment in &args.sets {
-        config::set(&mut settings, assignment)?;
-    }
+    config::set_all(&mut settings, &args.sets)?;
     let report = compress(context, &loaded.model, &args.codec, &settings, &args.out, &events)?;
     context.output.result(&report, || text(&report))
 }
@@ -68,14 +66,14 @@ pub fn compress(context: &Context, model: &Model, codec: &str, settings: &toml::
     let seconds = began.elapsed().as_secs_f64();
     let stored = Archive::open(out, &context.limits)?.stream_sizes();
     let of_kind = |kind| stored.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum();
-    let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.size };
+    let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.float32_size() };
     Ok(CompressReport {
         archive: out.to_path_buf(),
         codec: codec.to_string(),
         gaussians: model.gaussians.len(),
         bytes,
         size_mb: size.into(),
-        ratio: model.size.total as f64 / bytes.max(1) as f64,
+        ratio: model.float32_size().total as f64 / bytes.max(1) as f64,
         seconds,
         streams: stored.into_iter().map(StreamSize::from).collect(),
     })

@@ -33,12 +33,27 @@ fn list(context: &Context) -> Result<()> {
     })
 }
 
+/// The settings of a preset, such as `demo` or `dnerf+hexplane`.
+fn show_preset(context: &Context, name: &str, settings: &toml::Table) -> Result<()> {
+    let text = settings.to_string();
+    let family = name.split('+').next().unwrap_or(name);
+    let summary = RunConfig::presets().into_iter().find(|(known, _)| *known == family).map_or("", |(_, summary)| summary);
+    let array = [json!({ "kind": "preset", "name": name, "summary": summary, "settings": settings })];
+    context.output.result(&array, || format!("preset {name}: {summary}\n\n{text}"))
+}
+
 /// Everything of the name, whatever its kind: a codec and a deformer may share one.
 fn show(context: &Context, name: &str) -> Result<()> {
     let plugins = context.registry.plugins();
     let found: Vec<_> = plugins.iter().filter(|(_, p)| p.name == name).collect();
     if found.is_empty() {
-        return Err(unknown_name("plug-in", name, plugins.iter().map(|(_, p)| p.name)));
+        return match presets::table(name) {
+            Ok(settings) => show_preset(context, name, &settings),
+            Err(_) => {
+                let presets: Vec<&str> = RunConfig::presets().into_iter().map(|(name, _)| name).collect();
+                Err(unknown_name("plug-in or preset", name, plugins.iter().map(|(_, p)| p.name).chain(presets)))
+            }
+        };
     }
     let full = |(kind, p): &&(&str, &cc4dgs_core::Plugin)| json!({ "kind": kind, "name": p.name, "version": p.version, "summary": p.summary, "paper": p.paper, "capabilities": p.capabilities, "schema": p.schema });
     let array: Vec<_> = found.iter().map(full).collect();

@@ -14,12 +14,12 @@ pub fn encode_png(image: &Image8) -> Result<Vec<u8>> {
     };
     if image.data.len() as u64 != u64::from(image.width) * u64::from(image.height) * u64::from(image.channels) || image.data.is_empty() {
         let problem = format!("{} bytes for {}x{} pixels of {} channels", image.data.len(), image.width, image.height, image.channels);
-        return Err(Error::parameter("PNG", problem, "Pass a whole picture"));
+        return Err(Error::parameter("PNG", problem, "Pass a whole image"));
     }
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes)
         .write_image(&image.data, image.width, image.height, color)
-        .map_err(|e| Error::backend("PNG encoder", e.to_string(), "Report this: every 8-bit picture should encode"))?;
+        .map_err(|e| Error::backend("PNG encoder", e.to_string(), "Report this: every 8-bit image should encode"))?;
     Ok(bytes)
 }
 

@@ -8,10 +8,13 @@ const FOV_X: f64 = 0.9;
 /// Gaussians fainter than this are haze and say nothing of where the model is.
 const FAINT_LOGIT: f32 = -2.0;
 
-/// `frames` cameras on a circle around what `gaussians` show, making `turns` full turns; `up` is the axis that points up.
+/// `frames` cameras on a circle around what `gaussians` show, making `turns` full turns; `size` is in pixels, `up` the signed unit axis that points up.
+///
+/// # Errors
+/// [`Error::Parameter`] for turns that are no number, [`Error::Data`] for Gaussians so far away that no camera can look at them.
 pub fn orbit(gaussians: &HostGaussians, size: (u32, u32), frames: usize, turns: f64, up: [f64; 3]) -> Result<Vec<Camera>> {
     if !turns.is_finite() {
-        return Err(Error::parameter("--turns", format!("{turns} is not a number"), "Give the number of full turns, such as 1"));
+        return Err(Error::parameter("orbit", format!("{turns} turns are not a number"), "Give the number of full turns, such as 1"));
     }
     let (middle, radius) = middle_and_radius(gaussians);
     // Two axes perpendicular to `up`, which is a signed unit axis.

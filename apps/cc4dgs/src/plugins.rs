@@ -1,0 +1,33 @@
+//! Checking the plug-ins of a configuration before anything long begins.
+
+use cc4dgs_core::{DeformerContext, Registry, Result, Seed, parse_device};
+use cc4dgs_engine::config::RunConfig;
+
+/// Builds every plug-in of `config` once and drops it. A mistake in the settings of the deformer should not wait for the main stage, nor leave a
+/// folder behind.
+///
+/// # Errors
+/// Those of the plug-ins: unknown names, unknown settings, values out of range; and a device that does not answer.
+pub fn check(config: &RunConfig, registry: &Registry) -> Result<()> {
+    let device = parse_device(&config.device)?;
+    registry.build_rasterizer(&config.rasterizer)?;
+    let seed = Seed::root(config.seed).child("check");
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: config.train.sh_degree, seed };
+    registry.build_deformer(&config.deformer, &context, &device)?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn mistakes_are_found_before_training() {
+        let registry = Registry::collect().unwrap();
+        let config = |set: &str| RunConfig::resolve(Some("demo"), None, &[set.to_string()]).unwrap();
+        check(&config("deformer.levels=2"), &registry).unwrap();
+        assert!(check(&config("deformer.capasity=small"), &registry).unwrap_err().to_string().contains("capasity"));
+        assert!(check(&config("rasterizer.kind=tyle"), &registry).unwrap_err().to_string().contains("tile"));
+        assert!(check(&config("device=fleks"), &registry).unwrap_err().to_string().contains("flex"));
+    }
+}
