@@ -8,32 +8,65 @@ const FOV_X: f64 = 0.9;
 /// Gaussians fainter than this are haze and say nothing of where the model is.
 const FAINT_LOGIT: f32 = -2.0;
 
-/// `frames` cameras on a circle around what `gaussians` show, making `turns` full turns; `size` is in pixels, `up` the signed unit axis that points up.
-///
-/// # Errors
-/// [`Error::Parameter`] for turns that are no number, [`Error::Data`] for Gaussians so far away that no camera can look at them.
-pub fn orbit(gaussians: &HostGaussians, size: (u32, u32), frames: usize, turns: f64, up: [f64; 3]) -> Result<Vec<Camera>> {
-    if !turns.is_finite() {
-        return Err(Error::parameter("orbit", format!("{turns} turns are not a number"), "Give the number of full turns, such as 1"));
+/// A circle of cameras that look at the middle of a model.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Orbit {
+    /// Width and height of the images in pixels.
+    pub size: (u32, u32),
+    /// Cameras, evenly spread over the turns.
+    pub frames: usize,
+    /// Full turns.
+    pub turns: f64,
+    /// The signed unit axis of the world that points up.
+    pub up: [f64; 3],
+}
+
+impl Default for Orbit {
+    fn default() -> Self {
+        Self { size: (800, 600), frames: 60, turns: 1.0, up: [0.0, 0.0, 1.0] }
     }
-    let (middle, radius) = middle_and_radius(gaussians);
-    // Two axes perpendicular to `up`, which is a signed unit axis.
-    let axis = up.iter().position(|c| *c != 0.0).unwrap_or(2);
-    let (mut side, mut front) = ([0.0; 3], [0.0; 3]);
-    side[(axis + 1) % 3] = 1.0;
-    front[(axis + 2) % 3] = 1.0;
-    // Far enough for a sphere of the radius to fill most of the narrower field of view.
-    let narrow = 0.5 * FOV_X * f64::from(size.1.min(size.0)) / f64::from(size.0);
-    let distance = 1.1 * radius / narrow.sin();
-    let camera = |i: usize| {
-        let (s, c) = (turns * std::f64::consts::TAU * i as f64 / frames.max(1) as f64).sin_cos();
-        let flat = distance * ELEVATION.cos();
-        let eye: [f64; 3] = std::array::from_fn(|k| middle[k] + flat * (c * side[k] + s * front[k]) + distance * ELEVATION.sin() * up[k]);
-        Camera::look_at(&format!("orbit{i:05}"), size, FOV_X, eye, middle, up)
-    };
-    let cameras: Vec<Camera> = (0..frames).map(camera).collect();
-    cameras.iter().try_for_each(Camera::validate)?;
-    Ok(cameras)
+}
+
+impl Orbit {
+    /// The cameras, far enough to see most of what `gaussians` show.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for turns or an axis that are no numbers and for empty images, [`Error::Data`] for Gaussians so far away that no camera can look
+    /// at them.
+    pub fn around(&self, gaussians: &HostGaussians) -> Result<Vec<Camera>> {
+        let (width, height) = self.size;
+        let bad = |problem: String, remedy: &str| Err(Error::parameter("orbit", problem, remedy));
+        if !self.turns.is_finite() {
+            return bad(format!("{} turns are not a number", self.turns), "Give the number of full turns, such as 1");
+        }
+        let Some(axis) = self.up.iter().position(|c| c.abs() == 1.0).filter(|_| self.up.iter().map(|c| c.abs()).sum::<f64>() == 1.0) else {
+            return bad(format!("{:?} is no signed axis", self.up), "Give one of x, y and z with its sign, such as [0, 0, 1]");
+        };
+        if width == 0 || height == 0 {
+            return bad(format!("images of {width}x{height} pixels are empty"), "Give a size such as 800x600");
+        }
+        let (middle, radius) = middle_and_radius(gaussians);
+        // Two axes perpendicular to `up`.
+        let (mut side, mut front) = ([0.0; 3], [0.0; 3]);
+        side[(axis + 1) % 3] = 1.0;
+        front[(axis + 2) % 3] = 1.0;
+        // Far enough for a sphere of the radius to fill most of the narrower field of view.
+        let narrow = 0.5 * FOV_X * f64::from(height.min(width)) / f64::from(width);
+        let distance = 1.1 * radius / narrow.sin();
+        let camera = |i: usize| {
+            let (s, c) = (self.turns * std::f64::consts::TAU * i as f64 / self.frames.max(1) as f64).sin_cos();
+            let flat = distance * ELEVATION.cos();
+            let eye: [f64; 3] = std::array::from_fn(|k| middle[k] + flat * (c * side[k] + s * front[k]) + distance * ELEVATION.sin() * self.up[k]);
+            Camera::look_at(&format!("orbit{i:05}"), self.size, FOV_X, eye, middle, self.up)
+        };
+        let cameras: Vec<Camera> = (0..self.frames).map(camera).collect();
+        cameras.iter().try_for_each(Camera::validate)?;
+        Ok(cameras)
+    }
+    /// Normalised time of a frame, so that time runs from 0 to 1 over the orbit.
+    pub fn time(&self, frame: usize) -> f32 {
+        if self.frames > 1 { frame as f32 / (self.frames - 1) as f32 } else { 0.0 }
+    }
 }
 
 /// The median of the centres and the distance within which 70 % of them lie: a background far away must not push the camera out.
@@ -65,7 +98,7 @@ mod tests {
     #[test]
     fn cameras_circle_the_middle_and_look_at_it() {
         for up in [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]] {
-            let cameras = orbit(&cube(5.0), (80, 60), 12, 1.0, up).unwrap();
+            let cameras = Orbit { size: (80, 60), frames: 12, up, ..Orbit::default() }.around(&cube(5.0)).unwrap();
             for camera in &cameras {
                 let seen: [f64; 3] = std::array::from_fn(|r| (0..3).map(|c| camera.world_to_camera[r][c] * 5.5).sum::<f64>() + camera.world_to_camera[r][3]);
                 assert!(seen[2] > 1.0 && (seen[0] / seen[2]).abs() < 0.3 && (seen[1] / seen[2]).abs() < 0.3, "{seen:?}");
@@ -79,8 +112,11 @@ mod tests {
     #[test]
     fn degenerate_models_still_get_cameras() {
         let one = HostGaussians { means: vec![3.0; 3], opacity_logits: vec![-9.0], ..Default::default() };
-        assert_eq!(orbit(&one, (8, 8), 2, 1.0, [0.0, 0.0, 1.0]).unwrap().len(), 2);
-        assert_eq!(orbit(&HostGaussians::default(), (8, 8), 1, 0.5, [0.0, 1.0, 0.0]).unwrap().len(), 1);
-        assert!(orbit(&one, (8, 8), 2, f64::NAN, [0.0, 0.0, 1.0]).is_err());
+        let small = Orbit { size: (8, 8), frames: 2, ..Orbit::default() };
+        assert_eq!(small.around(&one).unwrap().len(), 2);
+        assert_eq!(small.around(&HostGaussians::default()).unwrap().len(), 2);
+        assert!(Orbit { turns: f64::NAN, ..small.clone() }.around(&one).is_err());
+        assert!(Orbit { up: [0.0, 0.5, 0.5], ..small.clone() }.around(&one).is_err());
+        assert!(Orbit { size: (0, 8), ..small }.around(&one).is_err());
     }
 }

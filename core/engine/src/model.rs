@@ -122,6 +122,14 @@ impl Model {
     pub fn background_on(&self, scene: Option<[f32; 3]>) -> [f32; 3] {
         self.background.or(scene).unwrap_or_default()
     }
+    /// Lower and upper corner of the box around all canonical centres, world units; zeros without Gaussians.
+    pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
+        let corner = |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
+            let axis = |k: usize| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
+            std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k) })
+        };
+        (corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max))
+    }
     /// Bytes of Gaussians and field as float32, whatever the model was read from.
     pub fn float32_size(&self) -> ModelSize {
         let (deform_grid, deform_net) = self.field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
@@ -245,9 +253,7 @@ impl Model {
             let widths: BTreeMap<&str, usize> = self.gaussians.extra.iter().map(|(name, a)| (name.as_str(), a.width)).collect();
             extra.insert(ATTRIBUTES.into(), json(&widths)?);
         }
-        let axis = |k: usize, start: f32, pick: fn(f32, f32) -> f32| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
-        let corner =
-            |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] { std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k, start, pick) }) };
+        let (lower, upper) = self.bounds();
         let manifest = Manifest {
             codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
             deformer,
@@ -260,7 +266,7 @@ impl Model {
             },
             frame_count: self.frame_count,
             time_range: [0.0, 1.0],
-            box_world: [corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max)],
+            box_world: [lower, upper],
             background: self.background_on(None),
             sh_degree: self.gaussians.sh_degree,
             dynamic_threshold: if let Moving::Scored { zeta } = moving { zeta } else { 0.0 },

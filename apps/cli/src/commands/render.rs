@@ -4,7 +4,7 @@ use super::{Context, create_parent, evenly};
 use crate::args::Render;
 use crate::interrupt;
 use crate::models::load_model;
-use cc4dgs::orbit::orbit;
+use cc4dgs::Orbit;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs::video;
 use cc4dgs_core::{Camera, Error, Event, EventSink, Result};
@@ -12,9 +12,6 @@ use cc4dgs_engine::images::write_png;
 use cc4dgs_engine::play::{Player, image_of};
 use serde::Serialize;
 use std::path::PathBuf;
-
-const ORBIT_FRAMES: usize = 60;
-const ORBIT_SIZE: (u32, u32) = (800, 600);
 
 #[derive(Serialize)]
 struct RenderReport {
@@ -84,10 +81,11 @@ fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) 
         if !args.sets.is_empty() {
             return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));
         }
-        let frames = args.frames.map_or(ORBIT_FRAMES, |n| n as usize);
-        let cameras = orbit(&model.gaussians, args.size.unwrap_or(ORBIT_SIZE), frames, args.turns, args.up.into())?;
-        let time = |i: usize| if frames > 1 { i as f32 / (frames - 1) as f32 } else { 0.0 };
-        return Ok((cameras.into_iter().enumerate().map(|(i, camera)| (camera, time(i))).collect(), None));
+        let standard = Orbit::default();
+        let frames = args.frames.map_or(standard.frames, |n| n as usize);
+        let orbit = Orbit { size: args.size.unwrap_or(standard.size), frames, turns: args.turns, up: args.up.into() };
+        let cameras = orbit.around(&model.gaussians)?;
+        return Ok((cameras.into_iter().enumerate().map(|(i, camera)| (camera, orbit.time(i))).collect(), None));
     };
     let scene = open_as_trained(path, model, &args.sets, &context.limits)?;
     let views = scene.split(args.split.into());
