@@ -229,6 +229,26 @@ fn every_kind_of_model_is_taken_everywhere() {
     }
 }
 
+#[test]
+fn the_storage_table_counts_attributes() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (run, archive) = (at("run"), at("a.cc4d"));
+    let settings = ["train.iterations=120", "train.checkpoint_every=0"];
+    let mut args = vec!["train", "--scene", "procedural:tiny", "--preset", "demo+native-4d", "--device", "flex", "--out", text(&run), "-q"];
+    args.extend(settings.iter().flat_map(|s| ["--set", s]));
+    succeed(&args);
+    // Every codec stores attributes in streams of its own.
+    for codec in ["raw", "quantize"] {
+        succeed(&["compress", text(&run), "--codec", codec, "--out", text(&archive), "-q"]);
+        let [before, after] = [&run, &archive].map(|path| json_of(&["info", text(path), "--json"]));
+        assert!(before["gaussians"]["extra"].as_array().unwrap().len() > 2, "{before}");
+        for row in 0..5 {
+            assert_eq!(before["storage"][row]["float32_mb"], after["storage"][row]["float32_mb"], "{codec}: row {row}");
+        }
+    }
+}
+
 /// What an archive says of plug-ins that this program lacks.
 #[test]
 fn archives_of_plug_ins_that_are_not_linked_say_what_to_link() {
