@@ -19,4 +19,5 @@ mod picture;
 mod raster;
 mod raster_fixtures;
 mod readers;
+mod session;
 mod sort;
