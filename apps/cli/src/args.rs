@@ -17,10 +17,10 @@ pub struct Cli {
     /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE.
     #[arg(long, global = true, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub json: Option<PathBuf>,
-    /// Say nothing but results and errors.
+    /// Print results and errors only.
     #[arg(long, short, global = true)]
     pub quiet: bool,
-    /// Threads to compute with; 0 takes all of the machine. Results do not depend on it.
+    /// Threads to compute with; 0 uses all cores. Results do not depend on it.
     #[arg(long, global = true, value_name = "N", default_value_t = 0)]
     pub threads: usize,
     /// Raise or lower what readers accept of a file, such as max_gaussians=50000000; may be given several times.
@@ -44,7 +44,7 @@ pub enum Command {
     Render(Render),
     /// Measure a model against the images of a scene.
     Eval(Eval),
-    /// Say what a model (checkpoint, archive, PLY, SPZ) or a scene holds.
+    /// Show what a model (checkpoint, archive, PLY, SPZ) or a scene contains.
     Info(Info),
     /// List the plug-ins, or show one with its settings.
     Plugins(Plugins),
@@ -81,7 +81,7 @@ pub struct Train {
     /// A TOML file laid over the preset.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Override a setting, such as train.iterations=5000; may be given several times.
+    /// Override a setting, such as train.iterations=5000; may be given several times. Plug-ins (deformer.kind=…) are chosen first, whatever the order.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
     /// Device to compute on: auto, flex, ndarray, wgpu, cuda.

@@ -10,9 +10,9 @@ use serde::Serialize;
 
 /// Gaussians this near to a ball's surface at the first frame, as shares of its radius, belong to it.
 const NEAR_SURFACE: [f64; 2] = [0.7, 1.2];
-/// Gaussians below this opacity are seen by nobody.
+/// Gaussians below this opacity count as invisible.
 const LEAST_OPACITY: f32 = 0.1;
-/// Moments at which it is asked which pixels an object covers.
+/// Times at which the pixels that an object covers are collected.
 const MOMENTS: usize = 24;
 
 /// One swaying object.

@@ -8,7 +8,7 @@ use cc4dgs_core::{Adapter, Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians
 use serde::Serialize;
 use std::time::Instant;
 
-/// The rasterizer that is slow, obvious, and right.
+/// The reference rasterizer: slow, in float64.
 const ORACLE: &str = "reference";
 /// Half a level of an 8-bit image: what float32 may cost. Two correct rasterizers differ by more only where a Gaussian is just at the cut-off.
 const TOLERANCE: f32 = 0.5 / 255.0;

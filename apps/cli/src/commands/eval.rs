@@ -25,7 +25,7 @@ pub struct FullReport {
     pub sheet: Option<PathBuf>,
     #[serde(flatten)]
     pub eval: EvalReport,
-    /// Where the scene's motion is known, how well it is followed, object by object.
+    /// Trajectory error per object, for built-in scenes with known motion.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionScore>,
     pub provenance: Provenance,
