@@ -25,7 +25,7 @@ mod tests {
     fn mistakes_are_found_before_training() {
         let registry = Registry::collect().unwrap();
         let config = |set: &str| RunConfig::resolve(Some("demo"), None, &[set.to_string()]).unwrap();
-        check(&config("deformer.levels=2"), &registry).unwrap();
+        check(&config("train.batch=1"), &registry).unwrap();
         assert!(check(&config("deformer.capasity=small"), &registry).unwrap_err().to_string().contains("capasity"));
         assert!(check(&config("rasterizer.kind=tyle"), &registry).unwrap_err().to_string().contains("tile"));
         assert!(check(&config("device=fleks"), &registry).unwrap_err().to_string().contains("flex"));
