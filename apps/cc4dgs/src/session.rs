@@ -137,16 +137,10 @@ impl Session {
     /// [`Error::Interrupted`](crate::Error::Interrupted) after [`Session::stop`], [`Error::Backend`](crate::Error::Backend) when the loss is no longer a
     /// number, and whatever scene, plug-ins and disk report.
     pub fn train(&self, config: &RunConfig, scene: impl Into<Arc<Scene>>, out: Option<&Path>) -> Result<Model> {
-        match out {
-            Some(folder) => {
-                check_folder(folder, Existing::Refuse, "Choose another folder, or go on with Session::resume")?;
-                self.train_in(config, scene.into(), folder, false)
-            }
-            None => {
-                let folder = tempfile::tempdir().map_err(|e| crate::Error::io(std::env::temp_dir(), e))?;
-                self.train_in(config, scene.into(), folder.path(), false)
-            }
+        if let Some(folder) = out {
+            check_folder(folder, Existing::Refuse, "Choose another folder, or go on with Session::resume")?;
         }
+        self.run(config, scene.into(), out, false)
     }
     /// Goes on with the run in `folder` from its checkpoint; the result is the same as without the interruption.
     ///
@@ -154,15 +148,15 @@ impl Session {
     /// As [`Session::train`], and for a folder without a run.
     pub fn resume(&self, scene: impl Into<Arc<Scene>>, folder: &Path) -> Result<Model> {
         let config = RunConfig::resolve(None, Some(&folder.join(CONFIG)), &[])?;
-        self.train_in(&config, scene.into(), folder, true)
+        self.run(&config, scene.into(), Some(folder), true)
     }
-    fn train_in(&self, config: &RunConfig, scene: Arc<Scene>, folder: &Path, resume: bool) -> Result<Model> {
+    fn run(&self, config: &RunConfig, scene: Arc<Scene>, out: Option<&Path>, resume: bool) -> Result<Model> {
         let config = &self.adopted(config.clone());
         plugins::check(config, self.registry())?;
         self.shared.stop.store(false, Ordering::Relaxed);
         let (registry, events, stop) = (self.registry(), self.events(), &self.shared.stop);
-        train(&TrainJob { config, scene, out: folder.to_path_buf(), resume, registry, events, stop })?;
-        self.open(folder)
+        let (model, _) = train(&TrainJob { config, scene, out: out.map(Path::to_path_buf), resume, registry, events, stop })?;
+        Ok(Model::new(model, self.clone()))
     }
     /// The configuration with this session's device and limits.
     fn adopted(&self, mut config: RunConfig) -> RunConfig {

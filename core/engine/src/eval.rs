@@ -3,7 +3,7 @@
 use crate::config::TrainConfig;
 use crate::masks::dynamic_masks;
 use crate::model::{Model, ModelSize};
-use crate::play::{FrameTime, PlayWork, Player, image_of};
+use crate::play::{FrameTime, PlayWork, Player};
 use burn::tensor::Device;
 use cc4dgs_core::metrics::{FrameSet, Metric, Rounding, SsimConvention};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
@@ -154,7 +154,7 @@ pub fn evaluate(
     for (done, &view) in views.iter().enumerate() {
         let camera = scene.camera(view);
         let (output, time) = player.render(camera, scene.views[view].time_norm)?;
-        let render = image_of(output)?;
+        let render = player.download(output.planes)?;
         let frame = scene.frame(view)?;
         // Both images are rounded to 8 bits before they are compared.
         let truth = Image8::from_planes(&frame.to_planes(background), camera.width, camera.height);

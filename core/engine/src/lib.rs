@@ -2,11 +2,10 @@
 
 pub mod agreement;
 pub mod checkpoint;
-pub mod columns;
 pub mod config;
 pub mod data;
-pub mod densify;
 pub mod eval;
+pub mod gaussian_set;
 pub mod images;
 pub mod init;
 pub mod knn;

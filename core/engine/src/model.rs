@@ -4,7 +4,7 @@ use crate::checkpoint;
 use crate::config::{RenderConfig, RunConfig};
 use crate::ply;
 use crate::source::{Source, SourceKind};
-use crate::train::Moving;
+use crate::train::{Moving, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_codecs::spz;
 use cc4dgs_core::archive::{
@@ -57,6 +57,13 @@ pub struct ModelDeformer {
     pub section: toml::Table,
     /// What it was built with.
     pub context: DeformerContext,
+}
+
+impl ModelDeformer {
+    /// Its name in the registry.
+    pub fn name(&self) -> &str {
+        self.section.get("kind").and_then(|kind| kind.as_str()).unwrap_or("without a name")
+    }
 }
 
 /// Sizes in bytes. For archives, PLY and SPZ files these are bytes on disk, headers included in `total`; for a checkpoint the float32 size of what playback
@@ -142,7 +149,14 @@ impl Model {
         let stored = checkpoint::load(path, registry, device, limits)?;
         let config = stored.config().clone();
         let (gaussians, moving, frame_count) = (stored.gaussians()?, stored.moving(), stored.frame_count());
-        let field = stored.into_field().map(|(field, section, context)| ModelDeformer { field, section, context });
+        Self::assembled(gaussians, stored.into_deformer(), moving, frame_count, &config)
+    }
+    /// The model that a run ends with.
+    pub fn from_training(state: TrainState, config: &RunConfig) -> Result<Self> {
+        let frame_count = state.deformer.as_ref().map_or(1, |d| d.context.frame_count);
+        Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, config)
+    }
+    fn assembled(gaussians: HostGaussians, field: Option<ModelDeformer>, moving: Moving, frame_count: usize, config: &RunConfig) -> Result<Self> {
         let mut model = Self {
             gaussians,
             field,
@@ -151,7 +165,7 @@ impl Model {
             render: config.render.clone(),
             rasterizer: config.rasterizer.clone(),
             frame_count,
-            provenance: provenance(&config)?,
+            provenance: provenance(config)?,
             size: ModelSize::default(),
             weight_precision: WeightPrecision::default(),
         };

@@ -2,8 +2,7 @@
 
 use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_backends::ops::picture::read_picture;
-use cc4dgs_core::{Camera, DeformerWork, Gaussians, Image8, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
+use cc4dgs_core::{Camera, DeformerWork, Gaussians, Image8, Rasterizer, Registry, RenderOutput, RenderSettings, Result, SpatialInput, Splats};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -48,8 +47,8 @@ pub struct Player<'a> {
     frame: Gaussians,
     /// The moving Gaussians without offsets.
     moving_gaussians: Gaussians,
-    /// The field's attributes of the moving Gaussians.
-    moving_attributes: Vec<Tensor<2>>,
+    /// What the deformer is asked about.
+    spatial_input: SpatialInput,
     moving: usize,
     cache: Option<Tensor<2>>,
     settings: RenderSettings,
@@ -80,11 +79,6 @@ pub struct FrameTime {
     pub field_ms: f64,
     /// Projection, sorting and blending, to pixels in host-readable memory.
     pub raster_ms: f64,
-}
-
-/// The 8-bit RGB image of what a rasterizer drew, read back from the device.
-pub fn image_of(output: RenderOutput) -> Result<Image8> {
-    read_picture(output.planes)
 }
 
 fn colour(rgb: [f32; 3], device: &Device) -> Tensor<1> {
@@ -121,8 +115,8 @@ impl<'a> Player<'a> {
             device: device.clone(),
             rasterizer: registry.build_rasterizer(&model.rasterizer)?,
             frame,
+            spatial_input: SpatialInput { means_world: moving_gaussians.means.clone(), attributes: moving_attributes },
             moving_gaussians,
-            moving_attributes,
             moving,
             cache: None,
             settings: model.render.settings(Some(colour(model.background_on(None), device))),
@@ -152,7 +146,7 @@ impl<'a> Player<'a> {
                 features.clone()
             }
             None => {
-                let spatial = field.field.spatial_with(self.moving_gaussians.means.clone(), &self.moving_attributes)?;
+                let spatial = field.field.spatial(&self.spatial_input)?;
                 self.work.spatial.gaussians += spatial.work.gaussians;
                 self.work.spatial.vertices_queried += spatial.work.vertices_queried;
                 self.work.spatial.vertices_decoded += spatial.work.vertices_decoded;
@@ -167,12 +161,13 @@ impl<'a> Player<'a> {
         // The frame is written in place. A caller who kept the last one keeps a copy of its own.
         let nothing = self.moving_gaussians.clone();
         let frame = std::mem::replace(&mut self.frame, nothing);
-        self.frame = offsets.apply_over(&self.moving_gaussians, frame);
+        self.frame = offsets.apply_over(field.name(), &self.moving_gaussians, frame)?;
         Ok(self.frame.clone())
     }
     /// The 8-bit RGB image that `camera` sees at `time_norm` (0 to 1).
     pub fn frame(&mut self, camera: &Camera, time_norm: f32) -> Result<Image8> {
-        image_of(self.render(camera, time_norm)?.0)
+        let planes = self.render(camera, time_norm)?.0.planes;
+        self.download(planes)
     }
     /// Draws one frame and waits for it.
     pub fn render(&mut self, camera: &Camera, time_norm: f32) -> Result<(RenderOutput, FrameTime)> {
@@ -191,12 +186,16 @@ impl<'a> Player<'a> {
     pub fn play(&mut self, camera: &Camera, time_norm: f32) -> Result<RenderOutput> {
         let gaussians = self.gaussians_at(time_norm)?;
         let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
-        let settings = RenderSettings { pair_room: self.pair_capacity.capacity, ..self.settings.clone() };
+        let settings = RenderSettings { pair_capacity: self.pair_capacity.capacity, ..self.settings.clone() };
         let output = self.rasterizer.render(&splats, camera, &settings)?;
         if let Some(count) = &output.stats.pair_count {
             self.pair_capacity.note(count.clone());
         }
         Ok(output)
+    }
+    /// The 8-bit image of rendered planes [5,H,W], read back from the device.
+    pub fn download(&self, planes: Tensor<3>) -> Result<Image8> {
+        self.rasterizer.download(planes)
     }
     /// Waits until the device has finished.
     pub fn sync(&self) -> Result<()> {

@@ -9,7 +9,7 @@ use cc4dgs::scenes::open_as_trained;
 use cc4dgs::video;
 use cc4dgs_core::{Camera, Error, Event, EventSink, Result};
 use cc4dgs_engine::images::write_png;
-use cc4dgs_engine::play::{Player, image_of};
+use cc4dgs_engine::play::Player;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -45,7 +45,8 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     for (index, (camera, time_norm)) in shots.iter().enumerate() {
         interrupt::check(stop, &format!("after {index} of {} frames in {}", shots.len(), args.out.display()))?;
         let (output, time) = player.render(camera, *time_norm)?;
-        write_png(&args.out.join(video::frame_name(index)), &image_of(output)?)?;
+        let image = player.download(output.planes)?;
+        write_png(args.out.join(video::frame_name(index)), &image)?;
         times.push(time);
         events.emit(&Event::Progress { task: "render".into(), done: index as u64 + 1, total: shots.len() as u64 });
     }

@@ -60,8 +60,8 @@ pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out:
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let resume = existing == Existing::Resume;
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;
-    let job = TrainJob { config, scene: scene.clone(), out: out.to_path_buf(), resume, registry: &context.registry, events: &events, stop };
-    Ok((scene.name.clone(), train(&job)?))
+    let job = TrainJob { config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop };
+    Ok((scene.name.clone(), train(&job)?.1))
 }
 
 /// The report for people.
@@ -73,6 +73,6 @@ pub fn text(report: &TrainReport) -> String {
         stages.join(", "),
         report.gaussians,
         report.dynamic_gaussians,
-        report.checkpoint.display()
+        report.checkpoint.as_ref().map_or_else(String::new, |path| path.display().to_string())
     )
 }
