@@ -78,7 +78,7 @@ fn main() -> Result<()> {
     let plain = load()?;
     let section = plain.provenance.config.get("scene").and_then(|s| s.as_table()).cloned().unwrap_or_default();
     let options: SceneOptions = config::parse_section("scene", &section)?;
-    let scene = data::open(scene.as_ref(), &options, &registry, &limits)?;
+    let scene = data::open_in(scene.as_ref(), &options, &plain.normalisation, &registry, &limits)?;
     let score = |model: &Model| evaluate(model, &scene, Split::Test, views, &registry, &device, &Silent, &mut |_, _, _, _| Ok(()));
     let before = score(&plain)?;
     println!("{} moving Gaussians, field {} bytes as float32, {:.3} dB", before.dynamic_gaussians, plain.size.deform, before.psnr_db);

@@ -27,7 +27,7 @@ pub fn resolved_device(name: &str) -> Result<&str> {
 
 /// Opens the dataset at `path` as the model was trained on it, with `--set scene.key=value` laid over.
 pub fn open_scene(path: &Path, model: &Model, sets: &[String], registry: &Registry, limits: &Limits) -> Result<Scene> {
-    data::open(path, &scene_options(&model.provenance.config, sets)?, registry, limits)
+    data::open_in(path, &scene_options(&model.provenance.config, sets)?, &model.normalisation, registry, limits)
 }
 
 fn scene_options(stored: &toml::Table, sets: &[String]) -> Result<SceneOptions> {

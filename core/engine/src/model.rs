@@ -8,8 +8,8 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream,
-    TrainingViews, WeightArray, split_kind,
+    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Similarity,
+    Stream, TrainingViews, WeightArray, split_kind,
 };
 use serde::Serialize;
 use std::io::Read;
@@ -31,6 +31,8 @@ pub struct Model {
     pub rasterizer: toml::Table,
     /// Frames in the sequence.
     pub frame_count: usize,
+    /// From the coordinates of the dataset to those of the model.
+    pub normalisation: Similarity,
     /// Where it came from.
     pub provenance: Provenance,
     /// Bytes per share.
@@ -100,15 +102,22 @@ impl Model {
     fn from_checkpoint(path: &Path, registry: &Registry, device: &Device, limits: &Limits) -> Result<Self> {
         let stored = checkpoint::load(path, registry, device, limits)?;
         let config = stored.config().clone();
-        let (gaussians, moving, frame_count) = (stored.gaussians()?, stored.moving(), stored.frame_count());
-        Self::assembled(gaussians, stored.into_deformer(), moving, frame_count, &config)
+        let (gaussians, moving, frame_count, normalisation) = (stored.gaussians()?, stored.moving(), stored.frame_count(), stored.normalisation());
+        Self::assembled(gaussians, stored.into_deformer(), moving, frame_count, normalisation, &config)
     }
     /// The model that a run ends with.
     pub fn from_training(state: TrainState, config: &RunConfig) -> Result<Self> {
         let frame_count = state.deformer.as_ref().map_or(1, |d| d.context.frame_count);
-        Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, config)
+        Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, state.normalisation, config)
     }
-    fn assembled(gaussians: HostGaussians, field: Option<ModelDeformer>, moving: Moving, frame_count: usize, config: &RunConfig) -> Result<Self> {
+    fn assembled(
+        gaussians: HostGaussians,
+        field: Option<ModelDeformer>,
+        moving: Moving,
+        frame_count: usize,
+        normalisation: Similarity,
+        config: &RunConfig,
+    ) -> Result<Self> {
         let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
         let floats: usize =
             gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
@@ -122,6 +131,7 @@ impl Model {
             render: config.render.clone(),
             rasterizer: config.rasterizer.clone(),
             frame_count,
+            normalisation,
             provenance: provenance(config)?,
             size: ModelSize { deform_grid, deform_net, deform, point_cloud, total: deform + point_cloud },
         })
@@ -189,9 +199,14 @@ impl Model {
             },
             rasterizer,
             frame_count: manifest.frame_count,
+            normalisation: manifest.normalisation,
             provenance: manifest.provenance.clone(),
             size,
         })
+    }
+    /// Brings Gaussians of this model into the coordinates of the dataset it was trained on, as other programs expect them.
+    pub fn to_dataset(&self, gaussians: &mut HostGaussians) {
+        self.normalisation.inverse().apply_gaussians(gaussians);
     }
     /// Writes a `.cc4d` archive and returns its size in bytes.
     pub fn save_archive(&self, path: &Path, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
@@ -237,6 +252,7 @@ impl Model {
             },
             frame_count: self.frame_count,
             time_range: [0.0, 1.0],
+            normalisation: self.normalisation,
             box_world: [corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max)],
             background: self.background,
             sh_degree: self.gaussians.sh_degree,
