@@ -303,9 +303,7 @@ impl RunConfig {
             table = Registry::collect()?.preset(&name)?;
         }
         config::merge(&mut table, &from_file);
-        for assignment in sets {
-            config::set(&mut table, assignment)?;
-        }
+        config::set_all(&mut table, sets)?;
         refuse_renamed(&table)?;
         let resolved: Self = config::parse_section("configuration", &table)?;
         resolved.validate()?;

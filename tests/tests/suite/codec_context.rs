@@ -72,7 +72,7 @@ fn model(registry: &Registry) -> Model {
         field: Some(ModelDeformer { field, section, context }),
         moving: Moving::Scored { zeta: 5.0 },
         render: RenderConfig::default(),
-        background: [0.2, 0.4, 0.6],
+        background: Some([0.2, 0.4, 0.6]),
         rasterizer: "kind = \"tile\"".parse().unwrap(),
         frame_count: 10,
         normalisation: Default::default(),
@@ -133,7 +133,7 @@ fn attributes_of_gaussians_that_stand_still_are_not_stored_by_lossy_codecs() {
         model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
         let stored: u64 = Archive::open(&path, &limits).unwrap().stream_sizes().iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
         sizes.push(stored);
-        let back = Model::load(&path, &registry, &Device::flex(), &limits, &Silent).unwrap();
+        let back = Model::open(&path, &registry, &Device::flex(), &limits, &Silent).unwrap();
         // Codecs reorder; where a Gaussian moves tells it from one that does not, and its attributes must be among those that went in.
         for spec in model.field.as_ref().unwrap().field.attributes() {
             let given = &model.gaussians.extra[&spec.name].values;
