@@ -6,6 +6,7 @@ use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::data::procedural::ProceduralScene;
 use cc4dgs_engine::eval::evaluate;
 use cc4dgs_engine::init::initialise;
+use cc4dgs_engine::model::{ArchiveOptions, Model};
 use cc4dgs_engine::train::{TrainJob, train};
 use glam::{DMat3, DQuat, DVec3};
 use std::path::Path;
@@ -178,8 +179,8 @@ fn the_normalised_scene_does_not_depend_on_unit_origin_and_direction() {
     }
 }
 
-/// Held-out PSNR after a short training.
-fn trained_psnr(scene: Scene, seed: u64) -> f64 {
+/// A short training, and its held-out PSNR.
+fn trained(scene: Scene, seed: u64) -> (Model, f64) {
     let registry = Registry::collect().unwrap();
     let sets = ["init.source=random", "init.count=400", "train.iterations=120", "train.log_every=1000", &format!("seed={seed}")];
     let (config, scene, never) = (config(&sets), Arc::new(scene), AtomicBool::new(false));
@@ -187,25 +188,46 @@ fn trained_psnr(scene: Scene, seed: u64) -> f64 {
     let (model, _) = train(&job).unwrap();
     assert_eq!(model.normalisation, scene.normalisation);
     let device = parse_device("flex").unwrap();
-    evaluate(&model, &scene, Split::Test, 0, &registry, &device, &Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db
+    let psnr = evaluate(&model, &scene, Split::Test, 0, &registry, &device, &Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db;
+    (model, psnr)
+}
+
+/// Middle and mean log-scale of a model's Gaussians in the coordinates of its dataset, read back from an archive.
+fn exported(model: &Model) -> (DVec3, f64) {
+    let (registry, limits, folder) = (Registry::collect().unwrap(), Limits::default(), tempfile::tempdir().unwrap());
+    let path = folder.path().join("model.cc4d");
+    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None };
+    model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
+    let model = Model::open(&path, &registry, &parse_device("flex").unwrap(), &limits, &Silent).unwrap();
+    let mut gaussians = model.gaussians.clone();
+    model.to_dataset(&mut gaussians);
+    let mean = |k: usize| gaussians.means.iter().skip(k).step_by(3).map(|&v| f64::from(v)).sum::<f64>() / gaussians.len() as f64;
+    let log_scale = gaussians.log_scales.iter().map(|&v| f64::from(v)).sum::<f64>() / gaussians.log_scales.len() as f64;
+    (DVec3::new(mean(0), mean(1), mean(2)), log_scale)
 }
 
 #[test]
 fn training_does_not_depend_on_unit_origin_and_direction() {
     let truth = Truth::new();
-    let psnr = |change: &Change, seed: u64| {
+    let run = |change: &Change, seed: u64| {
         // The images are read from the folder during training.
         let (_root, found) = scene(&truth, Truth::panoptic, change);
-        trained_psnr(found, seed)
+        trained(found, seed)
     };
-    let base: Vec<f64> = (0..3).map(|seed| psnr(&SAME, seed)).collect();
+    let (first, psnr) = run(&SAME, 0);
+    let base = [psnr, run(&SAME, 1).1, run(&SAME, 2).1];
+    let (middle, log_scale) = exported(&first);
     assert!(base[0] > 15.0, "nothing was learned: {base:?}");
     for (what, change) in moved() {
-        let psnr = psnr(&change, 0);
+        let (model, psnr) = run(&change, 0);
         eprintln!("{what}: {psnr:.2} dB, {base:?} unchanged");
         assert!((psnr - base[0]).abs() < 0.3, "{what}: {psnr} dB, {} dB unchanged", base[0]);
+        // What other programs get is where the dataset is, as large as the dataset.
+        let (found, found_scale) = exported(&model);
+        let distance = (found - change.point(middle)).length() / change.scale;
+        assert!(distance < 0.1 && (found_scale - change.scale.ln() - log_scale).abs() < 0.1, "{what}: {distance} from {found}, log-scale {found_scale}");
     }
-    let psnr = psnr(&turned(), 0);
+    let (_, psnr) = run(&turned(), 0);
     let (low, high) = (base.iter().copied().fold(f64::INFINITY, f64::min), base.iter().copied().fold(0.0, f64::max));
     eprintln!("turned: {psnr:.2} dB");
     // Three seeds do not show all of their spread.
