@@ -13,7 +13,7 @@ const OURS_ALONE: [&str; 3] = ["ffmpeg", "video_cache", "cache_mb"];
 /// # Errors
 /// [`Error::Parameter`] for an assignment that is no scene option, and whatever the reader reports.
 pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], registry: &Registry, limits: &Limits) -> Result<Scene> {
-    data::open(path, &options_as_trained(&model.provenance.config, sets)?, registry, limits)
+    data::open_in(path, &options_as_trained(&model.provenance.config, sets)?, &model.normalisation, registry, limits)
 }
 
 /// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. A model may come from anyone: what it says never chooses

@@ -7,7 +7,7 @@ use crate::train::{Moving, Parts, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::gaussians::{CORE_ATTRIBUTES, to_vec};
-use cc4dgs_core::{DeformerContext, Error, ExtraAttribute, HostGaussians, Limits, OptimizerState, Registry, Result, Stage, config};
+use cc4dgs_core::{DeformerContext, Error, ExtraAttribute, HostGaussians, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
@@ -32,6 +32,9 @@ struct ModelHeader {
     /// Attributes with their widths, the core ones first.
     attributes: Vec<(String, usize)>,
     moving: Moving,
+    /// From the coordinates of the dataset to those of the model.
+    #[serde(default)]
+    normalisation: Similarity,
     deformer: Option<DeformerHeader>,
 }
 
@@ -83,6 +86,10 @@ impl Checkpoint {
     pub fn moving(&self) -> Moving {
         self.header.model.moving
     }
+    /// From the coordinates of the dataset to those of the model.
+    pub fn normalisation(&self) -> Similarity {
+        self.header.model.normalisation
+    }
     /// Frames in the sequence the deformer was built for (1 before the main stage).
     pub fn frame_count(&self) -> usize {
         self.header.model.deformer.as_ref().map_or(1, |d| d.context.frame_count)
@@ -124,7 +131,7 @@ impl Checkpoint {
         };
         let arrays = training.optimizer.iter().zip(&self.training.optimizer).map(two).collect();
         parts.optimizer.restore(OptimizerState { arrays, steps: training.optimizer_steps })?;
-        let mut state = TrainState::new(GaussianSet::new(&self.host, &self.device), model.moving, parts);
+        let mut state = TrainState::new(GaussianSet::new(&self.host, &self.device), model.moving, model.normalisation, parts);
         (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, self.deformer);
         Ok(state)
     }
@@ -185,6 +192,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             sh_degree: state.set.sh_degree,
             attributes,
             moving: state.moving,
+            normalisation: state.normalisation,
             deformer: state.deformer.as_ref().map(|d| DeformerHeader { section: d.section.clone(), context: d.context.clone() }),
         },
         training: TrainingHeader {
@@ -231,6 +239,7 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
     }
     let header: Header = serde_json::from_str(json).map_err(|e| damaged(e.to_string()))?;
     limits.check_gaussians(&object, header.model.gaussians as u64)?;
+    header.model.normalisation.validate(&object)?;
     let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(e.to_string()))?;
     let array = |name: &str, len: Option<usize>| -> Result<Vec<f32>> {
         let len = len.ok_or_else(|| damaged(format!("{name} claims more values than there can be")))?;

@@ -98,7 +98,7 @@ pub struct RenderConfig {
     pub rules: Rules,
     /// Mip-Splatting's 2D filter.
     pub antialiased: bool,
-    /// Smallest camera depth drawn, world units; absent, the rules' own.
+    /// Smallest camera depth drawn, units of the normalised frame; absent, the rules' own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
     /// Colour behind everything, RGB in 0..1; absent, the dataset's own, else white (Swift4D's choice).
@@ -361,7 +361,11 @@ impl RunConfig {
             return bad("time_noise", format!("{} frames", t.time_noise), "Give 0 to 10 frames");
         }
         if let Some(near) = self.render.near.filter(|near| !near.is_finite() || *near < 0.0) {
-            return Err(Error::parameter("render.near", format!("{near} is not a depth"), "Give a finite depth of 0 or more, in world units"));
+            return Err(Error::parameter(
+                "render.near",
+                format!("{near} is not a depth"),
+                "Give a finite depth of 0 or more, in units of the normalised frame (cameras are about 4 from what they see)",
+            ));
         }
         if let Some(background) = self.render.background.filter(|b| b.iter().any(|c| !(0.0..=1.0).contains(c))) {
             return Err(Error::parameter("render.background", format!("{background:?} is not RGB in 0..1"), "Give three numbers in 0..1"));

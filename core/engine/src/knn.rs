@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Mean of the squared distances to the three nearest other points, per point (Inria's simple-knn; baselines §1.5).
+/// Mean of the squared distances to the three nearest other points, per point (what 3DGS's simple-knn computes).
 /// Exact: a uniform grid searched ring by ring. Fewer than two points give 1.
 pub fn mean_squared_distance_3nn(points: &[[f32; 3]]) -> Vec<f32> {
     let n = points.len();

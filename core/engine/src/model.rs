@@ -9,8 +9,8 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, Provenance, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream,
-    TrainingViews, WeightArray, config, ply, split_kind, spz,
+    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed,
+    Similarity, Stream, TrainingViews, WeightArray, config, ply, split_kind, spz,
 };
 use serde::Serialize;
 use serde_json::Value;
@@ -38,6 +38,8 @@ pub struct Model {
     pub rasterizer: toml::Table,
     /// Frames in the sequence.
     pub frame_count: usize,
+    /// From the coordinates of the dataset to those of the model.
+    pub normalisation: Similarity,
     /// Where it came from.
     pub provenance: Provenance,
     /// Bytes per share.
@@ -131,6 +133,7 @@ impl Model {
             background: None,
             rasterizer: defaults.rasterizer,
             frame_count: 1,
+            normalisation: Similarity::IDENTITY,
             provenance: Provenance::default(),
             size: ModelSize { point_cloud: bytes, total: bytes, ..Default::default() },
         })
@@ -158,15 +161,22 @@ impl Model {
     fn from_checkpoint(path: &Path, registry: &Registry, device: &Device, limits: &Limits) -> Result<Self> {
         let stored = checkpoint::load(path, registry, device, limits)?;
         let config = stored.config().clone();
-        let (gaussians, moving, frame_count) = (stored.gaussians()?, stored.moving(), stored.frame_count());
-        Self::assembled(gaussians, stored.into_deformer(), moving, frame_count, &config)
+        let (gaussians, moving, frame_count, normalisation) = (stored.gaussians()?, stored.moving(), stored.frame_count(), stored.normalisation());
+        Self::assembled(gaussians, stored.into_deformer(), moving, frame_count, normalisation, &config)
     }
     /// The model that a run ends with.
     pub fn from_training(state: TrainState, config: &RunConfig) -> Result<Self> {
         let frame_count = state.deformer.as_ref().map_or(1, |d| d.context.frame_count);
-        Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, config)
+        Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, state.normalisation, config)
     }
-    fn assembled(gaussians: HostGaussians, field: Option<ModelDeformer>, moving: Moving, frame_count: usize, config: &RunConfig) -> Result<Self> {
+    fn assembled(
+        gaussians: HostGaussians,
+        field: Option<ModelDeformer>,
+        moving: Moving,
+        frame_count: usize,
+        normalisation: Similarity,
+        config: &RunConfig,
+    ) -> Result<Self> {
         let mut model = Self {
             gaussians,
             field,
@@ -175,6 +185,7 @@ impl Model {
             render: config.render.clone(),
             rasterizer: config.rasterizer.clone(),
             frame_count,
+            normalisation,
             provenance: provenance(config)?,
             size: ModelSize::default(),
         };
@@ -245,9 +256,14 @@ impl Model {
             },
             rasterizer,
             frame_count: manifest.frame_count,
+            normalisation: manifest.normalisation,
             provenance: manifest.provenance.clone(),
             size,
         })
+    }
+    /// Brings Gaussians of this model into the coordinates of the dataset it was trained on, as other programs expect them.
+    pub fn to_dataset(&self, gaussians: &mut HostGaussians) {
+        self.normalisation.inverse().apply_gaussians(gaussians);
     }
     /// Writes a `.cc4d` archive and returns its size in bytes.
     pub fn save_archive(&self, path: &Path, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
@@ -296,6 +312,7 @@ impl Model {
             },
             frame_count: self.frame_count,
             time_range: [0.0, 1.0],
+            normalisation: self.normalisation,
             box_world: [lower, upper],
             background: self.background_on(None),
             sh_degree: self.gaussians.sh_degree,

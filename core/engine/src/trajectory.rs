@@ -31,7 +31,7 @@ pub struct MotionScore {
     pub psnr_db: f64,
 }
 
-/// Scores every swaying ball of `scene` at the times of its frames.
+/// Scores every swaying ball of `scene` at the times of its frames, in the coordinates of `scene`.
 pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry, device: &Device, events: &dyn EventSink) -> Result<Vec<MotionScore>> {
     let balls: Vec<(usize, f64, f64)> = scene
         .objects
@@ -46,7 +46,12 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
         return Ok(Vec::new());
     }
     let mut player = Player::new(model, registry, device)?.on(Some(scene.background));
-    let first = player.gaussians_at(0.0)?.to_host()?;
+    let gaussians_at = |player: &mut Player, time: f32| {
+        let mut found = player.gaussians_at(time)?.to_host()?;
+        model.to_dataset(&mut found);
+        Result::Ok(found)
+    };
+    let first = gaussians_at(&mut player, 0.0)?;
     let owned: Vec<Vec<usize>> = balls.iter().map(|&(object, _, radius)| on_ball(scene, object, radius, &first)).collect();
     let cameras: Vec<_> = scene.cameras().into_iter().filter(|(_, split)| *split == Split::Test).map(|(camera, _)| camera).collect();
     let masks: Vec<Vec<Vec<bool>>> = cameras.iter().map(|camera| covered(scene, camera, &balls)).collect();
@@ -55,7 +60,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
     let mut errors = vec![(0.0f64, 0u64); balls.len()];
     for frame in 0..scene.frames {
         let time = scene.time(frame);
-        let now = player.gaussians_at(time as f32)?.to_host()?;
+        let now = gaussians_at(&mut player, time as f32)?;
         for ((&(object, _, _), rows), sums) in balls.iter().zip(&owned).zip(&mut distances) {
             for &row in rows.iter().filter(|&&row| opacity(&now, row) >= LEAST_OPACITY) {
                 let start = point(&first, row);
@@ -65,7 +70,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
             }
         }
         for (camera, masks) in cameras.iter().zip(&masks) {
-            let found = player.frame(camera, time as f32)?;
+            let found = player.frame(&model.normalisation.apply_camera(camera), time as f32)?;
             let truth = scene.render(camera, time);
             for (mask, sum) in masks.iter().zip(&mut errors) {
                 for (pixel, _) in mask.iter().enumerate().filter(|(_, covered)| **covered) {

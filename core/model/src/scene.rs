@@ -1,6 +1,6 @@
 //! A scene: cameras, times, and lazily decoded 8-bit frames.
 
-use crate::{Camera, Error, Image8, Result};
+use crate::{Camera, Error, Image8, Result, Similarity};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -15,7 +15,7 @@ pub enum Split {
     Test,
 }
 
-/// One picture of the scene: a camera at a time.
+/// One image of the scene: a camera at a time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
     /// Index into [`Scene::cameras`].
@@ -31,15 +31,15 @@ pub struct View {
 /// Initial points with colours, as structure from motion leaves them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointCloud {
-    /// Positions in world units.
+    /// Positions in the scene's units.
     pub positions: Vec<[f32; 3]>,
     /// Colours in 0..1.
     pub colors: Vec<[f32; 3]>,
 }
 
-/// Decodes the picture of a view. Implementations read files or trace rays; they keep no cache of their own.
+/// Loads the image of a view. Implementations read files or trace rays; they keep no cache of their own.
 pub trait FrameSource: Send + Sync {
-    /// The picture of `view`, already undistorted and at the size of its camera.
+    /// The image of `view`, already undistorted and at the size of its camera.
     fn load(&self, view: usize) -> Result<Image8>;
 }
 
@@ -49,17 +49,19 @@ pub struct Scene {
     pub name: String,
     /// All cameras; a moving camera is one entry per pose.
     pub cameras: Vec<Camera>,
-    /// All pictures, train and test.
+    /// All images, train and test.
     pub views: Vec<View>,
     /// Frames in the sequence (1 for a static scene).
     pub frame_count: usize,
+    /// From the dataset's coordinates to those of this scene. Cameras, points, box, and all models trained on it are in the coordinates of the scene.
+    pub normalisation: Similarity,
     /// Points to start from, if the dataset has any.
     pub points: Option<PointCloud>,
-    /// Where random points go when there are none: box corners in world units.
+    /// Where random points go when there are none: box corners in the scene's units.
     pub init_box: Option<([f32; 3], [f32; 3])>,
     /// What the reader found odd and left out.
     pub warnings: Vec<String>,
-    /// The background the dataset's pictures want (RGBA scenes), if it says.
+    /// The background the dataset's images want (RGBA scenes), if it says.
     pub background: Option<[f32; 3]>,
     /// Foreground masks by view, where the dataset has them: white (first channel over 127) is foreground. Not cached.
     pub foreground_masks: Option<Arc<dyn FrameSource>>,
@@ -81,11 +83,23 @@ impl Scene {
             ));
         }
         if !views.iter().any(|v| v.split == Split::Train) {
-            return Err(Error::data(name, "there is no training view", "Check the path and that its pictures exist"));
+            return Err(Error::data(name, "there is no training view", "Check the path and that its images exist"));
         }
         let frame_count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
         let frames = FrameCache { source, cap: cache_bytes, state: Mutex::default() };
-        Ok(Self { name, cameras, views, frame_count, points: None, init_box: None, warnings: Vec::new(), background: None, foreground_masks: None, frames })
+        Ok(Self {
+            name,
+            cameras,
+            views,
+            frame_count,
+            normalisation: Similarity::IDENTITY,
+            points: None,
+            init_box: None,
+            warnings: Vec::new(),
+            background: None,
+            foreground_masks: None,
+            frames,
+        })
     }
     /// Indices of the views of `split`, in order.
     pub fn split(&self, split: Split) -> Vec<usize> {
@@ -95,7 +109,7 @@ impl Scene {
     pub fn camera(&self, view: usize) -> &Camera {
         &self.cameras[self.views[view].camera]
     }
-    /// The picture of a view, from the cache or decoded now.
+    /// The image of a view, from the cache or decoded now.
     pub fn frame(&self, view: usize) -> Result<Arc<Image8>> {
         self.frames.get(view)
     }

@@ -75,6 +75,7 @@ fn model(registry: &Registry) -> Model {
         background: Some([0.2, 0.4, 0.6]),
         rasterizer: "kind = \"tile\"".parse().unwrap(),
         frame_count: 10,
+        normalisation: Default::default(),
         provenance: Default::default(),
         size: ModelSize::default(),
     }

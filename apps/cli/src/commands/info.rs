@@ -144,6 +144,7 @@ fn scene(context: &Context, path: &Path) -> Result<Value> {
         "test_views": scene.split(Split::Test).len(),
         "image_sizes": sizes,
         "camera_extent": plain(&scene.extent())?,
+        "normalisation": plain(&scene.normalisation)?,
         "initial_points": scene.points.as_ref().map(|p| p.positions.len()),
         "init_box": plain(&scene.init_box)?,
         "background": plain(&scene.background)?,

@@ -2,21 +2,31 @@
 
 use super::camera_box::camera_box;
 use super::frames::{Job, Plan, SceneFrames};
+use super::normalise::{CAMERA_DISTANCE, normalisation};
 use super::select::select;
 use super::undistort::Undistort;
 use super::video::VideoFrames;
 use cc4dgs_core::reader::files::image_size;
-use cc4dgs_core::{Camera, Error, FrameSource, ImageSource, Limits, PointCloud, RawCamera, RawScene, Result, Scene, SceneOptions, Split};
+use cc4dgs_core::{
+    Camera, Error, FrameSource, ImageSource, InitBox, Limits, PointCloud, RawCamera, RawPoints, RawScene, Result, Scene, SceneOptions, Similarity, Split,
+};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+/// Positions over this many units of the normalised frame are useless.
+const FARTHEST: f64 = 1e9;
+
 /// The scene a reader parsed, with frames and cameras chosen, lenses undone and images brought to the size the options ask for.
 ///
+/// The scene is in the normalised frame of its cameras, or in the one that is given.
+///
 /// Errors: [`Error::Parameter`] for options that choose nothing, [`Error::Data`] for a scene that is not sound, [`Error::Limit`] for images over `limits`.
-pub fn assemble(mut raw: RawScene, options: &SceneOptions, limits: &Limits) -> Result<Scene> {
+pub fn assemble(mut raw: RawScene, options: &SceneOptions, frame: Option<Similarity>, limits: &Limits) -> Result<Scene> {
     if let Some(v) = raw.views.iter().find(|v| v.camera >= raw.cameras.len()) {
         return Err(Error::data(raw.name, format!("an image names camera {} of {}", v.camera, raw.cameras.len()), "Check the dataset's index files"));
     }
+    // Before views are chosen: the frame must not depend on the options.
+    let frame = frame.unwrap_or_else(|| normalisation(&raw));
     let views = select(&mut raw, options)?;
     if !views.iter().any(|v| v.split == Split::Train) {
         let hint = raw.warnings.last().cloned().unwrap_or_default();
@@ -32,7 +42,7 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, limits: &Limits) -> R
         };
         let (plan, pinhole) = plan_camera(camera, native, (!raw.resized).then_some(options), limits)?;
         plans.push(plan);
-        cameras.push(pinhole);
+        cameras.push(frame.apply_camera(&pinhole));
     }
     let videos = VideoFrames::new(&raw.views, &plans, options)?;
     let jobs = raw.views.iter().map(|v| Job { image: Some(v.image.clone()), plan: v.camera }).collect();
@@ -49,14 +59,34 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, limits: &Limits) -> R
         scene.foreground_masks = Some(source);
     }
     let single = |p: [f64; 3]| p.map(|v| v as f32);
-    scene.points =
-        raw.points.filter(|p| !p.positions.is_empty()).map(|p| PointCloud { positions: p.positions.into_iter().map(single).collect(), colors: p.colors });
-    let init_box = raw.init_box.map(|[low, high]| (single(low), single(high)));
+    scene.normalisation = frame;
+    scene.points = raw.points.map(|p| normalised_points(&p, &frame, &mut raw.warnings)).filter(|p| !p.positions.is_empty());
+    let init_box = raw.init_box.map(|found| match found {
+        InitBox::Corners { low, high } => (single(frame.apply(low)), single(frame.apply(high))),
+        InitBox::Cube { half_share } => (single([-half_share * CAMERA_DISTANCE; 3]), single([half_share * CAMERA_DISTANCE; 3])),
+    });
     let usable = |b: &([f32; 3], [f32; 3])| (0..3).all(|k| b.0[k] < b.1[k] && b.0[k].is_finite() && b.1[k].is_finite());
     scene.init_box = init_box.filter(usable).or_else(|| scene.points.is_none().then(|| camera_box(&scene)));
     scene.background = options.background.as_ref().map(|b| b.rgb()).transpose()?.or(raw.background);
     scene.warnings = dedupe(raw.warnings);
     Ok(scene)
+}
+
+/// The points in the normalised frame. Points so far away that squares of their distances leave float32 are left out.
+fn normalised_points(points: &RawPoints, frame: &Similarity, warnings: &mut Vec<String>) -> PointCloud {
+    let mut cloud = PointCloud::default();
+    for (position, color) in points.positions.iter().zip(&points.colors) {
+        let position = frame.apply(*position);
+        if position.iter().all(|v| v.abs() < FARTHEST) {
+            cloud.positions.push(position.map(|v| v as f32));
+            cloud.colors.push(*color);
+        }
+    }
+    let left_out = points.positions.len() - cloud.positions.len();
+    if left_out > 0 {
+        warnings.push(format!("{left_out} points are over {FARTHEST:e} units of the normalised frame away and were left out"));
+    }
+    cloud
 }
 
 /// Brings the calibration to the size the images really have, if only the scale differs.

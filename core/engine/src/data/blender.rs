@@ -3,7 +3,9 @@
 use super::nerfstudio::image_path;
 use cc4dgs_core::reader::files::{file_name, image_size, read_json};
 use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
-use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
+use cc4dgs_core::{
+    Distortion, Error, ImageSource, InitBox, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
+};
 use serde::Deserialize;
 use std::path::Path;
 
@@ -20,8 +22,8 @@ struct Frame {
     transform_matrix: Vec<Vec<f64>>,
 }
 
-/// Half the side of the cube D-NeRF scenes are initialised in (Deformable 3D Gaussians, 4DGS).
-const INIT_HALF_WIDTH: f64 = 1.3;
+/// Half the side of the cube D-NeRF scenes are initialised in (Deformable 3D Gaussians, 4DGS: 1.3 units) over the distance of their cameras.
+const INIT_HALF_SHARE: f64 = 1.3 / 4.0311;
 
 inventory::submit! {
     ReaderPlugin {
@@ -55,7 +57,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         scene.warnings.push(format!("there is no {test}; nothing is held out"));
     }
     scene.rank_times(&times, &path.display().to_string())?;
-    scene.init_box = Some([[-INIT_HALF_WIDTH; 3], [INIT_HALF_WIDTH; 3]]);
+    scene.init_box = Some(InitBox::Cube { half_share: INIT_HALF_SHARE });
     // The published tables composite over white (4DGS, Swift4D); images without alpha stay as they are.
     scene.background = Some([1.0; 3]);
     Ok(scene)

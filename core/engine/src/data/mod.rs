@@ -9,10 +9,12 @@ mod camera_box;
 mod colmap;
 mod colmap_binary;
 mod colmap_text;
+mod focus;
 mod frames;
 pub mod init;
 mod llff;
 mod nerfstudio;
+mod normalise;
 pub mod npy;
 mod panoptic;
 pub mod procedural;
@@ -27,16 +29,24 @@ pub use camera_box::camera_box;
 pub use resample::resize;
 pub use undistort::Undistort;
 
-use cc4dgs_core::{Error, Limits, ReaderPlugin, Registry, Result, Scene, SceneOptions};
+use cc4dgs_core::{Error, Limits, RawScene, ReaderPlugin, Registry, Result, Scene, SceneOptions, Similarity};
 use std::path::Path;
 
 /// Opens the scene at `path` with the registered reader that recognises it, or the one `options` name. Frames are decoded later, on demand.
 ///
 /// Errors: [`Error::Parameter`] for options and paths no reader understands, [`Error::Data`] for broken files, [`Error::Limit`] for claims over `limits`.
 pub fn open(path: &Path, options: &SceneOptions, registry: &Registry, limits: &Limits) -> Result<Scene> {
+    assemble(read(path, options, registry, limits)?, options, None, limits)
+}
+
+/// Opens the scene at `path` in the frame of a model that was trained on it: other frames or cameras of a dataset would be given another frame of their own.
+pub fn open_in(path: &Path, options: &SceneOptions, normalisation: &Similarity, registry: &Registry, limits: &Limits) -> Result<Scene> {
+    assemble(read(path, options, registry, limits)?, options, Some(*normalisation), limits)
+}
+
+fn read(path: &Path, options: &SceneOptions, registry: &Registry, limits: &Limits) -> Result<RawScene> {
     options.validate()?;
-    let reader = choose(path, options, registry)?;
-    assemble((reader.open)(path, options, limits)?, options, limits)
+    (choose(path, options, registry)?.open)(path, options, limits)
 }
 
 fn choose(path: &Path, options: &SceneOptions, registry: &Registry) -> Result<&'static ReaderPlugin> {

@@ -122,10 +122,20 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     };
     let checkpoint = job.out.as_ref().map(|out| out.join(CHECKPOINT));
     let mut state = match &checkpoint {
-        Some(path) if job.resume => checkpoint::load(path, job.registry, &device, &config.limits)?.into_state(config, parts)?,
+        Some(path) if job.resume => {
+            let stored = checkpoint::load(path, job.registry, &device, &config.limits)?;
+            if stored.normalisation() != job.scene.normalisation {
+                return Err(Error::parameter(
+                    "--resume",
+                    format!("the scene's normalisation is {:?}, the checkpoint's {:?}", job.scene.normalisation, stored.normalisation()),
+                    "Resume on the dataset the run was started on, or start in another folder",
+                ));
+            }
+            stored.into_state(config, parts)?
+        }
         _ => {
             let host = initialise(&job.scene, config, seed.child("init"), job.events)?;
-            TrainState::new(GaussianSet::new(&host, &device), moving, parts)
+            TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, parts)
         }
     };
     let context = Context {

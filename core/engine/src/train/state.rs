@@ -4,7 +4,7 @@ use crate::gaussian_set::GaussianSet;
 use crate::model::ModelDeformer;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Appearance, DeformerContext, DensityControl, Optimizer, Result, Seed, SpatialInput, Stage};
+use cc4dgs_core::{Appearance, DeformerContext, DensityControl, Optimizer, Result, Seed, Similarity, SpatialInput, Stage};
 use serde::{Deserialize, Serialize};
 
 /// Which Gaussians the field may move.
@@ -74,6 +74,8 @@ pub struct TrainState {
     pub set: GaussianSet,
     /// What may move.
     pub moving: Moving,
+    /// From the coordinates of the dataset to those of the Gaussians.
+    pub normalisation: Similarity,
     /// The deformer, from the main stage on.
     pub deformer: Option<ModelDeformer>,
     /// Between rendered and recorded images.
@@ -99,9 +101,9 @@ pub struct Parts {
 
 impl TrainState {
     /// A fresh run.
-    pub fn new(set: GaussianSet, moving: Moving, parts: Parts) -> Self {
+    pub fn new(set: GaussianSet, moving: Moving, normalisation: Similarity, parts: Parts) -> Self {
         let Parts { appearance, density, optimizer } = parts;
-        Self { stage: Stage::Coarse, iteration: 0, set, moving, deformer: None, appearance, density, optimizer, smooth: false, rows: None }
+        Self { stage: Stage::Coarse, iteration: 0, set, moving, normalisation, deformer: None, appearance, density, optimizer, smooth: false, rows: None }
     }
     /// New optimizer state and statistics, as every stage starts with (Swift4D).
     pub fn begin_stage(&mut self, device: &Device) {

@@ -103,6 +103,23 @@ pub struct RawPoints {
     pub colors: Vec<[f32; 3]>,
 }
 
+/// Where the first Gaussians of a scene without points go.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum InitBox {
+    /// A box in the dataset's units.
+    Corners {
+        /// Lower corner.
+        low: [f64; 3],
+        /// Upper corner.
+        high: [f64; 3],
+    },
+    /// A cube around the point the cameras look at.
+    Cube {
+        /// Half its side, as a share of the median distance of the cameras from that point.
+        half_share: f64,
+    },
+}
+
 /// A parsed dataset.
 #[derive(Clone, Debug, Default)]
 pub struct RawScene {
@@ -114,8 +131,8 @@ pub struct RawScene {
     pub views: Vec<RawView>,
     /// Points to start from, if the dataset has any.
     pub points: Option<RawPoints>,
-    /// Lower and upper corner of the box the scene is in, in the dataset's units, if the dataset says. Else it is judged from the cameras.
-    pub init_box: Option<[[f64; 3]; 2]>,
+    /// Where the scene is, if the format says. Else it is judged from the cameras.
+    pub init_box: Option<InitBox>,
     /// The background the dataset's RGBA images want, RGB in 0..1.
     pub background: Option<[f32; 3]>,
     /// Whether the reader has already followed `scene.width`, `scene.height` and `scene.downscale`, as one that computes its images can.

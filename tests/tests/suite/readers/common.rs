@@ -61,6 +61,16 @@ pub fn project(camera: &Camera, p: [f64; 3]) -> (f64, f64, f64) {
     (camera.fx * c[0] / c[2] + camera.cx, camera.fy * c[1] / c[2] + camera.cy, c[2])
 }
 
+/// The camera of a view, in the coordinates of the dataset.
+pub fn dataset_camera(scene: &Scene, view: usize) -> Camera {
+    scene.normalisation.inverse().apply_camera(scene.camera(view))
+}
+
+/// A position of a scene, in the coordinates of the dataset.
+pub fn dataset_point(scene: &Scene, p: [f32; 3]) -> [f64; 3] {
+    scene.normalisation.inverse().apply(p.map(f64::from))
+}
+
 pub fn same_pose(a: &Camera, b: &Camera) {
     for (x, y) in a.world_to_camera.iter().flatten().zip(b.world_to_camera.iter().flatten()) {
         assert!((x - y).abs() < 1e-9, "{}: {:?} against {:?}", a.name, a.world_to_camera, b.world_to_camera);

@@ -55,7 +55,7 @@ fn the_points_are_near_the_surface_and_have_its_colour() {
     let scene = builtin("default", &options());
     let points = scene.points.as_ref().unwrap();
     assert_eq!((points.positions.len(), points.colors.len()), (truth.points, truth.points));
-    let mean = points.positions.iter().map(|p| distance(&truth, DVec3::from(p.map(f64::from)))).sum::<f64>() / points.positions.len() as f64;
+    let mean = points.positions.iter().map(|p| distance(&truth, DVec3::from(dataset_point(&scene, *p)))).sum::<f64>() / points.positions.len() as f64;
     assert!(mean < truth.point_noise * 1.5, "mean distance to the surface {mean}");
 }
 
@@ -109,13 +109,13 @@ fn distance(truth: &ProceduralScene, p: DVec3) -> f64 {
 fn points_from_images_lie_on_the_truth() {
     // Cameras as near to each other as in a capture, and images large enough to match.
     let truth = ProceduralScene { width: 240, height: 200, train_cameras: 20, frames: 1, ..ProceduralScene::named("default").unwrap() };
-    let scene = assemble(truth.clone().into_raw("truth".into()), &options(), &Limits::default()).unwrap();
+    let scene = assemble(truth.clone().into_raw("truth".into()), &options(), None, &Limits::default()).unwrap();
     let start = std::time::Instant::now();
     let cloud = photo_points(&scene, 5000, Seed::root(3)).unwrap();
     eprintln!("{} points in {:.2} s", cloud.positions.len(), start.elapsed().as_secs_f64());
     assert!(cloud.positions.len() > 3000, "{}", cloud.positions.len());
     let sorted = |points: Vec<[f32; 3]>| {
-        let mut errors: Vec<f64> = points.iter().map(|p| distance(&truth, DVec3::from(p.map(f64::from)))).collect();
+        let mut errors: Vec<f64> = points.iter().map(|p| distance(&truth, DVec3::from(dataset_point(&scene, *p)))).collect();
         errors.sort_by(f64::total_cmp);
         errors
     };

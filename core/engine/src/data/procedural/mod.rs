@@ -10,8 +10,8 @@ pub use objects::{Material, Motion, Object, Pose, Shape, Texture};
 pub use trace::{Hit, Tracer};
 
 use cc4dgs_core::{
-    Camera, Distortion, Error, FrameSource, Image8, ImageSource, Limits, Plugin, PointCloud, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result,
-    SceneOptions, Seed, Split, inventory, unknown_name,
+    Camera, Distortion, Error, FrameSource, Image8, ImageSource, InitBox, Limits, Plugin, PointCloud, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin,
+    Result, SceneOptions, Seed, Split, inventory, unknown_name,
 };
 use glam::DVec3;
 use rand::Rng;
@@ -235,7 +235,7 @@ impl ProceduralScene {
             cameras,
             views,
             points: Some(RawPoints { positions: points.positions.iter().map(|p| p.map(f64::from)).collect(), colors: points.colors }),
-            init_box: Some([[-2.0, -2.0, -0.1], [2.0, 2.0, 2.2]]),
+            init_box: Some(InitBox::Corners { low: [-2.0, -2.0, -0.1], high: [2.0, 2.0, 2.2] }),
             background: Some(background),
             resized: true,
             warnings: Vec::new(),
