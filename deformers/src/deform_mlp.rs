@@ -9,8 +9,8 @@ use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
-    inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput,
+    config, inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -104,7 +104,8 @@ fn only(outputs: Vec<Tensor<2>>) -> Result<Tensor<2>> {
 }
 
 impl Deformer for DeformMlp {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = input.means_world.clone();
         let work = DeformerWork { gaussians: means_world.dims()[0] as u64, ..DeformerWork::default() };
         Ok(SpatialFeatures { values: encode(finite(means_world), self.settings.position_bands), work })
     }

@@ -12,7 +12,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
     AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
-    config, inventory,
+    SpatialInput, config, inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -149,32 +149,12 @@ impl Embedding {
 
 impl Deformer for Embedding {
     fn attributes(&self) -> Vec<AttributeSpec> {
-        vec![AttributeSpec {
-            name: ATTRIBUTE.into(),
-            width: self.settings.gaussian_features,
-            start: 0.0,
-            spread: 0.0,
-            lr: self.settings.gaussian_lr,
-            times_extent: false,
-        }]
+        vec![AttributeSpec::new(ATTRIBUTE, self.settings.gaussian_features, 0.0, self.settings.gaussian_lr)]
     }
-    /// Gaussians without a vector of their own get zeros, which is what they start as.
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-        let zeros = Tensor::zeros([means_world.dims()[0], self.settings.gaussian_features], &means_world.device());
-        self.spatial_with(means_world, &[zeros])
-    }
-    fn spatial_with(&self, means_world: Tensor<2>, attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
-        let [m, _] = means_world.dims();
-        match attributes {
-            [own] if own.dims() == [m, self.settings.gaussian_features] => {
-                Ok(SpatialFeatures { values: own.clone(), work: DeformerWork { gaussians: m as u64, ..DeformerWork::default() } })
-            }
-            _ => Err(Error::parameter(
-                "deformer embedding",
-                format!("the Gaussians lack the attribute {ATTRIBUTE} of width {}", self.settings.gaussian_features),
-                "Load a model that was trained with this field",
-            )),
-        }
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        input.check("embedding", &self.attributes())?;
+        let work = DeformerWork { gaussians: input.len() as u64, ..DeformerWork::default() };
+        Ok(SpatialFeatures { values: input.attributes[0].clone(), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         check_time(time_norm)?;

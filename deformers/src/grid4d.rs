@@ -12,8 +12,8 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
-    inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput,
+    config, inventory,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -189,7 +189,8 @@ fn rotate(q: Tensor<2>, x: Tensor<2>) -> Tensor<2> {
 }
 
 impl Deformer for Grid4d {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = input.means_world.clone();
         let m = means_world.dims()[0];
         let work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
         if m == 0 {
@@ -229,15 +230,15 @@ impl Deformer for Grid4d {
         vec![ParameterGroup::plain("grid4d net", s.lr_start, s.lr_end), ParameterGroup::plain("grid4d tables", s.lr_grid_start, s.lr_grid_end)]
     }
     /// Features at slightly other places shall be alike: squared differences, summed over channels and averaged over centres.
-    fn regularizer(&self, means_world: Tensor<2>, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
+    fn regularizer(&self, input: &SpatialInput, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
-        let m = means_world.dims()[0];
+        let m = input.len();
         if m == 0 || s.smooth_weight <= 0.0 {
             return Ok(None);
         }
         let mut random = self.context.seed.child("perturb").index(u64::from(progress.to_bits())).rng();
         let shift: Vec<f32> = (0..3 * m).map(|_| random.random_range(-s.smooth_delta..=s.smooth_delta)).collect();
-        let here = in_box(means_world, &self.context);
+        let here = in_box(input.means_world.clone(), &self.context);
         let there = here.clone() + Tensor::<2>::from_data(TensorData::new(shift, [m, 3]), &here.device());
         let squares = |a: Tensor<2>, b: Tensor<2>| (a - b).powi_scalar(2).sum().mul_scalar(s.smooth_weight / m as f32);
         let still = squares(lookup(self.weight(0), here.clone(), &self.space)?, lookup(self.weight(0), there.clone(), &self.space)?);

@@ -11,7 +11,8 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput, config,
+    inventory,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -142,7 +143,8 @@ impl HexPlane {
 }
 
 impl Deformer for HexPlane {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = input.means_world.clone();
         let m = means_world.dims()[0];
         let work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
         let position = in_box(means_world, &self.context);
@@ -184,7 +186,7 @@ impl Deformer for HexPlane {
     }
     /// Smooth planes, and planes of time near 1 (weights of the published code): squared second differences along a plane's second axis, which is time
     /// where it has one.
-    fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
+    fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let mut total: Option<Tensor<1>> = None;
         let mut add = |term: Tensor<1>| {

@@ -9,8 +9,8 @@ use crate::parts::centres::check_time;
 use crate::parts::settings::within;
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config,
-    inventory,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures,
+    SpatialInput, config, inventory,
 };
 use serde::Deserialize;
 use std::f32::consts::TAU;
@@ -81,24 +81,13 @@ impl Deformer for Native4d {
         let rates = [(s.time_lr, true), (s.duration_lr, false), (s.velocity_lr, true), (s.color_lr, false)];
         let all = NAMES.into_iter().zip(self.widths()).zip(starts).zip(rates);
         all.filter(|(((_, width), _), _)| *width > 0)
-            .map(|(((name, width), (start, spread)), (lr, times_extent))| AttributeSpec { name: name.into(), width, start, spread, lr, times_extent })
+            .map(|(((name, width), (start, spread)), (lr, times_extent))| AttributeSpec { spread, times_extent, ..AttributeSpec::new(name, width, start, lr) })
             .collect()
     }
-    /// Gaussians without attributes of their own get what new ones start from, their centres in time at the middle.
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-        let (m, device) = (means_world.dims()[0], means_world.device());
-        let own: Vec<Tensor<2>> = self.attributes().iter().map(|a| Tensor::full([m, a.width], a.start, &device)).collect();
-        self.spatial_with(means_world, &own)
-    }
-    fn spatial_with(&self, means_world: Tensor<2>, attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
-        let m = means_world.dims()[0];
-        let wanted = self.attributes();
-        if attributes.len() != wanted.len() || attributes.iter().zip(&wanted).any(|(a, spec)| a.dims() != [m, spec.width]) {
-            let names: Vec<&str> = wanted.iter().map(|a| a.name.as_str()).collect();
-            let problem = format!("the Gaussians lack the attributes {}", names.join(", "));
-            return Err(Error::parameter("deformer native-4d", problem, "Load a model that was trained with this field"));
-        }
-        Ok(SpatialFeatures { values: Tensor::cat(attributes.to_vec(), 1), work: DeformerWork { gaussians: m as u64, ..DeformerWork::default() } })
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        input.check("native-4d", &self.attributes())?;
+        let work = DeformerWork { gaussians: input.len() as u64, ..DeformerWork::default() };
+        Ok(SpatialFeatures { values: Tensor::cat(input.attributes.clone(), 1), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         check_time(time_norm)?;

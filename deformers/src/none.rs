@@ -2,7 +2,8 @@
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, SpatialInput, config,
+    inventory,
 };
 use serde::Deserialize;
 
@@ -13,10 +14,10 @@ struct NoDeformation;
 struct NoSettings {}
 
 impl Deformer for NoDeformation {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-        let [m, _] = means_world.dims();
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let m = input.len();
         let work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
-        Ok(SpatialFeatures { values: Tensor::zeros([m, 1], &means_world.inner().device()), work })
+        Ok(SpatialFeatures { values: Tensor::zeros([m, 1], &input.means_world.clone().inner().device()), work })
     }
     fn deform(&self, _features: Tensor<2>, _time_norm: f32) -> Result<Offsets> {
         Ok(Offsets::default())

@@ -12,7 +12,8 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput, config,
+    inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -95,7 +96,8 @@ impl Swift4d {
 }
 
 impl Deformer for Swift4d {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = input.means_world.clone();
         let work = DeformerWork { gaussians: means_world.dims()[0] as u64, ..DeformerWork::default() };
         // Space and time share one table, so nothing but the normalised position is time-invariant.
         Ok(SpatialFeatures { values: in_box(means_world, &self.context), work })

@@ -9,7 +9,9 @@
 
 use cc4dgs::core::burn::tensor::{Tensor, TensorData};
 use cc4dgs::core::gaussians::to_vec;
-use cc4dgs::core::{Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, Split, config, parse_device};
+use cc4dgs::core::{
+    Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, config, parse_device,
+};
 use cc4dgs::engine::{data, eval::evaluate, model::Model};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -24,10 +26,11 @@ struct Rounded {
 }
 
 impl Deformer for Rounded {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = &input.means_world;
         let (device, [m, _]) = (means_world.device(), means_world.dims());
         let order = cc4dgs::codecs::morton::order(&to_vec(means_world.clone(), "means")?);
-        let spatial = self.inner.spatial(means_world)?;
+        let spatial = self.inner.spatial(input)?;
         // Packed features are a Gaussian per row and a coefficient per column, wherever they lie.
         let mut values = to_vec(self.inner.packed(spatial.values), "features")?;
         let columns = values.len() / m.max(1);

@@ -23,6 +23,7 @@ pub use cc4dgs_codecs as codecs;
 pub use cc4dgs_core as core;
 pub use cc4dgs_deformers as deformers;
 pub use cc4dgs_engine as engine;
+pub use cc4dgs_parts as parts;
 
 use clap::Parser;
 use std::ffi::OsString;

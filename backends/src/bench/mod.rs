@@ -105,7 +105,7 @@ fn median(values: &mut [f64]) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Waits until a device that runs behind has done what it was asked for, so that each part of a step is charged with its own time.
+/// Waits until an asynchronous device has finished, so that each part of a step is measured by itself.
 fn settle(device: &Device) -> Result<()> {
     device.sync().map_err(|e| cc4dgs_core::Error::backend("device", format!("{e:?}"), "Try another device (--device flex)"))
 }
@@ -138,6 +138,7 @@ pub fn time_step(workload: &Workload, device: &Device, seed: Seed, repetitions: 
             colors: cc4dgs_core::SplatColors::Sh { dc: dc.clone(), rest: higher.clone(), degree },
             space: cc4dgs_core::ParameterSpace::Raw,
             screen_probe: Some(Tensor::zeros([n, 2], &tracked).require_grad()),
+            absolute_screen_probe: None,
             camera_probe: None,
         };
         let out = TileRasterizer.render(&splats, camera, &RenderSettings::default())?;
@@ -159,7 +160,7 @@ pub fn time_step(workload: &Workload, device: &Device, seed: Seed, repetitions: 
         }
         opacities.step(d_opacity, &settings)?;
         rest.step(d_rest, &settings)?;
-        // Reading one number back makes sure that nothing is still queued on devices that run behind.
+        // Reading one number back makes sure that nothing is still queued on asynchronous devices.
         if let Some(value) = &opacities.value {
             to_vec(value.clone().narrow(0, 0, 1.min(n)), "opacities")?;
         }

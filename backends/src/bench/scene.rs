@@ -1,4 +1,4 @@
-//! A room with people, as large as the scenes of the field: Gaussians on walls, floor and moving bodies, with the statistics of a trained scene.
+//! A synthetic room with people, of the size of published scenes: Gaussians on walls, floor and moving bodies, with the statistics of a trained scene.
 
 use super::workload::uniform;
 use super::{StepCase, Workload};
@@ -11,7 +11,7 @@ use std::borrow::Cow;
 pub struct RoomCase {
     /// For tables.
     pub name: Cow<'static, str>,
-    /// Pictures and Gaussians.
+    /// Size of the images and number of Gaussians.
     pub size: StepCase,
     /// Share of the Gaussians that moves.
     pub dynamic_share: f32,
@@ -26,7 +26,7 @@ pub const ROOM_CASES: [RoomCase; 2] = [
 /// Gaussians and megapixels along which costs are followed.
 const GROWTH: ([usize; 8], [f64; 6]) = ([10_000, 30_000, 100_000, 335_000, 1_000_000, 2_000_000, 3_000_000, 5_000_000], [0.1, 0.3, 1.0, 2.0, 4.0, 8.0]);
 
-/// The first room with ever more Gaussians, then with ever larger pictures.
+/// The first room with ever more Gaussians, then with ever larger images.
 pub fn growth() -> Vec<RoomCase> {
     let [room, _] = ROOM_CASES;
     let gaussians = GROWTH.0.map(|n| RoomCase { name: format!("{}k", n / 1000).into(), size: StepCase { gaussians: n, ..room.size }, ..room });
@@ -72,7 +72,7 @@ pub fn room(case: &RoomCase, seed: Seed) -> Workload {
     let n = case.size.gaussians;
     let moving = (n as f32 * case.dynamic_share).round() as usize;
     let normal = |seed: Seed, k: u64| {
-        // Box-Muller; the radius is kept finite.
+        // Box-Muller; the radius stays finite.
         let (u, v) = (0.5 + 0.5 * uniform(seed, 2 * k), uniform(seed, 2 * k + 1));
         (-2.0 * u.max(1e-7).ln()).sqrt() * (std::f32::consts::PI * v).cos()
     };

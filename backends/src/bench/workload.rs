@@ -49,7 +49,7 @@ impl Workload {
         };
         let read = |key: &str, width: usize, n: usize| -> Result<Vec<f64>> {
             let (shape, values) = get(key)?;
-            if values.len() == width * n { Ok(values) } else { Err(bad(format!("{key} is {shape:?}, wanted {n} rows of {width}"))) }
+            if values.len() == width * n { Ok(values) } else { Err(bad(format!("{key} is {shape:?}, expected {n} rows of {width}"))) }
         };
         let n = get("in.opacities")?.1.len();
         let (image_shape, _) = get("in.weights_image")?;

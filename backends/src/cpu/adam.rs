@@ -2,35 +2,17 @@
 
 use crate::cpu::scratch::scratch;
 use crate::cpu::simd::{Lanes, dispatch};
+use crate::ops::adam::AdamScalars;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Elements per task; rows are never split.
 const CHUNK: usize = 16 << 10;
-/// From this width on, runs of wanted rows are updated one after the other; narrower rows are masked element by element.
+/// From this width on, runs of selected rows are updated one after the other; narrower rows are masked element by element.
 const WIDE_ROW: usize = 16;
 
-/// The scalars of one step, bias corrections folded in.
-#[derive(Clone, Copy, Debug)]
-pub struct AdamScalars {
-    /// Decay of the first moment.
-    pub beta1: f32,
-    /// Decay of the second moment.
-    pub beta2: f32,
-    /// 1 - beta1, from float64.
-    pub one_minus_beta1: f32,
-    /// 1 - beta2, from float64.
-    pub one_minus_beta2: f32,
-    /// Learning rate over the first bias correction.
-    pub step_size: f32,
-    /// 1 / sqrt(second bias correction).
-    pub inverse_sqrt_correction: f32,
-    /// Added to the root of the second moment.
-    pub epsilon: f32,
-}
-
-/// One step in place over rows of `width` elements. Rows whose entry in `rows` is false are left alone, moments included; so are
+/// One step in place over rows of `width` elements. Rows whose entry in `rows` is false are unchanged, moments included; so are
 /// rows with a gradient that is not finite. Returns the number of the latter.
 pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width: usize, rows: Option<&[bool]>, scalars: &AdamScalars) -> u64 {
     if param.is_empty() || width == 0 {
@@ -112,7 +94,7 @@ impl WithSimd for Update<'_> {
             let keep = self.keep.map(|keep| &keep[at..]);
             advance(simd, &mut self.p[at..], &mut self.m[at..], &mut self.v[at..], &self.g[at..], keep, self.scalars);
         }
-        // The rest goes through a vector of its own, so that an element's arithmetic does not depend on its place.
+        // The rest goes through a vector of its own, so that an element's arithmetic does not depend on its index.
         let rest = self.p.len() - whole;
         if rest > 0 {
             let mut padded = [[0.0f32; MAX_LANES]; 5];

@@ -1,6 +1,6 @@
-//! Combinations of shared functions on the CPU. A frame reads every coefficient once, so memory sets the pace.
+//! Combinations of shared functions on the CPU. A frame reads every coefficient once, so memory bandwidth is the limit.
 //!
-//! Outputs lie head after head, each [M, outputs]; so do coefficients and their gradient, each [M, outputs x functions], as networks write them.
+//! Outputs are stored head after head, each `[M, outputs]`; so are coefficients and their gradient, each `[M, outputs x functions]`, as networks write them.
 
 use super::heads::row_blocks;
 use crate::cpu::simd::vectorized;
@@ -11,18 +11,18 @@ use rayon::prelude::*;
 const ROWS: usize = 256;
 /// Partial sums of a dot product; a fixed number, so that every processor adds in one order.
 const PARTS: usize = 4;
-/// Rows whose sums are kept in registers at a time.
+/// Rows whose sums are in registers at a time.
 const LANES: usize = 64;
 
-/// How coefficients [M, C] lie in memory.
+/// How coefficients `[M, C]` are stored.
 pub enum Coefficients<'a> {
     /// Head after head, each row by row.
     Heads(&'a [f32]),
-    /// Column by column, as playback keeps them: neighbouring Gaussians fill the lanes of a register, and nothing is added across lanes.
+    /// Column by column, as in playback: neighbouring Gaussians fill the lanes of a register, and nothing is added across lanes.
     Columns(&'a [f32]),
 }
 
-/// A head's place: its number, its outputs and functions, its first coefficient and its first function.
+/// A head: its index, its outputs and functions, its first coefficient and its first function.
 struct Head {
     index: usize,
     outputs: usize,
@@ -143,7 +143,7 @@ pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32])
     out
 }
 
-/// The gradient [F] of the functions. Tasks sum over rows of their own; their sums are added in order.
+/// The gradient `[F]` of the functions. Tasks sum over rows of their own; their sums are added in order.
 pub fn function_gradient(shape: &BasisShape, coefficients: &[f32], grad: &[f32]) -> Vec<f32> {
     let rows = grad.len() / shape.outputs();
     let mut out = Vec::with_capacity(shape.functions());

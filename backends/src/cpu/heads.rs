@@ -1,4 +1,4 @@
-//! Several outputs in one flat array: head after head, each [rows, width].
+//! Several outputs in one flat array: head after head, each `[rows, width]`.
 
 /// Splits `flat` into blocks of `block` rows: per block, its part of every head.
 pub fn row_blocks<'a>(flat: &'a mut [f32], widths: &[usize], rows: usize, block: usize) -> Vec<Vec<&'a mut [f32]>> {

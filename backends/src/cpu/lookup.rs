@@ -9,14 +9,14 @@ const ROWS: usize = 128;
 /// Features a backward task adds up: several tasks share a level where it has many.
 const FEATURES: usize = 8;
 
-/// Where a point lies on a level of `D` axes: per axis, the shares of its lower and upper vertex in weight, hash and index.
+/// The cell of a point on a level of `D` axes: per axis, the contributions of its lower and upper vertex in weight, hash and index.
 struct Cell<const D: usize> {
     weight: [[f32; 2]; D],
     hash: [[u32; 2]; D],
     index: [[u32; 2]; D],
 }
 
-/// The cell of `x` (in 0..1 per axis), `None` where the grid has nothing.
+/// The cell of `x` (in 0..1 per axis), `None` outside the grid.
 #[inline(always)]
 fn cell<const D: usize>(x: &[f32; D], level: &GridLevel, shape: &GridShape) -> Option<Cell<D>> {
     let mut cell = Cell { weight: [[0.0; 2]; D], hash: [[0; 2]; D], index: [[0; 2]; D] };
@@ -29,7 +29,7 @@ fn cell<const D: usize>(x: &[f32; D], level: &GridLevel, shape: &GridShape) -> O
         }
         let clamped = if raw > 0.0 { raw.min(1.0) } else { 0.0 };
         let position = clamped * level.scale[d] + shape.stagger;
-        // A dense level ends with its last vertex; a hashed one has a place for every number.
+        // A dense level ends with its last vertex; a hashed one has a row for every index.
         let low = if shape.clamps { position.floor().min((level.size[d] - 2) as f32) } else { position.floor() };
         let part = position - low;
         let part = if shape.smooth { part * part * (3.0 - 2.0 * part) } else { part };
@@ -89,8 +89,8 @@ macro_rules! with_dims {
     };
 }
 
-/// Rows of the table and weights of all corners of `points` [M, dims] on one level, each [M, 2^dims]; weight 0 where the grid has nothing. Not what the
-/// operation does, which keeps neither: for comparisons.
+/// Rows of the table and weights of all corners of `points` `[M, dims]` on one level, each `[M, 2^dims]`; weight 0 outside the grid. For
+/// comparisons: the operation stores neither.
 pub fn corners(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64>, Vec<f32>) {
     fn of<const D: usize>(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64>, Vec<f32>) {
         let one = |x: &[f32; D]| {
@@ -103,7 +103,7 @@ pub fn corners(shape: &GridShape, level: &GridLevel, points: &[f32]) -> (Vec<i64
     with_dims!(shape.dims, D => of::<D>(shape, level, points))
 }
 
-/// Features [M, levels * features] of `points` [M, dims].
+/// Features `[M, levels * features]` of `points` `[M, dims]`.
 pub fn forward(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f32> {
     let (dims, f) = (shape.dims, shape.features);
     let width = shape.levels.len() * f;
@@ -137,7 +137,7 @@ fn gather<const D: usize>(shape: &GridShape, table: &[f32], points: &[f32], widt
     }
 }
 
-/// The gradient of the table, given that of the features. A task owns some features of one level and visits the points in order, so that nothing is raced for.
+/// The gradient of the table, given that of the features. A task owns some features of one level and visits the points in order, so that no two tasks write the same element.
 pub fn backward(shape: &GridShape, points: &[f32], grad: &[f32]) -> Vec<f32> {
     let f = shape.features;
     let width = shape.levels.len() * f;

@@ -78,7 +78,7 @@ fn copy_padded(to: &mut [f32], row: &[f32]) {
     to[row.len()..].fill(0.0);
 }
 
-/// The loss terms of `image` against `target`, both planar [channels, height, width]. With `gradient` [channels, height, width],
+/// The loss terms of `image` against `target`, both planar `[channels, height, width]`. With `gradient` `[channels, height, width]`,
 /// writes d(lambda_c * l1 + (1 - lambda_c) * (1 - ssim)) / d image there; the derivative of |0| is 0.
 pub fn photometric(
     image: &[f32],
@@ -125,7 +125,7 @@ fn one_channel(image: &[f32], target: &[f32], width: usize, (l1_scale, ssim_scal
 
     let zeros = vec![0.0f32; 4 * stride];
     let with_gradient = gradient.is_some();
-    // Without a gradient the second sweep writes no field; a float per row keeps the zip below alive.
+    // Without a gradient the second sweep writes no field; one float per row, because the zip below ends with its shortest part.
     let width_out = if with_gradient { 3 * stride } else { 1 };
     let mut derivatives = scratch(rows * width_out);
     derivatives.par_chunks_mut(ROWS * width_out).zip(row_terms.par_chunks_mut(ROWS)).enumerate().for_each(|(task, (out, terms))| {
@@ -195,7 +195,7 @@ impl WithSimd for FirstRow<'_> {
             absolute += d.max(-d);
             squared = d.fma(d, squared);
         }
-        // A NaN must reach the loss, and `max` may drop it; the square keeps it.
+        // A NaN must reach the loss, and `max` may drop it; the square does not.
         let squared = squared.sum();
         self.terms[0] = if squared.is_nan() { f64::NAN } else { f64::from(absolute.sum()) };
         self.terms[2] = f64::from(squared);
@@ -209,8 +209,8 @@ impl WithSimd for FirstRow<'_> {
     }
 }
 
-/// Vertical blur, the SSIM of the row and, if asked for, the horizontally blurred derivatives of SSIM with respect to
-/// E[x], E[x^2] and E[xy].
+/// Vertical blur, the SSIM of the row and, for the gradient, the horizontally blurred derivatives of SSIM with respect to
+/// `E[x]`, `E[x^2]` and `E[xy]`.
 struct SecondRow<'a> {
     taps: [&'a [f32]; 11],
     width: usize,
@@ -262,7 +262,7 @@ impl WithSimd for SecondRow<'_> {
     }
 }
 
-/// SSIM from the local moments E[x], E[y], E[x^2 + y^2], E[xy], and its derivatives with respect to E[x], E[x^2], E[xy].
+/// SSIM from the local moments `E[x]`, `E[y]`, `E[x^2 + y^2]`, `E[xy]`, and its derivatives with respect to `E[x]`, `E[x^2]`, `E[xy]`.
 #[inline(always)]
 fn similarity<S: Simd>(mu_x: Lanes<S>, mu_y: Lanes<S>, squares: Lanes<S>, products: Lanes<S>) -> (Lanes<S>, [Lanes<S>; 3]) {
     let mu_product = mu_x * mu_y;

@@ -3,14 +3,14 @@
 use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
 
-/// Buffers kept at most; more than enough for every thread of a kernel to hold a few.
+/// Upper bound on pooled buffers; more than enough for every thread of a kernel to hold a few.
 const KEPT: usize = 64;
-/// Floats kept in one buffer at most (64 MiB); larger ones are freed.
+/// Upper bound on the floats of a pooled buffer (64 MiB); larger ones are freed.
 const KEPT_FLOATS: usize = 16 << 20;
 
 static POOL: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
 
-/// A borrowed buffer whose contents are arbitrary numbers of earlier work: write before you read.
+/// A borrowed buffer whose contents are arbitrary: write before you read.
 pub struct Scratch {
     buffer: Vec<f32>,
     len: usize,
@@ -26,7 +26,7 @@ pub fn scratch(len: usize) -> Scratch {
     Scratch { buffer, len }
 }
 
-/// The smallest kept buffer that is long enough.
+/// The smallest pooled buffer that is long enough.
 fn best_fit(pool: &mut Vec<Vec<f32>>, len: usize) -> Option<Vec<f32>> {
     let fit = (0..pool.len()).filter(|&i| pool[i].len() >= len).min_by_key(|&i| pool[i].len());
     fit.map(|i| pool.swap_remove(i))

@@ -15,7 +15,7 @@ pub fn dispatch<K: pulp::WithSimd>(kernel: K) -> K::Output {
 /// Runs plain loops, compiled for the best instruction set found at run time. Write `vectorized(#[inline(always)] || …)`.
 ///
 /// The loops are called as an `FnMut`. Called as an `FnOnce`, a closure that could be called twice goes through a shim, which is a function of its own and
-/// compiled for the least processor: 4 lanes in place of 16.
+/// compiled for the baseline processor: 4 lanes instead of 16.
 #[inline(always)]
 pub fn vectorized<R>(loops: impl FnMut() -> R) -> R {
     struct Loops<F>(F);
@@ -56,7 +56,7 @@ pub fn each<T: Copy, const N: usize>(mut f: impl FnMut(usize) -> T) -> [T; N] {
     out
 }
 
-/// Asks for `from[index]` before it is needed, where the processor can be asked.
+/// Prefetches `from[index]`, on processors that can.
 #[inline(always)]
 pub fn prefetch<T>(from: &[T], index: usize) {
     #[cfg(target_arch = "x86_64")]

@@ -11,11 +11,11 @@ use std::borrow::Cow;
 pub trait CpuBackend: Backend {
     /// The elements, row-major; borrowed when the tensor is contiguous.
     fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]>;
-    /// The elements of a matrix column by column, if that is how they lie in memory (the view that transposing a row-major matrix makes).
+    /// The elements of a matrix column by column, if they are stored that way (as in the transposed view of a row-major matrix).
     fn columns(tensor: &FloatTensor<Self>) -> Option<&[f32]>;
     /// The integer elements, row-major.
     fn ints(tensor: &IntTensor<Self>) -> Vec<i64>;
-    /// Changes the elements in place when nobody else holds them, in a copy otherwise.
+    /// Changes the elements in place if the tensor has no other owner, in a copy otherwise.
     fn update_floats(tensor: FloatTensor<Self>, change: impl FnOnce(&mut [f32])) -> FloatTensor<Self>;
     /// A tensor that owns `values`, row-major; no copy.
     fn from_floats(values: Vec<f32>, shape: impl Into<Shape>) -> FloatTensor<Self>;

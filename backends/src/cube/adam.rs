@@ -1,8 +1,7 @@
 //! The fused Adam step on the device: one sweep decides which rows move, a second one moves them.
 
-use super::tensor::{UNITS, cubes_for, is_finite, owned, upload};
-use crate::cpu::adam::AdamScalars;
-use crate::ops::adam::AdamOps;
+use super::tensor::{THREADS, is_finite, owned, upload, workgroups_for};
+use crate::ops::adam::{AdamOps, AdamScalars};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -10,7 +9,7 @@ use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// moves[row] is 1 where the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite.
+/// moves`[row]` is 1 where the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite.
 #[cube(launch)]
 fn rows_that_move(grad: &[f32], visible: &[i32], moves: &mut [u32], skipped: &mut [Atomic<i32>], width: u32, #[comptime] masked: bool) {
     let row = ABSOLUTE_POS;
@@ -70,12 +69,12 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
     let client = grad.client.clone();
     let moves = super::tensor::empty(&grad, [rows], DType::U32);
     let masked = visible.is_some();
-    // Never read without a mask; a binding must hold something.
+    // Not read without a mask, but a binding needs a buffer.
     let visible = visible.map_or_else(|| skipped.clone(), into_contiguous);
-    let dim = CubeDim::new_1d(UNITS);
+    let dim = CubeDim::new_1d(THREADS);
     rows_that_move::launch(
         &client,
-        cubes_for(rows),
+        workgroups_for(rows),
         dim,
         grad.clone().into_buffer_arg(),
         if masked { visible.into_buffer_arg() } else { upload(&grad, &[0i32], DType::I32).into_buffer_arg() },
@@ -86,7 +85,7 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
     );
     move_rows::launch(
         &client,
-        cubes_for(n),
+        workgroups_for(n),
         dim,
         param.clone().into_buffer_arg(),
         m.clone().into_buffer_arg(),

@@ -1,7 +1,7 @@
 //! Combinations of shared functions on the device.
 
 use super::field::add_segments;
-use super::tensor::{UNITS, cubes_for, floats, upload};
+use super::tensor::{THREADS, floats, upload, workgroups_for};
 use crate::ops::basis::{BasisBackward, BasisOps, BasisShape};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
@@ -10,20 +10,38 @@ use burn_cubecl::kernel::into_contiguous;
 use cubecl::prelude::*;
 use std::sync::Arc;
 
-/// Rows whose share of the functions' gradient one unit adds up.
+/// Rows over which one thread sums a function's gradient.
 const SEGMENT: usize = 128;
 
-/// Numbers per output in a plan.
+/// Words per output in a plan.
 const FIELDS: usize = 6;
+/// Where its coefficients start in a row.
+const COEFFICIENT: usize = 0;
+/// Where its functions start.
+const FUNCTION: usize = 1;
+/// How many functions it combines.
+const COUNT: usize = 2;
+/// Outputs of the heads before its own.
+const BEFORE: usize = 3;
+/// Outputs of its own head.
+const OUTPUTS: usize = 4;
+/// Its index among them.
+const INDEX: usize = 5;
 
-/// Per output, where its coefficients start, where its functions do, how many they are, the outputs of the heads before its own, those of its own, and its
-/// place among them.
+/// The words of every output.
 fn plan(shape: &BasisShape) -> Vec<u32> {
     let (mut at, mut function, mut before) = (0, 0, 0);
     let mut words = Vec::new();
     for &(outputs, count) in &shape.groups {
-        for place in 0..outputs as u32 {
-            words.extend([at, function, count as u32, before, outputs as u32, place]);
+        for index in 0..outputs as u32 {
+            let mut fields = [0; FIELDS];
+            fields[COEFFICIENT] = at;
+            fields[FUNCTION] = function;
+            fields[COUNT] = count as u32;
+            fields[BEFORE] = before;
+            fields[OUTPUTS] = outputs as u32;
+            fields[INDEX] = index;
+            words.extend(fields);
             at += count as u32;
         }
         function += count as u32;
@@ -32,20 +50,20 @@ fn plan(shape: &BasisShape) -> Vec<u32> {
     words
 }
 
-/// Where an output of a row lies: head after head, each [rows, outputs].
+/// The index of an output of a row: head after head, each `[rows, outputs]`.
 #[cube]
-fn place(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
-    (plan[FIELDS * output + 3] * rows) as usize + row * plan[FIELDS * output + 4] as usize + plan[FIELDS * output + 5] as usize
+fn output_index(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
+    (plan[FIELDS * output + BEFORE] * rows) as usize + row * plan[FIELDS * output + OUTPUTS] as usize + plan[FIELDS * output + INDEX] as usize
 }
 
-/// Where the coefficients of an output of a row start: head after head, each [rows, outputs x functions].
+/// The index of the first coefficient of an output of a row: head after head, each `[rows, outputs x functions]`.
 #[cube]
 fn first_coefficient(plan: &[u32], output: usize, row: usize, rows: u32) -> usize {
-    let (at, count, within) = (plan[FIELDS * output], plan[FIELDS * output + 2], plan[FIELDS * output + 5]);
-    ((at - within * count) * rows + within * count) as usize + row * (plan[FIELDS * output + 4] * count) as usize
+    let (at, count, within) = (plan[FIELDS * output + COEFFICIENT], plan[FIELDS * output + COUNT], plan[FIELDS * output + INDEX]);
+    ((at - within * count) * rows + within * count) as usize + row * (plan[FIELDS * output + OUTPUTS] * count) as usize
 }
 
-/// out, head after head. Neighbouring units take neighbouring coefficients: of one row, or of one column.
+/// out, head after head. Neighbouring threads read neighbouring coefficients: of one row, or of one column.
 #[cube(launch)]
 fn combine_outputs(coefficients: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], rows: u32, width: u32, #[comptime] by_columns: bool) {
     if ABSOLUTE_POS < out.len() {
@@ -53,32 +71,32 @@ fn combine_outputs(coefficients: &[f32], functions: &[f32], plan: &[u32], out: &
         let (run, within) = (ABSOLUTE_POS / per_run, ABSOLUTE_POS % per_run);
         let row = if by_columns { within } else { run };
         let output = if by_columns { run } else { within };
-        let from = if by_columns { plan[FIELDS * output] as usize * rows as usize + row } else { first_coefficient(plan, output, row, rows) };
+        let from = if by_columns { plan[FIELDS * output + COEFFICIENT] as usize * rows as usize + row } else { first_coefficient(plan, output, row, rows) };
         let step = if by_columns { rows as usize } else { (1usize).runtime() };
-        let own = plan[FIELDS * output + 1] as usize;
+        let own = plan[FIELDS * output + FUNCTION] as usize;
         let mut sum = 0.0f32;
-        for k in 0..plan[FIELDS * output + 2] as usize {
+        for k in 0..plan[FIELDS * output + COUNT] as usize {
             sum += coefficients[from + k * step] * functions[own + k];
         }
-        out[place(plan, output, row, rows)] = sum;
+        out[output_index(plan, output, row, rows)] = sum;
     }
 }
 
-/// out, as coefficients lie.
+/// out, in the order of the coefficients.
 #[cube(launch)]
 fn spread_gradient(grad: &[f32], functions: &[f32], plan: &[u32], out: &mut [f32], rows: u32, width: u32) {
     if ABSOLUTE_POS < grad.len() {
         let (row, output) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
         let from = first_coefficient(plan, output, row, rows);
-        let own = plan[FIELDS * output + 1] as usize;
-        let upstream = grad[place(plan, output, row, rows)];
-        for k in 0..plan[FIELDS * output + 2] as usize {
+        let own = plan[FIELDS * output + FUNCTION] as usize;
+        let upstream = grad[output_index(plan, output, row, rows)];
+        for k in 0..plan[FIELDS * output + COUNT] as usize {
             out[from + k] = upstream * functions[own + k];
         }
     }
 }
 
-/// partial [segments, F].
+/// partial `[segments, F]`.
 #[cube(launch)]
 fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mut [f32], rows: u32, width: u32, functions: u32) {
     if ABSOLUTE_POS < partial.len() {
@@ -88,9 +106,9 @@ fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mu
         let mut sum = 0.0f32;
         for row in start..end {
             for output in 0..width as usize {
-                let (own, count) = (plan[FIELDS * output + 1] as usize, plan[FIELDS * output + 2] as usize);
+                let (own, count) = (plan[FIELDS * output + FUNCTION] as usize, plan[FIELDS * output + COUNT] as usize);
                 if k >= own && k < own + count {
-                    sum += grad[place(plan, output, row, rows)] * coefficients[first_coefficient(plan, output, row, rows) + k - own];
+                    sum += grad[output_index(plan, output, row, rows)] * coefficients[first_coefficient(plan, output, row, rows) + k - own];
                 }
             }
         }
@@ -107,9 +125,9 @@ impl BasisOps for CubeBackend {
         let out = floats(&coefficients, [rows * shape.outputs()]);
         let client = coefficients.client.clone();
         let plan = upload(&coefficients, &plan(&shape), DType::U32);
-        let (cubes, dim) = (cubes_for(rows * shape.outputs()), CubeDim::new_1d(UNITS));
+        let (count, dim) = (workgroups_for(rows * shape.outputs()), CubeDim::new_1d(THREADS));
         let (c, f, p, o) = (coefficients.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
-        combine_outputs::launch(&client, cubes, dim, c, f, p, o, rows as u32, shape.outputs() as u32, by_columns);
+        combine_outputs::launch(&client, count, dim, c, f, p, o, rows as u32, shape.outputs() as u32, by_columns);
         out
     }
 }
@@ -125,14 +143,14 @@ impl BasisBackward for CubeBackend {
         let (coefficients, functions, grad) = (into_contiguous(coefficients), into_contiguous(functions), into_contiguous(grad));
         let (rows, count) = (coefficients.meta.shape()[0], functions.meta.shape()[0]);
         let client = coefficients.client.clone();
-        let dim = CubeDim::new_1d(UNITS);
+        let dim = CubeDim::new_1d(THREADS);
         let plan = upload(&coefficients, &plan(shape), DType::U32);
         let width = shape.outputs() as u32;
         let of_coefficients = wanted[0].then(|| {
             let out = floats(&grad, [rows, shape.coefficients()]);
             let (g, f) = (grad.clone().into_buffer_arg(), functions.clone().into_buffer_arg());
             let (p, o) = (plan.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-            spread_gradient::launch(&client, cubes_for(rows * shape.outputs()), dim, g, f, p, o, rows as u32, width);
+            spread_gradient::launch(&client, workgroups_for(rows * shape.outputs()), dim, g, f, p, o, rows as u32, width);
             out
         });
         let of_functions = wanted[1].then(|| {
@@ -140,10 +158,10 @@ impl BasisBackward for CubeBackend {
             let (partial, out) = (floats(&grad, [segments, count]), floats(&grad, [count]));
             let (c, g) = (coefficients.clone().into_buffer_arg(), grad.clone().into_buffer_arg());
             let (p, parts) = (plan.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
-            function_parts::launch(&client, cubes_for(segments * count), dim, c, g, p, parts, rows as u32, width, count as u32);
+            function_parts::launch(&client, workgroups_for(segments * count), dim, c, g, p, parts, rows as u32, width, count as u32);
             add_segments::launch(
                 &client,
-                cubes_for(count),
+                workgroups_for(count),
                 dim,
                 partial.into_buffer_arg(),
                 out.clone().into_buffer_arg(),

@@ -1,8 +1,8 @@
 //! Interpolated lookups in grids of stored features; the arithmetic of `cpu::lookup`.
 
 use super::sort::sort_pairs;
-use super::tensor::{UNITS, cubes_for, empty, floats, upload};
-use crate::ops::lookup::{GridShape, LookupBackward, LookupOps, Outside, PRIMES};
+use super::tensor::{THREADS, empty, floats, upload, workgroups_for};
+use crate::ops::lookup::{GridShape, LookupBackward, LookupOps, MAX_DIMS, Outside, PRIMES};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -11,18 +11,33 @@ use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 use std::sync::Arc;
 
-/// Words per level: sizes, bits of scales, first row, rows, whether hashed.
+/// Words per level.
 const WORDS: usize = 11;
+/// First of four words: vertices per axis.
+const SIZE: usize = 0;
+/// First of four words: bits of the scale per axis.
+const SCALE: usize = 4;
+/// First row of the table.
+const FIRST_ROW: usize = 8;
+/// Rows of the table.
+const ROWS: usize = 9;
+/// 1 where vertices share rows by their hash, else 0.
+const HASHED: usize = 10;
 
 fn words(shape: &GridShape) -> Vec<u32> {
     let level = |l: &crate::ops::lookup::GridLevel| {
-        let scales = l.scale.map(f32::to_bits);
-        l.size.into_iter().chain(scales).chain([l.first_row as u32, l.rows as u32, u32::from(l.hashed)]).collect::<Vec<_>>()
+        let mut words = [0; WORDS];
+        words[SIZE..SIZE + MAX_DIMS].copy_from_slice(&l.size);
+        words[SCALE..SCALE + MAX_DIMS].copy_from_slice(&l.scale.map(f32::to_bits));
+        words[FIRST_ROW] = l.first_row as u32;
+        words[ROWS] = l.rows as u32;
+        words[HASHED] = u32::from(l.hashed);
+        words
     };
     shape.levels.iter().flat_map(level).collect()
 }
 
-/// What the kernels know of a grid while they are compiled.
+/// Properties of a grid that are compile-time constants of its kernels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct Rules {
     dims: usize,
@@ -58,7 +73,7 @@ fn along(raw: f32, size: u32, scale: f32, #[comptime] rules: Rules) -> (u32, f32
     (floor as u32, part)
 }
 
-/// Row and weight of a corner of the cell of a point on a level; weight 0 where the grid has nothing.
+/// Row and weight of a corner of the cell of a point on a level; weight 0 outside the grid.
 #[cube]
 fn corner(points: &[f32], levels: &[u32], point: usize, level: usize, corner: u32, #[comptime] rules: Rules) -> (u32, f32) {
     let at = level * WORDS;
@@ -69,10 +84,10 @@ fn corner(points: &[f32], levels: &[u32], point: usize, level: usize, corner: u3
     #[unroll]
     for d in 0..comptime!(rules.dims) {
         let raw = points[point * rules.dims + d];
-        let size = levels[at + d];
-        let (low, part) = along(raw, size, f32::reinterpret(levels[at + 4 + d]), rules);
+        let size = levels[at + SIZE + d];
+        let (low, part) = along(raw, size, f32::reinterpret(levels[at + SCALE + d]), rules);
         if comptime!(rules.zero_outside) {
-            // False for what is no number, too.
+            // False for NaN, too.
             weight = select(raw >= 0.0 && raw <= 1.0, weight, 0.0f32);
         }
         let upper = (corner >> comptime!(d as u32)) & 1u32;
@@ -82,11 +97,11 @@ fn corner(points: &[f32], levels: &[u32], point: usize, level: usize, corner: u3
         index += vertex * stride;
         stride *= size;
     }
-    let row = select(levels[at + 10] == 1, hash, index) % levels[at + 9];
-    (levels[at + 8] + row, weight)
+    let row = select(levels[at + HASHED] == 1, hash, index) % levels[at + ROWS];
+    (levels[at + FIRST_ROW] + row, weight)
 }
 
-/// out [M, levels * features], a unit per number.
+/// out `[M, levels * features]`, a thread per number.
 #[cube(launch)]
 fn look_up(table: &[f32], points: &[f32], levels: &[u32], out: &mut [f32], features: u32, level_count: u32, #[comptime] rules: Rules) {
     if ABSOLUTE_POS < out.len() {
@@ -168,8 +183,8 @@ impl LookupOps for CubeBackend {
         let levels = upload(&points, &words(&shape), DType::U32);
         look_up::launch(
             &client,
-            cubes_for(m * shape.width()),
-            CubeDim::new_1d(UNITS),
+            workgroups_for(m * shape.width()),
+            CubeDim::new_1d(THREADS),
             table.into_buffer_arg(),
             points.into_buffer_arg(),
             levels.into_buffer_arg(),
@@ -186,13 +201,13 @@ impl LookupBackward for CubeBackend {
     fn lookup_backward(points: FloatTensor<Self>, shape: Arc<GridShape>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
         let (points, grad): (CubeTensor, CubeTensor) = (into_contiguous(points), into_contiguous(grad));
         let client = points.client.clone();
-        let dim = CubeDim::new_1d(UNITS);
+        let dim = CubeDim::new_1d(THREADS);
         let count = (points.meta.shape()[0] * shape.levels.len()) << shape.dims;
         let levels = upload(&points, &words(&shape), DType::U32);
         let (rows, slots) = (empty(&points, [count], DType::U32), empty(&points, [count], DType::U32));
         rows_of_slots::launch(
             &client,
-            cubes_for(count),
+            workgroups_for(count),
             dim,
             points.clone().into_buffer_arg(),
             levels.clone().into_buffer_arg(),
@@ -205,7 +220,7 @@ impl LookupBackward for CubeBackend {
         let out = floats(&grad, [shape.parameter_count()]);
         gather::launch(
             &client,
-            cubes_for(shape.parameter_count()),
+            workgroups_for(shape.parameter_count()),
             dim,
             sorted.into_buffer_arg(),
             slots.into_buffer_arg(),

@@ -1,9 +1,9 @@
 //! L1 + SSIM with its gradient, and the cross-entropy of the score stage, on the device.
 //!
-//! Four sweeps over the picture: horizontal blur of x, y, x^2, y^2, xy; vertical blur, SSIM and its derivatives; the same two blurs of the derivatives.
-//! Sums are taken per cube and then by one unit, in order, so that every run gives the same bytes.
+//! Four sweeps over the image: horizontal blur of x, y, x^2, y^2, xy; vertical blur, SSIM and its derivatives; the same two blurs of the derivatives.
+//! Sums are taken per workgroup and then by one thread, in order, so that every run gives the same bytes.
 
-use super::tensor::{UNITS, cubes_for, floats, upload};
+use super::tensor::{THREADS, floats, upload, workgroups_for};
 use crate::ops::photometric::{PhotometricKernels, PhotometricOps};
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
@@ -62,7 +62,7 @@ fn blur_moments_in_rows(x: &[f32], y: &[f32], taps: &[f32], moments: &mut [f32],
     }
 }
 
-/// Vertical blur of the moments; the terms of the loss per cube (l1, ssim, mse); d ssim / d (mean x, mean x^2, mean xy) as derivatives [3,3,H,W].
+/// Vertical blur of the moments; the terms of the loss per workgroup (l1, ssim, mse); d ssim / d (mean x, mean x^2, mean xy) as derivatives `[3,3,H,W]`.
 #[cube(launch)]
 fn ssim_and_derivatives(
     x: &[f32],
@@ -75,9 +75,9 @@ fn ssim_and_derivatives(
     pixels: u32,
     #[comptime] gradient: bool,
 ) {
-    let mut terms = Shared::<[f32]>::new_slice(3 * UNITS as usize);
+    let mut terms = Shared::<[f32]>::new_slice(3 * THREADS as usize);
     let at = ABSOLUTE_POS as u32;
-    let unit = UNIT_POS as usize;
+    let thread = UNIT_POS as usize;
     let mut l1 = 0.0f32;
     let mut ssim = 0.0f32;
     let mut mse = 0.0f32;
@@ -113,7 +113,7 @@ fn ssim_and_derivatives(
         l1 = difference.abs();
         mse = difference * difference;
         if comptime!(gradient) {
-            // By the quotient rule, with the variance's own dependence on the mean in the first one.
+            // By the quotient rule, the first one includes that the variance depends on the mean.
             let d_vx = -ssim / b2;
             let d_vxy = 2.0 * a1 / (b1 * b2);
             let d_mx = 2.0 * my * a2 / (b1 * b2) - 2.0 * mx * ssim / b1 - 2.0 * mx * d_vx - my * d_vxy;
@@ -123,30 +123,30 @@ fn ssim_and_derivatives(
             derivatives[base + 2 * pixels as usize] = d_vxy;
         }
     }
-    terms[unit] = l1;
-    terms[unit + UNITS as usize] = ssim;
-    terms[unit + 2 * UNITS as usize] = mse;
+    terms[thread] = l1;
+    terms[thread + THREADS as usize] = ssim;
+    terms[thread + 2 * THREADS as usize] = mse;
     sync_cube();
     if UNIT_POS < 3 {
         let mut sum = 0.0f32;
-        for k in 0..UNITS {
-            sum += terms[(UNIT_POS * UNITS + k) as usize];
+        for k in 0..THREADS {
+            sum += terms[(UNIT_POS * THREADS + k) as usize];
         }
-        let slot = CUBE_POS * 3 + unit;
+        let slot = CUBE_POS * 3 + thread;
         if slot < partial.len() {
             partial[slot] = sum;
         }
     }
 }
 
-/// Adds up the terms of all cubes, in order, with a compensation for what rounding drops; numbers = [loss, l1, ssim, mse].
+/// Adds up the terms of all workgroups, in order, with compensation for rounding (Kahan); numbers = `[loss, l1, ssim, mse]`.
 #[cube(launch)]
-fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], cubes: u32, scale: f32, lambda_c: f32) {
+fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], workgroups: u32, scale: f32, lambda_c: f32) {
     let mut means = Shared::<[f32]>::new_slice(3usize);
     if UNIT_POS < 3 {
         let mut sum = 0.0f32;
         let mut lost = 0.0f32;
-        for k in 0..cubes {
+        for k in 0..workgroups {
             let value = partial[(k * 3 + UNIT_POS) as usize] - lost;
             let next = sum + value;
             lost = (next - sum) - value;
@@ -161,7 +161,7 @@ fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], cubes: u32
     }
 }
 
-/// Horizontal blur of the derivatives [9,H,W].
+/// Horizontal blur of the derivatives `[9,H,W]`.
 #[cube(launch)]
 fn blur_derivatives_in_rows(from: &[f32], taps: &[f32], to: &mut [f32], width: u32) {
     let at = ABSOLUTE_POS as u32;
@@ -178,7 +178,7 @@ fn blur_derivatives_in_rows(from: &[f32], taps: &[f32], to: &mut [f32], width: u
     }
 }
 
-/// Vertical blur of the derivatives and the gradient of the loss [C,H,W]; planes beyond the third get 0.
+/// Vertical blur of the derivatives and the gradient of the loss `[C,H,W]`; planes beyond the third get 0.
 #[cube(launch)]
 fn gradient_of_planes(x: &[f32], y: &[f32], taps: &[f32], derivatives: &[f32], grad: &mut [f32], width: u32, pixels: u32, l1_scale: f32, ssim_scale: f32) {
     let at = ABSOLUTE_POS as u32;
@@ -211,10 +211,10 @@ fn gradient_of_planes(x: &[f32], y: &[f32], taps: &[f32], derivatives: &[f32], g
     }
 }
 
-/// Cross-entropy of logits against a mask: sums per cube, and the gradient of the mean.
+/// Cross-entropy of logits against a mask: sums per workgroup, and the gradient of the mean.
 #[cube(launch)]
 fn bce_terms(logits: &[f32], mask: &[f32], grad: &mut [f32], partial: &mut [f32], scale: f32, #[comptime] gradient: bool) {
-    let mut terms = Shared::<[f32]>::new_slice(UNITS as usize);
+    let mut terms = Shared::<[f32]>::new_slice(THREADS as usize);
     let at = ABSOLUTE_POS;
     let mut term = 0.0f32;
     if at < mask.len() {
@@ -235,7 +235,7 @@ fn bce_terms(logits: &[f32], mask: &[f32], grad: &mut [f32], partial: &mut [f32]
     sync_cube();
     if UNIT_POS == 0 {
         let mut sum = 0.0f32;
-        for k in 0..UNITS as usize {
+        for k in 0..THREADS as usize {
             sum += terms[k];
         }
         if CUBE_POS < partial.len() {
@@ -245,11 +245,11 @@ fn bce_terms(logits: &[f32], mask: &[f32], grad: &mut [f32], partial: &mut [f32]
 }
 
 #[cube(launch)]
-fn finish_mean(partial: &[f32], mean: &mut [f32], cubes: u32, scale: f32) {
+fn finish_mean(partial: &[f32], mean: &mut [f32], workgroups: u32, scale: f32) {
     if UNIT_POS == 0 {
         let mut sum = 0.0f32;
         let mut lost = 0.0f32;
-        for k in 0..cubes as usize {
+        for k in 0..workgroups as usize {
             let value = partial[k] - lost;
             let next = sum + value;
             lost = (next - sum) - value;
@@ -283,18 +283,18 @@ impl PhotometricKernels for CubeBackend {
             return (upload(&planes, &[0.0f32], DType::F32), upload(&planes, &[0.0f32; 3], DType::F32), none(&planes));
         }
         let taps = upload(&planes, &window(), DType::F32);
-        let dim = CubeDim::new_1d(UNITS);
+        let dim = CubeDim::new_1d(THREADS);
         let moments = floats(&planes, [3 * MOMENTS as usize * pixels]);
         let args = || (planes.clone().into_buffer_arg(), target.clone().into_buffer_arg(), taps.clone().into_buffer_arg());
         let (x, y, w) = args();
-        blur_moments_in_rows::launch(&client, cubes_for(3 * pixels), dim, x, y, w, moments.clone().into_buffer_arg(), width as u32, pixels as u32);
-        let cubes = (3 * pixels).div_ceil(UNITS as usize);
-        let partial = floats(&planes, [3 * cubes]);
+        blur_moments_in_rows::launch(&client, workgroups_for(3 * pixels), dim, x, y, w, moments.clone().into_buffer_arg(), width as u32, pixels as u32);
+        let workgroups = (3 * pixels).div_ceil(THREADS as usize);
+        let partial = floats(&planes, [3 * workgroups]);
         let derivatives = floats(&planes, [if gradient { 3 * DERIVATIVES as usize * pixels } else { 1 }]);
         let (x, y, w) = args();
         ssim_and_derivatives::launch(
             &client,
-            cubes_for(3 * pixels),
+            workgroups_for(3 * pixels),
             dim,
             x,
             y,
@@ -315,7 +315,7 @@ impl PhotometricKernels for CubeBackend {
             partial.into_buffer_arg(),
             loss.clone().into_buffer_arg(),
             terms.clone().into_buffer_arg(),
-            cubes as u32,
+            workgroups as u32,
             scale,
             lambda_c,
         );
@@ -327,7 +327,7 @@ impl PhotometricKernels for CubeBackend {
         let nine = 3 * DERIVATIVES as usize * pixels;
         blur_derivatives_in_rows::launch(
             &client,
-            cubes_for(nine),
+            workgroups_for(nine),
             dim,
             derivatives.into_buffer_arg(),
             taps.clone().into_buffer_arg(),
@@ -338,7 +338,7 @@ impl PhotometricKernels for CubeBackend {
         let (x, y, w) = args();
         gradient_of_planes::launch(
             &client,
-            cubes_for(shape.num_elements()),
+            workgroups_for(shape.num_elements()),
             dim,
             x,
             y,
@@ -361,15 +361,15 @@ impl PhotometricKernels for CubeBackend {
             return (upload(&planes, &[0.0f32], DType::F32), floats(&planes, shape));
         }
         let items = if gradient { shape.num_elements() } else { pixels };
-        let cubes = items.div_ceil(UNITS as usize);
+        let workgroups = items.div_ceil(THREADS as usize);
         let grad = floats(&planes, if gradient { shape } else { [1].into() });
-        let (partial, loss) = (floats(&planes, [cubes]), floats(&planes, [1]));
+        let (partial, loss) = (floats(&planes, [workgroups]), floats(&planes, [1]));
         let scale = 1.0 / pixels as f32;
-        let count = cubes_for(items);
+        let count = workgroups_for(items);
         bce_terms::launch(
             &client,
             count,
-            CubeDim::new_1d(UNITS),
+            CubeDim::new_1d(THREADS),
             planes.into_buffer_arg(),
             mask.into_buffer_arg(),
             grad.clone().into_buffer_arg(),
@@ -378,7 +378,7 @@ impl PhotometricKernels for CubeBackend {
             gradient,
         );
         let one = CubeCount::Static(1, 1, 1);
-        finish_mean::launch(&client, one, CubeDim::new_1d(32), partial.into_buffer_arg(), loss.clone().into_buffer_arg(), cubes as u32, scale);
+        finish_mean::launch(&client, one, CubeDim::new_1d(32), partial.into_buffer_arg(), loss.clone().into_buffer_arg(), workgroups as u32, scale);
         (loss, grad)
     }
     fn scale_by(gradient: FloatTensor<Self>, upstream: FloatTensor<Self>) -> FloatTensor<Self> {
@@ -389,7 +389,7 @@ impl PhotometricKernels for CubeBackend {
         }
         let client = gradient.client.clone();
         let factor = into_contiguous(upstream).into_buffer_arg();
-        multiply_by::launch(&client, cubes_for(n), CubeDim::new_1d(UNITS), gradient.clone().into_buffer_arg(), factor);
+        multiply_by::launch(&client, workgroups_for(n), CubeDim::new_1d(THREADS), gradient.clone().into_buffer_arg(), factor);
         gradient
     }
 }

@@ -8,21 +8,21 @@ use cubecl::prelude::*;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Units of a cube in kernels that treat one item per unit.
-pub const UNITS: u32 = 256;
+/// Threads of a workgroup in kernels with one item per thread.
+pub const THREADS: u32 = 256;
 
-/// The cubes for `items` items at [`UNITS`] per cube, spread over two dimensions where one would be over the limit of 65,535.
-pub fn cubes_for(items: usize) -> CubeCount {
-    spread(items.div_ceil(UNITS as usize))
+/// The workgroups for `items` items at [`THREADS`] per workgroup, over two dimensions where one would exceed the limit of 65,535.
+pub fn workgroups_for(items: usize) -> CubeCount {
+    spread(items.div_ceil(THREADS as usize))
 }
 
-/// `cubes` cubes (at least one), spread over two dimensions where one would be over the limit of 65,535. There may be more than asked for: kernels
-/// check their place.
-pub fn spread(cubes: usize) -> CubeCount {
+/// `count` workgroups (at least one), over two dimensions where one would exceed the limit of 65,535. There may be more than that: kernels check their
+/// index.
+pub fn spread(count: usize) -> CubeCount {
     const LIMIT: usize = 65_535;
-    let cubes = cubes.max(1);
-    let rows = cubes.div_ceil(LIMIT);
-    CubeCount::Static(cubes.div_ceil(rows) as u32, rows as u32, 1)
+    let count = count.max(1);
+    let rows = count.div_ceil(LIMIT);
+    CubeCount::Static(count.div_ceil(rows) as u32, rows as u32, 1)
 }
 
 /// A contiguous tensor of `shape` beside `like`, its contents undefined. It holds at least one element, because there are no empty buffers.
@@ -46,32 +46,32 @@ pub fn upload<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> 
 static BINDING_CAP: AtomicU64 = AtomicU64::new(u64::MAX);
 static SHARED_CAP: AtomicU64 = AtomicU64::new(u64::MAX);
 
-/// Unsigned numbers as the signed ones that burn's integers are: the same bits.
+/// Reinterprets unsigned numbers as signed ones, which burn's integers are.
 pub fn signed(values: CubeTensor) -> CubeTensor {
     CubeTensor::new_contiguous(values.client.clone(), values.device.clone(), values.meta.shape().clone(), values.handle.clone(), DType::I32)
 }
 
-/// Pretends from now on that kernels may read no more than so many bytes of a buffer: for tests, and to see what a smaller adapter would do.
+/// Lowers the limit on the bytes of a buffer that a kernel may read, to emulate a smaller adapter in tests.
 pub fn cap_bindings(bytes: u64) {
     BINDING_CAP.store(bytes, Ordering::Relaxed);
 }
 
-/// Pretends from now on that cubes may share no more than so many bytes of memory on the chip; every adapter allows 16 KiB.
+/// Lowers the limit on the bytes of shared memory per workgroup, to emulate a smaller adapter in tests; every adapter has 16 KiB.
 pub fn cap_shared_memory(bytes: u64) {
     SHARED_CAP.store(bytes, Ordering::Relaxed);
 }
 
-/// The most bytes a cube may share.
+/// Bytes of shared memory per workgroup.
 pub fn shared_bytes(client: &Client) -> usize {
     (client.properties().hardware.max_shared_memory_size as u64).min(SHARED_CAP.load(Ordering::Relaxed)) as usize
 }
 
-/// The most bytes of one buffer that a kernel may read.
+/// Upper bound on the bytes of one buffer that a kernel may read.
 pub fn binding_bytes(client: &Client) -> u64 {
     client.properties().memory.max_page_size.min(BINDING_CAP.load(Ordering::Relaxed))
 }
 
-/// 0..`rows` in parts whose rows of `width` floats a kernel may read at once. Parts start at multiples of 256 bytes, as bindings must.
+/// 0..`rows` in parts of rows of `width` floats that fit one binding. Parts start at multiples of 256 bytes, as bindings must.
 pub fn row_blocks(client: &Client, rows: usize, width: usize) -> Vec<Range<usize>> {
     const ALIGNED: usize = 64;
     let fit = (binding_bytes(client) / (4 * width.max(1) as u64)) as usize / ALIGNED * ALIGNED;
@@ -90,7 +90,7 @@ pub fn rows_of(tensor: &CubeTensor, rows: &Range<usize>, width: usize) -> CubeTe
     CubeTensor::new_contiguous(tensor.client.clone(), tensor.device.clone(), Shape::from([rows.len() * width]), handle, tensor.dtype)
 }
 
-/// `tensor` with its elements side by side in a buffer nobody else holds, so that a kernel may write to it.
+/// `tensor`, contiguous, in a buffer without other owners, so that a kernel may write to it.
 pub fn owned(tensor: CubeTensor) -> CubeTensor {
     let tensor = into_contiguous(tensor);
     if tensor.handle.can_mut() {
@@ -99,7 +99,7 @@ pub fn owned(tensor: CubeTensor) -> CubeTensor {
     let copy = empty(&tensor, tensor.meta.shape().clone(), tensor.dtype);
     let n = tensor.meta.shape().num_elements();
     let client = tensor.client.clone();
-    copy_words::launch(&client, cubes_for(n), CubeDim::new_1d(UNITS), tensor.into_buffer_arg(), copy.clone().into_buffer_arg());
+    copy_words::launch(&client, workgroups_for(n), CubeDim::new_1d(THREADS), tensor.into_buffer_arg(), copy.clone().into_buffer_arg());
     copy
 }
 
@@ -110,7 +110,7 @@ fn copy_words(from: &[f32], to: &mut [f32]) {
     }
 }
 
-/// Whether `value` is a number and not infinite, by its bits: shader compilers may assume that arithmetic never meets anything else.
+/// Whether `value` is finite, by its bits: shader compilers may assume that arithmetic never meets infinities and NaN.
 #[cube]
 pub fn is_finite(value: f32) -> bool {
     (u32::reinterpret(value) & 0x7f80_0000u32) != 0x7f80_0000u32

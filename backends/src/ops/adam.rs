@@ -3,7 +3,7 @@
 use crate::cpu::adam as kernel;
 use crate::cpu::tensor::CpuBackend;
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, Result};
 
@@ -31,6 +31,25 @@ impl AdamSettings {
     }
 }
 
+/// The scalars of one step, bias corrections folded in.
+#[derive(Clone, Copy, Debug)]
+pub struct AdamScalars {
+    /// Decay of the first moment.
+    pub beta1: f32,
+    /// Decay of the second moment.
+    pub beta2: f32,
+    /// 1 - beta1, from float64.
+    pub one_minus_beta1: f32,
+    /// 1 - beta2, from float64.
+    pub one_minus_beta2: f32,
+    /// Learning rate over the first bias correction.
+    pub step_size: f32,
+    /// 1 / sqrt(second bias correction).
+    pub inverse_sqrt_correction: f32,
+    /// Added to the root of the second moment.
+    pub epsilon: f32,
+}
+
 /// What a step leaves behind.
 #[derive(Clone, Debug)]
 pub struct AdamStep<const D: usize> {
@@ -40,14 +59,14 @@ pub struct AdamStep<const D: usize> {
     pub m: Tensor<D>,
     /// Second moment.
     pub v: Tensor<D>,
-    /// How many wanted rows were left alone because their gradient was not finite [1]; reading it is up to the caller.
+    /// Rows that were skipped because their gradient was not finite `[1]`, on the device.
     pub skipped_rows: Tensor<1, Int>,
 }
 
 type Moved<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>, IntTensor<B>);
 
 /// The operations per device: `(param, m, v, skipped rows [1])`.
-#[backend_extension(Flex, NdArray, Cube)]
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
 pub trait AdamOps: Backend {
     /// Moves `param` by one step; all four float tensors have one shape.
     fn adam(
@@ -55,7 +74,7 @@ pub trait AdamOps: Backend {
         m: FloatTensor<Self>,
         v: FloatTensor<Self>,
         grad: FloatTensor<Self>,
-        scalars: kernel::AdamScalars,
+        scalars: AdamScalars,
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, IntTensor<Self>);
     /// The same for the rows whose entry in `visible` is not 0.
     fn adam_visible(
@@ -64,17 +83,17 @@ pub trait AdamOps: Backend {
         v: FloatTensor<Self>,
         grad: FloatTensor<Self>,
         visible: IntTensor<Self>,
-        scalars: kernel::AdamScalars,
+        scalars: AdamScalars,
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, IntTensor<Self>);
 }
 
-fn on_cpu<B: CpuBackend>(
+fn step_on_cpu<B: CpuBackend>(
     param: FloatTensor<B>,
     m: FloatTensor<B>,
     v: FloatTensor<B>,
     grad: FloatTensor<B>,
     visible: Option<IntTensor<B>>,
-    scalars: kernel::AdamScalars,
+    scalars: AdamScalars,
 ) -> Moved<B> {
     let shape = param.shape();
     let width = shape.num_elements().checked_div(shape[0]).unwrap_or(0);
@@ -92,35 +111,23 @@ fn on_cpu<B: CpuBackend>(
     (param, moments.0.unwrap_or_else(empty), moments.1.unwrap_or_else(empty), B::from_ints(vec![skipped as i64], [1]))
 }
 
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl AdamOps for $backend {
-            fn adam(
-                param: FloatTensor<Self>,
-                m: FloatTensor<Self>,
-                v: FloatTensor<Self>,
-                grad: FloatTensor<Self>,
-                scalars: kernel::AdamScalars,
-            ) -> Moved<Self> {
-                on_cpu::<Self>(param, m, v, grad, None, scalars)
-            }
-            fn adam_visible(
-                param: FloatTensor<Self>,
-                m: FloatTensor<Self>,
-                v: FloatTensor<Self>,
-                grad: FloatTensor<Self>,
-                visible: IntTensor<Self>,
-                scalars: kernel::AdamScalars,
-            ) -> Moved<Self> {
-                on_cpu::<Self>(param, m, v, grad, Some(visible), scalars)
-            }
-        }
-    };
+impl<B: CpuBackend> AdamOps for B {
+    fn adam(param: FloatTensor<Self>, m: FloatTensor<Self>, v: FloatTensor<Self>, grad: FloatTensor<Self>, scalars: AdamScalars) -> Moved<Self> {
+        step_on_cpu::<Self>(param, m, v, grad, None, scalars)
+    }
+    fn adam_visible(
+        param: FloatTensor<Self>,
+        m: FloatTensor<Self>,
+        v: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+        visible: IntTensor<Self>,
+        scalars: AdamScalars,
+    ) -> Moved<Self> {
+        step_on_cpu::<Self>(param, m, v, grad, Some(visible), scalars)
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
-/// One Adam step, p -= lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps), in place when the caller hands over its only reference.
+/// One Adam step, p -= lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps), in place when the tensors have no other owner.
 /// Results carry no autodiff association; rows (dimension 0) with a gradient that is not finite are skipped and counted.
 pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, grad: Tensor<D>, settings: &AdamSettings) -> Result<AdamStep<D>> {
     let shape = param.dims();
@@ -147,7 +154,7 @@ pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, g
         ));
     }
     let t = settings.step as f64;
-    let scalars = kernel::AdamScalars {
+    let scalars = AdamScalars {
         beta1: settings.beta1 as f32,
         beta2: settings.beta2 as f32,
         one_minus_beta1: (1.0 - settings.beta1) as f32,

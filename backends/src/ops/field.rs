@@ -3,20 +3,20 @@
 use crate::cpu::mlp::{mish, relu};
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::interpolate;
+use crate::ops::autodiff::{differentiate, record};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
 
-pub use crate::cpu::mlp::mish::MishShape;
-pub use crate::cpu::mlp::relu::ReluShape;
-pub use crate::cpu::vertex::hash::LevelHash;
 pub use crate::cpu::vertex::index::MAX_RESOLUTION;
 pub use crate::ops::corners::{GridBox, VoxelCorners};
+pub use crate::ops::hash::LevelHash;
+pub use crate::ops::networks::{MishShape, ReluShape};
 
 /// One level's decoder: hash functions and layer widths (the input width is the number of functions).
 #[derive(Clone, Debug, PartialEq)]
@@ -27,13 +27,13 @@ pub struct Decoder {
     pub shape: MishShape,
 }
 
-/// What one device computes.
+/// The derivatives per device.
 pub trait FieldKernels: Backend {
     /// The gradient of the decoder's weights.
     fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self>;
-    /// The gradient [U, F] of the features.
+    /// The gradient `[U, F]` of the features.
     fn trilinear_backward(grad: FloatTensor<Self>, weights: FloatTensor<Self>, slots: IntTensor<Self>, starts: IntTensor<Self>) -> FloatTensor<Self>;
-    /// The gradients of input (when wanted) and weights.
+    /// The gradients of the input (if `wants_input`) and the weights.
     fn network_backward(
         x: FloatTensor<Self>,
         weights: FloatTensor<Self>,
@@ -44,11 +44,11 @@ pub trait FieldKernels: Backend {
 }
 
 /// The differentiable operations of this module per device.
-#[backend_extension(Flex, NdArray, Cube, Autodiff)]
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait FieldOps: Backend {
-    /// Features [U, F] of vertices [U, 3]; differentiable in the weights.
+    /// Features `[U, F]` of vertices `[U, 3]`; differentiable in the weights.
     fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self>;
-    /// Interpolated features [M, F]; differentiable in the features.
+    /// Interpolated features `[M, F]`; differentiable in the features.
     fn trilinear(
         features: FloatTensor<Self>,
         corners: IntTensor<Self>,
@@ -56,7 +56,7 @@ pub trait FieldOps: Backend {
         slots: IntTensor<Self>,
         starts: IntTensor<Self>,
     ) -> FloatTensor<Self>;
-    /// Flat outputs of the network for x [M, in]; differentiable in both.
+    /// Flat outputs of the network for x `[M, in]`; differentiable in both.
     fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self>;
 }
 
@@ -94,38 +94,32 @@ impl<B: CpuBackend> FieldKernels for B {
     }
 }
 
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl FieldOps for $backend {
-            fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
-                let vertices = triples::<Self>(&vertices);
-                let width = decoder.hash.len().max(1);
-                let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
-                let out = mish::forward(&decoder.shape, &Self::floats(&weights), vertices.len(), &rows);
-                Self::from_floats(out, [vertices.len(), decoder.shape.output])
-            }
-            fn trilinear(
-                features: FloatTensor<Self>,
-                corners: IntTensor<Self>,
-                weights: FloatTensor<Self>,
-                _slots: IntTensor<Self>,
-                _starts: IntTensor<Self>,
-            ) -> FloatTensor<Self> {
-                let f = features.shape()[1];
-                let corners = unsigned::<Self>(&corners);
-                let out = interpolate::forward(&Self::floats(&features), f, &corners, &Self::floats(&weights));
-                Self::from_floats(out, [corners.len() / 8, f])
-            }
-            fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
-                let out = relu::forward(&shape, &Self::floats(&weights), &Self::floats(&x));
-                let len = out.len();
-                Self::from_floats(out, [len])
-            }
-        }
-    };
+impl<B: CpuBackend> FieldOps for B {
+    fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
+        let vertices = triples::<Self>(&vertices);
+        let width = decoder.hash.len().max(1);
+        let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
+        let out = mish::forward(&decoder.shape, &Self::floats(&weights), vertices.len(), &rows);
+        Self::from_floats(out, [vertices.len(), decoder.shape.output])
+    }
+    fn trilinear(
+        features: FloatTensor<Self>,
+        corners: IntTensor<Self>,
+        weights: FloatTensor<Self>,
+        _slots: IntTensor<Self>,
+        _starts: IntTensor<Self>,
+    ) -> FloatTensor<Self> {
+        let f = features.shape()[1];
+        let corners = unsigned::<Self>(&corners);
+        let out = interpolate::forward(&Self::floats(&features), f, &corners, &Self::floats(&weights));
+        Self::from_floats(out, [corners.len() / 8, f])
+    }
+    fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
+        let out = relu::forward(&shape, &Self::floats(&weights), &Self::floats(&x));
+        let len = out.len();
+        Self::from_floats(out, [len])
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
 #[derive(Debug)]
 struct Decode;
@@ -134,12 +128,9 @@ impl<B: FieldKernels> Backward<B, 1> for Decode {
     type State = (FloatTensor<B>, IntTensor<B>, Arc<Decoder>);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [parent] = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (weights, vertices, decoder) = ops.state;
-        if let Some(parent) = parent {
-            grads.register::<B>(parent.id, B::decode_backward(weights, vertices, decoder, grad));
-        }
+        differentiate::<B, _, 1>(ops, grads, |(weights, vertices, decoder), upstream, [wanted]| {
+            [wanted.then(|| B::decode_backward(weights, vertices, decoder, upstream))]
+        });
     }
 }
 
@@ -150,12 +141,9 @@ impl<B: FieldKernels> Backward<B, 1> for Interpolate {
     type State = (FloatTensor<B>, IntTensor<B>, IntTensor<B>);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [parent] = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (weights, slots, starts) = ops.state;
-        if let Some(parent) = parent {
-            grads.register::<B>(parent.id, B::trilinear_backward(grad, weights, slots, starts));
-        }
+        differentiate::<B, _, 1>(ops, grads, |(weights, slots, starts), upstream, [wanted]| {
+            [wanted.then(|| B::trilinear_backward(upstream, weights, slots, starts))]
+        });
     }
 }
 
@@ -166,29 +154,17 @@ impl<B: FieldKernels> Backward<B, 2> for Network {
     type State = (FloatTensor<B>, FloatTensor<B>, Arc<ReluShape>);
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [input, parameters] = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (x, weights, shape) = ops.state;
-        let (grad_x, grad_weights) = B::network_backward(x, weights, shape, grad, input.is_some());
-        if let (Some(input), Some(grad_x)) = (input, grad_x) {
-            grads.register::<B>(input.id, grad_x);
-        }
-        if let Some(parameters) = parameters {
-            grads.register::<B>(parameters.id, grad_weights);
-        }
+        differentiate::<B, _, 2>(ops, grads, |(x, weights, shape), upstream, [wants_input, _]| {
+            let (of_input, of_weights) = B::network_backward(x, weights, shape, upstream, wants_input);
+            [of_input, Some(of_weights)]
+        });
     }
 }
 
 impl<B: FieldKernels + FieldOps, C: CheckpointStrategy> FieldOps for Autodiff<B, C> {
     fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
-        let (weights, node) = weights.into_parts();
-        match Decode.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::decode(weights.clone(), vertices.clone(), decoder.clone());
-                prep.finish((weights, vertices, decoder), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::decode(weights, vertices, decoder)),
-        }
+        let (weights, parent) = weights.into_parts();
+        record::<B, C, _, 1>(Decode, [parent], |_| (B::decode(weights.clone(), vertices.clone(), decoder.clone()), (weights, vertices, decoder)))
     }
     fn trilinear(
         features: FloatTensor<Self>,
@@ -197,31 +173,20 @@ impl<B: FieldKernels + FieldOps, C: CheckpointStrategy> FieldOps for Autodiff<B,
         slots: IntTensor<Self>,
         starts: IntTensor<Self>,
     ) -> FloatTensor<Self> {
-        let (features, node) = features.into_parts();
+        let (features, parent) = features.into_parts();
         let weights = weights.into_primitive();
-        match Interpolate.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::trilinear(features, corners, weights.clone(), slots.clone(), starts.clone());
-                prep.finish((weights, slots, starts), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::trilinear(features, corners, weights, slots, starts)),
-        }
+        record::<B, C, _, 1>(Interpolate, [parent], |_| {
+            (B::trilinear(features, corners, weights.clone(), slots.clone(), starts.clone()), (weights, slots, starts))
+        })
     }
     fn network(x: FloatTensor<Self>, weights: FloatTensor<Self>, shape: Arc<ReluShape>) -> FloatTensor<Self> {
-        let (x, input) = x.into_parts();
-        let (weights, parameters) = weights.into_parts();
-        match Network.prepare::<C>([input, parameters]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::network(x.clone(), weights.clone(), shape.clone());
-                prep.finish((x, weights, shape), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::network(x, weights, shape)),
-        }
+        let ((x, of_input), (weights, of_weights)) = (x.into_parts(), weights.into_parts());
+        record::<B, C, _, 2>(Network, [of_input, of_weights], |_| (B::network(x.clone(), weights.clone(), shape.clone()), (x, weights, shape)))
     }
 }
 
 impl VoxelCorners {
-    /// Features [U,F] of the vertices: hash signature, then the decoder's network. `weights` is flat in the order of [`crate::cpu::mlp::mish`];
+    /// Features `[U,F]` of the vertices: hash signature, then the decoder's network. `weights` is flat in the order of [`crate::cpu::mlp::mish`];
     /// the gradient goes to it alone.
     pub fn decode(&self, weights: Tensor<1>, decoder: &Arc<Decoder>) -> Result<Tensor<2>> {
         check_weights("decoder", weights.dims()[0], decoder.shape.parameter_count())?;
@@ -230,7 +195,7 @@ impl VoxelCorners {
         }
         Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::decode(weights.into_dispatch(), self.vertices.clone().into_dispatch(), decoder.clone())))
     }
-    /// Trilinear interpolation of vertex `features` [U,F] at the points [M,F].
+    /// Trilinear interpolation of vertex `features` `[U,F]` at the points `[M,F]`.
     pub fn interpolate(&self, features: Tensor<2>) -> Result<Tensor<2>> {
         let ([u, _], [vertices, _]) = (features.dims(), self.vertices.dims());
         if u != vertices {
@@ -241,14 +206,14 @@ impl VoxelCorners {
     }
 }
 
-/// Runs a trunk-and-heads ReLU network over `x` [M,in]; one output [M,width] per head (or the trunk's). `weights` is flat in the order of
+/// Runs a trunk-and-heads ReLU network over `x` `[M,in]`; one output `[M,width]` per head (or the trunk's). `weights` is flat in the order of
 /// [`crate::cpu::mlp::relu`].
 pub fn mlp_relu(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Result<Vec<Tensor<2>>> {
     let [m, _] = x.dims();
     Ok(split_heads(&mlp_relu_flat(x, weights, shape)?, m, &shape.output_widths()))
 }
 
-/// As [`mlp_relu`], with the outputs as they lie in memory: head after head.
+/// As [`mlp_relu`], with the outputs in one flat tensor, head after head.
 pub fn mlp_relu_flat(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -> Result<Tensor<1>> {
     let [m, width] = x.dims();
     if !shape.is_sound() || width != shape.input || m == 0 {
@@ -258,7 +223,7 @@ pub fn mlp_relu_flat(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -
     Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone())))
 }
 
-/// The heads [rows, width] of a flat array that holds one after the other.
+/// The heads `[rows, width]` of a flat array that holds one after the other.
 pub(super) fn split_heads(flat: &Tensor<1>, rows: usize, widths: &[usize]) -> Vec<Tensor<2>> {
     if let [only] = widths {
         return vec![flat.clone().reshape([rows, *only])];

@@ -2,11 +2,12 @@
 
 use crate::cpu::lookup as kernel;
 use crate::cpu::tensor::CpuBackend;
+use crate::ops::autodiff::{differentiate, record};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
@@ -97,9 +98,9 @@ pub trait LookupBackward: Backend {
 }
 
 /// The operation per device.
-#[backend_extension(Flex, NdArray, Cube, Autodiff)]
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait LookupOps: Backend {
-    /// Features [M, width] of points [M, dims]; differentiable in the flat table.
+    /// Features `[M, width]` of points `[M, dims]`; differentiable in the flat table.
     fn lookup(table: FloatTensor<Self>, points: FloatTensor<Self>, shape: Arc<GridShape>) -> FloatTensor<Self>;
 }
 
@@ -110,18 +111,12 @@ impl<B: CpuBackend> LookupBackward for B {
     }
 }
 
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl LookupOps for $backend {
-            fn lookup(table: FloatTensor<Self>, points: FloatTensor<Self>, shape: Arc<GridShape>) -> FloatTensor<Self> {
-                let out = kernel::forward(&shape, &Self::floats(&table), &Self::floats(&points));
-                Self::from_floats(out, [points.shape()[0], shape.width()])
-            }
-        }
-    };
+impl<B: CpuBackend> LookupOps for B {
+    fn lookup(table: FloatTensor<Self>, points: FloatTensor<Self>, shape: Arc<GridShape>) -> FloatTensor<Self> {
+        let out = kernel::forward(&shape, &Self::floats(&table), &Self::floats(&points));
+        Self::from_floats(out, [points.shape()[0], shape.width()])
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
 #[derive(Debug)]
 struct Lookup;
@@ -130,30 +125,19 @@ impl<B: LookupBackward> Backward<B, 1> for Lookup {
     type State = (FloatTensor<B>, Arc<GridShape>);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [parent] = ops.parents;
-        let grad = grads.consume::<B>(&ops.node);
-        let (points, shape) = ops.state;
-        if let Some(parent) = parent {
-            grads.register::<B>(parent.id, B::lookup_backward(points, shape, grad));
-        }
+        differentiate::<B, _, 1>(ops, grads, |(points, shape), upstream, [wanted]| [wanted.then(|| B::lookup_backward(points, shape, upstream))]);
     }
 }
 
 impl<B: LookupBackward + LookupOps, C: CheckpointStrategy> LookupOps for Autodiff<B, C> {
     fn lookup(table: FloatTensor<Self>, points: FloatTensor<Self>, shape: Arc<GridShape>) -> FloatTensor<Self> {
-        let (table, node) = table.into_parts();
+        let (table, parent) = table.into_parts();
         let points = points.into_primitive();
-        match Lookup.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let out = B::lookup(table, points.clone(), shape.clone());
-                prep.finish((points, shape), out)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::lookup(table, points, shape)),
-        }
+        record::<B, C, _, 1>(Lookup, [parent], |_| (B::lookup(table, points.clone(), shape.clone()), (points, shape)))
     }
 }
 
-/// Features [M, width] of `points` [M, dims] (in 0..1 inside the grid) from a flat `table` of [`GridShape::parameter_count`] weights.
+/// Features `[M, width]` of `points` `[M, dims]` (in 0..1 inside the grid) from a flat `table` of [`GridShape::parameter_count`] weights.
 pub fn lookup(table: Tensor<1>, points: Tensor<2>, shape: &Arc<GridShape>) -> Result<Tensor<2>> {
     let [m, dims] = points.dims();
     let bad = |problem: String, remedy: &str| Err(Error::parameter("grid lookup", problem, remedy));

@@ -2,35 +2,36 @@
 
 use crate::cpu::photometric as kernel;
 use crate::cpu::tensor::CpuBackend;
+use crate::ops::autodiff::{differentiate, record, record_beside};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 
-/// What one device computes.
+/// The passes per device.
 pub trait PhotometricKernels: Backend {
-    /// `(loss [1], terms [l1, ssim, mse], gradient)`; the gradient has the shape of `planes`, or is empty when not wanted.
+    /// `(loss [1], terms [l1, ssim, mse], gradient)`; the gradient has the shape of `planes`, or is empty without `gradient`.
     fn photometric_pass(
         planes: FloatTensor<Self>,
         target: FloatTensor<Self>,
         lambda_c: f32,
         gradient: bool,
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
-    /// `(loss [1], gradient)` of the first plane of `planes` as logits; the gradient has the shape of `planes`, or is empty when not wanted.
+    /// `(loss [1], gradient)` of the first plane of `planes` as logits; the gradient has the shape of `planes`, or is empty without `gradient`.
     fn bce_pass(planes: FloatTensor<Self>, mask: FloatTensor<Self>, gradient: bool) -> (FloatTensor<Self>, FloatTensor<Self>);
-    /// `gradient` times the number in `upstream` [1].
+    /// `gradient` times the number in `upstream` `[1]`.
     fn scale_by(gradient: FloatTensor<Self>, upstream: FloatTensor<Self>) -> FloatTensor<Self>;
 }
 
 /// The operations of this module per device.
-#[backend_extension(Flex, NdArray, Cube, Autodiff)]
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait PhotometricOps: Backend {
-    /// Loss [1] and terms [3] (l1, ssim, mse; without gradient) of the first three of `planes` [C,H,W] against `target` [3,H,W].
+    /// Loss `[1]` and terms `[3]` (l1, ssim, mse; without gradient) of the first three of `planes` `[C,H,W]` against `target` `[3,H,W]`.
     fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>);
-    /// Mean binary cross-entropy [1] of the first of `planes` [C,H,W] as logits against `mask` [H,W].
+    /// Mean binary cross-entropy `[1]` of the first of `planes` `[C,H,W]` as logits against `mask` `[H,W]`.
     fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self>;
 }
 
@@ -68,21 +69,15 @@ impl<B: CpuBackend> PhotometricKernels for B {
     }
 }
 
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl PhotometricOps for $backend {
-            fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>) {
-                let (loss, terms, _) = Self::photometric_pass(planes, target, lambda_c, false);
-                (loss, terms)
-            }
-            fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self> {
-                Self::bce_pass(planes, mask, false).0
-            }
-        }
-    };
+impl<B: CpuBackend> PhotometricOps for B {
+    fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>) {
+        let (loss, terms, _) = Self::photometric_pass(planes, target, lambda_c, false);
+        (loss, terms)
+    }
+    fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self> {
+        Self::bce_pass(planes, mask, false).0
+    }
 }
-on_cpu!(Flex);
-on_cpu!(NdArray);
 
 /// Backward of a scalar loss whose gradient was computed with it: the state is that gradient.
 #[derive(Debug)]
@@ -92,48 +87,33 @@ impl<B: PhotometricKernels> Backward<B, 1> for KnownGradient {
     type State = FloatTensor<B>;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let [parent] = ops.parents;
-        let upstream = grads.consume::<B>(&ops.node);
-        if let Some(parent) = parent {
-            grads.register::<B>(parent.id, B::scale_by(ops.state, upstream));
-        }
+        differentiate::<B, _, 1>(ops, grads, |gradient, upstream, [wanted]| [wanted.then(|| B::scale_by(gradient, upstream))]);
     }
 }
 
 impl<B: PhotometricKernels + PhotometricOps, C: CheckpointStrategy> PhotometricOps for Autodiff<B, C> {
     fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>) {
-        let (planes, node) = planes.into_parts();
+        let (planes, parent) = planes.into_parts();
         let target = target.into_primitive();
-        match KnownGradient.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let (loss, terms, gradient) = B::photometric_pass(planes, target, lambda_c, true);
-                (prep.finish(gradient, loss), Self::from_inner(terms))
-            }
-            OpsKind::UnTracked(prep) => {
-                let (loss, terms) = B::photometric(planes, target, lambda_c);
-                (prep.finish(loss), Self::from_inner(terms))
-            }
-        }
+        let (loss, terms) = record_beside::<B, C, _, _, 1>(KnownGradient, [parent], |tracked| {
+            let (loss, terms, gradient) = B::photometric_pass(planes, target, lambda_c, tracked);
+            (loss, gradient, terms)
+        });
+        (loss, Self::from_inner(terms))
     }
     fn bce_with_logits(planes: FloatTensor<Self>, mask: FloatTensor<Self>) -> FloatTensor<Self> {
-        let (planes, node) = planes.into_parts();
+        let (planes, parent) = planes.into_parts();
         let mask = mask.into_primitive();
-        match KnownGradient.prepare::<C>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => {
-                let (loss, gradient) = B::bce_pass(planes, mask, true);
-                prep.finish(gradient, loss)
-            }
-            OpsKind::UnTracked(prep) => prep.finish(B::bce_with_logits(planes, mask)),
-        }
+        record::<B, C, _, 1>(KnownGradient, [parent], |tracked| B::bce_pass(planes, mask, tracked))
     }
 }
 
 /// A photometric loss and what it is made of.
 #[derive(Clone, Debug)]
 pub struct PhotometricLoss {
-    /// lambda_c * L1 + (1 - lambda_c) * (1 - SSIM) [1]; carries the gradient to the planes.
+    /// lambda_c * L1 + (1 - lambda_c) * (1 - SSIM) `[1]`; carries the gradient to the planes.
     pub loss: Tensor<1>,
-    /// Mean absolute difference, mean SSIM, mean squared difference [3]; no gradient, and no read-back until asked for.
+    /// Mean absolute difference, mean SSIM, mean squared difference `[3]`; no gradient; on the device until [`PhotometricLoss::numbers`] reads them.
     pub terms: Tensor<1>,
 }
 
@@ -165,8 +145,8 @@ impl PhotometricLoss {
     }
 }
 
-/// The loss of 3DGS and of the paper's Section IV-E: lambda_c * L1 + (1 - lambda_c) * (1 - SSIM), SSIM with an 11x11 Gaussian window
-/// of sigma 1.5 and zero padding. Reads the first three of `planes` [C>=3,H,W]; the gradient of the others is zero. `target` is [3,H,W].
+/// The loss of 3DGS and of CC-4DGS (Section IV-E): lambda_c * L1 + (1 - lambda_c) * (1 - SSIM), SSIM with an 11x11 Gaussian window
+/// of sigma 1.5 and zero padding. Reads the first three of `planes` [C>=3,H,W]; the gradient of the others is zero. `target` is `[3,H,W]`.
 pub fn photometric_loss(planes: Tensor<3>, target: Tensor<3>, lambda_c: f32) -> Result<PhotometricLoss> {
     let ([c, h, w], [tc, th, tw]) = (planes.dims(), target.dims());
     if c < 3 || [tc, th, tw] != [3, h, w] {
@@ -183,7 +163,7 @@ pub fn photometric_loss(planes: Tensor<3>, target: Tensor<3>, lambda_c: f32) -> 
     Ok(PhotometricLoss { loss: Tensor::from_dispatch(loss), terms: Tensor::<1>::from_dispatch(terms).inner() })
 }
 
-/// Mean binary cross-entropy of the first of `planes` [C>=1,H,W] as logits against `mask` [H,W] in 0..1: the score stage's loss. The gradient of
+/// Mean binary cross-entropy of the first of `planes` [C>=1,H,W] as logits against `mask` `[H,W]` in 0..1: the score stage's loss. The gradient of
 /// the other planes is zero.
 pub fn bce_with_logits_loss(planes: Tensor<3>, mask: Tensor<2>) -> Result<Tensor<1>> {
     let ([c, h, w], [mh, mw]) = (planes.dims(), mask.dims());

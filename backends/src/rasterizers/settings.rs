@@ -1,6 +1,6 @@
-//! Inputs of a render, checked and brought to the form of the operation.
+//! Checks the inputs of a render and converts them to the form of the operation.
 
-use crate::cpu::raster::RasterSettings;
+use crate::ops::rasterize::RasterSettings;
 use cc4dgs_core::{Camera, Error, RenderSettings, Result, SplatColors, Splats};
 
 /// Pixels of the largest image drawn.
@@ -52,6 +52,9 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
     if let Some(probe) = &splats.screen_probe {
         shape("screen_probe", &probe.dims(), &[n, 2])?;
     }
+    if let Some(probe) = &splats.absolute_screen_probe {
+        shape("absolute_screen_probe", &probe.dims(), &[n, 2])?;
+    }
     if let Some(probe) = &splats.camera_probe {
         shape("camera_probe", &probe.dims(), &[4, 4])?;
     }
@@ -75,6 +78,7 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
         space: splats.space,
         sh_degree,
         max_weights: settings.max_weights,
-        pair_room: settings.pair_room,
+        absolute_centers: splats.absolute_screen_probe.is_some(),
+        pair_capacity: settings.pair_capacity,
     })
 }

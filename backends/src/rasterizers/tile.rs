@@ -1,8 +1,11 @@
 //! The rasterizer `tile`: 16x16 tiles, hand-written derivative.
 
 use super::settings::{no_settings, raster_settings};
+use crate::ops::image::{image_planes, read_image};
 use crate::ops::rasterize::{Method, RasterInputs, rasterize};
-use cc4dgs_core::{Camera, Plugin, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, SplatColors, Splats, inventory};
+use burn::tensor::{Device, Tensor};
+use cc4dgs_core::{Camera, Image8, Plugin, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, SplatColors, Splats, inventory};
+use std::sync::Arc;
 
 /// Draws with the operation of [`crate::ops::rasterize`].
 #[derive(Clone, Copy, Debug, Default)]
@@ -22,6 +25,7 @@ pub(crate) fn raster_inputs(splats: &Splats, settings: &RenderSettings) -> Raste
         colors,
         sh_rest,
         screen_probe: splats.screen_probe.clone(),
+        absolute_screen_probe: splats.absolute_screen_probe.clone(),
         camera_probe: splats.camera_probe.clone(),
         background: settings.background.clone(),
     }
@@ -30,6 +34,12 @@ pub(crate) fn raster_inputs(splats: &Splats, settings: &RenderSettings) -> Raste
 impl Rasterizer for TileRasterizer {
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput> {
         rasterize(raster_inputs(splats, settings), raster_settings(splats, camera, settings)?, Method::Tiles)
+    }
+    fn upload(&self, image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
+        image_planes(image, background, device)
+    }
+    fn download(&self, planes: Tensor<3>) -> Result<Image8> {
+        read_image(planes)
     }
 }
 

@@ -1,50 +1,76 @@
 //! Checkpoints: one safetensors file with everything needed to resume to the same bytes.
 
-use crate::columns::{GaussianSet, HostColumn, host_gaussians};
 use crate::config::RunConfig;
-use crate::densify::ScreenStats;
-use crate::schedule::Stage;
-use crate::train::{FieldOptimizer, Moving, TrainState};
+use crate::gaussian_set::GaussianSet;
+use crate::model::ModelDeformer;
+use crate::train::{Moving, Parts, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::write_atomically;
-use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Deformer, DeformerContext, Error, HostGaussians, Limits, Registry, Result, config};
+use cc4dgs_core::gaussians::{CORE_ATTRIBUTES, to_vec};
+use cc4dgs_core::{DeformerContext, Error, ExtraAttribute, HostGaussians, Limits, OptimizerState, Registry, Result, Stage, config};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// Everything about a checkpoint that is not an array.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Header {
     format: u32,
-    stage: Stage,
-    iteration: usize,
-    gaussians: usize,
-    sh_degree: usize,
-    gaussian_step: u64,
-    columns: Vec<(String, usize)>,
-    moving: Moving,
-    smooth: bool,
-    field: Option<FieldHeader>,
+    model: ModelHeader,
+    training: TrainingHeader,
     config: RunConfig,
 }
 
+/// What playback needs.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-struct FieldHeader {
+struct ModelHeader {
+    gaussians: usize,
+    sh_degree: usize,
+    /// Attributes with their widths, the core ones first.
+    attributes: Vec<(String, usize)>,
+    moving: Moving,
+    deformer: Option<DeformerHeader>,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct DeformerHeader {
     section: toml::Table,
     context: DeformerContext,
-    step: u64,
+}
+
+/// What training needs to go on.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct TrainingHeader {
+    stage: Stage,
+    iteration: usize,
+    smooth: bool,
+    /// Weights of the appearance model with their lengths.
+    appearance: Vec<(String, usize)>,
+    /// Arrays of the density control with their lengths.
+    density: Vec<(String, usize)>,
+    /// Arrays of the optimizer with their shapes.
+    optimizer: Vec<(String, [usize; 2])>,
+    /// Step counts of the optimizer.
+    optimizer_steps: BTreeMap<String, u64>,
+}
+
+/// Arrays of training by part.
+#[derive(Default)]
+struct TrainingArrays {
+    appearance: Vec<Vec<f32>>,
+    density: Vec<Vec<f32>>,
+    optimizer: Vec<Vec<f32>>,
 }
 
 /// A checkpoint read back.
 pub struct Checkpoint {
     header: Header,
-    columns: Vec<HostColumn>,
-    stats: [Vec<f32>; 3],
-    field: Option<FieldOptimizer>,
+    host: HostGaussians,
+    deformer: Option<ModelDeformer>,
+    training: TrainingArrays,
     device: Device,
 }
 
@@ -55,22 +81,22 @@ impl Checkpoint {
     }
     /// What may move.
     pub fn moving(&self) -> Moving {
-        self.header.moving
+        self.header.model.moving
     }
-    /// Frames in the sequence the field was built for (1 before the main stage).
+    /// Frames in the sequence the deformer was built for (1 before the main stage).
     pub fn frame_count(&self) -> usize {
-        self.header.field.as_ref().map_or(1, |f| f.context.frame_count)
+        self.header.model.deformer.as_ref().map_or(1, |d| d.context.frame_count)
     }
     /// The Gaussians.
     pub fn gaussians(&self) -> Result<HostGaussians> {
-        host_gaussians(self.header.sh_degree, self.columns.iter().map(|c| Ok((c.name.clone(), c.width, c.arrays[0].clone()))))
+        Ok(self.host.clone())
     }
-    /// The field with its section and context, if the main stage had begun.
-    pub fn into_field(self) -> Option<(Box<dyn Deformer>, toml::Table, DeformerContext)> {
-        self.field.map(|f| (f.field, f.section, f.context))
+    /// The deformer, if the main stage had begun.
+    pub fn into_deformer(self) -> Option<ModelDeformer> {
+        self.deformer
     }
-    /// The state to go on from. Refuses a configuration other than the one the run was started with.
-    pub fn into_state(self, config: &RunConfig) -> Result<TrainState> {
+    /// The state to go on from, with freshly built `parts`. Refuses a configuration other than the one the run was started with.
+    pub fn into_state(self, config: &RunConfig, mut parts: Parts) -> Result<TrainState> {
         let (mut now, mut then) = (config.clone(), self.header.config.clone());
         // How often to say something does not change a result.
         (now.train.log_every, now.train.checkpoint_every) = (0, 0);
@@ -82,58 +108,99 @@ impl Checkpoint {
                 "Resume with the run's own config.toml, or start in another folder",
             ));
         }
-        let h = self.header;
-        let set = GaussianSet::from_host(self.columns, h.gaussians, h.sh_degree, h.gaussian_step, &self.device);
-        let [gradient_sum, seen, max_weight] = self.stats.map(|v| Tensor::<1>::from_data(TensorData::new(v, [h.gaussians]), &self.device));
-        Ok(TrainState::restored(h.stage, h.iteration, set, ScreenStats { gradient_sum, seen, max_weight }, h.moving, self.field, h.smooth))
+        let Header { model, training, .. } = self.header;
+        let one = |values: &[f32]| Tensor::<1>::from_data(TensorData::new(values.to_vec(), [values.len()]), &self.device);
+        let damaged = |problem: String| Error::data("checkpoint", problem, "Use another checkpoint of the run");
+        let mut weights = parts.appearance.parameters_mut();
+        let found: Vec<(String, usize)> = weights.iter().map(|p| (p.name.clone(), p.value.dims()[0])).collect();
+        if found != training.appearance {
+            return Err(damaged(format!("the appearance model has the weights {found:?}, the checkpoint {:?}", training.appearance)));
+        }
+        weights.iter_mut().zip(&self.training.appearance).for_each(|(parameter, values)| parameter.value = one(values));
+        let density = training.density.iter().zip(&self.training.density).map(|((name, _), values)| (name.clone(), one(values))).collect();
+        parts.density.restore(density, model.gaussians)?;
+        let two = |((name, shape), values): (&(String, [usize; 2]), &Vec<f32>)| {
+            (name.clone(), Tensor::<2>::from_data(TensorData::new(values.clone(), *shape), &self.device))
+        };
+        let arrays = training.optimizer.iter().zip(&self.training.optimizer).map(two).collect();
+        parts.optimizer.restore(OptimizerState { arrays, steps: training.optimizer_steps })?;
+        let mut state = TrainState::new(GaussianSet::new(&self.host, &self.device), model.moving, parts);
+        (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, self.deformer);
+        Ok(state)
+    }
+}
+
+/// Arrays of a file, by name.
+#[derive(Default)]
+struct Arrays(Vec<(String, Vec<usize>, Vec<f32>)>);
+
+impl Arrays {
+    fn add<const D: usize>(&mut self, name: String, tensor: &Tensor<D>) -> Result<()> {
+        let values = to_vec(tensor.clone(), &name)?;
+        if values.iter().any(|v| !v.is_finite()) {
+            return Err(Error::backend(
+                format!("checkpoint array {name}"),
+                "it holds a value that is not finite",
+                "Resume from the checkpoint on disk with lower learning rates",
+            ));
+        }
+        self.0.push((name, tensor.dims().to_vec(), values));
+        Ok(())
     }
 }
 
 /// Writes `state` to `path` and returns its size in bytes.
 pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> {
-    let columns = state.set.to_host()?;
-    let mut arrays: Vec<(String, Vec<usize>, Vec<f32>)> = Vec::new();
-    let n = state.set.len();
-    let names: Vec<(String, usize)> = columns.iter().map(|c| (c.name.clone(), c.width)).collect();
-    for column in columns {
-        for (kind, values) in ["value", "first_moment", "second_moment"].into_iter().zip(column.arrays) {
-            arrays.push((format!("gaussians/{}/{kind}", column.name), vec![n, column.width], values));
+    let mut arrays = Arrays::default();
+    let mut attributes = Vec::new();
+    for (name, values) in state.set.iter() {
+        arrays.add(format!("gaussians/{name}"), values)?;
+        attributes.push((name.to_string(), values.dims()[1]));
+    }
+    if let Some(deformer) = &state.deformer {
+        for parameter in deformer.field.parameters() {
+            arrays.add(format!("deformer/{}", parameter.name), &parameter.value)?;
         }
     }
-    let stats = [("gradient_sum", &state.stats.gradient_sum), ("seen", &state.stats.seen), ("max_weight", &state.stats.max_weight)];
-    for (name, tensor) in stats {
-        arrays.push((format!("stats/{name}"), vec![n], to_vec(tensor.clone(), name)?));
+    let mut appearance = Vec::new();
+    for parameter in state.appearance.parameters() {
+        arrays.add(format!("appearance/{}", parameter.name), &parameter.value)?;
+        appearance.push((parameter.name.clone(), parameter.value.dims()[0]));
     }
-    if let Some(optimizer) = &state.field {
-        for (parameter, [first, second]) in optimizer.field.parameters().into_iter().zip(&optimizer.moments) {
-            for (kind, tensor) in [("value", &parameter.value), ("first_moment", first), ("second_moment", second)] {
-                let values = to_vec(tensor.clone(), &parameter.name)?;
-                arrays.push((format!("field/{}/{kind}", parameter.name), vec![values.len()], values));
-            }
-        }
+    let mut density = Vec::new();
+    for (name, values) in state.density.state() {
+        arrays.add(format!("density/{name}"), &values)?;
+        density.push((name, values.dims()[0]));
     }
-    if let Some((name, _, _)) = arrays.iter().find(|(_, _, values)| values.iter().any(|v| !v.is_finite())) {
-        return Err(Error::backend(
-            format!("checkpoint array {name}"),
-            "it holds a value that is not finite",
-            "Resume from the checkpoint on disk with lower learning rates",
-        ));
+    let optimizer_state = state.optimizer.state();
+    let mut optimizer = Vec::new();
+    for (name, values) in &optimizer_state.arrays {
+        arrays.add(format!("optimizer/{name}"), values)?;
+        optimizer.push((name.clone(), values.dims()));
     }
     let header = Header {
         format: FORMAT,
-        stage: state.stage,
-        iteration: state.iteration,
-        gaussians: n,
-        sh_degree: state.set.sh_degree,
-        gaussian_step: state.set.step,
-        columns: names,
-        moving: state.moving,
-        smooth: state.smooth,
-        field: state.field.as_ref().map(|f| FieldHeader { section: f.section.clone(), context: f.context.clone(), step: f.step }),
+        model: ModelHeader {
+            gaussians: state.set.len(),
+            sh_degree: state.set.sh_degree,
+            attributes,
+            moving: state.moving,
+            deformer: state.deformer.as_ref().map(|d| DeformerHeader { section: d.section.clone(), context: d.context.clone() }),
+        },
+        training: TrainingHeader {
+            stage: state.stage,
+            iteration: state.iteration,
+            smooth: state.smooth,
+            appearance,
+            density,
+            optimizer,
+            optimizer_steps: optimizer_state.steps,
+        },
         config: config.clone(),
     };
     let json = serde_json::to_string(&header).map_err(|e| Error::backend("checkpoint header", e.to_string(), "Report this"))?;
     let views: Vec<(&str, TensorView)> = arrays
+        .0
         .iter()
         .map(|(name, shape, values)| {
             TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(values))
@@ -155,17 +222,20 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
     let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
     let damaged = |problem: String| Error::data(object.clone(), problem, "The checkpoint is damaged or not one of this program; use another");
     let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|e| damaged(e.to_string()))?;
-    let json = metadata.metadata().as_ref().and_then(|m| m.get("cc4dgs")).ok_or_else(|| damaged("there is no cc4dgs header".into()))?;
+    let json = metadata.metadata().as_ref().and_then(|m| m.get("cc4dgs")).ok_or_else(|| damaged("the safetensors file has no cc4dgs header".into()))?;
     let version = serde_json::from_str::<serde_json::Value>(json).map_err(|e| damaged(e.to_string()))?;
-    if version.get("format").and_then(serde_json::Value::as_u64) != Some(u64::from(FORMAT)) {
-        return Err(Error::unsupported(object, format!("checkpoint format {:?}", version.get("format")), format!("This program reads format {FORMAT}")));
+    let version = version.get("format").and_then(serde_json::Value::as_u64);
+    if version != Some(u64::from(FORMAT)) {
+        let found = version.map_or_else(|| "checkpoint without a format number".to_string(), |v| format!("checkpoint format {v}"));
+        return Err(Error::unsupported(object, found, format!("This program reads format {FORMAT}; train again, or use the program that wrote it")));
     }
     let header: Header = serde_json::from_str(json).map_err(|e| damaged(e.to_string()))?;
-    limits.check_gaussians(&object, header.gaussians as u64)?;
+    limits.check_gaussians(&object, header.model.gaussians as u64)?;
     let tensors = SafeTensors::deserialize(&bytes).map_err(|e| damaged(e.to_string()))?;
-    let array = |name: &str, len: usize| -> Result<Vec<f32>> {
+    let array = |name: &str, len: Option<usize>| -> Result<Vec<f32>> {
+        let len = len.ok_or_else(|| damaged(format!("{name} claims more values than there can be")))?;
         let view = tensors.tensor(name).map_err(|e| damaged(format!("{name}: {e}")))?;
-        if view.dtype() != Dtype::F32 || view.data().len() != 4 * len {
+        if view.dtype() != Dtype::F32 || Some(view.data().len()) != len.checked_mul(4) {
             return Err(damaged(format!("{name} holds {} bytes of {:?}, {len} float32 values were expected", view.data().len(), view.dtype())));
         }
         let values: Vec<f32> = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
@@ -174,41 +244,52 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
             None => Ok(values),
         }
     };
-    let n = header.gaussians;
-    let mut columns = Vec::new();
-    for (name, width) in &header.columns {
-        let kinds = ["value", "first_moment", "second_moment"];
-        let len = n.checked_mul(*width).ok_or_else(|| damaged(format!("column {name} claims width {width}")))?;
-        let arrays = [
-            array(&format!("gaussians/{name}/{}", kinds[0]), len)?,
-            array(&format!("gaussians/{name}/{}", kinds[1]), len)?,
-            array(&format!("gaussians/{name}/{}", kinds[2]), len)?,
-        ];
-        columns.push(HostColumn { name: name.clone(), width: *width, arrays });
-    }
-    let host = host_gaussians(header.sh_degree, columns.iter().map(|c| Ok((c.name.clone(), c.width, c.arrays[0].clone()))))?;
-    host.validate(&object, limits)?;
-    if columns.len() < 7 || columns.iter().zip(crate::columns::CORE_COLUMNS).any(|(c, name)| c.name != name) {
-        return Err(damaged("a core column is missing or out of order".into()));
-    }
-    let stats = [array("stats/gradient_sum", n)?, array("stats/seen", n)?, array("stats/max_weight", n)?];
-    let field = match &header.field {
+    let host = gaussians(&header.model, &object, limits, &array)?;
+    let deformer = match &header.model.deformer {
         None => None,
-        Some(f) => {
-            let field = registry.build_deformer(&f.section, &f.context, device)?;
-            let mut optimizer = FieldOptimizer::new(field, f.section.clone(), f.context.clone());
-            optimizer.step = f.step;
-            let shapes: Vec<(String, usize)> = optimizer.field.parameters().iter().map(|p| (p.name.clone(), p.shape.iter().product())).collect();
-            for (i, (name, len)) in shapes.iter().enumerate() {
-                let [value, first, second] = ["value", "first_moment", "second_moment"].map(|kind| array(&format!("field/{name}/{kind}"), *len));
-                let upload = |values: Vec<f32>| Tensor::<1>::from_data(TensorData::new(values, [*len]), device);
-                optimizer.field.parameters_mut()[i].value = upload(value?);
-                optimizer.moments[i] = [upload(first?), upload(second?)];
+        Some(d) => {
+            let mut field = registry.build_deformer(&d.section, &d.context, device)?;
+            for parameter in field.parameters_mut() {
+                let len: usize = parameter.shape.iter().product();
+                let values = array(&format!("deformer/{}", parameter.name), Some(len))?;
+                parameter.value = Tensor::from_data(TensorData::new(values, [len]), device);
             }
-            Some(optimizer)
+            Some(ModelDeformer { field, section: d.section.clone(), context: d.context.clone() })
         }
     };
-    Ok(Checkpoint { header, columns, stats, field, device: device.clone() })
+    let list = |part: &str, names: &[(String, usize)]| names.iter().map(|(name, len)| array(&format!("{part}/{name}"), Some(*len))).collect::<Result<Vec<_>>>();
+    let training = TrainingArrays {
+        appearance: list("appearance", &header.training.appearance)?,
+        density: list("density", &header.training.density)?,
+        optimizer: header
+            .training
+            .optimizer
+            .iter()
+            .map(|(name, [rows, width])| array(&format!("optimizer/{name}"), rows.checked_mul(*width)))
+            .collect::<Result<_>>()?,
+    };
+    Ok(Checkpoint { header, host, deformer, training, device: device.clone() })
+}
+
+/// The Gaussians of a checkpoint, checked.
+fn gaussians(header: &ModelHeader, object: &str, limits: &Limits, array: &dyn Fn(&str, Option<usize>) -> Result<Vec<f32>>) -> Result<HostGaussians> {
+    if header.sh_degree > 4 {
+        return Err(Error::data(object, format!("spherical-harmonics degree {} is over 4", header.sh_degree), "Use another checkpoint"));
+    }
+    let mut host = HostGaussians { sh_degree: header.sh_degree, ..Default::default() };
+    for (name, width) in &header.attributes {
+        let values = array(&format!("gaussians/{name}"), header.gaussians.checked_mul(*width))?;
+        if CORE_ATTRIBUTES.contains(&name.as_str()) {
+            host.columns_mut().into_iter().filter(|(known, _, _)| known == name).for_each(|(_, _, slot)| slot.clone_from(&values));
+        } else {
+            host.extra.insert(name.clone(), ExtraAttribute::exact(*width, values));
+        }
+    }
+    host.validate(object, limits)?;
+    if host.len() != header.gaussians {
+        return Err(Error::data(object, format!("the header says {} Gaussians, the arrays hold {}", header.gaussians, host.len()), "Use another checkpoint"));
+    }
+    Ok(host)
 }
 
 /// Reads only the configuration of a run's folder.

@@ -4,8 +4,8 @@ use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, EvaluateDeformer, Gaussians, HostGaussians, Image8, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes, Result, Scene, Splats,
-    Split, TrainingViews,
+    Camera, EvaluateDeformer, Gaussians, HostGaussians, Image8, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes, Result, Scene, SpatialInput,
+    Splats, Split, TrainingViews,
 };
 
 /// The training views of a scene.
@@ -60,8 +60,8 @@ impl<'a> ModelServices<'a> {
         });
         let select = |values: &Tensor<2>| rows.as_ref().map_or_else(|| values.clone(), |rows| values.clone().select(0, rows.clone()));
         let attributes: Vec<Tensor<2>> = field.field.attributes().iter().filter_map(|spec| canonical.extra.get(&spec.name)).map(select).collect();
-        let features = field.field.spatial_with(select(&canonical.means), &attributes)?.values;
-        Ok(field.field.deform(features, time_norm)?.apply(&canonical, rows.as_ref()))
+        let features = field.field.spatial(&SpatialInput { means_world: select(&canonical.means), attributes })?.values;
+        field.field.deform(features, time_norm)?.apply(field.name(), &canonical, rows.as_ref())
     }
 }
 

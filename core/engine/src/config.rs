@@ -3,7 +3,7 @@
 use crate::data::SceneOptions;
 use crate::presets;
 use burn::tensor::Tensor;
-use cc4dgs_core::{Error, Limits, RenderSettings, Result, Rules, Scene, config, unknown_name};
+use cc4dgs_core::{Error, Limits, Registry, RenderSettings, Result, Rules, Scene, config, split_kind};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -35,6 +35,21 @@ pub struct RunConfig {
     /// The deformation field plug-in: `kind` and its settings.
     #[serde(default = "cdf")]
     pub deformer: toml::Table,
+    /// The density control plug-in: `kind` and its settings.
+    #[serde(default = "clone_split")]
+    pub density: toml::Table,
+    /// The loss terms: `kind`, `weight` (1 if absent) and their settings.
+    #[serde(default = "l1_and_dssim")]
+    pub loss: Vec<toml::Table>,
+    /// The loss term of the score stage: `kind` and its settings. Its target is the mask of what moves, [1,H,W].
+    #[serde(default = "mask_bce")]
+    pub score_loss: toml::Table,
+    /// The appearance plug-in: `kind` and its settings.
+    #[serde(default = "no_appearance")]
+    pub appearance: toml::Table,
+    /// The optimizer plug-in: `kind` and its settings.
+    #[serde(default = "adam")]
+    pub optimizer: toml::Table,
     /// Where the first Gaussians come from.
     #[serde(default)]
     pub init: InitConfig,
@@ -43,14 +58,38 @@ pub struct RunConfig {
     pub train: TrainConfig,
 }
 
+/// A plug-in section with nothing but its `kind`.
+fn kind(name: &str) -> toml::Table {
+    toml::Table::from_iter([("kind".into(), name.into())])
+}
+fn clone_split() -> toml::Table {
+    kind("clone-split")
+}
+/// The paper's loss with lambda_c = 0.8.
+fn l1_and_dssim() -> Vec<toml::Table> {
+    [("l1", 0.8), ("dssim", 0.2)]
+        .into_iter()
+        .map(|(name, weight)| toml::Table::from_iter([("kind".into(), name.into()), ("weight".into(), weight.into())]))
+        .collect()
+}
+fn mask_bce() -> toml::Table {
+    kind("mask-bce")
+}
+fn no_appearance() -> toml::Table {
+    kind("none")
+}
+fn adam() -> toml::Table {
+    kind("adam")
+}
+
 fn flex() -> String {
     "flex".into()
 }
 fn tile() -> toml::Table {
-    toml::Table::from_iter([("kind".into(), "tile".into())])
+    kind("tile")
 }
 fn cdf() -> toml::Table {
-    toml::Table::from_iter([("kind".into(), "cdf".into())])
+    kind("cdf")
 }
 
 /// How pictures are drawn, in training and afterwards.
@@ -82,12 +121,51 @@ impl RenderConfig {
     }
 }
 
+/// Where the points of the first Gaussians come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum InitSource {
+    /// The dataset's points, else photo-consistent ones if several cameras share a time, else random.
+    #[default]
+    Auto,
+    /// The dataset's points.
+    Points,
+    /// Photo-consistent points of cameras that share a time.
+    Photo,
+    /// Random points in the scene's box.
+    Random,
+}
+
+/// The frames that the coarse stage sees.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CoarseFrames {
+    /// The first one (all where no time has several cameras).
+    First,
+    /// All of them.
+    All,
+}
+
+/// Which Gaussians may move.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Dynamic {
+    /// By dynamic score where a camera has several frames, else all.
+    Auto,
+    /// By dynamic score.
+    Score,
+    /// All of them.
+    All,
+    /// None of them.
+    None,
+}
+
 /// Where the first Gaussians come from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InitConfig {
-    /// `auto` (the dataset's points, else photo-consistent ones if several cameras share a time, else random), `points`, `photo`, `random`.
-    pub source: String,
+    /// Where points come from.
+    pub source: InitSource,
     /// The most Gaussians to start with.
     pub count: usize,
     /// Opacity of a new Gaussian, 0..1.
@@ -96,7 +174,7 @@ pub struct InitConfig {
 
 impl Default for InitConfig {
     fn default() -> Self {
-        Self { source: "auto".into(), count: 40_000, opacity: 0.1 }
+        Self { source: InitSource::Auto, count: 40_000, opacity: 0.1 }
     }
 }
 
@@ -111,8 +189,8 @@ pub struct TrainConfig {
     pub shares: [f64; 3],
     /// Views per iteration.
     pub batch: usize,
-    /// Frames the coarse stage sees: `first` or `all` (`all` where no time has several cameras).
-    pub coarse_frames: String,
+    /// Frames the coarse stage sees.
+    pub coarse_frames: CoarseFrames,
     /// Share of the main stage over which frames come in one after another, where the coarse stage saw the first frame only; 0 is all at once.
     pub time_ramp: f64,
     /// Standard deviation, in frames, of noise on the times the field is asked about; it falls to zero by half of the main stage (Deformable 3DGS: 0.1).
@@ -121,8 +199,6 @@ pub struct TrainConfig {
     pub sh_degree: usize,
     /// Reference iterations between two degrees.
     pub sh_interval: usize,
-    /// Weight of L1; the rest goes to 1 - SSIM (the paper's lambda_c).
-    pub lambda_c: f32,
     /// Smoothness weight at the end of its ramp (the paper's lambda_r); 0 is off.
     pub lambda_r: f32,
     /// Switch smoothness on only when flicker is measured.
@@ -135,14 +211,12 @@ pub struct TrainConfig {
     pub zeta: f32,
     /// Temporal standard deviation over which a pixel counts as dynamic.
     pub mask_threshold: f32,
-    /// `auto` (score where a camera has several frames, else all move), `score`, `all`, `none`.
-    pub dynamic: String,
-    /// Skip invisible Gaussians in Adam.
+    /// Which Gaussians may move.
+    pub dynamic: Dynamic,
+    /// Step only the Gaussians that a view of the iteration shows.
     pub sparse_adam: bool,
     /// Learning rates of the Gaussians.
     pub lr: GaussianRates,
-    /// Adding and removing Gaussians.
-    pub densify: DensifyConfig,
     /// Iterations between two log events.
     pub log_every: usize,
     /// Iterations between two checkpoints; 0 writes only the last one.
@@ -155,22 +229,20 @@ impl Default for TrainConfig {
             iterations: 28_000,
             shares: [5.0, 3.0, 20.0],
             batch: 2,
-            coarse_frames: "first".into(),
+            coarse_frames: CoarseFrames::First,
             time_ramp: 0.0,
             time_noise: 0.0,
             sh_degree: 3,
             sh_interval: 1000,
-            lambda_c: 0.8,
             lambda_r: 0.05,
             smooth_auto: true,
             flicker_threshold: 0.5,
             smooth_delta: 0.005,
             zeta: 7.0,
             mask_threshold: 0.02,
-            dynamic: "auto".into(),
+            dynamic: Dynamic::Auto,
             sparse_adam: true,
             lr: GaussianRates::default(),
-            densify: DensifyConfig::default(),
             log_every: 10,
             checkpoint_every: 5000,
         }
@@ -217,52 +289,6 @@ impl Default for GaussianRates {
     }
 }
 
-/// Adding and removing Gaussians (Inria's rules, Swift4D's windows).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct DensifyConfig {
-    /// Reference iteration of a stage at which it begins.
-    pub from: usize,
-    /// Reference iteration of the main stage at which it ends.
-    pub until: usize,
-    /// Reference iterations between two rounds.
-    pub every: usize,
-    /// Mean screen gradient (normalised device units) that asks for more Gaussians.
-    pub gradient: f32,
-    /// Share of the camera extent that separates clone from split.
-    pub dense_share: f32,
-    /// Gaussians fainter than this go.
-    pub min_opacity: f32,
-    /// Gaussians larger than this share of the extent go; 0 is off.
-    pub max_scale_share: f32,
-    /// Largest blending weight below which a Gaussian goes at a weight pruning.
-    pub min_weight: f32,
-    /// Reference iterations between two weight prunings; 0 is off.
-    pub weight_every: usize,
-    /// Reference iterations between two opacity resets of the coarse stage; 0 is off.
-    pub reset_every: usize,
-    /// No growth at or over this many.
-    pub max_gaussians: usize,
-}
-
-impl Default for DensifyConfig {
-    fn default() -> Self {
-        Self {
-            from: 500,
-            until: 10_000,
-            every: 100,
-            gradient: 2e-4,
-            dense_share: 0.01,
-            min_opacity: 0.005,
-            max_scale_share: 0.0,
-            min_weight: 0.02,
-            weight_every: 3000,
-            reset_every: 3000,
-            max_gaussians: 400_000,
-        }
-    }
-}
-
 impl RunConfig {
     /// Names and summaries of the presets; see [`presets::methods`] for what may follow them.
     pub fn presets() -> Vec<(&'static str, &'static str)> {
@@ -286,9 +312,24 @@ impl RunConfig {
         for assignment in sets {
             config::set(&mut table, assignment)?;
         }
+        refuse_renamed(&table)?;
         let resolved: Self = config::parse_section("configuration", &table)?;
         resolved.validate()?;
         Ok(resolved)
+    }
+    /// This configuration with every setting of its plug-ins, defaults included.
+    pub fn completed(&self, registry: &Registry) -> Result<Self> {
+        let mut full = self.clone();
+        let kind = |section: &toml::Table, object: &str| split_kind(object, section).map(|(kind, _)| kind);
+        full.deformer = filled(registry.deformer(&kind(&self.deformer, "deformer")?)?.info.schema, &self.deformer)?;
+        full.rasterizer = filled(registry.rasterizer(&kind(&self.rasterizer, "rasterizer")?)?.info.schema, &self.rasterizer)?;
+        full.density = filled(registry.density(&kind(&self.density, "density")?)?.info.schema, &self.density)?;
+        full.appearance = filled(registry.appearance(&kind(&self.appearance, "appearance")?)?.info.schema, &self.appearance)?;
+        full.optimizer = filled(registry.optimizer(&kind(&self.optimizer, "optimizer")?)?.info.schema, &self.optimizer)?;
+        for section in full.loss.iter_mut().chain([&mut full.score_loss]) {
+            *section = filled(registry.loss(&kind(section, "loss")?)?.info.schema, section)?;
+        }
+        Ok(full)
     }
     /// The configuration as TOML text; reading it back gives the same run.
     pub fn to_toml(&self) -> Result<String> {
@@ -321,18 +362,12 @@ impl RunConfig {
         if t.shares.iter().any(|s| !s.is_finite() || *s < 0.0) || t.shares.iter().sum::<f64>() <= 0.0 {
             return bad("shares", format!("{:?} are not shares", t.shares), "Give three numbers of which one is positive");
         }
-        if !(0.0..=1.0).contains(&t.lambda_c) {
-            return bad("lambda_c", format!("{} is not in 0..1", t.lambda_c), "It is the weight of L1 against 1 - SSIM");
-        }
         if !(0.0..=1.0).contains(&t.time_ramp) {
             return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");
         }
         if !(0.0..=10.0).contains(&t.time_noise) {
             return bad("time_noise", format!("{} frames", t.time_noise), "Give 0 to 10 frames");
         }
-        one_of("train.coarse_frames", &t.coarse_frames, &["first", "all"])?;
-        one_of("train.dynamic", &t.dynamic, &["auto", "score", "all", "none"])?;
-        one_of("init.source", &self.init.source, &["auto", "points", "photo", "random"])?;
         if let Some(near) = self.render.near.filter(|near| !near.is_finite() || *near < 0.0) {
             return Err(Error::parameter("render.near", format!("{near} is not a depth"), "Give a finite depth of 0 or more, in world units"));
         }
@@ -350,8 +385,29 @@ impl RunConfig {
     }
 }
 
-fn one_of(object: &str, value: &str, known: &[&str]) -> Result<()> {
-    if known.contains(&value) { Ok(()) } else { Err(unknown_name(object, value, known.iter().copied())) }
+/// Keys of earlier versions and what replaces them.
+const RENAMED: [(&str, &str); 2] =
+    [("train.densify", "[density], such as density.max_gaussians"), ("train.lambda_c", "the weights of [[loss]] kind = \"l1\" and kind = \"dssim\"")];
+
+/// Refuses keys of earlier versions; the error names the new ones.
+fn refuse_renamed(table: &toml::Table) -> Result<()> {
+    for (old, new) in RENAMED {
+        let (section, key) = old.split_once('.').unwrap_or((old, ""));
+        if table.get(section).and_then(|s| s.as_table()).is_some_and(|s| s.contains_key(key)) {
+            return Err(Error::parameter(old, "this key was replaced", format!("Use {new}")));
+        }
+    }
+    Ok(())
+}
+
+/// `section` with the settings that its plug-in's `schema` states where it has none of its own.
+fn filled(schema: &str, section: &toml::Table) -> Result<toml::Table> {
+    let mut full = config::parse_table("plug-in schema", schema)?;
+    if let Some(kind) = section.get("kind") {
+        full.insert("kind".into(), kind.clone());
+    }
+    config::merge(&mut full, section);
+    Ok(full)
 }
 
 #[cfg(test)]
@@ -373,6 +429,10 @@ mod tests {
     fn mistakes_are_named() {
         let e = RunConfig::resolve(Some("dnerf_cpu"), None, &[]).unwrap_err().to_string();
         assert!(e.contains("dnerf-cpu"), "{e}");
+        let e = RunConfig::resolve(Some("demo"), None, &["train.densify.every=3".into()]).unwrap_err().to_string();
+        assert!(e.contains("[density]"), "{e}");
+        let e = RunConfig::resolve(Some("demo"), None, &["init.source=pionts".into()]).unwrap_err().to_string();
+        assert!(e.contains("pionts") && e.contains("points"), "{e}");
         let e = RunConfig::resolve(Some("demo"), None, &["train.iteratons=3".into()]).unwrap_err().to_string();
         assert!(e.contains("iteratons"), "{e}");
     }

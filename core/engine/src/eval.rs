@@ -5,7 +5,6 @@ use crate::masks::dynamic_masks;
 use crate::model::{Model, ModelSize};
 use crate::play::{FrameTime, PlayWork, Player};
 use burn::tensor::Device;
-use cc4dgs_backends::ops::picture::read_picture;
 use cc4dgs_core::metrics::{FrameSet, Metric, Rounding, SsimConvention};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
 use serde::Serialize;
@@ -150,7 +149,7 @@ pub fn evaluate(
     for (done, &view) in views.iter().enumerate() {
         let camera = scene.camera(view);
         let (output, time) = player.render(camera, scene.views[view].time_norm)?;
-        let render = read_picture(output.planes)?;
+        let render = player.download(output.planes)?;
         let frame = scene.frame(view)?;
         // Both pictures are rounded to 8 bits before they are compared.
         let truth = Image8::from_planes(&frame.to_planes(model.background), camera.width, camera.height);

@@ -1,6 +1,6 @@
 //! The first Gaussians: from the dataset's points, from photo-consistent points, or at random.
 
-use crate::config::RunConfig;
+use crate::config::{InitSource, RunConfig};
 use crate::knn::mean_squared_distance_3nn;
 use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::{Error, Event, EventSink, HostGaussians, PointCloud, Result, Scene, Seed, Split};
@@ -20,28 +20,32 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
         }
         cameras_of_frame.values().copied().max().unwrap_or(0) >= 4
     };
-    let source = match (config.init.source.as_str(), &scene.points) {
-        ("auto", Some(points)) if !points.positions.is_empty() => "points",
-        ("auto", _) if shared_time => "photo",
-        ("auto", _) => "random",
+    let source = match (config.init.source, &scene.points) {
+        (InitSource::Auto, Some(points)) if !points.positions.is_empty() => InitSource::Points,
+        (InitSource::Auto, _) if shared_time => InitSource::Photo,
+        (InitSource::Auto, _) => InitSource::Random,
         (other, _) => other,
     };
     let points = match source {
-        "points" => {
+        InitSource::Points => {
             scene.points.clone().ok_or_else(|| Error::parameter("init.source", "the scene has no points", "Use init.source = \"photo\" or \"random\""))?
         }
-        "photo" => crate::data::init::photo_points(scene, count, seed.child("photo"))?,
+        InitSource::Photo => crate::data::init::photo_points(scene, count, seed.child("photo"))?,
         _ => random_points(scene, count, seed.child("random"))?,
     };
     let points = thin(points, count, seed.child("thin"));
     if points.positions.is_empty() {
-        return Err(Error::data(&scene.name, format!("init.source = \"{source}\" found no points"), "Use init.source = \"random\""));
+        return Err(Error::data(&scene.name, format!("init.source = {source:?} found no points"), "Use init.source = \"random\""));
     }
-    events.emit(&Event::Progress { task: format!("initial Gaussians ({source})"), done: points.positions.len() as u64, total: points.positions.len() as u64 });
+    events.emit(&Event::Progress {
+        task: format!("initial Gaussians ({})", format!("{source:?}").to_lowercase()),
+        done: points.positions.len() as u64,
+        total: points.positions.len() as u64,
+    });
     Ok(from_points(&points, config.train.sh_degree, config.init.opacity))
 }
 
-/// Gaussians at `points`: isotropic with the root of the mean squared distance to three neighbours, `opacity`, no rotation (baselines §1.5).
+/// Gaussians at `points`: isotropic with the root of the mean squared distance to three neighbours, `opacity`, no rotation.
 pub fn from_points(points: &PointCloud, sh_degree: usize, opacity: f32) -> HostGaussians {
     let n = points.positions.len();
     let logit = (opacity / (1.0 - opacity)).ln();

@@ -3,11 +3,10 @@
 pub mod agreement;
 pub mod checkpoint;
 pub mod codec_services;
-pub mod columns;
 pub mod config;
 pub mod data;
-pub mod densify;
 pub mod eval;
+pub mod gaussian_set;
 pub mod init;
 pub mod knn;
 pub mod masks;

@@ -3,7 +3,7 @@
 use crate::checkpoint;
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::config::{RenderConfig, RunConfig};
-use crate::train::{CHECKPOINT, Moving};
+use crate::train::{CHECKPOINT, Moving, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
@@ -63,6 +63,13 @@ pub struct ModelDeformer {
     pub context: DeformerContext,
 }
 
+impl ModelDeformer {
+    /// Its name in the registry.
+    pub fn name(&self) -> &str {
+        self.section.get("kind").and_then(|kind| kind.as_str()).unwrap_or("without a name")
+    }
+}
+
 /// Sizes in bytes. For an archive these are bytes on disk, headers included in `total`; for a checkpoint the float32 size of what playback needs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ModelSize {
@@ -94,7 +101,14 @@ impl Model {
         let stored = checkpoint::load(path, registry, device, limits)?;
         let config = stored.config().clone();
         let (gaussians, moving, frame_count) = (stored.gaussians()?, stored.moving(), stored.frame_count());
-        let field = stored.into_field().map(|(field, section, context)| ModelDeformer { field, section, context });
+        Self::assembled(gaussians, stored.into_deformer(), moving, frame_count, &config)
+    }
+    /// The model that a run ends with.
+    pub fn from_training(state: TrainState, config: &RunConfig) -> Result<Self> {
+        let frame_count = state.deformer.as_ref().map_or(1, |d| d.context.frame_count);
+        Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, config)
+    }
+    fn assembled(gaussians: HostGaussians, field: Option<ModelDeformer>, moving: Moving, frame_count: usize, config: &RunConfig) -> Result<Self> {
         let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
         let floats: usize =
             gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
@@ -108,7 +122,7 @@ impl Model {
             render: config.render.clone(),
             rasterizer: config.rasterizer.clone(),
             frame_count,
-            provenance: provenance(&config)?,
+            provenance: provenance(config)?,
             size: ModelSize { deform_grid, deform_net, deform, point_cloud, total: deform + point_cloud },
         })
     }
@@ -253,12 +267,15 @@ impl Model {
             Moving::Scored { zeta } => Moving::Scored { zeta: zeta - slack as f32 },
             other => other,
         };
-        let Some(rows) = moving.rows(&out.dynamic_scores) else { return out };
-        let mut needed = vec![false; out.len()];
-        rows.into_iter().for_each(|row| needed[row] = true);
+        let needed = moving.rows(&out.dynamic_scores).map(|rows| {
+            let mut needed = vec![false; out.len()];
+            rows.into_iter().for_each(|row| needed[row] = true);
+            needed
+        });
         for spec in field.field.attributes() {
             if let Some(attribute) = out.extra.get_mut(&spec.name) {
-                attribute.needed = Some(NeededRows { rows: needed.clone(), start: spec.start });
+                attribute.tolerance = spec.tolerance;
+                attribute.needed = needed.clone().map(|rows| NeededRows { rows, start: spec.start });
             }
         }
         out

@@ -2,7 +2,7 @@
 
 use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_core::{Camera, DeformerWork, Gaussians, Rasterizer, Registry, RenderOutput, RenderSettings, Result, Splats};
+use cc4dgs_core::{Camera, DeformerWork, Gaussians, Image8, Rasterizer, Registry, RenderOutput, RenderSettings, Result, SpatialInput, Splats};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -47,8 +47,8 @@ pub struct Player<'a> {
     frame: Gaussians,
     /// Those that move, as they are without a field.
     moving_gaussians: Gaussians,
-    /// What the field keeps per Gaussian, of those that move.
-    moving_attributes: Vec<Tensor<2>>,
+    /// What the deformer is asked about.
+    spatial_input: SpatialInput,
     moving: usize,
     cache: Option<Tensor<2>>,
     settings: RenderSettings,
@@ -109,8 +109,8 @@ impl<'a> Player<'a> {
             device: device.clone(),
             rasterizer: registry.build_rasterizer(&model.rasterizer)?,
             frame,
+            spatial_input: SpatialInput { means_world: moving_gaussians.means.clone(), attributes: moving_attributes },
             moving_gaussians,
-            moving_attributes,
             moving,
             cache: None,
             settings: model.render.settings(Some(background)),
@@ -135,7 +135,7 @@ impl<'a> Player<'a> {
                 features.clone()
             }
             None => {
-                let spatial = field.field.spatial_with(self.moving_gaussians.means.clone(), &self.moving_attributes)?;
+                let spatial = field.field.spatial(&self.spatial_input)?;
                 self.work.spatial.gaussians += spatial.work.gaussians;
                 self.work.spatial.vertices_queried += spatial.work.vertices_queried;
                 self.work.spatial.vertices_decoded += spatial.work.vertices_decoded;
@@ -150,7 +150,7 @@ impl<'a> Player<'a> {
         // Nobody else holds the frame while it is written, unless a caller kept the last one, which then stays as it is.
         let nothing = self.moving_gaussians.clone();
         let frame = std::mem::replace(&mut self.frame, nothing);
-        self.frame = offsets.apply_over(&self.moving_gaussians, frame);
+        self.frame = offsets.apply_over(field.name(), &self.moving_gaussians, frame)?;
         Ok(self.frame.clone())
     }
     /// Draws one frame.
@@ -170,12 +170,16 @@ impl<'a> Player<'a> {
     pub fn play(&mut self, camera: &Camera, time_norm: f32) -> Result<RenderOutput> {
         let gaussians = self.gaussians_at(time_norm)?;
         let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
-        let settings = RenderSettings { pair_room: self.pair_room.room, ..self.settings.clone() };
+        let settings = RenderSettings { pair_capacity: self.pair_room.room, ..self.settings.clone() };
         let output = self.rasterizer.render(&splats, camera, &settings)?;
         if let Some(count) = &output.stats.pair_count {
             self.pair_room.note(count.clone());
         }
         Ok(output)
+    }
+    /// The 8-bit image of rendered planes.
+    pub fn download(&self, planes: Tensor<3>) -> Result<Image8> {
+        self.rasterizer.download(planes)
     }
     /// Waits until everything asked for is done.
     pub fn sync(&self) -> Result<()> {

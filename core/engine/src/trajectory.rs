@@ -4,7 +4,6 @@ use crate::data::procedural::{Motion, ProceduralScene, Shape};
 use crate::model::Model;
 use crate::play::Player;
 use burn::tensor::Device;
-use cc4dgs_backends::ops::picture::read_picture;
 use cc4dgs_core::{Event, EventSink, HostGaussians, Registry, Result, Split};
 use glam::DVec3;
 use serde::Serialize;
@@ -66,7 +65,8 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
             }
         }
         for (camera, masks) in cameras.iter().zip(&masks) {
-            let found = read_picture(player.render(camera, time as f32)?.0.planes)?;
+            let planes = player.render(camera, time as f32)?.0.planes;
+            let found = player.download(planes)?;
             let truth = scene.render(camera, time);
             for (mask, sum) in masks.iter().zip(&mut errors) {
                 for (pixel, _) in mask.iter().enumerate().filter(|(_, covered)| **covered) {

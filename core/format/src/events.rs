@@ -64,6 +64,8 @@ pub enum Event {
         cloned: usize,
         /// Gaussians split in two.
         split: usize,
+        /// Gaussians moved to another place.
+        moved: usize,
         /// Gaussians removed.
         pruned: usize,
         /// Gaussians now.

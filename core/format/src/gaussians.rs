@@ -10,6 +10,9 @@ pub const fn sh_rest_len(degree: usize) -> usize {
     (degree + 1) * (degree + 1) - 1
 }
 
+/// Names of the attributes every Gaussian has, in the order of [`HostGaussians::columns`].
+pub const CORE_ATTRIBUTES: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
+
 /// A per-Gaussian attribute a plug-in brings along (an embedding, a second rotation): `width` floats per Gaussian.
 ///
 /// `tolerance` and `needed` tell an encoder what it may lose. They are not stored: decoded attributes have neither.

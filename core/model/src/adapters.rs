@@ -1,32 +1,29 @@
 //! The graphics adapters of this machine, and which of them `auto` takes.
 
-use burn::tensor::DeviceKind;
 use serde::Serialize;
-use std::sync::OnceLock;
-use wgpu::{Backends, DeviceType, Instance, InstanceDescriptor};
 
-/// What an adapter is made of.
+/// What kind of hardware an adapter is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AdapterKind {
-    /// A card of its own.
+    /// A graphics card.
     Discrete,
-    /// Part of the processor's chip.
+    /// A GPU on the processor's chip.
     Integrated,
-    /// A share of a card, lent by a hypervisor.
+    /// A share of a graphics card, assigned by a hypervisor.
     Virtual,
-    /// A program on the processor, such as Mesa's lavapipe.
+    /// Software that runs on the processor, such as Mesa's lavapipe.
     Software,
     /// The driver does not say.
     Other,
 }
 
-/// One adapter, and the limits that decide what fits.
+/// One adapter and its limits.
 #[derive(Clone, Debug, Serialize)]
 pub struct Adapter {
-    /// What its driver calls it.
+    /// Its name, as the driver states it.
     pub name: String,
-    /// What it is made of.
+    /// Kind of hardware.
     pub kind: AdapterKind,
     /// Vulkan, Metal or Dx12.
     pub api: String,
@@ -36,94 +33,118 @@ pub struct Adapter {
     pub max_binding_bytes: u64,
     /// Largest buffer, in bytes.
     pub max_buffer_bytes: u64,
-    /// Memory the units of a workgroup share, in bytes.
+    /// Shared memory of a workgroup, in bytes.
     pub workgroup_memory_bytes: u32,
-    /// Most units of a workgroup.
-    pub max_workgroup_units: u32,
-    /// Most buffers a kernel may have.
+    /// Upper bound on the threads of a workgroup.
+    pub max_workgroup_threads: u32,
+    /// Upper bound on the buffers of a kernel.
     pub max_storage_buffers: u32,
-    /// Smallest and largest subgroup; `None` without subgroup operations.
-    pub subgroup_units: Option<[u32; 2]>,
+    /// Threads of the smallest and the largest subgroup; `None` without subgroup operations.
+    pub subgroup_threads: Option<[u32; 2]>,
     /// Whether kernels can write timestamps.
     pub timestamps: bool,
-    /// Place among the adapters of its kind.
-    place: usize,
+    /// Index among the adapters of its kind.
+    #[cfg_attr(not(feature = "wgpu"), allow(dead_code))]
+    index_in_kind: usize,
 }
 
 impl Adapter {
-    /// Whether it is a program on the processor.
+    /// Whether it is software that runs on the processor.
     pub fn is_software(&self) -> bool {
         self.kind == AdapterKind::Software
     }
-    /// What burn calls it.
-    pub(crate) fn device_kind(&self) -> DeviceKind {
-        match self.kind {
-            AdapterKind::Discrete => DeviceKind::DiscreteGpu(self.place),
-            AdapterKind::Integrated => DeviceKind::IntegratedGpu(self.place),
-            AdapterKind::Virtual => DeviceKind::VirtualGpu(self.place),
-            AdapterKind::Software => DeviceKind::Cpu,
-            AdapterKind::Other => DeviceKind::DefaultDevice,
-        }
-    }
 }
 
-/// All adapters, the most capable kind first; asked for once.
+/// All adapters, the most capable kind first; enumerated once. None in a build without the feature `wgpu`.
+#[cfg(not(feature = "wgpu"))]
 pub fn adapters() -> &'static [Adapter] {
-    static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
-    // A driver that cannot be asked is a driver that is not there.
-    ADAPTERS.get_or_init(|| std::panic::catch_unwind(enumerate).unwrap_or_default())
+    &[]
 }
 
-fn enumerate() -> Vec<Adapter> {
-    let instance = Instance::new(InstanceDescriptor { backends: Backends::PRIMARY, ..InstanceDescriptor::new_without_display_handle() });
-    let mut all: Vec<Adapter> = Vec::new();
-    for adapter in wait(instance.enumerate_adapters(Backends::PRIMARY)) {
-        let (info, limits, features) = (adapter.get_info(), adapter.limits(), adapter.features());
-        let kind = match info.device_type {
-            DeviceType::DiscreteGpu => AdapterKind::Discrete,
-            DeviceType::IntegratedGpu => AdapterKind::Integrated,
-            DeviceType::VirtualGpu => AdapterKind::Virtual,
-            DeviceType::Cpu => AdapterKind::Software,
-            DeviceType::Other => AdapterKind::Other,
-        };
-        let place = all.iter().filter(|a| a.kind == kind).count();
-        all.push(Adapter {
-            name: info.name,
-            kind,
-            api: format!("{:?}", info.backend),
-            driver: format!("{} {}", info.driver, info.driver_info).trim().to_string(),
-            max_binding_bytes: limits.max_storage_buffer_binding_size,
-            max_buffer_bytes: limits.max_buffer_size,
-            workgroup_memory_bytes: limits.max_compute_workgroup_storage_size,
-            max_workgroup_units: limits.max_compute_invocations_per_workgroup,
-            max_storage_buffers: limits.max_storage_buffers_per_shader_stage,
-            subgroup_units: features.contains(wgpu::Features::SUBGROUP).then_some([info.subgroup_min_size, info.subgroup_max_size]),
-            timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
-            place,
-        });
-    }
-    all.sort_by_key(|a| a.kind);
-    all
-}
+#[cfg(feature = "wgpu")]
+pub use enumeration::adapters;
 
-/// The value of a future that is ready as soon as it is asked, as wgpu's are outside browsers.
-fn wait<T>(future: impl Future<Output = T>) -> T {
-    let mut future = std::pin::pin!(future);
-    let mut context = std::task::Context::from_waker(std::task::Waker::noop());
-    loop {
-        if let std::task::Poll::Ready(value) = future.as_mut().poll(&mut context) {
-            return value;
+#[cfg(feature = "wgpu")]
+mod enumeration {
+    use super::{Adapter, AdapterKind};
+    use burn::tensor::DeviceKind;
+    use std::sync::OnceLock;
+    use wgpu::{Backends, DeviceType, Instance, InstanceDescriptor};
+
+    impl Adapter {
+        /// What burn calls it.
+        pub(crate) fn device_kind(&self) -> DeviceKind {
+            match self.kind {
+                AdapterKind::Discrete => DeviceKind::DiscreteGpu(self.index_in_kind),
+                AdapterKind::Integrated => DeviceKind::IntegratedGpu(self.index_in_kind),
+                AdapterKind::Virtual => DeviceKind::VirtualGpu(self.index_in_kind),
+                AdapterKind::Software => DeviceKind::Cpu,
+                AdapterKind::Other => DeviceKind::DefaultDevice,
+            }
         }
-        std::thread::yield_now();
+    }
+
+    /// All adapters, the most capable kind first; enumerated once. None in a build without the feature `wgpu`.
+    pub fn adapters() -> &'static [Adapter] {
+        static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
+        // A driver that panics when it is asked counts as absent.
+        ADAPTERS.get_or_init(|| std::panic::catch_unwind(enumerate).unwrap_or_default())
+    }
+
+    fn enumerate() -> Vec<Adapter> {
+        let instance = Instance::new(InstanceDescriptor { backends: Backends::PRIMARY, ..InstanceDescriptor::new_without_display_handle() });
+        let mut all: Vec<Adapter> = Vec::new();
+        for adapter in wait(instance.enumerate_adapters(Backends::PRIMARY)) {
+            let (info, limits, features) = (adapter.get_info(), adapter.limits(), adapter.features());
+            let kind = match info.device_type {
+                DeviceType::DiscreteGpu => AdapterKind::Discrete,
+                DeviceType::IntegratedGpu => AdapterKind::Integrated,
+                DeviceType::VirtualGpu => AdapterKind::Virtual,
+                DeviceType::Cpu => AdapterKind::Software,
+                DeviceType::Other => AdapterKind::Other,
+            };
+            let index_in_kind = all.iter().filter(|a| a.kind == kind).count();
+            all.push(Adapter {
+                name: info.name,
+                kind,
+                api: format!("{:?}", info.backend),
+                driver: format!("{} {}", info.driver, info.driver_info).trim().to_string(),
+                max_binding_bytes: limits.max_storage_buffer_binding_size,
+                max_buffer_bytes: limits.max_buffer_size,
+                workgroup_memory_bytes: limits.max_compute_workgroup_storage_size,
+                max_workgroup_threads: limits.max_compute_invocations_per_workgroup,
+                max_storage_buffers: limits.max_storage_buffers_per_shader_stage,
+                subgroup_threads: features.contains(wgpu::Features::SUBGROUP).then_some([info.subgroup_min_size, info.subgroup_max_size]),
+                timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
+                index_in_kind,
+            });
+        }
+        all.sort_by_key(|a| a.kind);
+        all
+    }
+
+    /// The value of a future that is ready when first polled, as wgpu's are outside browsers.
+    fn wait<T>(future: impl Future<Output = T>) -> T {
+        let mut future = std::pin::pin!(future);
+        let mut context = std::task::Context::from_waker(std::task::Waker::noop());
+        loop {
+            if let std::task::Poll::Ready(value) = future.as_mut().poll(&mut context) {
+                return value;
+            }
+            std::thread::yield_now();
+        }
     }
 }
 
-/// The device `auto` takes, and why.
+/// The device that `auto` stands for, and why.
 pub fn auto_device() -> (&'static str, String) {
+    if !cfg!(feature = "wgpu") {
+        return ("flex", "this build has no wgpu backend, and flex is the CPU device burn recommends".into());
+    }
     match adapters() {
         [] => ("flex", "no graphics adapter answers, and flex is the CPU device burn recommends".into()),
         [first, ..] if first.is_software() => {
-            ("flex", format!("the only adapter, {}, is a program on the processor, where flex is faster; --device wgpu takes it", first.name))
+            ("flex", format!("the only adapter, {}, is software on the processor, where flex is faster; --device wgpu selects it", first.name))
         }
         [first, ..] => ("wgpu", format!("{} is a graphics card", first.name)),
     }

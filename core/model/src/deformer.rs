@@ -1,8 +1,8 @@
 //! The first seam: deformation fields.
 
-use crate::Plugin;
-use crate::{DeformerContext, Offsets, Result};
-use burn::tensor::{Device, Tensor};
+use crate::gaussians::CORE_ATTRIBUTES;
+use crate::{DeformerContext, Error, Offsets, Plugin, Result};
+use burn::tensor::{Device, Int, Tensor};
 use serde::{Deserialize, Serialize};
 
 /// Which share of the stored bytes a parameter counts towards (the paper's Deform-Grid and Deform-Net).
@@ -76,37 +76,120 @@ pub struct SpatialFeatures {
     pub work: DeformerWork,
 }
 
-/// A number or vector that a field keeps per Gaussian, learned beside its weights. It lives among the Gaussians' extra attributes: it grows and is pruned with
-/// them, and goes into checkpoints and archives.
+/// What the time-invariant half of a deformer is computed from: M Gaussians.
+#[derive(Clone, Debug)]
+pub struct SpatialInput {
+    /// Canonical centres in world units [M,3]. They are constants: no gradient flows to them.
+    pub means_world: Tensor<2>,
+    /// Values [M,width] of [`Deformer::attributes`], in that order. Gradients flow through them.
+    pub attributes: Vec<Tensor<2>>,
+}
+
+impl SpatialInput {
+    /// Centres of a deformer without attributes.
+    pub fn new(means_world: Tensor<2>) -> Self {
+        Self { means_world, attributes: Vec::new() }
+    }
+    /// Centres with the start value of each attribute of `deformer`.
+    pub fn at_start(means_world: Tensor<2>, deformer: &dyn Deformer) -> Self {
+        let (m, device) = (means_world.dims()[0], means_world.device());
+        let attributes = deformer.attributes().iter().map(|a| Tensor::full([m, a.width], a.start, &device)).collect();
+        Self { means_world, attributes }
+    }
+    /// The number of Gaussians M.
+    pub fn len(&self) -> usize {
+        self.means_world.dims()[0]
+    }
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+    /// The Gaussians `rows` [K] of these.
+    pub fn select(&self, rows: &Tensor<1, Int>) -> Self {
+        self.map(|values| values.clone().select(0, rows.clone()))
+    }
+    /// The first `count` of these.
+    pub fn first(&self, count: usize) -> Self {
+        self.map(|values| values.clone().narrow(0, 0, count.min(self.len())))
+    }
+    fn map(&self, change: impl Fn(&Tensor<2>) -> Tensor<2>) -> Self {
+        Self { means_world: change(&self.means_world), attributes: self.attributes.iter().map(&change).collect() }
+    }
+    /// Refuses attributes other than those `wanted`, with their widths. `deformer` is the name in the error.
+    pub fn check(&self, deformer: &str, wanted: &[AttributeSpec]) -> Result<()> {
+        let m = self.len();
+        if self.attributes.len() == wanted.len() && self.attributes.iter().zip(wanted).all(|(a, spec)| a.dims() == [m, spec.width]) {
+            return Ok(());
+        }
+        let names: Vec<String> = wanted.iter().map(|a| format!("{} [{m},{}]", a.name, a.width)).collect();
+        let found: Vec<[usize; 2]> = self.attributes.iter().map(|a| a.dims()).collect();
+        let problem = format!("the Gaussians must have the attributes {}; found {} of shapes {found:?}", names.join(", "), found.len());
+        Err(Error::parameter(format!("deformer {deformer}"), problem, "Load a model that was trained with this deformer"))
+    }
+}
+
+/// A number or vector that a deformer keeps per Gaussian, learned beside its weights. It is one of the Gaussians' extra attributes: density control copies and
+/// removes it with its Gaussian, and checkpoints and archives store it by name.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AttributeSpec {
-    /// Name of the extra attribute.
+    /// Name of the extra attribute: letters, digits, `_`, `-` and `.`; unique, and none of the names every Gaussian has.
     pub name: String,
-    /// Floats per Gaussian.
+    /// Floats per Gaussian, at least 1.
     pub width: usize,
-    /// What every float starts as.
+    /// Start value of every float.
     pub start: f32,
-    /// Floats start evenly spread so far to either side of `start`, by the run's seed.
+    /// Start values are drawn uniformly from `start - spread` to `start + spread`, by the run's seed.
     pub spread: f32,
-    /// Learning rate (Adam).
+    /// Learning rate of the optimizer.
     pub lr: f64,
     /// Whether the rate is multiplied by the extent of the cameras (as that of the positions is).
     pub times_extent: bool,
+    /// The largest absolute error of a float that a lossy codec may make; `None` asks for the exact bits.
+    pub tolerance: Option<f32>,
+}
+
+impl AttributeSpec {
+    /// An attribute that starts at `start`, learns at the rate `lr`, and is stored exactly.
+    pub fn new(name: &str, width: usize, start: f32, lr: f64) -> Self {
+        Self { name: name.into(), width, start, spread: 0.0, lr, times_extent: false, tolerance: None }
+    }
+}
+
+/// Refuses attribute lists that could not be stored: names that are empty, taken or not printable, and widths of 0.
+pub fn check_attributes(deformer: &str, attributes: &[AttributeSpec]) -> Result<()> {
+    let bad = |name: &str, problem: &str| {
+        Err(Error::parameter(format!("deformer {deformer}: attribute '{name}'"), problem, "Give each attribute its own name and at least one float"))
+    };
+    for (index, spec) in attributes.iter().enumerate() {
+        let plain = |c: char| c.is_ascii_alphanumeric() || "_-.".contains(c);
+        if spec.name.is_empty() || spec.name.len() > 100 || !spec.name.chars().all(plain) {
+            return bad(&spec.name, "the name must be 1 to 100 letters, digits, '_', '-' or '.'");
+        }
+        if CORE_ATTRIBUTES.contains(&spec.name.as_str()) {
+            return bad(&spec.name, "every Gaussian has an attribute of this name");
+        }
+        if attributes[..index].iter().any(|other| other.name == spec.name) {
+            return bad(&spec.name, "the name is used twice");
+        }
+        if spec.width == 0 || spec.width > 4096 {
+            return bad(&spec.name, &format!("the width {} is not in 1..4096", spec.width));
+        }
+        if [spec.start, spec.spread, spec.lr as f32, spec.tolerance.unwrap_or(0.0)].iter().any(|v| !v.is_finite()) {
+            return bad(&spec.name, "start, spread, rate and tolerance must be finite");
+        }
+    }
+    Ok(())
 }
 
 /// A deformation field: canonical Gaussians in, offsets at a time out (paper Section IV-B).
 ///
 /// The time-invariant half is a call of its own so that playback can cache it; training recomputes it every step.
 pub trait Deformer: Send {
-    /// Features of the canonical centres `means_world` [M,3]; no gradient flows to the centres.
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures>;
-    /// What the field keeps per Gaussian; see [`Deformer::spatial_with`].
+    /// Features of M Gaussians, from their centres and the attributes that the deformer keeps per Gaussian.
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures>;
+    /// What the deformer keeps per Gaussian; [`Deformer::spatial`] receives the values.
     fn attributes(&self) -> Vec<AttributeSpec> {
         Vec::new()
-    }
-    /// As [`Deformer::spatial`], for a field with [`Deformer::attributes`]: their values [M,width], in that order, through which gradients flow.
-    fn spatial_with(&self, means_world: Tensor<2>, _attributes: &[Tensor<2>]) -> Result<SpatialFeatures> {
-        self.spatial(means_world)
     }
     /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F]; the same heads at every time.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
@@ -128,11 +211,11 @@ pub trait Deformer: Send {
     fn is_static(&self) -> bool {
         false
     }
-    /// A regularisation term of the field's own, at `progress` in 0..1 of the main stage.
-    fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
+    /// A loss term [1] of the deformer's own, for the moving Gaussians at a time, at `progress` in 0..1 of the main stage.
+    fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
-    /// Tells the field how far the main stage of training is, 0 to 1, before every step. A field that was never told is trained.
+    /// How far the main stage of training is, 0 to 1; called before every step. Default: progress 1, as after training.
     fn set_progress(&mut self, _progress: f32) {}
     /// After training, a smaller field that does nearly the same: without what this scene does not use. `features` [M,F] are those of all Gaussians that move,
     /// `times` the normalised times of the frames.

@@ -1,11 +1,8 @@
 //! Devices by name.
 
-use crate::adapters::{adapters, auto_device};
-use crate::unknown_name;
-use crate::{Error, Result};
-use burn::tensor::{Device, DeviceKind, Tensor};
-use std::collections::BTreeMap;
-use std::sync::Mutex;
+use crate::adapters::auto_device;
+use crate::{Error, Result, unknown_name};
+use burn::tensor::Device;
 
 /// The device names a configuration may use. `wgpu:N` is the N-th adapter of `cc4dgs doctor`, `wgpu` the first.
 pub const DEVICE_NAMES: [&str; 5] = ["auto", "flex", "ndarray", "wgpu", "cuda"];
@@ -28,42 +25,11 @@ pub fn parse_device(name: &str) -> Result<Device> {
     }
 }
 
-/// The adapter at `index`, once it has answered a small sum.
-fn wgpu_device(index: usize) -> Result<Device> {
-    static ANSWERS: Mutex<BTreeMap<usize, bool>> = Mutex::new(BTreeMap::new());
-    let kind = match adapters().get(index) {
-        Some(adapter) => adapter.device_kind(),
-        // burn may know a way to an adapter that enumeration does not.
-        None if index == 0 => DeviceKind::DefaultDevice,
-        None => {
-            let problem = format!("this machine has {} adapters", adapters().len());
-            return Err(Error::unsupported(format!("device wgpu:{index}"), problem, "`cc4dgs doctor` lists them"));
-        }
-    };
-    let device = || Device::wgpu(kind.clone());
-    let mut answers = ANSWERS.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    let answers = *answers.entry(index).or_insert_with(|| {
-        // burn reports a missing adapter by panicking.
-        let sum = std::panic::catch_unwind(|| Tensor::<1>::from_floats([1.0, 2.0], &device()).sum().into_scalar::<f32>());
-        // What is registered last runs first, so the driver must have been loaded by now.
-        end_without_destructors();
-        sum.is_ok_and(|sum| sum == 3.0)
-    });
-    if answers {
-        return Ok(device());
-    }
-    Err(Error::unsupported(
-        "device wgpu",
-        "no graphics adapter answers",
-        "Install a Vulkan driver (mesa-vulkan-drivers for a software one), or use --device flex",
-    ))
-}
-
 #[cfg(feature = "cuda")]
 fn cuda_device() -> Result<Device> {
     let device = || Device::cuda(0);
     // A missing driver is reported by panicking.
-    match std::panic::catch_unwind(|| Tensor::<1>::from_floats([1.0, 2.0], &device()).sum().into_scalar::<f32>()) {
+    match std::panic::catch_unwind(|| burn::tensor::Tensor::<1>::from_floats([1.0, 2.0], &device()).sum().into_scalar::<f32>()) {
         Ok(sum) if sum == 3.0 => Ok(device()),
         _ => Err(Error::unsupported("device cuda", "no CUDA driver answers", "Use --device wgpu or flex")),
     }
@@ -71,26 +37,88 @@ fn cuda_device() -> Result<Device> {
 
 #[cfg(not(feature = "cuda"))]
 fn cuda_device() -> Result<Device> {
-    Err(Error::unsupported("device cuda", "this build has no CUDA back end", "Build with `--features cuda`, or use --device wgpu or flex"))
+    Err(Error::unsupported("device cuda", "this build has no CUDA backend", "Build with `--features cuda`, or use --device wgpu or flex"))
 }
 
-/// Lets the process end without the static destructors of graphics drivers: Mesa's software one destroys its compiler while a thread may still be compiling
-/// the last kernels with it, which killed about one process in four after its work was done.
-fn end_without_destructors() {
-    #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    {
-        unsafe extern "C" {
-            fn on_exit(run: extern "C" fn(status: i32, context: *mut std::ffi::c_void), context: *mut std::ffi::c_void) -> i32;
-            fn _exit(status: i32) -> !;
+#[cfg(feature = "wgpu")]
+use adapter::wgpu_device;
+
+#[cfg(not(feature = "wgpu"))]
+fn wgpu_device(_: usize) -> Result<Device> {
+    Err(Error::unsupported("device wgpu", "this build has no wgpu backend", "Build with the feature `wgpu`, or use --device flex"))
+}
+
+#[cfg(all(test, not(feature = "wgpu")))]
+mod tests {
+    use super::parse_device;
+
+    #[test]
+    fn a_build_for_processors_says_so() {
+        for name in ["wgpu", "wgpu:1"] {
+            let message = parse_device(name).map(|_| ()).expect_err("no wgpu here").to_string();
+            assert!(message.contains("this build has no wgpu backend"), "{message}");
         }
-        extern "C" fn leave(status: i32, _: *mut std::ffi::c_void) {
-            use std::io::Write;
-            // Nothing can be done about an error here.
-            let _ = std::io::stdout().flush();
-            // SAFETY: ends the process; takes no memory.
-            unsafe { _exit(status) }
+        assert!(parse_device("auto").is_ok());
+    }
+}
+
+#[cfg(feature = "wgpu")]
+mod adapter {
+    use crate::adapters::adapters;
+    use crate::{Error, Result};
+    use burn::tensor::{Device, DeviceKind, Tensor};
+    use std::collections::BTreeMap;
+    use std::sync::Mutex;
+
+    /// The adapter at `index`, if it computes a small sum correctly.
+    pub fn wgpu_device(index: usize) -> Result<Device> {
+        static ANSWERS: Mutex<BTreeMap<usize, bool>> = Mutex::new(BTreeMap::new());
+        let kind = match adapters().get(index) {
+            Some(adapter) => adapter.device_kind(),
+            // burn may reach an adapter that enumeration does not list.
+            None if index == 0 => DeviceKind::DefaultDevice,
+            None => {
+                let problem = format!("this machine has {} adapters", adapters().len());
+                return Err(Error::unsupported(format!("device wgpu:{index}"), problem, "`cc4dgs doctor` lists them"));
+            }
+        };
+        let device = || Device::wgpu(kind.clone());
+        let mut answers = ANSWERS.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let answers = *answers.entry(index).or_insert_with(|| {
+            // burn reports a missing adapter by panicking.
+            let sum = std::panic::catch_unwind(|| Tensor::<1>::from_floats([1.0, 2.0], &device()).sum().into_scalar::<f32>());
+            // Exit handlers run in reverse order of registration, so this one must be registered after the driver was loaded.
+            end_without_destructors();
+            sum.is_ok_and(|sum| sum == 3.0)
+        });
+        if answers {
+            return Ok(device());
         }
-        // SAFETY: the handler is a function of this program and keeps no context.
-        unsafe { on_exit(leave, std::ptr::null_mut()) };
+        Err(Error::unsupported(
+            "device wgpu",
+            "no graphics adapter answers",
+            "Install a Vulkan driver (mesa-vulkan-drivers for a software one), or use --device flex",
+        ))
+    }
+
+    /// Lets the process end without the static destructors of graphics drivers: Mesa's software one destroys its compiler while a thread may still be compiling
+    /// the last kernels with it, which killed about one process in four after its work was done.
+    fn end_without_destructors() {
+        #[cfg(all(target_os = "linux", target_env = "gnu"))]
+        {
+            unsafe extern "C" {
+                fn on_exit(run: extern "C" fn(status: i32, context: *mut std::ffi::c_void), context: *mut std::ffi::c_void) -> i32;
+                fn _exit(status: i32) -> !;
+            }
+            extern "C" fn leave(status: i32, _: *mut std::ffi::c_void) {
+                use std::io::Write;
+                // Nothing can be done about an error here.
+                let _ = std::io::stdout().flush();
+                // SAFETY: ends the process; takes no memory.
+                unsafe { _exit(status) }
+            }
+            // SAFETY: the handler is a function of this program and keeps no context.
+            unsafe { on_exit(leave, std::ptr::null_mut()) };
+        }
     }
 }

@@ -4,7 +4,7 @@
 
 use crate::{Error, Result};
 use burn::tensor::{Device, Tensor, TensorData};
-pub use cc4dgs_format::gaussians::{ExtraAttribute, HostGaussians, sh_rest_len};
+pub use cc4dgs_format::gaussians::{CORE_ATTRIBUTES, ExtraAttribute, HostGaussians, NeededRows, sh_rest_len};
 use std::collections::BTreeMap;
 
 /// Gaussians as burn tensors on one device.
@@ -64,6 +64,51 @@ impl Gaussians {
                 .iter()
                 .map(|(name, t)| Ok((name.clone(), ExtraAttribute::exact(t.dims()[1], to_vec(t.clone(), name)?))))
                 .collect::<Result<_>>()?,
+        })
+    }
+    /// Names of all attributes: the core ones in the order of [`CORE_ATTRIBUTES`], then those of plug-ins.
+    pub fn attribute_names(&self) -> Vec<String> {
+        CORE_ATTRIBUTES.iter().map(ToString::to_string).chain(self.extra.keys().cloned()).collect()
+    }
+    /// An attribute by name, as rows [N,width]; `None` if there is none of this name.
+    pub fn attribute(&self, name: &str) -> Option<Tensor<2>> {
+        let n = self.len();
+        Some(match name {
+            "means" => self.means.clone(),
+            "log_scales" => self.log_scales.clone(),
+            "quaternions" => self.quaternions.clone(),
+            "opacity_logits" => self.opacity_logits.clone().reshape([n, 1]),
+            "sh_dc" => self.sh_dc.clone(),
+            "sh_rest" => self.sh_rest.clone().reshape([n, 3 * sh_rest_len(self.sh_degree)]),
+            "dynamic_scores" => self.dynamic_scores.clone().reshape([n, 1]),
+            other => self.extra.get(other)?.clone(),
+        })
+    }
+    /// Gaussians of named attributes [N,width]. A core attribute that is missing is an error; every other name is an attribute of a plug-in.
+    pub fn from_attributes(sh_degree: usize, attributes: impl IntoIterator<Item = (String, Tensor<2>)>) -> Result<Self> {
+        let mut by_name: BTreeMap<String, Tensor<2>> = attributes.into_iter().collect();
+        let mut take = |name: &str, width: usize| match by_name.remove(name) {
+            Some(values) if values.dims()[1] == width => Ok(values),
+            Some(values) => {
+                Err(Error::data(format!("attribute {name}"), format!("it has width {}, expected {width}", values.dims()[1]), "Use arrays of one model"))
+            }
+            None => Err(Error::data(format!("attribute {name}"), "it is missing", "Every Gaussian needs it")),
+        };
+        let rest = sh_rest_len(sh_degree);
+        let (means, log_scales, quaternions) = (take("means", 3)?, take("log_scales", 3)?, take("quaternions", 4)?);
+        let (opacity_logits, sh_dc, sh_rest, dynamic_scores) =
+            (take("opacity_logits", 1)?, take("sh_dc", 3)?, take("sh_rest", 3 * rest)?, take("dynamic_scores", 1)?);
+        let n = means.dims()[0];
+        Ok(Self {
+            sh_degree,
+            means,
+            log_scales,
+            quaternions,
+            opacity_logits: opacity_logits.reshape([n]),
+            sh_dc,
+            sh_rest: sh_rest.reshape([n, rest, 3]),
+            dynamic_scores: dynamic_scores.reshape([n]),
+            extra: by_name,
         })
     }
     /// The number of Gaussians N.

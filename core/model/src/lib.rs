@@ -4,18 +4,24 @@
 //! [`Rasterizer`] and `inventory::submit!` a [`DeformerPlugin`] or [`RasterizerPlugin`]. Codecs need only `cc4dgs-format`, of which everything is re-exported here.
 
 mod adapters;
+mod appearance;
 pub mod conformance;
 mod deformer;
+mod density;
 mod device;
 pub mod gaussians;
+mod loss;
 pub mod metrics;
 mod module_deformer;
 mod offsets;
+mod optimizer;
 mod raster;
 mod registry;
 mod scene;
+mod schedule;
 
 pub use adapters::{Adapter, AdapterKind, adapters, auto_device};
+pub use appearance::{Appearance, AppearanceContext, AppearancePlugin};
 pub use burn;
 pub use cc4dgs_format as format;
 pub use cc4dgs_format::{
@@ -24,11 +30,17 @@ pub use cc4dgs_format::{
     TrainingViews, WeightArray, WeightCodec, WeightCodecPlugin, archive, config, inventory, plugin_kind, ply, serde, split_kind, spz, storage, toml,
     unknown_name,
 };
-pub use deformer::{AttributeSpec, Deformer, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures};
+pub use deformer::{
+    AttributeSpec, Deformer, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures, SpatialInput, check_attributes,
+};
+pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
 pub use device::{DEVICE_NAMES, parse_device};
 pub use gaussians::Gaussians;
+pub use loss::{Fusion, LossInput, LossPlugin, LossTerm};
 pub use module_deformer::ModuleDeformer;
 pub use offsets::Offsets;
+pub use optimizer::{Optimizer, OptimizerPlugin, OptimizerState, StepSettings, state_array};
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, SplatColors, Splats};
 pub use registry::Registry;
 pub use scene::{FrameSource, PointCloud, Scene, Split, View};
+pub use schedule::{REFERENCE_ITERATIONS, Schedule, Stage};

@@ -3,37 +3,70 @@
 //! burn's `Module` is not object safe and owns its weights; a field is a trait object whose weights the optimizer replaces. This adapter keeps the weights
 //! flat and hands a module made of the current ones to the author's functions, so that a new field is its layers, its two functions and a registration.
 
-use crate::{Deformer, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures};
+use crate::{AttributeSpec, Deformer, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures, SpatialInput};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
 
-/// A [`Deformer`] made of a module `M`: `spatial(module, means_world [M,3])` gives features [M,F], `deform(module, features, time_norm)` offsets.
+/// A loss term of a module: module, input, normalised time, progress.
+type Regularizer<M> = Box<dyn Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send>;
+/// Changes a module, weights excepted, as training advances.
+type Progress<M> = Box<dyn Fn(&mut M, f32) + Send>;
+
+/// A [`Deformer`] made of a module `M`: `spatial(module, input)` gives features [M,F], `deform(module, features, time_norm)` offsets.
 ///
-/// Both functions see the weights of the current step; gradients flow through them. Register it like any field: `build` returns it in a box.
+/// Both functions see the weights of the current step; gradients flow through them. Register it like any deformer: `build` returns it in a box.
 pub struct ModuleDeformer<M, S, D> {
     module: M,
     spatial: S,
     deform: D,
     parameters: Vec<Parameter>,
     groups: Vec<ParameterGroup>,
+    attributes: Vec<AttributeSpec>,
+    regularizer: Option<Regularizer<M>>,
+    progress: Option<Progress<M>>,
     cached: bool,
 }
 
 impl<M, S, D> ModuleDeformer<M, S, D>
 where
     M: Module,
-    S: Fn(&M, Tensor<2>) -> Result<Tensor<2>> + Send,
+    S: Fn(&M, &SpatialInput) -> Result<Tensor<2>> + Send,
     D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
 {
     /// All float weights of `module` in one optimizer group, counted as network bytes. Names are the paths of the module tree (`trunk.0.weight`).
     pub fn new(module: M, group: ParameterGroup, spatial: S, deform: D) -> Self {
         let mut list = Collector { path: Vec::new(), parameters: Vec::new() };
         module.visit(&mut list);
-        Self { module, spatial, deform, parameters: list.parameters, groups: vec![group], cached: true }
+        Self {
+            module,
+            spatial,
+            deform,
+            parameters: list.parameters,
+            groups: vec![group],
+            attributes: Vec::new(),
+            regularizer: None,
+            progress: None,
+            cached: true,
+        }
+    }
+    /// What it keeps per Gaussian; `spatial` receives the values in [`SpatialInput::attributes`], in this order.
+    pub fn with_attributes(mut self, attributes: Vec<AttributeSpec>) -> Self {
+        self.attributes = attributes;
+        self
+    }
+    /// A loss term [1] of its own: `term(module, input, time_norm, progress)`.
+    pub fn with_regularizer(mut self, term: impl Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send + 'static) -> Self {
+        self.regularizer = Some(Box::new(term));
+        self
+    }
+    /// `change(module, progress)` is called before every training step, progress from 0 to 1. It may change anything but weights.
+    pub fn with_progress(mut self, change: impl Fn(&mut M, f32) + Send + 'static) -> Self {
+        self.progress = Some(Box::new(change));
+        self
     }
     /// Counts weights whose path starts with `prefix` as grid bytes, and gives them an optimizer group of their own if one is named.
     pub fn with_grid(mut self, prefix: &str, group: Option<ParameterGroup>) -> Self {
-        let place = match group {
+        let index = match group {
             Some(group) => {
                 self.groups.push(group);
                 self.groups.len() - 1
@@ -42,7 +75,7 @@ where
         };
         for parameter in self.parameters.iter_mut().filter(|p| p.name.starts_with(prefix)) {
             parameter.part = Part::Grid;
-            parameter.group = place;
+            parameter.group = index;
         }
         self
     }
@@ -60,12 +93,24 @@ where
 impl<M, S, D> Deformer for ModuleDeformer<M, S, D>
 where
     M: Module,
-    S: Fn(&M, Tensor<2>) -> Result<Tensor<2>> + Send,
+    S: Fn(&M, &SpatialInput) -> Result<Tensor<2>> + Send,
     D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
 {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-        let work = DeformerWork { gaussians: means_world.dims()[0] as u64, ..DeformerWork::default() };
-        Ok(SpatialFeatures { values: (self.spatial)(&self.current(), means_world)?, work })
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        input.check(&self.groups[0].name, &self.attributes)?;
+        let work = DeformerWork { gaussians: input.len() as u64, ..DeformerWork::default() };
+        Ok(SpatialFeatures { values: (self.spatial)(&self.current(), input)?, work })
+    }
+    fn attributes(&self) -> Vec<AttributeSpec> {
+        self.attributes.clone()
+    }
+    fn regularizer(&self, input: &SpatialInput, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
+        self.regularizer.as_ref().map_or(Ok(None), |term| term(&self.current(), input, time_norm, progress))
+    }
+    fn set_progress(&mut self, progress: f32) {
+        if let Some(change) = &self.progress {
+            change(&mut self.module, progress);
+        }
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         (self.deform)(&self.current(), features, time_norm)
@@ -140,9 +185,13 @@ mod tests {
         let module = Drift { table: param(3, 0.5), velocity: param(3, 2.0) };
         let group =
             |name: &str| ParameterGroup { name: name.into(), lr_start: 1e-3, lr_end: 1e-3, warmup: 0.0, times_extent: false, epsilon: 1e-15, clip_norm: 0.0 };
-        let spatial = |m: &Drift, means: Tensor<2>| Ok(means.matmul(m.table.val()));
+        let spatial = |m: &Drift, input: &SpatialInput| Ok(input.means_world.clone().matmul(m.table.val()) + input.attributes[0].clone());
         let deform = |m: &Drift, features: Tensor<2>, t: f32| Ok(Offsets { means: Some(features.matmul(m.velocity.val()) * t), ..Offsets::default() });
-        ModuleDeformer::new(module, group("net"), spatial, deform).with_grid("table", Some(group("grid")))
+        let pull = |_: &Drift, input: &SpatialInput, _: f32, progress: f32| Ok(Some(input.attributes[0].clone().sum().mul_scalar(progress)));
+        ModuleDeformer::new(module, group("net"), spatial, deform)
+            .with_grid("table", Some(group("grid")))
+            .with_attributes(vec![AttributeSpec::new("shift", 3, 0.0, 1e-3)])
+            .with_regularizer(pull)
     }
 
     #[test]
@@ -157,10 +206,16 @@ mod tests {
             parameter.value = Tensor::from_inner(parameter.value.clone()).require_grad();
         }
         let means = Tensor::<2>::from_inner(Tensor::ones([2, 3], &device));
-        let features = field.spatial(means).unwrap().values;
+        let shift = Tensor::<2>::from_inner(Tensor::zeros([2, 3], &device)).require_grad();
+        assert!(field.spatial(&SpatialInput::new(means.clone())).is_err(), "attributes are missing");
+        let input = SpatialInput { means_world: means, attributes: vec![shift.clone()] };
+        let features = field.spatial(&input).unwrap().values;
         let moved = field.deform(features, 0.5).unwrap().means.unwrap();
         assert_eq!(to_vec(moved.clone().inner(), "moved").unwrap(), vec![4.5; 6]);
-        let gradients = moved.sum().backward();
+        let term = field.regularizer(&input, 0.5, 0.25).unwrap().unwrap();
+        let gradients = (moved.sum() + term).backward();
+        // Half of each row sum of the velocity, and the regularizer's weight.
+        assert_eq!(to_vec(shift.grad(&gradients).unwrap(), "gradient").unwrap(), vec![3.25; 6]);
         // d/dV = features^T 1 t: two Gaussians, each with feature 1.5, half way through time.
         let gradient = field.parameters()[1].value.grad(&gradients).unwrap();
         assert_eq!(to_vec(gradient, "gradient").unwrap(), vec![1.5; 9]);

@@ -1,6 +1,6 @@
 //! What a deformation field returns, and the one function that applies it.
 
-use crate::Gaussians;
+use crate::{Error, Gaussians, Result};
 use burn::tensor::activation::{log_sigmoid, sigmoid};
 use burn::tensor::{Int, Tensor};
 
@@ -39,9 +39,81 @@ pub struct Offsets {
 }
 
 impl Offsets {
+    /// Refuses heads whose shape is not the one documented here for `count` Gaussians; the error names `deformer` and the head.
+    pub fn check(&self, deformer: &str, count: usize) -> Result<()> {
+        fn dims<const D: usize>(tensor: &Option<Tensor<D>>) -> Option<Vec<usize>> {
+            tensor.as_ref().map(|t| t.dims().to_vec())
+        }
+        let heads = [
+            ("means", dims(&self.means), vec![count, 3]),
+            ("log_scales", dims(&self.log_scales), vec![count, 3]),
+            ("scales", dims(&self.scales), vec![count, 3]),
+            ("quaternions", dims(&self.quaternions), vec![count, 4]),
+            ("rotation_vectors", dims(&self.rotation_vectors), vec![count, 3]),
+            ("opacity_logits", dims(&self.opacity_logits), vec![count]),
+            ("opacity_log_factor", dims(&self.opacity_log_factor), vec![count]),
+        ];
+        let bad = |head: &str, found: &[usize], wanted: String| {
+            let problem = format!("its offsets have shape {found:?}; {count} Gaussians need {wanted}");
+            Err(Error::parameter(format!("deformer {deformer}, head {head}"), problem, "Correct the shape that Deformer::deform returns"))
+        };
+        for (head, found, wanted) in heads {
+            if let Some(found) = found.filter(|found| *found != wanted) {
+                return bad(head, &found, format!("{wanted:?}"));
+            }
+        }
+        match dims(&self.sh) {
+            Some(found) if found[0] != count || found[2] != 3 || ![1, 4, 9, 16, 25].contains(&found[1]) => {
+                bad("sh", &found, format!("[{count}, (degree + 1)^2, 3]"))
+            }
+            _ => Ok(()),
+        }
+    }
+    /// Refuses offsets that are not finite; the error names `deformer` and the head. Reads one number per head back.
+    pub fn check_finite(&self, deformer: &str) -> Result<()> {
+        fn sum<const D: usize>(tensor: &Option<Tensor<D>>) -> Option<Tensor<1>> {
+            tensor.as_ref().map(|t| t.clone().sum())
+        }
+        let heads = [
+            ("means", sum(&self.means)),
+            ("log_scales", sum(&self.log_scales)),
+            ("scales", sum(&self.scales)),
+            ("quaternions", sum(&self.quaternions)),
+            ("rotation_vectors", sum(&self.rotation_vectors)),
+            ("opacity_logits", sum(&self.opacity_logits)),
+            ("opacity_log_factor", sum(&self.opacity_log_factor)),
+            ("sh", sum(&self.sh)),
+        ];
+        for (head, sum) in heads {
+            // A sum is finite only if every summand is, and shader compilers do not simplify it.
+            if let Some(total) = sum.map(|t| t.into_scalar::<f32>()).filter(|total| !total.is_finite()) {
+                return Err(Error::backend(
+                    format!("deformer {deformer}, head {head}"),
+                    format!("its offsets sum to {total}"),
+                    "Lower the deformer's learning rates, or limit what the head returns",
+                ));
+            }
+        }
+        Ok(())
+    }
     /// Applies the offsets to the Gaussians `rows` [M]; `None` means that row i of the offsets belongs to Gaussian i, for the first M.
     /// Everything else is returned as it came.
-    pub fn apply(self, canonical: &Gaussians, rows: Option<&Tensor<1, Int>>) -> Gaussians {
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] with the name of `deformer` and of the head, for a head of another shape.
+    pub fn apply(self, deformer: &str, canonical: &Gaussians, rows: Option<&Tensor<1, Int>>) -> Result<Gaussians> {
+        let count = rows.map_or_else(|| self.rows().unwrap_or(0).min(canonical.len()), |rows| rows.dims()[0]);
+        self.check(deformer, count)?;
+        Ok(self.applied(canonical, rows))
+    }
+    /// Rows of the first head there is.
+    fn rows(&self) -> Option<usize> {
+        let two = [&self.means, &self.log_scales, &self.scales, &self.quaternions, &self.rotation_vectors];
+        let one = [&self.opacity_logits, &self.opacity_log_factor];
+        let found = two.into_iter().flatten().map(|t| t.dims()[0]).chain(one.into_iter().flatten().map(|t| t.dims()[0])).next();
+        found.or_else(|| self.sh.as_ref().map(|t| t.dims()[0]))
+    }
+    fn applied(self, canonical: &Gaussians, rows: Option<&Tensor<1, Int>>) -> Gaussians {
         let mut moved = canonical.clone();
         moved.means = add(moved.means, self.means, rows);
         moved.log_scales = add(moved.log_scales, self.log_scales, rows);
@@ -89,13 +161,17 @@ impl Offsets {
     }
     /// Applies the offsets to `moving` [M] and writes the results over the first M Gaussians of `frame` [N >= M]: in place where nobody else holds them, and
     /// without touching what no head changes or the Gaussians behind.
-    pub fn apply_over(self, moving: &Gaussians, mut frame: Gaussians) -> Gaussians {
+    ///
+    /// # Errors
+    /// As [`Offsets::apply`].
+    pub fn apply_over(self, deformer: &str, moving: &Gaussians, mut frame: Gaussians) -> Result<Gaussians> {
         let means = self.means.is_some();
         let scales = self.log_scales.is_some() || self.scales.is_some();
         let rotations = self.quaternions.is_some() || self.rotation_vectors.is_some();
         let opacities = self.opacity_logits.is_some() || self.opacity_log_factor.is_some();
         let colors = self.sh.is_some();
-        let moved = self.apply(moving, None);
+        self.check(deformer, moving.len())?;
+        let moved = self.applied(moving, None);
         if means {
             frame.means = over(frame.means, moved.means);
         }
@@ -112,7 +188,7 @@ impl Offsets {
             frame.sh_dc = over(frame.sh_dc, moved.sh_dc);
             frame.sh_rest = over(frame.sh_rest, moved.sh_rest);
         }
-        frame
+        Ok(frame)
     }
     /// All heads side by side as one matrix [M, total width], for regularisers; `None` when every head is off.
     pub fn concatenated(&self) -> Option<Tensor<2>> {

@@ -1,11 +1,12 @@
-//! The third seam: rasterizers.
+//! Rasterizers: the trait, its inputs and outputs.
 
-use crate::Plugin;
-use crate::{Camera, Gaussians, Result, Rules};
-use burn::tensor::{Int, Tensor};
+use crate::gaussians::to_vec;
+use crate::{Camera, Error, Gaussians, Image8, Plugin, Result, Rules};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
-/// Whether the parameters of [`Splats`] still want their activations.
+/// Whether the parameters of [`Splats`] are raw or activated.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ParameterSpace {
     /// Log-scales and opacity logits, as stored and optimised.
@@ -22,35 +23,38 @@ pub enum ParameterSpace {
 pub enum SplatColors {
     /// Spherical harmonics seen from the camera: max(0, SH(direction) + 0.5).
     Sh {
-        /// Degree 0 [N,3].
+        /// Degree 0 `[N,3]`.
         dc: Tensor<2>,
-        /// Degree 1 and up [N,K,3]; K may exceed what `degree` uses.
+        /// Degree 1 and up `[N,K,3]`; K may exceed what `degree` uses.
         rest: Tensor<3>,
         /// The degree evaluated now.
         degree: usize,
     },
-    /// Three numbers blended as they are [N,3] (dynamic scores, labels).
+    /// Three numbers blended as they are `[N,3]` (dynamic scores, labels).
     Direct(Tensor<2>),
 }
 
 /// Inputs of one render. Any tensor may carry a gradient.
 #[derive(Clone, Debug)]
 pub struct Splats {
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: Tensor<2>,
-    /// Log-scales, or scales when `space` is activated [N,3].
+    /// Log-scales, or scales when `space` is activated `[N,3]`.
     pub scales: Tensor<2>,
-    /// Quaternions (w,x,y,z), normalised by the rasterizer [N,4].
+    /// Quaternions (w,x,y,z), normalised by the rasterizer `[N,4]`.
     pub quaternions: Tensor<2>,
-    /// Opacity logits, or opacities when `space` is activated [N].
+    /// Opacity logits, or opacities when `space` is activated `[N]`.
     pub opacities: Tensor<1>,
     /// Colours.
     pub colors: SplatColors,
-    /// What the numbers are.
+    /// Raw or activated.
     pub space: ParameterSpace,
-    /// A tensor of zeros [N,2] whose gradient becomes d loss / d projected centre in pixels (densification reads it).
+    /// A tensor of zeros `[N,2]` whose gradient becomes d loss / d projected centre in pixels (densification reads it).
     pub screen_probe: Option<Tensor<2>>,
-    /// A tensor of zeros [4,4] whose gradient becomes d loss / d world_to_camera.
+    /// A tensor of zeros `[N,2]` whose gradient becomes, per axis, the sum over pixels of the absolute value of each pixel's share in the gradient of
+    /// `screen_probe` (AbsGS, Ye et al. 2024). Computed only where it is given.
+    pub absolute_screen_probe: Option<Tensor<2>>,
+    /// A tensor of zeros `[4,4]` whose gradient becomes d loss / d world_to_camera.
     pub camera_probe: Option<Tensor<2>>,
 }
 
@@ -65,6 +69,7 @@ impl Splats {
             colors: SplatColors::Sh { dc: gaussians.sh_dc.clone(), rest: gaussians.sh_rest.clone(), degree: sh_degree.min(gaussians.sh_degree) },
             space: ParameterSpace::Raw,
             screen_probe: None,
+            absolute_screen_probe: None,
             camera_probe: None,
         }
     }
@@ -79,18 +84,18 @@ pub struct RenderSettings {
     pub antialiased: bool,
     /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
     pub near: Option<f32>,
-    /// Colour behind everything, linear RGB in 0..1 [3]; may carry a gradient. `None` is black.
+    /// Colour behind everything, linear RGB in 0..1 `[3]`; may carry a gradient. `None` is black.
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
-    /// Room for so many (Gaussian, tile) pairs, for playback on devices that would otherwise wait for the count of every frame. What does not fit is not
-    /// drawn, farthest Gaussians first; [`RenderStats::pair_count`] tells afterwards. Not for gradients. `None` makes room for all.
-    pub pair_room: Option<usize>,
+    /// Capacity in (Gaussian, tile) pairs, for playback on devices that would otherwise wait for the count of every frame. Pairs beyond it are not drawn,
+    /// farthest Gaussians first; [`RenderStats::pair_count`] tells afterwards. Not for gradients. `None` allocates for all.
+    pub pair_capacity: Option<usize>,
 }
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false, pair_room: None }
+        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false, pair_capacity: None }
     }
 }
 
@@ -105,15 +110,15 @@ pub struct RenderOutput {
 }
 
 impl RenderOutput {
-    /// Red, green, blue [3,H,W].
+    /// Red, green, blue `[3,H,W]`.
     pub fn image(&self) -> Tensor<3> {
         self.planes.clone().narrow(0, 0, 3)
     }
-    /// Coverage [1,H,W].
+    /// Coverage `[1,H,W]`.
     pub fn alpha(&self) -> Tensor<3> {
         self.planes.clone().narrow(0, 3, 1)
     }
-    /// Accumulated depth in world units [1,H,W].
+    /// Accumulated depth in world units `[1,H,W]`.
     pub fn depth(&self) -> Tensor<3> {
         self.planes.clone().narrow(0, 4, 1)
     }
@@ -122,17 +127,17 @@ impl RenderOutput {
 /// Statistics of one render.
 #[derive(Clone, Debug)]
 pub struct RenderStats {
-    /// Screen radius in pixels; 0 where the Gaussian was culled [N].
+    /// Screen radius in pixels; 0 where the Gaussian was culled `[N]`.
     pub radii: Tensor<1, Int>,
-    /// Largest blending weight of each Gaussian over the image [N], when asked for.
+    /// Largest blending weight of each Gaussian over the image `[N]`, if [`RenderSettings::max_weights`] is set.
     pub max_weights: Option<Tensor<1>>,
-    /// (Gaussian, tile) pairs there were [1], still on the device; `None` where a rasterizer has no such thing.
+    /// Number of (Gaussian, tile) pairs `[1]`, still on the device; `None` if a rasterizer has no tiles.
     pub pair_count: Option<Tensor<1, Int>>,
     /// Counts of work done.
     pub work: RenderWork,
 }
 
-/// Work counted during one render. Zero where a device does not read its counters back.
+/// Work counted during one render. Zero on devices that do not read their counters back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RenderWork {
     /// Gaussians that survived culling.
@@ -145,8 +150,26 @@ pub struct RenderWork {
 
 /// Draws Gaussians, differentiably.
 pub trait Rasterizer: Send + Sync {
-    /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn.
+    /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn. Every tensor of `splats` that tracks gradients receives one in the
+    /// backward pass, the probes included; no probe may change the planes or another gradient.
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput>;
+    /// Planes [3,H,W] in 0..1 of an 8-bit image on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
+    fn upload(&self, image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
+        let shape = [3, image.height as usize, image.width as usize];
+        Tensor::from_data(TensorData::new(image.to_planes(background), shape), device)
+    }
+    /// The 8-bit RGB image of planes [C,H,W] of which the first three are red, green and blue; the same rule as [`Image8::from_planes`].
+    fn download(&self, planes: Tensor<3>) -> Result<Image8> {
+        let [channels, height, width] = planes.dims();
+        if channels < 3 || height == 0 || width == 0 {
+            return Err(Error::parameter(
+                "image",
+                format!("planes have shape [{channels},{height},{width}]"),
+                "Give red, green and blue of at least one pixel",
+            ));
+        }
+        Ok(Image8::from_planes(&to_vec(planes.narrow(0, 0, 3), "planes")?, width as u32, height as u32))
+    }
 }
 
 /// A rasterizer in the registry.

@@ -1,7 +1,9 @@
 //! All plug-ins that are linked in, collected once into a value. A name taken twice and a name unknown are errors.
 
-use crate::{AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, Rasterizer, RasterizerPlugin, Result, WeightCodec, WeightCodecPlugin};
-use crate::{Entries, Plugin, split_kind};
+use crate::{
+    Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, DensityControl, DensityPlugin,
+    Entries, LossPlugin, Optimizer, OptimizerPlugin, Plugin, Rasterizer, RasterizerPlugin, Result, WeightCodec, WeightCodecPlugin, split_kind,
+};
 use burn::tensor::Device;
 
 /// The linked plug-ins by kind and name.
@@ -10,16 +12,31 @@ pub struct Registry {
     codecs: Entries<CodecPlugin>,
     rasterizers: Entries<RasterizerPlugin>,
     weight_codecs: Entries<WeightCodecPlugin>,
+    density: Entries<DensityPlugin>,
+    losses: Entries<LossPlugin>,
+    appearances: Entries<AppearancePlugin>,
+    optimizers: Entries<OptimizerPlugin>,
 }
 
 impl Registry {
     /// Collects everything linked into this program.
     pub fn collect() -> Result<Self> {
-        Ok(Self { deformers: Entries::collect()?, codecs: Entries::collect()?, rasterizers: Entries::collect()?, weight_codecs: Entries::collect()? })
+        Ok(Self {
+            deformers: Entries::collect()?,
+            codecs: Entries::collect()?,
+            rasterizers: Entries::collect()?,
+            weight_codecs: Entries::collect()?,
+            density: Entries::collect()?,
+            losses: Entries::collect()?,
+            appearances: Entries::collect()?,
+            optimizers: Entries::collect()?,
+        })
     }
     /// All entries as (kind, facts), sorted.
     pub fn plugins(&self) -> Vec<(&'static str, &'static Plugin)> {
-        self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts()).collect()
+        let model = self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts());
+        let training = self.density.facts().chain(self.losses.facts()).chain(self.appearances.facts()).chain(self.optimizers.facts());
+        model.chain(training).collect()
     }
     /// The deformer called `name`.
     pub fn deformer(&self, name: &str) -> Result<&'static DeformerPlugin> {
@@ -36,6 +53,41 @@ impl Registry {
     /// The weight codec called `name`.
     pub fn weight_codec(&self, name: &str) -> Result<&'static WeightCodecPlugin> {
         self.weight_codecs.get(name)
+    }
+    /// The density control called `name`.
+    pub fn density(&self, name: &str) -> Result<&'static DensityPlugin> {
+        self.density.get(name)
+    }
+    /// The loss term called `name`.
+    pub fn loss(&self, name: &str) -> Result<&'static LossPlugin> {
+        self.losses.get(name)
+    }
+    /// All loss terms, sorted by name.
+    pub fn losses(&self) -> impl Iterator<Item = &'static LossPlugin> + '_ {
+        self.losses.iter()
+    }
+    /// The appearance model called `name`.
+    pub fn appearance(&self, name: &str) -> Result<&'static AppearancePlugin> {
+        self.appearances.get(name)
+    }
+    /// The optimizer called `name`.
+    pub fn optimizer(&self, name: &str) -> Result<&'static OptimizerPlugin> {
+        self.optimizers.get(name)
+    }
+    /// Builds the density control of a `[density]` section (`kind` and its settings).
+    pub fn build_density(&self, section: &toml::Table) -> Result<Box<dyn DensityControl>> {
+        let (kind, settings) = split_kind("density", section)?;
+        (self.density(&kind)?.build)(&settings)
+    }
+    /// Builds the appearance model of an `[appearance]` section (`kind` and its settings).
+    pub fn build_appearance(&self, section: &toml::Table, context: &AppearanceContext, device: &Device) -> Result<Box<dyn Appearance>> {
+        let (kind, settings) = split_kind("appearance", section)?;
+        (self.appearance(&kind)?.build)(&settings, context, device)
+    }
+    /// Builds the optimizer of an `[optimizer]` section (`kind` and its settings).
+    pub fn build_optimizer(&self, section: &toml::Table) -> Result<Box<dyn Optimizer>> {
+        let (kind, settings) = split_kind("optimizer", section)?;
+        (self.optimizer(&kind)?.build)(&settings)
     }
     /// Builds the deformer of a `[deformer]` section (`kind` and its settings).
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {

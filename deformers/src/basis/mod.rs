@@ -22,7 +22,7 @@ use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu_flat};
 use cc4dgs_core::{
     Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
-    config, inventory,
+    SpatialInput, config, inventory,
 };
 use functions::TemporalFunctions;
 use serde::{Deserialize, Serialize};
@@ -213,7 +213,8 @@ impl CdfBasis {
 }
 
 impl Deformer for CdfBasis {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = input.means_world.clone();
         let [m, _] = means_world.dims();
         if m == 0 {
             let empty = Tensor::zeros([0, self.shape.coefficients()], &means_world.inner().device());
@@ -253,7 +254,7 @@ impl Deformer for CdfBasis {
     fn groups(&self) -> Vec<ParameterGroup> {
         vec![self.rates.group("cdf-basis grid"), self.rates.group("cdf-basis net")]
     }
-    fn regularizer(&self, _means_world: Tensor<2>, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
+    fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(if self.settings.sparsity > 0.0 { sparsity::group_lasso(self, self.settings.sparsity) } else { None })
     }
     fn simplified(&self, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {

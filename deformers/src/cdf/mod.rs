@@ -18,7 +18,7 @@ use crate::parts::{heads, time, weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput,
     config as toml_config, inventory,
 };
 use std::sync::Arc;
@@ -117,7 +117,8 @@ fn single(outputs: Vec<Tensor<2>>) -> Result<Tensor<2>> {
 }
 
 impl Deformer for Cdf {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = input.means_world.clone();
         let [m, _] = means_world.dims();
         if m == 0 {
             return Ok(SpatialFeatures { values: Tensor::zeros([0, self.sizes.width], &means_world.inner().device()), work: DeformerWork::default() });

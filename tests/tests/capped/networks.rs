@@ -76,7 +76,7 @@ fn networks_of_every_shape_are_those_of_their_layers() {
         shape(9, &[16, 12, 20], &[]),
         shape(17, &[], &[&[24, 3], &[11]]),
         shape(20, &[33, 24], &[&[24, 3], &[24, 16, 5], &[48]]),
-        // Outputs wider than what stays on the chip, behind a hidden layer and straight behind the trunk.
+        // Outputs wider than the shared memory, behind a hidden layer and directly behind the trunk.
         shape(12, &[16], &[&[16, 150], &[90]]),
         shape(130, &[130], &[&[130, 4]]),
         // Too wide for shared memory anywhere.

@@ -151,7 +151,7 @@ fn near_ties_of_depth_are_drawn_in_one_order() {
     });
     let draw = |rasterizer: &dyn Rasterizer, device: &Device| {
         let g = Gaussians::from_host(&gaussians, device);
-        to_vec(rasterizer.render(&Splats::from_gaussians(&g, 3), &camera, &RenderSettings::default()).unwrap().image(), "picture").unwrap()
+        to_vec(rasterizer.render(&Splats::from_gaussians(&g, 3), &camera, &RenderSettings::default()).unwrap().image(), "image").unwrap()
     };
     let truth = draw(&ReferenceRasterizer, &Device::flex());
     for (name, device) in devices() {
@@ -162,7 +162,7 @@ fn near_ties_of_depth_are_drawn_in_one_order() {
 }
 
 /// Adapters may let a kernel read as little as 128 MiB of a buffer (here it is 1 MiB, so that 10,000 Gaussians do what a million would), and share as little as
-/// 16 KiB on the chip.
+/// 16 KiB of shared memory.
 #[test]
 fn small_adapters_change_nothing_or_are_an_error() {
     let case = |count| Case {
@@ -182,14 +182,14 @@ fn small_adapters_change_nothing_or_are_an_error() {
         let camera = Camera::look_at("stress", (64, 48), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
         let refused = TileRasterizer.render(&Splats::from_gaussians(&many, 3), &camera, &RenderSettings::default());
         cap_bindings(u64::MAX);
-        assert!(whole == parts, "{name}: pictures or gradients differ");
+        assert!(whole == parts, "{name}: images or gradients differ");
         cap_shared_memory(16 << 10);
-        let (picture, gradients) = draw(&TileRasterizer, &case(10_000), &device, &upstream);
+        let (image, gradients) = draw(&TileRasterizer, &case(10_000), &device, &upstream);
         cap_shared_memory(u64::MAX);
-        assert!(whole.0 == picture, "{name}: pictures differ with less shared memory");
+        assert!(whole.0 == image, "{name}: images differ with less shared memory");
         for (k, (whole, small)) in whole.1.iter().zip(&gradients).enumerate() {
             let scale = whole.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-            // Sums over the pixels of a tile are cut elsewhere.
+            // Sums over the pixels of a tile are split differently.
             let worst = whole.iter().zip(small).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             // Round Gaussians have no gradient of rotation but rounding.
             assert!(worst < 1e-5 * scale + 1e-7, "{name}: gradient {k} differs by {worst:e} of {scale:e} with less shared memory");
@@ -200,26 +200,26 @@ fn small_adapters_change_nothing_or_are_an_error() {
 }
 
 #[test]
-fn room_for_pairs_changes_nothing_unless_it_is_too_small() {
+fn capacity_for_pairs_changes_nothing_unless_it_is_too_small() {
     let gaussians = changed(800, 12, |_| {});
     let camera = Camera::look_at("stress", (80, 48), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
     for (name, device) in devices() {
         let g = Gaussians::from_host(&gaussians, &device);
-        let draw = |pair_room| {
+        let draw = |pair_capacity| {
             poison(&device);
-            let settings = RenderSettings { pair_room, ..Default::default() };
+            let settings = RenderSettings { pair_capacity, ..Default::default() };
             let out = TileRasterizer.render(&Splats::from_gaussians(&g, 3), &camera, &settings).unwrap();
             (to_vec(out.planes, "planes").unwrap(), out.stats.pair_count.unwrap().into_scalar::<i64>() as usize)
         };
         let (exact, count) = draw(None);
         assert!(count > 800);
-        for room in [count, count + 1, 3 * count] {
-            assert!(draw(Some(room)) == (exact.clone(), count), "{name}: room for {room} of {count}");
+        for capacity in [count, count + 1, 3 * count] {
+            assert!(draw(Some(capacity)) == (exact.clone(), count), "{name}: capacity of {capacity} for {count} pairs");
         }
         let (less, still) = draw(Some(count / 2));
         assert!(still == count && less.iter().all(|v| v.is_finite()));
         if name == "wgpu" {
-            assert!(less != exact, "half of the pairs cannot draw the same picture");
+            assert!(less != exact, "half of the pairs cannot draw the same image");
         }
     }
 }

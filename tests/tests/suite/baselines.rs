@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformerContext, Registry, Seed, config};
+use cc4dgs_core::{DeformerContext, Registry, Seed, SpatialInput, config};
 use cc4dgs_deformers as _;
 use glam::{DMat3, DMat4, DVec3, DVec4};
 
@@ -76,7 +76,7 @@ fn native_4d_conditions_gaussians_of_four_dimensions() {
         let own =
             |values: &[f64]| Tensor::<2>::from_data(TensorData::new(values.iter().map(|&v| v as f32).collect::<Vec<_>>(), [1, values.len()]), &Device::flex());
         let attributes = [own(&[mean.w]), own(&[of_time.sqrt().ln()]), own(&velocity.to_array())];
-        let features = field.spatial_with(own(&mean.truncate().to_array()), &attributes).unwrap().values;
+        let features = field.spatial(&SpatialInput { means_world: own(&mean.truncate().to_array()), attributes: attributes.to_vec() }).unwrap().values;
         let rows = DMat3::from_cols(covariance.x_axis.truncate(), covariance.y_axis.truncate(), covariance.z_axis.truncate());
         let outer = DMat3::from_cols(mixed * mixed.x, mixed * mixed.y, mixed * mixed.z);
         let conditional = rows - outer * (1.0 / of_time);

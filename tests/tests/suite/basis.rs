@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Deformer, DeformerContext, Gaussians, HostGaussians, Offsets, Registry, Seed, config};
+use cc4dgs_core::{Deformer, DeformerContext, Gaussians, HostGaussians, Offsets, Registry, Seed, SpatialInput, config};
 use cc4dgs_deformers as _;
 use cc4dgs_tests::{devices, poison};
 use std::sync::Arc;
@@ -106,7 +106,7 @@ fn what_a_scene_does_not_use_is_left_out() {
     }
     let points = Tensor::<2>::from_data(TensorData::new(noise(60, 300), [100, 3]), &Device::flex());
     let times = [0.0, 0.2, 0.45, 0.7, 1.0];
-    let features = field.spatial(points.clone()).unwrap().values;
+    let features = field.spatial(&SpatialInput::new(points.clone())).unwrap().values;
     let simple = field.simplified(features, &times).unwrap().expect("something is unused");
     assert!(simple.message.contains("means keeps 4 of 9") && simple.message.contains("log_scales does nothing"), "{}", simple.message);
     let bytes = |f: &dyn Deformer| f.size_bytes().0 + f.size_bytes().1;
@@ -119,7 +119,7 @@ fn what_a_scene_does_not_use_is_left_out() {
         to.value = from.value.clone();
     }
     let offsets = |f: &dyn Deformer, time: f32| {
-        let found = f.deform(f.spatial(points.clone()).unwrap().values, time).unwrap();
+        let found = f.deform(f.spatial(&SpatialInput::new(points.clone())).unwrap().values, time).unwrap();
         let read = |t: Option<Tensor<2>>| t.map(|t| to_vec(t, "offsets").unwrap());
         (read(found.means), read(found.log_scales), read(found.quaternions))
     };
@@ -155,7 +155,7 @@ fn the_lasso_pulls_every_function_by_its_price() {
             parameter.value = Tensor::from_data(TensorData::new(noise(70 + k as u64, len), [len]), &device).require_grad();
         }
         let centres = Tensor::<2>::zeros([1, 3], &device);
-        let term = field.regularizer(centres, 0.5, 0.5).unwrap().expect("a term");
+        let term = field.regularizer(&SpatialInput::new(centres), 0.5, 0.5).unwrap().expect("a term");
         let gradients = term.clone().backward();
         let mut wanted = 0.0;
         for (head, outputs, unit) in [("net.head.means", 3, 3.0), ("net.head.quaternions", 4, 1.0)] {
@@ -189,7 +189,7 @@ fn rotation_vectors_turn_what_is_there() {
         host.quaternions = vec![2.0 * half, 2.0 * half, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5];
         let vectors = vec![0.0, 0.0, std::f32::consts::FRAC_PI_2, 0.0, 0.0, 0.0];
         let offsets = Offsets { rotation_vectors: Some(Tensor::from_data(TensorData::new(vectors, [2, 3]), &device)), ..Default::default() };
-        let moved = offsets.apply(&Gaussians::from_host(&host, &device), None).to_host().unwrap();
+        let moved = offsets.apply("test", &Gaussians::from_host(&host, &device), None).unwrap().to_host().unwrap();
         // z quarter after x quarter: (1, 1, 1, 1) / 2.
         let wanted = [1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5];
         assert!(moved.quaternions.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-6), "{name}: {:?}", moved.quaternions);

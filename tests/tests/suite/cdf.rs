@@ -2,7 +2,7 @@
 //! burn primitives.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::{Deformer, DeformerContext, Offsets, Registry, Seed};
+use cc4dgs_core::{Deformer, DeformerContext, Offsets, Registry, Seed, SpatialInput};
 use cc4dgs_deformers::cdf::{Cdf, CdfConfig, Formulas};
 use cc4dgs_tests::devices;
 use rand::{Rng, SeedableRng};
@@ -49,7 +49,7 @@ fn shake(field: &mut dyn Deformer, device: &Device) {
 }
 
 fn evaluate(field: &dyn Deformer, points: &[f32], time: f32, device: &Device) -> (Vec<f32>, Offsets) {
-    let spatial = field.spatial(matrix(points.to_vec(), 3, device)).expect("features").values;
+    let spatial = field.spatial(&SpatialInput::new(matrix(points.to_vec(), 3, device))).expect("features").values;
     let offsets = field.deform(spatial.clone(), time).expect("offsets");
     (values(spatial), offsets)
 }
@@ -101,7 +101,7 @@ fn vertex_reuse_changes_the_work_and_not_one_bit() {
         shake(&mut with, &device);
         shake(&mut without, &device);
         let points = centres(777);
-        let work = |f: &Cdf| f.spatial(matrix(points.clone(), 3, &device)).expect("features").work;
+        let work = |f: &Cdf| f.spatial(&SpatialInput::new(matrix(points.clone(), 3, &device))).expect("features").work;
         let (less, more) = (work(&with), work(&without));
         assert_eq!((more.gaussians, more.vertices_queried, more.vertices_decoded), (777, 3 * 8 * 777, 3 * 8 * 777));
         assert_eq!(less.vertices_queried, more.vertices_queried);
@@ -220,10 +220,10 @@ fn seeds_decide_the_weights() {
 fn odd_requests_get_answers() {
     let device = Device::flex();
     let small = field(TINY, &device);
-    let none = small.spatial(Tensor::zeros([0, 3], &device)).expect("no points are fine");
+    let none = small.spatial(&SpatialInput::new(Tensor::zeros([0, 3], &device))).expect("no points are fine");
     assert_eq!(none.values.dims(), [0, 16]);
     assert_eq!(small.deform(none.values, 0.5).expect("no rows are fine").means.map(|t| t.dims()), Some([0, 3]));
-    let one = small.spatial(Tensor::from_floats([[f32::NAN, f32::INFINITY, 0.0]], &device)).expect("a defined result").values;
+    let one = small.spatial(&SpatialInput::new(Tensor::from_floats([[f32::NAN, f32::INFINITY, 0.0]], &device))).expect("a defined result").values;
     assert!(values(one.clone()).iter().all(|v| v.is_finite()));
     assert!(small.deform(one.clone(), f32::NAN).is_err());
     assert!(small.deform(one.repeat_dim(1, 2), 0.5).is_err(), "features of another width");

@@ -1,7 +1,7 @@
 //! Whole runs on the built-in scene, small enough for a test: reproducibility, resuming, archives, switches.
 
 use burn::tensor::Device;
-use cc4dgs::{backends as _, codecs as _, deformers as _};
+use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
 use cc4dgs_core::{Error, Event, EventSink, Limits, Recorder, Registry, Scene, Silent, Split};
 use cc4dgs_engine::agreement::agreement;
 use cc4dgs_engine::config::RunConfig;
@@ -36,7 +36,7 @@ fn open(config: &RunConfig) -> Arc<Scene> {
 
 fn run(config: &RunConfig, out: &Path, resume: bool, events: &dyn EventSink, stop: &AtomicBool) -> cc4dgs_core::Result<TrainReport> {
     let registry = Registry::collect().unwrap();
-    train(&TrainJob { config, scene: open(config), out: out.to_path_buf(), resume, registry: &registry, events, stop })
+    train(&TrainJob { config, scene: open(config), out: Some(out.to_path_buf()), resume, registry: &registry, events, stop }).map(|(_, report)| report)
 }
 
 fn load(path: &Path) -> Model {
@@ -111,7 +111,7 @@ fn resuming_with_another_configuration_is_refused() {
     let config = tiny(&["train.iterations=12", "train.shares=[1,0,0]"]);
     let never = AtomicBool::new(false);
     run(&config, folder.path(), false, &Silent, &never).unwrap();
-    let other = tiny(&["train.iterations=12", "train.shares=[1,0,0]", "train.lambda_c=0.5"]);
+    let other = tiny(&["train.iterations=12", "train.shares=[1,0,0]", "loss=[{kind='l1'}]"]);
     let message = run(&other, folder.path(), true, &Silent, &never).unwrap_err().to_string();
     assert!(message.contains("--resume"), "{message}");
 }

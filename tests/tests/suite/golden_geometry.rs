@@ -157,7 +157,7 @@ impl Projection {
     fn part(&self, key: &str, camera: usize, width: usize) -> Vec<f64> {
         self.fixture.get(key)[camera * self.n * width..(camera + 1) * self.n * width].to_vec()
     }
-    fn settings(&self, camera: usize) -> cc4dgs_backends::cpu::raster::RasterSettings {
+    fn settings(&self, camera: usize) -> cc4dgs_backends::ops::rasterize::RasterSettings {
         let k = &self.fixture.get("in.Ks")[9 * camera..9 * camera + 9];
         settings(160, 120, k, &self.fixture.get("in.viewmats")[16 * camera..16 * camera + 16])
     }

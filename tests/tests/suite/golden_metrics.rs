@@ -9,7 +9,7 @@ fn golden() -> PathBuf {
     std::env::var_os("CC4DGS_GOLDEN").map_or(committed, PathBuf::from)
 }
 
-fn picture(path: &Path) -> Planes {
+fn image(path: &Path) -> Planes {
     let rgb = image::open(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())).to_rgb8();
     let (width, height) = rgb.dimensions();
     Planes::from_image8(&cc4dgs_core::Image8 { width, height, channels: 3, data: rgb.into_raw() }).unwrap()
@@ -34,7 +34,7 @@ fn golden_metrics() {
     assert!(!pairs.is_empty());
     let mut checked = 0;
     for pair in pairs {
-        let (a, b) = (picture(&folder.join(pair["a"].as_str().unwrap())), picture(&folder.join(pair["b"].as_str().unwrap())));
+        let (a, b) = (image(&folder.join(pair["a"].as_str().unwrap())), image(&folder.join(pair["b"].as_str().unwrap())));
         let mut check = |key: &str, got: &dyn Fn() -> f64, tolerance: f64| {
             if let Some(expected) = pair.get(key).and_then(Value::as_f64) {
                 let got = got();
@@ -56,7 +56,7 @@ fn golden_metrics() {
 }
 
 #[test]
-fn the_eight_bit_protocol_equals_measuring_saved_pictures() {
+fn the_eight_bit_protocol_equals_measuring_saved_images() {
     let (width, height) = (40, 30);
     let (a, b) = (texture(width, height, 0.0), texture(width, height, 0.4));
     let saved = |planes: &[f32]| Planes::from_image8(&cc4dgs_core::Image8::from_planes(planes, width as u32, height as u32)).unwrap();
@@ -72,7 +72,7 @@ fn the_eight_bit_protocol_equals_measuring_saved_pictures() {
 }
 
 #[test]
-fn identical_pictures_score_the_ceiling_and_one() {
+fn identical_images_score_the_ceiling_and_one() {
     let a = texture(170, 165, 0.0);
     let shape = [3, 165, 170];
     assert_eq!(Metric::psnr(Rounding::EightBit).score(&a, &a, shape, None).unwrap(), PSNR_CEILING_DB);

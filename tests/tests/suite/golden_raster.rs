@@ -159,6 +159,7 @@ fn check_operation(scene: &Scene, device: &Device, findings: &mut Findings) {
         colors: SplatColors::Sh { dc: dc.clone(), rest: rest.clone(), degree: s.sh_degree.unwrap() },
         space: ParameterSpace::Activated,
         screen_probe: Some(screen_probe.clone()),
+        absolute_screen_probe: None,
         camera_probe: Some(camera_probe.clone()),
     };
     let camera = Camera {
@@ -172,7 +173,7 @@ fn check_operation(scene: &Scene, device: &Device, findings: &mut Findings) {
         world_to_camera: s.world_to_camera,
     };
     let render =
-        RenderSettings { rules: s.rules, antialiased: s.antialiased, near: None, background: Some(background.clone()), max_weights: true, pair_room: None };
+        RenderSettings { rules: s.rules, antialiased: s.antialiased, near: None, background: Some(background.clone()), max_weights: true, pair_capacity: None };
     let out = TileRasterizer.render(&splats, &camera, &render).unwrap();
     let weights = Tensor::<3>::from_data(tensor(&scene.upstream(), vec![5, s.height, s.width]), &device);
     let grads = (out.planes.clone() * weights).sum().backward();

@@ -3,6 +3,7 @@
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::cpu::mlp::{activation, mish};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
+use cc4dgs_backends::ops::field::MishShape;
 use cc4dgs_backends::ops::photometric::{bce_with_logits_loss, photometric_loss};
 use cc4dgs_tests::devices;
 use std::collections::HashMap;
@@ -40,7 +41,7 @@ fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
     t.into_data().try_to_vec::<f32>().expect("float32")
 }
 
-/// [H, W, C] of a fixture to planes [C, H, W].
+/// `[H, W, C]` of a fixture to planes `[C, H, W]`.
 fn planes(fixture: &Fixture, name: &str) -> ([usize; 3], Vec<f64>) {
     let (shape, data) = &fixture[name];
     let (h, w, c) = (shape[0], shape[1], shape[2]);
@@ -131,7 +132,7 @@ fn adam_leaves_invisible_and_broken_rows_alone() {
         let mut settings = AdamSettings::new(0.01, 3);
         settings.visible = Some(Tensor::<1, Int>::from_data(TensorData::new(visible.clone(), [rows]), &device));
         let out = adam_step(matrix(p0.clone()), matrix(m0.clone()), matrix(v0.clone()), matrix(g.clone()), &settings).expect("a step");
-        // Row 9000 is a multiple of 3, so it was not wanted and does not count.
+        // Row 9000 is a multiple of 3, so it was not selected and does not count.
         assert_eq!(out.skipped_rows.into_data().iter::<i64>().collect::<Vec<_>>(), [2], "{name}");
         let (p, m, v) = (values(out.param), values(out.m), values(out.v));
         for (row, &shown) in visible.iter().enumerate() {
@@ -175,7 +176,7 @@ fn golden_nn_activations() {
 #[test]
 fn golden_nn_mlp() {
     let fixture = golden("nn");
-    let shape = mish::MishShape { input: 11, hidden: vec![16, 16], output: 5 };
+    let shape = MishShape { input: 11, hidden: vec![16, 16], output: 5 };
     // The fixture keeps W as [out, in]; the kernel as [in, out].
     let transposed = |name: &str| {
         let (shape, data) = &fixture[name];

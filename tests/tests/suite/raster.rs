@@ -2,7 +2,8 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::{STANDARD_CASES, StepCase, random_gaussians, step_camera};
-use cc4dgs_backends::cpu::raster::{self, GradientRequest, Gradients, RasterSettings, SplatArrays};
+use cc4dgs_backends::cpu::raster::{self, Gradients, SplatArrays};
+use cc4dgs_backends::ops::rasterize::{GradientRequest, RasterSettings};
 use cc4dgs_backends::rasterizers::reference::{self, ReferenceInput, ReferenceRasterizer};
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::{Camera, Error, Gaussians, HostGaussians, ParameterSpace, Rasterizer, Registry, RenderSettings, Rules, Seed, SplatColors, Splats};
@@ -14,9 +15,10 @@ const EVERYTHING: GradientRequest = GradientRequest {
     opacities: true,
     colors: true,
     sh_rest: true,
-    screen: true,
-    camera: true,
     background: true,
+    screen: true,
+    absolute_screen: true,
+    camera: true,
 };
 
 fn arrays<'a>(g: &'a HostGaussians, background: [f32; 3]) -> SplatArrays<'a> {
@@ -46,17 +48,18 @@ fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> 
         space: ParameterSpace::Raw,
         sh_degree: Some(degree),
         max_weights: true,
-        pair_room: None,
+        absolute_centers: false,
+        pair_capacity: None,
     }
 }
 
 /// Numbers in -1..1 that follow from `seed`.
-fn noise(seed: Seed, len: usize) -> Vec<f32> {
+pub fn noise(seed: Seed, len: usize) -> Vec<f32> {
     (0..len as u64).map(|k| (seed.index(k).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0).collect()
 }
 
 /// A random scene with some opaque Gaussians, so that pixels stop early.
-fn scene(count: usize, seed: Seed) -> HostGaussians {
+pub fn scene(count: usize, seed: Seed) -> HostGaussians {
     let mut g = random_gaussians(count, seed);
     let strength = noise(seed.child("opacity"), count);
     g.opacity_logits.iter_mut().zip(strength).for_each(|(o, s)| *o = 5.0 * s);
@@ -66,14 +69,17 @@ fn scene(count: usize, seed: Seed) -> HostGaussians {
     g
 }
 
-fn relative(a: &[f32], b: &[f64]) -> f64 {
+pub fn relative(a: &[f32], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
     let norm = b.iter().map(|v| v * v).sum::<f64>().sqrt();
     a.iter().zip(b).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum::<f64>().sqrt() / norm.max(1e-12)
 }
 
-fn columns(g: &Gradients) -> [&Vec<f32>; 9] {
-    [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.colors, &g.sh_rest, &g.screen, &g.camera, &g.background]
+/// The names of [`columns`].
+const NAMES: [&str; 10] = ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "background", "screen", "absolute screen", "camera"];
+
+fn columns(g: &Gradients) -> [&Vec<f32>; 10] {
+    [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.colors, &g.sh_rest, &g.background, &g.screen, &g.absolute_screen, &g.camera]
 }
 
 #[test]
@@ -109,9 +115,19 @@ fn tile_agrees_with_the_reference() {
         let got = raster::backward(&splats, &settings, &mut tile.workspace, &upstream, &EVERYTHING);
         let upstream: Vec<f64> = upstream.iter().map(|&v| f64::from(v)).collect();
         let want = reference::backward(&wide, &settings, &exact.items, &upstream);
-        let wanted = [&want.means, &want.scales, &want.quaternions, &want.opacities, &want.colors, &want.sh_rest, &want.screen, &want.camera, &want.background];
-        let names = ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "screen", "camera", "background"];
-        for ((name, got), want) in names.into_iter().zip(columns(&got)).zip(wanted) {
+        let wanted = [
+            &want.means,
+            &want.scales,
+            &want.quaternions,
+            &want.opacities,
+            &want.colors,
+            &want.sh_rest,
+            &want.background,
+            &want.screen,
+            &want.absolute_screen,
+            &want.camera,
+        ];
+        for ((name, got), want) in NAMES.into_iter().zip(columns(&got)).zip(wanted) {
             let error = relative(got, want);
             assert!(error < 2e-4, "{rules:?} {name}: {error:.2e}");
         }
@@ -243,7 +259,7 @@ fn bytes_do_not_depend_on_threads() {
 }
 
 #[test]
-fn hostile_gaussians_never_reach_the_picture() {
+fn hostile_gaussians_never_reach_the_image() {
     let camera = step_camera(&StepCase { width: 40, height: 24, gaussians: 64 });
     let clean = scene(64, Seed::root(21));
     let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30, -1e30, 3e38, 1e-40, 100.0];
@@ -260,9 +276,7 @@ fn hostile_gaussians_never_reach_the_picture() {
                 assert!(out.planes.iter().all(|v| v.is_finite()), "{value} in column {column}");
                 let upstream = vec![1e-3; out.planes.len()];
                 let gradients = raster::backward(&splats, &s, &mut out.workspace, &upstream, &EVERYTHING);
-                for (name, values) in
-                    ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "screen", "camera", "background"].iter().zip(columns(&gradients))
-                {
+                for (name, values) in NAMES.iter().zip(columns(&gradients)) {
                     assert!(values.iter().all(|v| !v.is_nan()), "{value} in column {column}: gradient of {name}");
                 }
                 if value.is_nan() {
@@ -321,16 +335,16 @@ fn direct_colours_are_blended_as_they_are() {
     let colors = Tensor::<2>::from_data(TensorData::new(noise(Seed::root(42), 150), [50, 3]), &device).require_grad();
     let mut splats = Splats::from_gaussians(&g, 3);
     splats.colors = SplatColors::Direct(colors.clone());
-    let mut pictures = Vec::new();
+    let mut images = Vec::new();
     let mut gradients = Vec::new();
     for rasterizer in [&TileRasterizer as &dyn Rasterizer, &ReferenceRasterizer] {
         let out = rasterizer.render(&splats, &camera, &RenderSettings::default()).unwrap();
         let grads = out.planes.clone().sum().backward();
-        pictures.push(out.planes.into_data().try_to_vec::<f32>().unwrap());
+        images.push(out.planes.into_data().try_to_vec::<f32>().unwrap());
         gradients.push(colors.grad(&grads).unwrap().into_data().try_to_vec::<f32>().unwrap());
     }
-    assert!(pictures[0].iter().any(|&v| v < -1e-3), "nothing negative was drawn");
-    for both in [pictures, gradients] {
+    assert!(images[0].iter().any(|&v| v < -1e-3), "nothing negative was drawn");
+    for both in [images, gradients] {
         let wide: Vec<f64> = both[1].iter().map(|&v| f64::from(v)).collect();
         assert!(relative(&both[0], &wide) < 1e-4);
     }

@@ -109,9 +109,9 @@ fn text(r: &Report) -> String {
 
 fn adapter_text(index: usize, a: &Adapter) -> String {
     let mib = |bytes: u64| bytes >> 20;
-    let subgroups = a.subgroup_units.map_or_else(|| "no subgroups".to_string(), |[low, high]| format!("subgroups of {low} to {high}"));
+    let subgroups = a.subgroup_threads.map_or_else(|| "no subgroups".to_string(), |[low, high]| format!("subgroups of {low} to {high}"));
     format!(
-        "adapter wgpu:{index}  {} ({:?}, {}, {})\n    bindings to {} MiB, buffers to {} MiB, {} KiB per workgroup of {} units, {} buffers per kernel, {subgroups}",
+        "adapter wgpu:{index}  {} ({:?}, {}, {})\n    bindings to {} MiB, buffers to {} MiB, {} KiB per workgroup of {} threads, {} buffers per kernel, {subgroups}",
         a.name,
         a.kind,
         a.api,
@@ -119,7 +119,7 @@ fn adapter_text(index: usize, a: &Adapter) -> String {
         mib(a.max_binding_bytes),
         mib(a.max_buffer_bytes),
         a.workgroup_memory_bytes >> 10,
-        a.max_workgroup_units,
+        a.max_workgroup_threads,
         a.max_storage_buffers,
     )
 }

@@ -5,7 +5,7 @@ use crate::args::Render;
 use crate::interrupt;
 use crate::model_source::{load_model, open_scene};
 use crate::orbit::orbit;
-use cc4dgs_backends::ops::picture::read_picture;
+use cc4dgs_backends::ops::image::read_image;
 use cc4dgs_core::{Camera, Error, Event, EventSink, Result};
 use cc4dgs_engine::pictures::write_png;
 use cc4dgs_engine::play::Player;
@@ -47,7 +47,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     for (index, (camera, time_norm)) in shots.iter().enumerate() {
         interrupt::check(stop, &format!("after {index} of {} frames in {}", shots.len(), args.out.display()))?;
         let (output, time) = player.render(camera, *time_norm)?;
-        let picture = read_picture(output.planes)?;
+        let picture = read_image(output.planes)?;
         write_png(&args.out.join(format!("frame_{index:05}.png")), &picture)?;
         times.push(time);
         events.emit(&Event::Progress { task: "render".into(), done: index as u64 + 1, total: shots.len() as u64 });

@@ -3,7 +3,7 @@
 use super::Context;
 use crate::args::Train;
 use crate::interrupt;
-use cc4dgs_core::{DeformerContext, Result, Scene, Seed, parse_device};
+use cc4dgs_core::{AppearanceContext, DeformerContext, Result, Scene, Seed, parse_device};
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::data;
 use cc4dgs_engine::train::{CONFIG, TrainJob, TrainReport, train};
@@ -54,8 +54,8 @@ pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out:
     let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &config.limits)?);
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;
-    let job = TrainJob { config, scene: scene.clone(), out: out.to_path_buf(), resume, registry: &context.registry, events: &events, stop };
-    Ok((scene.name.clone(), train(&job)?))
+    let job = TrainJob { config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop };
+    Ok((scene.name.clone(), train(&job)?.1))
 }
 
 /// Builds every plug-in of the configuration once and drops it: a mistake in the deformer's settings should not wait for the main stage, nor leave
@@ -66,6 +66,9 @@ fn check_plugins(context: &Context, config: &RunConfig) -> Result<()> {
     let seed = Seed::root(config.seed).child("check");
     let field = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: config.train.sh_degree, seed };
     context.registry.build_deformer(&config.deformer, &field, &device)?;
+    context.registry.build_density(&config.density)?;
+    context.registry.build_appearance(&config.appearance, &AppearanceContext { cameras: 1, seed }, &device)?;
+    context.registry.build_optimizer(&config.optimizer)?;
     Ok(())
 }
 
@@ -78,6 +81,6 @@ pub fn text(report: &TrainReport) -> String {
         stages.join(", "),
         report.gaussians,
         report.dynamic_gaussians,
-        report.checkpoint.display()
+        report.checkpoint.as_ref().map_or_else(String::new, |path| path.display().to_string())
     )
 }

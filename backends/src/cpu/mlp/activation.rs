@@ -1,5 +1,7 @@
 //! Mish and LayerNorm over rows, forward and backward, in loops that vectorise.
 
+use crate::ops::networks::LAYER_NORM_EPSILON;
+
 /// e^x for |x| <= 87, branch-free; relative error below 2e-7.
 #[inline(always)]
 pub fn exp(x: f32) -> f32 {
@@ -7,7 +9,7 @@ pub fn exp(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0;
     let shifted = x * std::f32::consts::LOG2_E + ROUND;
     let n = shifted - ROUND;
-    // ln 2 in two parts, so that the remainder keeps its bits.
+    // ln 2 in two parts, so that the remainder is exact.
     let r = (x - n * 0.693_359_4) + n * 2.121_944_4e-4;
     let mut p = 1.987_569_1e-4;
     p = p * r + 1.398_199_9e-3;
@@ -45,9 +47,6 @@ pub fn mish_derivative(x: f32) -> f32 {
     n * inverse + x * (4.0 * e * (e + 1.0) * inverse) * inverse
 }
 
-/// Added to the variance under the root.
-pub const LAYER_NORM_EPSILON: f32 = 1e-5;
-
 /// Sum of one row in a fixed order that vectorises.
 #[inline(always)]
 fn row_sum(row: &[f32]) -> f32 {
@@ -70,7 +69,7 @@ fn row_sum(row: &[f32]) -> f32 {
     lanes[0] + rest
 }
 
-/// Normalises each row of `z` [rows, n] to zero mean and unit (biased) variance in place; `inverse_std` [rows] keeps the scales.
+/// Normalises each row of `z` `[rows, n]` to zero mean and unit (biased) variance in place; `inverse_std` `[rows]` receives the scales.
 #[inline(always)]
 pub fn normalize_rows(z: &mut [f32], n: usize, inverse_std: &mut [f32], work: &mut [f32]) {
     let work = &mut work[..n];
@@ -100,8 +99,8 @@ pub fn affine_mish_rows(out: &mut [f32], normalized: &[f32], gain: &[f32], shift
     }
 }
 
-/// Backward of [`normalize_rows`] and [`affine_mish_rows`] together. `grad` [rows, n] holds d loss / d out and becomes
-/// d loss / d (input of the normalisation); `grad_gain` and `grad_shift` [n] are added to.
+/// Backward of [`normalize_rows`] and [`affine_mish_rows`] together. `grad` `[rows, n]` holds d loss / d out and becomes
+/// d loss / d (input of the normalisation); `grad_gain` and `grad_shift` `[n]` are added to.
 #[inline(always)]
 pub fn affine_mish_backward(
     grad: &mut [f32],
@@ -120,7 +119,7 @@ pub fn affine_mish_backward(
     layer_norm_backward(grad, normalized, inverse_std, gain, (grad_gain, grad_shift), work);
 }
 
-/// Backward of LayerNorm: `grad` [rows, n] holds d loss / d (normalized * gain + shift) and becomes d loss / d input.
+/// Backward of LayerNorm: `grad` `[rows, n]` holds d loss / d (normalized * gain + shift) and becomes d loss / d input.
 #[inline(always)]
 pub fn layer_norm_backward(
     grad: &mut [f32],

@@ -2,7 +2,7 @@
 
 use gemm::{Parallelism, gemm};
 
-/// `out` [rows, n] = `x` [rows, k] * `w` [k, n], added to what `out` holds if `accumulate`.
+/// `out` `[rows, n]` = `x` `[rows, k]` * `w` `[k, n]`, added to what `out` holds if `accumulate`.
 pub fn matmul(out: &mut [f32], x: &[f32], w: &[f32], (rows, k, n): (usize, usize, usize), accumulate: bool) {
     assert!(out.len() >= rows * n && x.len() >= rows * k && w.len() >= k * n, "matmul: slices shorter than {rows}x{k}x{n}");
     if rows == 0 || n == 0 {
@@ -35,7 +35,7 @@ pub fn matmul(out: &mut [f32], x: &[f32], w: &[f32], (rows, k, n): (usize, usize
     }
 }
 
-/// `out` [k, n] += `x` [rows, k]^T * `g` [rows, n]: the gradient of a weight matrix.
+/// `out` `[k, n]` += `x`^T * `g` for `x` `[rows, k]` and `g` `[rows, n]`: the gradient of a weight matrix.
 pub fn add_transposed_matmul(out: &mut [f32], x: &[f32], g: &[f32], (rows, k, n): (usize, usize, usize)) {
     assert!(out.len() >= k * n && x.len() >= rows * k && g.len() >= rows * n, "add_transposed_matmul: slices shorter than {rows}x{k}x{n}");
     if rows == 0 || n == 0 || k == 0 {
@@ -67,7 +67,7 @@ pub fn add_transposed_matmul(out: &mut [f32], x: &[f32], g: &[f32], (rows, k, n)
     }
 }
 
-/// The transpose [n, k] of `w` [k, n].
+/// The transpose `[n, k]` of `w` `[k, n]`.
 pub fn transposed(w: &[f32], (k, n): (usize, usize)) -> Vec<f32> {
     let mut out = vec![0.0; k * n];
     for (i, row) in w.chunks_exact(n.max(1)).enumerate() {
@@ -78,7 +78,7 @@ pub fn transposed(w: &[f32], (k, n): (usize, usize)) -> Vec<f32> {
     out
 }
 
-/// Every row of `out` [rows, n] = `bias` [n].
+/// Every row of `out` `[rows, n]` = `bias` `[n]`.
 #[inline(always)]
 pub fn fill_rows(out: &mut [f32], bias: &[f32]) {
     for row in out.chunks_exact_mut(bias.len().max(1)) {
@@ -86,7 +86,7 @@ pub fn fill_rows(out: &mut [f32], bias: &[f32]) {
     }
 }
 
-/// `out` [n] += the sum of the rows of `g` [rows, n].
+/// `out` `[n]` += the sum of the rows of `g` `[rows, n]`.
 #[inline(always)]
 pub fn add_column_sums(out: &mut [f32], g: &[f32]) {
     for row in g.chunks_exact(out.len().max(1)) {

@@ -1,6 +1,6 @@
-//! The hash-feature decoder's network: (Linear, LayerNorm, Mish) for each hidden layer, then Linear (paper Section IV-B).
+//! The hash-feature decoder's network: (Linear, LayerNorm, Mish) for each hidden layer, then Linear (CC-4DGS, Section IV-B).
 //!
-//! Weights are one flat array. Per hidden layer: W [in, out] row-major (y = x W + b), b [out], LayerNorm gain [out], shift [out]; then W and b
+//! Weights are one flat array. Per hidden layer: W `[in, out]` row-major (y = x W + b), b `[out]`, LayerNorm gain `[out]`, shift `[out]`; then W and b
 //! of the output layer. Rows are processed in blocks of a fixed, padded size, so that the result of a row does not depend on which rows
 //! it is computed with.
 
@@ -9,69 +9,11 @@ use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, t
 use super::{blocks_per_run, sum_in_order};
 use crate::cpu::scratch::{Scratch, scratch};
 use crate::cpu::simd::vectorized;
+use crate::ops::networks::{MishLayer, MishShape};
 use rayon::prelude::*;
-use std::ops::Range;
 
 /// Rows per block.
 pub const BLOCK: usize = 128;
-
-/// Layer widths: input, hidden layers, output.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct MishShape {
-    /// Input width.
-    pub input: usize,
-    /// Widths of the hidden layers.
-    pub hidden: Vec<usize>,
-    /// Output width.
-    pub output: usize,
-}
-
-/// Where the arrays of one layer lie in the flat weights.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct MishLayer {
-    /// Input width.
-    pub input: usize,
-    /// Output width.
-    pub output: usize,
-    /// W [input, output].
-    pub weight: Range<usize>,
-    /// b [output].
-    pub bias: Range<usize>,
-    /// LayerNorm gain [output]; `None` for the output layer, which has no norm and no activation.
-    pub gain: Option<Range<usize>>,
-    /// LayerNorm shift [output].
-    pub shift: Option<Range<usize>>,
-}
-
-impl MishShape {
-    /// The layers in order.
-    pub fn layers(&self) -> Vec<MishLayer> {
-        let mut at = 0;
-        let mut take = |n: usize| {
-            at += n;
-            at - n..at
-        };
-        let widths: Vec<usize> = self.hidden.iter().copied().chain([self.output]).collect();
-        let mut input = self.input;
-        let mut layers = Vec::with_capacity(widths.len());
-        for (i, &output) in widths.iter().enumerate() {
-            let hidden = i < self.hidden.len();
-            let (weight, bias) = (take(input * output), take(output));
-            let gain = hidden.then(|| take(output));
-            let shift = hidden.then(|| take(output));
-            layers.push(MishLayer { input, output, weight, bias, gain, shift });
-            input = output;
-        }
-        layers
-    }
-    /// The number of weights.
-    pub fn parameter_count(&self) -> usize {
-        self.layers().last().map_or(0, |l| l.bias.end)
-    }
-    fn widest(&self) -> usize {
-        self.hidden.iter().copied().chain([self.input, self.output]).max().unwrap_or(0)
-    }
-}
 
 /// Writes the input rows of a block: the first row's index and the rows to fill.
 pub type RowSource<'a> = dyn Fn(usize, &mut [f32]) + Sync + 'a;
@@ -122,7 +64,7 @@ impl Block {
     }
 }
 
-/// The outputs [rows, output] of the network for `count` rows.
+/// The outputs `[rows, output]` of the network for `count` rows.
 pub fn forward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource) -> Vec<f32> {
     let layers = shape.layers();
     let mut out = vec![0.0f32; count * shape.output];
@@ -137,8 +79,8 @@ pub fn forward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSourc
     out
 }
 
-/// The gradient of the weights given `grad` [rows, output], and, if `input_grad` [rows, input] is given, the gradient of the inputs.
-/// Activations are computed again rather than kept: at these widths that is cheaper than writing them out and reading them back.
+/// The gradient of the weights given `grad` `[rows, output]`, and, if `input_grad` `[rows, input]` is given, the gradient of the inputs.
+/// Activations are recomputed instead of saved: at these widths that is cheaper than writing and reading them.
 pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSource, grad: &[f32], input_grad: Option<&mut [f32]>) -> Vec<f32> {
     let layers = shape.layers();
     if count == 0 {
@@ -173,7 +115,7 @@ pub fn backward(shape: &MishShape, weights: &[f32], count: usize, rows: &RowSour
     sum_in_order(parts)
 }
 
-/// `g[0]` holds the gradient of the block's output and ends as that of its input (if wanted); `total` is added to.
+/// `g[0]` holds the gradient of the block's output and ends as that of its input (if requested); `total` is added to.
 fn block_backward(layers: &[MishLayer], weights: &[f32], back: &[Vec<f32>], block: &mut Block, g: &mut [Scratch; 2], total: &mut [f32], wants_input: bool) {
     for (i, layer) in layers.iter().enumerate().rev() {
         let len = BLOCK * layer.output;

@@ -1,93 +1,19 @@
 //! A trunk of Linear + ReLU layers that feeds any number of heads, each Linear (ReLU, Linear)* with no activation at its end
-//! (paper Section IV-B: the deformation network). A plain network is a trunk without heads or one head without a trunk.
+//! (CC-4DGS, Section IV-B: the deformation network). A plain network is a trunk without heads or one head without a trunk.
 //!
-//! Weights are one flat array: per layer W [in, out] row-major (y = x W + b), then b [out]; the trunk first, then head by head.
-//! The outputs are one flat array too, head after head, each [rows, width]; without heads, the trunk's output.
+//! Weights are one flat array: per layer W `[in, out]` row-major (y = x W + b), then b `[out]`; the trunk first, then head by head.
+//! The outputs are one flat array too, head after head, each `[rows, width]`; without heads, the trunk's output.
 
 use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, transposed};
 use super::{blocks_per_run, sum_in_order};
 use crate::cpu::heads::row_blocks;
 use crate::cpu::scratch::{Scratch, scratch};
 use crate::cpu::simd::vectorized;
+use crate::ops::networks::{Layer, ReluShape};
 use rayon::prelude::*;
-use std::ops::Range;
 
 /// Rows per block.
 pub const BLOCK: usize = 128;
-
-/// Layer widths of trunk and heads.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct ReluShape {
-    /// Input width.
-    pub input: usize,
-    /// Output widths of the trunk's layers; each ends in a ReLU.
-    pub trunk: Vec<usize>,
-    /// Per head, the output widths of its layers; all but the last end in a ReLU.
-    pub heads: Vec<Vec<usize>>,
-}
-
-/// One layer: its place in the tree and in the flat weights.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Layer {
-    /// The layer whose output it reads; `None` is the network's input.
-    pub(crate) parent: Option<usize>,
-    pub(crate) input: usize,
-    pub(crate) output: usize,
-    pub(crate) weight: Range<usize>,
-    pub(crate) bias: Range<usize>,
-    pub(crate) relu: bool,
-    /// Which output it writes, if any.
-    pub(crate) slot: Option<usize>,
-}
-
-impl ReluShape {
-    /// A chain of Linear + ReLU layers ending in a Linear layer, if `widths` is input, hidden…, output.
-    pub fn chain(widths: &[usize]) -> Self {
-        match widths {
-            [input, rest @ ..] => Self { input: *input, trunk: Vec::new(), heads: vec![rest.to_vec()] },
-            [] => Self::default(),
-        }
-    }
-    pub(crate) fn layers(&self) -> Vec<Layer> {
-        let mut layers: Vec<Layer> = Vec::new();
-        let mut at = 0;
-        let mut push = |parent: Option<usize>, input: usize, output: usize, relu: bool, slot: Option<usize>| {
-            let weight = at..at + input * output;
-            let bias = weight.end..weight.end + output;
-            at = bias.end;
-            layers.push(Layer { parent, input, output, weight, bias, relu, slot });
-            layers.len() - 1
-        };
-        let (mut parent, mut width) = (None, self.input);
-        for (i, &output) in self.trunk.iter().enumerate() {
-            let last = self.heads.is_empty() && i + 1 == self.trunk.len();
-            parent = Some(push(parent, width, output, true, last.then_some(0)));
-            width = output;
-        }
-        for (slot, head) in self.heads.iter().enumerate() {
-            let (mut parent, mut width) = (parent, width);
-            for (i, &output) in head.iter().enumerate() {
-                let last = i + 1 == head.len();
-                parent = Some(push(parent, width, output, !last, last.then_some(slot)));
-                width = output;
-            }
-        }
-        layers
-    }
-    /// The number of weights.
-    pub fn parameter_count(&self) -> usize {
-        self.layers().last().map_or(0, |l| l.bias.end)
-    }
-    /// The widths of the outputs, in order.
-    pub fn output_widths(&self) -> Vec<usize> {
-        if self.heads.is_empty() { self.trunk.last().copied().into_iter().collect() } else { self.heads.iter().filter_map(|h| h.last().copied()).collect() }
-    }
-    /// Whether every layer has a width and every head a layer.
-    pub fn is_sound(&self) -> bool {
-        let widths = self.trunk.iter().chain(self.heads.iter().flatten());
-        self.input > 0 && widths.clone().count() > 0 && widths.clone().all(|&w| w > 0) && self.heads.iter().all(|h| !h.is_empty())
-    }
-}
 
 #[inline(always)]
 fn relu(values: &mut [f32]) {
@@ -103,7 +29,7 @@ fn relu_backward(grad: &mut [f32], output: &[f32]) {
     }
 }
 
-/// The outputs of all layers for one block of `x` [count, input].
+/// The outputs of all layers for one block of `x` `[count, input]`.
 fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, outputs: &mut [Scratch]) {
     for (i, layer) in layers.iter().enumerate() {
         let (before, rest) = outputs.split_at_mut(i);
@@ -120,7 +46,7 @@ fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, out
     }
 }
 
-/// The flat outputs for `x` [rows, input].
+/// The flat outputs for `x` `[rows, input]`.
 pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
     let layers = shape.layers();
     let count = x.len() / shape.input.max(1);
@@ -143,7 +69,7 @@ pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
 }
 
 /// The gradients `(x [rows, input], weights)` given that of the flat outputs; the first is empty unless `wants_input`.
-/// Activations are computed again rather than kept.
+/// Activations are recomputed instead of saved.
 pub fn backward(shape: &ReluShape, weights: &[f32], x: &[f32], grad: &[f32], wants_input: bool) -> (Vec<f32>, Vec<f32>) {
     let layers = shape.layers();
     let count = x.len() / shape.input.max(1);

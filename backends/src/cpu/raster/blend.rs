@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Sigma up to which the exponential is evaluated; alpha is far below 1/255 beyond.
 pub const SIGMA_MAX: f32 = 87.0;
-/// How many list entries ahead Gaussians are asked for.
+/// Prefetch distance in list entries.
 pub const AHEAD: usize = 6;
 /// Planes of the output.
 const PLANES: usize = 5;
@@ -24,7 +24,7 @@ pub fn column_centers(origin_x: usize) -> [f32; TILE] {
     std::array::from_fn(|x| (origin_x + x) as f32 + 0.5)
 }
 
-/// Blends every tile into `planes` [5,H,W] and keeps what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
+/// Blends every tile into `planes` `[5,H,W]` and saves what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
 pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, planes: &mut [f32]) -> u64 {
     let tiles_x = settings.width.div_ceil(TILE);
     let tiles = tiles_x * settings.height.div_ceil(TILE);
@@ -49,10 +49,10 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
     run_tasks(tiles, |position| {
         let tile = order[position] as usize;
         let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
-        let places = starts[tile] as usize..starts[tile + 1] as usize;
-        // SAFETY: a place in the list belongs to one tile.
-        let weights: &mut [f32] = if settings.max_weights { unsafe { weights.slice(places.start, places.len()) } } else { &mut [] };
-        let list = &list[places];
+        let entries = starts[tile] as usize..starts[tile + 1] as usize;
+        // SAFETY: an entry of the list belongs to one tile.
+        let weights: &mut [f32] = if settings.max_weights { unsafe { weights.slice(entries.start, entries.len()) } } else { &mut [] };
+        let list = &list[entries];
         // SAFETY: every tile has its own part of these.
         let (transmittance, stop_at) = unsafe { (transmittance.slice(tile * TILE_PIXELS, TILE_PIXELS), stop_at.slice(tile * TILE_PIXELS, TILE_PIXELS)) };
         let mut state = TileState::new(origin, settings, stop_at);
@@ -97,7 +97,7 @@ pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
     let mut out = vec![0.0f32; n];
     for (rank, splat) in workspace.ranked.iter().enumerate() {
         let pairs = workspace.pair_start[rank] as usize..workspace.pair_start[rank + 1] as usize;
-        let weights = workspace.place_of_pair[pairs].iter().map(|&place| workspace.pair_weights[place as usize]);
+        let weights = workspace.list_index_of_pair[pairs].iter().map(|&index| workspace.pair_weights[index as usize]);
         out[splat.index as usize] = weights.fold(0.0, f32::max);
     }
     out
@@ -105,7 +105,7 @@ pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
 
 /// Running numbers of one tile.
 struct TileState<'a> {
-    /// Transmittance so far; NaN where the pixel has stopped or lies outside the image.
+    /// Transmittance so far; NaN where the pixel has stopped or is outside the image.
     running: TilePlane,
     /// Transmittance of stopped pixels.
     stopped: TilePlane,

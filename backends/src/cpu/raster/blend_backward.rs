@@ -12,33 +12,44 @@ use super::{RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
 use crate::cpu::simd::{Lanes, dispatch, each, prefetch};
 use pulp::{Simd, WithSimd};
 
-/// Fills the gradient records of all pairs from `upstream` [5,H,W].
-pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32]) {
+/// Fills the gradient records of all pairs from `upstream` `[5,H,W]`; with `absolute`, also the sums of absolute gradients of the centres.
+pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32], absolute: bool) {
     let rules = RuleConstants::new(settings);
     let tiles_x = settings.width.div_ceil(TILE);
     let buffers = &mut **workspace;
     set_len(&mut buffers.records, buffers.list.len());
+    set_len(&mut buffers.absolute, if absolute { buffers.list.len() } else { 0 });
     let records = SharedMut::new(&mut buffers.records);
+    let absolute_sums = SharedMut::new(&mut buffers.absolute);
     let (list, starts, ranked, order) = (&buffers.list, &buffers.tile_start, &buffers.ranked, &buffers.tile_order);
     let (ends, stops) = (&buffers.tile_end, &buffers.tile_stops);
     let (transmittance, stop_at) = (&buffers.final_transmittance, &buffers.stop_at);
     run_tasks(order.len(), |position| {
         let tile = order[position] as usize;
         let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
-        let places = starts[tile] as usize..starts[tile + 1] as usize;
-        // SAFETY: a place in the list belongs to one tile.
-        let records = unsafe { records.slice(places.start, places.len()) };
-        let list = &list[places];
+        let entries = starts[tile] as usize..starts[tile + 1] as usize;
+        // SAFETY: an entry of the list belongs to one tile.
+        let (records, absolute_sums) = unsafe {
+            let counted = if absolute { entries.clone() } else { 0..0 };
+            (records.slice(entries.start, entries.len()), absolute_sums.slice(counted.start, counted.len()))
+        };
+        let list = &list[entries];
         let pixels = tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS;
         let mut state = TileGradient::new(origin, settings, background, upstream, &transmittance[pixels.clone()]);
         let end = if state.live_rows == 0 { 0 } else { ends[tile] as usize };
         records[end..].fill([0.0; RECORD]);
-        let kernel = BackTile { ranked, list: &list[..end], origin, rules: &rules, state: &mut state, stop_at: &stop_at[pixels], records };
-        match (stops[tile] != 0, kernel.state.depth_matters) {
-            (false, false) => dispatch(Flags::<false, false>(kernel)),
-            (false, true) => dispatch(Flags::<false, true>(kernel)),
-            (true, false) => dispatch(Flags::<true, false>(kernel)),
-            (true, true) => dispatch(Flags::<true, true>(kernel)),
+        if absolute {
+            absolute_sums[end..].fill([0.0; 2]);
+        }
+        let kernel = BackTile { ranked, list: &list[..end], origin, rules: &rules, state: &mut state, stop_at: &stop_at[pixels], records, absolute_sums };
+        match (stops[tile] != 0, kernel.state.depth_matters, absolute) {
+            (false, false, false) => dispatch(Flags::<false, false, false>(kernel)),
+            (false, true, false) => dispatch(Flags::<false, true, false>(kernel)),
+            (true, false, false) => dispatch(Flags::<true, false, false>(kernel)),
+            (true, true, false) => dispatch(Flags::<true, true, false>(kernel)),
+            // Depth without gradient adds zeros: two more kernels suffice.
+            (false, _, true) => dispatch(Flags::<false, true, true>(kernel)),
+            (true, _, true) => dispatch(Flags::<true, true, true>(kernel)),
         }
     });
 }
@@ -95,16 +106,17 @@ struct BackTile<'k> {
     state: &'k mut TileGradient,
     stop_at: &'k [u32],
     records: &'k mut [[f32; RECORD]],
+    absolute_sums: &'k mut [[f32; 2]],
 }
 
-/// Whether pixels of the tile stopped early, and whether depth carries gradient.
-struct Flags<'k, const STOPS: bool, const DEPTH: bool>(BackTile<'k>);
+/// Whether pixels of the tile stopped early, whether depth carries gradient, and whether absolute gradients are summed.
+struct Flags<'k, const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool>(BackTile<'k>);
 
-impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> {
+impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Flags<'_, STOPS, DEPTH, ABSOLUTE> {
     type Output = ();
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let BackTile { ranked, list, origin, rules, state, stop_at, records } = self.0;
+        let BackTile { ranked, list, origin, rules, state, stop_at, records, absolute_sums } = self.0;
         let stop_at: &[f32] = bytemuck::cast_slice(stop_at);
         let like = |v: f32| Lanes::<S>::splat(simd, v);
         let columns = column_centers(origin[0]);
@@ -128,6 +140,7 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
             let depth = like(splat.depth);
             let position = like(f32::from_bits(i as u32 + 1));
             let mut record = [0.0f32; RECORD];
+            let mut absolute = [0.0f32; 2];
             for block in 0..TILE / S::F32_LANES {
                 let first = block * S::F32_LANES;
                 let dx = Lanes::load(simd, &columns[first..]) - splat.center[0];
@@ -136,6 +149,7 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                 let mut v_dy = zero;
                 let mut v_dy2 = zero;
                 let mut shown = [zero; 4];
+                let (mut absolute_x, mut absolute_y) = (zero, zero);
                 let mut left = rows;
                 while left != 0 {
                     let row = left.trailing_zeros() as usize;
@@ -172,6 +186,12 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                     weight.fma(q, behind).store(&mut state.behind[at..]);
                     // d alpha / d sigma = -alpha, uncapped.
                     let v = (hit & full.le(passing)).keep(full) * d_alpha;
+                    if ABSOLUTE {
+                        let along_x = v * dx.fma(like(2.0 * half_a), like(b * dy));
+                        let along_y = v * dx.fma(like(b), like(2.0 * half_c * dy));
+                        absolute_x += along_x.max(-along_x);
+                        absolute_y += along_y.max(-along_y);
+                    }
                     let dy = like(dy);
                     let moment = v * dy;
                     v_sum += v;
@@ -184,7 +204,7 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                 let v_dx = v_sum * dx;
                 let (v, x, xx) = (v_sum.sum(), v_dx.sum(), (v_dx * dx).sum());
                 let (y, xy, yy) = (v_dy.sum(), (v_dy * dx).sum(), v_dy2.sum());
-                // v was -d loss / d sigma: the signs turn here. dx is pixel minus centre.
+                // v was -d loss / d sigma: the signs turn here. dx is pixel minus centre. The order is that of the columns of a record.
                 let part = [
                     2.0 * half_a * x + b * y,
                     b * x + 2.0 * half_c * y,
@@ -200,6 +220,13 @@ impl<const STOPS: bool, const DEPTH: bool> WithSimd for Flags<'_, STOPS, DEPTH> 
                 for (sum, value) in record.iter_mut().zip(part) {
                     *sum += value;
                 }
+                if ABSOLUTE {
+                    absolute[0] += absolute_x.sum();
+                    absolute[1] += absolute_y.sum();
+                }
+            }
+            if ABSOLUTE {
+                absolute_sums[i] = absolute;
             }
             records[i] = record;
         }

@@ -37,15 +37,15 @@ fn write<S: Simd, const WIDTH: usize>(values: &[Lanes<S>; WIDTH], to: &mut [f32]
 
 /// Value and gradients of spherical harmonics (no offset, no clamp).
 pub struct Harmonics {
-    /// Basis values [N,(degree+1)^2].
+    /// Basis values `[N,(degree+1)^2]`.
     pub basis: Vec<f32>,
-    /// Sum over coefficients [N,3].
+    /// Sum over coefficients `[N,3]`.
     pub value: Vec<f32>,
-    /// Gradient of the directions [N,3].
+    /// Gradient of the directions `[N,3]`.
     pub directions: Vec<f32>,
 }
 
-/// Spherical harmonics of `degree` at `directions` [N,3] (any length) with `coefficients` [N,(degree+1)^2,3]; `upstream` [N,3] weighs the value.
+/// Spherical harmonics of `degree` at `directions` `[N,3]` (any length) with `coefficients` `[N,(degree+1)^2,3]`; `upstream` `[N,3]` weighs the value.
 pub fn harmonics(degree: usize, directions: &[f32], coefficients: &[f32], upstream: &[f32]) -> Harmonics {
     struct Kernel<'a>(usize, &'a [f32], &'a [f32], &'a [f32]);
     impl WithSimd for Kernel<'_> {
@@ -93,7 +93,7 @@ pub fn harmonics(degree: usize, directions: &[f32], coefficients: &[f32], upstre
     dispatch(Kernel(degree, directions, coefficients, upstream))
 }
 
-/// Rotation matrices [N,9] of raw quaternions [N,4], and the gradient of the quaternions for `upstream` [N,9].
+/// Rotation matrices `[N,9]` of raw quaternions `[N,4]`, and the gradient of the quaternions for `upstream` `[N,9]`.
 pub fn rotations(quaternions: &[f32], upstream: &[f32]) -> (Vec<f32>, Vec<f32>) {
     struct Kernel<'a>(&'a [f32], &'a [f32]);
     impl WithSimd for Kernel<'_> {
@@ -138,36 +138,36 @@ pub fn rotations(quaternions: &[f32], upstream: &[f32]) -> (Vec<f32>, Vec<f32>) 
 /// Projected Gaussians and, for upstream gradients, the gradients of what was projected.
 #[derive(Default)]
 pub struct Projected {
-    /// Centres in pixels [N,2].
+    /// Centres in pixels `[N,2]`.
     pub centers: Vec<f32>,
-    /// (A,B,C) [N,3].
+    /// (A,B,C) `[N,3]`.
     pub conics: Vec<f32>,
-    /// Camera depths [N].
+    /// Camera depths `[N]`.
     pub depths: Vec<f32>,
-    /// Compensations [N].
+    /// Compensations `[N]`.
     pub compensations: Vec<f32>,
-    /// Blurred covariances xx, xy, yy [N,3].
+    /// Blurred covariances xx, xy, yy `[N,3]`.
     pub covariances: Vec<f32>,
-    /// d loss / d means [N,3].
+    /// d loss / d means `[N,3]`.
     pub d_means: Vec<f32>,
-    /// d loss / d quaternions [N,4].
+    /// d loss / d quaternions `[N,4]`.
     pub d_quaternions: Vec<f32>,
-    /// d loss / d scales [N,3].
+    /// d loss / d scales `[N,3]`.
     pub d_scales: Vec<f32>,
     /// d loss / d world_to_camera, row-major.
     pub d_camera: [f32; 16],
 }
 
-/// Upstream gradients of [`projection`]: centres [N,2], conics [N,3], depths [N], compensations [N].
+/// Upstream gradients of [`projection`]: centres `[N,2]`, conics `[N,3]`, depths `[N]`, compensations `[N]`.
 #[derive(Clone, Copy)]
 pub struct ProjectionUpstream<'a> {
-    /// d loss / d centres [N,2].
+    /// d loss / d centres `[N,2]`.
     pub centers: &'a [f32],
-    /// d loss / d conics [N,3].
+    /// d loss / d conics `[N,3]`.
     pub conics: &'a [f32],
-    /// d loss / d depths [N].
+    /// d loss / d depths `[N]`.
     pub depths: &'a [f32],
-    /// d loss / d compensations [N].
+    /// d loss / d compensations `[N]`.
     pub compensations: &'a [f32],
 }
 

@@ -5,55 +5,34 @@ use super::geometry::{ProjectionGradient, Vec3, project, project_backward};
 use super::parallel::{SharedMut, run_tasks};
 use super::project::{CHUNK, Stage, WIDEST, activate, stage_coefficients, stage_inputs, view_direction};
 use super::scratch::Workspace;
-use super::{RECORD, RasterSettings, SplatArrays, TILE, TILE_PIXELS, sh};
+use super::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, GradientRequest, RECORD, RasterSettings, SplatArrays, TILE, TILE_PIXELS, sh};
 use crate::cpu::simd::{Lanes, dispatch, each};
 use cc4dgs_core::ParameterSpace;
 use pulp::{Simd, WithSimd};
 use std::mem::MaybeUninit;
 
-/// Which gradients are wanted.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct GradientRequest {
-    /// Of the centres.
-    pub means: bool,
-    /// Of the (log-)scales.
-    pub scales: bool,
-    /// Of the raw quaternions.
-    pub quaternions: bool,
-    /// Of the opacities (logits).
-    pub opacities: bool,
-    /// Of the degree-0 coefficients or colours.
-    pub colors: bool,
-    /// Of the higher coefficients.
-    pub sh_rest: bool,
-    /// Of the projected centres in pixels.
-    pub screen: bool,
-    /// Of world_to_camera.
-    pub camera: bool,
-    /// Of the background.
-    pub background: bool,
-}
-
-/// Gradients as asked for; the others are empty.
+/// The gradients in a [`GradientRequest`]; the others are empty.
 #[derive(Clone, Debug, Default)]
 pub struct Gradients {
-    /// [N,3]
+    /// `[N,3]`
     pub means: Vec<f32>,
-    /// [N,3]
+    /// `[N,3]`
     pub scales: Vec<f32>,
-    /// [N,4]
+    /// `[N,4]`
     pub quaternions: Vec<f32>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<f32>,
-    /// [N,3]
+    /// `[N,3]`
     pub colors: Vec<f32>,
-    /// [N,K,3]
+    /// `[N,K,3]`
     pub sh_rest: Vec<f32>,
-    /// [N,2]
+    /// `[N,2]`
     pub screen: Vec<f32>,
-    /// [4,4]
+    /// `[N,2]`
+    pub absolute_screen: Vec<f32>,
+    /// `[4,4]`
     pub camera: Vec<f32>,
-    /// [3]
+    /// `[3]`
     pub background: Vec<f32>,
 }
 
@@ -105,6 +84,7 @@ pub fn gradients(splats: &SplatArrays, settings: &RasterSettings, workspace: &Wo
         Column::new(request.colors, n, 3),
         Column::new(request.sh_rest, n, splats.rest_width()),
         Column::new(request.screen, n, 2),
+        Column::new(request.absolute_screen, n, 2),
     ];
     let mut camera_parts = vec![CameraSums::default(); if request.camera { chunks } else { 0 }];
     {
@@ -127,7 +107,7 @@ pub fn gradients(splats: &SplatArrays, settings: &RasterSettings, workspace: &Wo
     let mut sums = CameraSums::default();
     camera_parts.iter().for_each(|part| sums.add(part));
     // SAFETY: the chunks cover all rows.
-    let [means, scales, quaternions, opacities, colors, sh_rest, screen] = columns.map(|column| unsafe { column.finish(n) });
+    let [means, scales, quaternions, opacities, colors, sh_rest, screen, absolute_screen] = columns.map(|column| unsafe { column.finish(n) });
     Gradients {
         means,
         scales,
@@ -136,6 +116,7 @@ pub fn gradients(splats: &SplatArrays, settings: &RasterSettings, workspace: &Wo
         colors,
         sh_rest,
         screen,
+        absolute_screen,
         camera: if request.camera { sums.matrix_gradient(&settings.world_to_camera).to_vec() } else { Vec::new() },
         background: if request.background { background_gradient(settings, workspace, upstream).to_vec() } else { Vec::new() },
     }
@@ -168,8 +149,19 @@ struct GradientChunk<'a> {
     first: usize,
     count: usize,
     request: &'a GradientRequest,
-    out: [&'a mut [f32]; 7],
+    out: [&'a mut [f32]; OUTPUTS],
 }
+
+/// Arrays with a row per Gaussian, and which is which.
+const OUTPUTS: usize = 8;
+const MEANS: usize = 0;
+const SCALES: usize = 1;
+const QUATERNIONS: usize = 2;
+const OPACITIES: usize = 3;
+const COLORS: usize = 4;
+const SH_REST: usize = 5;
+const SCREEN: usize = 6;
+const ABSOLUTE_SCREEN: usize = 7;
 
 /// Staged columns of the screen side: the record, then 1 per colour channel that is not clamped at zero.
 const SCREEN_ROWS: usize = RECORD + 3;
@@ -192,6 +184,11 @@ impl WithSimd for GradientChunk<'_> {
                 let slot = self.first + start + lane.min(here - 1);
                 let splat = &self.workspace.slots[slot];
                 indices[lane] = splat.index as usize;
+                if lane < here && self.request.absolute_screen {
+                    let row = 2 * (indices[lane] - self.first);
+                    let sums = self.workspace.summed_absolute(self.workspace.rank_of_slot[slot] as usize);
+                    self.out[ABSOLUTE_SCREEN][row..row + 2].copy_from_slice(&sums);
+                }
                 let record = if lane < here { self.workspace.summed_record(self.workspace.rank_of_slot[slot] as usize) } else { [0.0; RECORD] };
                 for (row, value) in screen.iter_mut().zip(record) {
                     row[lane] = value;
@@ -201,7 +198,7 @@ impl WithSimd for GradientChunk<'_> {
                     screen[RECORD + c][lane] = if clamps && splat.color[c] <= 0.0 { 0.0 } else { 1.0 };
                 }
             }
-            // The records of the next group lie all over the lists: ask for them now.
+            // The records of the next group are scattered over the lists: prefetch them.
             for slot in start + here..self.count.min(start + here + S::F32_LANES) {
                 self.workspace.prefetch_records(self.workspace.rank_of_slot[self.first + slot] as usize);
             }
@@ -248,8 +245,9 @@ impl GradientChunk<'_> {
         let p = project(self.camera, mean, [inputs[6], inputs[7], inputs[8], inputs[9]], scales);
         let zero = Lanes::splat(simd, 0.0);
         let one = Lanes::splat(simd, 1.0);
-        let (mut d_opacity, d_compensation) = if self.settings.antialiased { (g[5] * p.compensation, g[5] * opacity) } else { (g[5], zero) };
-        let upstream = ProjectionGradient { center: [g[0], g[1]], conic: [g[2], g[3], g[4]], depth: g[9], compensation: d_compensation };
+        let (mut d_opacity, d_compensation) =
+            if self.settings.antialiased { (g[AT_OPACITY] * p.compensation, g[AT_OPACITY] * opacity) } else { (g[AT_OPACITY], zero) };
+        let upstream = ProjectionGradient { center: [g[AT_X], g[AT_Y]], conic: [g[AT_A], g[AT_B], g[AT_C]], depth: g[AT_DEPTH], compensation: d_compensation };
         let mut d = project_backward(self.camera, mean, &p, &upstream);
         if space == ParameterSpace::Raw {
             d_opacity = d_opacity * opacity * (one - opacity);
@@ -259,7 +257,7 @@ impl GradientChunk<'_> {
         }
         let color: Vec3<S> = each(
             #[inline(always)]
-            |c| g[6 + c] * Lanes::load(simd, &screen[RECORD + c]),
+            |c| g[AT_COLOR + c] * Lanes::load(simd, &screen[RECORD + c]),
         );
         let mut d_colors = color;
         if let Some(degree) = self.settings.sh_degree {
@@ -278,12 +276,12 @@ impl GradientChunk<'_> {
                 camera_sums[9 + k] += d.camera_translation[k];
             }
         }
-        self.scatter(0, indices, &d.mean);
-        self.scatter(1, indices, &d.scales);
-        self.scatter(2, indices, &d.quaternion);
-        self.scatter(3, indices, &[d_opacity]);
-        self.scatter(4, indices, &d_colors);
-        self.scatter(6, indices, &[g[0], g[1]]);
+        self.scatter(MEANS, indices, &d.mean);
+        self.scatter(SCALES, indices, &d.scales);
+        self.scatter(QUATERNIONS, indices, &d.quaternion);
+        self.scatter(OPACITIES, indices, &[d_opacity]);
+        self.scatter(COLORS, indices, &d_colors);
+        self.scatter(SCREEN, indices, &[g[AT_X], g[AT_Y]]);
     }
     /// Gradient of the degree-0 coefficients and of the offset from the camera; writes those of the higher coefficients.
     #[inline(always)]
@@ -315,7 +313,7 @@ impl GradientChunk<'_> {
                 color[c].store(&mut color_columns[c]);
             }
             for (lane, index) in indices.iter().enumerate() {
-                let row = &mut self.out[5][(index - self.first) * width..][..3 * (count - 1)];
+                let row = &mut self.out[SH_REST][(index - self.first) * width..][..3 * (count - 1)];
                 let rgb: [f32; 3] = each(
                     #[inline(always)]
                     |c| color_columns[c][lane],
@@ -336,7 +334,7 @@ impl GradientChunk<'_> {
             offset,
         )
     }
-    /// Writes columns to the rows of the Gaussians `indices` of output `which`, if that is wanted.
+    /// Writes columns to the rows of the Gaussians `indices` of output `which`, if it was requested.
     #[inline(always)]
     fn scatter<S: Simd, const WIDTH: usize>(&mut self, which: usize, indices: &[usize], columns: &[Lanes<S>; WIDTH]) {
         if self.out[which].is_empty() {

@@ -9,7 +9,6 @@
 
 mod blend;
 mod blend_backward;
-pub mod camera;
 pub mod check;
 pub mod geometry;
 mod gradient;
@@ -19,68 +18,28 @@ mod scratch;
 pub mod sh;
 mod tiles;
 
-pub use gradient::{GradientRequest, Gradients};
+pub use gradient::Gradients;
 pub use scratch::Workspace;
 
+use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, MAX_TILE_PAIRS, RECORD, TILE, TILE_PIXELS};
+use crate::ops::rasterize::{GradientRequest, RasterSettings, camera};
 use camera::{CameraConstants, RuleConstants};
-use cc4dgs_core::{ParameterSpace, RenderWork, Rules};
-
-/// Pixels along the side of a tile.
-pub const TILE: usize = 16;
-/// Pixels of a tile.
-pub const TILE_PIXELS: usize = TILE * TILE;
-/// Pairs of Gaussians and tiles one render may need at most, bounding boxes counted (about 7 GB of working memory).
-pub const MAX_TILE_PAIRS: u64 = 1 << 27;
-/// Numbers per gradient record: centre (2), conic (3), opacity, colour (3), depth.
-pub const RECORD: usize = 10;
-
-/// Everything a render needs besides the Gaussians; plain numbers, the same for every device.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RasterSettings {
-    /// Image width in pixels.
-    pub width: usize,
-    /// Image height in pixels.
-    pub height: usize,
-    /// Focal length along x in pixels.
-    pub fx: f64,
-    /// Focal length along y in pixels.
-    pub fy: f64,
-    /// Principal point x in pixels.
-    pub cx: f64,
-    /// Principal point y in pixels.
-    pub cy: f64,
-    /// World to camera, row-major, OpenCV axes.
-    pub world_to_camera: [[f64; 4]; 4],
-    /// Corner-case rules.
-    pub rules: Rules,
-    /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
-    pub near: Option<f32>,
-    /// Multiply opacity by the compensation of the pixel blur.
-    pub antialiased: bool,
-    /// Whether scales and opacities still want their activations.
-    pub space: ParameterSpace,
-    /// Degree of the spherical harmonics, or `None` for colours blended as they are.
-    pub sh_degree: Option<usize>,
-    /// Find the largest blending weight of every Gaussian.
-    pub max_weights: bool,
-    /// Room for so many (Gaussian, tile) pairs where asking for their number would cost a wait; `None` makes room for all.
-    pub pair_room: Option<usize>,
-}
+use cc4dgs_core::RenderWork;
 
 /// The arrays of N Gaussians, row-major.
 #[derive(Clone, Copy, Debug)]
 pub struct SplatArrays<'a> {
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: &'a [f32],
-    /// Log-scales or scales [N,3].
+    /// Log-scales or scales `[N,3]`.
     pub scales: &'a [f32],
-    /// Raw quaternions (w,x,y,z) [N,4].
+    /// Raw quaternions (w,x,y,z) `[N,4]`.
     pub quaternions: &'a [f32],
-    /// Logits or opacities [N].
+    /// Logits or opacities `[N]`.
     pub opacities: &'a [f32],
-    /// Degree-0 coefficients, or colours [N,3].
+    /// Degree-0 coefficients, or colours `[N,3]`.
     pub colors: &'a [f32],
-    /// Higher coefficients [N,K,3].
+    /// Higher coefficients `[N,K,3]`.
     pub sh_rest: &'a [f32],
     /// Colour behind everything.
     pub background: [f32; 3],
@@ -126,9 +85,9 @@ pub struct ScreenSplat {
 pub struct Forward {
     /// Planes [5,H,W]: red, green, blue, alpha, depth.
     pub planes: Vec<f32>,
-    /// Screen radius in pixels, 0 where culled [N].
+    /// Screen radius in pixels, 0 where culled `[N]`.
     pub radii: Vec<i64>,
-    /// Largest blending weight [N]; empty unless asked for.
+    /// Largest blending weight `[N]`; empty unless the settings ask for it.
     pub max_weights: Vec<f32>,
     /// Counts of work.
     pub work: RenderWork,
@@ -162,11 +121,11 @@ fn forward_in_pool(splats: &SplatArrays, settings: &RasterSettings) -> Result<Fo
     Ok(Forward { planes, radii, max_weights, work, workspace })
 }
 
-/// Gradients of a render from d loss / d planes [5,H,W].
+/// Gradients of a render from d loss / d planes `[5,H,W]`.
 pub fn backward(splats: &SplatArrays, settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32], request: &GradientRequest) -> Gradients {
     let mut result = None;
     rayon::scope(|_| {
-        blend_backward::blend_backward_all(splats.background, settings, workspace, upstream);
+        blend_backward::blend_backward_all(splats.background, settings, workspace, upstream, request.absolute_screen);
         result = Some(gradient::gradients(splats, settings, workspace, upstream, request));
     });
     result.unwrap_or_default()
@@ -175,6 +134,6 @@ pub fn backward(splats: &SplatArrays, settings: &RasterSettings, workspace: &mut
 /// Gradient of the screen-space quantities of every visible Gaussian, front to back: (Gaussian, [d centre (2), d (A,B,C), d opacity with
 /// compensation, d colour (3), d depth]).
 pub fn screen_gradients(background: [f32; 3], settings: &RasterSettings, workspace: &mut Workspace, upstream: &[f32]) -> Vec<(u32, [f32; RECORD])> {
-    rayon::scope(|_| blend_backward::blend_backward_all(background, settings, workspace, upstream));
+    rayon::scope(|_| blend_backward::blend_backward_all(background, settings, workspace, upstream, false));
     (0..workspace.ranked.len()).map(|rank| (workspace.ranked[rank].index, workspace.summed_record(rank))).collect()
 }

@@ -211,7 +211,7 @@ impl ProjectChunk<'_> {
     /// Adds one visible Gaussian.
     #[inline(always)]
     fn emit(&mut self, offset: usize, v: &[f32; 12]) {
-        // Inria keeps integer radii below 2^31; so do we.
+        // Integer radii stay below 2^31, as in Inria's code.
         let radius = v[11].ceil().min(1e9) as i64;
         if self.rules.square_tiles && tiles::square([v[0], v[1]], radius, self.settings).iter().any(|axis| axis[0] >= axis[1]) {
             return;

@@ -5,10 +5,10 @@ use super::{RECORD, ScreenSplat};
 use crate::cpu::simd::prefetch;
 use std::sync::Mutex;
 
-/// Workspaces kept for reuse.
-const KEPT: usize = 4;
-/// Bytes a kept workspace may hold.
-const KEPT_BYTES: usize = 512 << 20;
+/// Workspaces in the pool.
+const POOLED: usize = 4;
+/// Upper bound on the bytes of a workspace in the pool.
+const POOLED_BYTES: usize = 512 << 20;
 
 static POOL: Mutex<Vec<Buffers>> = Mutex::new(Vec::new());
 
@@ -57,7 +57,7 @@ impl Entry {
 /// Buffers of one render.
 #[derive(Default)]
 pub struct Buffers {
-    /// Visible Gaussians by slot: those of a chunk of inputs lie side by side from the chunk's start.
+    /// Visible Gaussians by slot: those of a chunk of inputs follow each other from the chunk's start.
     pub slots: Vec<ScreenSplat>,
     /// Footprints by slot.
     pub footprints: Vec<Footprint>,
@@ -73,8 +73,8 @@ pub struct Buffers {
     pub rank_of_slot: Vec<u32>,
     /// First pair of every rank, and the end.
     pub pair_start: Vec<u32>,
-    /// Position in `list` of every pair.
-    pub place_of_pair: Vec<u32>,
+    /// Index in `list` of every pair.
+    pub list_index_of_pair: Vec<u32>,
     /// Pairs per binning task.
     pub pairs: Vec<Vec<Pair>>,
     /// Entries per binning task and tile.
@@ -93,9 +93,11 @@ pub struct Buffers {
     pub final_transmittance: Vec<f32>,
     /// Position in the list where the pixel stopped, per tile and pixel.
     pub stop_at: Vec<u32>,
-    /// Gradient records by position in `list`.
+    /// Gradient records by index in `list`.
     pub records: Vec<[f32; RECORD]>,
-    /// Largest weight by position in `list`, when asked for.
+    /// Sums of absolute gradients of the centre (x, y) by index in `list`, when asked for.
+    pub absolute: Vec<[f32; 2]>,
+    /// Largest weight by index in `list`, when asked for.
     pub pair_weights: Vec<f32>,
 }
 
@@ -106,6 +108,7 @@ impl Buffers {
             + 16 * (self.footprints.capacity() + self.order.capacity())
             + 12 * self.list.capacity()
             + 4 * RECORD * self.records.capacity()
+            + 8 * self.absolute.capacity()
             + 8 * self.final_transmittance.capacity()
             + pairs
     }
@@ -118,23 +121,33 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// Takes a workspace whose contents are leftovers.
+    /// Takes a workspace; its contents are arbitrary.
     pub fn take() -> Self {
         Self { buffers: POOL.lock().ok().and_then(|mut pool| pool.pop()).unwrap_or_default() }
     }
-    /// Asks for the records that [`Workspace::summed_record`] will read.
+    /// Prefetches the records that [`Workspace::summed_record`] will read.
     #[inline(always)]
     pub fn prefetch_records(&self, rank: usize) {
-        for &place in &self.place_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
-            prefetch(&self.records, place as usize);
+        for &index in &self.list_index_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            prefetch(&self.records, index as usize);
         }
     }
     /// The sum of the records of the Gaussian at `rank`, in the order of its tiles.
     #[inline(always)]
     pub fn summed_record(&self, rank: usize) -> [f32; RECORD] {
         let mut sum = [0.0f32; RECORD];
-        for &place in &self.place_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
-            for (a, b) in sum.iter_mut().zip(&self.records[place as usize]) {
+        for &index in &self.list_index_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            for (a, b) in sum.iter_mut().zip(&self.records[index as usize]) {
+                *a += b;
+            }
+        }
+        sum
+    }
+    /// As [`Workspace::summed_record`], for the absolute gradients of the centre.
+    pub fn summed_absolute(&self, rank: usize) -> [f32; 2] {
+        let mut sum = [0.0f32; 2];
+        for &index in &self.list_index_of_pair[self.pair_start[rank] as usize..self.pair_start[rank + 1] as usize] {
+            for (a, b) in sum.iter_mut().zip(self.absolute[index as usize]) {
                 *a += b;
             }
         }
@@ -165,9 +178,9 @@ impl std::fmt::Debug for Workspace {
 
 impl Drop for Workspace {
     fn drop(&mut self) {
-        if self.buffers.bytes() <= KEPT_BYTES
+        if self.buffers.bytes() <= POOLED_BYTES
             && let Ok(mut pool) = POOL.lock()
-            && pool.len() < KEPT
+            && pool.len() < POOLED
         {
             pool.push(std::mem::take(&mut self.buffers));
         }

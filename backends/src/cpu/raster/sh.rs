@@ -57,7 +57,7 @@ pub fn basis<S: Simd>(degree: usize, d: Vec3<S>, out: &mut [Lanes<S>; MAX_BASIS]
     out[24] = (xx * (xx - yy * 3.0) - yy * (xx * 3.0 - yy)) * C4[8];
 }
 
-/// Gradient with respect to the unit direction of sum_k h[k] basis[k]; the part along the direction means nothing.
+/// Gradient with respect to the unit direction of sum_k h`[k]` basis`[k]`; its component along the direction has no meaning.
 #[inline(always)]
 pub fn basis_backward<S: Simd>(degree: usize, d: Vec3<S>, h: &[Lanes<S>; MAX_BASIS]) -> Vec3<S> {
     let [x, y, z] = d;

@@ -11,7 +11,7 @@ use pulp::{Simd, WithSimd};
 
 /// Binning tasks. The lists do not depend on it.
 const TASKS: usize = 8;
-/// How far ahead data is asked for.
+/// Prefetch distance.
 const AHEAD: usize = 8;
 /// Bits of a digit of the radix sort.
 const DIGIT: u32 = 12;
@@ -58,7 +58,7 @@ pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: 
             });
         });
     }
-    place_lists(buffers, tiles, per_task);
+    fill_lists(buffers, tiles, per_task);
 }
 
 /// One binning task: a run of the depth order.
@@ -141,9 +141,9 @@ fn sort_by_depth(buffers: &mut Buffers) {
             (*count, start) = (start, start + *count);
         }
         for &v in &buffers.order {
-            let place = &mut counts[digit(v)];
-            buffers.order_spare[*place as usize] = v;
-            *place += 1;
+            let next = &mut counts[digit(v)];
+            buffers.order_spare[*next as usize] = v;
+            *next += 1;
         }
         std::mem::swap(&mut buffers.order, &mut buffers.order_spare);
     }
@@ -214,7 +214,7 @@ fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettin
 }
 
 /// Turns the pairs of the binning tasks into one list per tile.
-fn place_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
+fn fill_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
     set_len(&mut buffers.tile_start, tiles + 1);
     let mut position = 0u32;
     for tile in 0..tiles {
@@ -226,7 +226,7 @@ fn place_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
     }
     buffers.tile_start[tiles] = position;
     set_len(&mut buffers.list, position as usize);
-    set_len(&mut buffers.place_of_pair, position as usize);
+    set_len(&mut buffers.list_index_of_pair, position as usize);
     let mut base = [0u32; TASKS + 1];
     for task in 0..TASKS {
         base[task + 1] = base[task] + buffers.pairs[task].len() as u32;
@@ -234,27 +234,27 @@ fn place_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
     let visible = buffers.ranked.len();
     {
         let list = SharedMut::new(&mut buffers.list);
-        let places = SharedMut::new(&mut buffers.place_of_pair);
+        let list_indices = SharedMut::new(&mut buffers.list_index_of_pair);
         let histograms = SharedMut::new(&mut buffers.histograms);
         let starts = SharedMut::new(&mut buffers.pair_start);
         let pairs = &buffers.pairs;
         run_tasks(TASKS, |task| {
             let first = (task * per_task).min(visible);
             let pairs = &pairs[task];
-            // SAFETY: a task's ranks, pairs and histogram are its own, and the histogram's places in the list are too.
-            let (next, starts, places) = unsafe {
+            // SAFETY: a task's ranks, pairs and histogram are its own, and so are the list entries counted in the histogram.
+            let (next, starts, list_indices) = unsafe {
                 let starts = starts.slice(first, per_task.min(visible - first));
-                (histograms.slice(task * tiles, tiles), starts, places.slice(base[task] as usize, pairs.len()))
+                (histograms.slice(task * tiles, tiles), starts, list_indices.slice(base[task] as usize, pairs.len()))
             };
             for start in starts {
                 *start += base[task];
             }
-            for (pair, place_of_pair) in pairs.iter().zip(places) {
-                let place = &mut next[pair.tile as usize];
+            for (pair, list_index) in pairs.iter().zip(list_indices) {
+                let entry = &mut next[pair.tile as usize];
                 // SAFETY: as above.
-                unsafe { list.slice(*place as usize, 1)[0] = Entry { rank: pair.rank, rows: pair.rows } };
-                *place_of_pair = *place;
-                *place += 1;
+                unsafe { list.slice(*entry as usize, 1)[0] = Entry { rank: pair.rank, rows: pair.rows } };
+                *list_index = *entry;
+                *entry += 1;
             }
         });
     }

@@ -1,28 +1,28 @@
-//! Which grid vertices surround each point, and which of them are the same (paper Sections IV-B and IV-C, vertex reuse).
+//! Which grid vertices surround each point, and which of them are the same (CC-4DGS, Sections IV-B and IV-C).
 
 use crate::cpu::sort::stable_order;
 use rayon::prelude::*;
 
-/// The most cells per axis; (cells + 1)^3 keys then fit in 32 bits.
+/// Upper bound on the cells per axis; (cells + 1)^3 keys then fit in 32 bits.
 pub const MAX_RESOLUTION: u32 = 1600;
 
 /// The corners of all points on one level.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Corners {
-    /// The vertices to decode [U], each (x, y, z) in 0..=resolution; sorted and distinct with reuse, one per corner without.
+    /// The vertices to decode `[U]`, each (x, y, z) in 0..=resolution; sorted and distinct with reuse, one per corner without.
     pub vertices: Vec<[u32; 3]>,
-    /// Per point and corner, the index of its vertex [8 M].
+    /// Per point and corner, the index of its vertex `[8 M]`.
     pub corners: Vec<u32>,
-    /// Per point and corner, its trilinear weight [8 M].
+    /// Per point and corner, its trilinear weight `[8 M]`.
     pub weights: Vec<f32>,
-    /// All (point, corner) slots grouped by vertex, ascending within each [8 M].
+    /// All (point, corner) slots grouped by vertex, ascending within each `[8 M]`.
     pub slots: Vec<u32>,
-    /// Where the slots of each vertex start [U + 1].
+    /// Where the slots of each vertex start `[U + 1]`.
     pub starts: Vec<u32>,
 }
 
-/// Places `points` [M, 3] on a grid of `resolution` cells per axis over the box. Points outside are moved to its nearest face, NaN to its
-/// lower face. Corner c of a cell lies at offsets (c & 1, c >> 1 & 1, c >> 2).
+/// Locates `points` `[M, 3]` on a grid of `resolution` cells per axis over the box. Points outside are moved to its nearest face, NaN to its
+/// lower face. Corner c of a cell has offsets (c & 1, c >> 1 & 1, c >> 2).
 pub fn corners(points: &[f32], box_min: [f32; 3], box_max: [f32; 3], resolution: u32, reuse: bool) -> Corners {
     let resolution = resolution.clamp(1, MAX_RESOLUTION);
     let m = points.len() / 3;

@@ -3,12 +3,11 @@
 use super::activation::{mish, mish_derivative};
 use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
-use super::program::{Input, Program, Step, Target, parts, scales};
-use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
-use crate::cpu::mlp::mish::MishLayer;
-use crate::cpu::vertex::hash::LevelHash;
-use crate::cube::tensor::{UNITS, cubes_for, floats, upload};
-use crate::ops::field::{Decoder, MishShape};
+use super::program::{Input, Program, SavedNorm, Step, Target, parts, scales};
+use crate::cube::tensor::{THREADS, floats, upload, workgroups_for};
+use crate::ops::field::Decoder;
+use crate::ops::hash::LevelHash;
+use crate::ops::networks::{LAYER_NORM_EPSILON as EPSILON, MishLayer, MishShape};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
@@ -22,7 +21,7 @@ fn fold(v: u32) -> u32 {
     (v & P) + (v >> 31)
 }
 
-/// a x modulo P (or P itself) for a < 2^31 and x < 2^11: in halves of 16 bits, so that nothing leaves 32 bits.
+/// a x modulo P (or P itself) for a < 2^31 and x < 2^11: in halves of 16 bits, so that everything fits 32 bits.
 #[cube]
 fn product(a: u32, x: u32) -> u32 {
     let high = (a >> 16) * x;
@@ -31,8 +30,8 @@ fn product(a: u32, x: u32) -> u32 {
     fold(fold(((high & 0x7fffu32) << 16) + (high >> 15)) + low)
 }
 
-/// Number `k` of the signature of a vertex of `vertices` [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold from `at` on A's three rows [k] each,
-/// then b [k].
+/// Entry `k` of the signature of a vertex of `vertices` [U,3]: ((A v + b) mod P) mod m, scaled to [-1, 1]; constants hold from `at` on A's three rows `[k]` each,
+/// then b `[k]`.
 #[cube]
 pub fn signature(vertices: &[i32], constants: &[u32], at: usize, vertex: usize, k: usize, hashes: usize, modulus: u32, scale: f32) -> f32 {
     let mut sum = constants[at + 3 * hashes + k];
@@ -44,7 +43,7 @@ pub fn signature(vertices: &[i32], constants: &[u32], at: usize, vertex: usize, 
     (residue % modulus) as f32 * scale - 1.0
 }
 
-/// Signatures [U,k] of vertices [U,3].
+/// Signatures `[U,k]` of vertices `[U,3]`.
 #[cube(launch)]
 fn signatures(vertices: &[i32], constants: &[u32], out: &mut [f32], hashes: u32, modulus: u32, scale: f32) {
     if ABSOLUTE_POS < out.len() {
@@ -53,7 +52,7 @@ fn signatures(vertices: &[i32], constants: &[u32], out: &mut [f32], hashes: u32,
     }
 }
 
-/// Mean and inverse deviation of a row of y [_, n].
+/// Mean and inverse deviation of a row of y `[_, n]`.
 #[cube]
 fn statistics(y: &[f32], row: usize, n: usize) -> (f32, f32) {
     let width = n as f32;
@@ -84,7 +83,7 @@ fn norm_mish(y: &[f32], weights: &[f32], out: &mut [f32], rows: u32, width: u32,
     }
 }
 
-/// The way back: d (of the output) becomes d of y; y becomes the normalised values; dz receives d of the value before Mish.
+/// The derivative: d (of the output) becomes d of y; y becomes the normalised values; dz receives d of the value before Mish.
 #[cube(launch)]
 fn norm_mish_backward(y: &mut [f32], weights: &[f32], d: &mut [f32], dz: &mut [f32], rows: u32, width: u32, gain: u32) {
     let row = ABSOLUTE_POS;
@@ -117,7 +116,7 @@ fn signature_rows(vertices: &CubeTensor, hash: &LevelHash, rows: usize) -> CubeT
     let client = vertices.client.clone();
     let (v, c, o) = (vertices.clone().into_buffer_arg(), constants.into_buffer_arg(), out.clone().into_buffer_arg());
     let scale = 2.0 / (hash.modulus() - 1) as f32;
-    signatures::launch(&client, cubes_for(rows * hashes), CubeDim::new_1d(UNITS), v, c, o, hashes as u32, hash.modulus(), scale);
+    signatures::launch(&client, workgroups_for(rows * hashes), CubeDim::new_1d(THREADS), v, c, o, hashes as u32, hash.modulus(), scale);
     out
 }
 
@@ -141,7 +140,7 @@ fn run(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, rows: usi
             Some(gain) => {
                 let out = floats(weights, [rows, layer.output]);
                 let (a, w, o) = (y.clone().into_buffer_arg(), weights.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-                norm_mish::launch(&client, cubes_for(rows), CubeDim::new_1d(UNITS), a, w, o, rows as u32, layer.output as u32, gain.start as u32);
+                norm_mish::launch(&client, workgroups_for(rows), CubeDim::new_1d(THREADS), a, w, o, rows as u32, layer.output as u32, gain.start as u32);
                 before_norm.push(y);
                 inputs.push(out);
             }
@@ -160,14 +159,14 @@ fn multiply(layer: &MishLayer, target: Target) -> Step {
     Step::Multiply { source: 0, target, input, output, weights, bias: Some(layer.bias.start), relu: false, add: false }
 }
 
-/// Features [U, F] of `vertices` [U,3].
+/// Features `[U, F]` of `vertices` `[U,3]`.
 pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -> CubeTensor {
     let rows = vertices.meta.shape()[0];
     let mut steps = Vec::new();
     for layer in decoder.shape.layers() {
         match &layer.gain {
             Some(gain) => {
-                let norm = Step::Norm { tile: 0, width: layer.output, gain: gain.start, keep: None };
+                let norm = Step::Norm { tile: 0, width: layer.output, gain: gain.start, save: None };
                 steps.extend([multiply(&layer, Target::Tile(0)), norm]);
             }
             None => steps.push(multiply(&layer, Target::Out(0))),
@@ -180,27 +179,36 @@ pub fn forward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder) -
     out
 }
 
-/// Where a layer's input, normalised values, and gradients before Mish and before the norm are kept.
+/// Where a layer's input, normalised values, and gradients before Mish and before the norm are saved.
 #[derive(Clone, Copy, Default)]
-struct Kept {
+struct Saved {
     input: usize,
     normal: usize,
     before_mish: usize,
     before_norm: usize,
 }
 
-/// There and back again for so many rows: the steps, what they keep where, and the floats that takes.
-fn there_and_back(layers: &[MishLayer], rows: usize) -> (Program, Vec<Kept>, usize) {
+/// The steps forwards and backwards, and where in the output buffer they save what.
+struct Plan {
+    program: Program,
+    /// By layer.
+    saved: Vec<Saved>,
+    /// Length of the output buffer.
+    floats: usize,
+}
+
+/// The plan for `rows` rows.
+fn plan(layers: &[MishLayer], rows: usize) -> Plan {
     let mut end = 0;
     let mut take = |floats: usize| {
         end += floats;
         end - floats
     };
     let transposed = layers.last().map_or(0, |l| l.bias.end);
-    let (mut steps, mut back, mut kept) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut steps, mut back, mut saved_by_layer) = (Vec::new(), Vec::new(), Vec::new());
     for (i, layer) in layers.iter().enumerate() {
-        let mut own = Kept { input: take(rows * layer.input), ..Kept::default() };
-        steps.push(Step::Keep { tile: 0, width: layer.input, at: own.input });
+        let mut own = Saved { input: take(rows * layer.input), ..Saved::default() };
+        steps.push(Step::Save { tile: 0, width: layer.input, at: own.input });
         let width = layer.output;
         if i > 0 {
             // Backwards, this comes before what the layer in front does.
@@ -210,20 +218,20 @@ fn there_and_back(layers: &[MishLayer], rows: usize) -> (Program, Vec<Kept>, usi
         match &layer.gain {
             Some(gain) => {
                 let scale = take(scales(rows));
-                own = Kept { normal: take(rows * width), before_mish: take(rows * width), before_norm: take(rows * width), ..own };
-                let keep = [own.normal, scale];
-                steps.extend([multiply(layer, Target::Tile(0)), Step::Norm { tile: 0, width, gain: gain.start, keep: Some(keep) }]);
-                back.push(Step::NormBack { tile: 0, width, gain: gain.start, kept: keep, before: own.before_mish, after: own.before_norm });
+                own = Saved { normal: take(rows * width), before_mish: take(rows * width), before_norm: take(rows * width), ..own };
+                let saved = SavedNorm { normal: own.normal, scale };
+                steps.extend([multiply(layer, Target::Tile(0)), Step::Norm { tile: 0, width, gain: gain.start, save: Some(saved) }]);
+                back.push(Step::NormBack { tile: 0, width, gain: gain.start, saved, before: own.before_mish, after: own.before_norm });
             }
             None => back.push(Step::Load { tile: 0, columns: 0..width, width, at: 0 }),
         }
-        kept.push(own);
+        saved_by_layer.push(own);
     }
     steps.extend(back.into_iter().rev());
-    (Program(steps), kept, end)
+    Plan { program: Program(steps), saved: saved_by_layer, floats: end }
 }
 
-/// The gradient of the flat weights from that of the features. Activations are computed again rather than kept.
+/// The gradient of the flat weights from that of the features. Activations are recomputed instead of saved.
 pub fn backward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, grad: &CubeTensor) -> CubeTensor {
     let rows = vertices.meta.shape()[0];
     let count = MishShape::parameter_count(&decoder.shape);
@@ -231,27 +239,27 @@ pub fn backward(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder, 
         return upload(weights, &vec![0.0f32; count], DType::F32);
     }
     let layers = decoder.shape.layers();
-    let Some(layout) = there_and_back(&layers, rows).0.layout_on(weights, decoder.hash.len(), rows) else {
+    let Some(layout) = plan(&layers, rows).program.layout_on(weights, decoder.hash.len(), rows) else {
         return layer_by_layer(weights, vertices, decoder, grad.clone(), rows);
     };
     let gradient = floats(weights, [count]);
     let all: Vec<Dense> = layers.iter().map(dense).collect();
     let both = gradients::with_transposed(weights, &all);
-    for part in parts(weights, rows, there_and_back(&layers, 16).2.div_ceil(16)) {
-        let (program, kept, floats_kept) = there_and_back(&layers, part.len());
-        let buffer = &floats(weights, [floats_kept]);
+    for part in parts(weights, rows, plan(&layers, 16).floats.div_ceil(16)) {
+        let Plan { program, saved, floats: length } = plan(&layers, part.len());
+        let buffer = &floats(weights, [length]);
         program.run(layout, Input::Signatures(vertices, &decoder.hash), &both, grad, buffer, &part);
         let sums = Sums { gradient: &gradient, rows: part.len(), add: part.start > 0, listed: Some((vertices, part.start)) };
         let own = |at| Rows { buffer, at };
-        for ((layer, &l), kept) in layers.iter().zip(&all).zip(kept) {
+        for ((layer, &l), saved) in layers.iter().zip(&all).zip(saved) {
             let dy = match &layer.gain {
                 Some(gain) => {
-                    sums.of_norm(own(kept.before_mish), own(kept.normal), l.output, gain.start);
-                    own(kept.before_norm)
+                    sums.of_norm(own(saved.before_mish), own(saved.normal), l.output, gain.start);
+                    own(saved.before_norm)
                 }
                 None => Rows { buffer: grad, at: part.start * l.output },
             };
-            sums.of_layer(own(kept.input), dy, l);
+            sums.of_layer(own(saved.input), dy, l);
         }
     }
     gradient
@@ -271,8 +279,8 @@ fn layer_by_layer(weights: &CubeTensor, vertices: &CubeTensor, decoder: &Decoder
             d = crate::cube::tensor::owned(d);
             norm_mish_backward::launch(
                 &client,
-                cubes_for(rows),
-                CubeDim::new_1d(UNITS),
+                workgroups_for(rows),
+                CubeDim::new_1d(THREADS),
                 pass.before_norm[i].clone().into_buffer_arg(),
                 weights.clone().into_buffer_arg(),
                 d.clone().into_buffer_arg(),

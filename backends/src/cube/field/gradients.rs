@@ -2,20 +2,20 @@
 
 use super::layers::Dense;
 use super::program::is_vertex;
-use crate::cube::tensor::{UNITS, binding_bytes, cubes_for, floats, signed, spread, upload};
+use crate::cube::tensor::{THREADS, binding_bytes, floats, signed, spread, upload, workgroups_for};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// Units of a cube along either side of a matrix.
+/// Threads of a workgroup along either side of a matrix.
 const SIDE: usize = 16;
 /// Rows in shared memory at a time.
 const CHUNK: usize = 8;
-/// The fewest rows of a segment, and the most segments.
+/// Lower bound on the rows of a segment, and upper bound on the segments.
 const LEAST_ROWS: usize = 64;
 const MOST_SEGMENTS: usize = 256;
 
-/// A matrix [rows, width] inside a buffer: where it starts.
+/// A matrix `[rows, width]` inside a buffer: where it starts.
 #[derive(Clone, Copy)]
 pub struct Rows<'a> {
     pub buffer: &'a CubeTensor,
@@ -45,23 +45,23 @@ fn end_of_vertices(vertices: &[i32], first: usize, start: usize, end: usize) -> 
     low
 }
 
-/// Brings the next rows of a matrix [_, width] on the chip, `per` times 16 of its columns; zeros where it ends.
+/// Loads the next rows of a matrix `[_, width]` into shared memory, `per` times 16 of its columns; zeros where it ends.
 #[cube]
-fn bring(from: &[f32], at: usize, to: &mut Shared<[f32]>, row: usize, end: usize, first: usize, width: usize, #[comptime] per: usize) {
+fn load_rows(from: &[f32], at: usize, to: &mut Shared<[f32]>, row: usize, end: usize, first: usize, width: usize, #[comptime] per: usize) {
     let side = comptime!(SIDE * per);
-    let mut place = UNIT_POS as usize;
-    while place < comptime!(CHUNK * SIDE * per) {
-        let (r, i) = (row + place / side, first + place % side);
+    let mut index = UNIT_POS as usize;
+    while index < comptime!(CHUNK * SIDE * per) {
+        let (r, i) = (row + index / side, first + index % side);
         let mut value = 0.0f32;
         if r < end && i < width {
             value = from[at + r * width + i];
         }
-        to[place] = value;
-        place += UNITS as usize;
+        to[index] = value;
+        index += THREADS as usize;
     }
 }
 
-/// Per segment of rows: x^T dy, and below it the sums of dy: partial [segments, (in + 1) out]. A unit computes `down` rows and `over` columns, 16 apart.
+/// Per segment of rows: x^T dy, and below it the sums of dy: partial `[segments, (in + 1) out]`. A thread computes `down` rows and `over` columns, 16 apart.
 #[cube(launch_unchecked)]
 fn outer_parts(
     x: &[f32],
@@ -88,8 +88,8 @@ fn outer_parts(
     let part = CUBE_POS / (cubes_down * cubes_over);
     let first_i = CUBE_POS / cubes_over % cubes_down * tile_down;
     let first_o = CUBE_POS % cubes_over * tile_over;
-    let unit = UNIT_POS as usize;
-    let (ui, uo) = (unit / SIDE, unit % SIDE);
+    let thread = UNIT_POS as usize;
+    let (ui, uo) = (thread / SIDE, thread % SIDE);
     let start = part * segment as usize;
     let mut end = select(start + (segment as usize) < rows as usize, start + segment as usize, rows as usize);
     if comptime!(listed) {
@@ -107,8 +107,8 @@ fn outer_parts(
     }
     let mut row = start;
     while row < end {
-        bring(x, x_at as usize, &mut xs, row, end, first_i, input, down);
-        bring(dy, dy_at as usize, &mut ds, row, end, first_o, output, over);
+        load_rows(x, x_at as usize, &mut xs, row, end, first_i, input, down);
+        load_rows(dy, dy_at as usize, &mut ds, row, end, first_o, output, over);
         sync_cube();
         for r in 0..CHUNK {
             let mut ours = Array::<f32>::new(over);
@@ -150,7 +150,7 @@ fn outer_parts(
     }
 }
 
-/// Sums over rows per segment of dz times the normalised values, then of dz alone: partial [segments, 2 out].
+/// Sums over rows per segment of dz times the normalised values, then of dz alone: partial `[segments, 2 out]`.
 #[cube(launch_unchecked)]
 fn norm_parts(
     dz: &[f32],
@@ -202,7 +202,7 @@ pub fn add_segments(partial: &[f32], gradient: &mut [f32], width: u32, segments:
     }
 }
 
-/// The weights, and behind them each matrix transposed at its own place: plan [layers, 3] holds place, inputs and outputs.
+/// The weights, then each matrix transposed at its own index: plan `[layers, 3]` holds index, inputs and outputs.
 #[cube(launch)]
 fn append_transposed(weights: &[f32], plan: &[u32], both: &mut [f32], layers: u32) {
     let count = both.len() / 2;
@@ -210,12 +210,12 @@ fn append_transposed(weights: &[f32], plan: &[u32], both: &mut [f32], layers: u3
         if ABSOLUTE_POS < count {
             both[ABSOLUTE_POS] = weights[ABSOLUTE_POS];
         } else {
-            let place = ABSOLUTE_POS - count;
+            let index = ABSOLUTE_POS - count;
             let mut value = 0.0f32;
             for layer in 0..layers as usize {
                 let (at, input, output) = (plan[3 * layer] as usize, plan[3 * layer + 1] as usize, plan[3 * layer + 2] as usize);
-                if place >= at && place < at + input * output {
-                    let (o, i) = ((place - at) / input, (place - at) % input);
+                if index >= at && index < at + input * output {
+                    let (o, i) = ((index - at) / input, (index - at) % input);
                     value = weights[at + i * output + o];
                 }
             }
@@ -225,7 +225,7 @@ fn append_transposed(weights: &[f32], plan: &[u32], both: &mut [f32], layers: u3
 }
 
 fn dim() -> CubeDim {
-    CubeDim::new_1d(UNITS)
+    CubeDim::new_1d(THREADS)
 }
 
 /// How many segments, and of how many rows, for partial sums of `width` floats.
@@ -235,21 +235,21 @@ fn segments_of(like: &CubeTensor, rows: usize, width: usize) -> (usize, usize) {
     (rows.div_ceil(segment).max(1), segment)
 }
 
-/// 1, 2, 4 or 8 columns (or rows) per unit for so many.
-fn per_unit(width: usize) -> usize {
+/// 1, 2, 4 or 8 columns (or rows) per thread for so many.
+fn per_thread(width: usize) -> usize {
     width.div_ceil(SIDE).next_power_of_two().min(8)
 }
 
 /// Sums over rows that go into one flat gradient.
 #[derive(Clone, Copy)]
 pub struct Sums<'a> {
-    /// Where the weights lie, their gradients go.
+    /// Receives the gradient of every weight at the index of that weight.
     pub gradient: &'a CubeTensor,
     /// The rows summed over.
     pub rows: usize,
-    /// Whether they come on top of what is there.
+    /// Whether they are added to what is there.
     pub add: bool,
-    /// The vertices of all rows [_,3] and which of them is that of row 0, where rows may hold none.
+    /// The vertices of all rows `[_,3]` and which of them is that of row 0, where rows may hold none.
     pub listed: Option<(&'a CubeTensor, usize)>,
 }
 
@@ -260,14 +260,14 @@ impl Sums<'_> {
     }
     fn finish(&self, partial: CubeTensor, width: usize, segments: usize, at: usize) {
         let (p, to) = (partial.into_buffer_arg(), self.gradient.clone().into_buffer_arg());
-        add_segments::launch(&self.gradient.client, cubes_for(width), dim(), p, to, width as u32, segments as u32, at as u32, self.add);
+        add_segments::launch(&self.gradient.client, workgroups_for(width), dim(), p, to, width as u32, segments as u32, at as u32, self.add);
     }
     /// Gradient of W and b of layer `l` from its input and the gradient of its output.
     pub fn of_layer(&self, x: Rows, dy: Rows, l: Dense) {
         let width = (l.input + 1) * l.output;
         let (segments, segment) = segments_of(self.gradient, self.rows, width);
         let partial = floats(self.gradient, [segments * width]);
-        let (down, over) = (per_unit(l.input), per_unit(l.output));
+        let (down, over) = (per_thread(l.input), per_thread(l.output));
         let (vertices, first) = self.vertices();
         // SAFETY: every index is compared with the sizes of the two matrices and of the sums.
         unsafe {
@@ -294,16 +294,16 @@ impl Sums<'_> {
         };
         self.finish(partial, width, segments, l.at);
     }
-    /// Gradient of gain and shift [width] each, which follow each other from `at` on, from the gradient before Mish and the normalised values.
+    /// Gradient of gain and shift `[width]` each, which follow each other from `at` on, from the gradient before Mish and the normalised values.
     pub fn of_norm(&self, dz: Rows, normalized: Rows, width: usize, at: usize) {
         let (segments, segment) = segments_of(self.gradient, self.rows, 2 * width);
         let partial = floats(self.gradient, [segments * 2 * width]);
         let (vertices, first) = self.vertices();
-        // SAFETY: units beyond the sums do nothing, rows end at `rows`.
+        // SAFETY: threads beyond the sums do nothing, rows end at `rows`.
         unsafe {
             norm_parts::launch_unchecked(
                 &self.gradient.client,
-                cubes_for(segments * 2 * width),
+                workgroups_for(segments * 2 * width),
                 dim(),
                 dz.buffer.clone().into_buffer_arg(),
                 normalized.buffer.clone().into_buffer_arg(),
@@ -330,6 +330,6 @@ pub fn with_transposed(weights: &CubeTensor, layers: &[Dense]) -> CubeTensor {
     let plan = upload(weights, &plan, DType::U32);
     let client = weights.client.clone();
     let (w, p, b) = (weights.clone().into_buffer_arg(), plan.into_buffer_arg(), both.clone().into_buffer_arg());
-    append_transposed::launch(&client, cubes_for(2 * count), dim(), w, p, b, layers.len() as u32);
+    append_transposed::launch(&client, workgroups_for(2 * count), dim(), w, p, b, layers.len() as u32);
     both
 }

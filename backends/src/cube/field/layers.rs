@@ -1,11 +1,11 @@
-//! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W [in, out] row-major and then b [out], at
-//! an offset. A unit computes one column of several rows, so that a weight is read once for all of them.
+//! Linear layers one at a time, for networks that are too wide for [`super::program`]. Weights lie in one flat buffer, W `[in, out]` row-major and then b `[out]`, at
+//! an offset. A thread computes one column of several rows, so that a weight is read once for all of them.
 
-use crate::cube::tensor::{UNITS, cubes_for, floats};
+use crate::cube::tensor::{THREADS, floats, workgroups_for};
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// Rows a unit computes.
+/// Rows per thread.
 const ROWS: usize = 8;
 
 /// Sizes of a layer and where its weights start.
@@ -16,7 +16,7 @@ pub struct Dense {
     pub at: usize,
 }
 
-/// y [rows, out] at `y_at`: x W + b, below zero cut off if `relu`.
+/// y `[rows, out]` at `y_at`: x W + b, with a ReLU if `relu`.
 #[cube(launch)]
 fn linear(x: &[f32], weights: &[f32], y: &mut [f32], rows: u32, input: u32, output: u32, at: u32, y_at: u32, #[comptime] relu: bool) {
     let (input, output, at) = (input as usize, output as usize, at as usize);
@@ -51,7 +51,7 @@ fn linear(x: &[f32], weights: &[f32], y: &mut [f32], rows: u32, input: u32, outp
     }
 }
 
-/// dx [rows, in] (+)= dy W^T.
+/// dx `[rows, in]` (+)= dy W^T.
 #[cube(launch)]
 fn linear_backward_input(dy: &[f32], weights: &[f32], dx: &mut [f32], rows: u32, input: u32, output: u32, at: u32, #[comptime] accumulate: bool) {
     let (input, output, at) = (input as usize, output as usize, at as usize);
@@ -74,11 +74,11 @@ fn linear_backward_input(dy: &[f32], weights: &[f32], dx: &mut [f32], rows: u32,
         #[unroll]
         for r in 0..8usize {
             if first + r < rows as usize {
-                let place = (first + r) * input + column;
+                let index = (first + r) * input + column;
                 if comptime!(accumulate) {
-                    dx[place] += sums[r];
+                    dx[index] += sums[r];
                 } else {
-                    dx[place] = sums[r];
+                    dx[index] = sums[r];
                 }
             }
         }
@@ -87,7 +87,7 @@ fn linear_backward_input(dy: &[f32], weights: &[f32], dx: &mut [f32], rows: u32,
 
 /// dy becomes 0 where the output of a ReLU is.
 #[cube(launch)]
-fn cut_where_off(dy: &mut [f32], y: &[f32]) {
+fn mask_relu(dy: &mut [f32], y: &[f32]) {
     if ABSOLUTE_POS < dy.len() && y[ABSOLUTE_POS] <= 0.0 {
         dy[ABSOLUTE_POS] = 0.0;
     }
@@ -101,39 +101,39 @@ fn copy_stretch(from: &[f32], to: &mut [f32], from_at: u32, to_at: u32, count: u
 }
 
 fn dim() -> CubeDim {
-    CubeDim::new_1d(UNITS)
+    CubeDim::new_1d(THREADS)
 }
 
-/// Layer `l` on `x` [rows, in] into `y` at `y_at`.
+/// Layer `l` on `x` `[rows, in]` into `y` at `y_at`.
 pub fn forward(x: &CubeTensor, weights: &CubeTensor, y: &CubeTensor, rows: usize, l: Dense, y_at: usize, relu: bool) {
     let client = x.client.clone();
-    let units = rows.div_ceil(ROWS) * l.output;
+    let threads = rows.div_ceil(ROWS) * l.output;
     let (a, w, b) = (x.clone().into_buffer_arg(), weights.clone().into_buffer_arg(), y.clone().into_buffer_arg());
-    linear::launch(&client, cubes_for(units), dim(), a, w, b, rows as u32, l.input as u32, l.output as u32, l.at as u32, y_at as u32, relu);
+    linear::launch(&client, workgroups_for(threads), dim(), a, w, b, rows as u32, l.input as u32, l.output as u32, l.at as u32, y_at as u32, relu);
 }
 
 /// Gradient of the input of layer `l`, written or added to `dx`.
 pub fn backward_input(dy: &CubeTensor, weights: &CubeTensor, dx: &CubeTensor, rows: usize, l: Dense, accumulate: bool) {
     let client = dy.client.clone();
-    let units = rows.div_ceil(ROWS) * l.input;
+    let threads = rows.div_ceil(ROWS) * l.input;
     let (g, w, d) = (dy.clone().into_buffer_arg(), weights.clone().into_buffer_arg(), dx.clone().into_buffer_arg());
-    linear_backward_input::launch(&client, cubes_for(units), dim(), g, w, d, rows as u32, l.input as u32, l.output as u32, l.at as u32, accumulate);
+    linear_backward_input::launch(&client, workgroups_for(threads), dim(), g, w, d, rows as u32, l.input as u32, l.output as u32, l.at as u32, accumulate);
 }
 
-/// dy where a ReLU let something through.
+/// Sets dy to zero where the output of a ReLU is zero.
 pub fn backward_relu(dy: &CubeTensor, y: &CubeTensor, count: usize) {
     let client = dy.client.clone();
-    cut_where_off::launch(&client, cubes_for(count), dim(), dy.clone().into_buffer_arg(), y.clone().into_buffer_arg());
+    mask_relu::launch(&client, workgroups_for(count), dim(), dy.clone().into_buffer_arg(), y.clone().into_buffer_arg());
 }
 
-/// Copies `count` values of `from` at one place to another place of `to`.
+/// Copies `count` values of `from` from index `from_at` on to `to` from index `to_at` on.
 pub fn copy(from: &CubeTensor, to: &CubeTensor, from_at: usize, to_at: usize, count: usize) {
     let client = from.client.clone();
     let (a, b) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
-    copy_stretch::launch(&client, cubes_for(count), dim(), a, b, from_at as u32, to_at as u32, count as u32);
+    copy_stretch::launch(&client, workgroups_for(count), dim(), a, b, from_at as u32, to_at as u32, count as u32);
 }
 
-/// The stretch of `from` at `at` as a buffer of its own [count].
+/// The stretch of `from` at `at` as a buffer of its own `[count]`.
 pub fn stretch(from: &CubeTensor, at: usize, count: usize) -> CubeTensor {
     let out = floats(from, [count]);
     copy(from, &out, at, 0, count);

@@ -64,8 +64,8 @@ impl CornerOps for CubeBackend {
         _corners: IntTensor<Self>,
         grid: GridBox,
         reuse: bool,
-        room: usize,
+        capacity: usize,
     ) -> (IntTensor<Self>, IntTensor<Self>, IntTensor<Self>) {
-        voxels::list(slots, vertices, starts, grid, reuse, room)
+        voxels::list(slots, vertices, starts, grid, reuse, capacity)
     }
 }

@@ -3,8 +3,8 @@
 use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
 use super::program::{Input, Program, Step, Target, parts};
-use crate::cpu::mlp::relu::{Layer, ReluShape};
 use crate::cube::tensor::{floats, upload};
+use crate::ops::networks::{Layer, ReluShape};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 
@@ -12,7 +12,7 @@ fn dense(layer: &Layer) -> Dense {
     Dense { input: layer.input, output: layer.output, at: layer.weight.start }
 }
 
-/// The outputs of all layers; those that leave the network lie in the flat result at the given place instead.
+/// The outputs of all layers; those of the network are parts of the flat result instead.
 fn run(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, rows: usize) -> (Vec<CubeTensor>, CubeTensor) {
     let widths = shape.output_widths();
     let flat = floats(x, [rows * widths.iter().sum::<usize>()]);
@@ -40,7 +40,7 @@ struct Tree {
 
 const TRUNK: usize = 0;
 const HEAD: usize = 1;
-/// For gradients of outputs that are wider than a tile and come in pieces.
+/// For gradients of outputs that are wider than a tile, which are loaded in pieces.
 const PIECE: usize = 2;
 
 impl Tree {
@@ -63,7 +63,7 @@ impl Tree {
         let weights = self.weights + l.weight.start + columns.start * l.input;
         Step::Multiply { source, target, input: columns.len(), output: l.input, weights, bias: None, relu: false, add }
     }
-    /// The widest row that stays on the chip: outputs leave it and come in pieces.
+    /// The widest row in shared memory: outputs are written to global memory, and their gradients are loaded in pieces.
     fn widest_inside(&self) -> usize {
         self.layers.iter().map(|l| l.input).max().unwrap_or(1)
     }
@@ -81,28 +81,39 @@ pub fn forward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape) -> CubeT
     flat
 }
 
-/// Where a layer's output and the gradient before its ReLU are kept.
+/// Where a layer's output and the gradient before its ReLU are saved.
 #[derive(Clone, Copy, Default)]
-struct Kept {
+struct Saved {
     output: usize,
     gradient: usize,
 }
 
-/// There and back again for `rows` of the rows: the steps, what they keep where, the place of the input's gradient, and the floats all that takes.
-fn there_and_back(tree: &Tree, rows: usize, wants_input: bool) -> (Program, Vec<Kept>, usize, usize) {
+/// The steps forwards and backwards, and where in the output buffer they save what.
+struct Plan {
+    program: Program,
+    /// By layer.
+    saved: Vec<Saved>,
+    /// Where the gradient of the input starts.
+    of_input: usize,
+    /// Length of the output buffer.
+    floats: usize,
+}
+
+/// The plan for `rows` rows.
+fn plan(tree: &Tree, rows: usize, wants_input: bool) -> Plan {
     let mut end = 0;
     let mut take = |floats: usize| {
         end += floats;
         end - floats
     };
     let mut steps = Vec::new();
-    let mut kept = vec![Kept::default(); tree.layers.len()];
+    let mut saved = vec![Saved::default(); tree.layers.len()];
     for (i, layer) in tree.layers.iter().enumerate() {
         // Outputs are not needed again, unless a ReLU made them.
         if layer.slot.is_none() || layer.relu {
             let (tile, width) = (tree.tile(i), layer.output);
-            kept[i] = Kept { output: take(rows * width), gradient: take(rows * width) };
-            steps.extend([tree.forward(i, Target::Tile(tile)), Step::Keep { tile, width, at: kept[i].output }]);
+            saved[i] = Saved { output: take(rows * width), gradient: take(rows * width) };
+            steps.extend([tree.forward(i, Target::Tile(tile)), Step::Save { tile, width, at: saved[i].output }]);
         }
     }
     let of_input = take(if wants_input { rows * tree.layers.first().map_or(0, |l| l.input) } else { 0 });
@@ -128,18 +139,18 @@ fn there_and_back(tree: &Tree, rows: usize, wants_input: bool) -> (Program, Vec<
         if let Some(at) = tree.slots[i] {
             steps.push(Step::Load { tile, columns: 0..width, width, at });
         }
-        steps.extend([Step::Cut { tile, width, at: kept[i].output }, Step::Keep { tile, width, at: kept[i].gradient }]);
+        steps.extend([Step::Mask { tile, width, at: saved[i].output }, Step::Save { tile, width, at: saved[i].gradient }]);
         if !leaves {
             steps.push(tree.backward(i, tile, 0..width, target, add));
         }
     }
     if wants_input && tree.trunk == 0 {
-        steps.push(Step::Keep { tile: TRUNK, width: tree.layers.first().map_or(0, |l| l.input), at: of_input });
+        steps.push(Step::Save { tile: TRUNK, width: tree.layers.first().map_or(0, |l| l.input), at: of_input });
     }
-    (Program(steps), kept, of_input, end)
+    Plan { program: Program(steps), saved, of_input, floats: end }
 }
 
-/// Gradients of the input, if wanted, and of the flat weights from that of the flat outputs. Activations are computed again rather than kept.
+/// Gradients of the input, if wanted, and of the flat weights from that of the flat outputs. Activations are recomputed instead of saved.
 pub fn backward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad: &CubeTensor, wants_input: bool) -> (Option<CubeTensor>, CubeTensor) {
     let rows = x.meta.shape()[0];
     let of_input = wants_input.then(|| floats(x, x.meta.shape().clone()));
@@ -147,22 +158,22 @@ pub fn backward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad: &
         return (of_input, upload(weights, &vec![0.0f32; shape.parameter_count()], DType::F32));
     }
     let tree = Tree::new(shape, rows);
-    let Some(layout) = there_and_back(&tree, rows, wants_input).0.layout_on(x, shape.input, rows) else {
+    let Some(layout) = plan(&tree, rows, wants_input).program.layout_on(x, shape.input, rows) else {
         return layer_by_layer(x, weights, shape, grad, wants_input);
     };
     let gradient = floats(weights, [tree.weights]);
     let all: Vec<Dense> = tree.layers.iter().map(dense).collect();
     let both = gradients::with_transposed(weights, &all);
-    for part in parts(x, rows, there_and_back(&tree, 16, wants_input).3.div_ceil(16)) {
-        let (program, kept, input_at, floats_kept) = there_and_back(&tree, part.len(), wants_input);
-        let buffer = &floats(x, [floats_kept]);
+    for part in parts(x, rows, plan(&tree, 16, wants_input).floats.div_ceil(16)) {
+        let Plan { program, saved, of_input: input_at, floats: length } = plan(&tree, part.len(), wants_input);
+        let buffer = &floats(x, [length]);
         program.run(layout, Input::Rows(x, shape.input), &both, grad, buffer, &part);
         let sums = Sums { gradient: &gradient, rows: part.len(), add: part.start > 0, listed: None };
         for (i, (layer, &l)) in tree.layers.iter().zip(&all).enumerate() {
-            let input = layer.parent.map_or(Rows { buffer: x, at: part.start * l.input }, |p| Rows { buffer, at: kept[p].output });
+            let input = layer.parent.map_or(Rows { buffer: x, at: part.start * l.input }, |p| Rows { buffer, at: saved[p].output });
             let dy = match tree.slots[i] {
                 Some(at) if !layer.relu => Rows { buffer: grad, at: at + part.start * l.output },
-                _ => Rows { buffer, at: kept[i].gradient },
+                _ => Rows { buffer, at: saved[i].gradient },
             };
             sums.of_layer(input, dy, l);
         }
@@ -198,7 +209,7 @@ fn layer_by_layer(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad:
         {
             layers::backward_relu(d, &outputs[i], rows * layer.output);
         }
-        // A layer whose output nobody reads has no gradient, and no such layer exists: every chain ends in an output.
+        // Every chain ends in an output, so every layer has a gradient.
         let Some(d) = d else { continue };
         let input = layer.parent.map_or(x, |p| &outputs[p]);
         let l = dense(layer);

@@ -1,14 +1,14 @@
 //! Grid corners of points, which of them are the same, and interpolation between them.
 
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{UNITS, cubes_for, empty, floats, signed, upload};
+use crate::cube::tensor::{THREADS, empty, floats, signed, upload, workgroups_for};
 use crate::ops::corners::{CornersBegun, GridBox};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// Keys of the vertices and trilinear weights of all (point, corner) slots [8M]; corner c lies at offsets (c & 1, c >> 1 & 1, c >> 2).
+/// Keys of the vertices and trilinear weights of all (point, corner) slots `[8M]`; corner c lies at offsets (c & 1, c >> 1 & 1, c >> 2).
 #[cube(launch)]
 fn find_corners(points: &[f32], grid: &[f32], keys: &mut [u32], slots: &mut [u32], weights: &mut [f32], resolution: u32) {
     let slot = ABSOLUTE_POS;
@@ -55,7 +55,7 @@ fn mark_heads(sorted: &[u32], heads: &mut [u32]) {
 /// Vertices, where their slots start, and the vertex of every slot, from the sorted keys and the number of heads before each. Behind the last vertex there are
 /// -1 and no slots.
 #[cube(launch)]
-fn list_vertices(sorted: &[u32], slots: &[u32], before: &[u32], vertices: &mut [i32], starts: &mut [i32], corners: &mut [i32], resolution: u32, room: u32) {
+fn list_vertices(sorted: &[u32], slots: &[u32], before: &[u32], vertices: &mut [i32], starts: &mut [i32], corners: &mut [i32], resolution: u32, capacity: u32) {
     let at = ABSOLUTE_POS;
     if at < sorted.len() {
         let key = sorted[at];
@@ -63,7 +63,7 @@ fn list_vertices(sorted: &[u32], slots: &[u32], before: &[u32], vertices: &mut [
         if at > 0 {
             head = key != sorted[at - 1];
         }
-        // `before` counts the heads in front, which is the vertex's own place if this is its head.
+        // `before` counts the heads in front, which is the vertex's own index if this is its head.
         let vertex = before[at] - select(head, 0u32, 1u32);
         let side = resolution + 1;
         if head {
@@ -79,9 +79,9 @@ fn list_vertices(sorted: &[u32], slots: &[u32], before: &[u32], vertices: &mut [
     if last > 0 {
         found = before[last] + select(sorted[last] != sorted[last - 1], 1u32, 0u32);
     }
-    if at >= found as usize && at <= room as usize {
+    if at >= found as usize && at <= capacity as usize {
         starts[at] = sorted.len() as i32;
-        if at < room as usize {
+        if at < capacity as usize {
             #[unroll]
             for d in 0..3usize {
                 vertices[3 * at + d] = -1i32;
@@ -103,25 +103,25 @@ fn interpolate_corners(features: &[f32], corners: &[i32], weights: &[f32], out: 
     }
 }
 
-/// Gradient [U,F] of the features: each vertex visits its slots in order, so nothing is scattered.
+/// Gradient `[U,F]` of the features: each vertex visits its slots in order, so nothing is scattered.
 #[cube(launch)]
 fn gather_gradients(grad: &[f32], weights: &[f32], slots: &[i32], starts: &[i32], out: &mut [f32], width: u32) {
     if ABSOLUTE_POS < out.len() {
         let (vertex, f) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
         let mut sum = 0.0f32;
-        for place in starts[vertex] as u32..starts[vertex + 1] as u32 {
-            let slot = slots[place as usize] as usize;
+        for index in starts[vertex] as u32..starts[vertex + 1] as u32 {
+            let slot = slots[index as usize] as usize;
             sum += weights[slot] * grad[slot / 8 * width as usize + f];
         }
         out[ABSOLUTE_POS] = sum;
     }
 }
 
-/// The corners of `points` [M,3], grouped by vertex; their number stays on the device.
+/// The corners of `points` `[M,3]`, grouped by vertex; their number stays on the device.
 pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<CubeBackend> {
     let client = points.client.clone();
     let slots_count = 8 * points.meta.shape()[0];
-    let dim = CubeDim::new_1d(UNITS);
+    let dim = CubeDim::new_1d(THREADS);
     let scale = (0..3).map(|d| if grid.max[d] > grid.min[d] { grid.resolution as f32 / (grid.max[d] - grid.min[d]) } else { 0.0 });
     let numbers: Vec<f32> = grid.min.into_iter().chain(scale).collect();
     let grid_buffer = upload(points, &numbers, DType::F32);
@@ -129,7 +129,7 @@ pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<Cu
     let weights = floats(points, [slots_count]);
     find_corners::launch(
         &client,
-        cubes_for(slots_count),
+        workgroups_for(slots_count),
         dim,
         points.clone().into_buffer_arg(),
         grid_buffer.into_buffer_arg(),
@@ -146,25 +146,25 @@ pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<Cu
     let side = u64::from(grid.resolution) + 1;
     let (sorted, slots) = sort_pairs(keys, slots, slots_count, u64::BITS - (side * side * side).leading_zeros());
     let heads = empty(points, [slots_count], DType::U32);
-    mark_heads::launch(&client, cubes_for(slots_count), dim, sorted.clone().into_buffer_arg(), heads.clone().into_buffer_arg());
+    mark_heads::launch(&client, workgroups_for(slots_count), dim, sorted.clone().into_buffer_arg(), heads.clone().into_buffer_arg());
     let count = exclusive_sums(&heads, slots_count);
     CornersBegun { weights, slots: signed(slots), vertices: signed(sorted), starts: signed(heads), corners: unused(), count: signed(count) }
 }
 
-/// Vertices [U,3], where their slots start [U+1], and the vertex of every corner [8M], with room for U of them.
-pub fn list(slots: CubeTensor, sorted: CubeTensor, before: CubeTensor, grid: GridBox, reuse: bool, room: usize) -> (CubeTensor, CubeTensor, CubeTensor) {
+/// Vertices `[U,3]`, where their slots start `[U+1]`, and the vertex of every corner `[8M]`, with a capacity of U.
+pub fn list(slots: CubeTensor, sorted: CubeTensor, before: CubeTensor, grid: GridBox, reuse: bool, capacity: usize) -> (CubeTensor, CubeTensor, CubeTensor) {
     let client = slots.client.clone();
-    let dim = CubeDim::new_1d(UNITS);
+    let dim = CubeDim::new_1d(THREADS);
     let slots_count = slots.meta.shape().num_elements();
     let int = |shape: Vec<usize>| empty(&slots, shape, DType::I32);
-    let (vertices, starts, corners) = (int(vec![room, 3]), int(vec![room + 1]), int(vec![slots_count]));
+    let (vertices, starts, corners) = (int(vec![capacity, 3]), int(vec![capacity + 1]), int(vec![slots_count]));
     let (v, st, c) = (vertices.clone().into_buffer_arg(), starts.clone().into_buffer_arg(), corners.clone().into_buffer_arg());
     let s = sorted.into_buffer_arg();
     if reuse {
         let (l, b) = (slots.into_buffer_arg(), before.into_buffer_arg());
-        list_vertices::launch(&client, cubes_for(slots_count.max(room + 1)), dim, s, l, b, v, st, c, grid.resolution, room as u32);
+        list_vertices::launch(&client, workgroups_for(slots_count.max(capacity + 1)), dim, s, l, b, v, st, c, grid.resolution, capacity as u32);
     } else {
-        list_all::launch(&client, cubes_for(slots_count), dim, s, v, st, c, grid.resolution);
+        list_all::launch(&client, workgroups_for(slots_count), dim, s, v, st, c, grid.resolution);
     }
     (vertices, starts, corners)
 }
@@ -186,18 +186,18 @@ fn list_all(keys: &[u32], vertices: &mut [i32], starts: &mut [i32], corners: &mu
     }
 }
 
-/// Interpolated features [M,F].
+/// Interpolated features `[M,F]`.
 pub fn interpolate(features: CubeTensor, corners: CubeTensor, weights: CubeTensor) -> CubeTensor {
     let width = features.meta.shape()[1];
     let points = corners.meta.shape().num_elements() / 8;
     let out = floats(&features, [points, width]);
     let client = features.client.clone();
     let (f, c, w, o) = (features.into_buffer_arg(), corners.into_buffer_arg(), weights.into_buffer_arg(), out.clone().into_buffer_arg());
-    interpolate_corners::launch(&client, cubes_for(points * width), CubeDim::new_1d(UNITS), f, c, w, o, width as u32);
+    interpolate_corners::launch(&client, workgroups_for(points * width), CubeDim::new_1d(THREADS), f, c, w, o, width as u32);
     out
 }
 
-/// Gradient [U,F] of the features.
+/// Gradient `[U,F]` of the features.
 pub fn interpolate_backward(grad: CubeTensor, weights: CubeTensor, slots: CubeTensor, starts: CubeTensor) -> CubeTensor {
     let width = grad.meta.shape()[1];
     let vertices = starts.meta.shape().num_elements().saturating_sub(1);
@@ -205,6 +205,6 @@ pub fn interpolate_backward(grad: CubeTensor, weights: CubeTensor, slots: CubeTe
     let client = grad.client.clone();
     let (g, w) = (grad.into_buffer_arg(), weights.into_buffer_arg());
     let (s, st, o) = (slots.into_buffer_arg(), starts.into_buffer_arg(), out.clone().into_buffer_arg());
-    gather_gradients::launch(&client, cubes_for(vertices * width), CubeDim::new_1d(UNITS), g, w, s, st, o, width as u32);
+    gather_gradients::launch(&client, workgroups_for(vertices * width), CubeDim::new_1d(THREADS), g, w, s, st, o, width as u32);
     out
 }

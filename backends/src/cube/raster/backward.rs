@@ -1,12 +1,11 @@
-//! From the gradient of a picture to those of the Gaussians.
+//! From the gradient of an image to those of the Gaussians.
 
 use super::blend;
-use super::gradient::{self, GEOMETRY, SCREEN};
+use super::gradient::{self, AT_OFFSET, GEOMETRY, OF_CAMERA, OF_MEAN, OF_OPACITY, OF_QUATERNION, OF_SCALES, SCREEN};
 use super::{DIM, Lists, read_floats, rest_width};
-use crate::cpu::raster::camera::{CameraSums, RuleConstants};
-use crate::cpu::raster::{RECORD, RasterSettings, TILE, TILE_PIXELS};
-use crate::cube::tensor::{cubes_for, floats, row_blocks, rows_of, shared_bytes, spread, upload};
-use crate::ops::rasterize::{PARENTS, Saved, SavedInputs};
+use crate::cube::tensor::{floats, row_blocks, rows_of, shared_bytes, spread, upload, workgroups_for};
+use crate::ops::rasterize::camera::{CameraSums, RuleConstants};
+use crate::ops::rasterize::{AT_X, GradientRequest, RasterGradients, RasterSettings, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
@@ -14,27 +13,30 @@ use burn_cubecl::tensor::CubeTensor;
 use cc4dgs_core::ParameterSpace;
 use cubecl::prelude::*;
 
-/// Gradients of the parents in the order of [`crate::ops::rasterize::RasterOps::rasterize`]; only those wanted.
+/// The gradients in `request`.
 pub fn backward(
-    inputs: SavedInputs<CubeBackend>,
+    splats: SplatTensors<CubeBackend>,
     settings: &RasterSettings,
     saved: &Saved,
     upstream: CubeTensor,
-    wanted: [bool; PARENTS],
-) -> [Option<CubeTensor>; PARENTS] {
-    // Nothing was drawn (too many pairs), so nothing flows back.
-    let Some(lists) = saved.get::<Lists>() else { return std::array::from_fn(|_| None) };
-    let rest_shape = inputs[5].meta.shape().clone();
-    let [means, scales, quaternions, opacities, _, sh_rest, background] = inputs.map(into_contiguous);
+    request: GradientRequest,
+) -> RasterGradients<CubeBackend> {
+    // Nothing was drawn (too many pairs), so no gradient flows back.
+    let Some(lists) = saved.get::<Lists>() else { return RasterGradients::default() };
+    let rest_shape = splats.sh_rest.meta.shape().clone();
+    let SplatTensors { means, scales, quaternions, opacities, sh_rest, background, .. } = super::contiguous(splats);
     let upstream = into_contiguous(upstream);
     let client = means.client.clone();
     let n = means.meta.shape()[0];
     let (width, height) = (settings.width, settings.height);
     let tiles_x = width.div_ceil(TILE);
     let rules = RuleConstants::new(settings);
-    let records = floats(&means, [lists.pairs, RECORD]);
+    // Asked for in the forward pass, which has made sure that the records fit.
+    let absolute = request.absolute_screen && settings.absolute_centers;
+    let stride = blend::record_floats(absolute);
+    let records = floats(&means, [lists.pairs, stride]);
     if lists.pairs > 0 {
-        // SAFETY: pixels are compared with the size of the picture; everything else is indexed by the lists that the forward pass made.
+        // SAFETY: pixels are compared with the size of the image; everything else is indexed by the lists that the forward pass made.
         unsafe {
             blend::blend_tiles_backward::launch_unchecked(
                 &client,
@@ -54,15 +56,16 @@ pub fn backward(
                 rules.alpha_max,
                 rules.pass_capped,
                 blend::backward_batch(shared_bytes(&client)),
+                absolute,
             )
         };
     }
     let (screen, geometry) = (floats(&means, [n, SCREEN]), floats(&means, [n, GEOMETRY]));
     let d_colors = floats(&means, [n, 3]);
     let degree = settings.sh_degree.unwrap_or(0);
-    let wants_rest = wanted[5] && settings.sh_degree.is_some();
+    let wants_rest = request.sh_rest && settings.sh_degree.is_some();
     let rest_floats = rest_shape.num_elements();
-    let d_rest = match (wanted[5], wants_rest) {
+    let d_rest = match (request.sh_rest, wants_rest) {
         (true, true) => floats(&means, rest_shape),
         // Colours that are blended as they are do not depend on the coefficients.
         (true, false) => {
@@ -74,19 +77,20 @@ pub fn backward(
     if n > 0 {
         gradient::sum_records::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
-            records.into_buffer_arg(),
+            records.clone().into_buffer_arg(),
             lists.start_of_gaussian.clone().into_buffer_arg(),
             lists.keys.clone().into_buffer_arg(),
             lists.splats.clone().into_buffer_arg(),
             screen.clone().into_buffer_arg(),
+            stride,
         );
         let width = rest_width(&sh_rest, n);
         for rows in row_blocks(&client, n, width) {
             gradient::color_backward::launch(
                 &client,
-                cubes_for(rows.len()),
+                workgroups_for(rows.len()),
                 DIM(),
                 means.clone().into_buffer_arg(),
                 rows_of(&sh_rest, &rows, width).into_buffer_arg(),
@@ -105,7 +109,7 @@ pub fn backward(
         }
         gradient::geometry_backward::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             means.clone().into_buffer_arg(),
             scales.into_buffer_arg(),
@@ -126,7 +130,7 @@ pub fn backward(
         if count > 0 {
             let width = (count / n) as u32;
             let (from, to) = (from.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-            gradient::take_columns::launch(&client, cubes_for(count), DIM(), from, to, stride as u32, first as u32, width);
+            gradient::take_columns::launch(&client, workgroups_for(count), DIM(), from, to, stride as u32, first as u32, width);
         }
         out
     };
@@ -134,7 +138,7 @@ pub fn backward(
         let mut sums = CameraSums::default();
         if n > 0 {
             let (of_camera, of_offset) = (floats(&means, [12]), floats(&means, [3]));
-            for (from, to, stride, first) in [(&geometry, &of_camera, GEOMETRY, 11), (&screen, &of_offset, SCREEN, RECORD)] {
+            for (from, to, stride, first) in [(&geometry, &of_camera, GEOMETRY, OF_CAMERA), (&screen, &of_offset, SCREEN, AT_OFFSET)] {
                 let (from, to) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
                 gradient::sum_rows::launch(&client, CubeCount::Static(1, 1, 1), CubeDim::new_1d(32), from, to, n as u32, stride as u32, first as u32);
             }
@@ -153,15 +157,25 @@ pub fn backward(
         gradient::background_backward::launch(&client, one, CubeDim::new_1d(32), state, upstream, out.clone().into_buffer_arg(), (width * height) as u32);
         out
     };
-    [
-        wanted[0].then(|| columns(&geometry, GEOMETRY, 0, vec![n, 3])),
-        wanted[1].then(|| columns(&geometry, GEOMETRY, 3, vec![n, 3])),
-        wanted[2].then(|| columns(&geometry, GEOMETRY, 6, vec![n, 4])),
-        wanted[3].then(|| columns(&geometry, GEOMETRY, 10, vec![n])),
-        wanted[4].then_some(d_colors),
-        wanted[5].then_some(d_rest),
-        wanted[6].then(|| columns(&screen, SCREEN, 0, vec![n, 2])),
-        wanted[7].then(camera),
-        wanted[8].then(of_background),
-    ]
+    let absolute_screen = || {
+        let out = floats(&means, [n, 2]);
+        if n > 0 {
+            let (records, starts) = (records.clone().into_buffer_arg(), lists.start_of_gaussian.clone().into_buffer_arg());
+            let (keys, to) = (lists.keys.clone().into_buffer_arg(), out.clone().into_buffer_arg());
+            gradient::sum_absolute::launch(&client, workgroups_for(n), DIM(), records, starts, keys, to, stride);
+        }
+        out
+    };
+    RasterGradients {
+        means: request.means.then(|| columns(&geometry, GEOMETRY, OF_MEAN, vec![n, 3])),
+        scales: request.scales.then(|| columns(&geometry, GEOMETRY, OF_SCALES, vec![n, 3])),
+        quaternions: request.quaternions.then(|| columns(&geometry, GEOMETRY, OF_QUATERNION, vec![n, 4])),
+        opacities: request.opacities.then(|| columns(&geometry, GEOMETRY, OF_OPACITY, vec![n])),
+        colors: request.colors.then_some(d_colors),
+        sh_rest: request.sh_rest.then_some(d_rest),
+        background: request.background.then(of_background),
+        screen: request.screen.then(|| columns(&screen, SCREEN, AT_X, vec![n, 2])),
+        absolute_screen: absolute.then(absolute_screen),
+        camera: request.camera.then(camera),
+    }
 }

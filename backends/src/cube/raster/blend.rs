@@ -1,19 +1,19 @@
-//! Front-to-back blending, a unit per pixel and a cube per tile, and its back-to-front derivative. What a tile draws is brought on the chip a batch at a time.
+//! Front-to-back blending, a thread per pixel and a workgroup per tile, and its back-to-front derivative. The Gaussians of a tile are loaded into shared memory
+//! a batch at a time.
 
-use super::project::SPLAT;
-use crate::cpu::raster::camera::{ALPHA_MIN, TRANSMITTANCE_STOP};
-use crate::cpu::raster::{RECORD, TILE, TILE_PIXELS};
+use crate::ops::rasterize::camera::{ALPHA_MIN, TRANSMITTANCE_STOP};
+use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, TILE, TILE_PIXELS};
 use cubecl::prelude::*;
 
 const SIDE: u32 = TILE as u32;
-/// Gaussians brought on the chip at a time, forwards.
+/// Gaussians per batch, forwards.
 const BATCH: usize = 64;
-/// The same backwards, where pixels leave what they found for those who add it up: the more the better, as far as shared memory goes.
+/// Gaussians per batch, backwards. Each pixel stores two numbers per Gaussian in shared memory, so the batch is as large as that memory allows.
 const BATCHES: [usize; 3] = [16, 8, 4];
-/// One more than the pixels of a tile, so that columns of sums lie in different banks.
+/// One more than the pixels of a tile, so that columns of sums are in different banks.
 const COLUMN: usize = TILE_PIXELS + 1;
 
-/// Floats that the backward pass shares for a batch of so many Gaussians: what pixels found (later sums), and the gradient of the picture.
+/// Floats of shared memory for what the pixels found of a batch of so many Gaussians, later for their sums.
 const fn found_floats(batch: usize) -> usize {
     let (found, sums) = (2 * batch * TILE_PIXELS, RECORD * COLUMN);
     if found > sums { found } else { sums }
@@ -28,12 +28,12 @@ pub fn backward_batch(shared_bytes: usize) -> usize {
 /// Alpha of a Gaussian at an offset from its centre before its cap; 0 where it is not drawn.
 #[cube]
 fn full_alpha(drawn: &Shared<[f32]>, at: usize, dx: f32, dy: f32) -> f32 {
-    let sigma = drawn[at + 2] * dx * dx + drawn[at + 3] * dx * dy + drawn[at + 4] * dy * dy;
-    let alpha = drawn[at + 5] * (-sigma).exp();
+    let sigma = drawn[at + AT_A] * dx * dx + drawn[at + AT_B] * dx * dy + drawn[at + AT_C] * dy * dy;
+    let alpha = drawn[at + AT_OPACITY] * (-sigma).exp();
     select(sigma >= 0.0 && alpha >= ALPHA_MIN, alpha, 0.0f32)
 }
 
-/// Planes [5,H,W]; per pixel the transmittance left and the place in the list where it stopped, as bits [2,H,W]; largest weights [N] if wanted.
+/// Planes `[5,H,W]`; per pixel the transmittance left and the list index at which it stopped, as bits `[2,H,W]`; largest weights `[N]` if asked for.
 #[cube(launch_unchecked)]
 pub fn blend_tiles(
     splats: &[f32],
@@ -53,7 +53,7 @@ pub fn blend_tiles(
     let mut drawn = Shared::<[f32]>::new_slice(comptime!(RECORD * BATCH));
     let mut gaussians = Shared::<[u32]>::new_slice(BATCH);
     let finished = Shared::<[Atomic<u32>]>::new_slice(1usize);
-    let unit = UNIT_POS as usize;
+    let thread = UNIT_POS as usize;
     let tile = CUBE_POS as u32;
     let x = tile % tiles_x * SIDE + UNIT_POS % SIDE;
     let y = tile / tiles_x * SIDE + UNIT_POS / SIDE;
@@ -72,7 +72,7 @@ pub fn blend_tiles(
     let mut blue = 0.0f32;
     let mut depth = 0.0f32;
     let mut running = inside;
-    if unit == 0 {
+    if thread == 0 {
         finished[0].store(0u32);
     }
     sync_cube();
@@ -84,19 +84,19 @@ pub fn blend_tiles(
     while first < end && done < TILE_PIXELS as u32 {
         let count = select(end - first < BATCH as u32, end - first, BATCH as u32);
         if UNIT_POS < count {
-            gaussians[unit] = gaussian_of_pair[sorted[first as usize + unit] as usize];
+            gaussians[thread] = gaussian_of_pair[sorted[first as usize + thread] as usize];
         }
         sync_cube();
-        let mut k = unit;
+        let mut k = thread;
         while k < RECORD * count as usize {
-            drawn[k] = splats[SPLAT * gaussians[k / RECORD] as usize + k % RECORD];
+            drawn[k] = splats[RECORD * gaussians[k / RECORD] as usize + k % RECORD];
             k += TILE_PIXELS;
         }
         sync_cube();
         let mut g = 0u32;
         while running && g < count {
             let at = RECORD * g as usize;
-            let full = full_alpha(&drawn, at, px - drawn[at], py - drawn[at + 1]);
+            let full = full_alpha(&drawn, at, px - drawn[at + AT_X], py - drawn[at + AT_Y]);
             if full > 0.0 {
                 let alpha = select(full < alpha_max, full, alpha_max);
                 let after = left - alpha * left;
@@ -106,10 +106,10 @@ pub fn blend_tiles(
                     finished[0].fetch_add(1u32);
                 } else {
                     let weight = alpha * left;
-                    red += weight * drawn[at + 6];
-                    green += weight * drawn[at + 7];
-                    blue += weight * drawn[at + 8];
-                    depth += weight * drawn[at + 9];
+                    red += weight * drawn[at + AT_COLOR];
+                    green += weight * drawn[at + AT_COLOR + 1];
+                    blue += weight * drawn[at + AT_COLOR + 2];
+                    depth += weight * drawn[at + AT_DEPTH];
                     left = after;
                     if comptime!(wants_weights) {
                         // Weights are positive, so their bits order like the numbers, and a maximum has no order.
@@ -137,8 +137,13 @@ pub fn blend_tiles(
     }
 }
 
-/// Gradient records of all pairs: centre (2), A, B, C, opacity, colour (3), depth. With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i
-/// the part of the loss behind it, d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i).
+/// Floats of a gradient record of a pair: moments of -d loss / d sigma, weighted colours and depth; with `absolute`, the centre's absolute gradient (x, y) too.
+pub const fn record_floats(absolute: bool) -> usize {
+    if absolute { RECORD + 2 } else { RECORD }
+}
+
+/// Gradient records of all pairs, [`record_floats`] each, which [`super::gradient::sum_records`] turns into gradients. With q_i the upstream gradient of what Gaussian i shows at a pixel and S_i
+/// the part of the loss that lies behind it, d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i).
 #[cube(launch_unchecked)]
 pub fn blend_tiles_backward(
     splats: &[f32],
@@ -155,13 +160,15 @@ pub fn blend_tiles_backward(
     alpha_max: f32,
     #[comptime] pass_capped: bool,
     #[comptime] batch: usize,
+    #[comptime] absolute: bool,
 ) {
+    let width_of_record = comptime!(record_floats(absolute));
     // Per Gaussian of a batch and pixel: -d loss / d sigma, then the blending weight.
     let mut found = Shared::<[f32]>::new_slice(comptime!(found_floats(batch)));
-    let mut of_picture = Shared::<[f32]>::new_slice(comptime!(4 * TILE_PIXELS));
+    let mut of_image = Shared::<[f32]>::new_slice(comptime!(4 * TILE_PIXELS));
     let mut drawn = Shared::<[f32]>::new_slice(comptime!(RECORD * batch));
     let mut pairs = Shared::<[u32]>::new_slice(batch);
-    let unit = UNIT_POS as usize;
+    let thread = UNIT_POS as usize;
     let tile = CUBE_POS as u32;
     let x = tile % tiles_x * SIDE + UNIT_POS % SIDE;
     let y = tile / tiles_x * SIDE + UNIT_POS / SIDE;
@@ -184,17 +191,17 @@ pub fn blend_tiles_backward(
         g_depth = upstream[at + 4 * pixels];
         behind = left * (background[0] * g_red + background[1] * g_green + background[2] * g_blue - upstream[at + 3 * pixels]);
     }
-    of_picture[unit] = g_red;
-    of_picture[unit + TILE_PIXELS] = g_green;
-    of_picture[unit + 2 * TILE_PIXELS] = g_blue;
-    of_picture[unit + 3 * TILE_PIXELS] = g_depth;
+    of_image[thread] = g_red;
+    of_image[thread + TILE_PIXELS] = g_green;
+    of_image[thread + 2 * TILE_PIXELS] = g_blue;
+    of_image[thread + 3 * TILE_PIXELS] = g_depth;
     let mut start = 0u32;
     let mut end = 0u32;
     if (tile as usize) + 1 < starts.len() {
         start = starts[tile as usize];
         end = starts[tile as usize + 1];
     }
-    // Behind the last Gaussian that any pixel of the tile shows, there is nothing to derive.
+    // Gaussians behind the last one that any pixel of the tile shows have no gradient.
     let deepest = Shared::<[Atomic<u32>]>::new_slice(1usize);
     if UNIT_POS == 0 {
         deepest[0].store(start);
@@ -203,25 +210,25 @@ pub fn blend_tiles_backward(
     deepest[0].fetch_max(stop);
     sync_cube();
     let mut i = deepest[0].load();
-    let unseen = (end - i) as usize * RECORD;
-    let mut k = unit;
+    let unseen = (end - i) as usize * width_of_record;
+    let mut k = thread;
     while k < unseen {
-        records[RECORD * sorted[i as usize + k / RECORD] as usize + k % RECORD] = 0.0;
+        records[width_of_record * sorted[i as usize + k / width_of_record] as usize + k % width_of_record] = 0.0;
         k += TILE_PIXELS;
     }
-    // The Gaussian of the batch and the pixels a unit adds up; they share a column of the tile.
+    // Each thread sums some pixels of one Gaussian of the batch; they share a column of the tile.
     let groups = comptime!(TILE_PIXELS / batch);
-    let (own, group) = (unit / groups, unit % groups);
+    let (own, group) = (thread / groups, thread % groups);
     let (column, top) = ((tile % tiles_x * SIDE) as f32 + (group % TILE) as f32 + 0.5, (tile / tiles_x * SIDE) as f32 + 0.5);
     while i > start {
         let count = select(i - start < batch as u32, i - start, batch as u32);
         let first = i - count;
         if UNIT_POS < count {
-            pairs[unit] = sorted[first as usize + unit];
+            pairs[thread] = sorted[first as usize + thread];
         }
         sync_cube();
-        if unit < RECORD * count as usize {
-            drawn[unit] = splats[SPLAT * gaussian_of_pair[pairs[unit / RECORD] as usize] as usize + unit % RECORD];
+        if thread < RECORD * count as usize {
+            drawn[thread] = splats[RECORD * gaussian_of_pair[pairs[thread / RECORD] as usize] as usize + thread % RECORD];
         }
         sync_cube();
         for step in 0..count {
@@ -230,13 +237,14 @@ pub fn blend_tiles_backward(
             let mut v = 0.0f32;
             let mut weight = 0.0f32;
             if first + (g as u32) < stop {
-                let full = full_alpha(&drawn, at, px - drawn[at], py - drawn[at + 1]);
+                let full = full_alpha(&drawn, at, px - drawn[at + AT_X], py - drawn[at + AT_Y]);
                 if full > 0.0 {
                     let alpha = select(full < alpha_max, full, alpha_max);
                     let inverse = 1.0 / (1.0 - alpha);
                     left *= inverse;
                     weight = alpha * left;
-                    let q = drawn[at + 6] * g_red + drawn[at + 7] * g_green + drawn[at + 8] * g_blue + drawn[at + 9] * g_depth;
+                    let mut q = drawn[at + AT_COLOR] * g_red + drawn[at + AT_COLOR + 1] * g_green;
+                    q = q + drawn[at + AT_COLOR + 2] * g_blue + drawn[at + AT_DEPTH] * g_depth;
                     let d_alpha = left * q - behind * inverse;
                     behind += weight * q;
                     // d alpha / d sigma = -alpha, uncapped.
@@ -246,8 +254,8 @@ pub fn blend_tiles_backward(
                     }
                 }
             }
-            found[g * TILE_PIXELS + unit] = v;
-            found[(batch + g) * TILE_PIXELS + unit] = weight;
+            found[g * TILE_PIXELS + thread] = v;
+            found[(batch + g) * TILE_PIXELS + thread] = weight;
         }
         sync_cube();
         // Moments of v give everything about the shape.
@@ -256,42 +264,63 @@ pub fn blend_tiles_backward(
         for k in 0..RECORD {
             sums[k] = 0.0f32;
         }
+        let mut absolute_x = 0.0f32;
+        let mut absolute_y = 0.0f32;
         if own < count as usize {
-            let dx = column - drawn[RECORD * own];
+            let at = RECORD * own;
+            let dx = column - drawn[at + AT_X];
             let mut along = 0.0f32;
             let mut square = 0.0f32;
             for k in 0..batch {
                 let pixel = k * groups + group;
-                let dy = top + (pixel / TILE) as f32 - drawn[RECORD * own + 1];
+                let dy = top + (pixel / TILE) as f32 - drawn[at + AT_Y];
                 let v = found[own * TILE_PIXELS + pixel];
                 let weight = found[(batch + own) * TILE_PIXELS + pixel];
-                sums[5] += v;
+                sums[AT_OPACITY] += v;
                 along += v * dy;
                 square += v * dy * dy;
                 #[unroll]
                 for c in 0..4usize {
-                    sums[6 + c] += weight * of_picture[c * TILE_PIXELS + pixel];
+                    sums[AT_COLOR + c] += weight * of_image[c * TILE_PIXELS + pixel];
+                }
+                if comptime!(absolute) {
+                    absolute_x += (v * (2.0 * drawn[at + AT_A] * dx + drawn[at + AT_B] * dy)).abs();
+                    absolute_y += (v * (drawn[at + AT_B] * dx + 2.0 * drawn[at + AT_C] * dy)).abs();
                 }
             }
-            sums[0] = dx * sums[5];
-            sums[1] = along;
-            sums[2] = dx * dx * sums[5];
-            sums[3] = dx * along;
-            sums[4] = square;
+            sums[AT_X] = dx * sums[AT_OPACITY];
+            sums[AT_Y] = along;
+            sums[AT_A] = dx * dx * sums[AT_OPACITY];
+            sums[AT_B] = dx * along;
+            sums[AT_C] = square;
         }
         sync_cube();
         #[unroll]
         for k in 0..RECORD {
-            found[k * COLUMN + unit] = sums[k];
+            found[k * COLUMN + thread] = sums[k];
         }
         sync_cube();
-        if unit < RECORD * count as usize {
-            let (g, k) = (unit / RECORD, unit % RECORD);
+        if thread < RECORD * count as usize {
+            let (g, k) = (thread / RECORD, thread % RECORD);
             let mut sum = 0.0f32;
             for part in 0..groups {
                 sum += found[k * COLUMN + g * groups + part];
             }
-            records[RECORD * pairs[g] as usize + k] = sum;
+            records[width_of_record * pairs[g] as usize + k] = sum;
+        }
+        if comptime!(absolute) {
+            sync_cube();
+            found[thread] = absolute_x;
+            found[COLUMN + thread] = absolute_y;
+            sync_cube();
+            if thread < 2 * count as usize {
+                let (g, k) = (thread / 2, thread % 2);
+                let mut sum = 0.0f32;
+                for part in 0..groups {
+                    sum += found[k * COLUMN + g * groups + part];
+                }
+                records[width_of_record * pairs[g] as usize + RECORD + k] = sum;
+            }
         }
         sync_cube();
         i = first;

@@ -4,16 +4,14 @@ use super::blend;
 use super::geometry::camera_buffer;
 use super::gradient::{GEOMETRY, SCREEN};
 use super::lists;
-use super::project::{self, KEYS, SPLAT};
+use super::project::{self, KEYS};
 use super::{DIM, Lists, read_words, rest_width, words};
-use crate::cpu::raster::camera::{CameraConstants, RuleConstants};
-use crate::cpu::raster::{MAX_TILE_PAIRS, RECORD, RasterSettings, TILE, TILE_PIXELS};
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{binding_bytes, cubes_for, empty, floats, row_blocks, rows_of, spread, upload};
-use crate::ops::rasterize::{Rasterized, Refusal, Saved, SavedInputs};
+use crate::cube::tensor::{binding_bytes, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for};
+use crate::ops::rasterize::camera::{CameraConstants, RuleConstants};
+use crate::ops::rasterize::{MAX_TILE_PAIRS, RECORD, RasterSettings, Rasterized, Refusal, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
-use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cc4dgs_core::{ParameterSpace, RenderWork};
 use cubecl::prelude::*;
@@ -31,8 +29,8 @@ fn refuse(like: &CubeTensor, refusal: Refusal) -> Rasterized<CubeBackend> {
 }
 
 /// Draws the Gaussians.
-pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> Rasterized<CubeBackend> {
-    let [means, scales, quaternions, opacities, colors, sh_rest, background] = inputs.map(into_contiguous);
+pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> Rasterized<CubeBackend> {
+    let SplatTensors { means, scales, quaternions, opacities, colors, sh_rest, background } = super::contiguous(splats);
     let client = means.client.clone();
     let n = means.meta.shape()[0];
     let (width, height) = (settings.width, settings.height);
@@ -40,10 +38,10 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
     let tiles = tiles_x * tiles_y;
     let (constants, rules) = (CameraConstants::new(settings), RuleConstants::new(settings));
     let cam = upload(&means, &camera_buffer(&constants, &rules, width, height), DType::F32);
-    let (splats, keys) = (floats(&means, [n, SPLAT]), empty(&means, [n, KEYS], DType::U32));
+    let (splats, keys) = (floats(&means, [n, RECORD]), empty(&means, [n, KEYS], DType::U32));
     let radii = empty(&means, [n], DType::I32);
     let raw = settings.space == ParameterSpace::Raw;
-    let widest = KEYS.max(SPLAT).max(SCREEN).max(GEOMETRY) as u64;
+    let widest = KEYS.max(RECORD).max(SCREEN).max(GEOMETRY) as u64;
     let most = binding_bytes(&client) / (4 * widest);
     if n as u64 > most {
         return refuse(&means, Refusal::Gaussians { found: n as u64, limit: most });
@@ -51,7 +49,7 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
     if n > 0 {
         project::project_gaussians::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             means.clone().into_buffer_arg(),
             scales.into_buffer_arg(),
@@ -69,7 +67,7 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
         for rows in row_blocks(&client, n, width) {
             project::color_gaussians::launch(
                 &client,
-                cubes_for(rows.len()),
+                workgroups_for(rows.len()),
                 DIM(),
                 means.clone().into_buffer_arg(),
                 colors.clone().into_buffer_arg(),
@@ -95,7 +93,7 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
     if n > 0 {
         lists::depth_keys::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             keys.clone().into_buffer_arg(),
             depth.clone().into_buffer_arg(),
@@ -104,7 +102,7 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
         order = sort_pairs(depth, index, n, 32).1;
         lists::counts_by_rank::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             keys.clone().into_buffer_arg(),
             order.clone().into_buffer_arg(),
@@ -112,12 +110,12 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
         );
         total = exclusive_sums(&counts, n);
     }
-    let pairs = match settings.pair_room {
-        Some(room) => room,
+    let pairs = match settings.pair_capacity {
+        Some(capacity) => capacity,
         None if n == 0 => 0,
         None => read_words(&total).first().copied().unwrap_or(0) as usize,
     };
-    let limit = MAX_TILE_PAIRS.min(binding_bytes(&client) / (4 * RECORD as u64));
+    let limit = MAX_TILE_PAIRS.min(binding_bytes(&client) / (4 * blend::record_floats(settings.absolute_centers) as u64));
     if pairs as u64 > limit {
         return refuse(&means, Refusal::Pairs { found: pairs as u64, limit });
     }
@@ -128,7 +126,7 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
     if pairs > 0 {
         lists::emit_pairs::launch(
             &client,
-            cubes_for(n),
+            workgroups_for(n),
             DIM(),
             keys.clone().into_buffer_arg(),
             order.into_buffer_arg(),
@@ -139,14 +137,14 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
             start_of_gaussian.clone().into_buffer_arg(),
             tiles_x as u32,
         );
-        if settings.pair_room.is_some() {
+        if settings.pair_capacity.is_some() {
             // What no Gaussian filled goes behind the last tile.
             let (tile, own) = (tile_of_pair.clone().into_buffer_arg(), pair.clone().into_buffer_arg());
-            lists::fill_unused::launch(&client, cubes_for(pairs), DIM(), tile, own, total.clone().into_buffer_arg(), tiles as u32);
+            lists::fill_unused::launch(&client, workgroups_for(pairs), DIM(), tile, own, total.clone().into_buffer_arg(), tiles as u32);
         }
         (sorted_tiles, sorted) = sort_pairs(tile_of_pair, pair, pairs, usize::BITS - tiles.leading_zeros());
     }
-    lists::tile_starts::launch(&client, cubes_for(pairs + 1), DIM(), sorted_tiles.into_buffer_arg(), tile_starts.clone().into_buffer_arg(), pairs as u32);
+    lists::tile_starts::launch(&client, workgroups_for(pairs + 1), DIM(), sorted_tiles.into_buffer_arg(), tile_starts.clone().into_buffer_arg(), pairs as u32);
     let planes = floats(&means, [5, height, width]);
     let state = floats(&means, [2, height, width]);
     let weights = if settings.max_weights && n > 0 { upload(&means, &vec![0.0f32; n], DType::F32) } else { upload(&means, &[0.0f32], DType::F32) };
@@ -174,7 +172,7 @@ pub fn forward(inputs: SavedInputs<CubeBackend>, settings: &RasterSettings) -> R
     let max_weights = if settings.max_weights && n > 0 { weights } else { floats(&means, [0]) };
     let saved = Lists { cam, splats, keys, gaussian_of_pair, start_of_gaussian, sorted, tile_starts, state, pairs };
     // Visible Gaussians and pixels are not counted here: that would need another read-back.
-    let work = RenderWork { visible: 0, tile_pairs: if settings.pair_room.is_none() { pairs as u64 } else { 0 }, pixel_pairs: 0 };
+    let work = RenderWork { visible: 0, tile_pairs: if settings.pair_capacity.is_none() { pairs as u64 } else { 0 }, pixel_pairs: 0 };
     // Counts stay below 2^31, so their bits are those of signed numbers too.
     let pair_count = CubeTensor::new_contiguous(total.client.clone(), total.device.clone(), [1].into(), total.handle.clone(), DType::I32);
     Rasterized { planes, radii, max_weights, work, pair_count, refused: None, saved: Saved::new(saved) }

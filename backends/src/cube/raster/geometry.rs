@@ -1,20 +1,30 @@
-//! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per unit.
+//! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per thread.
 
 use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
-use crate::cpu::raster::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
+use crate::ops::rasterize::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
 use cubecl::prelude::*;
 
-/// Places in the camera buffer: rotation by rows, translation, centre, focal lengths, principal point, limits of x/z and y/z, near plane, image size,
-/// and the row that gives the depth: four numbers, what float32 cuts off them, and a zero.
+/// Index of the translation in the camera buffer, which starts with the rotation by rows.
 pub const TRANSLATION: usize = 9;
+/// Index of the camera centre.
 pub const CENTER: usize = 12;
+/// Index of the two focal lengths.
 pub const FOCAL: usize = 15;
+/// Index of the principal point.
 pub const PRINCIPAL: usize = 17;
+/// Index of the limits of x/z (2) and y/z (2).
 pub const LIMITS: usize = 19;
+/// Index of the near plane.
 pub const NEAR: usize = 23;
+/// Index of width and height.
 pub const SIZE: usize = 24;
-pub const DEPTH: usize = 26;
-/// Of a float32, the upper half of the significand, so that products of halves are exact.
+/// Index of the four numbers of the row that gives the depth.
+const DEPTH: usize = 26;
+/// Index of the rounding errors of these in float32.
+const DEPTH_REST: usize = 30;
+/// Index of a zero that compilers do not know, see [`rounded`].
+const ZERO: usize = 34;
+/// Mask of the upper half of a float32's significand; products of halves are exact.
 const UPPER_HALF: u32 = 0xffff_f000;
 
 /// The camera as the kernels read it.
@@ -66,7 +76,7 @@ pub struct Projected {
     pub inside_y: f32,
 }
 
-/// a b as an exact float32 and a small rest, so that it does not matter whether a compiler fuses products with sums.
+/// a b as an exact float32 and a small remainder, so that the result does not depend on whether a compiler fuses products with sums.
 #[cube]
 fn exact_product(a: f32, b: f32) -> (f32, f32) {
     let a_upper = f32::reinterpret(u32::reinterpret(a) & UPPER_HALF);
@@ -75,13 +85,13 @@ fn exact_product(a: f32, b: f32) -> (f32, f32) {
     (a_upper * b_upper, a_upper * b_lower + a_lower * b_upper + a_lower * b_lower)
 }
 
-/// `v`, behind a door no compiler looks through: shaders may be simplified as if sums were exact (Mesa turns (a + b) - a into b).
+/// `v`, behind an optimisation barrier, because some shader compilers simplify (a + b) - a to b (Mesa). `zero` is 0, but not known to the compiler.
 #[cube]
 fn rounded(v: f32, zero: u32) -> f32 {
     f32::reinterpret(u32::reinterpret(v) ^ zero)
 }
 
-/// a + b and what rounding took (Knuth).
+/// a + b and its rounding error (Knuth).
 #[cube]
 fn exact_sum(a: f32, b: f32, zero: u32) -> (f32, f32) {
     let sum = rounded(a + b, zero);
@@ -96,12 +106,12 @@ pub fn sorting_depth(cam: &[f32], mean: V3) -> f32 {
     let (x, x_rest) = exact_product(cam[DEPTH], mean.x);
     let (y, y_rest) = exact_product(cam[DEPTH + 1], mean.y);
     let (z, z_rest) = exact_product(cam[DEPTH + 2], mean.z);
-    let zero = u32::reinterpret(cam[DEPTH + 8]);
+    let zero = u32::reinterpret(cam[ZERO]);
     let (first, first_rest) = exact_sum(cam[DEPTH + 3], x, zero);
     let (second, second_rest) = exact_sum(first, y, zero);
     let (third, third_rest) = exact_sum(second, z, zero);
-    let cut = cam[DEPTH + 4] * mean.x + cam[DEPTH + 5] * mean.y + cam[DEPTH + 6] * mean.z + cam[DEPTH + 7];
-    third + (x_rest + y_rest + z_rest + (first_rest + second_rest + third_rest) + cut)
+    let rest = cam[DEPTH_REST] * mean.x + cam[DEPTH_REST + 1] * mean.y + cam[DEPTH_REST + 2] * mean.z + cam[DEPTH_REST + 3];
+    third + (x_rest + y_rest + z_rest + (first_rest + second_rest + third_rest) + rest)
 }
 
 #[cube]
@@ -178,7 +188,7 @@ pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
     }
 }
 
-/// What flows out of a [`Projected`].
+/// Gradients of the inputs of [`project`].
 #[derive(CubeType, Clone, Copy)]
 pub struct GeometryGradient {
     pub mean: V3,

@@ -1,63 +1,90 @@
-//! From gradient records to the gradients of the parameters, one Gaussian per unit.
+//! From gradient records to the gradients of the parameters, one Gaussian per thread.
 
 use super::geometry::{CENTER, project, project_backward};
 use super::harmonics::{basis, basis_backward};
-use super::project::{KEYS, SPLAT, activated_opacity, activated_scales, quaternion, view_direction};
-use super::vector::{add, dot, load3, scale, v3};
-use crate::cpu::raster::RECORD;
+use super::project::{KEY_TILES, KEYS, activated_opacity, activated_scales, quaternion, view_direction};
+use super::vector::{V3, add, dot, load3, scale, store3, v3};
+use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD};
 use cubecl::prelude::*;
 
-/// Columns of the screen gradients: those of a record, then of the offset from the camera (through the view direction).
+/// Columns of the screen gradients: those of a record, then three for the offset from the camera (through the view direction).
 pub const SCREEN: usize = RECORD + 3;
-/// Columns of the geometry's gradients: centre, scales, quaternion, opacity, camera rotation, camera translation.
-pub const GEOMETRY: usize = 3 + 3 + 4 + 1 + 12;
+/// First column of the gradient of the offset from the camera.
+pub const AT_OFFSET: usize = RECORD;
 
-/// Adds up the records of each Gaussian, in the order of its tiles, and turns moments into gradients: screen [N,13].
+/// Columns of the geometry's gradients.
+pub const GEOMETRY: usize = 23;
+/// First of three columns of the centre in world units.
+pub const OF_MEAN: usize = 0;
+/// First of three columns of the scales.
+pub const OF_SCALES: usize = 3;
+/// First of four columns of the quaternion.
+pub const OF_QUATERNION: usize = 6;
+/// Column of the opacity.
+pub const OF_OPACITY: usize = 10;
+/// First of twelve columns of the camera: rotation by rows, translation.
+pub const OF_CAMERA: usize = 11;
+
+/// Adds up the records of each Gaussian, `stride` floats each, in the order of its tiles, and turns moments into gradients: screen `[N,13]`.
 #[cube(launch)]
-pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], splats: &[f32], screen: &mut [f32]) {
+pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], splats: &[f32], screen: &mut [f32], #[comptime] stride: usize) {
     let i = ABSOLUTE_POS;
     if i < start_of_gaussian.len() {
-        let mut sums = Array::<f32>::new(10usize);
+        let mut sums = Array::<f32>::new(RECORD);
         #[unroll]
-        for k in 0..10usize {
-            sums[k] = 0.0;
+        for k in 0..RECORD {
+            sums[k] = 0.0f32;
         }
         let start = start_of_gaussian[i];
-        let count = keys[KEYS * i + 1];
+        let count = keys[KEYS * i + KEY_TILES];
         for pair in start..start + count {
             #[unroll]
-            for k in 0..10usize {
-                sums[k] += records[RECORD * pair as usize + k];
+            for k in 0..RECORD {
+                sums[k] += records[stride * pair as usize + k];
             }
         }
         let to = SCREEN * i;
         if count > 0 {
-            let at = SPLAT * i;
-            let (half_a, b, half_c) = (splats[at + 2], splats[at + 3], splats[at + 4]);
-            screen[to] = 2.0 * half_a * sums[0] + b * sums[1];
-            screen[to + 1] = b * sums[0] + 2.0 * half_c * sums[1];
-            screen[to + 2] = -0.5f32 * sums[2];
-            screen[to + 3] = -sums[3];
-            screen[to + 4] = -0.5f32 * sums[4];
-            screen[to + 5] = sums[5] / splats[at + 5];
+            let at = RECORD * i;
+            let (half_a, b, half_c) = (splats[at + AT_A], splats[at + AT_B], splats[at + AT_C]);
+            screen[to + AT_X] = 2.0 * half_a * sums[AT_X] + b * sums[AT_Y];
+            screen[to + AT_Y] = b * sums[AT_X] + 2.0 * half_c * sums[AT_Y];
+            screen[to + AT_A] = -0.5f32 * sums[AT_A];
+            screen[to + AT_B] = -sums[AT_B];
+            screen[to + AT_C] = -0.5f32 * sums[AT_C];
+            screen[to + AT_OPACITY] = sums[AT_OPACITY] / splats[at + AT_OPACITY];
             #[unroll]
-            for k in 6..10usize {
-                screen[to + k] = sums[k];
+            for k in 0..4usize {
+                screen[to + AT_COLOR + k] = sums[AT_COLOR + k];
             }
         } else {
             #[unroll]
-            for k in 0..10usize {
+            for k in 0..RECORD {
                 screen[to + k] = 0.0;
             }
         }
-        #[unroll]
-        for k in 10..13usize {
-            screen[to + k] = 0.0;
-        }
+        store3(screen, to + AT_OFFSET, v3(0.0, 0.0, 0.0));
     }
 }
 
-/// Gradients of the degree-0 coefficients (or colours) [N,3] and of the higher ones [N,K,3], for `count` Gaussians from `first` on, whose higher coefficients
+/// The absolute gradients of the centres `[N,2]`, from the end of records of `stride` floats, in the order of each Gaussian's tiles.
+#[cube(launch)]
+pub fn sum_absolute(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], out: &mut [f32], #[comptime] stride: usize) {
+    let i = ABSOLUTE_POS;
+    if i < start_of_gaussian.len() {
+        let start = start_of_gaussian[i];
+        let mut x = 0.0f32;
+        let mut y = 0.0f32;
+        for pair in start..start + keys[KEYS * i + KEY_TILES] {
+            x += records[stride * pair as usize + RECORD];
+            y += records[stride * pair as usize + RECORD + 1];
+        }
+        out[2 * i] = x;
+        out[2 * i + 1] = y;
+    }
+}
+
+/// Gradients of the degree-0 coefficients (or colours) `[N,3]` and of the higher ones `[N,K,3]`, for `count` Gaussians from `first` on, whose higher coefficients
 /// `sh_rest` and `d_rest` hold; that of the offset goes to the screen gradients.
 #[cube(launch)]
 pub fn color_backward(
@@ -78,14 +105,14 @@ pub fn color_backward(
     let row = ABSOLUTE_POS;
     let i = first as usize + row;
     if row < count as usize {
-        let from = SCREEN * i + 6;
+        let from = SCREEN * i + AT_COLOR;
         let mut red = screen[from];
         let mut green = screen[from + 1];
         let mut blue = screen[from + 2];
         if comptime!(harmonics) {
             let seen = red != 0.0 || green != 0.0 || blue != 0.0;
             // What was clamped at zero passes nothing.
-            let at = SPLAT * i + 6;
+            let at = RECORD * i + AT_COLOR;
             let d = v3(select(splats[at] > 0.0, red, 0.0f32), select(splats[at + 1] > 0.0, green, 0.0f32), select(splats[at + 2] > 0.0, blue, 0.0f32));
             red = 0.0;
             green = 0.0;
@@ -118,9 +145,10 @@ pub fn color_backward(
                     let offset = add(mean, scale(load3(cam, CENTER), -1.0f32));
                     let inverse = 1.0 / dot(offset, offset).sqrt();
                     let along = dot(direction, g);
-                    screen[SCREEN * i + 10] = (g.x - direction.x * along) * inverse;
-                    screen[SCREEN * i + 11] = (g.y - direction.y * along) * inverse;
-                    screen[SCREEN * i + 12] = (g.z - direction.z * along) * inverse;
+                    let offset_at = SCREEN * i + AT_OFFSET;
+                    screen[offset_at] = (g.x - direction.x * along) * inverse;
+                    screen[offset_at + 1] = (g.y - direction.y * along) * inverse;
+                    screen[offset_at + 2] = (g.z - direction.z * along) * inverse;
                 }
             }
         }
@@ -130,7 +158,7 @@ pub fn color_backward(
     }
 }
 
-/// Gradients of centre, scales, quaternion, opacity and camera from those on the screen: [N,23].
+/// Gradients of centre, scales, quaternion, opacity and camera from those on the screen: `[N,23]`.
 #[cube(launch)]
 pub fn geometry_backward(
     means: &[f32],
@@ -148,19 +176,20 @@ pub fn geometry_backward(
     let i = ABSOLUTE_POS;
     if i < gaussians as usize {
         let to = GEOMETRY * i;
-        if keys[KEYS * i + 1] > 0 {
+        if keys[KEYS * i + KEY_TILES] > 0 {
             let from = SCREEN * i;
             let mean = load3(means, 3 * i);
             let s = activated_scales(scales, i, raw);
             let opacity = activated_opacity(opacities, i, raw);
             let p = project(cam, mean, quaternion(quaternions, i), s);
-            let mut d_opacity = screen[from + 5];
+            let mut d_opacity = screen[from + AT_OPACITY];
             let mut d_compensation = 0.0f32;
             if comptime!(antialiased) {
                 d_compensation = d_opacity * opacity;
                 d_opacity *= p.compensation;
             }
-            let d = project_backward(cam, mean, s, p, screen[from], screen[from + 1], load3(screen, from + 2), screen[from + 9], d_compensation);
+            let d_conic = load3(screen, from + AT_A);
+            let d = project_backward(cam, mean, s, p, screen[from + AT_X], screen[from + AT_Y], d_conic, screen[from + AT_DEPTH], d_compensation);
             let mut scale_x = d.scales.x;
             let mut scale_y = d.scales.y;
             let mut scale_z = d.scales.z;
@@ -170,30 +199,17 @@ pub fn geometry_backward(
                 scale_y *= s.y;
                 scale_z *= s.z;
             }
-            let d_mean = add(d.mean, load3(screen, from + 10));
-            out[to] = d_mean.x;
-            out[to + 1] = d_mean.y;
-            out[to + 2] = d_mean.z;
-            out[to + 3] = scale_x;
-            out[to + 4] = scale_y;
-            out[to + 5] = scale_z;
-            out[to + 6] = d.quaternion.w;
-            out[to + 7] = d.quaternion.x;
-            out[to + 8] = d.quaternion.y;
-            out[to + 9] = d.quaternion.z;
-            out[to + 10] = d_opacity;
-            out[to + 11] = d.camera0.x;
-            out[to + 12] = d.camera0.y;
-            out[to + 13] = d.camera0.z;
-            out[to + 14] = d.camera1.x;
-            out[to + 15] = d.camera1.y;
-            out[to + 16] = d.camera1.z;
-            out[to + 17] = d.camera2.x;
-            out[to + 18] = d.camera2.y;
-            out[to + 19] = d.camera2.z;
-            out[to + 20] = d.translation.x;
-            out[to + 21] = d.translation.y;
-            out[to + 22] = d.translation.z;
+            store3(out, to + OF_MEAN, add(d.mean, load3(screen, from + AT_OFFSET)));
+            store3(out, to + OF_SCALES, V3 { x: scale_x, y: scale_y, z: scale_z });
+            out[to + OF_QUATERNION] = d.quaternion.w;
+            out[to + OF_QUATERNION + 1] = d.quaternion.x;
+            out[to + OF_QUATERNION + 2] = d.quaternion.y;
+            out[to + OF_QUATERNION + 3] = d.quaternion.z;
+            out[to + OF_OPACITY] = d_opacity;
+            store3(out, to + OF_CAMERA, d.camera0);
+            store3(out, to + OF_CAMERA + 3, d.camera1);
+            store3(out, to + OF_CAMERA + 6, d.camera2);
+            store3(out, to + OF_CAMERA + 9, d.translation);
         } else {
             for k in 0..GEOMETRY {
                 out[to + k] = 0.0;
@@ -211,7 +227,7 @@ pub fn take_columns(from: &[f32], to: &mut [f32], stride: u32, first: u32, width
     }
 }
 
-/// Sums of columns over rows, in order, and of products over pixels: one unit per result, for the few that are asked for.
+/// Sums of columns over rows, in order: one thread per column, for few columns.
 #[cube(launch)]
 pub fn sum_rows(from: &[f32], to: &mut [f32], rows: u32, stride: u32, first: u32) {
     if ABSOLUTE_POS < to.len() {

@@ -50,7 +50,7 @@ pub fn basis(d: V3, #[comptime] degree: usize) -> Array<f32> {
     out
 }
 
-/// Gradient with respect to the unit direction of sum_k h[k] basis[k]; the part along the direction means nothing.
+/// Gradient with respect to the unit direction of sum_k h`[k]` basis`[k]`; its component along the direction has no meaning.
 #[cube]
 pub fn basis_backward(d: V3, h: &Array<f32>, #[comptime] degree: usize) -> V3 {
     let (x, y, z) = (d.x, d.y, d.z);

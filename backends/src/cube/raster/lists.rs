@@ -1,13 +1,13 @@
 //! Tile lists: which Gaussians meet a tile, in depth order.
 
-use super::project::KEYS;
+use super::project::{KEY_COLUMNS, KEY_DEPTH, KEY_ROWS, KEY_TILES, KEYS};
 use cubecl::prelude::*;
 
 /// Depth keys and indices of all Gaussians, to be sorted.
 #[cube(launch)]
 pub fn depth_keys(keys: &[u32], depth: &mut [u32], index: &mut [u32]) {
     if ABSOLUTE_POS < depth.len() {
-        depth[ABSOLUTE_POS] = keys[KEYS * ABSOLUTE_POS];
+        depth[ABSOLUTE_POS] = keys[KEYS * ABSOLUTE_POS + KEY_DEPTH];
         index[ABSOLUTE_POS] = ABSOLUTE_POS as u32;
     }
 }
@@ -16,12 +16,12 @@ pub fn depth_keys(keys: &[u32], depth: &mut [u32], index: &mut [u32]) {
 #[cube(launch)]
 pub fn counts_by_rank(keys: &[u32], order: &[u32], counts: &mut [u32]) {
     if ABSOLUTE_POS < order.len() {
-        counts[ABSOLUTE_POS] = keys[KEYS * order[ABSOLUTE_POS] as usize + 1];
+        counts[ABSOLUTE_POS] = keys[KEYS * order[ABSOLUTE_POS] as usize + KEY_TILES];
     }
 }
 
-/// Pairs of tiles and Gaussians in depth order: tile and Gaussian of each pair, its own number (which sorting carries along), and where the pairs of
-/// each Gaussian start.
+/// (Gaussian, tile) pairs in depth order: tile and Gaussian of each pair, its index (which sorting carries along), and where the pairs of each Gaussian
+/// start.
 #[cube(launch)]
 pub fn emit_pairs(
     keys: &[u32],
@@ -36,18 +36,18 @@ pub fn emit_pairs(
     if ABSOLUTE_POS < order.len() {
         let gaussian = order[ABSOLUTE_POS];
         let at = KEYS * gaussian as usize;
-        let mut place = starts[ABSOLUTE_POS];
-        start_of_gaussian[gaussian as usize] = place;
-        if keys[at + 1] > 0 {
-            let (columns, rows) = (keys[at + 2], keys[at + 3]);
+        let mut index = starts[ABSOLUTE_POS];
+        start_of_gaussian[gaussian as usize] = index;
+        if keys[at + KEY_TILES] > 0 {
+            let (columns, rows) = (keys[at + KEY_COLUMNS], keys[at + KEY_ROWS]);
             for row in (rows & 0xffffu32)..(rows >> 16) {
                 for column in (columns & 0xffffu32)..(columns >> 16) {
-                    if (place as usize) < tile_of_pair.len() {
-                        tile_of_pair[place as usize] = row * tiles_x + column;
-                        pair[place as usize] = place;
-                        gaussian_of_pair[place as usize] = gaussian;
+                    if (index as usize) < tile_of_pair.len() {
+                        tile_of_pair[index as usize] = row * tiles_x + column;
+                        pair[index as usize] = index;
+                        gaussian_of_pair[index as usize] = gaussian;
                     }
-                    place += 1;
+                    index += 1;
                 }
             }
         }
@@ -63,7 +63,7 @@ pub fn fill_unused(tile_of_pair: &mut [u32], pair: &mut [u32], total: &[u32], ti
     }
 }
 
-/// starts[tile] is the first of the sorted pairs of a tile; starts[tiles] their number.
+/// starts`[tile]` is the first of the sorted pairs of a tile; starts`[tiles]` their number.
 #[cube(launch)]
 pub fn tile_starts(tile_of_pair: &[u32], starts: &mut [u32], pairs: u32) {
     let tiles = starts.len() as u32 - 1;

@@ -1,8 +1,8 @@
 //! The tile rasterizer on the device.
 //!
-//! Gaussians are projected, sorted by depth, and appended to the lists of the tiles they meet in that order; sorting the pairs by tile alone then leaves every
-//! list in depth order. The number of pairs is the one thing read back per render, and not even that where the caller says how much room to make. Backwards,
-//! each pair has a gradient record of its own place, and the pairs of a Gaussian lie side by side, so that all sums have a fixed order.
+//! Gaussians are projected, sorted by depth, and appended to the lists of the tiles they meet in that order; a stable sort of the pairs by tile alone then keeps
+//! every list in depth order. The number of pairs is the one thing read back per render, and not even that where the caller states a capacity. Backwards,
+//! each pair has a gradient record of its own, and the pairs of a Gaussian are adjacent, so that all sums have a fixed order.
 
 mod backward;
 mod blend;
@@ -14,12 +14,12 @@ mod lists;
 mod project;
 mod vector;
 
-use super::tensor::{UNITS, empty};
-use crate::cpu::raster::RasterSettings;
-use crate::ops::rasterize::{Method, PARENTS, RasterBackward, RasterOps, Rasterized, Saved, SavedInputs};
+use super::tensor::{THREADS, empty};
+use crate::ops::rasterize::{GradientRequest, Method, Probes, RasterBackward, RasterGradients, RasterOps, RasterSettings, Rasterized, Saved, SplatTensors};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
@@ -36,13 +36,13 @@ struct Lists {
     pairs: usize,
 }
 
-const DIM: fn() -> CubeDim = || CubeDim::new_1d(UNITS);
+const DIM: fn() -> CubeDim = || CubeDim::new_1d(THREADS);
 
 fn words(like: &CubeTensor, count: usize) -> CubeTensor {
     empty(like, [count], DType::U32)
 }
 
-/// The numbers of a buffer of words, read back.
+/// Reads a buffer of words back.
 fn read_words(tensor: &CubeTensor) -> Vec<u32> {
     u32::from_bytes(&tensor.client.read_one_unchecked(tensor.handle.clone())).to_vec()
 }
@@ -56,32 +56,33 @@ fn rest_width(sh_rest: &CubeTensor, n: usize) -> usize {
     sh_rest.meta.shape().num_elements().checked_div(n).unwrap_or(0)
 }
 
+/// Every tensor with its elements side by side.
+fn contiguous(splats: SplatTensors<CubeBackend>) -> SplatTensors<CubeBackend> {
+    SplatTensors {
+        means: into_contiguous(splats.means),
+        scales: into_contiguous(splats.scales),
+        quaternions: into_contiguous(splats.quaternions),
+        opacities: into_contiguous(splats.opacities),
+        colors: into_contiguous(splats.colors),
+        sh_rest: into_contiguous(splats.sh_rest),
+        background: into_contiguous(splats.background),
+    }
+}
+
 impl RasterOps for CubeBackend {
-    fn rasterize(
-        means: FloatTensor<Self>,
-        scales: FloatTensor<Self>,
-        quaternions: FloatTensor<Self>,
-        opacities: FloatTensor<Self>,
-        colors: FloatTensor<Self>,
-        sh_rest: FloatTensor<Self>,
-        _screen_probe: FloatTensor<Self>,
-        _camera_probe: FloatTensor<Self>,
-        background: FloatTensor<Self>,
-        settings: RasterSettings,
-        _method: Method,
-    ) -> Rasterized<Self> {
-        forward::forward([means, scales, quaternions, opacities, colors, sh_rest, background], &settings)
+    fn rasterize(splats: SplatTensors<Self>, _: Probes<Self>, settings: RasterSettings, _: Method) -> Rasterized<Self> {
+        forward::forward(splats, &settings)
     }
 }
 
 impl RasterBackward for CubeBackend {
     fn rasterize_backward(
-        inputs: SavedInputs<Self>,
+        splats: SplatTensors<Self>,
         settings: &RasterSettings,
         saved: &Saved,
         upstream: FloatTensor<Self>,
-        wanted: [bool; PARENTS],
-    ) -> [Option<FloatTensor<Self>>; PARENTS] {
-        backward::backward(inputs, settings, saved, upstream, wanted)
+        request: GradientRequest,
+    ) -> RasterGradients<Self> {
+        backward::backward(splats, settings, saved, upstream, request)
     }
 }

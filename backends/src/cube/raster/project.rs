@@ -2,16 +2,22 @@
 
 use super::geometry::{CENTER, NEAR, Projected, SIZE, project, sorting_depth};
 use super::harmonics::basis;
-use super::vector::{V3, V4, add, dot, load3, scale, v3};
-use crate::cpu::raster::TILE;
-use crate::cpu::raster::camera::{ALPHA_MIN, FAR};
+use super::vector::{V3, V4, add, dot, load3, scale, store3, v3};
 use crate::cube::tensor::is_finite;
+use crate::ops::rasterize::camera::{ALPHA_MIN, FAR};
+use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, TILE};
 use cubecl::prelude::*;
 
-/// Floats of a screen record: centre (2), A/2, B, C/2, opacity, colour (3), depth.
-pub const SPLAT: usize = 10;
-/// Words of what sorting needs: depth key, tile count, first and end tile per axis packed in halves.
+/// Columns of what sorting needs of a Gaussian.
 pub const KEYS: usize = 4;
+/// Column of the depth key.
+pub const KEY_DEPTH: usize = 0;
+/// Column of the number of tiles.
+pub const KEY_TILES: usize = 1;
+/// Column of the first and end tile along x, packed in halves.
+pub const KEY_COLUMNS: usize = 2;
+/// Column of the first and end tile along y, packed in halves.
+pub const KEY_ROWS: usize = 3;
 /// Sigma by which footprints are enlarged, so that rounding never cuts off a pixel that blending would count.
 const CUTOFF_MARGIN: f32 = 0.005;
 /// Colours of this size and above count as infinite: their sums could overflow.
@@ -96,7 +102,7 @@ fn all_finite(mean: V3, s: V3, q: V4, opacity: f32, p: Projected) -> bool {
         && is_finite(p.center_y)
 }
 
-/// Screen records [N,10] without colour, sorting keys [N,4], radii [N].
+/// Screen records `[N,10]` without colour, sorting keys `[N,4]`, radii `[N]`.
 #[cube(launch)]
 pub fn project_gaussians(
     means: &[f32],
@@ -156,21 +162,22 @@ pub fn project_gaussians(
             columns = overlap(columns, square_columns);
             rows = overlap(rows, square_rows);
         }
-        let at = SPLAT * i;
-        splats[at] = p.center_x;
-        splats[at + 1] = p.center_y;
-        splats[at + 2] = p.conic.x * 0.5;
-        splats[at + 3] = p.conic.y;
-        splats[at + 4] = p.conic.z * 0.5;
-        splats[at + 5] = opacity;
+        let at = RECORD * i;
+        splats[at + AT_X] = p.center_x;
+        splats[at + AT_Y] = p.center_y;
+        splats[at + AT_A] = p.conic.x * 0.5;
+        splats[at + AT_B] = p.conic.y;
+        splats[at + AT_C] = p.conic.z * 0.5;
+        splats[at + AT_OPACITY] = opacity;
         let depth = sorting_depth(cam, mean);
-        splats[at + 9] = depth;
+        splats[at + AT_DEPTH] = depth;
+        let key = KEYS * i;
         // Depths are positive, so their bits order like the numbers.
-        keys[KEYS * i] = select(drawn, u32::reinterpret(depth), 0xffff_ffffu32);
-        keys[KEYS * i + 1] = select(drawn, length_of(columns) * length_of(rows), 0u32);
-        keys[KEYS * i + 2] = columns;
-        keys[KEYS * i + 3] = rows;
-        // Inria keeps integer radii below 2^31; so do we.
+        keys[key + KEY_DEPTH] = select(drawn, u32::reinterpret(depth), 0xffff_ffffu32);
+        keys[key + KEY_TILES] = select(drawn, length_of(columns) * length_of(rows), 0u32);
+        keys[key + KEY_COLUMNS] = columns;
+        keys[key + KEY_ROWS] = rows;
+        // Integer radii stay below 2^31, as in Inria's code.
         radii[i] = select(drawn, select(radius < 1e9, radius, 1e9f32) as i32, 0i32);
     }
 }
@@ -224,12 +231,10 @@ pub fn color_gaussians(
                 green = select(green > 0.0, green, 0.0f32);
                 blue = select(blue > 0.0, blue, 0.0f32);
             }
-            splats[SPLAT * i + 6] = red;
-            splats[SPLAT * i + 7] = green;
-            splats[SPLAT * i + 8] = blue;
+            store3(splats, RECORD * i + AT_COLOR, v3(red, green, blue));
         } else {
-            keys[KEYS * i] = 0xffff_ffffu32;
-            keys[KEYS * i + 1] = 0;
+            keys[KEYS * i + KEY_DEPTH] = 0xffff_ffffu32;
+            keys[KEYS * i + KEY_TILES] = 0;
             radii[i] = 0;
         }
     }

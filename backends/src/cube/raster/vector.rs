@@ -30,6 +30,14 @@ pub fn load3(values: &[f32], at: usize) -> V3 {
     V3 { x: values[at], y: values[at + 1], z: values[at + 2] }
 }
 
+/// Writes three numbers to `values` from `at`.
+#[cube]
+pub fn store3(values: &mut [f32], at: usize, v: V3) {
+    values[at] = v.x;
+    values[at + 1] = v.y;
+    values[at + 2] = v.z;
+}
+
 #[cube]
 pub fn dot(a: V3, b: V3) -> f32 {
     a.x * b.x + a.y * b.y + a.z * b.z

@@ -1,54 +1,83 @@
 //! Rasterization on the CPU's devices: tiles, or the reference on the host.
 
-use super::{Method, PARENTS, RasterBackward, RasterOps, RasterSettings, Rasterized, Refusal, Saved, SavedInputs};
-use crate::cpu::raster::{self, GradientRequest, SplatArrays, Workspace};
+use super::{GradientRequest, Method, Probes, RasterBackward, RasterGradients, RasterOps, RasterSettings, Rasterized, Refusal, Saved, SplatTensors};
+use crate::cpu::raster::{self, SplatArrays, Workspace};
 use crate::cpu::tensor::CpuBackend;
 use crate::rasterizers::reference::blend::Item;
 use crate::rasterizers::reference::{self, ReferenceInput};
+use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Flex, NdArray, TensorMetadata};
+use burn::tensor::Shape;
 use cc4dgs_core::RenderWork;
 use std::borrow::Cow;
 use std::sync::Mutex;
 
 /// The inputs as slices.
-fn arrays<B: CpuBackend>(inputs: &SavedInputs<B>) -> [Cow<'_, [f32]>; 7] {
-    std::array::from_fn(|k| B::floats(&inputs[k]))
+struct Borrowed<'a> {
+    means: Cow<'a, [f32]>,
+    scales: Cow<'a, [f32]>,
+    quaternions: Cow<'a, [f32]>,
+    opacities: Cow<'a, [f32]>,
+    colors: Cow<'a, [f32]>,
+    sh_rest: Cow<'a, [f32]>,
+    background: Cow<'a, [f32]>,
 }
 
-fn splats<'a>([means, scales, quaternions, opacities, colors, sh_rest, background]: &'a [Cow<'_, [f32]>; 7]) -> SplatArrays<'a> {
-    let background = std::array::from_fn(|k| background.get(k).copied().unwrap_or(0.0));
-    SplatArrays { means, scales, quaternions, opacities, colors, sh_rest, background }
-}
-
-fn rasterize_on_cpu<B: CpuBackend>(inputs: &SavedInputs<B>, settings: &RasterSettings, method: Method) -> Rasterized<B> {
-    let arrays = arrays::<B>(inputs);
-    let splats = splats(&arrays);
-    if method == Method::Reference {
-        return reference_forward::<B>(&splats, settings);
-    }
-    match raster::forward(&splats, settings) {
-        Ok(out) => {
-            let weights = out.max_weights.len();
-            Rasterized {
-                planes: B::from_floats(out.planes, [5, settings.height, settings.width]),
-                radii: B::from_ints(out.radii, [splats.len()]),
-                max_weights: B::from_floats(out.max_weights, [weights]),
-                pair_count: B::from_ints(vec![out.work.tile_pairs as i64], [1]),
-                work: out.work,
-                refused: None,
-                saved: Saved::new(Mutex::new(out.workspace)),
-            }
+impl<'a> Borrowed<'a> {
+    fn new<B: CpuBackend>(splats: &'a SplatTensors<B>) -> Self {
+        Self {
+            means: B::floats(&splats.means),
+            scales: B::floats(&splats.scales),
+            quaternions: B::floats(&splats.quaternions),
+            opacities: B::floats(&splats.opacities),
+            colors: B::floats(&splats.colors),
+            sh_rest: B::floats(&splats.sh_rest),
+            background: B::floats(&splats.background),
         }
-        Err(raster::TooManyPairs(pairs)) => Rasterized {
-            planes: B::from_floats(Vec::new(), [0, 0, 0]),
-            radii: B::from_ints(Vec::new(), [0]),
-            max_weights: B::from_floats(Vec::new(), [0]),
-            work: RenderWork::default(),
-            pair_count: B::from_ints(vec![pairs as i64], [1]),
-            refused: Some(Refusal::Pairs { found: pairs, limit: raster::MAX_TILE_PAIRS }),
-            saved: Saved::new(()),
-        },
+    }
+    fn arrays(&self) -> SplatArrays<'_> {
+        SplatArrays {
+            means: &self.means,
+            scales: &self.scales,
+            quaternions: &self.quaternions,
+            opacities: &self.opacities,
+            colors: &self.colors,
+            sh_rest: &self.sh_rest,
+            background: std::array::from_fn(|k| self.background.get(k).copied().unwrap_or(0.0)),
+        }
+    }
+}
+
+impl<B: CpuBackend> RasterOps for B {
+    fn rasterize(splats: SplatTensors<Self>, _: Probes<Self>, settings: RasterSettings, method: Method) -> Rasterized<Self> {
+        let borrowed = Borrowed::new(&splats);
+        let splats = borrowed.arrays();
+        if method == Method::Reference {
+            return reference_forward::<B>(&splats, &settings);
+        }
+        match raster::forward(&splats, &settings) {
+            Ok(out) => {
+                let weights = out.max_weights.len();
+                Rasterized {
+                    planes: B::from_floats(out.planes, [5, settings.height, settings.width]),
+                    radii: B::from_ints(out.radii, [splats.len()]),
+                    max_weights: B::from_floats(out.max_weights, [weights]),
+                    pair_count: B::from_ints(vec![out.work.tile_pairs as i64], [1]),
+                    work: out.work,
+                    refused: None,
+                    saved: Saved::new(Mutex::new(out.workspace)),
+                }
+            }
+            Err(raster::TooManyPairs(pairs)) => Rasterized {
+                planes: B::from_floats(Vec::new(), [0, 0, 0]),
+                radii: B::from_ints(Vec::new(), [0]),
+                max_weights: B::from_floats(Vec::new(), [0]),
+                work: RenderWork::default(),
+                pair_count: B::from_ints(vec![pairs as i64], [1]),
+                refused: Some(Refusal::Pairs { found: pairs, limit: super::MAX_TILE_PAIRS }),
+                saved: Saved::new(()),
+            },
+        }
     }
 }
 
@@ -83,6 +112,7 @@ fn reference_backward(splats: &SplatArrays, settings: &RasterSettings, items: &[
         colors: narrow(g.colors),
         sh_rest: narrow(g.sh_rest),
         screen: narrow(g.screen),
+        absolute_screen: narrow(g.absolute_screen),
         camera: narrow(g.camera),
         background: narrow(g.background),
     }
@@ -90,67 +120,38 @@ fn reference_backward(splats: &SplatArrays, settings: &RasterSettings, items: &[
 
 impl<B: CpuBackend> RasterBackward for B {
     fn rasterize_backward(
-        inputs: SavedInputs<Self>,
+        splats: SplatTensors<Self>,
         settings: &RasterSettings,
         saved: &Saved,
         upstream: FloatTensor<Self>,
-        wanted: [bool; PARENTS],
-    ) -> [Option<FloatTensor<Self>>; PARENTS] {
-        let shapes: [_; 7] = std::array::from_fn(|k| inputs[k].shape());
-        let arrays = arrays::<B>(&inputs);
-        let splats = splats(&arrays);
-        let [w_means, w_scales, w_quaternions, w_opacities, w_colors, w_rest, w_screen, w_camera, w_background] = wanted;
-        let request = GradientRequest {
-            means: w_means,
-            scales: w_scales,
-            quaternions: w_quaternions,
-            opacities: w_opacities,
-            colors: w_colors,
-            sh_rest: w_rest,
-            screen: w_screen,
-            camera: w_camera,
-            background: w_background,
-        };
+        request: GradientRequest,
+    ) -> RasterGradients<Self> {
+        let borrowed = Borrowed::new(&splats);
+        let arrays = borrowed.arrays();
         let upstream = B::floats(&upstream);
         let g = if let Some(items) = saved.get::<Vec<Item>>() {
-            reference_backward(&splats, settings, items, &upstream)
+            reference_backward(&arrays, settings, items, &upstream)
         } else if let Some(workspace) = saved.get::<Mutex<Workspace>>() {
-            // A panic of an earlier backward pass leaves leftovers at worst, and every buffer is written before it is read.
+            // A panic in an earlier backward pass leaves old values behind at worst, and every buffer is written before it is read.
             let mut workspace = workspace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-            raster::backward(&splats, settings, &mut workspace, &upstream, &request)
+            raster::backward(&arrays, settings, &mut workspace, &upstream, &request)
         } else {
-            // Nothing was drawn (too many pairs), so nothing flows back.
-            return std::array::from_fn(|_| None);
+            // Nothing was drawn (too many pairs), so no gradient flows back.
+            return RasterGradients::default();
         };
-        let n = splats.len();
-        let [s_means, s_scales, s_quaternions, s_opacities, s_colors, s_rest, s_background] = shapes;
-        let values = [g.means, g.scales, g.quaternions, g.opacities, g.colors, g.sh_rest, g.screen, g.camera, g.background];
-        let shapes = [s_means, s_scales, s_quaternions, s_opacities, s_colors, s_rest, [n, 2].into(), [4, 4].into(), s_background];
-        let mut parts = values.into_iter().zip(shapes).zip(wanted);
-        std::array::from_fn(|_| parts.next().and_then(|((values, shape), wanted)| wanted.then(|| B::from_floats(values, shape))))
+        let n = arrays.len();
+        let tensor = |wanted: bool, values: Vec<f32>, shape: Shape| wanted.then(|| B::from_floats(values, shape));
+        RasterGradients {
+            means: tensor(request.means, g.means, splats.means.shape()),
+            scales: tensor(request.scales, g.scales, splats.scales.shape()),
+            quaternions: tensor(request.quaternions, g.quaternions, splats.quaternions.shape()),
+            opacities: tensor(request.opacities, g.opacities, splats.opacities.shape()),
+            colors: tensor(request.colors, g.colors, splats.colors.shape()),
+            sh_rest: tensor(request.sh_rest, g.sh_rest, splats.sh_rest.shape()),
+            background: tensor(request.background, g.background, splats.background.shape()),
+            screen: tensor(request.screen, g.screen, [n, 2].into()),
+            absolute_screen: tensor(request.absolute_screen, g.absolute_screen, [n, 2].into()),
+            camera: tensor(request.camera, g.camera, [4, 4].into()),
+        }
     }
 }
-
-macro_rules! on_cpu {
-    ($backend:ty) => {
-        impl RasterOps for $backend {
-            fn rasterize(
-                means: FloatTensor<Self>,
-                scales: FloatTensor<Self>,
-                quaternions: FloatTensor<Self>,
-                opacities: FloatTensor<Self>,
-                colors: FloatTensor<Self>,
-                sh_rest: FloatTensor<Self>,
-                _screen_probe: FloatTensor<Self>,
-                _camera_probe: FloatTensor<Self>,
-                background: FloatTensor<Self>,
-                settings: RasterSettings,
-                method: Method,
-            ) -> Rasterized<Self> {
-                rasterize_on_cpu::<Self>(&[means, scales, quaternions, opacities, colors, sh_rest, background], &settings, method)
-            }
-        }
-    };
-}
-on_cpu!(Flex);
-on_cpu!(NdArray);

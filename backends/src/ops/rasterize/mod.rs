@@ -1,19 +1,19 @@
 //! Rasterization as one operation with a hand-written derivative.
 
+mod autodiff;
+pub mod camera;
 mod cpu;
+mod settings;
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, DispatchDevice, ExtensionType, backend_extension};
+use burn::backend::{Backend, Dispatch, DispatchDevice, ExtensionType, backend_extension};
 use burn::tensor::{Device, Int, Tensor};
 use cc4dgs_core::{Error, RenderOutput, RenderStats, RenderWork, Result};
 use std::any::Any;
 use std::fmt;
 use std::sync::Arc;
 
-pub use crate::cpu::raster::RasterSettings;
+pub use settings::*;
 
 /// Which implementation of a device draws.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -25,7 +25,7 @@ pub enum Method {
     Reference,
 }
 
-/// What a device keeps between the forward and the backward pass. Only the device that made it can read it.
+/// What a device saves between the forward and the backward pass. Only the device that made it can read it.
 #[derive(Clone)]
 pub struct Saved(Arc<dyn Any + Send + Sync>);
 
@@ -46,21 +46,21 @@ impl fmt::Debug for Saved {
     }
 }
 
-/// Why a device does not draw.
+/// Why a device refuses to draw.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// More (Gaussian, tile) pairs than there may be.
+    /// More (Gaussian, tile) pairs than the limit.
     Pairs {
-        /// Pairs there are.
+        /// Number of pairs.
         found: u64,
-        /// Pairs there may be.
+        /// Upper bound on pairs.
         limit: u64,
     },
-    /// An array of so many Gaussians is larger than a kernel of the device may read.
+    /// An array with a row per Gaussian is larger than a kernel of the device may read.
     Gaussians {
-        /// Gaussians there are.
+        /// Number of Gaussians.
         found: u64,
-        /// Gaussians that fit.
+        /// Upper bound on Gaussians.
         limit: u64,
     },
 }
@@ -69,13 +69,13 @@ impl Refusal {
     fn error(self) -> Error {
         match self {
             Self::Pairs { found, limit } => {
-                Error::limit("render", found, limit, "The value counts (Gaussian, tile) pairs: prune huge Gaussians or render a smaller image")
+                Error::limit("render", found, limit, "The value counts (Gaussian, tile) pairs. Prune huge Gaussians or render a smaller image")
             }
             Self::Gaussians { found, limit } => Error::limit(
                 "render",
                 found,
                 limit,
-                "The value counts Gaussians; the limit is what the adapter lets a kernel read at once. Use a device with larger bindings (cc4dgs doctor), or fewer Gaussians",
+                "The value counts Gaussians; the limit follows from the largest binding of the adapter. Use a device with larger bindings (`cc4dgs doctor` lists them), or fewer Gaussians",
             ),
         }
     }
@@ -84,15 +84,15 @@ impl Refusal {
 /// What the forward pass of a device returns.
 #[derive(ExtensionType)]
 pub struct Rasterized<B: Backend> {
-    /// Red, green, blue, alpha, depth [5,H,W].
+    /// Red, green, blue, alpha, depth `[5,H,W]`.
     pub planes: FloatTensor<B>,
-    /// Screen radii in pixels [N].
+    /// Screen radii in pixels `[N]`.
     pub radii: IntTensor<B>,
-    /// Largest blending weights [N]; [0] unless asked for.
+    /// Largest blending weights `[N]`; `[0]` unless asked for.
     pub max_weights: FloatTensor<B>,
     /// Counts of work.
     pub work: RenderWork,
-    /// Pairs of Gaussians and tiles [1].
+    /// Pairs of Gaussians and tiles `[1]`.
     pub pair_count: IntTensor<B>,
     /// Why nothing was drawn, if so; the planes are empty then.
     pub refused: Option<Refusal>,
@@ -100,133 +100,119 @@ pub struct Rasterized<B: Backend> {
     pub saved: Saved,
 }
 
-/// Rasterization per device. The screen and camera probes are not read; they are there to receive gradients.
-#[backend_extension(Flex, NdArray, Cube, Autodiff)]
+/// The Gaussians of one render, and what is behind them. Every field is a differentiable input.
+#[derive(Clone, Debug, ExtensionType)]
+pub struct SplatTensors<B: Backend> {
+    /// Centres in world units `[N,3]`.
+    pub means: FloatTensor<B>,
+    /// Log-scales or scales `[N,3]`.
+    pub scales: FloatTensor<B>,
+    /// Raw quaternions (w,x,y,z) `[N,4]`.
+    pub quaternions: FloatTensor<B>,
+    /// Logits or opacities `[N]`.
+    pub opacities: FloatTensor<B>,
+    /// Degree-0 coefficients, or colours `[N,3]`.
+    pub colors: FloatTensor<B>,
+    /// Higher coefficients `[N,K,3]`.
+    pub sh_rest: FloatTensor<B>,
+    /// Colour behind everything `[3]`.
+    pub background: FloatTensor<B>,
+}
+
+/// Inputs that are never read: they are there to receive gradients.
+#[derive(Clone, Debug, ExtensionType)]
+pub struct Probes<B: Backend> {
+    /// Receives d loss / d projected centre `[N,2]`.
+    pub screen: FloatTensor<B>,
+    /// Receives the sums over pixels of the absolute values of what adds up to the gradient of `screen` `[N,2]`.
+    pub absolute_screen: FloatTensor<B>,
+    /// Receives d loss / d world_to_camera `[4,4]`.
+    pub camera: FloatTensor<B>,
+}
+
+/// Gradients of [`SplatTensors`] and [`Probes`], shaped like them; those asked for.
+#[derive(Clone, Debug, Default)]
+pub struct RasterGradients<B: Backend> {
+    /// `[N,3]`
+    pub means: Option<FloatTensor<B>>,
+    /// `[N,3]`
+    pub scales: Option<FloatTensor<B>>,
+    /// `[N,4]`
+    pub quaternions: Option<FloatTensor<B>>,
+    /// `[N]`
+    pub opacities: Option<FloatTensor<B>>,
+    /// `[N,3]`
+    pub colors: Option<FloatTensor<B>>,
+    /// `[N,K,3]`
+    pub sh_rest: Option<FloatTensor<B>>,
+    /// `[3]`
+    pub background: Option<FloatTensor<B>>,
+    /// `[N,2]`
+    pub screen: Option<FloatTensor<B>>,
+    /// `[N,2]`
+    pub absolute_screen: Option<FloatTensor<B>>,
+    /// `[4,4]`
+    pub camera: Option<FloatTensor<B>>,
+}
+
+/// Rasterization per device.
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
 pub trait RasterOps: Backend {
-    /// Renders Gaussians: `means` [N,3], `scales` [N,3], `quaternions` [N,4], `opacities` [N], `colors` [N,3], `sh_rest` [N,K,3],
-    /// `screen_probe` [N,2], `camera_probe` [4,4], `background` [3].
+    /// Renders Gaussians.
     fn rasterize(
-        means: FloatTensor<Self>,
-        scales: FloatTensor<Self>,
-        quaternions: FloatTensor<Self>,
-        opacities: FloatTensor<Self>,
-        colors: FloatTensor<Self>,
-        sh_rest: FloatTensor<Self>,
-        screen_probe: FloatTensor<Self>,
-        camera_probe: FloatTensor<Self>,
-        background: FloatTensor<Self>,
+        #[extension_type] splats: SplatTensors<Self>,
+        #[extension_type] probes: Probes<Self>,
         settings: RasterSettings,
         method: Method,
     ) -> Rasterized<Self>;
 }
 
-/// The parents of the operation, as the backward pass reads them: means, scales, quaternions, opacities, colors, sh_rest, background.
-pub type SavedInputs<B> = [FloatTensor<B>; 7];
-
-/// Number of parents: those of [`SavedInputs`], the screen probe and the camera probe.
-pub const PARENTS: usize = 9;
-
 /// The derivative per device.
 pub trait RasterBackward: Backend {
-    /// Gradients of the parents in the order of the arguments of [`RasterOps::rasterize`]; only those wanted.
+    /// Gradients for `upstream` = d loss / d planes `[5,H,W]`; only those in `request`.
     fn rasterize_backward(
-        inputs: SavedInputs<Self>,
+        splats: SplatTensors<Self>,
         settings: &RasterSettings,
         saved: &Saved,
         upstream: FloatTensor<Self>,
-        wanted: [bool; PARENTS],
-    ) -> [Option<FloatTensor<Self>>; PARENTS];
+        request: GradientRequest,
+    ) -> RasterGradients<Self>;
 }
 
-/// The node in the graph.
-#[derive(Debug)]
-struct RasterNode;
-
-/// What the node remembers: inputs, settings, the device's state.
-type NodeState<B> = (SavedInputs<B>, RasterSettings, Saved);
-
-impl<B: RasterBackward> Backward<B, PARENTS> for RasterNode {
-    type State = NodeState<B>;
-
-    fn backward(self, ops: Ops<Self::State, PARENTS>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let upstream = grads.consume::<B>(&ops.node);
-        let (inputs, settings, saved) = ops.state;
-        let wanted = ops.parents.each_ref().map(Option::is_some);
-        let gradients = B::rasterize_backward(inputs, &settings, &saved, upstream, wanted);
-        for (parent, gradient) in ops.parents.into_iter().zip(gradients) {
-            if let (Some(parent), Some(gradient)) = (parent, gradient) {
-                grads.register::<B>(parent.id, gradient);
-            }
-        }
-    }
-}
-
-impl<B: RasterOps + RasterBackward, C: CheckpointStrategy> RasterOps for Autodiff<B, C> {
-    fn rasterize(
-        means: FloatTensor<Self>,
-        scales: FloatTensor<Self>,
-        quaternions: FloatTensor<Self>,
-        opacities: FloatTensor<Self>,
-        colors: FloatTensor<Self>,
-        sh_rest: FloatTensor<Self>,
-        screen_probe: FloatTensor<Self>,
-        camera_probe: FloatTensor<Self>,
-        background: FloatTensor<Self>,
-        settings: RasterSettings,
-        method: Method,
-    ) -> Rasterized<Self> {
-        let (means, n0) = means.into_parts();
-        let (scales, n1) = scales.into_parts();
-        let (quaternions, n2) = quaternions.into_parts();
-        let (opacities, n3) = opacities.into_parts();
-        let (colors, n4) = colors.into_parts();
-        let (sh_rest, n5) = sh_rest.into_parts();
-        let (screen_probe, n6) = screen_probe.into_parts();
-        let (camera_probe, n7) = camera_probe.into_parts();
-        let (background, n8) = background.into_parts();
-        let inputs = [means, scales, quaternions, opacities, colors, sh_rest, background];
-        let [means, scales, quaternions, opacities, colors, sh_rest, background] = inputs.clone();
-        let prep = RasterNode.prepare::<C>([n0, n1, n2, n3, n4, n5, n6, n7, n8]).compute_bound().stateful();
-        let out = B::rasterize(means, scales, quaternions, opacities, colors, sh_rest, screen_probe, camera_probe, background, settings.clone(), method);
-        let Rasterized { planes, radii, max_weights, work, pair_count, refused, saved } = out;
-        let planes = match prep {
-            OpsKind::Tracked(prep) => prep.finish((inputs, settings, saved.clone()), planes),
-            OpsKind::UnTracked(prep) => prep.finish(planes),
-        };
-        Rasterized { planes, radii, max_weights: Self::from_inner(max_weights), work, pair_count, refused, saved }
-    }
-}
-
-/// The tensors of one render; what is absent is a constant without gradient.
+/// The tensors of one render; absent ones are constants without gradient.
 pub struct RasterInputs {
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: Tensor<2>,
-    /// Log-scales or scales [N,3].
+    /// Log-scales or scales `[N,3]`.
     pub scales: Tensor<2>,
-    /// Raw quaternions (w,x,y,z) [N,4].
+    /// Raw quaternions (w,x,y,z) `[N,4]`.
     pub quaternions: Tensor<2>,
-    /// Logits or opacities [N].
+    /// Logits or opacities `[N]`.
     pub opacities: Tensor<1>,
-    /// Degree-0 coefficients, or colours [N,3].
+    /// Degree-0 coefficients, or colours `[N,3]`.
     pub colors: Tensor<2>,
-    /// Higher coefficients [N,K,3].
+    /// Higher coefficients `[N,K,3]`.
     pub sh_rest: Option<Tensor<3>>,
-    /// Receives d loss / d projected centre [N,2].
+    /// Receives d loss / d projected centre `[N,2]`.
     pub screen_probe: Option<Tensor<2>>,
-    /// Receives d loss / d world_to_camera [4,4].
+    /// Receives the sums over pixels of the absolute values of what adds up to the gradient of `screen_probe` `[N,2]`.
+    pub absolute_screen_probe: Option<Tensor<2>>,
+    /// Receives d loss / d world_to_camera `[4,4]`.
     pub camera_probe: Option<Tensor<2>>,
-    /// Colour behind everything [3]; black if absent.
+    /// Colour behind everything `[3]`; black if absent.
     pub background: Option<Tensor<1>>,
 }
 
-/// Refuses a device that lacks the operation.
+/// An error for a device without the operation.
 fn check_device(device: &Device, method: Method) -> Result<()> {
     match device.clone().without_autodiff().as_dispatch() {
         DispatchDevice::Flex(_) | DispatchDevice::NdArray(_) => Ok(()),
+        #[cfg(feature = "cube")]
         DispatchDevice::Cube(_) if method == Method::Tiles => Ok(()),
+        #[cfg(feature = "cube")]
         DispatchDevice::Cube(_) => Err(Error::unsupported(
             format!("rasterizer reference on {device:?}"),
-            "it computes in float64, on the host",
+            "it computes in float64 on the processor",
             "Use --device flex, or the rasterizer tile",
         )),
         _ => Err(Error::unsupported(format!("rasterize on {device:?}"), "this device has no rasterizer yet", "Use --device flex or ndarray")),
@@ -237,23 +223,26 @@ fn check_device(device: &Device, method: Method) -> Result<()> {
 pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method) -> Result<RenderOutput> {
     let device = inputs.means.device();
     check_device(&device, method)?;
-    // Stand-ins for what is absent: probes are never read, no background is black.
-    let absent = || Tensor::<1>::empty([3], &device);
-    let black = || Tensor::<1>::zeros([3], &device);
+    // What is absent still needs a tensor: probes are never read, and no background is black.
+    let absent = || Tensor::<1>::empty([3], &device).into_dispatch();
+    let black = || Tensor::<1>::zeros([3], &device).into_dispatch();
     let wants_weights = settings.max_weights;
-    let out = <Dispatch as RasterOps>::rasterize(
-        inputs.means.into_dispatch(),
-        inputs.scales.into_dispatch(),
-        inputs.quaternions.into_dispatch(),
-        inputs.opacities.into_dispatch(),
-        inputs.colors.into_dispatch(),
-        inputs.sh_rest.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
-        inputs.screen_probe.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
-        inputs.camera_probe.map_or_else(|| absent().into_dispatch(), Tensor::into_dispatch),
-        inputs.background.map_or_else(|| black().into_dispatch(), Tensor::into_dispatch),
-        settings,
-        method,
-    );
+    let settings = RasterSettings { absolute_centers: inputs.absolute_screen_probe.is_some(), ..settings };
+    let splats = SplatTensors::<Dispatch> {
+        means: inputs.means.into_dispatch(),
+        scales: inputs.scales.into_dispatch(),
+        quaternions: inputs.quaternions.into_dispatch(),
+        opacities: inputs.opacities.into_dispatch(),
+        colors: inputs.colors.into_dispatch(),
+        sh_rest: inputs.sh_rest.map_or_else(absent, Tensor::into_dispatch),
+        background: inputs.background.map_or_else(black, Tensor::into_dispatch),
+    };
+    let probes = Probes::<Dispatch> {
+        screen: inputs.screen_probe.map_or_else(absent, Tensor::into_dispatch),
+        absolute_screen: inputs.absolute_screen_probe.map_or_else(absent, Tensor::into_dispatch),
+        camera: inputs.camera_probe.map_or_else(absent, Tensor::into_dispatch),
+    };
+    let out = <Dispatch as RasterOps>::rasterize(splats, probes, settings, method);
     if let Some(refusal) = out.refused {
         return Err(refusal.error());
     }

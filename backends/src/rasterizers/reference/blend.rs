@@ -1,11 +1,8 @@
 //! Blending pixel by pixel over the whole depth-sorted list, forwards and backwards.
 
 use super::gaussian::TileRange;
-use crate::cpu::raster::RasterSettings;
-use crate::cpu::raster::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
-
-/// Numbers per Gaussian that a pixel reads: centre (2), conic (3), opacity, colour (3), depth.
-pub const SCREEN: usize = 10;
+use crate::ops::rasterize::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
+use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, RasterSettings};
 
 /// A Gaussian on the screen.
 #[derive(Clone, Debug)]
@@ -13,7 +10,7 @@ pub struct Item {
     /// Which Gaussian.
     pub index: usize,
     /// Centre (2), conic (3), opacity, colour (3), depth.
-    pub numbers: [f64; SCREEN],
+    pub numbers: [f64; RECORD],
     /// Tiles it is restricted to: first and end per axis.
     pub tiles: Option<TileRange>,
 }
@@ -60,9 +57,9 @@ fn touches(items: &[Item], settings: &RasterSettings, column: usize, row: usize)
     (found, left)
 }
 
-/// The picture and what was counted.
-pub struct Picture {
-    /// Red, green, blue, alpha, depth [5,H,W].
+/// The image and what was counted.
+pub struct Blended {
+    /// Red, green, blue, alpha, depth `[5,H,W]`.
     pub planes: Vec<f64>,
     /// Largest weight per item.
     pub max_weights: Vec<f64>,
@@ -71,57 +68,66 @@ pub struct Picture {
 }
 
 /// Blends depth-sorted `items`.
-pub fn blend(items: &[Item], settings: &RasterSettings, background: [f64; 3]) -> Picture {
+pub fn blend(items: &[Item], settings: &RasterSettings, background: [f64; 3]) -> Blended {
     let plane = settings.width * settings.height;
-    let mut picture = Picture { planes: vec![0.0; 5 * plane], max_weights: vec![0.0; items.len()], pairs: 0 };
+    let mut image = Blended { planes: vec![0.0; 5 * plane], max_weights: vec![0.0; items.len()], pairs: 0 };
     for row in 0..settings.height {
         for column in 0..settings.width {
             let pixel = row * settings.width + column;
             let (found, left) = touches(items, settings, column, row);
-            picture.pairs += found.len() as u64;
+            image.pairs += found.len() as u64;
             for touch in &found {
                 let weight = touch.alpha * touch.before;
                 let numbers = &items[touch.item].numbers;
                 for c in 0..3 {
-                    picture.planes[c * plane + pixel] += weight * numbers[6 + c];
+                    image.planes[c * plane + pixel] += weight * numbers[AT_COLOR + c];
                 }
-                picture.planes[4 * plane + pixel] += weight * numbers[9];
-                picture.max_weights[touch.item] = picture.max_weights[touch.item].max(weight);
+                image.planes[4 * plane + pixel] += weight * numbers[AT_DEPTH];
+                image.max_weights[touch.item] = image.max_weights[touch.item].max(weight);
             }
             for c in 0..3 {
-                picture.planes[c * plane + pixel] += left * background[c];
+                image.planes[c * plane + pixel] += left * background[c];
             }
-            picture.planes[3 * plane + pixel] = 1.0 - left;
+            image.planes[3 * plane + pixel] = 1.0 - left;
         }
     }
-    picture
+    image
 }
 
-/// Gradients of the items' numbers and of the background for `upstream` [5,H,W].
-pub fn blend_backward(items: &[Item], settings: &RasterSettings, background: [f64; 3], upstream: &[f64]) -> (Vec<[f64; SCREEN]>, [f64; 3]) {
+/// What flows out of [`blend`].
+pub struct BlendGradients {
+    /// Of the numbers of every item.
+    pub items: Vec<[f64; RECORD]>,
+    /// Sums over pixels of the absolute gradients of every item's centre.
+    pub absolute_centers: Vec<[f64; 2]>,
+    /// Of the background.
+    pub background: [f64; 3],
+}
+
+/// Gradients for `upstream` `[5,H,W]`.
+pub fn blend_backward(items: &[Item], settings: &RasterSettings, background: [f64; 3], upstream: &[f64]) -> BlendGradients {
     let rules = RuleConstants::new(settings);
     let plane = settings.width * settings.height;
-    let mut d_items = vec![[0.0; SCREEN]; items.len()];
-    let mut d_background = [0.0; 3];
+    let mut out = BlendGradients { items: vec![[0.0; RECORD]; items.len()], absolute_centers: vec![[0.0; 2]; items.len()], background: [0.0; 3] };
     for row in 0..settings.height {
         for column in 0..settings.width {
             let pixel = row * settings.width + column;
             let g: [f64; 5] = std::array::from_fn(|k| upstream[k * plane + pixel]);
             let (found, left) = touches(items, settings, column, row);
             for c in 0..3 {
-                d_background[c] += left * g[c];
+                out.background[c] += left * g[c];
             }
             // d loss / d transmittance behind everything.
             let mut d_left = (0..3).map(|c| g[c] * background[c]).sum::<f64>() - g[3];
             for touch in found.iter().rev() {
                 let numbers = &items[touch.item].numbers;
-                let d = &mut d_items[touch.item];
-                let shown = (0..3).map(|c| g[c] * numbers[6 + c]).sum::<f64>() + g[4] * numbers[9];
+                let d = &mut out.items[touch.item];
+                let shown = (0..3).map(|c| g[c] * numbers[AT_COLOR + c]).sum::<f64>() + g[4] * numbers[AT_DEPTH];
                 let weight = touch.alpha * touch.before;
                 for c in 0..3 {
-                    d[6 + c] += weight * g[c];
+                    d[AT_COLOR + c] += weight * g[c];
                 }
-                d[9] += weight * g[4];
+                d[AT_DEPTH] += weight * g[4];
                 let d_alpha = touch.before * (shown - d_left);
                 // The loss is linear in the transmittance in front of this Gaussian.
                 d_left = touch.alpha * shown + (1.0 - touch.alpha) * d_left;
@@ -129,15 +135,19 @@ pub fn blend_backward(items: &[Item], settings: &RasterSettings, background: [f6
                     continue;
                 }
                 let [_, _, a, b, c, opacity, ..] = *numbers;
-                d[5] += d_alpha * touch.uncapped / opacity;
+                d[AT_OPACITY] += d_alpha * touch.uncapped / opacity;
                 let d_sigma = -d_alpha * touch.uncapped;
-                d[0] -= d_sigma * (a * touch.dx + b * touch.dy);
-                d[1] -= d_sigma * (b * touch.dx + c * touch.dy);
-                d[2] += d_sigma * 0.5 * touch.dx * touch.dx;
-                d[3] += d_sigma * touch.dx * touch.dy;
-                d[4] += d_sigma * 0.5 * touch.dy * touch.dy;
+                let d_center = [-d_sigma * (a * touch.dx + b * touch.dy), -d_sigma * (b * touch.dx + c * touch.dy)];
+                d[AT_X] += d_center[0];
+                d[AT_Y] += d_center[1];
+                for (sum, value) in out.absolute_centers[touch.item].iter_mut().zip(d_center) {
+                    *sum += value.abs();
+                }
+                d[AT_A] += d_sigma * 0.5 * touch.dx * touch.dx;
+                d[AT_B] += d_sigma * touch.dx * touch.dy;
+                d[AT_C] += d_sigma * 0.5 * touch.dy * touch.dy;
             }
         }
     }
-    (d_items, d_background)
+    out
 }

@@ -1,8 +1,8 @@
 //! One Gaussian onto the screen, written as the textbook has it: Sigma = R S S^T R^T, J W Sigma W^T J^T + blur, inverse of the result.
 
 use super::real::Real;
-use crate::cpu::raster::RasterSettings;
-use crate::cpu::raster::camera::{ALPHA_MIN, FAR, RuleConstants};
+use crate::ops::rasterize::RasterSettings;
+use crate::ops::rasterize::camera::{ALPHA_MIN, FAR, RuleConstants};
 use cc4dgs_core::ParameterSpace;
 
 /// Blur added to the diagonal of the projected covariance, square pixels.

@@ -11,9 +11,8 @@ pub mod real;
 
 use super::settings::{no_settings, raster_settings};
 use super::tile::raster_inputs;
-use crate::cpu::raster::RasterSettings;
-use crate::ops::rasterize::{Method, rasterize};
-use blend::{Item, SCREEN};
+use crate::ops::rasterize::{AT_COLOR, AT_DEPTH, Method, RECORD, RasterSettings, rasterize};
+use blend::Item;
 use cc4dgs_core::{Camera, Plugin, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, Splats, inventory};
 use gaussian::{Gaussian, Projected};
 use real::{Dual, Real};
@@ -21,17 +20,17 @@ use real::{Dual, Real};
 /// The arrays of N Gaussians in float64, row-major, as in [`crate::cpu::raster::SplatArrays`].
 #[derive(Clone, Debug, Default)]
 pub struct ReferenceInput {
-    /// [N,3]
+    /// `[N,3]`
     pub means: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub scales: Vec<f64>,
-    /// [N,4]
+    /// `[N,4]`
     pub quaternions: Vec<f64>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub colors: Vec<f64>,
-    /// [N,K,3]
+    /// `[N,K,3]`
     pub sh_rest: Vec<f64>,
     /// Colour behind everything.
     pub background: [f64; 3],
@@ -40,11 +39,11 @@ pub struct ReferenceInput {
 /// What a forward pass returns.
 #[derive(Clone, Debug)]
 pub struct ReferenceOutput {
-    /// Red, green, blue, alpha, depth [5,H,W].
+    /// Red, green, blue, alpha, depth `[5,H,W]`.
     pub planes: Vec<f64>,
-    /// Screen radius, the larger of the two axes; 0 where culled [N].
+    /// Screen radius, the larger of the two axes; 0 where culled `[N]`.
     pub radii: Vec<i64>,
-    /// Largest blending weight [N].
+    /// Largest blending weight `[N]`.
     pub max_weights: Vec<f64>,
     /// Visible Gaussians, front to back.
     pub items: Vec<Item>,
@@ -55,26 +54,28 @@ pub struct ReferenceOutput {
 /// Gradients of everything.
 #[derive(Clone, Debug)]
 pub struct ReferenceGradients {
-    /// [N,3]
+    /// `[N,3]`
     pub means: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub scales: Vec<f64>,
-    /// [N,4]
+    /// `[N,4]`
     pub quaternions: Vec<f64>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<f64>,
-    /// [N,3]
+    /// `[N,3]`
     pub colors: Vec<f64>,
-    /// [N,K,3]
+    /// `[N,K,3]`
     pub sh_rest: Vec<f64>,
-    /// [N,2]
+    /// `[N,2]`
     pub screen: Vec<f64>,
-    /// [4,4]
+    /// `[N,2]`
+    pub absolute_screen: Vec<f64>,
+    /// `[4,4]`
     pub camera: Vec<f64>,
-    /// [3]
+    /// `[3]`
     pub background: Vec<f64>,
     /// Of the screen quantities, by item: centre, conic, opacity, colour, depth.
-    pub items: Vec<[f64; SCREEN]>,
+    pub items: Vec<[f64; RECORD]>,
 }
 
 fn three(values: &[f64], i: usize) -> [f64; 3] {
@@ -149,25 +150,25 @@ pub fn visible(input: &ReferenceInput, settings: &RasterSettings) -> (Vec<Item>,
         items.push(Item { index: i, numbers, tiles });
     }
     // By depth as float32; equal depths stay in order of index.
-    items.sort_by(|a, b| (a.numbers[9] as f32).total_cmp(&(b.numbers[9] as f32)));
+    items.sort_by(|a, b| (a.numbers[AT_DEPTH] as f32).total_cmp(&(b.numbers[AT_DEPTH] as f32)));
     (items, radii)
 }
 
 /// Renders.
 pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOutput {
     let (items, radii) = visible(input, settings);
-    let picture = blend::blend(&items, settings, input.background);
+    let image = blend::blend(&items, settings, input.background);
     let mut max_weights = vec![0.0; radii.len()];
-    for (item, weight) in items.iter().zip(&picture.max_weights) {
+    for (item, weight) in items.iter().zip(&image.max_weights) {
         max_weights[item.index] = *weight;
     }
-    ReferenceOutput { planes: picture.planes, radii, max_weights, items, pairs: picture.pairs }
+    ReferenceOutput { planes: image.planes, radii, max_weights, items, pairs: image.pairs }
 }
 
-/// Gradients for `upstream` [5,H,W] at the visible `items` of the forward pass.
+/// Gradients for `upstream` `[5,H,W]` at the visible `items` of the forward pass.
 pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item], upstream: &[f64]) -> ReferenceGradients {
     let n = input.opacities.len();
-    let (d_items, d_background) = blend::blend_backward(items, settings, input.background, upstream);
+    let blended = blend::blend_backward(items, settings, input.background, upstream);
     let mut out = ReferenceGradients {
         means: vec![0.0; 3 * n],
         scales: vec![0.0; 3 * n],
@@ -176,11 +177,12 @@ pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item
         colors: vec![0.0; 3 * n],
         sh_rest: vec![0.0; input.sh_rest.len()],
         screen: vec![0.0; 2 * n],
+        absolute_screen: vec![0.0; 2 * n],
         camera: vec![0.0; 16],
-        background: d_background.to_vec(),
+        background: blended.background.to_vec(),
         items: Vec::new(),
     };
-    for (item, g) in items.iter().zip(&d_items) {
+    for ((item, g), absolute) in items.iter().zip(&blended.items).zip(&blended.absolute_centers) {
         let i = item.index;
         let p = gaussian::project(&input.gaussian(i, settings, Dual::<VARIABLES>::variable), settings);
         let color = input.color(i, settings.sh_degree, p.direction);
@@ -189,8 +191,8 @@ pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item
         for (quantity, g) in [p.center[0], p.center[1], p.conic[0], p.conic[1], p.conic[2], p.opacity].into_iter().zip(g) {
             add(quantity, *g);
         }
-        add(p.depth, g[9]);
-        let d_color: [f64; 3] = std::array::from_fn(|c| if settings.sh_degree.is_some() && color[c].value < 0.0 { 0.0 } else { g[6 + c] });
+        add(p.depth, g[AT_DEPTH]);
+        let d_color: [f64; 3] = std::array::from_fn(|c| if settings.sh_degree.is_some() && color[c].value < 0.0 { 0.0 } else { g[AT_COLOR + c] });
         for c in 0..3 {
             add(color[c], d_color[c]);
         }
@@ -202,6 +204,7 @@ pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item
             out.camera[k] += d[11 + k];
         }
         out.screen[2 * i..2 * i + 2].copy_from_slice(&g[0..2]);
+        out.absolute_screen[2 * i..2 * i + 2].copy_from_slice(absolute);
         let values = settings.sh_degree.map_or(vec![1.0], |degree| harmonics::basis(degree, p.direction.map(|v| v.value)));
         let width = input.sh_rest.len() / n;
         for (k, value) in values.into_iter().enumerate() {
@@ -211,7 +214,7 @@ pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item
             }
         }
     }
-    out.items = d_items;
+    out.items = blended.items;
     out
 }
 

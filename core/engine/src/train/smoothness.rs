@@ -1,21 +1,20 @@
-//! Smoothness of the field (paper Equation "L_smooth") and the measurement that decides whether a scene needs it.
+//! Smoothness of the deformer (paper Equation "L_smooth") and the measurement that decides whether a scene needs it.
 
-use super::state::Rows;
 use crate::config::TrainConfig;
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Deformer, DeformerContext, Result, Seed};
+use cc4dgs_core::{Deformer, DeformerContext, Result, Seed, SpatialInput};
 use rand::Rng;
 
 /// Flicker of the field's motion: rms of its second difference from frame to frame over the rms of its deviation from the mean.
 /// A straight or slowly curving path is near 0, white noise is sqrt(6). Sampled at up to 33 consecutive frames and 2,048 Gaussians.
-pub fn flicker(field: &dyn Deformer, means_world: Tensor<2>, frame_count: usize) -> Result<f32> {
-    let n = means_world.dims()[0];
+pub fn flicker(field: &dyn Deformer, input: &SpatialInput, frame_count: usize) -> Result<f32> {
+    let n = input.len();
     let frames = frame_count.min(33);
     if n == 0 || frames < 4 {
         return Ok(0.0);
     }
-    let features = field.spatial(means_world.narrow(0, 0, n.min(2048)))?.values;
+    let features = field.spatial(&input.first(2048))?.values;
     let mut paths: Vec<Vec<f32>> = Vec::new();
     for frame in 0..frames {
         let offsets = field.deform(features.clone(), frame as f32 / frame_count as f32)?;
@@ -36,13 +35,13 @@ pub fn flicker(field: &dyn Deformer, means_world: Tensor<2>, frame_count: usize)
 pub fn smoothness(
     field: &dyn Deformer,
     context: &DeformerContext,
-    means_world: Tensor<2>,
+    input: &SpatialInput,
     time_norm: f32,
     config: &TrainConfig,
     progress: f64,
     seed: Seed,
 ) -> Result<Option<Tensor<1>>> {
-    let n = means_world.dims()[0];
+    let n = input.len();
     let m = n.div_ceil(4);
     if m == 0 {
         return Ok(None);
@@ -52,12 +51,12 @@ pub fn smoothness(
     let delta = config.smooth_delta;
     let shifts: Vec<f32> = (0..3 * m).map(|i| rng.random_range(-delta..=delta) * (context.box_max[i % 3] - context.box_min[i % 3])).collect();
     let time_shift = rng.random_range(-delta..=delta);
-    let device = means_world.device();
-    let rows = Rows::Some(Tensor::from_data(TensorData::new(picked, [m]), &device), m);
-    let here = rows.select(means_world);
-    let there = here.clone() + Tensor::<2>::from_data(TensorData::new(shifts, [m, 3]), &device);
-    let d = field.deform(field.spatial(here)?.values, time_norm)?.concatenated();
-    let d_shifted = field.deform(field.spatial(there)?.values, (time_norm + time_shift).clamp(0.0, 1.0))?.concatenated();
+    let device = input.means_world.device();
+    let here = input.select(&Tensor::<1, Int>::from_data(TensorData::new(picked, [m]), &device));
+    let shifted = here.means_world.clone() + Tensor::<2>::from_data(TensorData::new(shifts, [m, 3]), &device);
+    let there = SpatialInput { means_world: shifted, attributes: here.attributes.clone() };
+    let d = field.deform(field.spatial(&here)?.values, time_norm)?.concatenated();
+    let d_shifted = field.deform(field.spatial(&there)?.values, (time_norm + time_shift).clamp(0.0, 1.0))?.concatenated();
     let weight = f64::from(config.lambda_r) * progress / m as f64;
     Ok(match (d, d_shifted) {
         (Some(a), Some(b)) => {
@@ -78,8 +77,8 @@ mod tests {
     struct Along(fn(f32) -> f32);
 
     impl Deformer for Along {
-        fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
-            Ok(SpatialFeatures { values: means_world, work: DeformerWork::default() })
+        fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+            Ok(SpatialFeatures { values: input.means_world.clone(), work: DeformerWork::default() })
         }
         fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
             Ok(Offsets { means: Some(features.mul_scalar(self.0(time_norm))), ..Offsets::default() })
@@ -95,20 +94,20 @@ mod tests {
         }
     }
 
-    fn means() -> Tensor<2> {
-        Tensor::from_floats([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0], [-1.0, 0.0, 3.0]], &Device::flex())
+    fn means() -> SpatialInput {
+        SpatialInput::new(Tensor::from_floats([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0], [-1.0, 0.0, 3.0]], &Device::flex()))
     }
 
     #[test]
     fn flicker_tells_jitter_from_motion() {
         let threshold = TrainConfig::default().flicker_threshold;
-        let of = |path: fn(f32) -> f32| flicker(&Along(path), means(), 30).unwrap();
+        let of = |path: fn(f32) -> f32| flicker(&Along(path), &means(), 30).unwrap();
         // At 30 frames: a sway of one cycle, a straight line, and a sign that flips with every frame.
         let (sway, line, jitter) = (of(|t| (std::f32::consts::TAU * t).sin()), of(|t| t), of(|t| if (t * 30.0).round() as i32 % 2 == 0 { 1.0 } else { -1.0 }));
         assert!(line < 1e-3 && sway < 0.1 && sway < threshold, "line {line}, sway {sway}");
         assert!((jitter - 4.0).abs() < 0.05 && jitter > threshold, "second differences of +-1 are 4: {jitter}");
         assert_eq!(of(|_| 0.3), 0.0, "what stands still does not flicker");
-        assert_eq!(flicker(&Along(|t| t), Tensor::zeros([0, 3], &Device::flex()), 30).unwrap(), 0.0);
+        assert_eq!(flicker(&Along(|t| t), &SpatialInput::new(Tensor::zeros([0, 3], &Device::flex())), 30).unwrap(), 0.0);
     }
 
     #[test]
@@ -116,7 +115,7 @@ mod tests {
         let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 30, sh_degree: 0, seed: Seed::root(1) };
         let config = TrainConfig { smooth_delta: 0.1, ..TrainConfig::default() };
         let term = |path: fn(f32) -> f32, progress: f64| {
-            let term = smoothness(&Along(path), &context, means(), 0.5, &config, progress, Seed::root(3)).unwrap().unwrap();
+            let term = smoothness(&Along(path), &context, &means(), 0.5, &config, progress, Seed::root(3)).unwrap().unwrap();
             to_vec(term, "smoothness").unwrap()[0]
         };
         let (half, whole) = (term(|t| t, 0.5), term(|t| t, 1.0));

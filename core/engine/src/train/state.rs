@@ -1,12 +1,10 @@
 //! Everything a run needs to continue to the same bytes.
 
-use super::FieldOptimizer;
-use crate::columns::GaussianSet;
-use crate::densify::ScreenStats;
-use crate::schedule::Stage;
+use crate::gaussian_set::GaussianSet;
+use crate::model::ModelDeformer;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformerContext, HostGaussians, Result, Seed};
+use cc4dgs_core::{Appearance, DeformerContext, DensityControl, Optimizer, Result, Seed, SpatialInput, Stage};
 use serde::{Deserialize, Serialize};
 
 /// Which Gaussians the field may move.
@@ -35,49 +33,34 @@ impl Moving {
     }
 }
 
-/// The rows the field is asked about, on the device.
-// One value per run: boxing the tensor would only cost an allocation.
-#[allow(clippy::large_enum_variant)]
+/// The Gaussians that the deformer is asked about, on the device: indices [M], or all where they are `None`.
 #[derive(Clone, Debug)]
-pub enum Rows {
-    /// Every Gaussian, in order.
-    All,
-    /// These rows [M].
-    Some(Tensor<1, Int>, usize),
+pub struct MovingRows {
+    indices: Option<Tensor<1, Int>>,
+    count: usize,
 }
 
-impl Rows {
-    /// Uploads `rows`.
-    pub fn new(rows: Option<Vec<usize>>, device: &Device) -> Self {
-        match rows {
-            None => Rows::All,
-            Some(rows) => {
-                let count = rows.len();
-                let rows: Vec<i64> = rows.into_iter().map(|i| i as i64).collect();
-                Rows::Some(Tensor::from_data(TensorData::new(rows, [count]), device), count)
-            }
-        }
+impl MovingRows {
+    /// The rows `rows` of `total` Gaussians; `None` is all of them.
+    pub fn new(rows: Option<Vec<usize>>, total: usize, device: &Device) -> Self {
+        let count = rows.as_ref().map_or(total, Vec::len);
+        let upload = |rows: Vec<usize>| Tensor::from_data(TensorData::new(rows.into_iter().map(|i| i as i64).collect::<Vec<_>>(), [count]), device);
+        Self { indices: rows.map(upload), count }
     }
-    /// How many of `n` Gaussians these are.
-    pub fn count(&self, n: usize) -> usize {
-        match self {
-            Rows::All => n,
-            Rows::Some(_, count) => *count,
-        }
+    /// How many there are.
+    pub fn count(&self) -> usize {
+        self.count
     }
-    /// The rows of `values` [N,C].
+    /// These rows of `values` [N,C].
     pub fn select(&self, values: Tensor<2>) -> Tensor<2> {
-        match self {
-            Rows::All => values,
-            Rows::Some(rows, _) => values.select(0, rows.clone()),
+        match &self.indices {
+            None => values,
+            Some(rows) => values.select(0, rows.clone()),
         }
     }
     /// The index tensor, `None` for all.
-    pub fn tensor(&self) -> Option<&Tensor<1, Int>> {
-        match self {
-            Rows::All => None,
-            Rows::Some(rows, _) => Some(rows),
-        }
+    pub fn indices(&self) -> Option<&Tensor<1, Int>> {
+        self.indices.as_ref()
     }
 }
 
@@ -87,57 +70,67 @@ pub struct TrainState {
     pub stage: Stage,
     /// Iterations of the stage that are done.
     pub iteration: usize,
-    /// The Gaussians with their moments.
+    /// The Gaussians.
     pub set: GaussianSet,
-    /// Densification statistics.
-    pub stats: ScreenStats,
     /// What may move.
     pub moving: Moving,
-    /// The field and its moments, from the main stage on.
-    pub field: Option<FieldOptimizer>,
+    /// The deformer, from the main stage on.
+    pub deformer: Option<ModelDeformer>,
+    /// Between rendered and recorded images.
+    pub appearance: Box<dyn Appearance>,
+    /// Adds, moves and removes Gaussians.
+    pub density: Box<dyn DensityControl>,
+    /// Steps everything that learns.
+    pub optimizer: Box<dyn Optimizer>,
     /// Whether smoothness was switched on.
     pub smooth: bool,
-    rows: Option<Rows>,
+    rows: Option<MovingRows>,
+}
+
+/// The parts of the trainer that have state.
+pub struct Parts {
+    /// Between rendered and recorded images.
+    pub appearance: Box<dyn Appearance>,
+    /// Adds, moves and removes Gaussians.
+    pub density: Box<dyn DensityControl>,
+    /// Steps everything that learns.
+    pub optimizer: Box<dyn Optimizer>,
 }
 
 impl TrainState {
     /// A fresh run.
-    pub fn new(host: &HostGaussians, moving: Moving, device: &Device) -> Self {
-        let set = GaussianSet::new(host, device);
-        let stats = ScreenStats::zeros(&set);
-        Self { stage: Stage::Coarse, iteration: 0, set, stats, moving, field: None, smooth: false, rows: None }
+    pub fn new(set: GaussianSet, moving: Moving, parts: Parts) -> Self {
+        let Parts { appearance, density, optimizer } = parts;
+        Self { stage: Stage::Coarse, iteration: 0, set, moving, deformer: None, appearance, density, optimizer, smooth: false, rows: None }
     }
-    /// A run from stored parts.
-    pub fn restored(stage: Stage, iteration: usize, set: GaussianSet, stats: ScreenStats, moving: Moving, field: Option<FieldOptimizer>, smooth: bool) -> Self {
-        Self { stage, iteration, set, stats, moving, field, smooth, rows: None }
+    /// New optimizer state and statistics, as every stage starts with (Swift4D).
+    pub fn begin_stage(&mut self, device: &Device) {
+        self.optimizer.restart("");
+        self.density.begin_stage(self.set.len(), device);
     }
-    /// New optimisers and statistics, as every stage starts with (baselines §2.3).
-    pub fn begin_stage(&mut self) {
-        self.set.step = 0;
-        for column in &mut self.set.columns {
-            column.first_moment = column.first_moment.zeros_like();
-            column.second_moment = column.second_moment.zeros_like();
-        }
-        self.stats = ScreenStats::zeros(&self.set);
-    }
-    /// The rows the field moves; kept until the set changes.
-    pub fn moving_rows(&mut self, device: &Device) -> Result<Rows> {
+    /// The rows the deformer moves; kept until the set changes.
+    pub fn moving_rows(&mut self, device: &Device) -> Result<MovingRows> {
         if let Some(rows) = &self.rows {
             return Ok(rows.clone());
         }
         let rows = match self.moving {
-            Moving::Scored { .. } => self.moving.rows(&to_vec(self.set.columns[6].value.clone(), "dynamic_scores")?),
+            Moving::Scored { .. } => self.moving.rows(&to_vec(self.set.get("dynamic_scores")?.clone(), "dynamic_scores")?),
             other => other.rows(&[]),
         };
-        let rows = Rows::new(rows, device);
+        let rows = MovingRows::new(rows, self.set.len(), device);
         self.rows = Some(rows.clone());
         Ok(rows)
+    }
+    /// What the deformer is asked about, without gradient.
+    pub fn spatial_input(&self, deformer: &ModelDeformer, rows: &MovingRows) -> Result<SpatialInput> {
+        let attributes = deformer.field.attributes().iter().map(|a| Ok(rows.select(self.set.get(&a.name)?.clone()))).collect::<Result<_>>()?;
+        Ok(SpatialInput { means_world: rows.select(self.set.get("means")?.clone()), attributes })
     }
     /// To be called whenever Gaussians or scores changed.
     pub fn invalidate_rows(&mut self) {
         self.rows = None;
     }
-    /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres, padded by 5 % (baselines §10, row 3).
+    /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres, padded by 5 %.
     pub fn field_context(&mut self, frame_count: usize, seed: Seed) -> Result<DeformerContext> {
         let host = self.set.host_gaussians()?;
         let mut rows = self.moving.rows(&host.dynamic_scores).unwrap_or_default();

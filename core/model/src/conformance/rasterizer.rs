@@ -1,21 +1,27 @@
 //! What a rasterizer must keep to.
 
+mod probes;
+
 use super::uniform;
 use crate::gaussians::to_vec;
-use crate::{Camera, Gaussians, HostGaussians, Rasterizer, RasterizerPlugin, RenderSettings, Result, Seed, Splats};
+use crate::{Camera, Gaussians, HostGaussians, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, Seed, Splats};
 use burn::tensor::{Device, Tensor, TensorData};
 
-/// Picture size of the suite.
+/// Image size of the suite.
 const SIZE: (u32, u32) = (37, 25);
 /// Gaussians of the suite.
 const COUNT: usize = 30;
 /// Largest relative difference between a slope by finite differences and the gradient along itself.
 const SLOPE_TOLERANCE: f64 = 0.05;
 
-/// Holds a rasterizer to its promises on `device`: unknown settings are refused; without Gaussians there is the background; a Gaussian in the middle of a
-/// picture has its own colour and opacity there; what lies behind the camera, or is not finite, is not drawn; planes have their shapes, alpha lies in 0..1, two
-/// renders are the same bit for bit; radii are 0 for what is not drawn; largest weights lie in 0..1 where they are asked for; gradients agree with finite
-/// differences.
+/// Holds a rasterizer to its promises on `device`:
+///
+/// - Unknown settings are refused.
+/// - Without Gaussians, the image is the background.
+/// - A Gaussian in the middle of the image has its own colour and opacity there.
+/// - Gaussians behind the camera, and those that are not finite, are not drawn; their radius is 0.
+/// - Planes have their shapes, alpha lies in 0..1, and two renders are the same bit for bit. Largest weights lie in 0..1 where they are asked for.
+/// - Gradients agree with finite differences: of every attribute, of projected centres (signed, and absolute per pixel), and of the camera's pose.
 pub fn rasterizer(plugin: &RasterizerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let name = plugin.info.name;
     let rasterizer = match (plugin.build)(settings) {
@@ -23,13 +29,15 @@ pub fn rasterizer(plugin: &RasterizerPlugin, settings: &toml::Table, device: &De
         Err(e) => return vec![format!("{name}: it cannot be built: {e}")],
     };
     let suite = Suite { rasterizer: rasterizer.as_ref(), device };
-    let checks: [(&str, Result<Option<String>>); 6] = [
+    let checks: [(&str, Result<Option<String>>); 8] = [
         ("settings", refuses_unknown_settings(plugin, settings)),
         ("background", suite.nothing_is_background()),
         ("one Gaussian", suite.one_gaussian_is_itself()),
         ("odd Gaussians", suite.odd_gaussians_are_left_out()),
         ("planes", suite.planes_are_sound()),
         ("gradients", suite.gradients_are_slopes()),
+        ("screen probes", suite.screen_probes_are_slopes()),
+        ("camera probe", suite.camera_probe_is_a_slope()),
     ];
     checks
         .into_iter()
@@ -44,6 +52,11 @@ pub fn rasterizer(plugin: &RasterizerPlugin, settings: &toml::Table, device: &De
 struct Suite<'a> {
     rasterizer: &'a dyn Rasterizer,
     device: &'a Device,
+}
+
+/// Whether a slope by finite differences along a gradient is that gradient's norm.
+fn agrees(slopes: &[f64], norm: f64) -> bool {
+    slopes.iter().any(|slope| (slope / norm - 1.0).abs() <= SLOPE_TOLERANCE)
 }
 
 fn refuses_unknown_settings(plugin: &RasterizerPlugin, settings: &toml::Table) -> Result<Option<String>> {
@@ -74,18 +87,18 @@ fn cloud(count: usize) -> HostGaussians {
 }
 
 impl Suite<'_> {
-    fn draw(&self, host: &HostGaussians, settings: &RenderSettings) -> Result<crate::RenderOutput> {
+    fn draw(&self, host: &HostGaussians, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput> {
         let g = Gaussians::from_host(host, self.device);
-        self.rasterizer.render(&Splats::from_gaussians(&g, g.sh_degree), &camera(), settings)
+        self.rasterizer.render(&Splats::from_gaussians(&g, g.sh_degree), camera, settings)
     }
     fn planes(&self, host: &HostGaussians) -> Result<Vec<f32>> {
-        to_vec(self.draw(host, &RenderSettings::default())?.planes, "planes")
+        to_vec(self.draw(host, &camera(), &RenderSettings::default())?.planes, "planes")
     }
     fn nothing_is_background(&self) -> Result<Option<String>> {
         let colour = [0.25f32, 0.5, 1.0];
         let background = Some(Tensor::<1>::from_data(TensorData::new(colour.to_vec(), [3]), self.device));
         let empty = HostGaussians { sh_degree: 1, ..Default::default() };
-        let planes = to_vec(self.draw(&empty, &RenderSettings { background, ..Default::default() })?.planes, "planes")?;
+        let planes = to_vec(self.draw(&empty, &camera(), &RenderSettings { background, ..Default::default() })?.planes, "planes")?;
         let pixels = (SIZE.0 * SIZE.1) as usize;
         let wrong = colour.into_iter().chain([0.0, 0.0]).enumerate().find(|(k, v)| planes[k * pixels..(k + 1) * pixels].iter().any(|p| p != v));
         Ok(wrong.map(|(k, v)| format!("plane {k} is not {v} everywhere")))
@@ -96,7 +109,7 @@ impl Suite<'_> {
         g.opacity_logits = vec![0.4];
         g.sh_rest.fill(0.0);
         let planes = self.planes(&g)?;
-        // The picture has an odd number of rows and columns, so that a pixel's centre is the principal point.
+        // Rows and columns are odd in number, so that the principal point is the centre of a pixel.
         let (width, height) = (SIZE.0 as usize, SIZE.1 as usize);
         let (middle, pixels) = (height / 2 * width + width / 2, width * height);
         let opacity = 1.0 / (1.0 + (-0.4f32).exp());
@@ -115,16 +128,16 @@ impl Suite<'_> {
         let clean = cloud(4);
         let truth = self.planes(&clean)?;
         for (what, column, value) in
-            [("behind the camera", 0, -50.0), ("at infinity", 0, f32::INFINITY), ("no number", 0, f32::NAN), ("of no opacity", 3, f32::NAN)]
+            [("behind the camera", 0, -50.0), ("at infinity", 0, f32::INFINITY), ("not a number", 0, f32::NAN), ("of no opacity", 3, f32::NAN)]
         {
             let mut odd = cloud(5);
             if let Some((_, width, values)) = odd.columns_mut().into_iter().nth(column) {
                 values[5 * width - 1] = value;
             }
-            let output = self.draw(&odd, &RenderSettings::default())?;
+            let output = self.draw(&odd, &camera(), &RenderSettings::default())?;
             let found = to_vec(output.planes, "planes")?;
             if found != truth {
-                return Ok(Some(format!("a Gaussian {what} changes the picture")));
+                return Ok(Some(format!("a Gaussian {what} changes the image")));
             }
             let radii: Vec<i64> = output.stats.radii.into_data().iter::<i64>().collect();
             if radii.len() != 5 || radii[4] != 0 || radii[..4].contains(&0) {
@@ -134,7 +147,7 @@ impl Suite<'_> {
         Ok(None)
     }
     fn planes_are_sound(&self) -> Result<Option<String>> {
-        let output = self.draw(&cloud(COUNT), &RenderSettings { max_weights: true, ..Default::default() })?;
+        let output = self.draw(&cloud(COUNT), &camera(), &RenderSettings { max_weights: true, ..Default::default() })?;
         if output.planes.dims() != [5, SIZE.1 as usize, SIZE.0 as usize] {
             return Ok(Some(format!("planes have shape {:?}", output.planes.dims())));
         }
@@ -181,7 +194,7 @@ impl Suite<'_> {
                 return Ok(Some(format!("the gradient of {name} has norm {norm}")));
             }
             let mut slopes = Vec::new();
-            // Short and long steps: the first drown in rounding where the second cross a threshold, and the other way round.
+            // Short steps drown in rounding where long ones cross a threshold, and the other way round.
             for step in [3e-4, 1e-3, 3e-3] {
                 let mut ends = [0.0; 2];
                 for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
@@ -193,7 +206,7 @@ impl Suite<'_> {
                 }
                 slopes.push((ends[0] - ends[1]) / (2.0 * step));
             }
-            if !slopes.iter().any(|slope| (slope / norm - 1.0).abs() <= SLOPE_TOLERANCE) {
+            if !agrees(&slopes, norm) {
                 return Ok(Some(format!("{name}: the loss rises by {slopes:.5?} per unit along its gradient of norm {norm:.5}")));
             }
         }

@@ -3,7 +3,7 @@
 use cc4dgs_core::burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::serde::{self, Deserialize};
 use cc4dgs_core::{
-    Deformer, Error, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, config,
+    Deformer, Error, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput, config,
     inventory, toml,
 };
 
@@ -28,7 +28,8 @@ struct Sway {
 }
 
 impl Deformer for Sway {
-    fn spatial(&self, means_world: Tensor<2>) -> Result<SpatialFeatures> {
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        let means_world = input.means_world.clone();
         let m = means_world.dims()[0];
         // What is no number stays where it is.
         let odd = means_world.clone().is_nan();

@@ -1,6 +1,6 @@
 //! Reads the golden fixtures of the rasterizer.
 
-use cc4dgs_backends::cpu::raster::RasterSettings;
+use cc4dgs_backends::ops::rasterize::RasterSettings;
 use cc4dgs_core::{ParameterSpace, Rules};
 use safetensors::{Dtype, SafeTensors};
 use std::path::{Path, PathBuf};
@@ -94,7 +94,8 @@ pub fn settings(width: usize, height: usize, k: &[f64], view: &[f64]) -> RasterS
         space: ParameterSpace::Activated,
         sh_degree: None,
         max_weights: false,
-        pair_room: None,
+        absolute_centers: false,
+        pair_capacity: None,
     }
 }
 
@@ -142,18 +143,18 @@ impl Scene {
         };
         Self { name: name.to_string(), results: Fixture::open(name), inputs, settings, ill_conditioned: scene.contains("needles") }
     }
-    /// Degree-0 coefficients [N,3] and the others [N,K,3].
+    /// Degree-0 coefficients `[N,3]` and the others `[N,K,3]`.
     pub fn coefficients(&self) -> (Vec<f64>, Vec<f64>) {
         split_coefficients(&self.inputs.get("in.sh"), self.inputs.shape("in.sh")[1])
     }
-    /// Weights of the loss as planes [5,H,W].
+    /// Weights of the loss as planes `[5,H,W]`.
     pub fn upstream(&self) -> Vec<f64> {
         let mut planes = to_planes(&self.inputs.get("in.weights_image"));
         planes.extend(self.inputs.get("in.weights_alpha"));
         planes.extend(vec![0.0; self.settings.width * self.settings.height]);
         planes
     }
-    /// Reference planes [5,H,W].
+    /// Reference planes `[5,H,W]`.
     pub fn planes(&self) -> Vec<f64> {
         let mut planes = to_planes(&self.results.get("out.image"));
         planes.extend(self.results.get("out.alpha"));
@@ -180,13 +181,13 @@ impl Scene {
     }
 }
 
-/// Degree-0 coefficients and the rest of [N,count,3].
+/// Degree-0 coefficients and the rest of `[N,count,3]`.
 pub fn split_coefficients(all: &[f64], count: usize) -> (Vec<f64>, Vec<f64>) {
     let rows = all.chunks_exact(3 * count);
     (rows.clone().flat_map(|row| row[..3].to_vec()).collect(), rows.flat_map(|row| row[3..].to_vec()).collect())
 }
 
-/// [H,W,3] to [3,H,W].
+/// `[H,W,3]` to `[3,H,W]`.
 pub fn to_planes(image: &[f64]) -> Vec<f64> {
     (0..3).flat_map(|c| image.iter().skip(c).step_by(3).copied()).collect()
 }

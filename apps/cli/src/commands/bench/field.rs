@@ -6,7 +6,7 @@ use crate::commands::Context;
 use crate::model_source::resolved_device;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, config, parse_device};
+use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, SpatialInput, config, parse_device};
 use cc4dgs_deformers::cdf::{Cdf, CdfConfig, Formulas};
 use rand::Rng;
 use serde::Serialize;
@@ -53,9 +53,9 @@ pub fn field(context: &Context, args: &BenchField) -> Result<()> {
     stir(&mut field, Seed::root(args.seed).child("weights"), &device)?;
     let means_world = blobs(args.gaussians as usize, Seed::root(args.seed).child("points"), &device);
 
-    let cached = field.spatial(means_world.clone())?;
+    let cached = field.spatial(&SpatialInput::new(means_world.clone()))?;
     let repeats = args.repeats as usize;
-    let spatial = timed(repeats, || first(field.spatial(means_world.clone())?.values))?;
+    let spatial = timed(repeats, || first(field.spatial(&SpatialInput::new(means_world.clone()))?.values))?;
     let deform = timed(repeats, || match field.deform(cached.values.clone(), TIME)?.concatenated() {
         Some(offsets) => first(offsets),
         None => Ok(()),
@@ -65,7 +65,7 @@ pub fn field(context: &Context, args: &BenchField) -> Result<()> {
     }
     let tracked = Tensor::<2>::from_inner(means_world.clone());
     let fused = || -> Result<Tensor<2>> {
-        let offsets = field.deform(field.spatial(tracked.clone())?.values, TIME)?.concatenated();
+        let offsets = field.deform(field.spatial(&SpatialInput::new(tracked.clone()))?.values, TIME)?.concatenated();
         offsets.ok_or_else(|| Error::parameter("heads", "none is on", "Turn one on"))
     };
     let primitive = || Formulas(&field).offsets(tracked.clone(), TIME);

@@ -9,7 +9,7 @@ use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::bench::{RoomCase, growth, room, shrunk};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformerContext, Event, EventSink, Result, Seed, config, parse_device};
+use cc4dgs_core::{DeformerContext, Event, EventSink, Result, Seed, SpatialInput, config, parse_device};
 use cc4dgs_engine::config::{RenderConfig, RunConfig};
 use cc4dgs_engine::model::{Model, ModelDeformer, ModelSize};
 use cc4dgs_engine::play::Player;
@@ -131,7 +131,7 @@ fn time_field(field: &mut dyn cc4dgs_core::Deformer, means_world: Tensor<2>, rep
     let (mut spatial, mut both) = (Vec::new(), Vec::new());
     for round in 0..WARM_UP + repeats as usize {
         let began = Instant::now();
-        let features = field.spatial(means_world.clone())?.values;
+        let features = field.spatial(&SpatialInput::new(means_world.clone()))?.values;
         // One number read back says that everything before it is done.
         to_vec(features.narrow(0, 0, 1), "features")?;
         let spatial_ms = began.elapsed().as_secs_f64() * 1e3;
@@ -140,7 +140,7 @@ fn time_field(field: &mut dyn cc4dgs_core::Deformer, means_world: Tensor<2>, rep
         }
         let began = Instant::now();
         let tracked = Tensor::<2>::from_inner(means_world.clone());
-        let features = field.spatial(tracked)?.values;
+        let features = field.spatial(&SpatialInput::new(tracked))?.values;
         if let Some(offsets) = field.deform(features, 0.3)?.concatenated() {
             let gradients = offsets.sum().backward();
             if let Some(gradient) = field.parameters().first().and_then(|p| p.value.grad(&gradients)) {

@@ -1,25 +1,27 @@
-//! Small networks in one launch, forwards and backwards. A cube keeps a tile of rows in shared memory and takes it through a list of steps, so that
-//! activations leave the chip only where a gradient of weights will want them; the steps are numbers, so that one kernel serves decoders (behind their hash
-//! signatures) and deformation networks alike. Widths that do not fit the shared memory go layer by layer instead ([`super::layers`]).
+//! Small networks in one launch, forwards and backwards. A workgroup keeps tiles of rows in shared memory and takes them through a list of steps, so that
+//! activations are written to global memory only where the gradient of weights needs them. The steps are data, so that one kernel serves decoders (behind their
+//! hash signatures) and deformation networks alike. Widths that do not fit the shared memory go layer by layer instead ([`super::layers`]).
 
+mod fields;
 mod steps;
 
 pub use steps::is_vertex;
 
-use crate::cpu::vertex::hash::LevelHash;
 use crate::cube::tensor::{binding_bytes, shared_bytes, spread, upload};
+use crate::ops::hash::LevelHash;
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
+use fields::{FIELDS, Fields, LOAD, MASK, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, SAVE};
 use std::ops::Range;
-use steps::{ACCUMULATE, BLOCK, CUT, KEEP, LOAD, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, PARTS, RELU};
+use steps::{BLOCK, PARTS};
 
-/// Rows a cube may keep, the more the better: weights are read once per tile.
+/// Rows per workgroup, the more the better: weights are read once per tile.
 const TILES: [usize; 3] = [64, 32, 16];
-/// The most units of a cube that every adapter allows.
-const MOST_UNITS: usize = 256;
-/// Cubes that keep a card busy; for fewer rows, smaller tiles are taken.
-const ENOUGH_CUBES: usize = 64;
+/// Threads per workgroup that every adapter allows.
+const MAX_THREADS: usize = 256;
+/// Workgroups that keep a GPU busy; for fewer rows, smaller tiles are taken.
+const ENOUGH_WORKGROUPS: usize = 64;
 
 /// Where a layer writes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,21 +32,30 @@ pub enum Target {
     Out(usize),
 }
 
-/// One thing done to a tile. Places are elements of the result, where rows of the given width follow each other.
+/// One thing done to a tile. `at` and its like are indices into the output buffer, where rows of the given width follow each other.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Step {
-    /// The tile becomes these columns of rows of `width` values, given from outside from element `at` on.
+    /// The tile becomes these columns of rows of `width` values of the buffer `given`, from element `at` on.
     Load { tile: usize, columns: Range<usize>, width: usize, at: usize },
-    /// x W (+ b): W [input, output] and b [output] are places among the weights. With `add`, on top of what the target tile holds.
+    /// x W (+ b): `weights` and `bias` are the indices of W `[input, output]` and b `[output]`. With `add`, on top of what the target tile holds.
     Multiply { source: usize, target: Target, input: usize, output: usize, weights: usize, bias: Option<usize>, relu: bool, add: bool },
-    /// The tile is written to the result.
-    Keep { tile: usize, width: usize, at: usize },
-    /// Zero where the kept output of a ReLU is.
-    Cut { tile: usize, width: usize, at: usize },
-    /// LayerNorm and Mish; gain and shift follow each other among the weights. Normalised values and scales are kept for the way back if wanted.
-    Norm { tile: usize, width: usize, gain: usize, keep: Option<[usize; 2]> },
-    /// The way back: takes the gradient of the output to that of the input, and keeps it (`after`) and that of the value before Mish (`before`).
-    NormBack { tile: usize, width: usize, gain: usize, kept: [usize; 2], before: usize, after: usize },
+    /// The tile is written to the output buffer: a saved activation.
+    Save { tile: usize, width: usize, at: usize },
+    /// The ReLU mask: zero where the saved output of a ReLU is.
+    Mask { tile: usize, width: usize, at: usize },
+    /// LayerNorm and Mish; gain and shift follow each other among the weights. `save` says where normalised values and scales go, if they are needed.
+    Norm { tile: usize, width: usize, gain: usize, save: Option<SavedNorm> },
+    /// The derivative of `Norm`: takes the gradient of the output to that of the input, and saves it (`after`) and that of the value before Mish (`before`).
+    NormBack { tile: usize, width: usize, gain: usize, saved: SavedNorm, before: usize, after: usize },
+}
+
+/// Where a [`Step::Norm`] saves what its derivative needs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SavedNorm {
+    /// Normalised values.
+    pub normal: usize,
+    /// Scales, see [`scales`].
+    pub scale: usize,
 }
 
 impl Step {
@@ -53,42 +64,55 @@ impl Step {
             Self::Multiply { source, target: Target::Tile(t), input, output, .. } => (source.max(t), input.max(output)),
             Self::Multiply { source, input, .. } => (source, input),
             Self::Load { tile, ref columns, .. } => (tile, columns.len()),
-            Self::Keep { tile, width, .. } | Self::Cut { tile, width, .. } | Self::Norm { tile, width, .. } | Self::NormBack { tile, width, .. } => {
+            Self::Save { tile, width, .. } | Self::Mask { tile, width, .. } | Self::Norm { tile, width, .. } | Self::NormBack { tile, width, .. } => {
                 (tile, width)
             }
         }
     }
-    fn encode(&self) -> [usize; steps::FIELDS] {
-        let none = NONE as usize;
-        match *self {
-            Self::Load { tile, ref columns, width, at } => [LOAD as usize, tile, columns.start, columns.len(), width, at, 0, 0, 0],
+    fn encode(&self) -> [u32; FIELDS] {
+        let fields = match *self {
+            Self::Load { tile, ref columns, width, at } => {
+                Fields { kind: LOAD, tile, width: columns.len(), at, column: columns.start, stride: width, ..Fields::default() }
+            }
             Self::Multiply { source, target, input, output, weights, bias, relu, add } => {
                 let (target, at) = match target {
                     Target::Tile(t) => (t, 0),
                     Target::Out(at) => (OUTSIDE, at),
                 };
-                let flags = if relu { RELU } else { 0 } + if add { ACCUMULATE } else { 0 };
-                [MULTIPLY as usize, source, target, input, output, weights, bias.unwrap_or(none), at, flags as usize]
+                Fields {
+                    kind: MULTIPLY,
+                    tile: source,
+                    width: input,
+                    at,
+                    weights,
+                    target,
+                    output,
+                    bias: bias.unwrap_or(NONE as usize),
+                    relu,
+                    add,
+                    ..Fields::default()
+                }
             }
-            Self::Keep { tile, width, at } => [KEEP as usize, tile, width, at, 0, 0, 0, 0, 0],
-            Self::Cut { tile, width, at } => [CUT as usize, tile, width, at, 0, 0, 0, 0, 0],
-            Self::Norm { tile, width, gain, keep } => {
-                let [normal, scale] = keep.unwrap_or([none; 2]);
-                [NORM as usize, tile, width, gain, normal, scale, 0, 0, 0]
+            Self::Save { tile, width, at } => Fields { kind: SAVE, tile, width, at, ..Fields::default() },
+            Self::Mask { tile, width, at } => Fields { kind: MASK, tile, width, at, ..Fields::default() },
+            Self::Norm { tile, width, gain, save } => {
+                let SavedNorm { normal, scale } = save.unwrap_or(SavedNorm { normal: NONE as usize, scale: 0 });
+                Fields { kind: NORM, tile, width, weights: gain, normal, scale, ..Fields::default() }
             }
-            Self::NormBack { tile, width, gain, kept: [normal, scale], before, after } => {
-                [NORM_BACK as usize, tile, width, gain, normal, scale, before, after, 0]
+            Self::NormBack { tile, width, gain, saved: SavedNorm { normal, scale }, before, after } => {
+                Fields { kind: NORM_BACK, tile, width, at: after, weights: gain, normal, scale, before, ..Fields::default() }
             }
-        }
+        };
+        fields.encode()
     }
 }
 
 /// What the first tile starts with.
 #[derive(Clone, Copy)]
 pub enum Input<'a> {
-    /// Rows [_, in].
+    /// Rows `[_, in]`.
     Rows(&'a CubeTensor, usize),
-    /// Signatures of vertices [_, 3].
+    /// Signatures of vertices `[_, 3]`.
     Signatures(&'a CubeTensor, &'a LevelHash),
 }
 
@@ -101,26 +125,26 @@ impl Input<'_> {
     }
 }
 
-/// How a program is cut for a device.
+/// How a program is laid out in the shared memory of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Layout {
     tile: usize,
     stride: usize,
     tiles: usize,
-    /// Units per row of the tile.
+    /// Threads per row of the tile.
     per_row: usize,
 }
 
 impl Layout {
-    /// Units of a cube.
-    fn units(&self) -> usize {
+    /// Threads of a workgroup.
+    fn threads(&self) -> usize {
         self.tile * self.per_row
     }
 }
 
-/// The places that the scales of [`Step::Norm`] take for so many rows, whatever the layout: each unit keeps its own.
+/// The floats that the scales of [`Step::Norm`] take for so many rows, whatever the layout: each thread saves its own.
 pub fn scales(rows: usize) -> usize {
-    // Units per row times rows, of whole tiles of the largest kind.
+    // Threads per row times rows, of whole tiles of the largest kind.
     rows.next_multiple_of(TILES[0]) * PARTS
 }
 
@@ -148,25 +172,25 @@ impl Program {
             _ => 0,
         });
         let widest = in_place.max().unwrap_or(0);
-        // A layer that overwrites its own tile must be done in one go: as many blocks as units.
+        // A layer that overwrites its own tile must be done in one pass: as many threads as blocks.
         let per_row = widest.div_ceil(BLOCK * BLOCK).max(2).next_power_of_two();
-        let fits = |tile: &usize| 4 * tile * (stride * tiles + PARTS) <= shared_bytes && per_row <= PARTS && tile * per_row <= MOST_UNITS;
+        let fits = |tile: &usize| 4 * tile * (stride * tiles + PARTS) <= shared_bytes && per_row <= PARTS && tile * per_row <= MAX_THREADS;
         let least = TILES[TILES.len() - 1];
-        let tile = TILES.into_iter().filter(fits).find(|&tile| tile == least || rows >= tile * ENOUGH_CUBES)?;
+        let tile = TILES.into_iter().filter(fits).find(|&tile| tile == least || rows >= tile * ENOUGH_WORKGROUPS)?;
         Some(Layout { tile, stride, tiles, per_row })
     }
     /// The layout on the device of `like`.
     pub fn layout_on(&self, like: &CubeTensor, input: usize, rows: usize) -> Option<Layout> {
         self.layout(input, rows, shared_bytes(&like.client))
     }
-    /// Runs all steps on these rows of the inputs; `given` is what [`Step::Load`] reads. Places in `out` count from the first of these rows, those in `given` from
-    /// row 0.
+    /// Runs all steps on these rows of the inputs; `given` is what [`Step::Load`] reads. Indices into `out` count from the first of these rows, those into `given`
+    /// from row 0.
     pub fn run(&self, layout: Layout, input: Input, weights: &CubeTensor, given: &CubeTensor, out: &CubeTensor, rows: &Range<usize>) {
         if rows.is_empty() {
             return;
         }
         let client = weights.client.clone();
-        let mut plan: Vec<u32> = self.0.iter().flat_map(|step| step.encode().map(|v| v as u32)).collect();
+        let mut plan: Vec<u32> = self.0.iter().flat_map(|step| step.encode()).collect();
         let constants = plan.len();
         let (x, vertices, modulus) = match input {
             Input::Rows(x, _) => (x.clone(), None, 2),
@@ -179,13 +203,13 @@ impl Program {
         let hashed = vertices.is_some();
         let plan = upload(weights, &plan, DType::U32);
         let vertices = vertices.unwrap_or_else(|| crate::cube::tensor::signed(plan.clone()));
-        // SAFETY: rows beyond the last are neither read nor written; columns and places are inside because weights, inputs and result have the sizes that
+        // SAFETY: rows beyond the last are neither read nor written; columns and indices are in bounds because weights, inputs and result have the sizes that
         // the steps were made for, which the operations check.
         unsafe {
             steps::run_steps::launch_unchecked(
                 &client,
                 spread(rows.len().div_ceil(layout.tile)),
-                CubeDim::new_1d(layout.units() as u32),
+                CubeDim::new_1d(layout.threads() as u32),
                 x.into_buffer_arg(),
                 vertices.into_buffer_arg(),
                 plan.into_buffer_arg(),
@@ -226,10 +250,10 @@ mod tests {
     }
 
     #[test]
-    fn a_layer_over_its_own_tile_is_done_in_one_go() {
-        let units = |width| Program(vec![multiply(0, Target::Tile(0), width, width)]).layout(width, 16, 1 << 20).map(|l| l.units());
-        assert_eq!((units(16), units(128), units(129), units(1024), units(1025)), (Some(32), Some(32), Some(64), Some(256), None));
-        // A result outside may be as wide as it likes.
+    fn a_layer_over_its_own_tile_is_done_in_one_pass() {
+        let threads = |width| Program(vec![multiply(0, Target::Tile(0), width, width)]).layout(width, 16, 1 << 20).map(|l| l.threads());
+        assert_eq!((threads(16), threads(128), threads(129), threads(1024), threads(1025)), (Some(32), Some(32), Some(64), Some(256), None));
+        // A result that leaves the tiles may have any width.
         assert!(Program(vec![multiply(0, Target::Out(0), 16, 4000)]).layout(16, 16, 16_384).is_some());
     }
 }

@@ -1,32 +1,19 @@
-//! The kernel behind [`super::Program`]: what each step does to the tiles of one cube.
+//! The kernel behind [`super::Program`]: what each step does to the tiles of one workgroup.
 
 use super::Layout;
-use crate::cpu::mlp::activation::LAYER_NORM_EPSILON as EPSILON;
+use super::fields::{
+    ACCUMULATE, AT, BEFORE, BIAS, COLUMN, FIELDS, FLAGS, KIND, LOAD, MASK, MULTIPLY, NONE, NORM, NORMAL, OUTPUT, OUTSIDE, RELU, SAVE, SCALE, STRIDE, TARGET,
+    TILE, WEIGHTS, WIDTH,
+};
 use crate::cube::field::activation::{mish, mish_derivative};
 use crate::cube::field::decoder::signature;
+use crate::ops::networks::LAYER_NORM_EPSILON as EPSILON;
 use cubecl::prelude::*;
 
-/// Numbers per step in a plan.
-pub const FIELDS: usize = 9;
-/// Stands for "none".
-pub const NONE: u32 = u32::MAX;
-/// Stands for the result where a tile is named.
-pub const OUTSIDE: usize = 3;
-/// Rows and columns a unit computes: 64 sums for 16 loads.
+/// Rows and columns a thread computes: 64 sums for 16 loads.
 pub const BLOCK: usize = 8;
 
-pub const MULTIPLY: u32 = 0;
-pub const LOAD: u32 = 1;
-pub const KEEP: u32 = 2;
-pub const CUT: u32 = 3;
-pub const NORM: u32 = 4;
-pub const NORM_BACK: u32 = 5;
-
-/// Flags of a multiplication.
-pub const RELU: u32 = 1;
-pub const ACCUMULATE: u32 = 2;
-
-/// Whether a row of `vertices` [U,3] holds one; those that do not come last.
+/// Whether a row of `vertices` `[U,3]` holds one; rows without a vertex come last.
 #[cube]
 pub fn is_vertex(vertices: &[i32], row: usize) -> bool {
     vertices[3 * row] >= 0
@@ -52,60 +39,62 @@ pub fn run_steps(
     #[comptime] layout: Layout,
 ) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
-    let mut kept = Shared::<[f32]>::new_slice(comptime!(layout.tile * layout.stride * layout.tiles));
+    let mut tiles = Shared::<[f32]>::new_slice(comptime!(layout.tile * layout.stride * layout.tiles));
     let mut partial = Shared::<[f32]>::new_slice(comptime!(PARTS * layout.tile));
     let (first, count, start) = (CUBE_POS * tile, count as usize, start as usize);
     let inputs = inputs as usize;
     let mut steps = steps as usize;
     if comptime!(hashed) {
-        // Behind the last vertex there is nothing to do.
+        // Past the last vertex there is nothing to do.
         let row = start + select(first < count, first, count - 1);
         steps = select(first < count && is_vertex(vertices, row), steps, 0);
     }
-    let mut place = select(steps > 0, UNIT_POS as usize, tile * inputs);
-    while place < tile * inputs {
-        let (r, i) = (place / inputs, place % inputs);
+    let mut index = select(steps > 0, UNIT_POS as usize, tile * inputs);
+    while index < tile * inputs {
+        let (r, i) = (index / inputs, index % inputs);
         // Rows beyond the last repeat it; they are not written.
         let row = start + select(first + r < count, first + r, count - 1);
         if comptime!(hashed) {
-            kept[r * stride + i] = signature(vertices, plan, constants as usize, row, i, inputs, modulus, scale);
+            tiles[r * stride + i] = signature(vertices, plan, constants as usize, row, i, inputs, modulus, scale);
         } else {
-            kept[r * stride + i] = x[row * inputs + i];
+            tiles[r * stride + i] = x[row * inputs + i];
         }
-        place += comptime!(layout.units());
+        index += comptime!(layout.threads());
     }
     sync_cube();
     for step in 0..steps {
         let at = FIELDS * step;
-        let what = plan[at];
-        if what == MULTIPLY {
-            multiply(&mut kept, weights, plan, out, at, first, count, layout);
-        } else if what == LOAD {
-            load(&mut kept, given, plan, at, first, count, start, layout);
-        } else if what == KEEP {
-            keep(&mut kept, plan, out, at, first, count, layout);
-        } else if what == CUT {
-            cut(&mut kept, plan, &*out, at, first, count, layout);
-        } else if what == NORM {
-            norm(&mut kept, &mut partial, weights, plan, out, at, first, count, layout);
+        let kind = plan[at + KIND];
+        if kind == MULTIPLY {
+            multiply(&mut tiles, weights, plan, out, at, first, count, layout);
+        } else if kind == LOAD {
+            load(&mut tiles, given, plan, at, first, count, start, layout);
+        } else if kind == SAVE {
+            save(&mut tiles, plan, out, at, first, count, layout);
+        } else if kind == MASK {
+            mask(&mut tiles, plan, &*out, at, first, count, layout);
+        } else if kind == NORM {
+            norm(&mut tiles, &mut partial, weights, plan, out, at, first, count, layout);
         } else {
-            norm_back(&mut kept, &mut partial, weights, plan, out, at, first, count, layout);
+            norm_back(&mut tiles, &mut partial, weights, plan, out, at, first, count, layout);
         }
         sync_cube();
     }
 }
 
-/// A unit computes a block of rows and, `across` apart, a few columns, so that neighbouring units read neighbouring weights.
+/// A thread computes a block of rows and, `across` apart, a few columns, so that neighbouring threads read neighbouring weights.
 #[cube]
-fn multiply(kept: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+fn multiply(tiles: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
-    let (source, target, input, output) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize, plan[at + 4] as usize);
-    let (matrix, bias, place, flags) = (plan[at + 5] as usize, plan[at + 6], plan[at + 7] as usize, plan[at + 8]);
-    let units = comptime!(layout.units());
+    let (source, target) = (plan[at + TILE] as usize, plan[at + TARGET] as usize);
+    let (input, output) = (plan[at + WIDTH] as usize, plan[at + OUTPUT] as usize);
+    let (matrix, bias, flags) = (plan[at + WEIGHTS] as usize, plan[at + BIAS], plan[at + FLAGS]);
+    let result = plan[at + AT] as usize;
+    let threads = comptime!(layout.threads());
     let across = output.div_ceil(BLOCK);
     let blocks = across * comptime!(layout.tile / BLOCK);
-    for pass in 0..blocks.div_ceil(units) {
-        let block = pass * units + UNIT_POS as usize;
+    for pass in 0..blocks.div_ceil(threads) {
+        let block = pass * threads + UNIT_POS as usize;
         let active = block < blocks;
         let (row, column) = (block / across * BLOCK, block % across);
         let mut sums = Array::<f32>::new(comptime!(BLOCK * BLOCK));
@@ -129,7 +118,7 @@ fn multiply(kept: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [
                 }
                 #[unroll]
                 for r in 0..BLOCK {
-                    let value = kept[from + r * stride + i];
+                    let value = tiles[from + r * stride + i];
                     #[unroll]
                     for c in 0..BLOCK {
                         sums[r * BLOCK + c] = fma(value, factors[c], sums[r * BLOCK + c]);
@@ -137,7 +126,7 @@ fn multiply(kept: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [
                 }
             }
         }
-        // Everybody has read before anybody writes to the same tile.
+        // Every thread has read before any writes to the same tile.
         sync_cube();
         if active {
             #[unroll]
@@ -154,11 +143,11 @@ fn multiply(kept: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [
                         let value = select((flags & RELU) != 0 && sum <= 0.0, 0.0f32, sum);
                         if target == OUTSIDE {
                             if first + row + r < count {
-                                out[place + (first + row + r) * output + own] = value;
+                                out[result + (first + row + r) * output + own] = value;
                             }
                         } else {
                             let to = target * (tile * stride) + (row + r) * stride + own;
-                            kept[to] = value + select((flags & ACCUMULATE) != 0, kept[to], 0.0f32);
+                            tiles[to] = value + select((flags & ACCUMULATE) != 0, tiles[to], 0.0f32);
                         }
                     }
                 }
@@ -168,57 +157,57 @@ fn multiply(kept: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [
 }
 
 #[cube]
-fn load(kept: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first: usize, count: usize, start: usize, #[comptime] layout: Layout) {
+fn load(tiles: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first: usize, count: usize, start: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
-    let (target, column, taken, width, from) =
-        (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize, plan[at + 4] as usize, plan[at + 5] as usize);
-    let mut place = UNIT_POS as usize;
-    while place < tile * taken {
-        let (r, i) = (place / taken, place % taken);
+    let (target, column, taken) = (plan[at + TILE] as usize, plan[at + COLUMN] as usize, plan[at + WIDTH] as usize);
+    let (width, from) = (plan[at + STRIDE] as usize, plan[at + AT] as usize);
+    let mut index = UNIT_POS as usize;
+    while index < tile * taken {
+        let (r, i) = (index / taken, index % taken);
         let mut value = 0.0f32;
         if first + r < count {
             value = given[from + (start + first + r) * width + column + i];
         }
-        kept[target * (tile * stride) + r * stride + i] = value;
-        place += comptime!(layout.units());
+        tiles[target * (tile * stride) + r * stride + i] = value;
+        index += comptime!(layout.threads());
     }
 }
 
-/// What a unit keeps here is what it reads in [`cut`]: no other unit's writes have to arrive.
+/// A thread saves here what it reads in [`mask`], so that no other thread's writes have to arrive.
 #[cube]
-fn keep(kept: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+fn save(tiles: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
-    let (source, width, to) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize);
-    let mut place = UNIT_POS as usize;
-    while place < tile * width {
-        let (r, i) = (place / width, place % width);
+    let (source, width, to) = (plan[at + TILE] as usize, plan[at + WIDTH] as usize, plan[at + AT] as usize);
+    let mut index = UNIT_POS as usize;
+    while index < tile * width {
+        let (r, i) = (index / width, index % width);
         if first + r < count {
-            out[to + (first + r) * width + i] = kept[source * (tile * stride) + r * stride + i];
+            out[to + (first + r) * width + i] = tiles[source * (tile * stride) + r * stride + i];
         }
-        place += comptime!(layout.units());
+        index += comptime!(layout.threads());
     }
 }
 
 #[cube]
-fn cut(kept: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+fn mask(tiles: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
-    let (target, width, from) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize);
-    let mut place = UNIT_POS as usize;
-    while place < tile * width {
-        let (r, i) = (place / width, place % width);
+    let (target, width, from) = (plan[at + TILE] as usize, plan[at + WIDTH] as usize, plan[at + AT] as usize);
+    let mut index = UNIT_POS as usize;
+    while index < tile * width {
+        let (r, i) = (index / width, index % width);
         if first + r < count {
             if out[from + (first + r) * width + i] <= 0.0 {
-                kept[target * (tile * stride) + r * stride + i] = 0.0f32;
+                tiles[target * (tile * stride) + r * stride + i] = 0.0f32;
             }
         }
-        place += comptime!(layout.units());
+        index += comptime!(layout.threads());
     }
 }
 
-/// Parts into which the sum of a row is cut, whatever the tile, so that it does not depend on how many rows there are: part k adds up values k, k + 16, ….
+/// Parts into which the sum of a row is split, whatever the tile, so that it does not depend on how many rows there are: part k adds up values k, k + 16, ….
 pub const PARTS: usize = 16;
 
-/// The sum over a row of which this unit holds the parts `own`, in order.
+/// The sum over a row of which this thread holds the parts `own`, in order.
 #[cube]
 fn row_sum(partial: &mut Shared<[f32]>, own: &Array<f32>, #[comptime] per_row: usize) -> f32 {
     let (r, part) = (UNIT_POS as usize / per_row, UNIT_POS as usize % per_row);
@@ -238,7 +227,7 @@ fn row_sum(partial: &mut Shared<[f32]>, own: &Array<f32>, #[comptime] per_row: u
 
 #[cube]
 fn norm(
-    kept: &mut Shared<[f32]>,
+    tiles: &mut Shared<[f32]>,
     partial: &mut Shared<[f32]>,
     weights: &[f32],
     plan: &[u32],
@@ -249,7 +238,8 @@ fn norm(
     #[comptime] layout: Layout,
 ) {
     let (tile, stride, per_row) = (comptime!(layout.tile), comptime!(layout.stride), comptime!(layout.per_row));
-    let (target, width, gain, normals, scales) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize, plan[at + 4], plan[at + 5]);
+    let (target, width, gain) = (plan[at + TILE] as usize, plan[at + WIDTH] as usize, plan[at + WEIGHTS] as usize);
+    let (normals, scales) = (plan[at + NORMAL], plan[at + SCALE]);
     let (r, part) = (UNIT_POS as usize / per_row, UNIT_POS as usize % per_row);
     let line = target * (tile * stride) + r * stride;
     let mut sums = Array::<f32>::new(comptime!(PARTS / per_row));
@@ -258,7 +248,7 @@ fn norm(
         sums[k] = 0.0f32;
         let mut i = part + k * per_row;
         while i < width {
-            sums[k] += kept[line + i];
+            sums[k] += tiles[line + i];
             i += PARTS;
         }
     }
@@ -268,31 +258,31 @@ fn norm(
         sums[k] = 0.0f32;
         let mut i = part + k * per_row;
         while i < width {
-            let d = kept[line + i] - mean;
+            let d = tiles[line + i] - mean;
             sums[k] = fma(d, d, sums[k]);
             i += PARTS;
         }
     }
     let variance = row_sum(partial, &sums, per_row) / width as f32;
     let inverse = 1.0 / (variance + EPSILON).sqrt();
-    let keeps = normals != NONE && first + r < count;
-    if keeps {
-        out[scales as usize + CUBE_POS * comptime!(layout.units()) + UNIT_POS as usize] = inverse;
+    let saves = normals != NONE && first + r < count;
+    if saves {
+        out[scales as usize + CUBE_POS * comptime!(layout.threads()) + UNIT_POS as usize] = inverse;
     }
     let mut i = part;
     while i < width {
-        let normal = (kept[line + i] - mean) * inverse;
-        if keeps {
+        let normal = (tiles[line + i] - mean) * inverse;
+        if saves {
             out[normals as usize + (first + r) * width + i] = normal;
         }
-        kept[line + i] = mish(fma(normal, weights[gain + i], weights[gain + width + i]));
+        tiles[line + i] = mish(fma(normal, weights[gain + i], weights[gain + width + i]));
         i += per_row;
     }
 }
 
 #[cube]
 fn norm_back(
-    kept: &mut Shared<[f32]>,
+    tiles: &mut Shared<[f32]>,
     partial: &mut Shared<[f32]>,
     weights: &[f32],
     plan: &[u32],
@@ -303,8 +293,9 @@ fn norm_back(
     #[comptime] layout: Layout,
 ) {
     let (tile, stride, per_row) = (comptime!(layout.tile), comptime!(layout.stride), comptime!(layout.per_row));
-    let (target, width, gain) = (plan[at + 1] as usize, plan[at + 2] as usize, plan[at + 3] as usize);
-    let (normals, scales, before, after) = (plan[at + 4] as usize, plan[at + 5] as usize, plan[at + 6] as usize, plan[at + 7] as usize);
+    let (target, width, gain) = (plan[at + TILE] as usize, plan[at + WIDTH] as usize, plan[at + WEIGHTS] as usize);
+    let (normals, scales) = (plan[at + NORMAL] as usize, plan[at + SCALE] as usize);
+    let (before, after) = (plan[at + BEFORE] as usize, plan[at + AT] as usize);
     let (r, part) = (UNIT_POS as usize / per_row, UNIT_POS as usize % per_row);
     let line = target * (tile * stride) + r * stride;
     let row = (first + r) * width;
@@ -320,8 +311,8 @@ fn norm_back(
             while i < width {
                 let normal = out[normals + row + i];
                 let g = weights[gain + i];
-                let dz = kept[line + i] * mish_derivative(fma(normal, g, weights[gain + width + i]));
-                kept[line + i] = dz;
+                let dz = tiles[line + i] * mish_derivative(fma(normal, g, weights[gain + width + i]));
+                tiles[line + i] = dz;
                 out[before + row + i] = dz;
                 sums[k] = fma(dz, g, sums[k]);
                 along[k] = fma(dz * g, normal, along[k]);
@@ -332,11 +323,11 @@ fn norm_back(
     let sum = row_sum(partial, &sums, per_row) / width as f32;
     let along = row_sum(partial, &along, per_row) / width as f32;
     if real {
-        let inverse = out[scales + CUBE_POS * comptime!(layout.units()) + UNIT_POS as usize];
+        let inverse = out[scales + CUBE_POS * comptime!(layout.threads()) + UNIT_POS as usize];
         let mut i = part;
         while i < width {
-            let d = inverse * (kept[line + i] * weights[gain + i] - sum - out[normals + row + i] * along);
-            kept[line + i] = d;
+            let d = inverse * (tiles[line + i] * weights[gain + i] - sum - out[normals + row + i] * along);
+            tiles[line + i] = d;
             out[after + row + i] = d;
             i += per_row;
         }

@@ -1,7 +1,7 @@
-//! Pictures from 8-bit files.
+//! 8-bit images to planes and back.
 
-use super::tensor::{UNITS, cubes_for, empty, floats, signed, upload};
-use crate::ops::picture::PictureOps;
+use super::tensor::{THREADS, empty, floats, signed, upload, workgroups_for};
+use crate::ops::image::ImageOps;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -16,7 +16,7 @@ fn byte(words: &[u32], at: usize) -> f32 {
     ((words[at / 4] >> ((at % 4) as u32 * 8)) & 255u32) as f32 / 255.0
 }
 
-/// planes [3,H,W] of interleaved bytes.
+/// planes `[3,H,W]` of interleaved bytes.
 #[cube(launch)]
 fn unpack(words: &[u32], background: &[f32], planes: &mut [f32], pixels: u32, #[comptime] channels: usize) {
     let (pixel, plane) = (ABSOLUTE_POS % pixels as usize, ABSOLUTE_POS / pixels as usize);
@@ -29,14 +29,14 @@ fn unpack(words: &[u32], background: &[f32], planes: &mut [f32], pixels: u32, #[
     }
 }
 
-/// 0..1 as a byte, rounded half up; what is no number is black.
+/// 0..1 as a byte, rounded half up; NaN is black.
 #[cube]
 fn rounded(value: f32) -> u32 {
     let low = select(value > 0.0, value, 0.0f32);
     (select(low < 1.0, low, 1.0f32) * 255.0 + 0.5) as u32
 }
 
-/// words [H W] of planes [C,H,W].
+/// words `[H W]` of planes `[C,H,W]`.
 #[cube(launch)]
 fn pack(planes: &[f32], words: &mut [u32]) {
     let pixels = words.len();
@@ -46,32 +46,32 @@ fn pack(planes: &[f32], words: &mut [u32]) {
     }
 }
 
-impl PictureOps for CubeBackend {
+impl ImageOps for CubeBackend {
     fn words(planes: FloatTensor<Self>) -> IntTensor<Self> {
         let planes = into_contiguous(planes);
         let pixels = planes.meta.shape()[1] * planes.meta.shape()[2];
         let words = empty(&planes, [pixels], DType::U32);
         let client = planes.client.clone();
         let arguments = (planes.into_buffer_arg(), words.clone().into_buffer_arg());
-        pack::launch(&client, cubes_for(pixels), CubeDim::new_1d(UNITS), arguments.0, arguments.1);
+        pack::launch(&client, workgroups_for(pixels), CubeDim::new_1d(THREADS), arguments.0, arguments.1);
         signed(words)
     }
-    fn planes(like: FloatTensor<Self>, picture: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
-        let (width, height) = (picture.width as usize, picture.height as usize);
+    fn planes(like: FloatTensor<Self>, image: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
+        let (width, height) = (image.width as usize, image.height as usize);
         let planes = floats(&like, [3, height, width]);
-        let words: Vec<u32> = picture.data.chunks(4).map(|b| b.iter().rev().fold(0, |word, &byte| word << 8 | u32::from(byte))).collect();
+        let words: Vec<u32> = image.data.chunks(4).map(|b| b.iter().rev().fold(0, |word, &byte| word << 8 | u32::from(byte))).collect();
         let client = like.client.clone();
         let (w, b) = (upload(&like, &words, DType::U32).into_buffer_arg(), upload(&like, &background, DType::F32).into_buffer_arg());
         let pixels = width * height;
         unpack::launch(
             &client,
-            cubes_for(3 * pixels),
-            CubeDim::new_1d(UNITS),
+            workgroups_for(3 * pixels),
+            CubeDim::new_1d(THREADS),
             w,
             b,
             planes.clone().into_buffer_arg(),
             pixels as u32,
-            if picture.channels == 4 { 4 } else { 3 },
+            if image.channels == 4 { 4 } else { 3 },
         );
         planes
     }

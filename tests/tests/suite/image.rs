@@ -1,7 +1,7 @@
-//! 8-bit pictures become the same numbers on every device.
+//! 8-bit images become the same numbers on every device.
 
 use burn::tensor::{Tensor, TensorData};
-use cc4dgs_backends::ops::picture::{picture_planes, read_picture};
+use cc4dgs_backends::ops::image::{image_planes, read_image};
 use cc4dgs_core::Image8;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_tests::devices;
@@ -11,10 +11,10 @@ use std::sync::Arc;
 fn planes_are_those_of_the_host() {
     for (width, height, channels) in [(1, 1, 3), (7, 5, 3), (7, 5, 4), (33, 2, 4)] {
         let data: Vec<u8> = (0..width * height * channels).map(|i| (i * 37 % 256) as u8).collect();
-        let picture = Arc::new(Image8 { width, height, channels, data });
-        let truth = picture.to_planes([0.2, 0.7, 1.0]);
+        let image = Arc::new(Image8 { width, height, channels, data });
+        let truth = image.to_planes([0.2, 0.7, 1.0]);
         for (name, device) in devices() {
-            let found = to_vec(picture_planes(&picture, [0.2, 0.7, 1.0], &device), "planes").unwrap();
+            let found = to_vec(image_planes(&image, [0.2, 0.7, 1.0], &device), "planes").unwrap();
             let worst = truth.iter().zip(&found).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(found.len() == truth.len() && worst <= 1.5e-7, "{name}: {width}x{height}x{channels} differs by {worst}");
         }
@@ -27,7 +27,7 @@ fn bytes_are_those_of_the_host() {
     let truth = Image8::from_planes(&values, 7, 5);
     for (name, device) in devices() {
         let planes = Tensor::<3>::from_data(TensorData::new(values.clone(), [4, 5, 7]), &device);
-        assert_eq!(read_picture(planes).unwrap(), truth, "{name}");
-        assert!(read_picture(Tensor::zeros([2, 5, 7], &device)).is_err());
+        assert_eq!(read_image(planes).unwrap(), truth, "{name}");
+        assert!(read_image(Tensor::zeros([2, 5, 7], &device)).is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! The camera as the kernels want it, and the way back from sums over Gaussians to the gradient of its matrix.
+//! The camera in the form kernels read, and the gradient of its matrix from sums over Gaussians.
 
 use super::RasterSettings;
 use cc4dgs_core::Rules;
@@ -15,7 +15,7 @@ pub const TRANSMITTANCE_STOP: f32 = 1e-4;
 /// Beyond this depth nothing is drawn.
 pub const FAR: f32 = 1e10;
 
-/// What the rule sets disagree about (golden README, table of variants).
+/// The constants in which the rule sets differ.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RuleConstants {
     /// Smallest camera depth drawn.
@@ -85,8 +85,8 @@ impl CameraConstants {
             depth_row: m[2],
         }
     }
-    /// The depth by which Gaussians are sorted: exact, then rounded once. Rounded on the way, two Gaussians within 1e-7 of each other would be blended in
-    /// one order here and in the other there, which shows.
+    /// The depth by which Gaussians are sorted: computed in float64 and rounded once. With intermediate rounding, two Gaussians within 1e-7 of each other
+    /// could be blended in different orders on different devices, which is visible.
     pub fn depth(&self, mean: &[f32]) -> f32 {
         let [x, y, z, t] = self.depth_row;
         (x * f64::from(mean[0]) + y * f64::from(mean[1]) + z * f64::from(mean[2]) + t) as f32
@@ -103,7 +103,7 @@ fn camera_center(m: &[[f64; 4]; 4]) -> DVec3 {
     matrix(m).inverse().col(3).truncate()
 }
 
-/// Sums over Gaussians of what flows into the camera.
+/// Sums over Gaussians of the gradients of the camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CameraSums {
     /// d loss / d rotation, by rows.

@@ -1,0 +1,89 @@
+//! What every device agrees on: the numbers of a render, the size of a tile, the columns of a record.
+
+use cc4dgs_core::{ParameterSpace, Rules};
+
+/// Pixels along the side of a tile.
+pub const TILE: usize = 16;
+/// Pixels of a tile.
+pub const TILE_PIXELS: usize = TILE * TILE;
+/// Upper bound on the (Gaussian, tile) pairs of one render, bounding boxes counted (about 7 GB of working memory).
+pub const MAX_TILE_PAIRS: u64 = 1 << 27;
+
+/// Columns of a screen record: what a pixel reads of a Gaussian. Gradient records have the same columns.
+pub const RECORD: usize = 10;
+/// Column of the centre's x in pixels.
+pub const AT_X: usize = 0;
+/// Column of the centre's y in pixels.
+pub const AT_Y: usize = 1;
+/// Column of the conic's A; screen records hold A / 2.
+pub const AT_A: usize = 2;
+/// Column of the conic's B.
+pub const AT_B: usize = 3;
+/// Column of the conic's C; screen records hold C / 2.
+pub const AT_C: usize = 4;
+/// Column of the opacity, compensation included.
+pub const AT_OPACITY: usize = 5;
+/// First of the three columns of the colour.
+pub const AT_COLOR: usize = 6;
+/// Column of the camera depth.
+pub const AT_DEPTH: usize = 9;
+
+/// Everything a render needs besides the Gaussians; plain numbers, the same for every device.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RasterSettings {
+    /// Image width in pixels.
+    pub width: usize,
+    /// Image height in pixels.
+    pub height: usize,
+    /// Focal length along x in pixels.
+    pub fx: f64,
+    /// Focal length along y in pixels.
+    pub fy: f64,
+    /// Principal point x in pixels.
+    pub cx: f64,
+    /// Principal point y in pixels.
+    pub cy: f64,
+    /// World to camera, row-major, OpenCV axes.
+    pub world_to_camera: [[f64; 4]; 4],
+    /// Corner-case rules.
+    pub rules: Rules,
+    /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
+    pub near: Option<f32>,
+    /// Multiply opacity by the compensation of the pixel blur.
+    pub antialiased: bool,
+    /// Whether scales and opacities still need their activations.
+    pub space: ParameterSpace,
+    /// Degree of the spherical harmonics, or `None` for colours blended as they are.
+    pub sh_degree: Option<usize>,
+    /// Find the largest blending weight of every Gaussian.
+    pub max_weights: bool,
+    /// Sum the absolute values of every pixel's gradient of the projected centres in the backward pass. [`super::rasterize`] sets it where a probe asks.
+    pub absolute_centers: bool,
+    /// Capacity in (Gaussian, tile) pairs, where reading their number back would stall the device; `None` allocates for all.
+    pub pair_capacity: Option<usize>,
+}
+
+/// Which gradients are wanted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct GradientRequest {
+    /// Of the centres.
+    pub means: bool,
+    /// Of the (log-)scales.
+    pub scales: bool,
+    /// Of the raw quaternions.
+    pub quaternions: bool,
+    /// Of the opacities (logits).
+    pub opacities: bool,
+    /// Of the degree-0 coefficients or colours.
+    pub colors: bool,
+    /// Of the higher coefficients.
+    pub sh_rest: bool,
+    /// Of the background.
+    pub background: bool,
+    /// Of the projected centres in pixels.
+    pub screen: bool,
+    /// The same, absolute values summed over pixels.
+    pub absolute_screen: bool,
+    /// Of world_to_camera.
+    pub camera: bool,
+}

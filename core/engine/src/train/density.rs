@@ -1,0 +1,55 @@
+//! Carries out what the density control plans.
+
+use super::{Context, TrainState};
+use crate::gaussian_set::GaussianSet;
+use cc4dgs_core::{DensityPlan, Error, Event, Result, Schedule};
+
+impl Context<'_> {
+    /// What the density control wants after an optimizer step: new values of all rows, then a plan for the rows themselves.
+    pub(crate) fn control_density(&self, schedule: &Schedule, state: &mut TrainState) -> Result<()> {
+        let kind = self.job.config.density.get("kind").and_then(|k| k.as_str()).unwrap_or_default();
+        let seed = self.seed.child(schedule.stage.name());
+        let index = schedule.iteration as u64;
+        let gaussians = state.set.gaussians()?;
+        for (name, values) in state.density.after_step(&gaussians, schedule, seed.child("density noise").index(index))? {
+            if values.dims()[0] != state.set.len() {
+                let problem = format!("after_step returned {} rows of '{name}' for {} Gaussians", values.dims()[0], state.set.len());
+                return Err(Error::backend(format!("density control {kind}"), problem, "Correct the control, or choose another"));
+            }
+            state.set.set(&name, values)?;
+        }
+        // The values may have changed.
+        let gaussians = state.set.gaussians()?;
+        let Some(plan) = state.density.plan(&gaussians, schedule, seed.child("densify").index(index))? else { return Ok(()) };
+        plan.check(kind, &gaussians)?;
+        self.carry_out(&plan, state, schedule)
+    }
+
+    fn carry_out(&self, plan: &DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        let gaussians = state.set.gaussians()?;
+        let keeps_all = plan.keeps_all(gaussians.len());
+        state.set = GaussianSet::from_gaussians(&plan.apply(&gaussians)?);
+        if !keeps_all {
+            state.optimizer.select_rows("gaussians/", plan.parents(), plan.fresh())?;
+        }
+        let rows: Vec<usize> = (0..state.set.len()).collect();
+        for attribute in plan.restarted() {
+            state.optimizer.select_rows(&format!("gaussians/{attribute}"), &rows, &vec![true; rows.len()])?;
+        }
+        if keeps_all {
+            return Ok(());
+        }
+        state.invalidate_rows();
+        let report = plan.report;
+        let gaussians = state.set.len();
+        self.job.events.emit(&Event::Densified {
+            iteration: schedule.iteration,
+            cloned: report.cloned,
+            split: report.split,
+            moved: report.moved,
+            pruned: report.removed,
+            gaussians,
+        });
+        Ok(())
+    }
+}

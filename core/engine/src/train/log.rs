@@ -1,0 +1,75 @@
+//! Numbers of a stage, gathered between two log events.
+
+use cc4dgs_core::{Error, Event, EventSink, Result, Schedule, Stage};
+use std::time::Instant;
+
+/// Gathers numbers between two log events.
+pub(crate) struct Log {
+    stage: Stage,
+    length: usize,
+    every: usize,
+    loss: f32,
+    psnr_db: f32,
+    psnr_sum: (f32, u32),
+    since: (Instant, usize),
+    work: [(u64, u64); 3],
+}
+
+impl Log {
+    pub(crate) fn new(stage: Stage, length: usize, every: usize) -> Self {
+        Self { stage, length, every: every.max(1), loss: 0.0, psnr_db: 0.0, psnr_sum: (0.0, 0), since: (Instant::now(), 0), work: [(0, 0); 3] }
+    }
+    /// Whether this iteration's numbers are read back.
+    pub(crate) fn due(&self, iteration: usize) -> bool {
+        iteration.is_multiple_of(self.every) || iteration == self.length
+    }
+    pub(crate) fn psnr(&mut self, psnr_db: f32) {
+        self.psnr_sum.0 += psnr_db;
+        self.psnr_sum.1 += 1;
+    }
+    pub(crate) fn loss(&mut self, loss: f32, schedule: &Schedule) -> Result<()> {
+        if !loss.is_finite() {
+            return Err(Error::backend(
+                format!("loss of stage {} at iteration {}", schedule.stage.name(), schedule.iteration),
+                format!("it is {loss}"),
+                "Lower the learning rates (train.lr) or resume from the last checkpoint with another seed",
+            ));
+        }
+        self.loss = if self.loss == 0.0 { loss } else { 0.9 * self.loss + 0.1 * loss };
+        Ok(())
+    }
+    pub(crate) fn count_deformer(&mut self, decoded: u64, reused: u64, moved: u64, still: u64) {
+        self.work[0].0 += decoded;
+        self.work[0].1 += reused;
+        self.work[1].0 += moved;
+        self.work[1].1 += still;
+    }
+    pub(crate) fn count_optimizer(&mut self, updated: u64, skipped: u64) {
+        self.work[2].0 += updated;
+        self.work[2].1 += skipped;
+    }
+    pub(crate) fn step(&mut self, events: &dyn EventSink, iteration: usize, gaussians: usize) {
+        if !self.due(iteration) {
+            return;
+        }
+        if self.psnr_sum.1 > 0 {
+            let psnr = self.psnr_sum.0 / self.psnr_sum.1 as f32;
+            self.psnr_db = if self.psnr_db == 0.0 { psnr } else { 0.9 * self.psnr_db + 0.1 * psnr };
+            self.psnr_sum = (0.0, 0);
+        }
+        let steps = (iteration - self.since.1.min(iteration)).max(1);
+        let ms = self.since.0.elapsed().as_secs_f32() * 1000.0 / steps as f32;
+        self.since = (Instant::now(), iteration);
+        let stage = self.stage.name().to_string();
+        events.emit(&Event::Iteration { stage, iteration, of: self.length, loss: self.loss, psnr_db: self.psnr_db, gaussians, ms });
+    }
+    /// Tells the counted work of the stage.
+    pub(crate) fn finish(&self, events: &dyn EventSink) {
+        let names = ["vertices decoded", "Gaussians deformed", "Gaussians stepped (sampled)"];
+        for (name, (done, skipped)) in names.into_iter().zip(self.work) {
+            if done + skipped > 0 {
+                events.emit(&Event::Work { stage: self.stage.name().into(), counter: name.into(), done, skipped });
+            }
+        }
+    }
+}

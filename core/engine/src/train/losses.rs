@@ -1,0 +1,65 @@
+//! The loss of a run: a weighted sum of the terms that the configuration lists.
+
+use burn::tensor::Tensor;
+use cc4dgs_core::{Error, LossInput, LossTerm, Registry, Result, split_kind};
+
+/// Loss terms with their weights.
+pub(crate) struct LossTerms(Vec<(f64, Box<dyn LossTerm>)>);
+
+/// One `[[loss]]` section, read.
+struct Listed {
+    kind: String,
+    weight: f64,
+    settings: toml::Table,
+}
+
+impl LossTerms {
+    /// Builds the terms of the `[[loss]]` sections. Terms that a plug-in computes together are replaced by it.
+    pub fn build(registry: &Registry, sections: &[toml::Table]) -> Result<Self> {
+        let mut listed = sections.iter().map(read).collect::<Result<Vec<_>>>()?;
+        listed.retain(|term| term.weight != 0.0);
+        if listed.is_empty() {
+            return Err(Error::parameter("loss", "no term has a weight", "List at least one, such as [[loss]] kind = \"l1\", weight = 1.0"));
+        }
+        let mut terms = Vec::new();
+        for fusion in registry.losses().filter_map(|plugin| plugin.fuses.as_ref()) {
+            let index_of = |kind: &&str| listed.iter().position(|term| term.kind == **kind && term.settings.is_empty());
+            let Some(mut found) = fusion.kinds.iter().map(index_of).collect::<Option<Vec<usize>>>() else { continue };
+            let weights: Vec<f64> = found.iter().map(|&index| listed[index].weight).collect();
+            terms.push((1.0, (fusion.build)(&weights)?));
+            found.sort_unstable();
+            found.into_iter().rev().for_each(|index| drop(listed.remove(index)));
+        }
+        for term in &listed {
+            terms.push((term.weight, (registry.loss(&term.kind)?.build)(&term.settings)?));
+        }
+        Ok(Self(terms))
+    }
+    /// The weighted sum [1] for one view.
+    pub fn value(&self, input: &LossInput) -> Result<Tensor<1>> {
+        let mut total: Option<Tensor<1>> = None;
+        for (weight, term) in &self.0 {
+            let Some(value) = term.value(input)? else { continue };
+            let value = if *weight == 1.0 { value } else { value.mul_scalar(*weight) };
+            total = Some(match total {
+                Some(sum) => sum + value,
+                None => value,
+            });
+        }
+        Ok(total.unwrap_or_else(|| Tensor::zeros([1], &input.planes.device())))
+    }
+}
+
+fn read(section: &toml::Table) -> Result<Listed> {
+    let (kind, mut settings) = split_kind("loss", section)?;
+    let weight = match settings.remove("weight") {
+        None => 1.0,
+        Some(toml::Value::Float(weight)) => weight,
+        Some(toml::Value::Integer(weight)) => weight as f64,
+        Some(other) => return Err(Error::parameter(format!("loss {kind}: weight"), format!("{other} is not a number"), "Give a number of 0 or more")),
+    };
+    if !weight.is_finite() || weight < 0.0 {
+        return Err(Error::parameter(format!("loss {kind}: weight"), format!("{weight} cannot be used"), "Give a finite number of 0 or more"));
+    }
+    Ok(Listed { kind, weight, settings })
+}

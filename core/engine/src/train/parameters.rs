@@ -1,0 +1,52 @@
+//! Weights of plug-ins under optimisation: group schedules, gradient clipping, one optimizer step.
+
+use crate::gaussian_set::log_linear;
+use burn::tensor::{Gradients, Tensor};
+use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings};
+
+/// Makes the weights leaves of the coming step; [`update`] undoes it.
+pub(crate) fn track(parameters: Vec<&mut Parameter>) {
+    for parameter in parameters {
+        parameter.value = Tensor::from_inner(parameter.value.clone()).require_grad();
+    }
+}
+
+/// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `progress` is in 0..1 of the stage.
+pub(crate) fn update(
+    prefix: &str,
+    mut parameters: Vec<&mut Parameter>,
+    groups: &[ParameterGroup],
+    gradients: &Gradients,
+    optimizer: &mut dyn Optimizer,
+    progress: f64,
+    extent: f64,
+) -> Result<()> {
+    let mut gradient_of: Vec<Option<Tensor<1>>> = parameters.iter().map(|p| p.value.grad(gradients)).collect();
+    for (g, group) in groups.iter().enumerate().filter(|(_, group)| group.clip_norm > 0.0) {
+        let members: Vec<usize> = parameters.iter().enumerate().filter(|(_, p)| p.group == g).map(|(i, _)| i).collect();
+        let squares = members.iter().filter_map(|&i| gradient_of[i].clone()).map(|t| (t.clone() * t).sum());
+        let Some(total) = squares.reduce(|a, b| a + b) else { continue };
+        // clip / max(norm, clip): one number on the device, no read-back.
+        let scale = total.sqrt().clamp_min(group.clip_norm).recip().mul_scalar(group.clip_norm);
+        for &i in &members {
+            gradient_of[i] = gradient_of[i].take().map(|t| t * scale.clone());
+        }
+    }
+    for (parameter, gradient) in parameters.iter_mut().zip(gradient_of) {
+        let device = parameter.value.device();
+        // Moved out, so that the optimizer holds the only reference and works in place.
+        let value = std::mem::replace(&mut parameter.value, Tensor::empty([0], &device)).inner();
+        let Some(gradient) = gradient else {
+            parameter.value = value;
+            continue;
+        };
+        let group = &groups[parameter.group];
+        let warm = if group.warmup > 0.0 { (progress / group.warmup).min(1.0) } else { 1.0 };
+        let lr = log_linear(group.lr_start, group.lr_end, progress) * warm * if group.times_extent { extent } else { 1.0 };
+        let settings = StepSettings { epsilon: group.epsilon, ..StepSettings::new(lr) };
+        let count = value.dims()[0];
+        let name = format!("{prefix}{}", parameter.name);
+        parameter.value = optimizer.step(&name, value.reshape([count, 1]), gradient.reshape([count, 1]), &settings)?.reshape([count]);
+    }
+    Ok(())
+}

@@ -1,0 +1,46 @@
+//! Appearance: what lies between the rendered image and the one a camera recorded.
+
+use crate::Plugin;
+use crate::{Parameter, ParameterGroup, Result, Seed};
+use burn::tensor::{Device, Tensor};
+
+/// What an appearance model must know before its weights mean anything.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AppearanceContext {
+    /// Cameras that training sees.
+    pub cameras: usize,
+    /// The model's own node of the seed tree.
+    pub seed: Seed,
+}
+
+/// Turns rendered planes into those a camera records. Used in training only: held-out cameras and playback see the rendered image.
+pub trait Appearance: Send {
+    /// The planes [5,H,W] as training camera `camera` (0-based) records them; `None` is a camera that was not trained on, for which it must be the identity.
+    /// Alpha and depth stay.
+    fn apply(&self, planes: Tensor<3>, camera: Option<usize>) -> Result<Tensor<3>>;
+    /// The weights, in a fixed order.
+    fn parameters(&self) -> Vec<&Parameter> {
+        Vec::new()
+    }
+    /// The weights for the optimizer and for loading, in the same order.
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        Vec::new()
+    }
+    /// The optimizer groups that [`Parameter::group`] points into.
+    fn groups(&self) -> Vec<ParameterGroup> {
+        Vec::new()
+    }
+    /// A loss term [1] of its own.
+    fn regularizer(&self) -> Result<Option<Tensor<1>>> {
+        Ok(None)
+    }
+}
+
+/// An appearance model in the registry.
+pub struct AppearancePlugin {
+    /// Facts for people, tables and checks.
+    pub info: Plugin,
+    /// Builds the model from the `[appearance]` section without `kind`; unknown keys are errors.
+    pub build: fn(&toml::Table, &AppearanceContext, &Device) -> Result<Box<dyn Appearance>>,
+}
+crate::plugin_kind!(AppearancePlugin, "appearance");

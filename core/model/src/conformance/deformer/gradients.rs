@@ -1,0 +1,132 @@
+//! Gradients of weights and attributes against finite differences.
+
+use super::super::uniform;
+use super::{CENTRES, Suite, no_heads};
+use crate::gaussians::to_vec;
+use crate::{Deformer, Result, Seed, SpatialInput};
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// Largest relative difference between a slope by finite differences and the gradient along itself.
+const SLOPE_TOLERANCE: f64 = 0.05;
+/// Step along the gradient's direction: short enough to cross few kinks of ReLU, long enough to stand out from rounding.
+const STEP: f64 = 5e-4;
+/// Time at which gradients are taken.
+const TIME: f32 = 0.43;
+
+/// A scalar function of a deformer and its input.
+type Scalar<'a> = dyn Fn(&dyn Deformer, &SpatialInput) -> Result<Option<Tensor<1>>> + 'a;
+
+impl Suite<'_> {
+    pub(super) fn gradients_are_slopes(&self) -> Result<Option<String>> {
+        if self.fresh(self.device)?.is_static() {
+            return Ok(None);
+        }
+        let weighted = |built: &dyn Deformer, input: &SpatialInput| {
+            let offsets = self.offsets(built, input, TIME)?.concatenated().ok_or_else(no_heads)?;
+            let [n, width] = offsets.dims();
+            let weights: Vec<f32> = (0..n * width).map(|k| 1.0 + 0.5 * uniform(Seed::root(8), k)).collect();
+            let weights = Tensor::<2>::from_inner(Tensor::from_data(TensorData::new(weights, [n, width]), self.device));
+            Ok(Some((offsets * weights).sum()))
+        };
+        self.slopes(&weighted, true)
+    }
+    pub(super) fn regularizer_is_sound(&self) -> Result<Option<String>> {
+        for progress in [0.0, 1.0] {
+            let term = |built: &dyn Deformer, input: &SpatialInput| built.regularizer(input, TIME, progress);
+            if let Some(finding) = self.slopes(&term, false)? {
+                return Ok(Some(format!("at progress {progress}: {finding}")));
+            }
+        }
+        Ok(None)
+    }
+    /// Compares the gradient of every weight array and attribute with the slope of `scalar` along it. With `all`, each must have a gradient.
+    fn slopes(&self, scalar: &Scalar, all: bool) -> Result<Option<String>> {
+        let device = self.device.clone().autodiff();
+        let mut built = self.shaken(&device)?;
+        let plain = self.input(built.as_ref(), CENTRES, &device);
+        let track = |t: &Tensor<2>| Tensor::<2>::from_inner(t.clone().inner()).require_grad();
+        let tracked = SpatialInput { means_world: plain.means_world.clone(), attributes: plain.attributes.iter().map(track).collect() };
+        let Some(value) = scalar(built.as_ref(), &tracked)? else { return Ok(None) };
+        if value.dims() != [1] {
+            return Ok(Some(format!("the value has shape {:?} in place of [1]", value.dims())));
+        }
+        let size = f64::from(to_vec(value.clone(), "value")?[0]);
+        if !size.is_finite() {
+            return Ok(Some(format!("the value is {size}")));
+        }
+        let gradients = value.backward();
+        let measure = |built: &dyn Deformer, input: &SpatialInput| -> Result<f64> {
+            Ok(scalar(built, input)?.map_or(Ok(vec![0.0]), |t| to_vec(t, "value"))?.first().map_or(0.0, |v| f64::from(*v)))
+        };
+        for index in 0..built.parameters().len() {
+            let (name, start, gradient) = {
+                let p = built.parameters()[index];
+                (p.name.clone(), to_vec(p.value.clone(), "weights")?, p.value.grad(&gradients).map(|g| to_vec(g, "gradient")).transpose()?)
+            };
+            let Some(gradient) = gradient else {
+                if all {
+                    return Ok(Some(format!("no gradient reaches {name}")));
+                }
+                continue;
+            };
+            let finding = compare(&name, &start, &gradient, size, all, |values| {
+                built.parameters_mut()[index].value = upload1(values, &device);
+                measure(built.as_ref(), &plain)
+            })?;
+            built.parameters_mut()[index].value = upload1(start, &device);
+            if finding.is_some() {
+                return Ok(finding);
+            }
+        }
+        for (index, spec) in built.attributes().into_iter().enumerate() {
+            let name = format!("attribute {}", spec.name);
+            let Some(gradient) = tracked.attributes[index].grad(&gradients) else {
+                if all {
+                    return Ok(Some(format!("no gradient reaches {name}")));
+                }
+                continue;
+            };
+            let (start, gradient) = (to_vec(plain.attributes[index].clone(), &name)?, to_vec(gradient, "gradient")?);
+            let finding = compare(&name, &start, &gradient, size, all, |values| {
+                let mut input = plain.clone();
+                input.attributes[index] = Tensor::from_data(TensorData::new(values, [CENTRES, spec.width]), &device);
+                measure(built.as_ref(), &input)
+            })?;
+            if finding.is_some() {
+                return Ok(finding);
+            }
+        }
+        Ok(None)
+    }
+}
+
+fn upload1(values: Vec<f32>, device: &Device) -> Tensor<1> {
+    let n = values.len();
+    Tensor::from_data(TensorData::new(values, [n]), device)
+}
+
+/// The slope of `measure` along `gradient` from `start` against the gradient's norm. With `needed`, a gradient of zero is a finding.
+fn compare(name: &str, start: &[f32], gradient: &[f32], size: f64, needed: bool, mut measure: impl FnMut(Vec<f32>) -> Result<f64>) -> Result<Option<String>> {
+    let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
+    if !norm.is_finite() || (norm == 0.0 && needed) {
+        return Ok(Some(format!("the gradient of {name} has norm {norm}")));
+    }
+    if norm == 0.0 {
+        return Ok(None);
+    }
+    // The change must stand out from the rounding of the value itself.
+    let step = (1e-3 * size.abs() / norm).clamp(STEP, 20.0 * STEP);
+    // A short and a long step: the first may drown in rounding where the second crosses kinks.
+    let mut slopes = Vec::new();
+    for step in [STEP, step] {
+        let mut ends = [0.0; 2];
+        for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
+            *end = measure(start.iter().zip(gradient).map(|(s, g)| s + (sign * step * f64::from(*g) / norm) as f32).collect())?;
+        }
+        slopes.push((ends[0] - ends[1]) / (2.0 * step));
+        if (slopes[slopes.len() - 1] / norm - 1.0).abs() <= SLOPE_TOLERANCE {
+            return Ok(None);
+        }
+    }
+    Ok(Some(format!("{name}: the value rises by {slopes:.5?} per unit along its gradient of norm {norm:.5}")))
+}

@@ -1,0 +1,276 @@
+//! Density control: which Gaussians are added, moved and removed during training.
+//!
+//! A control sees statistics of the rendered views and answers with a [`DensityPlan`]. The trainer carries the plan out, so that attributes of plug-ins, optimizer state and
+//! checkpoints are handled in one place.
+
+use crate::Plugin;
+use crate::gaussians::to_vec;
+use crate::{Error, Gaussians, Result, Schedule, Seed};
+use burn::tensor::{Device, Int, Tensor, TensorData};
+
+/// A statistic that the rasterizer collects only when asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Statistic {
+    /// Gradient of the loss by the projected centres.
+    ScreenGradient,
+    /// Sum over pixels of the absolute values of that gradient (AbsGS).
+    AbsoluteScreenGradient,
+    /// The largest blending weight of every Gaussian.
+    MaxWeight,
+}
+
+/// What one rendered view says of N Gaussians. Fields that were not asked for are `None`.
+#[derive(Clone, Debug)]
+pub struct ViewStatistics {
+    /// Screen radius in pixels [N]; 0 where the Gaussian was culled.
+    pub radii: Tensor<1, Int>,
+    /// [`Statistic::ScreenGradient`] per pixel of x and y [N,2].
+    pub screen_gradient: Option<Tensor<2>>,
+    /// [`Statistic::AbsoluteScreenGradient`] per pixel of x and y [N,2].
+    pub absolute_screen_gradient: Option<Tensor<2>>,
+    /// [`Statistic::MaxWeight`] in 0..1 [N].
+    pub max_weights: Option<Tensor<1>>,
+    /// Image size in pixels.
+    pub size: (u32, u32),
+    /// Views of this iteration; the loss behind the gradients was divided by it.
+    pub views: usize,
+}
+
+/// Numbers of what a plan does, for events.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct DensityReport {
+    /// Copies added.
+    pub cloned: usize,
+    /// Gaussians replaced by two smaller ones.
+    pub split: usize,
+    /// Gaussians moved to another place.
+    pub moved: usize,
+    /// Gaussians removed.
+    pub removed: usize,
+}
+
+/// New values of one attribute in some rows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RowValues {
+    /// Name of the attribute, as in [`Gaussians::attribute`].
+    pub attribute: String,
+    /// Rows of the new set, each at most once.
+    pub rows: Vec<usize>,
+    /// Floats of each row, row-major.
+    pub values: Vec<f32>,
+}
+
+/// What becomes of the Gaussians: every row of the new set has a parent among the old rows, whose attributes it inherits. Rows that no new row names are removed.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct DensityPlan {
+    parents: Vec<usize>,
+    fresh: Vec<bool>,
+    values: Vec<RowValues>,
+    restarted: Vec<String>,
+    /// What is told of it.
+    pub report: DensityReport,
+}
+
+impl DensityPlan {
+    /// A plan without rows; add them with [`DensityPlan::keep`] and [`DensityPlan::copy`].
+    pub fn new() -> Self {
+        Self::default()
+    }
+    /// A plan that keeps all of `count` rows in their order.
+    pub fn unchanged(count: usize) -> Self {
+        Self { parents: (0..count).collect(), fresh: vec![false; count], ..Self::default() }
+    }
+    /// Keeps the old row `row` with its optimizer state; returns its new row.
+    pub fn keep(&mut self, row: usize) -> usize {
+        self.add(row, false)
+    }
+    /// Adds a Gaussian with the attributes of the old row `parent`, whose optimizer state starts from zero; returns its new row. A split is two copies with new values and no
+    /// [`DensityPlan::keep`] of the parent; a relocation is a copy in place of a row that is not kept.
+    pub fn copy(&mut self, parent: usize) -> usize {
+        self.add(parent, true)
+    }
+    fn add(&mut self, parent: usize, fresh: bool) -> usize {
+        self.parents.push(parent);
+        self.fresh.push(fresh);
+        self.parents.len() - 1
+    }
+    /// Gives the new row `row` other values of `attribute`.
+    pub fn set(&mut self, row: usize, attribute: &str, values: &[f32]) {
+        match self.values.iter_mut().find(|v| v.attribute == attribute) {
+            Some(found) => {
+                found.rows.push(row);
+                found.values.extend_from_slice(values);
+            }
+            None => self.values.push(RowValues { attribute: attribute.into(), rows: vec![row], values: values.to_vec() }),
+        }
+    }
+    /// Lets the optimizer state of `attribute` start from zero in all rows (opacity resets).
+    pub fn restart(&mut self, attribute: &str) {
+        self.restarted.push(attribute.into());
+    }
+    /// Gaussians of the new set.
+    pub fn len(&self) -> usize {
+        self.parents.len()
+    }
+    /// Whether the new set has none.
+    pub fn is_empty(&self) -> bool {
+        self.parents.is_empty()
+    }
+    /// The old row behind every new one.
+    pub fn parents(&self) -> &[usize] {
+        &self.parents
+    }
+    /// Whether the optimizer state of a new row starts from zero.
+    pub fn fresh(&self) -> &[bool] {
+        &self.fresh
+    }
+    /// Values that are set after the rows are in place.
+    pub fn values(&self) -> &[RowValues] {
+        &self.values
+    }
+    /// Attributes whose optimizer state starts from zero.
+    pub fn restarted(&self) -> &[String] {
+        &self.restarted
+    }
+    /// Whether rows stay as and where they are.
+    pub fn keeps_all(&self, count: usize) -> bool {
+        self.parents.len() == count && self.parents.iter().enumerate().all(|(i, &p)| i == p) && !self.fresh.contains(&true)
+    }
+    /// The Gaussians after the plan, on the same device. Check it first.
+    pub fn apply(&self, gaussians: &Gaussians) -> Result<Gaussians> {
+        let device = gaussians.means.device();
+        let rows = (!self.keeps_all(gaussians.len())).then(|| index_tensor(&self.parents, &device));
+        let changed = gaussians.attribute_names().into_iter().filter_map(|name| Some((gaussians.attribute(&name)?, name))).map(|(values, name)| {
+            let mut values = match &rows {
+                Some(rows) => values.select(0, rows.clone()),
+                None => values,
+            };
+            if let Some(set) = self.values.iter().find(|set| set.attribute == name) {
+                let [count, width] = values.dims();
+                let mut host = to_vec(values, &name)?;
+                for (&row, new) in set.rows.iter().zip(set.values.chunks_exact(width.max(1))) {
+                    host[row * width..(row + 1) * width].copy_from_slice(new);
+                }
+                values = Tensor::from_data(TensorData::new(host, [count, width]), &device);
+            }
+            Ok((name, values))
+        });
+        let attributes = changed.collect::<Result<Vec<_>>>()?;
+        Gaussians::from_attributes(gaussians.sh_degree, attributes)
+    }
+    /// Refuses plans that name rows or attributes `gaussians` do not have, remove everything, or set values that are not finite.
+    pub fn check(&self, control: &str, gaussians: &Gaussians) -> Result<()> {
+        let bad =
+            |problem: String| Err(Error::backend(format!("density control {control}"), problem, "Correct the plan it returns, or choose another control"));
+        let count = gaussians.len();
+        if self.is_empty() && count > 0 {
+            return bad(format!("its plan removes all {count} Gaussians"));
+        }
+        if let Some(row) = self.parents.iter().find(|&&row| row >= count) {
+            return bad(format!("its plan names row {row} of {count}"));
+        }
+        for set in &self.values {
+            let Some(width) = gaussians.attribute(&set.attribute).map(|a| a.dims()[1]) else {
+                return bad(format!("its plan sets the attribute '{}', which the Gaussians do not have", set.attribute));
+            };
+            if set.values.len() != width * set.rows.len() {
+                return bad(format!("its plan sets {} values of '{}' in {} rows of width {width}", set.values.len(), set.attribute, set.rows.len()));
+            }
+            if let Some(row) = set.rows.iter().find(|&&row| row >= self.len()) {
+                return bad(format!("its plan sets '{}' of row {row}; the new set has {}", set.attribute, self.len()));
+            }
+            if let Some(value) = set.values.iter().find(|v| !v.is_finite()) {
+                return bad(format!("its plan sets '{}' to {value}", set.attribute));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Row indices on a device.
+fn index_tensor(rows: &[usize], device: &Device) -> Tensor<1, Int> {
+    let rows: Vec<i64> = rows.iter().map(|&row| row as i64).collect();
+    let count = rows.len();
+    Tensor::from_data(TensorData::new(rows, [count]), device)
+}
+
+/// Adds, moves and removes Gaussians during the coarse and the main stage. It owns its settings, its statistics, and what it writes to checkpoints.
+pub trait DensityControl: Send {
+    /// A stage begins with `count` Gaussians: statistics start from zero.
+    fn begin_stage(&mut self, count: usize, device: &Device);
+    /// Which statistics it wants of the views of this iteration.
+    fn statistics(&self, schedule: &Schedule) -> Vec<Statistic>;
+    /// Takes the statistics of one view, after the backward pass.
+    fn observe(&mut self, view: &ViewStatistics) -> Result<()>;
+    /// After the optimizer step of an iteration: what is due now, `None` for nothing. The trainer carries the plan out before the next iteration; the control's own statistics must
+    /// fit the new set when this returns. Everything random comes from `seed`, which is another one in every iteration.
+    fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
+    /// After every optimizer step: attributes with new values of all rows [N,width], which keep their optimizer state (the noise of 3DGS-MCMC).
+    fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
+        Ok(Vec::new())
+    }
+    /// What checkpoints must keep, by name.
+    fn state(&self) -> Vec<(String, Tensor<1>)>;
+    /// Takes back what [`DensityControl::state`] returned, for `count` Gaussians. Arrays come from a file: an error, never a panic.
+    fn restore(&mut self, state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()>;
+}
+
+/// A density control in the registry.
+pub struct DensityPlugin {
+    /// Facts for people, tables and checks.
+    pub info: Plugin,
+    /// Builds the control from the `[density]` section without `kind`; unknown keys are errors.
+    pub build: fn(&toml::Table) -> Result<Box<dyn DensityControl>>,
+}
+crate::plugin_kind!(DensityPlugin, "density");
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::HostGaussians;
+
+    fn three() -> Gaussians {
+        let host = HostGaussians {
+            means: vec![0.0; 9],
+            log_scales: vec![0.0; 9],
+            quaternions: vec![1.0; 12],
+            opacity_logits: vec![0.0; 3],
+            sh_dc: vec![0.0; 9],
+            dynamic_scores: vec![0.0; 3],
+            ..Default::default()
+        };
+        Gaussians::from_host(&host, &Device::flex())
+    }
+
+    #[test]
+    fn plans_are_carried_out() {
+        let mut g = three();
+        g.opacity_logits = Tensor::from_floats([0.0, 1.0, 2.0], &Device::flex());
+        g.extra.insert("label".into(), Tensor::from_floats([[10.0], [11.0], [12.0]], &Device::flex()));
+        let mut plan = DensityPlan::new();
+        plan.keep(2);
+        let copy = plan.copy(1);
+        plan.set(copy, "opacity_logits", &[7.0]);
+        let after = plan.apply(&g).unwrap().to_host().unwrap();
+        assert_eq!((after.opacity_logits, after.extra["label"].values.clone()), (vec![2.0, 7.0], vec![12.0, 11.0]));
+        assert_eq!((plan.fresh(), plan.keeps_all(3)), (&[false, true][..], false));
+    }
+
+    #[test]
+    fn plans_are_checked() {
+        let g = three();
+        assert!(DensityPlan::unchanged(3).check("t", &g).is_ok() && DensityPlan::unchanged(3).keeps_all(3));
+        assert!(DensityPlan::new().check("t", &g).is_err(), "nothing is left");
+        assert!(DensityPlan::unchanged(4).check("t", &g).is_err(), "there is no fourth row");
+        let with = |attribute: &str, values: &[f32]| {
+            let mut plan = DensityPlan::new();
+            let row = plan.copy(2);
+            plan.set(row, attribute, values);
+            plan.check("t", &g)
+        };
+        assert!(with("means", &[1.0, 2.0, 3.0]).is_ok());
+        for (attribute, values) in [("means", &[1.0][..]), ("means", &[1.0, f32::NAN, 0.0]), ("colour", &[1.0])] {
+            assert!(with(attribute, values).unwrap_err().to_string().contains(attribute), "{attribute}");
+        }
+    }
+}

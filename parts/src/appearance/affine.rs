@@ -1,0 +1,102 @@
+//! A 3x3 matrix and an offset per training camera: exposure, white balance and flare.
+//!
+//! Camera c records (I + D_c - mean D) rgb + (b_c - mean b). The mean over the training cameras is the identity by construction, so that the model cannot move colour from the
+//! Gaussians into all cameras at once, and held-out cameras see the mean.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::{Appearance, AppearanceContext, AppearancePlugin, Error, Parameter, ParameterGroup, Part, Plugin, Result, config, inventory};
+use serde::Deserialize;
+
+const SCHEMA: &str = "\
+lr = 1e-3                # learning rate of all numbers
+identity = 1e-3          # weight of the squared distance from the identity, mean over cameras (FreeTimeGS++: 1e-3)
+";
+/// Numbers per camera: nine of the matrix, three of the offset.
+const NUMBERS: usize = 12;
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    lr: f64,
+    identity: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { lr: 1e-3, identity: 1e-3 }
+    }
+}
+
+struct Affine {
+    settings: Settings,
+    cameras: usize,
+    /// D and b of all cameras [cameras x 12], rows of a matrix before the offset.
+    parameters: Vec<Parameter>,
+}
+
+impl Affine {
+    /// Differences from the mean [cameras, 12].
+    fn differences(&self) -> Tensor<2> {
+        let all = self.parameters[0].value.clone().reshape([self.cameras, NUMBERS]);
+        all.clone() - all.mean_dim(0)
+    }
+}
+
+impl Appearance for Affine {
+    fn apply(&self, planes: Tensor<3>, camera: Option<usize>) -> Result<Tensor<3>> {
+        let Some(camera) = camera else { return Ok(planes) };
+        if camera >= self.cameras {
+            return Err(Error::parameter("appearance affine", format!("camera {camera} of {}", self.cameras), "Report this as a defect"));
+        }
+        let [count, height, width] = planes.dims();
+        let own = self.differences().narrow(0, camera, 1).reshape([NUMBERS]);
+        let matrix = own.clone().narrow(0, 0, 9).reshape([3, 3]);
+        let offset = own.narrow(0, 9, 3).reshape([3, 1]);
+        let rgb = planes.clone().narrow(0, 0, 3).reshape([3, height * width]);
+        let recorded = (rgb.clone() + matrix.matmul(rgb) + offset).reshape([3, height, width]);
+        Ok(Tensor::cat(vec![recorded, planes.narrow(0, 3, count - 3)], 0))
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        self.parameters.iter().collect()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        self.parameters.iter_mut().collect()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        vec![ParameterGroup { epsilon: 1e-8, ..ParameterGroup::plain("affine appearance", self.settings.lr, self.settings.lr) }]
+    }
+    fn regularizer(&self) -> Result<Option<Tensor<1>>> {
+        if self.settings.identity == 0.0 {
+            return Ok(None);
+        }
+        let own = self.parameters[0].value.clone();
+        Ok(Some((own.clone() * own).sum().mul_scalar(self.settings.identity / self.cameras.max(1) as f64)))
+    }
+}
+
+fn build(section: &toml::Table, context: &AppearanceContext, device: &Device) -> Result<Box<dyn Appearance>> {
+    let settings: Settings = config::parse_section("appearance affine", section)?;
+    for (name, value) in [("lr", settings.lr), ("identity", settings.identity)] {
+        if !(0.0..=1e6).contains(&value) {
+            return Err(Error::parameter(format!("appearance affine: {name}"), format!("{value} cannot be used"), "Give a finite number of 0 or more"));
+        }
+    }
+    let cameras = context.cameras.max(1);
+    let value = Tensor::<1>::from_data(TensorData::new(vec![0.0f32; cameras * NUMBERS], [cameras * NUMBERS]), device);
+    let parameter = Parameter { name: "affine".into(), part: Part::Net, shape: vec![cameras, NUMBERS], value, group: 0 };
+    Ok(Box::new(Affine { settings, cameras, parameters: vec![parameter] }))
+}
+
+inventory::submit! {
+    AppearancePlugin {
+        info: Plugin {
+            name: "affine",
+            version: "1",
+            summary: "a colour matrix and offset per training camera, the identity on average",
+            paper: "after FreeTimeGS++ and Dynamic 3D Gaussians (per-camera colour)",
+            schema: SCHEMA,
+            capabilities: &["differentiable"],
+        },
+        build,
+    }
+}

@@ -1,0 +1,183 @@
+//! Clone and split by screen gradient, prune by opacity, size and blending weight (3DGS; windows and weight pruning of Swift4D).
+
+mod rules;
+mod statistics;
+
+use burn::tensor::{Device, Tensor};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{
+    DensityControl, DensityPlan, DensityPlugin, Error, Gaussians, Plugin, Result, Schedule, Seed, Stage, Statistic, ViewStatistics, config, inventory,
+};
+use rules::{Due, round};
+use serde::Deserialize;
+use statistics::Statistics;
+
+const SCHEMA: &str = "\
+from = 500               # first round, in reference iterations of the stage (coarse 5,000, main 20,000)
+until = 10000            # last round, in reference iterations of the main stage; the coarse stage ends at 5,000
+every = 100              # reference iterations between two rounds
+gradient = 2e-4          # mean screen gradient, in normalised device units, from which a Gaussian is cloned or split
+dense_share = 0.01       # largest size that is cloned instead of split, as a share of the extent of the cameras
+min_opacity = 0.005      # fainter Gaussians are removed
+max_scale_share = 0.0    # larger Gaussians are removed, as a share of the extent; 0 is off
+min_weight = 0.02        # a weight pruning removes Gaussians whose largest blending weight is below this
+weight_every = 3000      # reference iterations between two weight prunings; 0 is off
+reset_every = 3000       # reference iterations between two opacity resets of the coarse stage; 0 is off
+max_gaussians = 400000   # no growth at or over this many
+";
+
+/// Opacity that a reset leaves at most.
+const RESET_OPACITY: f32 = 0.01;
+/// Fewest iterations left after an opacity reset; a shorter rest of the stage is not reset.
+const MIN_RECOVERY: usize = 500;
+/// Fewest iterations between two weight prunings, so that every view had a chance to show a Gaussian.
+const MIN_WEIGHT_INTERVAL: usize = 100;
+/// Fewest iterations between two rounds.
+const MIN_INTERVAL: usize = 25;
+
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Settings {
+    from: usize,
+    until: usize,
+    every: usize,
+    gradient: f32,
+    dense_share: f32,
+    min_opacity: f32,
+    max_scale_share: f32,
+    min_weight: f32,
+    weight_every: usize,
+    reset_every: usize,
+    max_gaussians: usize,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            from: 500,
+            until: 10_000,
+            every: 100,
+            gradient: 2e-4,
+            dense_share: 0.01,
+            min_opacity: 0.005,
+            max_scale_share: 0.0,
+            min_weight: 0.02,
+            weight_every: 3000,
+            reset_every: 3000,
+            max_gaussians: 400_000,
+        }
+    }
+}
+
+impl Settings {
+    /// The iteration of the stage at which rounds end.
+    fn end(&self, schedule: &Schedule) -> usize {
+        schedule.at(if schedule.stage == Stage::Coarse { self.until.min(Stage::Coarse.reference_length()) } else { self.until })
+    }
+    fn weight_interval(&self, schedule: &Schedule) -> usize {
+        schedule.at(self.weight_every).max(MIN_WEIGHT_INTERVAL)
+    }
+    /// What is due after this iteration.
+    fn due(&self, schedule: &Schedule) -> Due {
+        let (iteration, end) = (schedule.iteration, self.end(schedule));
+        let reset_interval = schedule.at(self.reset_every).max(1);
+        let coarse = schedule.stage == Stage::Coarse;
+        Due {
+            grow: iteration > schedule.at(self.from) && iteration < end && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL)),
+            prune_weight: self.weight_every > 0 && iteration < end && iteration.is_multiple_of(self.weight_interval(schedule)),
+            reset: coarse && self.reset_every > 0 && iteration.is_multiple_of(reset_interval) && schedule.left() >= MIN_RECOVERY,
+        }
+    }
+}
+
+struct CloneSplit {
+    settings: Settings,
+    statistics: Statistics,
+}
+
+impl DensityControl for CloneSplit {
+    fn begin_stage(&mut self, count: usize, device: &Device) {
+        self.statistics = Statistics::zeros(count, device);
+    }
+    fn statistics(&self, schedule: &Schedule) -> Vec<Statistic> {
+        let end = self.settings.end(schedule);
+        let mut wanted = Vec::new();
+        if schedule.iteration < end {
+            wanted.push(Statistic::ScreenGradient);
+        }
+        // Weights are asked for while a weight pruning is still to come.
+        let interval = self.settings.weight_interval(schedule);
+        if self.settings.weight_every > 0 && schedule.iteration.div_ceil(interval) * interval < end {
+            wanted.push(Statistic::MaxWeight);
+        }
+        wanted
+    }
+    fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
+        self.statistics.add(view);
+        Ok(())
+    }
+    fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
+        let due = self.settings.due(schedule);
+        let device = gaussians.means.device();
+        let mut plan = None;
+        let mut logits = None;
+        if due.grow || due.prune_weight {
+            let mut host = gaussians.to_host()?;
+            if due.reset {
+                host.opacity_logits.iter_mut().for_each(|v| *v = v.min(reset_logit()));
+            }
+            plan = round(&self.settings, &mut self.statistics, &host, due, schedule.extent, seed, &device)?;
+            logits = Some(host.opacity_logits);
+        }
+        if due.reset {
+            let logits = match logits {
+                Some(logits) => logits,
+                None => to_vec(gaussians.opacity_logits.clone(), "opacity_logits")?,
+            };
+            let plan = plan.get_or_insert_with(|| DensityPlan::unchanged(logits.len()));
+            for row in 0..plan.len() {
+                let parent = plan.parents()[row];
+                plan.set(row, "opacity_logits", &[logits[parent].min(reset_logit())]);
+            }
+            plan.restart("opacity_logits");
+        }
+        Ok(plan)
+    }
+    fn state(&self) -> Vec<(String, Tensor<1>)> {
+        self.statistics.arrays()
+    }
+    fn restore(&mut self, state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()> {
+        self.statistics = Statistics::from_arrays(state, count)?;
+        Ok(())
+    }
+}
+
+fn reset_logit() -> f32 {
+    (RESET_OPACITY / (1.0 - RESET_OPACITY)).ln()
+}
+
+fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
+    let settings: Settings = config::parse_section("density clone-split", section)?;
+    let numbers = [settings.gradient, settings.dense_share, settings.min_opacity, settings.max_scale_share, settings.min_weight];
+    if let Some(odd) = numbers.iter().find(|v| !v.is_finite() || **v < 0.0) {
+        return Err(Error::parameter("density clone-split", format!("a threshold is {odd}"), "Give finite numbers of 0 or more"));
+    }
+    if settings.every == 0 {
+        return Err(Error::parameter("density clone-split: every", "0 iterations", "Give at least 1, or use density.kind = \"none\""));
+    }
+    Ok(Box::new(CloneSplit { settings, statistics: Statistics::zeros(0, &Device::flex()) }))
+}
+
+inventory::submit! {
+    DensityPlugin {
+        info: Plugin {
+            name: "clone-split",
+            version: "1",
+            summary: "clone and split by screen gradient, prune by opacity, size and blending weight",
+            paper: "Kerbl et al. 2023 (3DGS); Swift4D (Wu et al. 2025)",
+            schema: SCHEMA,
+            capabilities: &[],
+        },
+        build,
+    }
+}

@@ -1,0 +1,159 @@
+//! One round: clone, split, prune.
+
+use super::Settings;
+use super::statistics::Statistics;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{DensityPlan, HostGaussians, Result, Seed};
+use rand::Rng;
+
+/// Two Gaussians of 1/1.6 the size stand for one (3DGS: 0.8 times 2).
+const SPLIT_SHRINK: f32 = 1.6;
+
+/// What is due after an iteration.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Due {
+    /// Clone and split.
+    pub grow: bool,
+    /// Remove by blending weight, and start that statistic anew.
+    pub prune_weight: bool,
+    /// Lower all opacities.
+    pub reset: bool,
+}
+
+/// A Gaussian to add: its parent, and a standard normal sample if it comes from a split.
+type Child = (usize, Option<[f32; 3]>);
+
+/// One round. Statistics start anew; `None` where every Gaussian would have to go, which keeps them all.
+pub(super) fn round(
+    settings: &Settings,
+    statistics: &mut Statistics,
+    host: &HostGaussians,
+    due: Due,
+    extent: f32,
+    seed: Seed,
+    device: &Device,
+) -> Result<Option<DensityPlan>> {
+    let n = host.len();
+    let gradient = to_vec(statistics.gradient_sum.clone(), "screen gradients")?;
+    let seen = to_vec(statistics.seen.clone(), "screen counts")?;
+    let weight = to_vec(statistics.max_weight.clone(), "blending weights")?;
+    let largest = |i: usize| host.log_scales[3 * i..3 * i + 3].iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)).exp();
+    let opacity = |i: usize| 1.0 / (1.0 + (-host.opacity_logits[i]).exp());
+    let weak = |i: usize| due.prune_weight && weight[i] < settings.min_weight;
+    let finite = |i: usize| {
+        let of_row = |width: usize, values: &[f32]| values[i * width..(i + 1) * width].iter().all(|v| v.is_finite());
+        host.columns().iter().all(|(_, width, values)| of_row(*width, values)) && host.extra.values().all(|a| of_row(a.width, &a.values))
+    };
+    let dead = |i: usize| !finite(i) || opacity(i) < settings.min_opacity || (settings.max_scale_share > 0.0 && largest(i) > settings.max_scale_share * extent);
+
+    let mut plan = DensityPlan::new();
+    let mut children: Vec<Child> = Vec::new();
+    let capacity = settings.max_gaussians.saturating_sub(n);
+    for i in 0..n {
+        if dead(i) || weak(i) {
+            plan.report.removed += 1;
+            continue;
+        }
+        let mean_gradient = if seen[i] > 0.0 { gradient[i] / seen[i] } else { 0.0 };
+        let grows = due.grow && mean_gradient >= settings.gradient && plan.report.cloned + plan.report.split < capacity;
+        if !grows {
+            plan.keep(i);
+        } else if largest(i) <= settings.dense_share * extent {
+            plan.keep(i);
+            children.push((i, None));
+            plan.report.cloned += 1;
+        } else {
+            let mut rng = seed.index(i as u64).rng();
+            for _ in 0..2 {
+                children.push((i, Some(std::array::from_fn(|_| standard_normal(&mut rng)))));
+            }
+            plan.report.split += 1;
+        }
+    }
+    if plan.is_empty() && children.is_empty() {
+        statistics.reset_gradients();
+        return Ok(None);
+    }
+    let kept = plan.len();
+    for &(parent, normal) in &children {
+        let row = plan.copy(parent);
+        let Some(normal) = normal else { continue };
+        let (means, log_scales) = (&host.means[3 * parent..3 * parent + 3], &host.log_scales[3 * parent..3 * parent + 3]);
+        let sample = rotate(&host.quaternions[4 * parent..4 * parent + 4], std::array::from_fn(|a| normal[a] * log_scales[a].exp()));
+        plan.set(row, "means", &[means[0] + sample[0], means[1] + sample[1], means[2] + sample[2]]);
+        let shrink = SPLIT_SHRINK.ln();
+        plan.set(row, "log_scales", &[log_scales[0] - shrink, log_scales[1] - shrink, log_scales[2] - shrink]);
+    }
+    let count = plan.len();
+    *statistics = Statistics::zeros(count, device);
+    if !due.prune_weight {
+        // New Gaussians have no history: they cannot fail the next weight pruning.
+        let weights: Vec<f32> = plan.parents().iter().enumerate().map(|(row, &parent)| if row < kept { weight[parent].min(1.0) } else { 1.0 }).collect();
+        statistics.max_weight = Tensor::from_data(TensorData::new(weights, [count]), device);
+    }
+    Ok(Some(plan))
+}
+
+fn rotate(q: &[f32], v: [f32; 3]) -> [f32; 3] {
+    let norm = q.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-12);
+    let rotation = glam::Quat::from_xyzw(q[1] / norm, q[2] / norm, q[3] / norm, q[0] / norm);
+    (rotation * glam::Vec3::from(v)).to_array()
+}
+
+fn standard_normal(rng: &mut impl Rng) -> f32 {
+    // Box-Muller; 1 - u keeps the logarithm finite.
+    let (u, v): (f32, f32) = (rng.random(), rng.random());
+    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f32::consts::TAU * v).cos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::ExtraAttribute;
+
+    fn host_of(n: usize) -> HostGaussians {
+        HostGaussians {
+            means: (0..n).flat_map(|i| [i as f32, 0.0, 0.0]).collect(),
+            log_scales: vec![0.0; 3 * n],
+            quaternions: [1.0, 0.0, 0.0, 0.0].repeat(n),
+            opacity_logits: vec![0.0; n],
+            sh_dc: vec![0.0; 3 * n],
+            dynamic_scores: vec![0.0; n],
+            extra: [("label".to_string(), ExtraAttribute::exact(1, (0..n).map(|i| i as f32).collect()))].into(),
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn clone_split_and_prune_carry_every_attribute() {
+        let device = Device::flex();
+        let mut host = host_of(4);
+        // 0: small with a large gradient, cloned; 1: large with a large gradient, split; 2: transparent, removed; 3: kept.
+        host.log_scales[0..3].fill(0.001f32.ln());
+        host.opacity_logits[2] = -20.0;
+        let mut statistics = Statistics::zeros(4, &device);
+        statistics.gradient_sum = Tensor::from_floats([1.0, 1.0, 1.0, 0.0], &device);
+        statistics.seen = Tensor::ones([4], &device);
+        let due = Due { grow: true, ..Default::default() };
+        let plan = round(&Settings::default(), &mut statistics, &host, due, 1.0, Seed::root(1), &device).unwrap().unwrap();
+        assert_eq!((plan.report.cloned, plan.report.split, plan.report.removed), (1, 1, 1));
+        assert_eq!(statistics.max_weight.dims(), [5]);
+        let gaussians = cc4dgs_core::Gaussians::from_host(&host, &device);
+        plan.check("clone-split", &gaussians).unwrap();
+        let after = plan.apply(&gaussians).unwrap().to_host().unwrap();
+        assert_eq!(after.extra["label"].values, vec![0.0, 3.0, 0.0, 1.0, 1.0]);
+        assert!((after.log_scales[9] + SPLIT_SHRINK.ln()).abs() < 1e-6);
+        assert_ne!(after.means[9..12], after.means[12..15], "the two halves are different samples");
+    }
+
+    #[test]
+    fn weight_pruning_removes_what_no_view_shows() {
+        let device = Device::flex();
+        let mut statistics = Statistics::zeros(3, &device);
+        statistics.max_weight = Tensor::from_floats([0.5, 0.0, 0.019], &device);
+        let due = Due { prune_weight: true, ..Default::default() };
+        let plan = round(&Settings::default(), &mut statistics, &host_of(3), due, 1.0, Seed::root(1), &device).unwrap().unwrap();
+        assert_eq!((plan.report.removed, plan.parents()), (2, &[0][..]));
+    }
+}

@@ -1,0 +1,62 @@
+//! Running statistics between two rounds, on the device.
+
+use burn::tensor::{Device, Tensor};
+use cc4dgs_core::{Error, Result, ViewStatistics};
+
+/// Sums over the views since the last round.
+pub(super) struct Statistics {
+    /// Sum of screen-gradient norms in normalised device units [N].
+    pub gradient_sum: Tensor<1>,
+    /// Views that saw the Gaussian [N].
+    pub seen: Tensor<1>,
+    /// Largest blending weight since the last weight pruning [N].
+    pub max_weight: Tensor<1>,
+}
+
+impl Statistics {
+    /// Zeros for `count` Gaussians.
+    pub fn zeros(count: usize, device: &Device) -> Self {
+        let zeros = || Tensor::<1>::zeros([count], device);
+        Self { gradient_sum: zeros(), seen: zeros(), max_weight: zeros() }
+    }
+    /// Adds one view.
+    pub fn add(&mut self, view: &ViewStatistics) {
+        if let Some(gradient) = &view.screen_gradient {
+            let n = gradient.dims()[0];
+            // From pixels of a loss that was divided by the number of views to half images of the view's own loss.
+            let scale = view.views as f32 * 0.5;
+            let axis = |k: usize, side: u32| gradient.clone().narrow(1, k, 1).reshape([n]).mul_scalar(scale * side as f32);
+            let (x, y) = (axis(0, view.size.0), axis(1, view.size.1));
+            let norm = (x.clone() * x + y.clone() * y).sqrt();
+            let visible = view.radii.clone().greater_elem(0).float();
+            self.gradient_sum = self.gradient_sum.clone() + norm * visible.clone();
+            self.seen = self.seen.clone() + visible;
+        }
+        if let Some(weights) = &view.max_weights {
+            self.max_weight = self.max_weight.clone().max_pair(weights.clone());
+        }
+    }
+    /// Forgets gradients, as every round does.
+    pub fn reset_gradients(&mut self) {
+        self.gradient_sum = self.gradient_sum.zeros_like();
+        self.seen = self.seen.zeros_like();
+    }
+    /// The arrays by name.
+    pub fn arrays(&self) -> Vec<(String, Tensor<1>)> {
+        vec![("gradient_sum".into(), self.gradient_sum.clone()), ("seen".into(), self.seen.clone()), ("max_weight".into(), self.max_weight.clone())]
+    }
+    /// The arrays of [`Statistics::arrays`] for `count` Gaussians.
+    pub fn from_arrays(arrays: Vec<(String, Tensor<1>)>, count: usize) -> Result<Self> {
+        let damaged =
+            |name: &str, problem: String| Error::data(format!("density state '{name}'"), problem, "The checkpoint is damaged or of another density control");
+        if arrays.len() != 3 {
+            return Err(damaged("clone-split", format!("there are {} arrays, expected 3", arrays.len())));
+        }
+        let take = |name: &str| match arrays.iter().find(|(n, _)| n == name) {
+            Some((_, values)) if values.dims() == [count] => Ok(values.clone()),
+            Some((_, values)) => Err(damaged(name, format!("it has {} values for {count} Gaussians", values.dims()[0]))),
+            None => Err(damaged(name, "it is missing".into())),
+        };
+        Ok(Self { gradient_sum: take("gradient_sum")?, seen: take("seen")?, max_weight: take("max_weight")? })
+    }
+}

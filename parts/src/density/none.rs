@@ -1,0 +1,52 @@
+//! No density control: the Gaussians of the initialisation stay.
+
+use burn::tensor::{Device, Tensor};
+use cc4dgs_core::{DensityControl, DensityPlan, DensityPlugin, Error, Gaussians, Plugin, Result, Schedule, Seed, Statistic, ViewStatistics, config, inventory};
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoSettings {}
+
+struct Fixed;
+
+impl DensityControl for Fixed {
+    fn begin_stage(&mut self, _count: usize, _device: &Device) {}
+    fn statistics(&self, _schedule: &Schedule) -> Vec<Statistic> {
+        Vec::new()
+    }
+    fn observe(&mut self, _view: &ViewStatistics) -> Result<()> {
+        Ok(())
+    }
+    fn plan(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Option<DensityPlan>> {
+        Ok(None)
+    }
+    fn state(&self) -> Vec<(String, Tensor<1>)> {
+        Vec::new()
+    }
+    fn restore(&mut self, state: Vec<(String, Tensor<1>)>, _count: usize) -> Result<()> {
+        match state.first() {
+            Some((name, _)) => Err(Error::data(format!("density state '{name}'"), "the control 'none' keeps nothing", "Resume with the run's own config.toml")),
+            None => Ok(()),
+        }
+    }
+}
+
+fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
+    let NoSettings {} = config::parse_section("density none", section)?;
+    Ok(Box::new(Fixed))
+}
+
+inventory::submit! {
+    DensityPlugin {
+        info: Plugin {
+            name: "none",
+            version: "1",
+            summary: "the Gaussians of the initialisation stay",
+            paper: "",
+            schema: "# no settings\n",
+            capabilities: &[],
+        },
+        build,
+    }
+}

@@ -1,0 +1,7 @@
+//! The exchangeable parts of the trainer, one file each: density controls, loss terms, appearance models and optimizers. Nobody names them in code; they are found in the
+//! registry by the names that configurations use.
+
+mod appearance;
+mod density;
+mod loss;
+mod optimizer;

@@ -1,0 +1,8 @@
+//! Terms of the loss.
+
+mod dssim;
+mod l1;
+mod mask_bce;
+mod opacity;
+mod photometric;
+mod scale;

@@ -1,0 +1,41 @@
+//! Mean standard deviation of the Gaussians over the extent of the cameras: a pull towards few and small Gaussians (3DGS-MCMC).
+
+use burn::tensor::Tensor;
+
+use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory};
+use serde::Deserialize;
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoSettings {}
+
+struct MeanScale;
+
+impl LossTerm for MeanScale {
+    fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
+        if input.gaussians.is_empty() {
+            return Ok(None);
+        }
+        Ok(Some(input.gaussians.log_scales.clone().exp().mean().div_scalar(input.schedule.extent.max(f32::MIN_POSITIVE))))
+    }
+}
+
+fn build(section: &toml::Table) -> Result<Box<dyn LossTerm>> {
+    let NoSettings {} = config::parse_section("loss scale", section)?;
+    Ok(Box::new(MeanScale))
+}
+
+inventory::submit! {
+    LossPlugin {
+        info: Plugin {
+            name: "scale",
+            version: "1",
+            summary: "mean standard deviation of the Gaussians over the extent of the cameras",
+            paper: "Kheradmand et al. 2024 (3DGS-MCMC)",
+            schema: "# no settings\n",
+            capabilities: &["differentiable"],
+        },
+        build,
+        fuses: None,
+    }
+}

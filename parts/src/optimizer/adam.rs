@@ -1,0 +1,124 @@
+//! Adam (Kingma and Ba 2015) with the fused kernel: moments and step counts by name of the array.
+
+use burn::tensor::{Int, Tensor, TensorData};
+use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
+use cc4dgs_core::{Error, Optimizer, OptimizerPlugin, OptimizerState, Plugin, Result, StepSettings, config, inventory, state_array};
+use serde::Deserialize;
+use std::collections::BTreeMap;
+
+const SCHEMA: &str = "\
+beta1 = 0.9              # decay of the first moment
+beta2 = 0.999            # decay of the second moment
+";
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Settings {
+    beta1: f64,
+    beta2: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { beta1: 0.9, beta2: 0.999 }
+    }
+}
+
+/// State of one array: first and second moment [N,W], and how many steps they have seen.
+struct Moments {
+    first: Tensor<2>,
+    second: Tensor<2>,
+    steps: u64,
+}
+
+struct Adam {
+    settings: Settings,
+    moments: BTreeMap<String, Moments>,
+}
+
+impl Optimizer for Adam {
+    fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>> {
+        // The moments are taken out of the map, so that the kernel holds the only reference and works in place.
+        let Moments { first, second, steps } =
+            self.moments.remove(name).unwrap_or_else(|| Moments { first: value.zeros_like(), second: value.zeros_like(), steps: 0 });
+        let steps = steps + 1;
+        let settings = AdamSettings {
+            beta1: self.settings.beta1,
+            beta2: self.settings.beta2,
+            epsilon: settings.epsilon,
+            visible: settings.visible.cloned(),
+            ..AdamSettings::new(settings.lr, steps)
+        };
+        let stepped = adam_step(value, first, second, gradient, &settings)?;
+        self.moments.insert(name.to_string(), Moments { first: stepped.m, second: stepped.v, steps });
+        Ok(stepped.param)
+    }
+    fn restart(&mut self, prefix: &str) {
+        self.moments.retain(|name, _| !name.starts_with(prefix));
+    }
+    fn select_rows(&mut self, prefix: &str, parents: &[usize], fresh: &[bool]) -> Result<()> {
+        let count = parents.len();
+        let rows: Vec<i64> = parents.iter().map(|&row| row as i64).collect();
+        for (name, moments) in self.moments.iter_mut().filter(|(name, _)| name.starts_with(prefix)) {
+            let [have, width] = moments.first.dims();
+            if fresh.len() != count || parents.iter().any(|&row| row >= have) {
+                return Err(Error::backend(format!("optimizer adam: {name}"), format!("{count} rows are selected of {have}"), "Report this as a defect"));
+            }
+            let device = moments.first.device();
+            let rows = Tensor::<1, Int>::from_data(TensorData::new(rows.clone(), [count]), &device);
+            let zero = Tensor::<1, Int>::from_data(TensorData::new(fresh.iter().map(|&f| i64::from(f)).collect::<Vec<_>>(), [count]), &device);
+            let zero = zero.reshape([count, 1]).repeat_dim(1, width).equal_elem(1);
+            for moment in [&mut moments.first, &mut moments.second] {
+                *moment = moment.clone().select(0, rows.clone()).mask_fill(zero.clone(), 0.0);
+            }
+        }
+        Ok(())
+    }
+    fn state(&self) -> OptimizerState {
+        let mut state = OptimizerState::default();
+        for (name, moments) in &self.moments {
+            state.arrays.insert(format!("{name}/first_moment"), moments.first.clone());
+            state.arrays.insert(format!("{name}/second_moment"), moments.second.clone());
+            state.steps.insert(name.clone(), moments.steps);
+        }
+        state
+    }
+    fn restore(&mut self, mut state: OptimizerState) -> Result<()> {
+        self.moments.clear();
+        for (name, steps) in std::mem::take(&mut state.steps) {
+            let first = state_array(&mut state, &format!("{name}/first_moment"))?;
+            let second = state_array(&mut state, &format!("{name}/second_moment"))?;
+            if first.dims() != second.dims() {
+                return Err(Error::data(format!("optimizer state of {name}"), "the two moments have other shapes", "The checkpoint is damaged; use another"));
+            }
+            self.moments.insert(name, Moments { first, second, steps });
+        }
+        match state.arrays.keys().next() {
+            Some(name) => Err(Error::data(format!("optimizer state '{name}'"), "it belongs to no array", "The checkpoint is damaged or of another optimizer")),
+            None => Ok(()),
+        }
+    }
+}
+
+fn build(section: &toml::Table) -> Result<Box<dyn Optimizer>> {
+    let settings: Settings = config::parse_section("optimizer adam", section)?;
+    if [settings.beta1, settings.beta2].iter().any(|b| !(0.0..1.0).contains(b)) {
+        let problem = format!("beta1 {} and beta2 {} must be at least 0 and below 1", settings.beta1, settings.beta2);
+        return Err(Error::parameter("optimizer adam", problem, "The usual values are 0.9 and 0.999"));
+    }
+    Ok(Box::new(Adam { settings, moments: BTreeMap::new() }))
+}
+
+inventory::submit! {
+    OptimizerPlugin {
+        info: Plugin {
+            name: "adam",
+            version: "1",
+            summary: "Adam; rows that no view shows keep value and state where training asks for it",
+            paper: "Kingma and Ba 2015; Mallick et al. 2024 (rows in view only)",
+            schema: SCHEMA,
+            capabilities: &[],
+        },
+        build,
+    }
+}

@@ -1,0 +1,3 @@
+//! From gradients to new values.
+
+mod adam;
