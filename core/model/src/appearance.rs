@@ -43,4 +43,4 @@ pub struct AppearancePlugin {
     /// Builds the model from the `[appearance]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table, &AppearanceContext, &Device) -> Result<Box<dyn Appearance>>,
 }
-crate::plugin_kind!(AppearancePlugin, "appearance");
+cc4dgs_format::plugin_kind!(AppearancePlugin, "appearance");

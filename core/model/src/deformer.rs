@@ -246,4 +246,4 @@ pub struct DeformerPlugin {
     /// Builds a fresh field. The table is the `[deformer]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>,
 }
-crate::plugin_kind!(DeformerPlugin, "deformer");
+cc4dgs_format::plugin_kind!(DeformerPlugin, "deformer");

@@ -222,7 +222,7 @@ pub struct DensityPlugin {
     /// Builds the control from the `[density]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table) -> Result<Box<dyn DensityControl>>,
 }
-crate::plugin_kind!(DensityPlugin, "density");
+cc4dgs_format::plugin_kind!(DensityPlugin, "density");
 
 #[cfg(test)]
 mod tests {

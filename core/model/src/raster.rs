@@ -179,4 +179,4 @@ pub struct RasterizerPlugin {
     /// Builds the rasterizer from the `[rasterizer]` section without `kind`.
     pub build: fn(&toml::Table) -> Result<Box<dyn Rasterizer>>,
 }
-crate::plugin_kind!(RasterizerPlugin, "rasterizer");
+cc4dgs_format::plugin_kind!(RasterizerPlugin, "rasterizer");

@@ -11,11 +11,11 @@ pub struct Registry {
     deformers: Entries<DeformerPlugin>,
     codecs: Entries<CodecPlugin>,
     rasterizers: Entries<RasterizerPlugin>,
-    weight_codecs: Entries<WeightCodecPlugin>,
     density: Entries<DensityPlugin>,
     losses: Entries<LossPlugin>,
     appearances: Entries<AppearancePlugin>,
     optimizers: Entries<OptimizerPlugin>,
+    weight_codecs: Entries<WeightCodecPlugin>,
 }
 
 impl Registry {
@@ -25,11 +25,11 @@ impl Registry {
             deformers: Entries::collect()?,
             codecs: Entries::collect()?,
             rasterizers: Entries::collect()?,
-            weight_codecs: Entries::collect()?,
             density: Entries::collect()?,
             losses: Entries::collect()?,
             appearances: Entries::collect()?,
             optimizers: Entries::collect()?,
+            weight_codecs: Entries::collect()?,
         })
     }
     /// All entries as (kind, facts), sorted.
@@ -49,10 +49,6 @@ impl Registry {
     /// The rasterizer called `name`.
     pub fn rasterizer(&self, name: &str) -> Result<&'static RasterizerPlugin> {
         self.rasterizers.get(name)
-    }
-    /// The weight codec called `name`.
-    pub fn weight_codec(&self, name: &str) -> Result<&'static WeightCodecPlugin> {
-        self.weight_codecs.get(name)
     }
     /// The density control called `name`.
     pub fn density(&self, name: &str) -> Result<&'static DensityPlugin> {
@@ -88,6 +84,10 @@ impl Registry {
     pub fn build_optimizer(&self, section: &toml::Table) -> Result<Box<dyn Optimizer>> {
         let (kind, settings) = split_kind("optimizer", section)?;
         (self.optimizer(&kind)?.build)(&settings)
+    }
+    /// The weight codec called `name`.
+    pub fn weight_codec(&self, name: &str) -> Result<&'static WeightCodecPlugin> {
+        self.weight_codecs.get(name)
     }
     /// Builds the deformer of a `[deformer]` section (`kind` and its settings).
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
