@@ -29,3 +29,8 @@ pub fn poison(device: &Device) {
 #[cfg(doctest)]
 #[doc = include_str!("../../CONTRIBUTING.md")]
 pub struct Contributing;
+
+/// The program in README.md, likewise.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+pub struct Readme;

@@ -17,13 +17,13 @@ pub struct Cli {
     /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE.
     #[arg(long, global = true, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub json: Option<PathBuf>,
-    /// Say nothing but results and errors.
+    /// Print results and errors only.
     #[arg(long, short, global = true)]
     pub quiet: bool,
-    /// Threads to compute with; 0 takes all of the machine. Results do not depend on it.
+    /// Threads to compute with; 0 uses all cores. Results do not depend on it.
     #[arg(long, global = true, value_name = "N", default_value_t = 0)]
     pub threads: usize,
-    /// Raise or lower what readers believe of a file, such as max_gaussians=50000000; may be given several times.
+    /// Raise or lower what readers accept of a file, such as max_gaussians=50000000; may be given several times.
     #[arg(long = "limit", global = true, value_name = "NAME=VALUE")]
     pub limits: Vec<String>,
     #[command(subcommand)]
@@ -42,13 +42,13 @@ pub enum Command {
     Decompress(Decompress),
     /// Render a model to PNG frames, and to a video if asked.
     Render(Render),
-    /// Measure a model against the pictures of a scene.
+    /// Measure a model against the images of a scene.
     Eval(Eval),
-    /// Say what a checkpoint, an archive, a PLY file or a scene holds.
+    /// Show what a model (checkpoint, archive, PLY, SPZ) or a scene contains.
     Info(Info),
     /// List the plug-ins, or show one with its settings.
     Plugins(Plugins),
-    /// Check this machine: processor, threads, devices, ffmpeg, and a picture drawn by two rasterizers.
+    /// Check this machine: processor, threads, devices, ffmpeg, and an image drawn by two rasterizers.
     Doctor(Doctor),
     /// Measure speed.
     Bench(Bench),
@@ -59,6 +59,9 @@ pub struct Demo {
     /// Folder for everything the demo makes.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Start anew where DIR holds a run already.
+    #[arg(long)]
+    pub overwrite: bool,
     /// Override a setting, such as train.iterations=500; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
@@ -69,7 +72,7 @@ pub struct Demo {
 
 #[derive(Debug, Args)]
 pub struct Train {
-    /// A dataset, or `procedural` for the built-in scene. The format is found out.
+    /// A dataset, or `procedural` for the built-in scene. The format is recognised.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
     /// Settings to start from; see `cc4dgs plugins`.
@@ -78,7 +81,7 @@ pub struct Train {
     /// A TOML file laid over the preset.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Override a setting, such as train.iterations=5000; may be given several times.
+    /// Override a setting, such as train.iterations=5000; may be given several times. Plug-ins (deformer.kind=…) are chosen first, whatever the order.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
     /// Device to compute on: auto, flex, ndarray, wgpu, cuda.
@@ -90,11 +93,14 @@ pub struct Train {
     /// Go on from DIR/checkpoint; the result is the same as without the interruption. Settings default to DIR/config.toml.
     #[arg(long)]
     pub resume: bool,
+    /// Start anew where DIR holds a run already.
+    #[arg(long, conflicts_with = "resume")]
+    pub overwrite: bool,
 }
 
 #[derive(Debug, Args)]
 pub struct Compress {
-    /// A run's folder or a checkpoint.
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
     /// Codec, with its profile after a colon.
@@ -112,14 +118,14 @@ pub struct Compress {
     /// The archive to write.
     #[arg(long, value_name = "F.cc4d")]
     pub out: PathBuf,
-    /// Device to compute on.
-    #[arg(long, value_name = "NAME", default_value = "auto")]
+    /// Device the field is loaded on.
+    #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }
 
 #[derive(Debug, Args)]
 pub struct Decompress {
-    /// An archive, or a run's folder.
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
     /// The file to write: PLY in the layout of 3DGS, or Niantic's SPZ where it ends in .spz.
@@ -132,13 +138,13 @@ pub struct Decompress {
     #[arg(long, value_name = "T")]
     pub time: Option<f32>,
     /// Device to compute on.
-    #[arg(long, value_name = "NAME", default_value = "auto")]
+    #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }
 
 #[derive(Debug, Args)]
 pub struct Render {
-    /// A run's folder, a checkpoint or an archive.
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
     /// Folder for the frames, frame_00000.png and on.
@@ -156,7 +162,7 @@ pub struct Render {
     /// Frames to render: of the orbit (default 60), or at most so many of the dataset, evenly spread.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
-    /// Picture size in pixels; for datasets the default is their own.
+    /// Image size in pixels; for datasets the default is their own.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<(u32, u32)>,
     /// Full turns of the orbit while time runs from 0 to 1.
@@ -176,10 +182,10 @@ pub struct Render {
     pub device: String,
 }
 
-/// A trained model and the views of a dataset that it draws.
+/// A model and the views of a dataset to draw with it.
 #[derive(Debug, Args)]
 pub struct ModelViews {
-    /// A run's folder, a checkpoint or an archive.
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
     /// The dataset, or `procedural`.
@@ -188,7 +194,7 @@ pub struct ModelViews {
     /// Which side of its split.
     #[arg(long, value_enum, default_value_t = SplitArg::Test)]
     pub split: SplitArg,
-    /// Scene options over those the model was trained with, such as scene.width=800 (0 is the pictures' own size); may be given several times.
+    /// Scene options over those the model was trained with, such as scene.width=800 (0 is the images' own size); may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
 }
@@ -197,13 +203,13 @@ pub struct ModelViews {
 pub struct Eval {
     #[command(flatten)]
     pub views: ModelViews,
-    /// Measure at most so many pictures, evenly spread; 0 measures all.
+    /// Measure at most so many images, evenly spread; 0 measures all.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub max_views: usize,
     /// The contact sheet: ground truth, render and error. Without it, it lies beside the JSON file or, for a run, in its folder.
     #[arg(long, value_name = "F.png")]
     pub sheet: Option<PathBuf>,
-    /// Rows of the contact sheet, evenly spread over the pictures; 0 draws none.
+    /// Rows of the contact sheet, evenly spread over the images; 0 draws none.
     #[arg(long, value_name = "N", default_value_t = 6)]
     pub sheet_rows: usize,
     /// Also write every render as a PNG file into this folder.
@@ -216,7 +222,7 @@ pub struct Eval {
 
 #[derive(Debug, Args)]
 pub struct Info {
-    /// A run's folder, a checkpoint, an archive, a PLY file or a dataset.
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file, or a dataset.
     #[arg(value_name = "PATH")]
     pub path: PathBuf,
 }
@@ -234,9 +240,9 @@ pub struct Doctor {}
 /// The two sides of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum SplitArg {
-    /// Pictures seen in training.
+    /// Images seen in training.
     Train,
-    /// Pictures held out.
+    /// Images held out.
     Test,
 }
 

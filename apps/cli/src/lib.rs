@@ -1,12 +1,9 @@
-//! cc4dgs: train a dynamic scene from calibrated pictures, store it in a few megabytes, play it back.
-//!
-//! This crate is the facade: it re-exports the parts of the framework and holds the `cc4dgs` command as [`run`]. A program that links further
-//! plug-in crates is three lines long:
+//! The `cc4dgs` command as a library function, for programs that link further plug-in crates. Such a program is three lines long:
 //!
 //! ```no_run
-//! use cc4dgs as _; // and: use my_deformer as _;
+//! use cc4dgs_cli as _; // and: use my_deformer as _;
 //! fn main() -> std::process::ExitCode {
-//!     cc4dgs::run(std::env::args_os())
+//!     cc4dgs_cli::run(std::env::args_os())
 //! }
 //! ```
 
@@ -14,16 +11,8 @@ mod args;
 mod commands;
 mod interrupt;
 mod listeners;
-mod model_source;
-mod orbit;
+mod models;
 mod output;
-
-pub use cc4dgs_backends as backends;
-pub use cc4dgs_codecs as codecs;
-pub use cc4dgs_core as core;
-pub use cc4dgs_deformers as deformers;
-pub use cc4dgs_engine as engine;
-pub use cc4dgs_parts as parts;
 
 use clap::Parser;
 use std::ffi::OsString;

@@ -28,7 +28,7 @@ impl Output {
     pub fn result(&self, value: &impl Serialize, text: impl FnOnce() -> String) -> Result<()> {
         let mut stdout = std::io::stdout().lock();
         let mut print = |line: &str| match writeln!(stdout, "{}", line.trim_end()) {
-            // Whoever reads us has heard enough (`| head`); that is not our failure.
+            // The reader closed the pipe (`| head`): not a failure.
             Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
             Err(e) => Err(Error::io("standard output", e)),
             Ok(()) => Ok(()),
@@ -50,7 +50,7 @@ impl Output {
     }
     /// Reports a failure: a line on standard error, and an object on standard output where JSON was expected there.
     pub fn failure(&self, error: &Error) {
-        // With the streams themselves broken there is nobody left to tell.
+        // If the streams themselves are broken, nothing can be reported.
         writeln!(std::io::stderr(), "error: {error}").ok();
         if self.json.as_ref().is_some_and(|p| p.as_os_str() == "-") {
             let object = serde_json::json!({ "error": { "message": error.to_string(), "exit_code": error.exit_code() } });

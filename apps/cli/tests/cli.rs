@@ -78,6 +78,10 @@ fn plugins_are_listed_with_four_facts_each() {
     let cdf = json_of(&["plugins", "cdf", "--json"]);
     assert!(cdf[0]["schema"].as_str().unwrap().contains("capacity"), "{cdf}");
     assert!(fail(&["plugins", "cfd"], 2).contains("cdf"));
+    // What the list names can be shown, presets among it.
+    let preset = json_of(&["plugins", "dnerf-cpu+hexplane", "--json"]);
+    assert_eq!((&preset[0]["kind"], &preset[0]["settings"]["deformer"]["kind"]), (&Value::from("preset"), &Value::from("hexplane")));
+    assert!(fail(&["plugins", "dmeo"], 2).contains("demo"));
 }
 
 #[test]
@@ -137,6 +141,12 @@ fn a_scene_goes_through_the_whole_chain() {
     assert!(plain["size_mb"]["total"].as_f64().unwrap() > number("/size_mb/total"));
     assert!((plain["psnr_db"].as_f64().unwrap() - number("/psnr_db")).abs() < 0.5);
 
+    // A run is not overwritten unasked.
+    let before = std::fs::read(dir.join("checkpoint")).unwrap();
+    assert!(fail(&train_args(text(&dir), "train.iterations=30"), 2).contains("--overwrite"));
+    assert_eq!(std::fs::read(dir.join("checkpoint")).unwrap(), before);
+    assert_eq!(std::fs::read_to_string(dir.join("events.jsonl")).unwrap(), log, "a refused run leaves the log alone");
+
     succeed(&["decompress", text(&archive), "--out", text(&ply), "-q"]);
     let played = json_of(&["bench", "play", text(&archive), "--scene", "procedural:tiny", "--device", "flex", "--frames", "5", "-q", "--json"]);
     assert!(played["frames_per_s"].as_f64().unwrap() > 0.0 && played["field"]["median_ms"].as_f64().unwrap() > 0.0, "{played}");
@@ -171,6 +181,101 @@ fn a_scene_goes_through_the_whole_chain() {
     // A limit below the model's size is its own kind of failure.
     fail(&["--limit", "max_gaussians=5", "decompress", text(&archive), "--out", text(&at("no.ply")), "-q"], 4);
     assert!(!at("no.ply").exists());
+}
+
+/// Every command that takes a model takes all kinds of it.
+#[test]
+fn every_kind_of_model_is_taken_everywhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (dir, archive, ply, spz) = (at("run"), at("a.cc4d"), at("a.ply"), at("a.spz"));
+    succeed(&train_args(text(&dir), "train.iterations=120"));
+    succeed(&["compress", text(&dir), "--codec", "raw", "--out", text(&archive), "-q"]);
+    succeed(&["decompress", text(&dir), "--out", text(&ply), "-q"]);
+    succeed(&["decompress", text(&dir), "--out", text(&spz), "-q"]);
+    let checkpoint = dir.join("checkpoint");
+    let mut sources = vec![(dir.clone(), "checkpoint"), (checkpoint, "checkpoint"), (archive, "archive"), (ply, "ply"), (spz, "spz")];
+    // Somebody else's file, where the folder with real data is named.
+    match std::env::var_os("CC4DGS_DATA").map(|root| Path::new(&root).join("playbot_31k/lod3_decoded_3dgs.ply")).filter(|p| p.is_file()) {
+        Some(file) => sources.push((file, "ply")),
+        None => eprintln!("CC4DGS_DATA names no folder with playbot_31k: its part of the test is skipped"),
+    }
+    for (source, kind) in sources {
+        let source = text(&source);
+        let info = json_of(&["info", source, "--json"]);
+        assert_eq!(info["kind"], kind, "{source}");
+        let count = info.pointer("/gaussians/count").or(info.pointer("/manifest/gaussian_count")).unwrap().as_u64().unwrap();
+        assert!(count > 0);
+        let (packed, flat, frames) = (at("packed.cc4d"), at("flat.ply"), at("frames"));
+        let report = json_of(&["compress", source, "--codec", "quantize", "--out", text(&packed), "-q", "--json"]);
+        assert_eq!(report["gaussians"].as_u64(), Some(count), "{source}");
+        // Against float32, whatever the source was.
+        assert!(report["ratio"].as_f64().unwrap() > 1.2, "{source}: {report}");
+        let report = json_of(&["decompress", source, "--out", text(&flat), "-q", "--json"]);
+        assert_eq!(report["gaussians"].as_u64(), Some(count), "{source}");
+        json_of(&["decompress", text(&packed), "--out", text(&flat), "--time", "0.5", "-q", "--json"]);
+        let report = json_of(&["render", source, "--out", text(&frames), "--frames", "2", "--size", "40x30", "--device", "flex", "-q", "--json"]);
+        assert_eq!(report["frames"], 2);
+        let drawn = image::open(frames.join("frame_00000.png")).unwrap().to_rgb8();
+        assert!(drawn.pixels().any(|p| p != drawn.get_pixel(0, 0)), "{source}: the image is empty");
+        let report = json_of(&["eval", source, "--scene", "procedural:tiny", "--device", "flex", "--max-views", "1", "--sheet-rows", "0", "-q", "--json"]);
+        assert_eq!(report["gaussians"].as_u64(), Some(count), "{source}");
+        assert!(report["psnr_db"].as_f64().unwrap().is_finite() && report["size_mb"]["total"].as_f64().unwrap() > 0.0, "{source}: {report}");
+    }
+    // What is no model is said to be none.
+    std::fs::write(at("notes.txt"), "no model").unwrap();
+    for bad in [at("notes.txt"), at("frames")] {
+        assert!(fail(&["compress", text(&bad), "--out", text(&at("no.cc4d")), "-q"], 3).contains("SPZ"));
+    }
+}
+
+#[test]
+fn the_storage_table_counts_attributes() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (run, archive) = (at("run"), at("a.cc4d"));
+    let settings = ["train.iterations=120", "train.checkpoint_every=0"];
+    let mut args = vec!["train", "--scene", "procedural:tiny", "--preset", "demo+native-4d", "--device", "flex", "--out", text(&run), "-q"];
+    args.extend(settings.iter().flat_map(|s| ["--set", s]));
+    succeed(&args);
+    // Every codec stores attributes in streams of its own.
+    for codec in ["raw", "quantize"] {
+        succeed(&["compress", text(&run), "--codec", codec, "--out", text(&archive), "-q"]);
+        let [before, after] = [&run, &archive].map(|path| json_of(&["info", text(path), "--json"]));
+        assert!(before["gaussians"]["extra"].as_array().unwrap().len() > 2, "{before}");
+        for row in 0..5 {
+            assert_eq!(before["storage"][row]["float32_mb"], after["storage"][row]["float32_mb"], "{codec}: row {row}");
+        }
+    }
+}
+
+/// What an archive says of plug-ins that this program lacks.
+#[test]
+fn archives_of_plug_ins_that_are_not_linked_say_what_to_link() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    succeed(&train_args(text(&at("run")), "train.iterations=120"));
+    succeed(&["compress", text(&at("run")), "--codec", "raw", "--out", text(&at("a.cc4d")), "-q"]);
+    let limits = cc4dgs_core::Limits::default();
+    let archive = cc4dgs_core::archive::Archive::open(at("a.cc4d"), &limits).unwrap();
+    let rewrite = |name: &str, change: &dyn Fn(&mut cc4dgs_core::archive::Manifest)| {
+        use cc4dgs_core::archive::{ArchiveWriter, StreamKind};
+        let mut manifest = archive.manifest().clone();
+        change(&mut manifest);
+        let writer = [StreamKind::Canonical, StreamKind::Field]
+            .into_iter()
+            .fold(ArchiveWriter::new(manifest), |writer, kind| writer.add_all(kind, archive.read_kind(kind).unwrap()));
+        writer.write_to(at(name)).unwrap();
+    };
+    rewrite("codec.cc4d", &|m| (m.codec.name, m.codec.version) = ("halves".into(), "7".into()));
+    rewrite("field.cc4d", &|m| m.deformer.as_mut().unwrap().name = "sway".into());
+    for (file, kind, name) in [("codec.cc4d", "codec", "halves' (version 7)"), ("field.cc4d", "deformer", "sway'")] {
+        let said = fail(&["render", text(&at(file)), "--out", text(&at("frames")), "-q"], 2);
+        assert!([file, kind, name, "links the crate"].iter().all(|part| said.contains(part)), "{said}");
+        let info = json_of(&["info", text(&at(file)), "--json"]);
+        assert!(info["notes"][0].as_str().unwrap().contains(name), "{info}");
+        assert!(info["manifest"]["gaussian_count"].as_u64().unwrap() > 0 && !info["streams"].as_array().unwrap().is_empty());
+    }
 }
 
 #[cfg(unix)]

@@ -157,7 +157,7 @@ pub fn photometric_loss(planes: Tensor<3>, target: Tensor<3>, lambda_c: f32) -> 
         ));
     }
     if !(0.0..=1.0).contains(&lambda_c) {
-        return Err(Error::parameter("photometric loss", format!("lambda_c = {lambda_c} is outside 0..1"), "Set loss.lambda_c between 0 and 1"));
+        return Err(Error::parameter("photometric loss", format!("lambda_c = {lambda_c} is outside 0..1"), "Give the weight of L1 as a number from 0 to 1"));
     }
     let (loss, terms) = <Dispatch as PhotometricOps>::photometric(planes.into_dispatch(), target.into_dispatch(), lambda_c);
     Ok(PhotometricLoss { loss: Tensor::from_dispatch(loss), terms: Tensor::<1>::from_dispatch(terms).inner() })

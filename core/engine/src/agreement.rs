@@ -1,4 +1,4 @@
-//! Whether devices draw the same pictures of one model.
+//! Whether devices draw the same images of one model.
 
 use crate::model::Model;
 use crate::play::Player;
@@ -8,24 +8,24 @@ use cc4dgs_core::metrics::{Metric, Rounding};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene};
 use serde::Serialize;
 
-/// One level of an 8-bit picture.
+/// One level of an 8-bit image.
 const LEVEL: f32 = 1.0 / 255.0;
 /// Differences are counted per tenth of a level up to this many levels.
 const COUNTED_LEVELS: usize = 4;
 const BINS: usize = 10 * COUNTED_LEVELS;
 
-/// One device's pictures against those of the first.
+/// One device's images against those of the first.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Agreement {
     /// Device by name.
     pub device: String,
     /// Views drawn.
     pub views: usize,
-    /// Mean PSNR of 8-bit pictures against the truth.
+    /// Mean PSNR of 8-bit images against the truth.
     pub psnr_db: f64,
     /// That minus the first device's.
     pub psnr_difference_db: f64,
-    /// Largest difference of a channel of a pixel from the first device's, pictures in 0..1, before rounding to 8 bits; infinite where a value is no number.
+    /// Largest difference of a channel of a pixel from the first device's, images in 0..1, before rounding to 8 bits; infinite where a value is no number.
     pub max_difference: f32,
     /// Mean difference.
     pub mean_difference: f64,
@@ -84,7 +84,7 @@ impl Agreement {
 /// Draws `views` of `scene` with one model per device, and compares all with the first.
 pub fn agreement(models: &[(String, Device, Model)], scene: &Scene, views: &[usize], registry: &Registry, events: &dyn EventSink) -> Result<Vec<Agreement>> {
     let psnr = Metric::psnr(Rounding::EightBit);
-    let mut players = models.iter().map(|(_, device, model)| Player::new(model, registry, device)).collect::<Result<Vec<_>>>()?;
+    let mut players = models.iter().map(|(_, device, model)| Ok(Player::new(model, registry, device)?.on(scene.background))).collect::<Result<Vec<_>>>()?;
     let mut found: Vec<Agreement> = models.iter().map(|(name, _, _)| Agreement::new(name)).collect();
     for (done, &view) in views.iter().enumerate() {
         let camera = scene.camera(view);
@@ -92,11 +92,11 @@ pub fn agreement(models: &[(String, Device, Model)], scene: &Scene, views: &[usi
         let mut first: Option<Vec<f32>> = None;
         for ((player, agreement), (_, _, model)) in players.iter_mut().zip(&mut found).zip(models) {
             let (output, _) = player.render(camera, scene.views[view].time_norm)?;
-            let picture = to_vec(output.image(), "render")?;
-            let truth = Image8::from_planes(&frame.to_planes(model.background), camera.width, camera.height);
-            agreement.psnr_db += psnr.score_images(&truth, &Image8::from_planes(&picture, camera.width, camera.height))?;
+            let image = to_vec(output.image(), "render")?;
+            let truth = Image8::from_planes(&frame.to_planes(model.background_on(scene.background)), camera.width, camera.height);
+            agreement.psnr_db += psnr.score_images(&truth, &Image8::from_planes(&image, camera.width, camera.height))?;
             agreement.views += 1;
-            agreement.add(first.get_or_insert_with(|| picture.clone()), &picture);
+            agreement.add(first.get_or_insert_with(|| image.clone()), &image);
         }
         events.emit(&Event::Progress { task: "compare".into(), done: done as u64 + 1, total: views.len() as u64 });
     }

@@ -45,7 +45,7 @@ pub struct ModelServices<'a> {
 impl<'a> ModelServices<'a> {
     /// Services of `model` on `device`, which its field must be on.
     pub fn new(model: &'a Model, registry: &Registry, device: &Device) -> Result<Self> {
-        let background = Tensor::<1>::from_data(TensorData::new(model.background.to_vec(), [3]), device);
+        let background = Tensor::<1>::from_data(TensorData::new(model.background_on(None).to_vec(), [3]), device);
         let rasterizer = registry.build_rasterizer(&model.rasterizer)?;
         Ok(Self { model, device: device.clone(), rasterizer, settings: model.render.settings(Some(background)) })
     }

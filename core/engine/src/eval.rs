@@ -1,4 +1,4 @@
-//! Evaluation by the protocol of published tables: 8-bit pictures, metrics per image, then their means.
+//! Evaluation by the protocol of published tables: 8-bit images, metrics per image, then their means.
 
 use crate::config::TrainConfig;
 use crate::masks::dynamic_masks;
@@ -47,7 +47,7 @@ pub struct FrameMs {
     pub raster: f64,
 }
 
-/// One picture's numbers.
+/// One image's numbers.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ImageScore {
     /// Index of the view in the scene.
@@ -56,7 +56,7 @@ pub struct ImageScore {
     pub camera: String,
     /// Frame index.
     pub frame: usize,
-    /// Peak signal-to-noise ratio, 8-bit pictures, all pixels and channels.
+    /// Peak signal-to-noise ratio, 8-bit images, all pixels and channels.
     pub psnr_db: f64,
     /// The same over the pixels that see something move; absent where the camera has no such pixel, or one frame only.
     pub psnr_dynamic_db: Option<f64>,
@@ -87,7 +87,7 @@ pub struct EvalReport {
     pub ssim_dynamic: Option<f64>,
     /// Mean over images, skimage's Gaussian convention.
     pub ssim_skimage: f64,
-    /// Mean over images; absent where a picture is too small for five scales.
+    /// Mean over images; absent where an image is too small for five scales.
     pub ms_ssim: Option<f64>,
     /// Sizes.
     pub size_mb: SizeMb,
@@ -103,14 +103,18 @@ pub struct EvalReport {
     pub protocol: &'static str,
     /// The protocol of each mean by its key.
     pub metrics: BTreeMap<&'static str, Metric>,
-    /// Per picture.
+    /// Per image.
     pub images: Vec<ImageScore>,
 }
 
 /// What [`evaluate`] hands to `on_image`: the view, the truth, the render, and their score.
 pub type OnImage<'a> = dyn FnMut(usize, &Image8, &Image8, &ImageScore) -> Result<()> + 'a;
 
-/// Renders every view of `split` (at most `max_views`, evenly spread; 0 is all) and scores it.
+/// Renders every view of `split` (at most `max_views`, evenly spread; 0 is all) and scores it. A model without a background of its own is drawn on the
+/// scene's.
+///
+/// # Errors
+/// [`cc4dgs_core::Error::Parameter`] for a split without views, and what scene, field, rasterizer and `on_image` report.
 pub fn evaluate(
     model: &Model,
     scene: &Scene,
@@ -129,7 +133,8 @@ pub fn evaluate(
     if views.is_empty() {
         return Err(cc4dgs_core::Error::parameter("--split", format!("{} has no view of split {split:?}", scene.name), "Evaluate the other split"));
     }
-    let mut player = Player::new(model, registry, device)?;
+    let background = model.background_on(scene.background);
+    let mut player = Player::new(model, registry, device)?.on(scene.background);
     let mut images = Vec::with_capacity(views.len());
     let mut times: Vec<FrameTime> = Vec::with_capacity(views.len());
     let (mut skimage, mut ms_ssim) = (0.0, Some(0.0));
@@ -137,7 +142,7 @@ pub fn evaluate(
     let metric = |m: Metric| m.over(frames.clone());
     let psnr_metric = metric(Metric::psnr(Rounding::EightBit));
     let dynamic_metric = metric(Metric::psnr(Rounding::EightBit).masked());
-    let masks: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, model.background, events)?
+    let masks: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, background, events)?
         .into_iter()
         .filter(|m| m.mask.contains(&1.0))
         .map(|m| (scene.views[m.view].camera, m.mask.iter().map(|v| *v > 0.0).collect()))
@@ -151,14 +156,14 @@ pub fn evaluate(
         let (output, time) = player.render(camera, scene.views[view].time_norm)?;
         let render = player.download(output.planes)?;
         let frame = scene.frame(view)?;
-        // Both pictures are rounded to 8 bits before they are compared.
-        let truth = Image8::from_planes(&frame.to_planes(model.background), camera.width, camera.height);
+        // Both images are rounded to 8 bits before they are compared.
+        let truth = Image8::from_planes(&frame.to_planes(background), camera.width, camera.height);
         skimage += skimage_metric.score_images(&truth, &render)?;
         let multi_scale = ms_ssim_metric.score_images(&truth, &render).ok();
         ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);
         let mask = masks.get(&scene.views[view].camera);
         let shape = [3, camera.height as usize, camera.width as usize];
-        let planes = mask.map(|mask| ([&truth, &render].map(|picture| picture.to_planes(model.background)), mask));
+        let planes = mask.map(|mask| ([&truth, &render].map(|image| image.to_planes(background)), mask));
         let masked = |metric: &Metric| planes.as_ref().map(|([a, b], mask)| metric.score(a, b, shape, Some(mask))).transpose();
         let (psnr_dynamic_db, ssim_dynamic) = (masked(&dynamic_metric)?, masked(&ssim_dynamic_metric)?);
         let score = ImageScore {
@@ -200,7 +205,7 @@ pub fn evaluate(
         gaussians: model.gaussians.len(),
         dynamic_gaussians: player.moving(),
         work: player.work,
-        protocol: "8-bit RGB pictures, range 255; PSNR over all pixels and channels; SSIM 11x11 Gaussian sigma 1.5, zero padding (Inria); means over images; times on the stated device, synchronised, first frame apart",
+        protocol: "8-bit RGB images, range 255; PSNR over all pixels and channels; SSIM 11x11 Gaussian sigma 1.5, zero padding (Inria); means over images; times on the stated device, synchronised, first frame apart",
         metrics: BTreeMap::from([
             ("psnr_db", psnr_metric),
             ("psnr_dynamic_db", dynamic_metric),

@@ -3,17 +3,24 @@
 use crate::checkpoint;
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::config::{RenderConfig, RunConfig};
-use crate::train::{CHECKPOINT, Moving, TrainState};
+use crate::source::{Source, SourceKind};
+use crate::train::{Moving, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, MAGIC, Manifest, Provenance, RasterizerEntry, StreamKind};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, Provenance, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream,
-    TrainingViews, WeightArray, split_kind,
+    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream,
+    TrainingViews, WeightArray, config, ply, split_kind, spz,
 };
 use serde::Serialize;
-use std::io::Read;
+use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::Path;
+
+/// Key of the manifest's `extra` under which [`Moving`] is stored.
+const MOVING: &str = "moving";
+/// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
+const ATTRIBUTES: &str = "attributes";
 
 /// A model, wherever it came from.
 pub struct Model {
@@ -25,8 +32,8 @@ pub struct Model {
     pub moving: Moving,
     /// How it wants to be drawn.
     pub render: RenderConfig,
-    /// Colour behind everything, RGB in 0..1.
-    pub background: [f32; 3],
+    /// Colour behind everything, RGB in 0..1; `None` where the file does not say (PLY and SPZ). See [`Model::background_on`].
+    pub background: Option<[f32; 3]>,
     /// The `[rasterizer]` section.
     pub rasterizer: toml::Table,
     /// Frames in the sequence.
@@ -70,7 +77,8 @@ impl ModelDeformer {
     }
 }
 
-/// Sizes in bytes. For an archive these are bytes on disk, headers included in `total`; for a checkpoint the float32 size of what playback needs.
+/// Sizes in bytes. For archives, PLY and SPZ files these are bytes on disk, headers included in `total`; for a checkpoint the float32 size of what playback
+/// needs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ModelSize {
     /// Weights of the field: spatial encoding (the paper's Deform-Grid).
@@ -86,16 +94,66 @@ pub struct ModelSize {
 }
 
 impl Model {
-    /// Loads a run's folder, a checkpoint file or a `.cc4d` archive; the first bytes decide which.
-    pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
-        let file = if path.is_dir() { path.join(CHECKPOINT) } else { path.to_path_buf() };
-        let mut head = [0u8; 8];
-        let read = std::fs::File::open(&file).and_then(|mut f| f.read(&mut head)).map_err(|e| Error::io(&file, e))?;
-        if read == 8 && head == MAGIC {
-            Self::from_archive(&file, registry, device, limits, events)
-        } else {
-            Self::from_checkpoint(&file, registry, device, limits)
+    /// Opens the folder of a run, a checkpoint, a `.cc4d` archive, a PLY file of 3D Gaussian splatting or an SPZ file; the first bytes decide which
+    /// ([`SourceKind`]). PLY and SPZ files become static models, drawn by the default rasterizer.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for files that are no model or damaged, [`Error::Unsupported`] for versions and plug-ins this program does not have,
+    /// [`Error::Limit`] for claims over `limits`.
+    pub fn open(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
+        let Source { kind, file } = Source::expect(path)?;
+        match kind {
+            SourceKind::Checkpoint => Self::from_checkpoint(&file, registry, device, limits),
+            SourceKind::Archive => Self::from_archive(&file, registry, device, limits, events),
+            SourceKind::Ply => {
+                let (gaussians, remarks) = ply::read_reporting(&file, limits)?;
+                for message in remarks {
+                    events.emit(&Event::Note { object: file.display().to_string(), message });
+                }
+                Self::from_static(gaussians, file_bytes(&file)?)
+            }
+            SourceKind::Spz => {
+                let (object, bytes) = (file.display().to_string(), file_bytes(&file)?);
+                limits.check_bytes(&object, bytes)?;
+                let content = std::fs::read(&file).map_err(|e| Error::io(&file, e))?;
+                Self::from_static(spz::from_spz(&object, &content, limits)?, bytes)
+            }
         }
+    }
+    /// A static model of `gaussians` that take `bytes` in their file.
+    fn from_static(gaussians: HostGaussians, bytes: u64) -> Result<Self> {
+        let defaults: RunConfig = config::parse_section("configuration", &toml::Table::new())?;
+        Ok(Self {
+            gaussians,
+            field: None,
+            moving: Moving::Nothing,
+            render: defaults.render,
+            background: None,
+            rasterizer: defaults.rasterizer,
+            frame_count: 1,
+            provenance: Provenance::default(),
+            size: ModelSize { point_cloud: bytes, total: bytes, ..Default::default() },
+        })
+    }
+    /// The background it is drawn on: its own, else that of the scene whose images it is compared with, else black as in 3D Gaussian splatting.
+    pub fn background_on(&self, scene: Option<[f32; 3]>) -> [f32; 3] {
+        self.background.or(scene).unwrap_or_default()
+    }
+    /// Lower and upper corner of the box around all canonical centres, world units; zeros without Gaussians.
+    pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
+        let corner = |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
+            let axis = |k: usize| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
+            std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k) })
+        };
+        (corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max))
+    }
+    /// Bytes of Gaussians and field as float32, whatever the model was read from.
+    pub fn float32_size(&self) -> ModelSize {
+        let (deform_grid, deform_net) = self.field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
+        let extra = self.gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
+        let floats = self.gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + extra;
+        let (deform, point_cloud) = (deform_grid + deform_net, 4 * floats as u64);
+        ModelSize { deform_grid, deform_net, deform, point_cloud, total: deform + point_cloud }
     }
     fn from_checkpoint(path: &Path, registry: &Registry, device: &Device, limits: &Limits) -> Result<Self> {
         let stored = checkpoint::load(path, registry, device, limits)?;
@@ -109,30 +167,27 @@ impl Model {
         Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, config)
     }
     fn assembled(gaussians: HostGaussians, field: Option<ModelDeformer>, moving: Moving, frame_count: usize, config: &RunConfig) -> Result<Self> {
-        let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
-        let floats: usize =
-            gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
-        let point_cloud = 4 * floats as u64;
-        let deform = deform_grid + deform_net;
-        Ok(Self {
+        let mut model = Self {
             gaussians,
             field,
             moving,
-            background: config.background()?,
+            background: Some(config.background()?),
             render: config.render.clone(),
             rasterizer: config.rasterizer.clone(),
             frame_count,
             provenance: provenance(config)?,
-            size: ModelSize { deform_grid, deform_net, deform, point_cloud, total: deform + point_cloud },
-        })
+            size: ModelSize::default(),
+        };
+        model.size = model.float32_size();
+        Ok(model)
     }
     fn from_archive(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
         let archive = Archive::open(path, limits)?;
         let object = path.display().to_string();
         let manifest = archive.manifest().clone();
         let spec = format!("{}:{}", manifest.codec.name, manifest.codec.profile);
-        let known = registry.codec(&manifest.codec.name)?.info.version;
-        check_version(&object, "codec", &manifest.codec.name, &manifest.codec.version, known)?;
+        let codec = linked(&object, "codec", &manifest.codec.name, &manifest.codec.version, registry)?;
+        check_version(&object, "codec", &manifest.codec.name, &manifest.codec.version, codec)?;
         let codec = registry.build_codec(&spec, &manifest.codec.settings)?;
         let context = CodecContext::new(codec_seed(manifest.provenance.seed), *limits, events);
         let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
@@ -150,7 +205,8 @@ impl Model {
         let field = match &manifest.deformer {
             None => None,
             Some(entry) => {
-                check_version(&object, "deformer", &entry.name, &entry.version, registry.deformer(&entry.name)?.info.version)?;
+                let known = linked(&object, "deformer", &entry.name, &entry.version, registry)?;
+                check_version(&object, "deformer", &entry.name, &entry.version, known)?;
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
                 let mut field = registry.build_deformer(&section, &entry.context, device)?;
@@ -159,7 +215,7 @@ impl Model {
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
             }
         };
-        let moving = match manifest.extra.get("moving") {
+        let moving = match manifest.extra.get(MOVING) {
             Some(value) => {
                 serde_json::from_value(value.clone()).map_err(|e| Error::data(&object, format!("moving: {e}"), "The archive is damaged; fetch it again"))?
             }
@@ -180,7 +236,7 @@ impl Model {
             gaussians,
             field,
             moving,
-            background: manifest.background,
+            background: Some(manifest.background),
             render: RenderConfig {
                 rules: manifest.rasterizer.rules,
                 antialiased: manifest.rasterizer.antialiased,
@@ -222,9 +278,12 @@ impl Model {
         };
         let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
         let moving = if movable { self.moving } else { Moving::Nothing };
-        let axis = |k: usize, start: f32, pick: fn(f32, f32) -> f32| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
-        let corner =
-            |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] { std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k, start, pick) }) };
+        let mut extra = serde_json::Map::from_iter([(MOVING.to_string(), json(&moving)?)]);
+        if !self.gaussians.extra.is_empty() {
+            let widths: BTreeMap<&str, usize> = self.gaussians.extra.iter().map(|(name, a)| (name.as_str(), a.width)).collect();
+            extra.insert(ATTRIBUTES.into(), json(&widths)?);
+        }
+        let (lower, upper) = self.bounds();
         let manifest = Manifest {
             codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
             deformer,
@@ -237,16 +296,13 @@ impl Model {
             },
             frame_count: self.frame_count,
             time_range: [0.0, 1.0],
-            box_world: [corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max)],
-            background: self.background,
+            box_world: [lower, upper],
+            background: self.background_on(None),
             sh_degree: self.gaussians.sh_degree,
             dynamic_threshold: if let Moving::Scored { zeta } = moving { zeta } else { 0.0 },
             gaussian_count: self.gaussians.len() as u64,
             provenance: self.provenance.clone(),
-            extra: serde_json::Map::from_iter([(
-                "moving".to_string(),
-                serde_json::to_value(moving).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))?,
-            )]),
+            extra,
             ..Default::default()
         };
         let mut writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams);
@@ -303,6 +359,31 @@ fn read_weights(archive: &Archive, object: &str, entry: &CodecEntry, registry: &
     let streams: Vec<Stream> =
         streams.into_iter().filter_map(|s| Some(Stream { name: s.name.strip_prefix(FIELD_STREAMS)?.to_string(), bytes: s.bytes })).collect();
     codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events))
+}
+
+/// Floats per Gaussian of all plug-in attributes that the archive of `manifest` holds.
+pub fn attribute_width(manifest: &Manifest) -> u64 {
+    let widths = manifest.extra.get(ATTRIBUTES).and_then(Value::as_object);
+    widths.map_or(0, |all| all.values().filter_map(Value::as_u64).fold(0, u64::saturating_add))
+}
+
+fn json(value: &impl Serialize) -> Result<Value> {
+    serde_json::to_value(value).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))
+}
+
+fn file_bytes(path: &Path) -> Result<u64> {
+    Ok(std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len())
+}
+
+/// The version of the linked plug-in that `object` names, or an error that says what to link.
+fn linked(object: &str, kind: &str, name: &str, version: &str, registry: &Registry) -> Result<&'static str> {
+    let plugins = registry.plugins();
+    let known: Vec<_> = plugins.into_iter().filter(|(k, _)| *k == kind).map(|(_, p)| p).collect();
+    known.iter().find(|p| p.name == name).map(|p| p.version).ok_or_else(|| {
+        let names: Vec<&str> = known.iter().map(|p| p.name).collect();
+        let remedy = format!("Use a program that links the crate of this {kind}; this one links {}", names.join(", "));
+        Error::unsupported(object, format!("it needs the {kind} '{name}' (version {version}), which is not linked into this program"), remedy)
+    })
 }
 
 fn codec_seed(root: u64) -> Seed {

@@ -1,4 +1,4 @@
-//! How well a model follows motion that is known: trajectories of its Gaussians against the true ones, and pictures where the motion is, object by object.
+//! Trajectory error on a synthetic scene with known motion: trajectories of its Gaussians against the true ones, and images where the motion is, object by object.
 
 use crate::data::procedural::{Motion, ProceduralScene, Shape};
 use crate::model::Model;
@@ -10,9 +10,9 @@ use serde::Serialize;
 
 /// Gaussians this near to a ball's surface at the first frame, as shares of its radius, belong to it.
 const NEAR_SURFACE: [f64; 2] = [0.7, 1.2];
-/// Gaussians below this opacity are seen by nobody.
+/// Gaussians below this opacity count as invisible.
 const LEAST_OPACITY: f32 = 0.1;
-/// Moments at which it is asked which pixels an object covers.
+/// Times at which the pixels that an object covers are collected.
 const MOMENTS: usize = 24;
 
 /// One swaying object.
@@ -45,7 +45,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
     if balls.is_empty() {
         return Ok(Vec::new());
     }
-    let mut player = Player::new(model, registry, device)?;
+    let mut player = Player::new(model, registry, device)?.on(Some(scene.background));
     let first = player.gaussians_at(0.0)?.to_host()?;
     let owned: Vec<Vec<usize>> = balls.iter().map(|&(object, _, radius)| on_ball(scene, object, radius, &first)).collect();
     let cameras: Vec<_> = scene.cameras().into_iter().filter(|(_, split)| *split == Split::Test).map(|(camera, _)| camera).collect();
@@ -65,8 +65,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
             }
         }
         for (camera, masks) in cameras.iter().zip(&masks) {
-            let planes = player.render(camera, time as f32)?.0.planes;
-            let found = player.download(planes)?;
+            let found = player.frame(camera, time as f32)?;
             let truth = scene.render(camera, time);
             for (mask, sum) in masks.iter().zip(&mut errors) {
                 for (pixel, _) in mask.iter().enumerate().filter(|(_, covered)| **covered) {

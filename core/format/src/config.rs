@@ -54,9 +54,31 @@ pub fn set(table: &mut toml::Table, assignment: &str) -> Result<()> {
     Ok(())
 }
 
+/// Applies several assignments in their order, except that plug-ins are chosen first: `deformer.levels=3` before `deformer.kind=cdf` sets the levels of
+/// `cdf`, where [`set`] alone would drop them with the settings of the plug-in before.
+pub fn set_all(table: &mut toml::Table, assignments: &[String]) -> Result<()> {
+    let chooses = |assignment: &&String| assignment.split('=').next().is_some_and(|path| path.trim().ends_with(".kind"));
+    let (kinds, others): (Vec<&String>, Vec<&String>) = assignments.iter().partition(chooses);
+    kinds.into_iter().chain(others).try_for_each(|assignment| set(table, assignment))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn plug_ins_are_chosen_before_their_settings() {
+        let start = parse_table("test", "[deformer]\nkind = \"cdf\"\nlevels = 5").unwrap();
+        let with = |assignments: [&str; 3]| {
+            let mut table = start.clone();
+            set_all(&mut table, &assignments.map(String::from)).unwrap();
+            table["deformer"].as_table().unwrap().clone()
+        };
+        let late = with(["deformer.width=3", "deformer.kind=hexplane", "train.batch=1"]);
+        assert_eq!(late, with(["deformer.kind=hexplane", "deformer.width=3", "train.batch=1"]));
+        assert_eq!((late["width"].as_integer(), late.get("levels")), (Some(3), None));
+        assert_eq!(with(["deformer.levels=3", "deformer.levels=4", "deformer.kind=cdf"])["levels"].as_integer(), Some(4));
+    }
 
     #[test]
     fn set_reads_numbers_and_bare_words() {

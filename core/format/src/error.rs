@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 /// The result of every fallible call of this workspace.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// What went wrong, by fault. Applications map the variants to exit codes (see [`Error::exit_code`]).
-#[derive(Debug, thiserror::Error)]
+/// What went wrong, by fault. Applications map the variants to exit codes (see [`Error::exit_code`]). `Debug` prints the same sentence as `Display`, so that
+/// an error returned from `main` reads well.
+#[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// The user asked for something impossible: a configuration key, a command-line value, a name.
@@ -72,6 +73,12 @@ pub enum Error {
     /// The user interrupted; everything needed to resume was written.
     #[error("interrupted: {0}")]
     Interrupted(String),
+}
+
+impl std::fmt::Debug for Error {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        std::fmt::Display::fmt(self, f)
+    }
 }
 
 impl Error {

@@ -25,7 +25,7 @@ pub struct Adapter {
     pub name: String,
     /// Kind of hardware.
     pub kind: AdapterKind,
-    /// Vulkan, Metal or Dx12.
+    /// Vulkan, Metal or Dx12; Gl where nothing answers through these.
     pub api: String,
     /// Driver and its version.
     pub driver: String,
@@ -53,6 +53,10 @@ impl Adapter {
     pub fn is_software(&self) -> bool {
         self.kind == AdapterKind::Software
     }
+    /// Whether it answers through OpenGL only.
+    pub fn is_opengl(&self) -> bool {
+        self.api == "Gl"
+    }
 }
 
 /// All adapters, the most capable kind first; enumerated once. None in a build without the feature `wgpu`.
@@ -75,6 +79,7 @@ mod enumeration {
         /// What burn calls it.
         pub(crate) fn device_kind(&self) -> DeviceKind {
             match self.kind {
+                _ if self.is_opengl() => DeviceKind::DefaultDevice,
                 AdapterKind::Discrete => DeviceKind::DiscreteGpu(self.index_in_kind),
                 AdapterKind::Integrated => DeviceKind::IntegratedGpu(self.index_in_kind),
                 AdapterKind::Virtual => DeviceKind::VirtualGpu(self.index_in_kind),
@@ -88,13 +93,15 @@ mod enumeration {
     pub fn adapters() -> &'static [Adapter] {
         static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
         // A driver that panics when it is asked counts as absent.
-        ADAPTERS.get_or_init(|| std::panic::catch_unwind(enumerate).unwrap_or_default())
+        let enumerate = |backends| std::panic::catch_unwind(|| enumerate(backends)).unwrap_or_default();
+        // burn takes OpenGL where there is nothing better. Beside Vulkan it would list the same cards again.
+        ADAPTERS.get_or_init(|| Some(enumerate(Backends::PRIMARY)).filter(|all| !all.is_empty()).unwrap_or_else(|| enumerate(Backends::GL)))
     }
 
-    fn enumerate() -> Vec<Adapter> {
-        let instance = Instance::new(InstanceDescriptor { backends: Backends::PRIMARY, ..InstanceDescriptor::new_without_display_handle() });
+    fn enumerate(backends: Backends) -> Vec<Adapter> {
+        let instance = Instance::new(InstanceDescriptor { backends, ..InstanceDescriptor::new_without_display_handle() });
         let mut all: Vec<Adapter> = Vec::new();
-        for adapter in wait(instance.enumerate_adapters(Backends::PRIMARY)) {
+        for adapter in wait(instance.enumerate_adapters(backends)) {
             let (info, limits, features) = (adapter.get_info(), adapter.limits(), adapter.features());
             let kind = match info.device_type {
                 DeviceType::DiscreteGpu => AdapterKind::Discrete,
@@ -146,6 +153,7 @@ pub fn auto_device() -> (&'static str, String) {
         [first, ..] if first.is_software() => {
             ("flex", format!("the only adapter, {}, is software on the processor, where flex is faster; --device wgpu selects it", first.name))
         }
+        [first, ..] if first.is_opengl() => ("flex", format!("{} answers through OpenGL only; --device wgpu selects it", first.name)),
         [first, ..] => ("wgpu", format!("{} is a graphics card", first.name)),
     }
 }

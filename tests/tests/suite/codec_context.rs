@@ -1,6 +1,7 @@
 //! What a codec is handed when a model is stored with its scene, and what it may lose of a field's attributes.
 
 use burn::tensor::Device;
+use cc4dgs_core::SceneOptions;
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Event, ExtraAttribute, HostGaussians, Limits, Plugin, Recorder, Registry, Result,
@@ -9,7 +10,7 @@ use cc4dgs_core::{
 use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
 use cc4dgs_engine::codec_services::{ModelServices, SceneViews};
 use cc4dgs_engine::config::RenderConfig;
-use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_engine::data;
 use cc4dgs_engine::model::{ArchiveOptions, Model, ModelDeformer, ModelSize};
 use cc4dgs_engine::play::Player;
 use cc4dgs_engine::train::Moving;
@@ -71,7 +72,7 @@ fn model(registry: &Registry) -> Model {
         field: Some(ModelDeformer { field, section, context }),
         moving: Moving::Scored { zeta: 5.0 },
         render: RenderConfig::default(),
-        background: [0.2, 0.4, 0.6],
+        background: Some([0.2, 0.4, 0.6]),
         rasterizer: "kind = \"tile\"".parse().unwrap(),
         frame_count: 10,
         provenance: Default::default(),
@@ -80,7 +81,8 @@ fn model(registry: &Registry) -> Model {
 }
 
 fn scene() -> cc4dgs_core::Scene {
-    data::open(Path::new("procedural"), &SceneOptions { width: 40, height: 40, ..Default::default() }, &Limits::default()).unwrap()
+    data::open(Path::new("procedural"), &SceneOptions { width: 40, height: 40, ..Default::default() }, &Registry::collect().unwrap(), &Limits::default())
+        .unwrap()
 }
 
 #[test]
@@ -130,7 +132,7 @@ fn attributes_of_gaussians_that_stand_still_are_not_stored_by_lossy_codecs() {
         model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
         let stored: u64 = Archive::open(&path, &limits).unwrap().stream_sizes().iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
         sizes.push(stored);
-        let back = Model::load(&path, &registry, &Device::flex(), &limits, &Silent).unwrap();
+        let back = Model::open(&path, &registry, &Device::flex(), &limits, &Silent).unwrap();
         // Codecs reorder; where a Gaussian moves tells it from one that does not, and its attributes must be among those that went in.
         for spec in model.field.as_ref().unwrap().field.attributes() {
             let given = &model.gaussians.extra[&spec.name].values;

@@ -2,7 +2,7 @@
 
 use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
-use cc4dgs_core::{Error, Event, EventSink, Limits, Recorder, Registry, Scene, Silent, Split};
+use cc4dgs_core::{Error, Event, EventSink, Limits, PresetRole, Recorder, Registry, Scene, Silent, Split};
 use cc4dgs_engine::agreement::agreement;
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::eval::{EvalReport, evaluate};
@@ -31,7 +31,7 @@ fn options<'a>(codec: &'a str, field_weights: &'a str) -> ArchiveOptions<'a> {
 }
 
 fn open(config: &RunConfig) -> Arc<Scene> {
-    Arc::new(cc4dgs_engine::data::open(Path::new("procedural"), &config.scene, &config.limits).unwrap())
+    Arc::new(cc4dgs_engine::data::open(Path::new("procedural"), &config.scene, &Registry::collect().unwrap(), &config.limits).unwrap())
 }
 
 fn run(config: &RunConfig, out: &Path, resume: bool, events: &dyn EventSink, stop: &AtomicBool) -> cc4dgs_core::Result<TrainReport> {
@@ -40,7 +40,7 @@ fn run(config: &RunConfig, out: &Path, resume: bool, events: &dyn EventSink, sto
 }
 
 fn load(path: &Path) -> Model {
-    Model::load(path, &Registry::collect().unwrap(), &Device::flex(), &Limits::default(), &Silent).unwrap()
+    Model::open(path, &Registry::collect().unwrap(), &Device::flex(), &Limits::default(), &Silent).unwrap()
 }
 
 fn score(model: &Model, config: &RunConfig) -> EvalReport {
@@ -168,7 +168,7 @@ fn static_gaussians_cost_no_field_time() {
     // A frame is written over the one before it, unless somebody kept that; either way it is what it would have been as the first.
     let registry = Registry::collect().unwrap();
     for (name, device) in cc4dgs_tests::devices() {
-        let model = Model::load(folder.path(), &registry, &device, &Limits::default(), &Silent).unwrap();
+        let model = Model::open(folder.path(), &registry, &device, &Limits::default(), &Silent).unwrap();
         let fresh = |time| Player::new(&model, &registry, &device).unwrap().gaussians_at(time).unwrap().to_host().unwrap();
         let mut player = Player::new(&model, &registry, &device).unwrap();
         let kept = player.gaussians_at(0.2).unwrap();
@@ -195,7 +195,7 @@ fn runs_on_wgpu_are_reproducible_and_every_device_draws_the_same() {
     assert!(bytes(&a) == bytes(&b), "two runs of one seed differ");
 
     let (scene, registry) = (open(&config), Registry::collect().unwrap());
-    let load = |device: &Device| Model::load(&a, &registry, device, &Limits::default(), &Silent).unwrap();
+    let load = |device: &Device| Model::open(&a, &registry, device, &Limits::default(), &Silent).unwrap();
     let models: Vec<(String, Device, Model)> = devices.into_iter().map(|(name, device)| (name.to_string(), device.clone(), load(&device))).collect();
     for found in agreement(&models, &scene, &scene.split(Split::Test), &registry, &Silent).unwrap() {
         assert!(found.max_difference <= 1.0 / 255.0 && found.psnr_difference_db.abs() < 0.01, "{found:?}");
@@ -208,7 +208,7 @@ fn every_field_trains_resumes_plays_and_is_archived() {
     let registry = Registry::collect().unwrap();
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
-    for (method, _) in cc4dgs_engine::presets::methods() {
+    for method in registry.presets().filter(|p| p.role == PresetRole::Method).map(|p| p.info.name) {
         let sets: Vec<String> = ["scene.width=32", "scene.height=32", "train.iterations=40", "init.count=150", "train.log_every=5", "train.dynamic=all"]
             .iter()
             .map(ToString::to_string)

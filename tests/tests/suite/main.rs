@@ -20,4 +20,5 @@ mod raster;
 mod raster_fixtures;
 mod raster_probes;
 mod readers;
+mod session;
 mod sort;

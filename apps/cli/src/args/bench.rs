@@ -18,7 +18,7 @@ pub enum BenchWhat {
     Frame(BenchFrame),
     /// Playback of a trained model through the cameras of a dataset: field and rasterizer, frame by frame.
     Play(BenchPlay),
-    /// The same model on several devices: how far their pictures differ.
+    /// The same model on several devices: how far their images differ.
     Agree(BenchAgree),
     /// The computational field forwards and backwards, against the same field in burn's primitives.
     Field(BenchField),
@@ -26,7 +26,7 @@ pub enum BenchWhat {
     Lookup(BenchLookup),
     /// Sorting of growing numbers of pairs.
     Sort(BenchSort),
-    /// L1 and SSIM with their gradient on growing pictures.
+    /// L1 and SSIM with their gradient on growing images.
     Loss(BenchLoss),
 }
 
@@ -70,7 +70,7 @@ pub struct BenchLoss {
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
-    /// Sizes of the pictures, 4:3.
+    /// Sizes of the images, 4:3.
     #[arg(long, value_name = "MP", value_delimiter = ',', default_value = "0.1,0.5,1.4,2.2", value_parser = positive)]
     pub megapixels: Vec<f64>,
     /// Runs measured per size, after warming up.
@@ -113,7 +113,7 @@ pub struct BenchFrame {
     /// Time only this case; may be given again.
     #[arg(long, value_name = "NAME")]
     pub case: Vec<String>,
-    /// In place of the cases: one room with 10 thousand to 5 million Gaussians, then with pictures of 0.1 to 8 megapixels.
+    /// In place of the cases: one room with 10 thousand to 5 million Gaussians, then with images of 0.1 to 8 megapixels.
     #[arg(long)]
     pub growth: bool,
     /// Frames measured per case, after warming up.

@@ -2,7 +2,8 @@
 
 use super::{Context, create_parent, megabytes};
 use crate::args::Compress;
-use crate::model_source::{load_model, open_scene};
+use crate::models::load_model;
+use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
 use cc4dgs_core::{Event, EventSink, Result, config};
 use cc4dgs_engine::eval::SizeMb;
@@ -51,12 +52,10 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let mut settings = toml::Table::new();
-    for assignment in &args.sets {
-        config::set(&mut settings, assignment)?;
-    }
+    config::set_all(&mut settings, &args.sets)?;
     // A name that nobody knows is told before the scene is read.
     context.registry.weight_codec(&args.field_weights)?;
-    let scene = args.scene.as_ref().map(|path| open_scene(path, &loaded.model, &[], &context.limits)).transpose()?;
+    let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?;
     let options = ArchiveOptions {
         codec: &args.codec,
         settings: &settings,
@@ -76,14 +75,14 @@ pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out:
     let seconds = began.elapsed().as_secs_f64();
     let stored = Archive::open(out, &context.limits)?.stream_sizes();
     let of_kind = |kind| stored.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum();
-    let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.size };
+    let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.float32_size() };
     Ok(CompressReport {
         archive: out.to_path_buf(),
         codec: options.codec.to_string(),
         gaussians: model.gaussians.len(),
         bytes,
         size_mb: size.into(),
-        ratio: model.size.total as f64 / bytes.max(1) as f64,
+        ratio: model.float32_size().total as f64 / bytes.max(1) as f64,
         seconds,
         streams: stored.into_iter().map(StreamSize::from).collect(),
     })

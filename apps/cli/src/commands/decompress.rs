@@ -2,7 +2,7 @@
 
 use super::{Context, create_parent, megabytes};
 use crate::args::Decompress;
-use crate::model_source::load_model;
+use crate::models::load_model;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Event, EventSink, Result, ply, spz};
 use cc4dgs_engine::play::Player;

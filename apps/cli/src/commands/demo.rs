@@ -1,11 +1,13 @@
 //! `cc4dgs demo`: the whole chain on the built-in scene.
 
-use super::eval::{FullReport, Pictures, measure};
-use super::train::{EVENTS, resolve, train_into};
+use super::eval::{FullReport, Images, measure};
+use super::train::{resolve, train_into};
 use super::{Context, compress, create_parent, eval, train};
 use crate::args::Demo;
-use crate::model_source::{load_model, open_scene};
+use crate::models::load_model;
 use crate::output::to_json;
+use cc4dgs::runs::{EVENTS, Existing};
+use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Result, Split};
 use cc4dgs_engine::model::ArchiveOptions;
@@ -43,7 +45,7 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let began = Instant::now();
     let config = resolve(context, Some("demo"), None, &args.sets, args.device.as_deref())?;
     let scene_path = Path::new("procedural");
-    let (scene_name, trained) = train_into(context, &config, scene_path, &args.out, false)?;
+    let (scene_name, trained) = train_into(context, &config, scene_path, &args.out, if args.overwrite { Existing::Overwrite } else { Existing::Refuse })?;
 
     let events = context.listeners(Some((&args.out.join(EVENTS), true)))?;
     let archive = args.out.join("model.cc4d");
@@ -51,12 +53,12 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None };
     let packed = compress::compress(context, &loaded.model, &options, &archive, &events)?;
 
-    let scene = open_scene(scene_path, &loaded.model, &[], &context.limits)?;
-    let plain = Pictures::default();
+    let scene = open_as_trained(scene_path, &loaded.model, &[], &context.registry, &context.limits)?;
+    let plain = Images::default();
     let before = measure(context, &args.out, &loaded, &scene, Split::Test, 0, &plain, &events)?;
-    let pictures = Pictures { sheet: Some(args.out.join("sheet.png")), sheet_rows: 6, renders: None };
+    let images = Images { sheet: Some(args.out.join("sheet.png")), sheet_rows: 6, renders: None };
     let unpacked = load_model(&archive, &config.device, &context.registry, &context.limits, &events)?;
-    let after = measure(context, &archive, &unpacked, &scene, Split::Test, 0, &pictures, &events)?;
+    let after = measure(context, &archive, &unpacked, &scene, Split::Test, 0, &images, &events)?;
 
     let report = DemoReport {
         scene: scene_name,

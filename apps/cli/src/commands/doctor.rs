@@ -1,15 +1,16 @@
-//! `cc4dgs doctor`: what this machine offers, and whether pictures come out right on it.
+//! `cc4dgs doctor`: what this machine offers, and whether images come out right on it.
 
-use super::{Context, video};
+use super::Context;
 use burn::tensor::Device;
+use cc4dgs::video;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Adapter, Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, adapters, auto_device, parse_device};
 use serde::Serialize;
 use std::time::Instant;
 
-/// The rasterizer that is slow, obvious, and right.
+/// The reference rasterizer: slow, in float64.
 const ORACLE: &str = "reference";
-/// Half a level of an 8-bit picture: what float32 may cost. Two correct rasterizers differ by more only where a Gaussian is just at the cut-off.
+/// Half a level of an 8-bit image: what float32 may cost. Two correct rasterizers differ by more only where a Gaussian is just at the cut-off.
 const TOLERANCE: f32 = 0.5 / 255.0;
 /// Relative, of the whole gradient of the centres.
 const GRADIENT_TOLERANCE: f32 = 1e-3;
@@ -45,7 +46,7 @@ struct Check {
     max_difference: Option<f32>,
     /// Relative difference of the gradient of the centres from the reference's.
     gradient_difference: Option<f32>,
-    /// Wall milliseconds of picture and gradient, kernels compiled on the way.
+    /// Wall milliseconds of image and gradient, kernels compiled on the way.
     ms: f64,
     problem: Option<String>,
 }
@@ -61,7 +62,10 @@ pub fn run(context: &Context) -> Result<()> {
         }
         let note = match &device {
             Err(e) => e.to_string(),
-            Ok(_) if name == "wgpu" => adapters().first().map_or_else(String::new, |a| format!("computes on {}", a.name)),
+            Ok(_) if name == "wgpu" => match adapters().first() {
+                Some(adapter) => format!("computes on {} ({})", adapter.name, adapter.api),
+                None => "computes on an adapter that this program cannot list".to_string(),
+            },
             Ok(_) => "computes on the processor".to_string(),
         };
         devices.push(DeviceReport { name, available: device.is_ok(), note });
@@ -124,13 +128,13 @@ fn adapter_text(index: usize, a: &Adapter) -> String {
     )
 }
 
-/// A picture, and the gradient of its sum of squares with respect to the centres.
+/// An image, and the gradient of its sum of squares with respect to the centres.
 struct Drawn {
-    picture: Vec<f32>,
+    image: Vec<f32>,
     gradient: Vec<f32>,
 }
 
-/// Draws one picture with every rasterizer and compares it, and its gradient, with the reference's.
+/// Draws one image with every rasterizer and compares it, and its gradient, with the reference's.
 fn check_device(context: &Context, device_name: &'static str, device: &Device, truth: &Drawn) -> Vec<Check> {
     let names = context.registry.plugins().into_iter().filter(|(kind, p)| *kind == "rasterizer" && p.name != ORACLE).map(|(_, p)| p.name);
     names
@@ -142,7 +146,7 @@ fn check_device(context: &Context, device_name: &'static str, device: &Device, t
                 Err(e) => (None, None, Some(e.to_string())),
                 Ok(drawn) => {
                     // A value that is not a number must fail: `max` would drop it.
-                    let max = truth.picture.iter().zip(&drawn.picture).map(|(a, b)| (a - b).abs()).fold(0.0f32, |m, d| if d <= m { m } else { d });
+                    let max = truth.image.iter().zip(&drawn.image).map(|(a, b)| (a - b).abs()).fold(0.0f32, |m, d| if d <= m { m } else { d });
                     let gradient = relative(&truth.gradient, &drawn.gradient);
                     let close = max <= TOLERANCE && gradient <= GRADIENT_TOLERANCE;
                     let problem = || format!("a pixel differs by {max} ({TOLERANCE} is allowed), the gradient by {gradient} ({GRADIENT_TOLERANCE})");
@@ -171,7 +175,7 @@ fn draw(context: &Context, rasterizer: &str, device: &Device) -> Result<Drawn> {
     let image = output.image();
     let gradients = (image.clone() * image.clone()).sum().backward();
     let gradient = means.grad(&gradients).ok_or_else(|| Error::backend("self-check", "the centres have no gradient", "Report this"))?;
-    Ok(Drawn { picture: to_vec(image.inner(), "self-check picture")?, gradient: to_vec(gradient, "self-check gradient")? })
+    Ok(Drawn { image: to_vec(image.inner(), "self-check image")?, gradient: to_vec(gradient, "self-check gradient")? })
 }
 
 /// Coloured Gaussians on a spiral around a ball: every size, direction and opacity occurs, and no random number is needed.

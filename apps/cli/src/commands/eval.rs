@@ -3,11 +3,12 @@
 use super::{Context, evenly};
 use crate::args::Eval;
 use crate::interrupt;
-use crate::model_source::{Loaded, load_model, open_scene};
+use crate::models::{Loaded, load_model};
+use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::{Event, EventSink, Limits, Result, Scene, Split};
 use cc4dgs_engine::data::procedural::{self, ProceduralScene};
 use cc4dgs_engine::eval::{EvalReport, evaluate};
-use cc4dgs_engine::pictures::{Comparison, SheetOptions, comparison_sheet, write_png};
+use cc4dgs_engine::images::{Comparison, SheetOptions, comparison_sheet, write_png};
 use cc4dgs_engine::trajectory::{MotionScore, motion_scores};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -24,7 +25,7 @@ pub struct FullReport {
     pub sheet: Option<PathBuf>,
     #[serde(flatten)]
     pub eval: EvalReport,
-    /// Where the scene's motion is known, how well it is followed, object by object.
+    /// Trajectory error per object, for built-in scenes with known motion.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionScore>,
     pub provenance: Provenance,
@@ -43,7 +44,7 @@ pub struct Provenance {
 
 /// What to draw besides the numbers.
 #[derive(Default)]
-pub struct Pictures {
+pub struct Images {
     pub sheet: Option<PathBuf>,
     pub sheet_rows: usize,
     pub renders: Option<PathBuf>,
@@ -52,11 +53,11 @@ pub struct Pictures {
 pub fn run(context: &Context, args: &Eval) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_scene(&args.views.scene, &loaded.model, &args.views.sets, &context.limits)?;
+    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.registry, &context.limits)?;
     let split = args.views.split.into();
     let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_file()));
-    let pictures = Pictures { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };
-    let report = measure(context, &args.views.model, &loaded, &scene, split, args.max_views, &pictures, &events)?;
+    let images = Images { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };
+    let report = measure(context, &args.views.model, &loaded, &scene, split, args.max_views, &images, &events)?;
     context.output.result(&report, || text(&report))
 }
 
@@ -81,7 +82,7 @@ pub fn measure(
     scene: &Scene,
     split: Split,
     max_views: usize,
-    pictures: &Pictures,
+    images: &Images,
     events: &dyn EventSink,
 ) -> Result<FullReport> {
     let began = Instant::now();
@@ -93,7 +94,7 @@ pub fn measure(
     }
     let in_split = scene.split(split).len();
     let measured = if max_views == 0 { in_split } else { max_views.min(in_split) };
-    let mut rows = if pictures.sheet.is_some() { evenly(measured, pictures.sheet_rows) } else { Vec::new() };
+    let mut rows = if images.sheet.is_some() { evenly(measured, images.sheet_rows) } else { Vec::new() };
     rows.reverse();
     let mut comparisons = Vec::with_capacity(rows.len());
     let mut index = 0;
@@ -105,13 +106,13 @@ pub fn measure(
                 format!("{} frame {} t {:.3}  PSNR {:.2} dB  SSIM {:.4}", score.camera, score.frame, scene.views[view].time_norm, score.psnr_db, score.ssim);
             comparisons.push(Comparison { caption, reference: truth.clone(), render: render.clone() });
         }
-        if let Some(folder) = &pictures.renders {
+        if let Some(folder) = &images.renders {
             write_png(&folder.join(format!("{index:05}.png")), render)?;
         }
         index += 1;
         Ok(())
     })?;
-    if let Some(path) = &pictures.sheet {
+    if let Some(path) = &images.sheet {
         let title = format!("{}: PSNR {:.2} dB  SSIM {:.4}  {:.3} MB", report.scene, report.psnr_db, report.ssim, report.size_mb.total);
         write_png(path, &comparison_sheet(&comparisons, &SheetOptions { title, ..Default::default() })?)?;
     }
@@ -138,7 +139,7 @@ pub fn measure(
         model: model_path.to_path_buf(),
         device: loaded.device_name.clone(),
         seconds: began.elapsed().as_secs_f64(),
-        sheet: pictures.sheet.clone(),
+        sheet: images.sheet.clone(),
         eval: report,
         motion,
         provenance: Provenance {
@@ -157,7 +158,7 @@ pub fn text(report: &FullReport) -> String {
     let e = &report.eval;
     let ms_ssim = e.ms_ssim.map_or_else(|| "too small".to_string(), |v| format!("{v:.4}"));
     let mut lines = vec![
-        format!("{} on {} ({} pictures)", report.model.display(), e.scene, e.images.len()),
+        format!("{} on {} ({} images)", report.model.display(), e.scene, e.images.len()),
         format!("  PSNR {:.3} dB   SSIM {:.4} (Inria) {:.4} (skimage)   MS-SSIM {ms_ssim}", e.psnr_db, e.ssim, e.ssim_skimage),
         e.psnr_dynamic_db
             .zip(e.ssim_dynamic)

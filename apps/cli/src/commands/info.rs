@@ -4,19 +4,18 @@ use super::compress::StreamSize;
 use super::storage::{Storage, table};
 use super::{Context, megabytes};
 use crate::args::Info;
-use cc4dgs_core::archive::{Archive, MAGIC, StreamKind};
+use cc4dgs_core::archive::{Archive, DeformerEntry, StreamKind};
 use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, HostGaussians, Result, Silent, Split, parse_device, ply, spz};
-use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_core::{Error, HostGaussians, Result, SceneOptions, Silent, Split, parse_device};
+use cc4dgs_engine::data;
 use cc4dgs_engine::eval::SizeMb;
-use cc4dgs_engine::model::Model;
-use cc4dgs_engine::train::CHECKPOINT;
+use cc4dgs_engine::model::{Model, attribute_width};
+use cc4dgs_engine::source::{Source, SourceKind};
 use serde_json::{Value, json};
-use std::io::Read;
 use std::path::Path;
 
-/// How SPZ files start: they are gzip streams.
-const GZIP: [u8; 2] = [0x1f, 0x8b];
+/// Nothing is drawn here, so no graphics driver is asked.
+const DEVICE: &str = "flex";
 
 pub fn run(context: &Context, args: &Info) -> Result<()> {
     let (mut value, storage) = describe(context, &args.path)?;
@@ -31,66 +30,82 @@ pub fn run(context: &Context, args: &Info) -> Result<()> {
 }
 
 fn describe(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
-    if path.is_dir() && path.join(CHECKPOINT).is_file() {
-        return checkpoint(context, path);
+    // The built-in scenes are names and not paths.
+    let source = if path.exists() { Source::find(path)? } else { None };
+    match source.map(|s| s.kind) {
+        Some(SourceKind::Archive) => archive(context, path),
+        Some(SourceKind::Checkpoint) => checkpoint(context, path),
+        Some(kind @ (SourceKind::Ply | SourceKind::Spz)) => {
+            let model = Model::open(path, &context.registry, &parse_device(DEVICE)?, &context.limits, &Silent)?;
+            let size: SizeMb = model.size.into();
+            Ok((json!({ "kind": kind, "path": path, "size_mb": size.total, "gaussians": gaussians(&model.gaussians)? }), None))
+        }
+        None => Ok((scene(context, path)?, None)),
     }
-    if path.is_file() {
-        let mut head = Vec::new();
-        std::fs::File::open(path).and_then(|f| f.take(8).read_to_end(&mut head)).map_err(|e| Error::io(path, e))?;
-        if head == MAGIC {
-            return archive(context, path);
-        }
-        if head.starts_with(b"ply") {
-            return Ok((json!({ "kind": "ply", "path": path, "gaussians": gaussians(&ply::read(path, &context.limits)?)? }), None));
-        }
-        if head.starts_with(&GZIP) {
-            let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-            let found = spz::from_spz(&path.display().to_string(), &bytes, &context.limits)?;
-            return Ok((json!({ "kind": "spz", "path": path, "gaussians": gaussians(&found)? }), None));
-        }
-        // A checkpoint is a safetensors file: a length of eight bytes, of which the upper ones are zero.
-        if head.len() == 8 && head[4..] == [0; 4] {
-            return checkpoint(context, path);
-        }
-    }
-    Ok((scene(context, path)?, None))
 }
 
-/// An archive's directory and manifest; no stream is decoded.
+/// An archive's directory and manifest; no stream is decoded. Plug-ins that are not linked are named in `notes`.
 fn archive(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     let archive = Archive::open(path, &context.limits)?;
-    let manifest = plain(archive.manifest())?;
-    let stored = archive.stream_sizes();
-    let of_kind = |kind| stored.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();
     let of = archive.manifest();
-    let (deform_grid, deform_net) = match &of.deformer {
-        None => (0, 0),
-        Some(entry) => {
-            let mut section = entry.settings.clone();
-            section.insert("kind".into(), entry.name.clone().into());
-            context.registry.build_deformer(&section, &entry.context, &parse_device("flex")?)?.size_bytes()
+    let stored = archive.stream_sizes();
+    let sum = |kind, bytes: fn(&cc4dgs_core::archive::StreamInfo) -> u64| stored.iter().filter(|s| s.kind == kind).map(bytes).sum::<u64>();
+    let mut notes = Vec::new();
+    if context.registry.codec(&of.codec.name).is_err() {
+        notes.push(not_linked("codec", &of.codec.name, &of.codec.version));
+    }
+    let field = match &of.deformer {
+        None => Some((0, 0)),
+        Some(entry) if context.registry.deformer(&entry.name).is_err() => {
+            notes.push(not_linked("deformer", &entry.name, &entry.version));
+            None
         }
+        Some(entry) => match field_bytes(context, entry) {
+            Ok(parts) => Some(parts),
+            Err(e) => {
+                notes.push(e.to_string());
+                None
+            }
+        },
     };
     let total = archive.total_bytes()?;
-    // Plug-ins' own attributes are stored as they are.
-    let extra: u64 = stored.iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
-    let point_cloud = 4 * of.gaussian_count * (15 + 3 * sh_rest_len(of.sh_degree) as u64) + extra;
-    let storage = Storage { deform_grid, deform_net, point_cloud, stored: Some([of_kind(StreamKind::Field), of_kind(StreamKind::Canonical), total]) };
+    let floats = (15 + 3 * sh_rest_len(of.sh_degree) as u64).saturating_add(attribute_width(of));
+    let storage = Storage {
+        field,
+        point_cloud: of.gaussian_count.saturating_mul(floats).saturating_mul(4),
+        stored: Some([sum(StreamKind::Field, |s| s.stored_bytes), sum(StreamKind::Canonical, |s| s.stored_bytes), total]),
+    };
+    let manifest = plain(of)?;
     let streams: Vec<StreamSize> = stored.into_iter().map(StreamSize::from).collect();
-    Ok((json!({ "kind": "archive", "path": path, "size_mb": megabytes(total), "streams": streams, "manifest": manifest }), Some(storage)))
+    let mut value = json!({ "kind": SourceKind::Archive, "path": path, "size_mb": megabytes(total), "streams": streams, "manifest": manifest });
+    if let (false, Value::Object(map)) = (notes.is_empty(), &mut value) {
+        map.insert("notes".into(), notes.into());
+    }
+    Ok((value, Some(storage)))
+}
+
+/// Float32 bytes of the weights of a stored deformer: (grid, net).
+fn field_bytes(context: &Context, entry: &DeformerEntry) -> Result<(u64, u64)> {
+    let mut section = entry.settings.clone();
+    section.insert("kind".into(), entry.name.clone().into());
+    Ok(context.registry.build_deformer(&section, &entry.context, &parse_device(DEVICE)?)?.size_bytes())
+}
+
+fn not_linked(kind: &str, name: &str, version: &str) -> String {
+    format!("the {kind} '{name}' (version {version}) is not linked into this program; use one that links the crate of this {kind} to play the model")
 }
 
 fn checkpoint(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
-    let model = Model::load(path, &context.registry, &parse_device("auto")?, &context.limits, &Silent)?;
+    let model = Model::open(path, &context.registry, &parse_device(DEVICE)?, &context.limits, &Silent)?;
     let moving = model.moving.rows(&model.gaussians.dynamic_scores).map_or(model.gaussians.len(), |rows| rows.len());
     let size: SizeMb = model.size.into();
-    let storage = Storage { deform_grid: model.size.deform_grid, deform_net: model.size.deform_net, point_cloud: model.size.point_cloud, stored: None };
+    let storage = Storage { field: Some((model.size.deform_grid, model.size.deform_net)), point_cloud: model.size.point_cloud, stored: None };
     let field = match &model.field {
         Some(f) => json!({ "settings": plain(&f.section)?, "context": plain(&f.context)? }),
         None => Value::Null,
     };
     let value = json!({
-        "kind": "checkpoint",
+        "kind": SourceKind::Checkpoint,
         "path": path,
         "size_mb": size,
         "gaussians": gaussians(&model.gaussians)?,
@@ -116,7 +131,7 @@ fn gaussians(host: &HostGaussians) -> Result<Value> {
 }
 
 fn scene(context: &Context, path: &Path) -> Result<Value> {
-    let scene = data::open(path, &SceneOptions::default(), &context.limits)?;
+    let scene = data::open(path, &SceneOptions::default(), &context.registry, &context.limits)?;
     let sizes: std::collections::BTreeSet<(u32, u32)> = scene.cameras.iter().map(|c| (c.width, c.height)).collect();
     let sizes: Vec<String> = sizes.into_iter().map(|(w, h)| format!("{w}x{h}")).collect();
     Ok(json!({
@@ -127,7 +142,7 @@ fn scene(context: &Context, path: &Path) -> Result<Value> {
         "frames": scene.frame_count,
         "train_views": scene.split(Split::Train).len(),
         "test_views": scene.split(Split::Test).len(),
-        "picture_sizes": sizes,
+        "image_sizes": sizes,
         "camera_extent": plain(&scene.extent())?,
         "initial_points": scene.points.as_ref().map(|p| p.positions.len()),
         "init_box": plain(&scene.init_box)?,

@@ -11,7 +11,6 @@ mod plugins;
 mod render;
 mod storage;
 mod train;
-mod video;
 
 use crate::args::{BenchWhat, Cli, Command};
 use crate::listeners::{JsonLines, Progress};
@@ -74,9 +73,7 @@ pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
 
 fn limits(options: &[String]) -> Result<Limits> {
     let mut table = toml::Table::new();
-    for option in options {
-        config::set(&mut table, option)?;
-    }
+    config::set_all(&mut table, options)?;
     config::parse_section("--limit", &table)
 }
 

@@ -1,19 +1,17 @@
 //! `cc4dgs render`.
 
-use super::{Context, create_parent, evenly, video};
+use super::{Context, create_parent, evenly};
 use crate::args::Render;
 use crate::interrupt;
-use crate::model_source::{load_model, open_scene};
-use crate::orbit::orbit;
-use cc4dgs_backends::ops::image::read_image;
+use crate::models::load_model;
+use cc4dgs::Orbit;
+use cc4dgs::scenes::open_as_trained;
+use cc4dgs::video;
 use cc4dgs_core::{Camera, Error, Event, EventSink, Result};
-use cc4dgs_engine::pictures::write_png;
+use cc4dgs_engine::images::write_png;
 use cc4dgs_engine::play::Player;
 use serde::Serialize;
 use std::path::PathBuf;
-
-const ORBIT_FRAMES: usize = 60;
-const ORBIT_SIZE: (u32, u32) = (800, 600);
 
 #[derive(Serialize)]
 struct RenderReport {
@@ -40,15 +38,15 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     let stop = interrupt::stop_flag()?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    let shots = shots(context, args, &loaded.model)?;
+    let (shots, background) = shots(context, args, &loaded.model)?;
     std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
-    let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?;
+    let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(background);
     let mut times = Vec::with_capacity(shots.len());
     for (index, (camera, time_norm)) in shots.iter().enumerate() {
         interrupt::check(stop, &format!("after {index} of {} frames in {}", shots.len(), args.out.display()))?;
         let (output, time) = player.render(camera, *time_norm)?;
-        let picture = read_image(output.planes)?;
-        write_png(&args.out.join(format!("frame_{index:05}.png")), &picture)?;
+        let image = player.download(output.planes)?;
+        write_png(args.out.join(video::frame_name(index)), &image)?;
         times.push(time);
         events.emit(&Event::Progress { task: "render".into(), done: index as u64 + 1, total: shots.len() as u64 });
     }
@@ -78,18 +76,19 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     })
 }
 
-/// Cameras and times to render.
-fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) -> Result<Vec<(Camera, f32)>> {
+/// Cameras and times to render, and the background of the scene they are from.
+fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) -> Result<(Vec<(Camera, f32)>, Option<[f32; 3]>)> {
     let Some(path) = &args.scene else {
         if !args.sets.is_empty() {
             return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));
         }
-        let frames = args.frames.map_or(ORBIT_FRAMES, |n| n as usize);
-        let cameras = orbit(&model.gaussians, args.size.unwrap_or(ORBIT_SIZE), frames, args.turns, args.up.into())?;
-        let time = |i: usize| if frames > 1 { i as f32 / (frames - 1) as f32 } else { 0.0 };
-        return Ok(cameras.into_iter().enumerate().map(|(i, camera)| (camera, time(i))).collect());
+        let standard = Orbit::default();
+        let frames = args.frames.map_or(standard.frames, |n| n as usize);
+        let orbit = Orbit { size: args.size.unwrap_or(standard.size), frames, turns: args.turns, up: args.up.into() };
+        let cameras = orbit.around(&model.gaussians)?;
+        return Ok((cameras.into_iter().enumerate().map(|(i, camera)| (camera, orbit.time(i))).collect(), None));
     };
-    let scene = open_scene(path, model, &args.sets, &context.limits)?;
+    let scene = open_as_trained(path, model, &args.sets, &context.registry, &context.limits)?;
     let views = scene.split(args.split.into());
     if views.is_empty() {
         return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));
@@ -99,5 +98,5 @@ fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) 
         let camera = scene.camera(views[i]);
         (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[views[i]].time_norm)
     };
-    Ok(evenly(views.len(), wanted).into_iter().map(shot).collect())
+    Ok((evenly(views.len(), wanted).into_iter().map(shot).collect(), scene.background))
 }

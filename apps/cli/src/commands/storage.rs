@@ -8,20 +8,18 @@ use serde::Serialize;
 pub struct StorageRow {
     /// What is stored.
     pub part: &'static str,
-    /// As float32.
-    pub float32_mb: f64,
-    /// As it lies on disk; the parts of a field lie there as one.
+    /// As float32; `None` where the deformer that would say is not linked.
+    pub float32_mb: Option<f64>,
+    /// On disk; the parts of a field are stored as one.
     pub stored_mb: Option<f64>,
 }
 
 /// Bytes of a model as float32 and, if it has been compressed, on disk.
 #[derive(Clone, Copy, Debug)]
 pub struct Storage {
-    /// Weights of the field's spatial encoding, float32.
-    pub deform_grid: u64,
-    /// All other weights of the field, float32.
-    pub deform_net: u64,
-    /// The Gaussians, float32.
+    /// Weights of the field as float32: of its spatial encoding, and all others. `None` if they are not known.
+    pub field: Option<(u64, u64)>,
+    /// The Gaussians with their attributes, float32.
     pub point_cloud: u64,
     /// On disk: field, Gaussians, whole file.
     pub stored: Option<[u64; 3]>,
@@ -30,14 +28,14 @@ pub struct Storage {
 impl Storage {
     /// The rows of the table.
     pub fn rows(&self) -> Vec<StorageRow> {
-        let row = |part, bytes, stored: Option<u64>| StorageRow { part, float32_mb: megabytes(bytes), stored_mb: stored.map(megabytes) };
-        let deform = self.deform_grid + self.deform_net;
+        let row = |part, bytes: Option<u64>, stored: Option<u64>| StorageRow { part, float32_mb: bytes.map(megabytes), stored_mb: stored.map(megabytes) };
+        let deform = self.field.map(|(grid, net)| grid + net);
         vec![
-            row("deform grid", self.deform_grid, None),
-            row("deform net", self.deform_net, None),
+            row("deform grid", self.field.map(|f| f.0), None),
+            row("deform net", self.field.map(|f| f.1), None),
             row("deform", deform, self.stored.map(|s| s[0])),
-            row("point cloud", self.point_cloud, self.stored.map(|s| s[1])),
-            row("total", deform + self.point_cloud, self.stored.map(|s| s[2])),
+            row("point cloud", Some(self.point_cloud), self.stored.map(|s| s[1])),
+            row("total", deform.map(|d| d + self.point_cloud), self.stored.map(|s| s[2])),
         ]
     }
 }
@@ -46,8 +44,8 @@ impl Storage {
 pub fn table(rows: &[StorageRow]) -> Vec<String> {
     let mut lines = vec![format!("{:<14}{:>12}{:>12}", "storage, MB", "float32", "on disk")];
     lines.extend(rows.iter().map(|r| {
-        let stored = r.stored_mb.map_or(String::new(), |mb| format!("{mb:.3}"));
-        format!("{:<14}{:>12.3}{stored:>12}", r.part, r.float32_mb)
+        let cell = |mb: Option<f64>, missing: &str| mb.map_or_else(|| missing.to_string(), |mb| format!("{mb:.3}"));
+        format!("{:<14}{:>12}{:>12}", r.part, cell(r.float32_mb, "-"), cell(r.stored_mb, ""))
     }));
     lines
 }

@@ -3,16 +3,15 @@
 use super::Context;
 use crate::args::Train;
 use crate::interrupt;
-use cc4dgs_core::{AppearanceContext, DeformerContext, Result, Scene, Seed, parse_device};
+use cc4dgs::plugins;
+use cc4dgs::runs::{EVENTS, Existing, check_folder};
+use cc4dgs_core::{Result, Scene};
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::data;
 use cc4dgs_engine::train::{CONFIG, TrainJob, TrainReport, train};
 use serde::Serialize;
 use std::path::Path;
 use std::sync::Arc;
-
-/// Name of the log inside a run's folder.
-pub const EVENTS: &str = "events.jsonl";
 
 #[derive(Serialize)]
 struct Report<'a> {
@@ -33,7 +32,12 @@ pub fn run(context: &Context, args: &Train) -> Result<()> {
         given => given.as_deref(),
     };
     let config = resolve(context, args.preset.as_deref(), file, &args.sets, args.device.as_deref())?;
-    let (scene, report) = train_into(context, &config, &args.scene, &args.out, args.resume)?;
+    let existing = match (args.resume, args.overwrite) {
+        (true, _) => Existing::Resume,
+        (false, true) => Existing::Overwrite,
+        (false, false) => Existing::Refuse,
+    };
+    let (scene, report) = train_into(context, &config, &args.scene, &args.out, existing)?;
     let shown =
         Report { scene, preset: config.preset.clone(), device: config.device.clone(), seed: config.seed, iterations: config.train.iterations, train: &report };
     context.output.result(&shown, || text(&report))
@@ -48,28 +52,16 @@ pub fn resolve(context: &Context, preset: Option<&str>, file: Option<&Path>, set
 }
 
 /// Trains the scene at `scene_path` into the folder `out`; returns the scene's name and the report.
-pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out: &Path, resume: bool) -> Result<(String, TrainReport)> {
+pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out: &Path, existing: Existing) -> Result<(String, TrainReport)> {
     let stop = interrupt::stop_flag()?;
-    check_plugins(context, config)?;
-    let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &config.limits)?);
+    check_folder(out, existing, "Go on with it (train --resume), start anew in its place (--overwrite), or choose another folder")?;
+    plugins::check(config, &context.registry)?;
+    let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &context.registry, &config.limits)?);
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
+    let resume = existing == Existing::Resume;
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;
     let job = TrainJob { config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop };
     Ok((scene.name.clone(), train(&job)?.1))
-}
-
-/// Builds every plug-in of the configuration once and drops it: a mistake in the deformer's settings should not wait for the main stage, nor leave
-/// a folder behind.
-fn check_plugins(context: &Context, config: &RunConfig) -> Result<()> {
-    let device = parse_device(&config.device)?;
-    context.registry.build_rasterizer(&config.rasterizer)?;
-    let seed = Seed::root(config.seed).child("check");
-    let field = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: config.train.sh_degree, seed };
-    context.registry.build_deformer(&config.deformer, &field, &device)?;
-    context.registry.build_density(&config.density)?;
-    context.registry.build_appearance(&config.appearance, &AppearanceContext { cameras: 1, seed }, &device)?;
-    context.registry.build_optimizer(&config.optimizer)?;
-    Ok(())
 }
 
 /// The report for people.

@@ -1,4 +1,4 @@
-//! What people see of a run, on standard error: a bar on a terminal, an occasional line elsewhere.
+//! Progress on standard error: a bar on a terminal, an occasional line elsewhere.
 
 use cc4dgs_core::{Event, EventSink};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -17,7 +17,7 @@ pub struct Progress {
 
 #[derive(Default)]
 struct State {
-    /// The bar on show and what it is about.
+    /// The visible bar and its task.
     bar: Option<(String, ProgressBar)>,
     last_line: Option<Instant>,
 }
@@ -32,11 +32,11 @@ impl State {
     fn say(&self, line: &str) {
         match &self.bar {
             Some((_, bar)) if !bar.is_hidden() => bar.println(line),
-            // Without a standard error nobody reads progress.
+            // A closed standard error is not a failure.
             _ => _ = writeln!(std::io::stderr(), "{line}"),
         }
     }
-    /// The bar about `task`, made anew when the task changes.
+    /// The bar of `task`; a new one when the task changes.
     fn bar(&mut self, task: &str, total: u64, terminal: bool) -> &ProgressBar {
         if self.bar.as_ref().is_none_or(|(name, _)| name != task) {
             self.clear();
@@ -46,7 +46,7 @@ impl State {
                 bar.set_style(style.progress_chars("=> "));
             }
             bar.set_prefix(task.to_string());
-            // Short tasks need no line of their own where there is no bar to watch.
+            // Without a terminal, short tasks get no line of their own.
             self.last_line = Some(Instant::now());
             self.bar = Some((task.to_string(), bar));
         }

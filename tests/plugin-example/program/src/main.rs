@@ -4,5 +4,5 @@ use half_floats as _;
 use sway as _;
 
 fn main() -> std::process::ExitCode {
-    cc4dgs::run(std::env::args_os())
+    cc4dgs_cli::run(std::env::args_os())
 }

@@ -1,8 +1,9 @@
-//! Whether devices draw the same pictures.
+//! Whether devices draw the same images.
 
 use crate::args::BenchAgree;
 use crate::commands::{Context, evenly};
-use crate::model_source::{load_model, open_scene};
+use crate::models::load_model;
+use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::{Error, Result};
 use cc4dgs_engine::agreement::{Agreement, agreement};
 use serde::Serialize;
@@ -15,7 +16,7 @@ struct AgreeReport {
     devices: Vec<Agreement>,
 }
 
-/// Draws the views of a split on several devices and compares the pictures.
+/// Draws the views of a split on several devices and compares the images.
 pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
     let events = context.listeners(None)?;
     let mut models = Vec::new();
@@ -31,7 +32,7 @@ pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
     let Some((_, _, first)) = models.first() else {
         return Err(Error::parameter("--devices", "none is named", "Give at least two, such as flex,wgpu"));
     };
-    let scene = open_scene(&args.views.scene, first, &args.views.sets, &context.limits)?;
+    let scene = open_as_trained(&args.views.scene, first, &args.views.sets, &context.registry, &context.limits)?;
     let views = scene.split(args.views.split.into());
     let wanted = if args.max_views == 0 { views.len() } else { args.max_views };
     let views: Vec<usize> = evenly(views.len(), wanted).into_iter().map(|i| views[i]).collect();

@@ -3,7 +3,7 @@
 use super::{Spread, timed};
 use crate::args::BenchField;
 use crate::commands::Context;
-use crate::model_source::resolved_device;
+use crate::models::resolved_device;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, SpatialInput, config, parse_device};
@@ -45,9 +45,7 @@ struct FieldReport<'a> {
 pub fn field(context: &Context, args: &BenchField) -> Result<()> {
     let device = parse_device(&args.device)?;
     let mut table = toml::Table::new();
-    for assignment in &args.set {
-        config::set(&mut table, assignment)?;
-    }
+    config::set_all(&mut table, &args.set)?;
     let scene = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(args.seed).child("field") };
     let mut field = Cdf::new(config::parse_section::<CdfConfig>("deformer cdf", &table)?, &scene, &device)?;
     stir(&mut field, Seed::root(args.seed).child("weights"), &device)?;
@@ -76,7 +74,7 @@ pub fn field(context: &Context, args: &BenchField) -> Result<()> {
     let primitives = timed(repeats.min(5), || gradients(&field, primitive()?).map(|_| ()))?;
     let report = FieldReport {
         version: env!("CARGO_PKG_VERSION"),
-        device: resolved_device(&args.device)?,
+        device: resolved_device(&args.device),
         threads: rayon::current_num_threads(),
         seed: args.seed,
         gaussians: args.gaussians as usize,

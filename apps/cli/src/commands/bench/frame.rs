@@ -4,7 +4,7 @@ use super::{Playback, Spread, WARM_UP, rooms, time_playback};
 use crate::args::BenchFrame;
 use crate::commands::Context;
 use crate::interrupt;
-use crate::model_source::resolved_device;
+use crate::models::resolved_device;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::bench::{RoomCase, growth, room, shrunk};
 use cc4dgs_core::archive::Provenance;
@@ -51,9 +51,7 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     let device = parse_device(&args.device)?;
     let events = context.listeners(None)?;
     let mut table = toml::Table::from_iter([("deformer".to_string(), toml::Value::Table(toml::Table::from_iter([("kind".into(), "cdf".into())])))]);
-    for assignment in &args.set {
-        config::set(&mut table, assignment)?;
-    }
+    config::set_all(&mut table, &args.set)?;
     let config: RunConfig = config::parse_section("configuration", &table)?;
     let mut cases = Vec::new();
     let wanted = if args.growth { growth().iter().map(|case| shrunk(case, args.scale)).collect() } else { rooms(&args.case, args.scale)? };
@@ -69,7 +67,7 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     let deformer = config.deformer.get("kind").and_then(|k| k.as_str()).unwrap_or_default().to_string();
     let report = FrameReport {
         version: env!("CARGO_PKG_VERSION"),
-        device: resolved_device(&args.device)?,
+        device: resolved_device(&args.device),
         threads: rayon::current_num_threads(),
         cpu_features: crate::commands::doctor::cpu_features(),
         seed: args.seed,
@@ -103,7 +101,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         field: Some(ModelDeformer { field, section: config.deformer.clone(), context: field_context }),
         moving,
         render: RenderConfig::default(),
-        background: [0.0; 3],
+        background: Some([0.0; 3]),
         rasterizer: config.rasterizer.clone(),
         frame_count: SEQUENCE,
         provenance: Provenance::default(),
@@ -161,7 +159,7 @@ fn time_field(field: &mut dyn cc4dgs_core::Deformer, means_world: Tensor<2>, rep
 
 fn text(report: &FrameReport) -> String {
     let mut lines = vec![format!("playback on {}, {} threads, deformer {}", report.device, report.threads, report.deformer)];
-    lines.push("case           picture  Gaussians  moving   field ms  raster ms    play ms   frames/s  first ms  spatial ms  field fwd+bwd ms".into());
+    lines.push("case             image  Gaussians  moving   field ms  raster ms    play ms   frames/s  first ms  spatial ms  field fwd+bwd ms".into());
     lines.extend(report.cases.iter().map(|c| {
         format!(
             "{:<12} {:>4}x{:<4} {:>9} {:>7} {:>10.3} {:>10.2} {:>10.2} {:>10.1} {:>9.1} {:>11.2} {:>17.2}",

@@ -3,7 +3,7 @@
 use super::{Spread, timed};
 use crate::args::BenchLookup;
 use crate::commands::Context;
-use crate::model_source::resolved_device;
+use crate::models::resolved_device;
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::cpu::lookup::corners;
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup as look_up};
@@ -106,7 +106,7 @@ pub fn lookup(context: &Context, args: &BenchLookup) -> Result<()> {
     }
     let report = LookupReport {
         version: env!("CARGO_PKG_VERSION"),
-        device: resolved_device(&args.device)?,
+        device: resolved_device(&args.device),
         threads: rayon::current_num_threads(),
         seed: args.seed,
         gaussians: m,

@@ -84,7 +84,7 @@ pub struct Playback {
     work: PlayWork,
 }
 
-/// Times `frames` frames after some that are not counted, waiting after the field and after the picture; and as many without waiting. `moment` is the camera and
+/// Times `frames` frames after some that are not counted, waiting after the field and after the image; and as many without waiting. `moment` is the camera and
 /// the time of a frame.
 pub fn time_playback<'c>(player: &mut Player, frames: usize, moment: impl Fn(usize) -> (&'c Camera, f32)) -> Result<Playback> {
     let mut times: [Vec<f64>; 3] = Default::default();

@@ -3,7 +3,7 @@
 use super::{Spread, timed};
 use crate::args::{BenchLoss, BenchSort};
 use crate::commands::Context;
-use crate::model_source::resolved_device;
+use crate::models::resolved_device;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::ops::photometric::photometric_loss;
 use cc4dgs_backends::ops::sort::sort_order;
@@ -37,7 +37,7 @@ pub fn sort(context: &Context, args: &BenchSort) -> Result<()> {
     let mut random = Seed::root(args.seed).child("sort").rng();
     let mut cases = Vec::new();
     for &pairs in &args.pairs {
-        // Random keys of as many bits as depths have, and of as many as tiles of a picture have.
+        // Random keys of as many bits as depths have, and of as many as tiles of an image have.
         for bits in [32, 13] {
             let keys: Vec<i32> = (0..pairs).map(|_| (random.random::<u32>() >> (32 - bits)) as i32).collect();
             let keys = Tensor::<1, burn::tensor::Int>::from_data(TensorData::new(keys, [pairs]), &device);
@@ -50,13 +50,8 @@ pub fn sort(context: &Context, args: &BenchSort) -> Result<()> {
             cases.push(SortCase { pairs, bits, time, million_pairs_per_s: per_s * 1e-6, gigabytes_per_s: 16.0 * per_s * 1e-9 });
         }
     }
-    let report = SortReport {
-        version: env!("CARGO_PKG_VERSION"),
-        device: resolved_device(&args.device)?,
-        threads: rayon::current_num_threads(),
-        seed: args.seed,
-        cases,
-    };
+    let report =
+        SortReport { version: env!("CARGO_PKG_VERSION"), device: resolved_device(&args.device), threads: rayon::current_num_threads(), seed: args.seed, cases };
     context.output.result(&report, || {
         let mut lines = vec![format!("sort on {}, {} threads", report.device, report.threads), "     pairs  bits  median ms   Mpairs/s     GB/s".to_string()];
         lines.extend(
@@ -84,7 +79,7 @@ struct LossCase {
     height: usize,
     forward: Spread,
     forward_backward: Spread,
-    /// Two pictures in and a gradient out, over the time of both passes.
+    /// Two images in and a gradient out, over the time of both passes.
     gigabytes_per_s: f64,
 }
 
@@ -97,11 +92,11 @@ pub fn loss(context: &Context, args: &BenchLoss) -> Result<()> {
     for &megapixels in &args.megapixels {
         let width = ((megapixels * 1e6 * 4.0 / 3.0).sqrt().round() as usize).max(16);
         let height = ((megapixels * 1e6 / width as f64).round() as usize).max(16);
-        let mut picture = |planes: usize| {
+        let mut image = |planes: usize| {
             let values: Vec<f32> = (0..planes * width * height).map(|_| random.random()).collect();
             Tensor::<3>::from_data(TensorData::new(values, [planes, height, width]), &tracked)
         };
-        let (render, target) = (picture(5).require_grad(), picture(3));
+        let (render, target) = (image(5).require_grad(), image(3));
         let forward = timed(args.repeats as usize, || to_vec(photometric_loss(render.clone(), target.clone(), 0.8)?.loss.inner(), "loss").map(|_| ()))?;
         let forward_backward = timed(args.repeats as usize, || {
             let gradients = photometric_loss(render.clone(), target.clone(), 0.8)?.loss.backward();
@@ -113,16 +108,11 @@ pub fn loss(context: &Context, args: &BenchLoss) -> Result<()> {
         let bytes = 4.0 * (5 + 3 + 5) as f64 * (width * height) as f64;
         cases.push(LossCase { width, height, forward, forward_backward, gigabytes_per_s: bytes / (forward_backward.median_ms * 1e6).max(1e-9) });
     }
-    let report = LossReport {
-        version: env!("CARGO_PKG_VERSION"),
-        device: resolved_device(&args.device)?,
-        threads: rayon::current_num_threads(),
-        seed: args.seed,
-        cases,
-    };
+    let report =
+        LossReport { version: env!("CARGO_PKG_VERSION"), device: resolved_device(&args.device), threads: rayon::current_num_threads(), seed: args.seed, cases };
     context.output.result(&report, || {
         let mut lines =
-            vec![format!("L1 and SSIM on {}, {} threads", report.device, report.threads), "   picture  forward ms  with gradient ms     GB/s".to_string()];
+            vec![format!("L1 and SSIM on {}, {} threads", report.device, report.threads), "     image  forward ms  with gradient ms     GB/s".to_string()];
         lines.extend(report.cases.iter().map(|c| {
             format!("{:>5}x{:<5} {:>10.3} {:>17.3} {:>8.2}", c.width, c.height, c.forward.median_ms, c.forward_backward.median_ms, c.gigabytes_per_s)
         }));

@@ -3,7 +3,8 @@
 use super::{Playback, time_playback};
 use crate::args::BenchPlay;
 use crate::commands::Context;
-use crate::model_source::{load_model, open_scene};
+use crate::models::load_model;
+use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::{Camera, Error, Result};
 use cc4dgs_engine::play::Player;
 use serde::Serialize;
@@ -27,12 +28,12 @@ struct PlayReport<'a> {
 pub fn play(context: &Context, args: &BenchPlay) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_scene(&args.views.scene, &loaded.model, &args.views.sets, &context.limits)?;
+    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.registry, &context.limits)?;
     let moments: Vec<(Camera, f32)> = scene.split(args.views.split.into()).into_iter().map(|v| (scene.camera(v).clone(), scene.views[v].time_norm)).collect();
     let Some((camera, _)) = moments.first() else {
         return Err(Error::parameter("--split", format!("{} has no view of this split", scene.name), "Play the other split"));
     };
-    let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?;
+    let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(scene.background);
     let playback = time_playback(&mut player, args.frames as usize, |frame| {
         let (camera, time_norm) = &moments[frame % moments.len()];
         (camera, *time_norm)

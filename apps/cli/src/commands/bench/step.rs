@@ -3,7 +3,7 @@
 use super::rooms;
 use crate::args::BenchStep;
 use crate::commands::Context;
-use crate::model_source::resolved_device;
+use crate::models::resolved_device;
 use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, Workload, room, time_step};
 use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device};
 use serde::Serialize;
@@ -40,7 +40,7 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
     }
     let report = StepReport {
         version: env!("CARGO_PKG_VERSION"),
-        device: resolved_device(&args.device)?,
+        device: resolved_device(&args.device),
         threads: rayon::current_num_threads(),
         cpu_features: crate::commands::doctor::cpu_features(),
         seed: args.seed,
@@ -53,7 +53,7 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
 
 fn text(report: &StepReport) -> String {
     let mut lines = vec![format!("training step on {}, {} threads, {} repeats", report.device, report.threads, report.repeats)];
-    lines.push("workload      picture  Gaussians  median ms   min ms  (render    loss  backward   Adam)   pairs/s  of peak".into());
+    lines.push("workload        image  Gaussians  median ms   min ms  (render    loss  backward   Adam)   pairs/s  of peak".into());
     lines.extend(report.cases.iter().map(|c| {
         // Devices that do not read their counters back have no pairs to show.
         let counted = Some(c).filter(|c| c.pixel_pairs > 0);

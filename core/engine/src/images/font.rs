@@ -98,7 +98,7 @@ pub fn text_width(text: &str, scale: u32) -> u32 {
     text.chars().count() as u32 * GLYPH_WIDTH * scale
 }
 
-/// Draws `text` with its top left corner at (`x`, `y`), each font pixel `scale` pixels wide. What falls outside the picture is left out.
+/// Draws `text` with its top left corner at (`x`, `y`), each font pixel `scale` pixels wide. What falls outside the image is left out.
 pub fn draw_text(image: &mut Image8, x: u32, y: u32, text: &str, color: [u8; 3], scale: u32) {
     for (index, character) in text.chars().enumerate() {
         let rows = GLYPHS.binary_search_by_key(&character, |g| g.0).map_or(MISSING, |found| GLYPHS[found].1);

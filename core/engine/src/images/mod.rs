@@ -1,4 +1,4 @@
-//! Pictures for people: PNG files, error maps, contact sheets with captions.
+//! Images to look at: PNG files, error maps, contact sheets with captions.
 
 mod font;
 mod heat;

@@ -9,9 +9,9 @@ use image::{RgbImage, imageops};
 pub struct Comparison {
     /// What is shown and how well it came out, one line.
     pub caption: String,
-    /// The picture to match.
+    /// The image to match.
     pub reference: Image8,
-    /// The picture made, of the same size.
+    /// The rendered image, of the same size.
     pub render: Image8,
 }
 
@@ -20,7 +20,7 @@ pub struct Comparison {
 pub struct SheetOptions {
     /// A line above everything; may be empty.
     pub title: String,
-    /// Wider pictures are shrunk to this width, in pixels.
+    /// Wider images are shrunk to this width, in pixels.
     pub max_cell_width: u32,
     /// The mean absolute difference (0..1) drawn brightest in the error column.
     pub error_full_scale: f32,
@@ -49,13 +49,13 @@ pub fn comparison_sheet(comparisons: &[Comparison], options: &SheetOptions) -> R
     let scale = if cell_width >= 240 { 2 } else { 1 };
     let line = GLYPH_HEIGHT * scale + GAP;
     let head = if options.title.is_empty() { line } else { 2 * line };
-    // Narrow pictures must not cut their captions off.
+    // Narrow images must not cut their captions off.
     let texts = comparisons.iter().map(|c| &c.caption).chain([&options.title]);
     let widest_text = texts.map(|t| text_width(t, scale)).max().unwrap_or(0).min(COLUMNS * 400) + 2 * GAP;
     let width = u64::from((COLUMNS * cell_width + (COLUMNS + 1) * GAP).max(widest_text));
     let height = u64::from(head) + cells.iter().map(|c| u64::from(c.1 + line + GAP)).sum::<u64>() + u64::from(GAP);
     if width * height > MAX_SHEET_PIXELS {
-        return Err(Error::limit("contact sheet pixels", width * height, MAX_SHEET_PIXELS, "Show fewer views or narrower pictures"));
+        return Err(Error::limit("contact sheet pixels", width * height, MAX_SHEET_PIXELS, "Show fewer views or narrower images"));
     }
     let mut sheet = Image8 { width: width as u32, height: height as u32, channels: 3, data: PAPER.repeat((width * height) as usize) };
     if !options.title.is_empty() {
@@ -73,8 +73,8 @@ pub fn comparison_sheet(comparisons: &[Comparison], options: &SheetOptions) -> R
         y += line - GAP;
         // The error is taken at full size and then shrunk: shrinking first would hide it.
         let error = error_map(&comparison.reference, &comparison.render, options.error_full_scale)?;
-        for (column, picture) in [&comparison.reference, &comparison.render, &error].into_iter().enumerate() {
-            paste(&mut sheet, &shrink(picture, size)?, GAP + column as u32 * (cell_width + GAP), y);
+        for (column, image) in [&comparison.reference, &comparison.render, &error].into_iter().enumerate() {
+            paste(&mut sheet, &shrink(image, size)?, GAP + column as u32 * (cell_width + GAP), y);
         }
         y += size.1 + 2 * GAP;
     }
@@ -97,14 +97,14 @@ fn fit(text: &str, width: u32, scale: u32) -> String {
 fn shrink(image: &Image8, (width, height): (u32, u32)) -> Result<RgbImage> {
     let rgb = image.data.chunks_exact(image.channels.max(1) as usize).flat_map(|p| [p[0], p[1], p[2]]).collect();
     let whole = RgbImage::from_raw(image.width, image.height, rgb).ok_or_else(|| {
-        Error::parameter("contact sheet", format!("a picture of {} bytes is not {}x{}", image.data.len(), image.width, image.height), "Pass whole pictures")
+        Error::parameter("contact sheet", format!("an image of {} bytes is not {}x{}", image.data.len(), image.width, image.height), "Pass whole images")
     })?;
     Ok(if (image.width, image.height) == (width, height) { whole } else { imageops::thumbnail(&whole, width, height) })
 }
 
-fn paste(sheet: &mut Image8, picture: &RgbImage, x: u32, y: u32) {
-    let row_bytes = 3 * picture.width() as usize;
-    for (row, line) in picture.as_raw().chunks_exact(row_bytes).enumerate() {
+fn paste(sheet: &mut Image8, image: &RgbImage, x: u32, y: u32) {
+    let row_bytes = 3 * image.width() as usize;
+    for (row, line) in image.as_raw().chunks_exact(row_bytes).enumerate() {
         let at = 3 * ((y as usize + row) * sheet.width as usize + x as usize);
         sheet.data[at..at + row_bytes].copy_from_slice(line);
     }
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn each_picture_lands_in_its_column() {
+    fn each_image_lands_in_its_column() {
         let row = Comparison { caption: "cam 3 t 0.25".into(), reference: flat(60, 20, 200), render: flat(60, 20, 149) };
         let sheet = comparison_sheet(&[row.clone(), row], &SheetOptions { title: "demo".into(), ..Default::default() }).unwrap();
         assert_eq!(sheet.data.len(), (3 * sheet.width * sheet.height) as usize);
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn wide_pictures_shrink_and_bad_input_is_refused() {
+    fn wide_images_shrink_and_bad_input_is_refused() {
         let pair = |a: Image8, b: Image8| Comparison { caption: String::new(), reference: a, render: b };
         let sheet = comparison_sheet(&[pair(flat(1000, 500, 7), flat(1000, 500, 7))], &SheetOptions::default()).unwrap();
         assert_eq!(sheet.width, 3 * 400 + 4 * GAP);

@@ -1,7 +1,7 @@
 //! Would storing the coefficients of `cdf-basis` per Gaussian be smaller than storing the networks that compute them?
 //!
 //! Coefficients are rounded to steps that are a share of the root-mean-square of them all, and every column is charged its entropy: of its values, or of the differences between
-//! neighbours along the Morton curve, whichever is less. The picture is scored with the rounded ones.
+//! neighbours along the Morton curve, whichever is less. The image is scored with the rounded ones.
 //!
 //! `cargo run --release --example stored_coefficients -- MODEL SCENE [VIEWS]`
 
@@ -9,10 +9,9 @@
 
 use cc4dgs::core::burn::tensor::{Tensor, TensorData};
 use cc4dgs::core::gaussians::to_vec;
-use cc4dgs::core::{
-    Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, config, parse_device,
-};
-use cc4dgs::engine::{data, eval::evaluate, model::Model};
+use cc4dgs::core::{Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, parse_device};
+use cc4dgs::engine::{eval::evaluate, model::Model};
+use cc4dgs::scenes::open_as_trained;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
@@ -74,11 +73,9 @@ fn main() -> Result<()> {
     let (model, scene) = (args.next().unwrap_or_default(), args.next().unwrap_or_default());
     let views = args.next().and_then(|v| v.parse().ok()).unwrap_or(20);
     let (registry, limits, device) = (Registry::collect()?, Limits::default(), parse_device("flex")?);
-    let load = || Model::load(model.as_ref(), &registry, &device, &limits, &Silent);
+    let load = || Model::open(model.as_ref(), &registry, &device, &limits, &Silent);
     let plain = load()?;
-    let section = plain.provenance.config.get("scene").and_then(|s| s.as_table()).cloned().unwrap_or_default();
-    let options: data::SceneOptions = config::parse_section("scene", &section)?;
-    let scene = data::open(scene.as_ref(), &options, &limits)?;
+    let scene = open_as_trained(scene.as_ref(), &plain, &[], &registry, &limits)?;
     let score = |model: &Model| evaluate(model, &scene, Split::Test, views, &registry, &device, &Silent, &mut |_, _, _, _| Ok(()));
     let before = score(&plain)?;
     println!("{} moving Gaussians, field {} bytes as float32, {:.3} dB", before.dynamic_gaussians, plain.size.deform, before.psnr_db);

@@ -14,17 +14,18 @@ pub fn encode_png(image: &Image8) -> Result<Vec<u8>> {
     };
     if image.data.len() as u64 != u64::from(image.width) * u64::from(image.height) * u64::from(image.channels) || image.data.is_empty() {
         let problem = format!("{} bytes for {}x{} pixels of {} channels", image.data.len(), image.width, image.height, image.channels);
-        return Err(Error::parameter("PNG", problem, "Pass a whole picture"));
+        return Err(Error::parameter("PNG", problem, "Pass a whole image"));
     }
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes)
         .write_image(&image.data, image.width, image.height, color)
-        .map_err(|e| Error::backend("PNG encoder", e.to_string(), "Report this: every 8-bit picture should encode"))?;
+        .map_err(|e| Error::backend("PNG encoder", e.to_string(), "Report this: every 8-bit image should encode"))?;
     Ok(bytes)
 }
 
 /// Writes a PNG file, creating its folder; the file appears complete or not at all.
-pub fn write_png(path: &Path, image: &Image8) -> Result<()> {
+pub fn write_png(path: impl AsRef<Path>, image: &Image8) -> Result<()> {
+    let path = path.as_ref();
     let bytes = encode_png(image)?;
     if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
@@ -46,6 +47,6 @@ mod tests {
         assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 1, "no temporary file may stay");
         assert!(write_png(&path, &Image8 { width: 4, ..image.clone() }).is_err());
         assert_eq!(image::open(&path).unwrap().to_rgb8().into_raw(), image.data, "a failed write leaves the old file");
-        assert!(write_png(&path.join("below-a-file.png"), &image).is_err());
+        assert!(write_png(path.join("below-a-file.png"), &image).is_err());
     }
 }

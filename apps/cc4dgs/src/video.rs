@@ -4,9 +4,12 @@ use cc4dgs_core::{Error, Result};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-const REMEDY: &str = "Install ffmpeg (Debian: apt install ffmpeg), or leave --mp4 out and use the PNG frames";
+const REMEDY: &str = "Install ffmpeg (Debian: apt install ffmpeg), or use the PNG frames without a video";
 
 /// The first line `ffmpeg -version` prints, or why there is none.
+///
+/// # Errors
+/// [`Error::Unsupported`] where the command does not start.
 pub fn ffmpeg_version() -> Result<String> {
     let output = Command::new("ffmpeg").arg("-version").stdin(Stdio::null()).output();
     match output {
@@ -16,7 +19,15 @@ pub fn ffmpeg_version() -> Result<String> {
     }
 }
 
-/// Makes the video `out` of frame_00000.png to frame_`count - 1`.png in `frames`; it appears complete or not at all.
+/// Name of the image of frame `index`, as [`encode`] expects it.
+pub fn frame_name(index: usize) -> String {
+    format!("frame_{index:05}.png")
+}
+
+/// Makes the video `out` of the first `count` images in `frames`, named by [`frame_name`], at `fps` images per second; it appears complete or not at all.
+///
+/// # Errors
+/// [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] with its last message where it fails, [`Error::Io`] for a folder that cannot be written.
 pub fn encode(frames: &Path, count: usize, fps: u32, out: &Path) -> Result<()> {
     let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let part = tempfile::Builder::new().prefix(".cc4dgs-").suffix(".mp4").tempfile_in(folder).map_err(|e| Error::io(folder, e))?.into_temp_path();

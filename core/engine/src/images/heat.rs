@@ -18,8 +18,8 @@ pub fn heat_color(value: f32) -> [u8; 3] {
 pub fn error_map(reference: &Image8, render: &Image8, full_scale: f32) -> Result<Image8> {
     let size = |i: &Image8| (i.width, i.height);
     if size(reference) != size(render) {
-        let problem = format!("a picture of {:?} pixels against one of {:?}", size(reference), size(render));
-        return Err(Error::parameter("error map", problem, "Compare pictures of one size"));
+        let problem = format!("an image of {:?} pixels against one of {:?}", size(reference), size(render));
+        return Err(Error::parameter("error map", problem, "Compare images of one size"));
     }
     if full_scale.is_nan() || full_scale <= 0.0 {
         return Err(Error::parameter("error map", format!("full scale {full_scale} is not positive"), "Give a difference in 0..1, such as 0.2"));

@@ -1,0 +1,50 @@
+//! A trained model with the session it belongs to.
+
+use crate::Session;
+use cc4dgs_core::{Event, Result};
+use cc4dgs_engine::model::ArchiveOptions;
+use std::ops::{Deref, DerefMut};
+use std::path::Path;
+
+/// A model: its Gaussians, the deformer that moves them, and how they want to be drawn. Everything of [`cc4dgs_engine::model::Model`] is there as well.
+pub struct Model {
+    inner: cc4dgs_engine::model::Model,
+    session: Session,
+}
+
+impl Model {
+    /// `inner` as a model of `session`.
+    pub fn new(inner: cc4dgs_engine::model::Model, session: Session) -> Self {
+        Self { inner, session }
+    }
+    /// Writes a `.cc4d` archive with the codec `name` or `name:profile` and returns its size in bytes. The file appears complete or not at all.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`](crate::Error::Parameter) for unknown codecs and profiles, and what codec and disk report.
+    pub fn save(&self, path: impl AsRef<Path>, codec: &str) -> Result<u64> {
+        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: "fp32", scene: None })
+    }
+    /// As [`Model::save`], with settings of the codec, a codec of the field's weights, and a scene that codecs may use.
+    ///
+    /// # Errors
+    /// As [`Model::save`], and for settings the codec does not have.
+    pub fn save_with(&self, path: impl AsRef<Path>, options: &ArchiveOptions) -> Result<u64> {
+        let (path, session) = (path.as_ref(), &self.session);
+        let bytes = self.inner.save_archive(path, options, session.registry(), session.limits(), session.events())?;
+        session.events().emit(&Event::Saved { path: path.display().to_string(), bytes });
+        Ok(bytes)
+    }
+}
+
+impl Deref for Model {
+    type Target = cc4dgs_engine::model::Model;
+    fn deref(&self) -> &Self::Target {
+        &self.inner
+    }
+}
+
+impl DerefMut for Model {
+    fn deref_mut(&mut self) -> &mut Self::Target {
+        &mut self.inner
+    }
+}

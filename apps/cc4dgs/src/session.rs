@@ -1,0 +1,189 @@
+//! The front door: a session holds what every call needs, so that programs pass it once.
+
+use crate::Model;
+use crate::runs::{Existing, check_folder};
+use crate::{plugins, scenes};
+use burn::tensor::Device;
+use cc4dgs_core::SceneOptions;
+use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, Silent, Split, parse_device};
+use cc4dgs_engine::config::RunConfig;
+use cc4dgs_engine::data;
+use cc4dgs_engine::eval::{EvalReport, evaluate};
+use cc4dgs_engine::play::Player;
+use cc4dgs_engine::train::{CONFIG, TrainJob, train};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Plug-ins, limits, events and the device. Cloning shares them.
+#[derive(Clone)]
+pub struct Session {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    registry: Registry,
+    limits: Limits,
+    events: Arc<dyn EventSink>,
+    device: Device,
+    device_name: String,
+    stop: AtomicBool,
+}
+
+/// How a [`Session`] is set up; see [`Session::builder`].
+pub struct SessionBuilder {
+    device: String,
+    limits: Limits,
+    events: Arc<dyn EventSink>,
+}
+
+impl SessionBuilder {
+    /// The device to compute on: `auto` (the default: a graphics card if there is one, else `flex`), `flex`, `ndarray`, `wgpu`, `wgpu:N` or `cuda`.
+    pub fn device(mut self, name: impl Into<String>) -> Self {
+        self.device = name.into();
+        self
+    }
+    /// What readers accept of files; the default is generous for trusted files of this field.
+    pub fn limits(mut self, limits: Limits) -> Self {
+        self.limits = limits;
+        self
+    }
+    /// Who hears what happens; by default nobody.
+    pub fn events(mut self, sink: impl EventSink + 'static) -> Self {
+        self.events = Arc::new(sink);
+        self
+    }
+    /// Calls `listener` for everything that happens, from any thread.
+    pub fn on_event(self, listener: impl Fn(&Event) + Send + Sync + 'static) -> Self {
+        self.events(Listener(listener))
+    }
+    /// Collects the linked plug-ins and starts the device.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`](crate::Error::Parameter) for an unknown device and for two plug-ins of one name,
+    /// [`Error::Unsupported`](crate::Error::Unsupported) for a device that does not answer.
+    pub fn build(self) -> Result<Session> {
+        let device = parse_device(&self.device)?;
+        let (limits, events, stop) = (self.limits, self.events, AtomicBool::new(false));
+        Ok(Session { shared: Arc::new(Shared { registry: Registry::collect()?, limits, events, device, device_name: self.device, stop }) })
+    }
+}
+
+struct Listener<F>(F);
+
+impl<F: Fn(&Event) + Send + Sync> EventSink for Listener<F> {
+    fn emit(&self, event: &Event) {
+        (self.0)(event);
+    }
+}
+
+impl Session {
+    /// A session with the defaults: device `auto`, default limits, no listener.
+    ///
+    /// # Errors
+    /// As [`SessionBuilder::build`].
+    pub fn new() -> Result<Self> {
+        Self::builder().build()
+    }
+    /// Starts from the defaults.
+    pub fn builder() -> SessionBuilder {
+        SessionBuilder { device: "auto".into(), limits: Limits::default(), events: Arc::new(Silent) }
+    }
+    /// The linked plug-ins.
+    pub fn registry(&self) -> &Registry {
+        &self.shared.registry
+    }
+    /// What readers accept of files.
+    pub fn limits(&self) -> &Limits {
+        &self.shared.limits
+    }
+    /// Who hears what happens.
+    pub fn events(&self) -> &dyn EventSink {
+        self.shared.events.as_ref()
+    }
+    /// The device to compute on.
+    pub fn device(&self) -> &Device {
+        &self.shared.device
+    }
+    /// Asks a running [`Session::train`] to stop after its current iteration, with a checkpoint where it has a folder. May be called from any thread.
+    pub fn stop(&self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+    }
+    /// The settings of a preset (`demo`, `dnerf-cpu+hexplane`) with `key=value` overrides, on this session's device and limits.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`](crate::Error::Parameter) for unknown presets, unknown keys and values out of range.
+    pub fn config(&self, preset: &str, overrides: &[&str]) -> Result<RunConfig> {
+        let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
+        Ok(self.adopted(RunConfig::resolve(Some(preset), None, &overrides)?))
+    }
+    /// Opens the dataset at `path`; `procedural` and `procedural:NAME` are built in. Images are decoded later, on demand.
+    ///
+    /// # Errors
+    /// What the reader reports: options without meaning, formats that are not known, broken files, claims over the limits.
+    pub fn read_scene(&self, path: impl AsRef<Path>, options: &SceneOptions) -> Result<Scene> {
+        data::open(path.as_ref(), options, self.registry(), self.limits())
+    }
+    /// Opens the dataset at `path` as `model` was trained on it. What a stranger's model says never chooses programs to run, folders to write or memory to
+    /// take.
+    ///
+    /// # Errors
+    /// As [`Session::read_scene`].
+    pub fn open_scene(&self, path: impl AsRef<Path>, model: &Model) -> Result<Scene> {
+        scenes::open_as_trained(path.as_ref(), model, &[], self.registry(), self.limits())
+    }
+    /// Trains on `scene`. With a folder, checkpoint and configuration are left there; it must not hold a run already.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`](crate::Error::Interrupted) after [`Session::stop`], [`Error::Backend`](crate::Error::Backend) when the loss is no longer a
+    /// number, and whatever scene, plug-ins and disk report.
+    pub fn train(&self, config: &RunConfig, scene: impl Into<Arc<Scene>>, out: Option<&Path>) -> Result<Model> {
+        if let Some(folder) = out {
+            check_folder(folder, Existing::Refuse, "Choose another folder, or go on with Session::resume")?;
+        }
+        self.run(config, scene.into(), out, false)
+    }
+    /// Goes on with the run in `folder` from its checkpoint; the result is the same as without the interruption.
+    ///
+    /// # Errors
+    /// As [`Session::train`], and for a folder without a run.
+    pub fn resume(&self, scene: impl Into<Arc<Scene>>, folder: &Path) -> Result<Model> {
+        let config = RunConfig::resolve(None, Some(&folder.join(CONFIG)), &[])?;
+        self.run(&config, scene.into(), Some(folder), true)
+    }
+    fn run(&self, config: &RunConfig, scene: Arc<Scene>, out: Option<&Path>, resume: bool) -> Result<Model> {
+        let config = &self.adopted(config.clone());
+        plugins::check(config, self.registry())?;
+        self.shared.stop.store(false, Ordering::Relaxed);
+        let (registry, events, stop) = (self.registry(), self.events(), &self.shared.stop);
+        let (model, _) = train(&TrainJob { config, scene, out: out.map(Path::to_path_buf), resume, registry, events, stop })?;
+        Ok(Model::new(model, self.clone()))
+    }
+    /// The configuration with this session's device and limits.
+    fn adopted(&self, mut config: RunConfig) -> RunConfig {
+        (config.device, config.limits) = (self.shared.device_name.clone(), self.shared.limits);
+        config
+    }
+    /// Opens a model: the folder of a run, a checkpoint, an archive, a PLY or an SPZ file. The first bytes decide.
+    ///
+    /// # Errors
+    /// As [`cc4dgs_engine::model::Model::open`].
+    pub fn open(&self, path: impl AsRef<Path>) -> Result<Model> {
+        let inner = cc4dgs_engine::model::Model::open(path.as_ref(), self.registry(), self.device(), self.limits(), self.events())?;
+        Ok(Model::new(inner, self.clone()))
+    }
+    /// Uploads `model` for playback.
+    ///
+    /// # Errors
+    /// What the rasterizer says of the model's settings.
+    pub fn player<'a>(&self, model: &'a Model) -> Result<Player<'a>> {
+        Player::new(model, self.registry(), self.device())
+    }
+    /// Scores `model` against the images of one side of the scene's split.
+    ///
+    /// # Errors
+    /// As [`evaluate`].
+    pub fn evaluate(&self, model: &Model, scene: &Scene, split: Split) -> Result<EvalReport> {
+        evaluate(model, scene, split, 0, self.registry(), self.device(), self.events(), &mut |_, _, _, _| Ok(()))
+    }
+}

@@ -1,0 +1,99 @@
+//! The library as a program uses it.
+
+use cc4dgs::{Error, Event, Orbit, Session, Split};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+fn flex() -> Session {
+    Session::builder().device("flex").build().unwrap()
+}
+
+#[test]
+fn a_session_trains_saves_opens_and_plays() {
+    let heard = Arc::new(AtomicUsize::new(0));
+    let count = heard.clone();
+    let session =
+        Session::builder().device("flex").on_event(move |event| _ = count.fetch_add(usize::from(matches!(event, Event::Saved { .. })), Ordering::Relaxed));
+    let session = session.build().unwrap();
+    let config = session.config("demo", &["train.iterations=60", "scene.background=black"]).unwrap();
+    assert_eq!(config.device, "flex");
+    let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
+
+    // With and without a folder: the same bytes.
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let model = session.train(&config, scene.clone(), Some(&run)).unwrap();
+    assert!(run.join("checkpoint").is_file());
+    let alone = session.train(&config, scene.clone(), None).unwrap();
+    assert!(alone.gaussians == model.gaussians && alone.provenance == model.provenance);
+    let refused = session.train(&config, scene.clone(), Some(&run)).err().unwrap();
+    assert!(refused.to_string().contains("holds a run already"), "{refused}");
+    assert!(session.resume(scene.clone(), &run).unwrap().gaussians == model.gaussians, "a finished run has nothing left to do");
+
+    let (lower, upper) = model.bounds();
+    assert!((0..3).all(|k| lower[k] < upper[k] && lower[k] > -20.0 && upper[k] < 20.0), "{lower:?} {upper:?}");
+
+    let file = folder.path().join("model.cc4d");
+    let before = heard.load(Ordering::Relaxed);
+    assert_eq!(model.save(&file, "raw").unwrap(), std::fs::metadata(&file).unwrap().len());
+    assert_eq!(heard.load(Ordering::Relaxed), before + 1, "saving is an event");
+    let opened = session.open(&file).unwrap();
+    let orbit = Orbit { size: (40, 30), frames: 3, ..Orbit::default() };
+    let cameras = orbit.around(&model.gaussians).unwrap();
+    let (mut first, mut second) = (session.player(&model).unwrap(), session.player(&opened).unwrap());
+    for (index, camera) in cameras.iter().enumerate() {
+        let image = first.frame(camera, orbit.time(index)).unwrap();
+        assert_eq!((image.width, image.height, image.data.len()), (40, 30, 3 * 40 * 30));
+        assert!(image == second.frame(camera, orbit.time(index)).unwrap(), "a lossless archive draws the same image");
+    }
+
+    // The scene as the model was trained on it: a black background, not the scene's own.
+    let again = session.open_scene("procedural:tiny", &opened).unwrap();
+    assert_eq!(again.background, Some([0.0; 3]));
+    let report = session.evaluate(&opened, &again, Split::Test).unwrap();
+    assert_eq!(report.psnr_db, session.evaluate(&model, &scene, Split::Test).unwrap().psnr_db);
+}
+
+#[test]
+fn a_stopped_training_leaves_a_checkpoint_and_resumes() {
+    let session = flex();
+    let stopper = session.clone();
+    let stopping = Session::builder().device("flex").on_event(move |_| stopper.stop()).build().unwrap();
+    // A session stops its own trainings alone.
+    let config = stopping.config("demo", &["train.iterations=30"]).unwrap();
+    let scene = Arc::new(stopping.read_scene("procedural:tiny", &config.scene).unwrap());
+    let whole = stopping.train(&config, scene.clone(), None).unwrap();
+
+    let folder = tempfile::tempdir().unwrap();
+    let handle: Arc<std::sync::OnceLock<Session>> = Arc::default();
+    let inside = handle.clone();
+    let session = Session::builder().device("flex").on_event(move |event| match (event, inside.get()) {
+        (Event::StageFinished { .. }, Some(session)) => session.stop(),
+        _ => {}
+    });
+    let session = session.build().unwrap();
+    assert!(handle.set(session.clone()).is_ok());
+    let mut result = session.train(&config, scene.clone(), Some(folder.path()));
+    let mut stops = 0;
+    while let Err(Error::Interrupted(_)) = result {
+        stops += 1;
+        assert!(stops < 10, "it never ends");
+        result = session.resume(scene.clone(), folder.path());
+    }
+    assert!(stops > 0, "nothing was interrupted");
+    assert!(result.unwrap().gaussians == whole.gaussians, "interruption changed the result");
+}
+
+#[test]
+fn errors_are_sentences_however_they_are_printed() {
+    let session = flex();
+    for error in [
+        Session::builder().device("fleks").build().err().unwrap(),
+        session.open("no/such/model.cc4d").err().unwrap(),
+        session.config("dmeo", &[]).err().unwrap(),
+        session.config("demo", &["train.iterations=0"]).err().unwrap(),
+    ] {
+        assert_eq!(format!("{error:?}"), error.to_string());
+        assert!(error.to_string().contains(". "), "no remedy: {error}");
+    }
+}
