@@ -172,7 +172,7 @@ fn other_format(object: &str, header: &str) -> Error {
     }
 }
 
-/// What a checkpoint says of its model. The arrays are `gaussians/NAME` [N,width] per attribute and `deformer/NAME` per weight array.
+/// What a checkpoint says of its model. The arrays are `gaussians/NAME` `[N,width]` per attribute and `deformer/NAME` per weight array.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ModelHeader {
     /// Gaussians N.

@@ -29,7 +29,7 @@ impl Moving {
     }
 }
 
-/// The Gaussians that the deformer is asked about, on the device: indices [M], or all where they are `None`.
+/// The Gaussians that the deformer is asked about, on the device: indices `[M]`, or all where they are `None`.
 #[derive(Clone, Debug)]
 pub struct MovingRows {
     indices: Option<Tensor<1, Int>>,
@@ -47,7 +47,7 @@ impl MovingRows {
     pub fn count(&self) -> usize {
         self.count
     }
-    /// These rows of `values` [N,C].
+    /// These rows of `values` `[N,C]`.
     pub fn select(&self, values: Tensor<2>) -> Tensor<2> {
         match &self.indices {
             None => values,

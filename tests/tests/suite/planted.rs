@@ -2,8 +2,8 @@
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, SpatialInput,
-    conformance,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures,
+    SpatialInput, conformance,
 };
 
 /// What is wrong with [`Velocities`].
