@@ -5,7 +5,7 @@ use rayon::prelude::*;
 /// Cells per axis, as bits.
 const BITS: u32 = 21;
 
-/// The indices of the points [N,3] along the Z-curve of their bounding box; equal cells keep their order.
+/// The indices of the points `[N,3]` along the Z-curve of their bounding box; equal cells keep their order.
 pub fn order(means: &[f32]) -> Vec<usize> {
     let mut low = [f64::INFINITY; 3];
     let mut high = [f64::NEG_INFINITY; 3];

@@ -50,7 +50,7 @@ impl Default for Settings {
 struct Vq(Settings);
 
 impl Vq {
-    /// A codebook for `rows` [N,width] and which of its rows each is; `None` where it would lose too much.
+    /// A codebook for `rows` `[N,width]` and which of its rows each is; `None` where it would lose too much.
     fn book(&self, rows: &[f32], width: usize, seed: Seed) -> Option<(Vec<f32>, Vec<u32>)> {
         let n = rows.len().checked_div(width).unwrap_or(0);
         if n == 0 {

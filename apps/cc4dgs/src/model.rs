@@ -2,19 +2,19 @@
 
 use crate::Session;
 use cc4dgs_core::{Event, Result};
-use cc4dgs_engine::model::ArchiveOptions;
+use cc4dgs_play::ArchiveOptions;
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
 
-/// A model: its Gaussians, the deformer that moves them, and how they want to be drawn. Everything of [`cc4dgs_engine::model::Model`] is there as well.
+/// A model: its Gaussians, the deformer that moves them, and how they want to be drawn. Everything of [`cc4dgs_play::model::Model`] is there as well.
 pub struct Model {
-    inner: cc4dgs_engine::model::Model,
+    inner: cc4dgs_play::model::Model,
     session: Session,
 }
 
 impl Model {
     /// `inner` as a model of `session`.
-    pub fn new(inner: cc4dgs_engine::model::Model, session: Session) -> Self {
+    pub fn new(inner: cc4dgs_play::model::Model, session: Session) -> Self {
         Self { inner, session }
     }
     /// Writes a `.cc4d` archive with the codec `name` or `name:profile` and returns its size in bytes. The file appears complete or not at all.
@@ -37,7 +37,7 @@ impl Model {
 }
 
 impl Deref for Model {
-    type Target = cc4dgs_engine::model::Model;
+    type Target = cc4dgs_play::model::Model;
     fn deref(&self) -> &Self::Target {
         &self.inner
     }

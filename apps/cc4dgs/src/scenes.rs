@@ -1,8 +1,8 @@
 //! Opening a dataset as a model was trained on it.
 
 use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config};
-use cc4dgs_engine::data;
-use cc4dgs_engine::model::Model;
+use cc4dgs_play::model::Model;
+use cc4dgs_train::data;
 use std::path::Path;
 
 /// Keys of `[scene]` that a stored configuration must not choose: programs to run, folders to write, memory to take.

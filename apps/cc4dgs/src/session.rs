@@ -6,11 +6,11 @@ use crate::{plugins, scenes};
 use burn::tensor::Device;
 use cc4dgs_core::SceneOptions;
 use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, Silent, Split, parse_device};
-use cc4dgs_engine::config::RunConfig;
-use cc4dgs_engine::data;
-use cc4dgs_engine::eval::{EvalReport, evaluate};
-use cc4dgs_engine::play::Player;
-use cc4dgs_engine::train::{CONFIG, TrainJob, train};
+use cc4dgs_play::player::Player;
+use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::data;
+use cc4dgs_train::eval::{EvalReport, evaluate};
+use cc4dgs_train::train::{CONFIG, TrainJob, train};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -167,9 +167,9 @@ impl Session {
     /// Opens a model: the folder of a run, a checkpoint, an archive, a PLY or an SPZ file. The first bytes decide.
     ///
     /// # Errors
-    /// As [`cc4dgs_engine::model::Model::open`].
+    /// As [`cc4dgs_play::model::Model::open`].
     pub fn open(&self, path: impl AsRef<Path>) -> Result<Model> {
-        let inner = cc4dgs_engine::model::Model::open(path.as_ref(), self.registry(), self.device(), self.limits(), self.events())?;
+        let inner = cc4dgs_play::model::Model::open(path.as_ref(), self.registry(), self.device(), self.limits(), self.events())?;
         Ok(Model::new(inner, self.clone()))
     }
     /// Uploads `model` for playback.

@@ -199,7 +199,7 @@ fn row_weights(gaussians: &HostGaussians) -> Vec<f32> {
     raw.iter().map(|w| (w / mean.max(f64::MIN_POSITIVE)).clamp(ROW_WEIGHTS.0, ROW_WEIGHTS.1) as f32).collect()
 }
 
-/// Coefficients [N,width] from latents `z` [N,latents], the conditions and, if given, the codebook. Encoder and decoder both call this.
+/// Coefficients `[N,width]` from latents `z` `[N,latents]`, the conditions and, if given, the codebook. Encoder and decoder both call this.
 fn reconstruct(
     network: &Decoder,
     statistics: &Statistics,

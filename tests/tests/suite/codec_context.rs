@@ -8,12 +8,13 @@ use cc4dgs_core::{
     Seed, Silent, Stream, inventory,
 };
 use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
-use cc4dgs_engine::codec_services::{ModelServices, SceneViews};
-use cc4dgs_engine::config::RenderConfig;
-use cc4dgs_engine::data;
-use cc4dgs_engine::model::{ArchiveOptions, Model, ModelDeformer, ModelSize};
-use cc4dgs_engine::play::Player;
-use cc4dgs_engine::train::Moving;
+use cc4dgs_play::Moving;
+use cc4dgs_play::RenderConfig;
+use cc4dgs_play::codec_services::{ModelServices, SceneViews};
+use cc4dgs_play::model::{ModelDeformer, ModelSize};
+use cc4dgs_play::player::Player;
+use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_train::data;
 use std::path::Path;
 
 /// `raw`, and a note of what the context held.

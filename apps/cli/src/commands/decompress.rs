@@ -5,7 +5,7 @@ use crate::args::Decompress;
 use crate::models::load_model;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Event, EventSink, Result, ply, spz};
-use cc4dgs_engine::play::Player;
+use cc4dgs_play::player::Player;
 use serde_json::json;
 
 pub fn run(context: &Context, args: &Decompress) -> Result<()> {

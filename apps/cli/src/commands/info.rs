@@ -7,10 +7,10 @@ use crate::args::Info;
 use cc4dgs_core::archive::{Archive, DeformerEntry, StreamKind};
 use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::{Error, HostGaussians, Result, SceneOptions, Silent, Split, parse_device};
-use cc4dgs_engine::data;
-use cc4dgs_engine::eval::SizeMb;
-use cc4dgs_engine::model::{Model, attribute_width};
-use cc4dgs_engine::source::{Source, SourceKind};
+use cc4dgs_play::source::{Source, SourceKind};
+use cc4dgs_play::{Model, attribute_width};
+use cc4dgs_train::data;
+use cc4dgs_train::eval::SizeMb;
 use serde_json::{Value, json};
 use std::path::Path;
 

@@ -3,7 +3,7 @@
 //! * [`Shape`], [`StreamSet`], [`open`], [`assemble`], [`close`]: the frame of a codec. A `meta` stream holds a version, the number of Gaussians, the degree
 //!   and the extra attributes; a decoder reads and checks all that before it allocates anything.
 //! * [`extra_streams`], [`Shape::read_extra`]: the extra attributes of plug-ins, bit for bit or within their tolerance, in the rows that are needed.
-//! * [`column`], [`store`], [`load`], [`split`], [`interleave`]: numbers as columns of codes with few bits, outliers kept exactly beside them.
+//! * [`mod@column`], [`store`], [`load`], [`split`], [`interleave`]: numbers as columns of codes with few bits, outliers kept exactly beside them.
 //! * [`to_planes`], [`from_planes`]: float32 values, column by column.
 //! * [`write_shapes`], [`read_shapes`]: names and shapes of a field's weights.
 //!

@@ -13,7 +13,7 @@ pub fn load(path: &Path) -> Result<Scene, Error> {
 
 /// Opens with everything that is linked into the tests.
 pub fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Scene, Error> {
-    cc4dgs_engine::data::open(path, options, &Registry::collect().unwrap(), limits)
+    cc4dgs_train::data::open(path, options, &Registry::collect().unwrap(), limits)
 }
 
 /// An image whose pixel (x, y) is [x, y, marker] (and alpha).

@@ -2,12 +2,12 @@
 
 use super::common::*;
 use cc4dgs_core::{Camera, HostGaussians, Limits, Registry, Scene, Seed, Silent, Split, parse_device};
-use cc4dgs_engine::config::RunConfig;
-use cc4dgs_engine::data::procedural::ProceduralScene;
-use cc4dgs_engine::eval::evaluate;
-use cc4dgs_engine::init::initialise;
-use cc4dgs_engine::model::{ArchiveOptions, Model};
-use cc4dgs_engine::train::{TrainJob, train};
+use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::data::procedural::ProceduralScene;
+use cc4dgs_train::eval::evaluate;
+use cc4dgs_train::init::initialise;
+use cc4dgs_train::train::{TrainJob, train};
 use glam::{DMat3, DQuat, DVec3};
 use std::path::Path;
 use std::sync::Arc;
@@ -244,7 +244,7 @@ fn a_model_brings_its_frame_to_other_choices_of_the_dataset() {
     let options = cc4dgs_core::SceneOptions { frames: Some([0, 1, 1]), ..options() };
     assert_eq!(open(root.path(), &options, &Limits::default()).unwrap().normalisation, whole.normalisation);
     let other = cc4dgs_core::Similarity::centred([1e5, -1e5, 1e5], 0.5);
-    let found = cc4dgs_engine::data::open_in(root.path(), &options, &other, &registry, &Limits::default()).unwrap();
+    let found = cc4dgs_train::data::open_in(root.path(), &options, &other, &registry, &Limits::default()).unwrap();
     assert_eq!(found.normalisation, other);
     let (a, b) = (dataset_camera(&found, 0), dataset_camera(&whole, 0));
     assert!((DVec3::from(a.center_world()) - DVec3::from(b.center_world())).length() < 1e-6);

@@ -2,9 +2,9 @@
 
 use super::common::*;
 use cc4dgs_core::{Limits, Scene, SceneOptions, Seed, Split};
-use cc4dgs_engine::data::assemble;
-use cc4dgs_engine::data::init::photo_points;
-use cc4dgs_engine::data::procedural::{NAMES, ProceduralScene};
+use cc4dgs_train::data::assemble;
+use cc4dgs_train::data::init::photo_points;
+use cc4dgs_train::data::procedural::{NAMES, ProceduralScene};
 use glam::DVec3;
 use rand::Rng;
 use std::path::Path;
@@ -89,7 +89,7 @@ fn frames_can_be_finer_and_subsets_agree() {
 
 /// Distance of a point to the surface of one object at a time, by the shape's own formula.
 fn object_distance(truth: &ProceduralScene, object: usize, p: DVec3, time: f64) -> f64 {
-    use cc4dgs_engine::data::procedural::Shape;
+    use cc4dgs_train::data::procedural::Shape;
     let o = &truth.objects[object];
     let local = o.motion.pose(time).inverse_apply(p);
     match o.shape {

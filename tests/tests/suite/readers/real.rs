@@ -2,7 +2,7 @@
 
 use super::common::*;
 use cc4dgs_core::{Limits, SceneOptions, Seed, Split};
-use cc4dgs_engine::data::init::photo_points;
+use cc4dgs_train::data::init::photo_points;
 
 #[test]
 fn dnerf_mutant() {

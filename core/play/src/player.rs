@@ -193,7 +193,7 @@ impl<'a> Player<'a> {
         }
         Ok(output)
     }
-    /// The 8-bit image of rendered planes [5,H,W], read back from the device.
+    /// The 8-bit image of rendered planes `[5,H,W]`, read back from the device.
     pub fn download(&self, planes: Tensor<3>) -> Result<Image8> {
         self.rasterizer.download(planes)
     }

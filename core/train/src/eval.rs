@@ -2,11 +2,12 @@
 
 use crate::config::TrainConfig;
 use crate::masks::dynamic_masks;
-use crate::model::{Model, ModelSize};
-use crate::play::{FrameTime, PlayWork, Player};
 use burn::tensor::Device;
 use cc4dgs_core::metrics::{FrameSet, Metric, Rounding, SsimConvention};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
+use cc4dgs_play::model::ModelSize;
+use cc4dgs_play::player::{FrameTime, PlayWork};
+use cc4dgs_play::{Model, Player};
 use serde::Serialize;
 use std::collections::BTreeMap;
 

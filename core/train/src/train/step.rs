@@ -2,13 +2,13 @@
 
 use super::log::Log;
 use super::smoothness::{flicker, smoothness};
-use super::state::MovingRows;
 use super::{Context, TrainState, parameters};
 use crate::gaussian_set::{Leaves, gaussian_rate};
-use crate::model::ModelDeformer;
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Camera, Event, LossInput, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics};
+use cc4dgs_play::MovingRows;
+use cc4dgs_play::model::ModelDeformer;
 use std::collections::BTreeMap;
 
 /// What the deformer has to say about this iteration's Gaussians before a time is known.

@@ -1,10 +1,9 @@
 //! Trajectory error on a synthetic scene with known motion: trajectories of its Gaussians against the true ones, and images where the motion is, object by object.
 
 use crate::data::procedural::{Motion, ProceduralScene, Shape};
-use crate::model::Model;
-use crate::play::Player;
 use burn::tensor::Device;
 use cc4dgs_core::{Event, EventSink, HostGaussians, Registry, Result, Split};
+use cc4dgs_play::{Model, Player};
 use glam::DVec3;
 use serde::Serialize;
 

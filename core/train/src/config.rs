@@ -1,7 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
-use burn::tensor::Tensor;
-use cc4dgs_core::{Error, Limits, Registry, RenderSettings, Result, Rules, Scene, SceneOptions, config, split_kind};
+use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
+use cc4dgs_play::{RenderConfig, default_rasterizer};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -28,7 +28,7 @@ pub struct RunConfig {
     #[serde(default)]
     pub render: RenderConfig,
     /// The rasterizer plug-in: `kind` and its settings.
-    #[serde(default = "tile")]
+    #[serde(default = "default_rasterizer")]
     pub rasterizer: toml::Table,
     /// The deformation field plug-in: `kind` and its settings.
     #[serde(default = "cdf")]
@@ -83,40 +83,8 @@ fn adam() -> toml::Table {
 fn flex() -> String {
     "flex".into()
 }
-fn tile() -> toml::Table {
-    kind("tile")
-}
 fn cdf() -> toml::Table {
     kind("cdf")
-}
-
-/// How pictures are drawn, in training and afterwards.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RenderConfig {
-    /// Corner-case rules of projection and blending.
-    pub rules: Rules,
-    /// Mip-Splatting's 2D filter.
-    pub antialiased: bool,
-    /// Smallest camera depth drawn, units of the normalised frame; absent, the rules' own.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub near: Option<f32>,
-    /// Colour behind everything, RGB in 0..1; absent, the dataset's own, else white (Swift4D's choice).
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub background: Option<[f32; 3]>,
-}
-
-impl Default for RenderConfig {
-    fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None }
-    }
-}
-
-impl RenderConfig {
-    /// What a rasterizer is told; the colour behind everything comes as a tensor, `None` is black.
-    pub fn settings(&self, background: Option<Tensor<1>>) -> RenderSettings {
-        RenderSettings { rules: self.rules, antialiased: self.antialiased, near: self.near, background, ..RenderSettings::default() }
-    }
 }
 
 /// Where the points of the first Gaussians come from.

@@ -1,11 +1,10 @@
 //! Whether devices draw the same images of one model.
 
-use crate::model::Model;
-use crate::play::Player;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::metrics::{Metric, Rounding};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene};
+use cc4dgs_play::{Model, Player};
 use serde::Serialize;
 
 /// One level of an 8-bit image.

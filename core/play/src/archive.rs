@@ -1,16 +1,14 @@
-//! A trained model: canonical Gaussians, the field that moves them, and how they want to be drawn.
+//! A model as a `.cc4d` archive.
 
-use crate::checkpoint;
 use crate::codec_services::{ModelServices, SceneViews};
-use crate::config::{RenderConfig, RunConfig};
-use crate::source::{Source, SourceKind};
-use crate::train::{Moving, TrainState};
+use crate::model::{Model, ModelDeformer, ModelSize};
+use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, Provenance, RasterizerEntry, StreamKind};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed,
-    Similarity, Stream, TrainingViews, WeightArray, config, ply, split_kind, spz,
+    CodecContext, DeclaredLoss, Deformer, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
+    WeightArray, split_kind,
 };
 use serde::Serialize;
 use serde_json::Value;
@@ -21,30 +19,6 @@ use std::path::Path;
 const MOVING: &str = "moving";
 /// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
 const ATTRIBUTES: &str = "attributes";
-
-/// A model, wherever it came from.
-pub struct Model {
-    /// The canonical Gaussians.
-    pub gaussians: HostGaussians,
-    /// The deformation field, absent from static models.
-    pub field: Option<ModelDeformer>,
-    /// What may move.
-    pub moving: Moving,
-    /// How it wants to be drawn.
-    pub render: RenderConfig,
-    /// Colour behind everything, RGB in 0..1; `None` where the file does not say (PLY and SPZ). See [`Model::background_on`].
-    pub background: Option<[f32; 3]>,
-    /// The `[rasterizer]` section.
-    pub rasterizer: toml::Table,
-    /// Frames in the sequence.
-    pub frame_count: usize,
-    /// From the coordinates of the dataset to those of the model.
-    pub normalisation: Similarity,
-    /// Where it came from.
-    pub provenance: Provenance,
-    /// Bytes per share.
-    pub size: ModelSize,
-}
 
 /// How [`Model::save_archive`] stores a model.
 pub struct ArchiveOptions<'a> {
@@ -62,137 +36,9 @@ pub struct ArchiveOptions<'a> {
 /// Weights of a field are stored in streams of these names, before the names that the weight codec gave them.
 const FIELD_STREAMS: &str = "field.";
 
-/// A field with what is needed to build it again.
-pub struct ModelDeformer {
-    /// The field.
-    pub field: Box<dyn Deformer>,
-    /// Its `[deformer]` section.
-    pub section: toml::Table,
-    /// What it was built with.
-    pub context: DeformerContext,
-}
-
-impl ModelDeformer {
-    /// Its name in the registry.
-    pub fn name(&self) -> &str {
-        self.section.get("kind").and_then(|kind| kind.as_str()).unwrap_or("without a name")
-    }
-}
-
-/// Sizes in bytes. For archives, PLY and SPZ files these are bytes on disk, headers included in `total`; for a checkpoint the float32 size of what playback
-/// needs.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct ModelSize {
-    /// Weights of the field: spatial encoding (the paper's Deform-Grid).
-    pub deform_grid: u64,
-    /// Weights of the field: everything else (the paper's Deform-Net).
-    pub deform_net: u64,
-    /// The field as stored.
-    pub deform: u64,
-    /// The Gaussians as stored.
-    pub point_cloud: u64,
-    /// Everything.
-    pub total: u64,
-}
-
 impl Model {
-    /// Opens the folder of a run, a checkpoint, a `.cc4d` archive, a PLY file of 3D Gaussian splatting or an SPZ file; the first bytes decide which
-    /// ([`SourceKind`]). PLY and SPZ files become static models, drawn by the default rasterizer.
-    ///
-    /// # Errors
-    /// [`Error::Data`] for files that are no model or damaged, [`Error::Unsupported`] for versions and plug-ins this program does not have,
-    /// [`Error::Limit`] for claims over `limits`.
-    pub fn open(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
-        let Source { kind, file } = Source::expect(path)?;
-        match kind {
-            SourceKind::Checkpoint => Self::from_checkpoint(&file, registry, device, limits),
-            SourceKind::Archive => Self::from_archive(&file, registry, device, limits, events),
-            SourceKind::Ply => {
-                let (gaussians, remarks) = ply::read_reporting(&file, limits)?;
-                for message in remarks {
-                    events.emit(&Event::Note { object: file.display().to_string(), message });
-                }
-                Self::from_static(gaussians, file_bytes(&file)?)
-            }
-            SourceKind::Spz => {
-                let (object, bytes) = (file.display().to_string(), file_bytes(&file)?);
-                limits.check_bytes(&object, bytes)?;
-                let content = std::fs::read(&file).map_err(|e| Error::io(&file, e))?;
-                Self::from_static(spz::from_spz(&object, &content, limits)?, bytes)
-            }
-        }
-    }
-    /// A static model of `gaussians` that take `bytes` in their file.
-    fn from_static(gaussians: HostGaussians, bytes: u64) -> Result<Self> {
-        let defaults: RunConfig = config::parse_section("configuration", &toml::Table::new())?;
-        Ok(Self {
-            gaussians,
-            field: None,
-            moving: Moving::Nothing,
-            render: defaults.render,
-            background: None,
-            rasterizer: defaults.rasterizer,
-            frame_count: 1,
-            normalisation: Similarity::IDENTITY,
-            provenance: Provenance::default(),
-            size: ModelSize { point_cloud: bytes, total: bytes, ..Default::default() },
-        })
-    }
-    /// The background it is drawn on: its own, else that of the scene whose images it is compared with, else black as in 3D Gaussian splatting.
-    pub fn background_on(&self, scene: Option<[f32; 3]>) -> [f32; 3] {
-        self.background.or(scene).unwrap_or_default()
-    }
-    /// Lower and upper corner of the box around all canonical centres, world units; zeros without Gaussians.
-    pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
-        let corner = |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
-            let axis = |k: usize| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
-            std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k) })
-        };
-        (corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max))
-    }
-    /// Bytes of Gaussians and field as float32, whatever the model was read from.
-    pub fn float32_size(&self) -> ModelSize {
-        let (deform_grid, deform_net) = self.field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
-        let extra = self.gaussians.extra.values().map(|a| a.values.len()).sum::<usize>();
-        let floats = self.gaussians.columns().iter().map(|(_, _, v)| v.len()).sum::<usize>() + extra;
-        let (deform, point_cloud) = (deform_grid + deform_net, 4 * floats as u64);
-        ModelSize { deform_grid, deform_net, deform, point_cloud, total: deform + point_cloud }
-    }
-    fn from_checkpoint(path: &Path, registry: &Registry, device: &Device, limits: &Limits) -> Result<Self> {
-        let stored = checkpoint::load(path, registry, device, limits)?;
-        let config = stored.config().clone();
-        let (gaussians, moving, frame_count, normalisation) = (stored.gaussians()?, stored.moving(), stored.frame_count(), stored.normalisation());
-        Self::assembled(gaussians, stored.into_deformer(), moving, frame_count, normalisation, &config)
-    }
-    /// The model that a run ends with.
-    pub fn from_training(state: TrainState, config: &RunConfig) -> Result<Self> {
-        let frame_count = state.deformer.as_ref().map_or(1, |d| d.context.frame_count);
-        Self::assembled(state.set.host_gaussians()?, state.deformer, state.moving, frame_count, state.normalisation, config)
-    }
-    fn assembled(
-        gaussians: HostGaussians,
-        field: Option<ModelDeformer>,
-        moving: Moving,
-        frame_count: usize,
-        normalisation: Similarity,
-        config: &RunConfig,
-    ) -> Result<Self> {
-        let mut model = Self {
-            gaussians,
-            field,
-            moving,
-            background: Some(config.background()?),
-            render: config.render.clone(),
-            rasterizer: config.rasterizer.clone(),
-            frame_count,
-            normalisation,
-            provenance: provenance(config)?,
-            size: ModelSize::default(),
-        };
-        model.size = model.float32_size();
-        Ok(model)
-    }
-    fn from_archive(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
+    /// Reads the archive at `path`.
+    pub(crate) fn from_archive(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
         let archive = Archive::open(path, limits)?;
         let object = path.display().to_string();
         let manifest = archive.manifest().clone();
@@ -261,10 +107,6 @@ impl Model {
             size,
         })
     }
-    /// Brings Gaussians of this model into the coordinates of the dataset it was trained on, as other programs expect them.
-    pub fn to_dataset(&self, gaussians: &mut HostGaussians) {
-        self.normalisation.inverse().apply_gaussians(gaussians);
-    }
     /// Writes a `.cc4d` archive and returns its size in bytes.
     pub fn save_archive(&self, path: &Path, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
         let ArchiveOptions { codec: spec, settings, field_weights, scene } = *options;
@@ -311,8 +153,8 @@ impl Model {
                 settings: rasterizer_settings,
             },
             frame_count: self.frame_count,
-            time_range: [0.0, 1.0],
             normalisation: self.normalisation,
+            time_range: [0.0, 1.0],
             box_world: [lower, upper],
             background: self.background_on(None),
             sh_degree: self.gaussians.sh_degree,
@@ -388,10 +230,6 @@ fn json(value: &impl Serialize) -> Result<Value> {
     serde_json::to_value(value).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))
 }
 
-fn file_bytes(path: &Path) -> Result<u64> {
-    Ok(std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len())
-}
-
 /// The version of the linked plug-in that `object` names, or an error that says what to link.
 fn linked(object: &str, kind: &str, name: &str, version: &str, registry: &Registry) -> Result<&'static str> {
     let plugins = registry.plugins();
@@ -438,9 +276,4 @@ fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightArray
         parameter.value = Tensor::from_data(TensorData::new(array.values, [len]), device);
     }
     Ok(())
-}
-
-fn provenance(config: &RunConfig) -> Result<Provenance> {
-    let table = config.to_toml()?.parse().unwrap_or_default();
-    Ok(Provenance { commit: env!("CC4DGS_COMMIT").into(), seed: config.seed, device: config.device.clone(), config: table })
 }

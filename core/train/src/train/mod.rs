@@ -11,18 +11,20 @@ mod smoothness;
 mod state;
 mod step;
 
-pub use state::{Moving, MovingRows, Parts, TrainState};
+pub use state::{Parts, TrainState};
 
 use crate::checkpoint;
 use crate::config::{CoarseFrames, Dynamic, RunConfig};
 use crate::gaussian_set::GaussianSet;
 use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
-use crate::model::{Model, ModelDeformer};
 use crate::schedule::StageLengths;
 use burn::tensor::Device;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{AppearanceContext, Error, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, check_attributes, parse_device};
+use cc4dgs_play::checkpoint::CHECKPOINT;
+use cc4dgs_play::model::ModelDeformer;
+use cc4dgs_play::{Model, Moving};
 use losses::LossTerms;
 use sampler::{Prefetcher, Sampler};
 use serde::Serialize;
@@ -32,8 +34,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Name of the checkpoint inside a run's folder.
-pub const CHECKPOINT: &str = "checkpoint";
 /// Name of the configuration inside a run's folder.
 pub const CONFIG: &str = "config.toml";
 
@@ -173,7 +173,7 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
         dynamic_gaussians,
         checkpoint: context.checkpoint.clone(),
     };
-    Ok((Model::from_training(state, config)?, report))
+    Ok((checkpoint::trained_model(state, config)?, report))
 }
 
 /// Index among the training cameras, by index in the scene.

@@ -1,8 +1,7 @@
-//! The engine: readers, initialisation, the three-stage trainer, checkpoints, playback, evaluation. It names no concrete plug-in.
+//! Training and evaluation: readers, initialisation, the three-stage trainer, its checkpoints, scores of whole scenes. Plug-ins are named only in defaults.
 
 pub mod agreement;
 pub mod checkpoint;
-pub mod codec_services;
 pub mod config;
 pub mod data;
 pub mod eval;
@@ -11,11 +10,7 @@ pub mod images;
 pub mod init;
 pub mod knn;
 pub mod masks;
-pub mod model;
-pub mod play;
-pub use cc4dgs_core::ply;
 pub mod presets;
 pub mod schedule;
-pub mod source;
 pub mod train;
 pub mod trajectory;

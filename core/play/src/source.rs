@@ -1,6 +1,6 @@
 //! What a file holds, by its first bytes: the one place that tells models apart.
 
-use crate::train::CHECKPOINT;
+use crate::checkpoint::CHECKPOINT;
 use cc4dgs_core::archive::MAGIC;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
