@@ -3,7 +3,7 @@
 //!
 //! From a start along a space-filling curve, pairs of places swap contents wherever both come closer to what lies around, looked at ever more closely.
 
-use cc4dgs_core::{HostGaussians, Seed};
+use cc4dgs_format::{HostGaussians, Seed};
 
 /// Numbers compared per Gaussian: centre, log-scales, colour.
 const FEATURES: usize = 9;

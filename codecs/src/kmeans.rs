@@ -1,6 +1,6 @@
 //! K-means with k-means++ seeding (Arthur and Vassilvitskii 2007) and Lloyd iterations, the same bytes for any number of threads.
 
-use cc4dgs_core::Seed;
+use cc4dgs_format::Seed;
 use rand::Rng;
 use rayon::prelude::*;
 

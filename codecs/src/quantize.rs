@@ -1,14 +1,16 @@
 //! `quantize`: each component of each attribute by itself, in even steps between percentiles. No model, no training; what a cleverer codec must beat.
 
-use crate::column::{self, Column, Target};
 use crate::morton;
-use crate::rows::{interleave, load, split, store};
-use crate::streams::{ESCAPES, Shape, assemble, close, open};
-use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
+use cc4dgs_format::storage::{
+    ESCAPES, Shape, assemble, close,
+    column::{self, Column, Target},
+    interleave, load, open, split, store,
+};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
 
 /// Version of the stored form.
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 /// Share of the values at either end that may be kept exactly, beside the steps.
 const TAIL: f64 = 1e-3;
 /// A step is at most so many standard deviations times 2^-bits wide, or more bits are taken: percentiles of long-tailed values lie some ten deviations apart.
@@ -132,7 +134,7 @@ impl AttributeCodec for Quantize {
     }
 }
 
-fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
     Ok(Box::new(Quantize { bits: Bits::from_settings("quantize", profile, settings)? }))
 }
 
@@ -140,7 +142,7 @@ inventory::submit! {
     CodecPlugin {
         info: Plugin {
             name: "quantize",
-            version: "1",
+            version: "2",
             summary: "every component by itself in 6 to 16 bits, no training",
             paper: "the simple base line",
             schema: SCHEMA,

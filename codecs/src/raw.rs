@@ -1,11 +1,11 @@
 //! `raw`: every attribute as float32, bit-exact and in order.
 
-use crate::streams::{META, Shape, from_planes, open, to_planes};
-use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
+use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams, from_planes, open, to_planes};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
 
 /// Version of the stored form.
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 
 struct Raw;
 
@@ -16,7 +16,7 @@ impl AttributeCodec for Raw {
         Shape::of(gaussians).write(&mut meta)?;
         let mut streams = vec![Stream { name: META.into(), bytes: meta }];
         streams.extend(gaussians.columns().into_iter().map(|(name, width, values)| Stream { name: name.into(), bytes: to_planes(values, width) }));
-        streams.extend(Shape::extra_streams(gaussians));
+        streams.extend(extra_streams(gaussians, Attributes::Exact));
         Ok(streams)
     }
 
@@ -41,7 +41,7 @@ impl AttributeCodec for Raw {
 #[serde(deny_unknown_fields)]
 struct Settings {}
 
-fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
     if !matches!(profile, "" | "default") {
         return Err(unknown_name("profile of codec raw", profile, ["default"].into_iter()));
     }
@@ -53,7 +53,7 @@ inventory::submit! {
     CodecPlugin {
         info: Plugin {
             name: "raw",
-            version: "1",
+            version: "2",
             summary: "float32, bit-exact",
             paper: "the uncompressed base line",
             schema: "# no settings\n",

@@ -2,19 +2,21 @@
 //!
 //! Steps are those of `quantize`; only the order and the coder differ, so that the two codecs measure what pictures are worth.
 
-use crate::column::{self, Column};
 use crate::grid_sort::{side_of, square_order};
 use crate::morton;
 use crate::quantize::Bits;
-use crate::rows::{interleave, load, split, store};
-use crate::streams::{ESCAPES, Shape, assemble, close, open};
-use cc4dgs_core::archive::ByteReader;
-use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
+use cc4dgs_format::archive::ByteReader;
+use cc4dgs_format::storage::{
+    ESCAPES, Shape, assemble, close,
+    column::{self, Column},
+    interleave, load, open, split, store,
+};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
 use png::{BitDepth, ColorType, Decoder, Encoder, Filter, Limits as PngLimits};
 use std::io::Cursor;
 
 /// Version of the stored form.
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 
 /// The last chunk of every PNG file.
 const END: [u8; 12] = [0, 0, 0, 0, b'I', b'E', b'N', b'D', 0xae, 0x42, 0x60, 0x82];
@@ -138,7 +140,7 @@ impl AttributeCodec for SortedImage {
     }
 }
 
-fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
     Ok(Box::new(SortedImage { bits: Bits::from_settings("sorted-image", profile, settings)? }))
 }
 
@@ -146,7 +148,7 @@ inventory::submit! {
     CodecPlugin {
         info: Plugin {
             name: "sorted-image",
-            version: "1",
+            version: "2",
             summary: "Gaussians sorted into a square, every component a PNG picture of it",
             paper: "Self-Organizing Gaussian Grids (Morgenstern et al. 2024); gsplat's PNG compression",
             schema: crate::quantize::SCHEMA,

@@ -3,18 +3,20 @@
 //! A codebook is worth its bytes only where rows resemble each other. Where the best codebook loses more than is declared, the attribute is stored in even
 //! steps instead.
 
-use crate::column::{self, Target};
-use crate::rows::{interleave, load, split, store};
-use crate::streams::{ESCAPES, Shape, assemble, close, from_planes, open, to_planes};
 use crate::{kmeans, morton};
-use cc4dgs_core::{
+use cc4dgs_format::storage::{
+    ESCAPES, Shape, assemble, close,
+    column::{self, Target},
+    from_planes, interleave, load, open, split, store, to_planes,
+};
+use cc4dgs_format::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, config, inventory, unknown_name,
 };
 use rand::seq::index::sample;
 use serde::Deserialize;
 
 /// Version of the stored form.
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 /// The attributes that get codebooks.
 const BOOKS: [&str; 3] = ["log_scales", "quaternions", "sh_rest"];
 /// What the others may lose, by their bits.
@@ -143,7 +145,7 @@ impl AttributeCodec for Vq {
     }
 }
 
-fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
     if !matches!(profile, "" | "default") {
         return Err(unknown_name("profile of codec vq", profile, ["default"].into_iter()));
     }
@@ -162,7 +164,7 @@ inventory::submit! {
     CodecPlugin {
         info: Plugin {
             name: "vq",
-            version: "1",
+            version: "2",
             summary: "codebooks for scales, rotations and colours, even steps for the rest",
             paper: "CompGS (Navaneet et al. 2024)",
             schema: SCHEMA,

@@ -2,8 +2,12 @@
 
 use crate::Session;
 use cc4dgs_core::{Event, Result};
+use cc4dgs_engine::model::ArchiveOptions;
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
+
+/// The weight codec of [`Model::save`]: exact.
+const FIELD_WEIGHTS: &str = "fp32";
 
 /// A model: its Gaussians, the deformer that moves them, and how they want to be drawn. Everything of [`cc4dgs_engine::model::Model`] is there as well.
 pub struct Model {
@@ -21,15 +25,15 @@ impl Model {
     /// # Errors
     /// [`Error::Parameter`](crate::Error::Parameter) for unknown codecs and profiles, and what codec and disk report.
     pub fn save(&self, path: impl AsRef<Path>, codec: &str) -> Result<u64> {
-        self.save_with(path, codec, &toml::Table::new())
+        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None })
     }
-    /// As [`Model::save`], with settings of the codec.
+    /// As [`Model::save`], with settings of the codec, a weight codec for the deformer, and the scene for codecs that make use of it.
     ///
     /// # Errors
     /// As [`Model::save`], and for settings the codec does not have.
-    pub fn save_with(&self, path: impl AsRef<Path>, codec: &str, settings: &toml::Table) -> Result<u64> {
+    pub fn save_with(&self, path: impl AsRef<Path>, options: &ArchiveOptions) -> Result<u64> {
         let (path, session) = (path.as_ref(), &self.session);
-        let bytes = self.inner.save_archive(path, codec, settings, session.registry(), session.limits(), session.events())?;
+        let bytes = self.inner.save_archive(path, options, session.registry(), session.limits(), session.events())?;
         session.events().emit(&Event::Saved { path: path.display().to_string(), bytes });
         Ok(bytes)
     }

@@ -109,9 +109,12 @@ pub struct Compress {
     /// Override a setting of the codec; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// How the field's weights are stored: fp32, fp16, or int8 with a scale per 64 values.
-    #[arg(long, value_enum, default_value_t = PrecisionArg::Fp32)]
-    pub field_weights: PrecisionArg,
+    /// Weight codec of the field, such as fp32, fp16 or int8; see `cc4dgs plugins`.
+    #[arg(long, value_name = "NAME", default_value = "fp32")]
+    pub field_weights: String,
+    /// The dataset that the model was trained on, for codecs that make use of its training views.
+    #[arg(long, value_name = "PATH")]
+    pub scene: Option<PathBuf>,
     /// The archive to write.
     #[arg(long, value_name = "F.cc4d")]
     pub out: PathBuf,
@@ -233,24 +236,6 @@ pub struct Plugins {
 
 #[derive(Debug, Args)]
 pub struct Doctor {}
-
-/// How a field's weights are stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum PrecisionArg {
-    Fp32,
-    Fp16,
-    Int8,
-}
-
-impl From<PrecisionArg> for cc4dgs_core::archive::WeightPrecision {
-    fn from(precision: PrecisionArg) -> Self {
-        match precision {
-            PrecisionArg::Fp32 => Self::Fp32,
-            PrecisionArg::Fp16 => Self::Fp16,
-            PrecisionArg::Int8 => Self::Int8,
-        }
-    }
-}
 
 /// The two sides of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

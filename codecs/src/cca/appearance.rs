@@ -5,13 +5,15 @@ use super::network::{Decoder, Scratch, decoder_len, latents};
 use super::profile::{Profile, Settings};
 use super::shard::Data;
 use super::train;
-use crate::column::{self, Column, Target};
 use crate::kmeans;
-use crate::rows::{interleave, load, split, store};
-use crate::streams::StreamSet;
-use cc4dgs_core::archive::{ByteReader, estimate_stored_len};
-use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{CodecContext, Event, HostGaussians, Result, Stream};
+use cc4dgs_format::archive::{ByteReader, estimate_stored_len};
+use cc4dgs_format::gaussians::sh_rest_len;
+use cc4dgs_format::storage::{
+    StreamSet,
+    column::{self, Column, Target},
+    interleave, load, split, store,
+};
+use cc4dgs_format::{CodecContext, Event, HostGaussians, Result, Stream};
 use half::f16;
 use rayon::prelude::*;
 
@@ -25,12 +27,12 @@ const DECODER: &str = "sh_rest.decoder";
 const CODEBOOK: &str = "sh_rest.codebook";
 const RESIDUALS: &str = "sh_rest.residuals";
 
-/// Share of a latent's values at either end beyond its quantiser (fact sheet, section 10 row 41).
+/// Share of a latent's values at either end beyond its quantiser.
 const LATENT_TAIL: f64 = 1e-4;
-/// Samples and iterations of the residual codebook (row 42).
+/// Samples and iterations of the residual codebook.
 const CODEBOOK_SAMPLES: usize = 50_000;
 const CODEBOOK_ITERATIONS: usize = 25;
-/// A Gaussian counts at least and at most this many times the average one in training (row 40).
+/// A Gaussian counts at least and at most this many times the average one in training.
 const ROW_WEIGHTS: (f64, f64) = (0.2, 5.0);
 
 /// Encodes the coefficients of `gaussians`; `known` is what the decoder will have by then.

@@ -1,11 +1,13 @@
 //! The quantised path: log-scales, opacity logits, quaternions, dynamic scores; and the conditions made of them.
 
 use super::profile::Profile;
-use crate::column::{self, Column, Target};
-use crate::rows::{interleave, load, split, store};
-use crate::streams::StreamSet;
-use cc4dgs_core::archive::ByteReader;
-use cc4dgs_core::{HostGaussians, Result, Stream};
+use cc4dgs_format::archive::ByteReader;
+use cc4dgs_format::storage::{
+    StreamSet,
+    column::{self, Column, Target},
+    interleave, load, split, store,
+};
+use cc4dgs_format::{HostGaussians, Result, Stream};
 
 /// Share of a scalar column's values at either end that may be kept as outliers.
 const TAIL: f64 = 5e-4;

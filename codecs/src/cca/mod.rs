@@ -1,4 +1,4 @@
-//! `cca`: compression of canonical attributes (paper Section IV-D; open numbers from the fact sheet, section 10 rows 35 to 46).
+//! `cca`: compression of canonical attributes (paper Section IV-D; numbers that the paper leaves open are chosen here).
 //!
 //! Three paths. Positions and degree-0 colours stay float32. Log-scales, opacity logits and quaternions are quantised per component, dynamic
 //! scores after mu-law companding. The higher colour coefficients pass through a conditional autoencoder whose latents are quantised; what it
@@ -8,7 +8,7 @@
 //! * Gaussians are stored in Morton order of their positions; their order carries no meaning and neighbours compress together.
 //! * Quaternions are split into a unit part, whose sign is kept, and a norm, because deformation offsets are added before normalisation and
 //!   so both matter. A model with unit quaternions pays nothing for the norms.
-//! * Quantisers keep outliers exactly instead of clamping them (see `column`).
+//! * Quantisers keep outliers exactly instead of clamping them (see [`cc4dgs_format::storage::column`]).
 //! * Coefficients go without autoencoder, at 16 bits each or exactly, where that takes fewer bytes (few Gaussians, low degrees) or where the
 //!   autoencoder would lose more than [`AttributeCodec::losses`] declares.
 
@@ -21,12 +21,12 @@ mod shard;
 mod train;
 
 use crate::morton;
-use crate::streams::{ESCAPES, META, Shape, StreamSet, from_planes, to_planes};
-use cc4dgs_core::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
+use cc4dgs_format::storage::{Attributes, ESCAPES, META, Shape, extra_streams, from_planes, open, to_planes};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, inventory};
 pub use profile::{Profile, Settings};
 
 /// Version of the stored form.
-const VERSION: u8 = 1;
+const VERSION: u8 = 2;
 
 /// The codec with its profile and settings.
 #[derive(Clone, Debug)]
@@ -48,20 +48,14 @@ impl AttributeCodec for Cca {
         let (geometry, known) = geometry::encode(&sorted, &self.profile, &mut meta, &mut escapes);
         streams.extend(geometry);
         streams.extend(appearance::encode(&sorted, &known, &self.profile, &self.settings, context, &mut meta, &mut escapes)?);
-        streams.extend(Shape::extra_streams(&sorted));
+        streams.extend(extra_streams(&sorted, Attributes::AsAllowed));
         streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
         streams.insert(0, Stream { name: META.into(), bytes: meta });
         Ok(streams)
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let set = StreamSet::new("cca", streams);
-        let mut meta = set.reader(META)?;
-        let version = meta.u8()?;
-        if version != VERSION {
-            return Err(Error::unsupported("cca streams", format!("version {version} is not {VERSION}"), "Use a release of cc4dgs that knows it"));
-        }
-        let shape = Shape::read(&mut meta, &context.limits)?;
+        let (set, mut meta, shape) = open("cca", streams, VERSION, &context.limits)?;
         let mut escapes = set.reader(ESCAPES)?;
         let mut out = HostGaussians {
             sh_degree: shape.sh_degree,
@@ -90,7 +84,7 @@ impl AttributeCodec for Cca {
     }
 }
 
-fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
     Ok(Box::new(Cca { profile: Profile::named(profile)?, settings: Settings::parse(settings)? }))
 }
 
@@ -98,7 +92,7 @@ inventory::submit! {
     CodecPlugin {
         info: Plugin {
             name: "cca",
-            version: "1",
+            version: "2",
             summary: "conditional autoencoder and residual codebook for colours, selective quantisation for the rest",
             paper: "CC-4DGS, Section IV-D",
             schema: profile::SCHEMA,

@@ -1,7 +1,7 @@
 //! The networks of the autoencoder and the inference both sides of the codec share.
 //!
 //! Encoder: coefficients and conditions, two hidden layers, latents. Decoder: latents and conditions, two hidden layers, coefficients; GELU
-//! after each hidden layer (paper Section IV-D; widths from the fact sheet, section 10 rows 35 to 39).
+//! after each hidden layer (paper Section IV-D, which leaves the widths open).
 //!
 //! The decoder must give the same bits wherever it runs, because the residual codebook is made from its output. So it is plain float32:
 //! each sum runs over its inputs in order, nothing is contracted or reassociated, and the exponential is a polynomial of such operations.

@@ -4,7 +4,7 @@
 //! linear one has nothing to forget and is useful after any number of training steps, even none.
 
 use super::network::{HALF, Layer};
-use cc4dgs_core::Seed;
+use cc4dgs_format::Seed;
 use rand::Rng;
 
 /// Eigenvalues, largest first, and eigenvectors (one per row) of the symmetric matrix `a` [n,n], by cyclic Jacobi rotations.

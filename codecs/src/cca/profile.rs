@@ -1,6 +1,6 @@
 //! Bit budgets (paper, table of the CCA bitrate sweep) and the encoder's effort.
 
-use cc4dgs_core::{Error, Result, config, unknown_name};
+use cc4dgs_format::{Error, Result, config, unknown_name};
 use serde::Deserialize;
 
 /// Bits per quantised value, codebook size, and the loss that is allowed to each attribute.
@@ -75,7 +75,7 @@ impl Settings {
     /// Reads a configuration table; unknown keys and values out of range are errors.
     pub fn parse(table: &toml::Table) -> Result<Self> {
         let settings: Self = config::parse_section("codec cca", table)?;
-        if !(1..=100_000).contains(&settings.epochs) || !(1..=10_000_000_000).contains(&settings.sample_budget) {
+        if !(1..=100_000).contains(&settings.epochs) || !(1..=10_000_000_000).contains(&(settings.sample_budget as u64)) {
             return Err(Error::parameter(
                 "codec cca",
                 format!("epochs {} or sample_budget {} is out of range", settings.epochs, settings.sample_budget),

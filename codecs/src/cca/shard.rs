@@ -2,7 +2,7 @@
 
 use super::geometry::CONDITIONS;
 use super::network::{HALF, Layer, decoder, encoder, gelu_with_slopes, latents};
-use cc4dgs_core::Seed;
+use cc4dgs_format::Seed;
 use gemm::Parallelism;
 use rand::Rng;
 

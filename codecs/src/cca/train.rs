@@ -7,7 +7,7 @@ use super::network::{HALF, decoder, encoder};
 use super::principal::{eigen, linear_half};
 use super::profile::Settings;
 use super::shard::{Data, Net, SHARD, Shard, backward, forward, half};
-use cc4dgs_core::{Event, EventSink, Seed};
+use cc4dgs_format::{Event, EventSink, Seed};
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
@@ -181,7 +181,7 @@ fn total_loss(net: &Net, parameters: &[f32], data: &Data) -> f64 {
 mod tests {
     use super::super::geometry::CONDITIONS;
     use super::*;
-    use cc4dgs_core::Silent;
+    use cc4dgs_format::Silent;
     use rand::Rng;
 
     fn toy(n: usize, width: usize) -> (Vec<f32>, Vec<[f32; CONDITIONS]>) {

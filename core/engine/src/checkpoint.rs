@@ -282,7 +282,7 @@ fn gaussians(header: &ModelHeader, object: &str, limits: &Limits, array: &dyn Fn
         if CORE_ATTRIBUTES.contains(&name.as_str()) {
             host.columns_mut().into_iter().filter(|(known, _, _)| known == name).for_each(|(_, _, slot)| slot.clone_from(&values));
         } else {
-            host.extra.insert(name.clone(), ExtraAttribute { width: *width, values });
+            host.extra.insert(name.clone(), ExtraAttribute::exact(*width, values));
         }
     }
     host.validate(object, limits)?;

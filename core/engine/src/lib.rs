@@ -2,6 +2,7 @@
 
 pub mod agreement;
 pub mod checkpoint;
+pub mod codec_services;
 pub mod config;
 pub mod data;
 pub mod eval;
@@ -12,7 +13,7 @@ pub mod knn;
 pub mod masks;
 pub mod model;
 pub mod play;
-pub mod ply;
+pub use cc4dgs_core::ply;
 pub mod presets;
 pub mod schedule;
 pub mod source;

@@ -1,19 +1,16 @@
 //! A trained model: canonical Gaussians, the field that moves them, and how they want to be drawn.
 
 use crate::checkpoint;
+use crate::codec_services::{ModelServices, SceneViews};
 use crate::config::{RenderConfig, RunConfig};
-use crate::ply;
 use crate::source::{Source, SourceKind};
 use crate::train::{Moving, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_codecs::spz;
-use cc4dgs_core::archive::{
-    Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, Provenance, RasterizerEntry, StreamKind, WeightArray, WeightPrecision, decode_weights,
-    encode_weights,
-};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, Provenance, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    CodecContext, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Seed, Stream, config, split_kind,
+    CodecContext, DeclaredLoss, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream,
+    TrainingViews, WeightArray, config, ply, split_kind, spz,
 };
 use serde::Serialize;
 use serde_json::Value;
@@ -45,9 +42,23 @@ pub struct Model {
     pub provenance: Provenance,
     /// Bytes per share.
     pub size: ModelSize,
-    /// How the field's weights are written to archives.
-    pub weight_precision: WeightPrecision,
 }
+
+/// How [`Model::save_archive`] stores a model.
+pub struct ArchiveOptions<'a> {
+    /// Codec of the Gaussians: `name` or `name:profile`.
+    pub codec: &'a str,
+    /// Settings of that codec.
+    pub settings: &'a toml::Table,
+    /// Name of the weight codec of the field.
+    pub field_weights: &'a str,
+    /// The scene that the model was trained on and the device that its field is on, for codecs that make use of the training views, of renders and of the
+    /// field. Every codec works without.
+    pub scene: Option<(&'a Scene, &'a Device)>,
+}
+
+/// Weights of a field are stored in streams of these names, before the names that the weight codec gave them.
+const FIELD_STREAMS: &str = "field.";
 
 /// A field with what is needed to build it again.
 pub struct ModelDeformer {
@@ -122,7 +133,6 @@ impl Model {
             frame_count: 1,
             provenance: Provenance::default(),
             size: ModelSize { point_cloud: bytes, total: bytes, ..Default::default() },
-            weight_precision: WeightPrecision::default(),
         })
     }
     /// The background it is drawn on: its own, else that of the scene whose images it is compared with, else black as in 3D Gaussian splatting.
@@ -167,7 +177,6 @@ impl Model {
             frame_count,
             provenance: provenance(config)?,
             size: ModelSize::default(),
-            weight_precision: WeightPrecision::default(),
         };
         model.size = model.float32_size();
         Ok(model)
@@ -180,7 +189,7 @@ impl Model {
         let codec = linked(&object, "codec", &manifest.codec.name, &manifest.codec.version, registry)?;
         check_version(&object, "codec", &manifest.codec.name, &manifest.codec.version, codec)?;
         let codec = registry.build_codec(&spec, &manifest.codec.settings)?;
-        let context = CodecContext { seed: codec_seed(manifest.provenance.seed), limits: *limits, events };
+        let context = CodecContext::new(codec_seed(manifest.provenance.seed), *limits, events);
         let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
         gaussians.validate(&object, limits)?;
         if gaussians.len() as u64 != manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
@@ -201,9 +210,7 @@ impl Model {
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
                 let mut field = registry.build_deformer(&section, &entry.context, device)?;
-                let stored = archive.stream_sizes();
-                let precision = WeightPrecision::ALL.into_iter().find(|p| stored.iter().any(|s| s.name == p.stream())).unwrap_or_default();
-                let weights = decode_weights(&object, &archive.read_stream(precision.stream())?, precision, limits)?;
+                let weights = read_weights(&archive, &object, &entry.weights, registry, limits, events)?;
                 load_weights(&object, field.as_mut(), weights, device)?;
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
             }
@@ -240,15 +247,22 @@ impl Model {
             frame_count: manifest.frame_count,
             provenance: manifest.provenance.clone(),
             size,
-            weight_precision: WeightPrecision::default(),
         })
     }
-    /// Writes a `.cc4d` archive with the codec `spec` (`name` or `name:profile`) and returns its size in bytes.
-    pub fn save_archive(&self, path: &Path, spec: &str, settings: &toml::Table, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
+    /// Writes a `.cc4d` archive and returns its size in bytes.
+    pub fn save_archive(&self, path: &Path, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
+        let ArchiveOptions { codec: spec, settings, field_weights, scene } = *options;
         let codec = registry.build_codec(spec, settings)?;
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
-        let context = CodecContext { seed: codec_seed(self.provenance.seed), limits: *limits, events };
-        let streams = codec.encode(&self.gaussians, &context)?;
+        let views = scene.map(|(scene, _)| SceneViews::new(scene));
+        let services = scene.map(|(_, device)| ModelServices::new(self, registry, device)).transpose()?;
+        let context = |seed: Seed| CodecContext {
+            views: views.as_ref().map(|v| v as &dyn TrainingViews),
+            renderer: services.as_ref().map(|s| s as &dyn cc4dgs_core::RenderModel),
+            deformer: services.as_ref().filter(|_| self.field.is_some()).map(|s| s as &dyn cc4dgs_core::EvaluateDeformer),
+            ..CodecContext::new(seed, *limits, events)
+        };
+        let streams = codec.encode(&self.for_codec(&codec.losses()), &context(codec_seed(self.provenance.seed)))?;
         // A field that moves nothing is not stored.
         let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
         let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
@@ -257,7 +271,9 @@ impl Model {
             Some(f) => {
                 let (name, settings) = split_kind("deformer", &f.section)?;
                 let version = registry.deformer(&name)?.info.version.to_string();
-                Some(DeformerEntry { name, version, settings, context: f.context.clone() })
+                let weight_version = registry.weight_codec(field_weights)?.info.version.to_string();
+                let weights = CodecEntry { name: field_weights.into(), version: weight_version, ..Default::default() };
+                Some(DeformerEntry { name, version, settings, context: f.context.clone(), weights })
             }
         };
         let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
@@ -291,11 +307,58 @@ impl Model {
         };
         let mut writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams);
         if let Some(f) = field {
-            let bytes = encode_weights(&weights_of(f.field.as_ref())?, self.weight_precision)?;
-            writer = writer.add(StreamKind::Field, Stream { name: self.weight_precision.stream().into(), bytes });
+            let codec = registry.build_weight_codec(field_weights, &toml::Table::new())?;
+            let streams = codec.encode(&weights_of(f.field.as_ref())?, &context(weight_seed(self.provenance.seed)))?;
+            writer = writer.add_all(StreamKind::Field, streams.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s }));
         }
         writer.write_to(path)
     }
+    /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move. `losses` are the codec's.
+    fn for_codec(&self, losses: &[DeclaredLoss]) -> HostGaussians {
+        let mut out = self.gaussians.clone();
+        let Some(field) = &self.field else { return out };
+        // A score just under the threshold may come back over it.
+        let slack = losses.iter().find(|l| l.attribute == "dynamic_scores").map_or(0.0, |l| SCORE_SLACK * l.relative_rms * deviation(&out.dynamic_scores));
+        let moving = match self.moving {
+            Moving::Scored { zeta } => Moving::Scored { zeta: zeta - slack as f32 },
+            other => other,
+        };
+        let needed = moving.rows(&out.dynamic_scores).map(|rows| {
+            let mut needed = vec![false; out.len()];
+            rows.into_iter().for_each(|row| needed[row] = true);
+            needed
+        });
+        for spec in field.field.attributes() {
+            if let Some(attribute) = out.extra.get_mut(&spec.name) {
+                attribute.tolerance = spec.tolerance;
+                attribute.needed = needed.clone().map(|rows| NeededRows { rows, start: spec.start });
+            }
+        }
+        out
+    }
+}
+
+/// Attributes are kept of Gaussians whose score is under the threshold by at most so many root-mean-square errors of the codec.
+const SCORE_SLACK: f64 = 6.0;
+
+fn deviation(values: &[f32]) -> f64 {
+    let n = values.len().max(1) as f64;
+    let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
+    (values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n).sqrt()
+}
+
+fn weight_seed(root: u64) -> Seed {
+    Seed::root(root).child("weight-codec")
+}
+
+/// The field's weights, decoded by the codec that the manifest names.
+fn read_weights(archive: &Archive, object: &str, entry: &CodecEntry, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
+    check_version(object, "weight codec", &entry.name, &entry.version, linked(object, "weight-codec", &entry.name, &entry.version, registry)?)?;
+    let codec = registry.build_weight_codec(&entry.name, &entry.settings)?;
+    let streams = archive.read_kind(StreamKind::Field)?;
+    let streams: Vec<Stream> =
+        streams.into_iter().filter_map(|s| Some(Stream { name: s.name.strip_prefix(FIELD_STREAMS)?.to_string(), bytes: s.bytes })).collect();
+    codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events))
 }
 
 /// Floats per Gaussian of all plug-in attributes that the archive of `manifest` holds.

@@ -1,6 +1,6 @@
 //! Appearance: what lies between the rendered image and the one a camera recorded.
 
-use crate::plugin::Plugin;
+use crate::Plugin;
 use crate::{Parameter, ParameterGroup, Result, Seed};
 use burn::tensor::{Device, Tensor};
 
@@ -43,4 +43,4 @@ pub struct AppearancePlugin {
     /// Builds the model from the `[appearance]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table, &AppearanceContext, &Device) -> Result<Box<dyn Appearance>>,
 }
-crate::plugin_kind!(AppearancePlugin, "appearance");
+cc4dgs_format::plugin_kind!(AppearancePlugin, "appearance");

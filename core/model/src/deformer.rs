@@ -1,25 +1,9 @@
 //! The first seam: deformation fields.
 
 use crate::gaussians::CORE_ATTRIBUTES;
-use crate::plugin::Plugin;
-use crate::{Error, Offsets, Result, Seed};
+use crate::{DeformerContext, Error, Offsets, Plugin, Result};
 use burn::tensor::{Device, Int, Tensor};
 use serde::{Deserialize, Serialize};
-
-/// What a field must know of its scene before its weights mean anything. Stored in checkpoints and archives.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct DeformerContext {
-    /// Lower corner of the box the field covers, world units.
-    pub box_min: [f32; 3],
-    /// Upper corner of the box the field covers, world units.
-    pub box_max: [f32; 3],
-    /// The number of frames of the sequence (sets temporal bandwidth).
-    pub frame_count: usize,
-    /// Spherical-harmonics degree of the Gaussians it will move.
-    pub sh_degree: usize,
-    /// The field's own node of the seed tree.
-    pub seed: Seed,
-}
 
 /// Which share of the stored bytes a parameter counts towards (the paper's Deform-Grid and Deform-Net).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -262,4 +246,4 @@ pub struct DeformerPlugin {
     /// Builds a fresh field. The table is the `[deformer]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>,
 }
-crate::plugin_kind!(DeformerPlugin, "deformer");
+cc4dgs_format::plugin_kind!(DeformerPlugin, "deformer");

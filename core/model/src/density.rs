@@ -3,8 +3,8 @@
 //! A control sees statistics of the rendered views and answers with a [`DensityPlan`]. The trainer carries the plan out, so that attributes of plug-ins, optimizer state and
 //! checkpoints are handled in one place.
 
+use crate::Plugin;
 use crate::gaussians::to_vec;
-use crate::plugin::Plugin;
 use crate::{Error, Gaussians, Result, Schedule, Seed};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
@@ -222,7 +222,7 @@ pub struct DensityPlugin {
     /// Builds the control from the `[density]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table) -> Result<Box<dyn DensityControl>>,
 }
-crate::plugin_kind!(DensityPlugin, "density");
+cc4dgs_format::plugin_kind!(DensityPlugin, "density");
 
 #[cfg(test)]
 mod tests {

@@ -1,8 +1,7 @@
 //! Devices by name.
 
 use crate::adapters::auto_device;
-use crate::error::{Error, Result};
-use crate::plugin::unknown_name;
+use crate::{Error, Result, unknown_name};
 use burn::tensor::Device;
 
 /// The device names a configuration may use. `wgpu:N` is the N-th adapter of `cc4dgs doctor`, `wgpu` the first.
@@ -66,7 +65,7 @@ mod tests {
 #[cfg(feature = "wgpu")]
 mod adapter {
     use crate::adapters::adapters;
-    use crate::error::{Error, Result};
+    use crate::{Error, Result};
     use burn::tensor::{Device, DeviceKind, Tensor};
     use std::collections::BTreeMap;
     use std::sync::Mutex;

@@ -1,6 +1,6 @@
 //! Loss terms: what training minimises, as a weighted sum.
 
-use crate::plugin::Plugin;
+use crate::Plugin;
 use crate::{Gaussians, Result, Schedule};
 use burn::tensor::Tensor;
 
@@ -35,7 +35,7 @@ pub struct LossPlugin {
     /// Terms without settings that this one computes together, in one pass: their weighted sum.
     pub fuses: Option<Fusion>,
 }
-crate::plugin_kind!(LossPlugin, "loss");
+cc4dgs_format::plugin_kind!(LossPlugin, "loss");
 
 /// How a term stands for several others.
 pub struct Fusion {

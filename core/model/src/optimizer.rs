@@ -1,6 +1,6 @@
 //! Optimizers: from gradients to new values. The state (moments, step counts) belongs to the optimizer and is found by the name of the array.
 
-use crate::plugin::Plugin;
+use crate::Plugin;
 use crate::{Error, Result};
 use burn::tensor::{Int, Tensor};
 use std::collections::BTreeMap;
@@ -53,7 +53,7 @@ pub struct OptimizerPlugin {
     /// Builds the optimizer from the `[optimizer]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table) -> Result<Box<dyn Optimizer>>,
 }
-crate::plugin_kind!(OptimizerPlugin, "optimizer");
+cc4dgs_format::plugin_kind!(OptimizerPlugin, "optimizer");
 
 /// The state array `name`, or an error that names it.
 pub fn state_array(state: &mut OptimizerState, name: &str) -> Result<Tensor<2>> {

@@ -1,24 +1,10 @@
 //! Rasterizers: the trait, its inputs and outputs.
 
 use crate::gaussians::to_vec;
-use crate::plugin::Plugin;
-use crate::{Camera, Error, Gaussians, Image8, Result};
+use crate::{Camera, Error, Gaussians, Image8, Plugin, Result, Rules};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
-
-/// Which reference implementation's rules decide the corner cases of projection and blending.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Rules {
-    /// gsplat 1.6: near 0.01, 3.33 sigma per axis, alpha cap 0.99 without gradient beyond the cap.
-    #[default]
-    Gsplat099,
-    /// gsplat up to 1.5.3: as above with the cap at 0.999.
-    Gsplat0999,
-    /// Inria: near 0.2, square of 3 sigma of the major axis, alpha cap 0.99 that the gradient ignores.
-    Inria,
-}
 
 /// Whether the parameters of [`Splats`] are raw or activated.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -193,4 +179,4 @@ pub struct RasterizerPlugin {
     /// Builds the rasterizer from the `[rasterizer]` section without `kind`.
     pub build: fn(&toml::Table) -> Result<Box<dyn Rasterizer>>,
 }
-crate::plugin_kind!(RasterizerPlugin, "rasterizer");
+cc4dgs_format::plugin_kind!(RasterizerPlugin, "rasterizer");

@@ -1,9 +1,8 @@
 //! All plug-ins that are linked in, collected once into a value. A name taken twice and a name unknown are errors.
 
-use crate::plugin::{Entries, Plugin, split_kind};
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, DensityControl, DensityPlugin,
-    LossPlugin, Optimizer, OptimizerPlugin, Rasterizer, RasterizerPlugin, Result,
+    Entries, LossPlugin, Optimizer, OptimizerPlugin, Plugin, Rasterizer, RasterizerPlugin, Result, WeightCodec, WeightCodecPlugin, split_kind,
 };
 use burn::tensor::Device;
 
@@ -16,6 +15,7 @@ pub struct Registry {
     losses: Entries<LossPlugin>,
     appearances: Entries<AppearancePlugin>,
     optimizers: Entries<OptimizerPlugin>,
+    weight_codecs: Entries<WeightCodecPlugin>,
 }
 
 impl Registry {
@@ -29,11 +29,12 @@ impl Registry {
             losses: Entries::collect()?,
             appearances: Entries::collect()?,
             optimizers: Entries::collect()?,
+            weight_codecs: Entries::collect()?,
         })
     }
     /// All entries as (kind, facts), sorted.
     pub fn plugins(&self) -> Vec<(&'static str, &'static Plugin)> {
-        let model = self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts());
+        let model = self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts());
         let training = self.density.facts().chain(self.losses.facts()).chain(self.appearances.facts()).chain(self.optimizers.facts());
         model.chain(training).collect()
     }
@@ -84,6 +85,10 @@ impl Registry {
         let (kind, settings) = split_kind("optimizer", section)?;
         (self.optimizer(&kind)?.build)(&settings)
     }
+    /// The weight codec called `name`.
+    pub fn weight_codec(&self, name: &str) -> Result<&'static WeightCodecPlugin> {
+        self.weight_codecs.get(name)
+    }
     /// Builds the deformer of a `[deformer]` section (`kind` and its settings).
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
         let (kind, settings) = split_kind("deformer", section)?;
@@ -98,5 +103,9 @@ impl Registry {
     pub fn build_codec(&self, spec: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
         (self.codec(name)?.build)(profile, settings)
+    }
+    /// Builds the weight codec called `name` with `settings`.
+    pub fn build_weight_codec(&self, name: &str, settings: &toml::Table) -> Result<Box<dyn WeightCodec>> {
+        (self.weight_codec(name)?.build)(settings)
     }
 }

@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use rand::Rng;
 
 fn context() -> CodecContext<'static> {
-    CodecContext { seed: Seed::root(11), limits: Limits::default(), events: &Silent }
+    CodecContext::new(Seed::root(11), Limits::default(), &Silent)
 }
 
 /// Every codec with every profile it says it has.
@@ -52,7 +52,7 @@ fn scene(n: usize, sh_degree: usize, seed: u64) -> HostGaussians {
         let factors: Vec<f32> = (0..8).map(|k| 0.1 * normal() / (1.0 + k as f32) + 0.1 * (p[k % 3] + k as f32).sin()).collect();
         g.sh_rest.extend((0..rest).map(|c| (0..8).map(|k| factors[k] * basis[8 * c + k]).sum::<f32>() + 0.01 * normal()));
     }
-    g.extra.insert("embedding".into(), ExtraAttribute { width: 2, values: (0..2 * n).map(|i| i as f32).collect() });
+    g.extra.insert("embedding".into(), ExtraAttribute::exact(2, (0..2 * n).map(|i| i as f32).collect()));
     g
 }
 
@@ -62,7 +62,7 @@ const MARK: &str = "mark";
 /// Decodes, and puts the original into the order the codec chose, if it reorders.
 fn round_trip(name: &str, codec: &dyn AttributeCodec, g: &HostGaussians) -> (HostGaussians, HostGaussians, Vec<Stream>) {
     let mut g = g.clone();
-    g.extra.insert(MARK.into(), ExtraAttribute { width: 1, values: (0..g.len()).map(|i| i as f32).collect() });
+    g.extra.insert(MARK.into(), ExtraAttribute::exact(1, (0..g.len()).map(|i| i as f32).collect()));
     let streams = codec.encode(&g, &context()).unwrap_or_else(|e| panic!("{name}: {e}"));
     let decoded = codec.decode(&streams, &context()).unwrap_or_else(|e| panic!("{name}: {e}"));
     let order: Vec<usize> = decoded.extra[MARK].values.iter().map(|v| *v as usize).collect();
@@ -282,7 +282,7 @@ fn hostile_autoencoder_streams_never_panic() {
 fn report_bytes_of_a_trained_model() {
     let data = std::env::var_os("CC4DGS_DATA").map_or_else(|| std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), Into::into);
     let path = data.join("playbot_31k/lod3_decoded_3dgs.ply");
-    let trained = path.exists().then(|| cc4dgs_engine::ply::read(&path, &Limits::default()).unwrap());
+    let trained = path.exists().then(|| cc4dgs_core::ply::read(&path, &Limits::default()).unwrap());
     if trained.is_none() {
         println!("{} is absent", path.display());
     }

@@ -55,6 +55,14 @@ fn every_codec_conforms() {
 }
 
 #[test]
+fn every_weight_codec_conforms() {
+    let registry = Registry::collect().unwrap();
+    let names: Vec<&str> = registry.plugins().into_iter().filter(|(kind, _)| *kind == "weight-codec").map(|(_, p)| p.name).collect();
+    let findings: Vec<String> = names.iter().flat_map(|name| conformance::weight_codec(registry.weight_codec(name).unwrap(), &toml::Table::new())).collect();
+    assert!(findings.is_empty() && names.len() >= 3, "{names:?}\n{}", findings.join("\n"));
+}
+
+#[test]
 fn every_rasterizer_conforms() {
     let registry = Registry::collect().unwrap();
     let mut findings = Vec::new();

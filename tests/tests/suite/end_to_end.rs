@@ -2,17 +2,16 @@
 
 use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
-use cc4dgs_core::archive::WeightPrecision;
 use cc4dgs_core::{Error, Event, EventSink, Limits, Recorder, Registry, Scene, Silent, Split};
 use cc4dgs_engine::agreement::agreement;
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::eval::{EvalReport, evaluate};
-use cc4dgs_engine::model::Model;
+use cc4dgs_engine::model::{ArchiveOptions, Model};
 use cc4dgs_engine::play::Player;
 use cc4dgs_engine::train::{CHECKPOINT, TrainJob, TrainReport, train};
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, LazyLock};
 
 /// The demo, shrunk: every stage runs, every mechanism fires at least once.
 fn tiny(extra: &[&str]) -> RunConfig {
@@ -23,6 +22,12 @@ fn tiny(extra: &[&str]) -> RunConfig {
             .collect();
     sets.extend(extra.iter().map(ToString::to_string));
     RunConfig::resolve(Some("demo"), None, &sets).unwrap()
+}
+
+/// Storage by `codec` and the weight codec `field_weights`, without a scene.
+fn options<'a>(codec: &'a str, field_weights: &'a str) -> ArchiveOptions<'a> {
+    static NO_SETTINGS: LazyLock<toml::Table> = LazyLock::new(toml::Table::new);
+    ArchiveOptions { codec, settings: &NO_SETTINGS, field_weights, scene: None }
 }
 
 fn open(config: &RunConfig) -> Arc<Scene> {
@@ -91,7 +96,7 @@ fn same_seed_gives_the_same_bytes_and_resuming_does_too() {
     let registry = Registry::collect().unwrap();
     let archives = [(&a, "a.cc4d"), (&b, "b.cc4d")].map(|(run, name)| {
         let path = folder.path().join(name);
-        load(run).save_archive(&path, "cca:default", &toml::Table::new(), &registry, &Limits::default(), &Silent).unwrap();
+        load(run).save_archive(&path, &options("cca:default", "fp32"), &registry, &Limits::default(), &Silent).unwrap();
         std::fs::read(path).unwrap()
     });
     assert!(archives[0] == archives[1], "archives of equal checkpoints differ");
@@ -218,7 +223,7 @@ fn every_field_trains_resumes_plays_and_is_archived() {
         let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
         assert!(bytes(&whole) == bytes(&parts), "{method}: resuming ends in other bytes");
 
-        let mut model = load(&whole);
+        let model = load(&whole);
         if let Some(field) = &model.field {
             for spec in field.field.attributes() {
                 let own = &model.gaussians.extra[&spec.name];
@@ -231,17 +236,12 @@ fn every_field_trains_resumes_plays_and_is_archived() {
         }
         let before = score(&model, &config).psnr_db;
         let mut deform = Vec::new();
-        for (precision, allowed) in WeightPrecision::ALL.into_iter().zip([1e-3, 0.05, 0.5]) {
-            let archive = folder.path().join(format!("{method}-{}.cc4d", precision.name()));
-            model.weight_precision = precision;
-            model.save_archive(&archive, "raw", &toml::Table::new(), &registry, &Limits::default(), &Silent).unwrap();
+        for (precision, allowed) in [("fp32", 1e-3), ("fp16", 0.05), ("int8", 0.5)] {
+            let archive = folder.path().join(format!("{method}-{precision}.cc4d"));
+            model.save_archive(&archive, &options("raw", precision), &registry, &Limits::default(), &Silent).unwrap();
             let stored = load(&archive);
             let after = score(&stored, &config).psnr_db;
-            assert!(
-                before.is_finite() && (before - after).abs() < allowed,
-                "{method}: {before} dB, {after} from the archive with {} weights",
-                precision.name()
-            );
+            assert!(before.is_finite() && (before - after).abs() < allowed, "{method}: {before} dB, {after} from the archive with {precision} weights");
             deform.push(stored.size.deform);
         }
         let weightless = model.field.as_ref().is_none_or(|f| f.field.parameters().is_empty());

@@ -1,7 +1,8 @@
 //! K-means and mu-law against scikit-learn and torchaudio.
 
-use cc4dgs_codecs::{kmeans, mulaw};
+use cc4dgs_codecs::kmeans;
 use cc4dgs_core::Seed;
+use cc4dgs_core::storage::mulaw;
 use safetensors::SafeTensors;
 use std::path::PathBuf;
 

@@ -5,6 +5,7 @@
 mod baselines;
 mod basis;
 mod cdf;
+mod codec_context;
 mod codecs;
 mod conformance;
 mod end_to_end;
@@ -13,7 +14,6 @@ mod golden_geometry;
 mod golden_metrics;
 mod golden_raster;
 mod golden_training;
-mod hostile_archive;
 mod image;
 mod lookup;
 mod raster;

@@ -3,10 +3,11 @@
 use super::{Context, create_parent, megabytes};
 use crate::args::Compress;
 use crate::models::load_model;
+use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
 use cc4dgs_core::{Event, EventSink, Result, config};
 use cc4dgs_engine::eval::SizeMb;
-use cc4dgs_engine::model::{Model, ModelSize};
+use cc4dgs_engine::model::{ArchiveOptions, Model, ModelSize};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -49,19 +50,27 @@ impl From<StreamInfo> for StreamSize {
 
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let events = context.listeners(None)?;
-    let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    loaded.model.weight_precision = args.field_weights.into();
+    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let mut settings = toml::Table::new();
     config::set_all(&mut settings, &args.sets)?;
-    let report = compress(context, &loaded.model, &args.codec, &settings, &args.out, &events)?;
+    // An unknown name is refused before the scene is read.
+    context.registry.weight_codec(&args.field_weights)?;
+    let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.limits)).transpose()?;
+    let options = ArchiveOptions {
+        codec: &args.codec,
+        settings: &settings,
+        field_weights: &args.field_weights,
+        scene: scene.as_ref().map(|scene| (scene, &loaded.device)),
+    };
+    let report = compress(context, &loaded.model, &options, &args.out, &events)?;
     context.output.result(&report, || text(&report))
 }
 
 /// Writes `model` to the archive `out` and reads its directory back.
-pub fn compress(context: &Context, model: &Model, codec: &str, settings: &toml::Table, out: &Path, events: &dyn EventSink) -> Result<CompressReport> {
+pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out: &Path, events: &dyn EventSink) -> Result<CompressReport> {
     let began = Instant::now();
     create_parent(out)?;
-    let bytes = model.save_archive(out, codec, settings, &context.registry, &context.limits, events)?;
+    let bytes = model.save_archive(out, options, &context.registry, &context.limits, events)?;
     events.emit(&Event::Saved { path: out.display().to_string(), bytes });
     let seconds = began.elapsed().as_secs_f64();
     let stored = Archive::open(out, &context.limits)?.stream_sizes();
@@ -69,7 +78,7 @@ pub fn compress(context: &Context, model: &Model, codec: &str, settings: &toml::
     let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.float32_size() };
     Ok(CompressReport {
         archive: out.to_path_buf(),
-        codec: codec.to_string(),
+        codec: options.codec.to_string(),
         gaussians: model.gaussians.len(),
         bytes,
         size_mb: size.into(),

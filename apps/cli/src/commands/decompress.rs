@@ -3,11 +3,9 @@
 use super::{Context, create_parent, megabytes};
 use crate::args::Decompress;
 use crate::models::load_model;
-use cc4dgs_codecs::spz;
 use cc4dgs_core::archive::write_atomically;
-use cc4dgs_core::{Error, Event, EventSink, Result};
+use cc4dgs_core::{Error, Event, EventSink, Result, ply, spz};
 use cc4dgs_engine::play::Player;
-use cc4dgs_engine::ply;
 use serde_json::json;
 
 pub fn run(context: &Context, args: &Decompress) -> Result<()> {

@@ -10,12 +10,14 @@ use cc4dgs::runs::{EVENTS, Existing};
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Result, Split};
+use cc4dgs_engine::model::ArchiveOptions;
 use cc4dgs_engine::train::TrainReport;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 const CODEC: &str = "cca:default";
+const FIELD_WEIGHTS: &str = "fp32";
 
 /// What the demo reports, and writes as `report.json`.
 #[derive(Serialize)]
@@ -48,7 +50,8 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let events = context.listeners(Some((&args.out.join(EVENTS), true)))?;
     let archive = args.out.join("model.cc4d");
     let loaded = load_model(&args.out, &config.device, &context.registry, &context.limits, &events)?;
-    let packed = compress::compress(context, &loaded.model, CODEC, &toml::Table::new(), &archive, &events)?;
+    let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None };
+    let packed = compress::compress(context, &loaded.model, &options, &archive, &events)?;
 
     let scene = open_as_trained(scene_path, &loaded.model, &[], &context.limits)?;
     let plain = Images::default();

@@ -2,21 +2,16 @@
 //!
 //! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data.
 
-mod codec;
 mod deformer;
 mod rasterizer;
 
-pub use codec::codec;
+pub use cc4dgs_format::conformance::{codec, weight_codec};
 pub use deformer::deformer;
 pub use rasterizer::rasterizer;
 
 use crate::Seed;
 use burn::tensor::{Device, Tensor, TensorData};
-
-/// A number of the `k`-th draw of a stream, uniform in -1..1.
-fn uniform(seed: Seed, k: usize) -> f32 {
-    (seed.index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
-}
+use cc4dgs_format::conformance::uniform;
 
 /// [rows, width] uniform in -1..1.
 fn matrix(seed: Seed, rows: usize, width: usize, device: &Device) -> Tensor<2> {

@@ -1,4 +1,3 @@
-//! A deformer and a codec that cc4dgs knows nothing of.
+//! A deformer that cc4dgs knows nothing of.
 
-mod half;
 mod sway;

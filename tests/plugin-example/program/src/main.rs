@@ -1,5 +1,6 @@
-//! The whole `cc4dgs` command with the plug-ins of `sway` beside its own.
+//! The whole `cc4dgs` command with the plug-ins of `sway` and `half-floats` beside its own.
 
+use half_floats as _;
 use sway as _;
 
 fn main() -> std::process::ExitCode {

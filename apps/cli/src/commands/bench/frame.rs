@@ -106,7 +106,6 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         frame_count: SEQUENCE,
         provenance: Provenance::default(),
         size: ModelSize::default(),
-        weight_precision: Default::default(),
     };
     let mut player = Player::new(&model, &context.registry, device)?;
     let playback = time_playback(&mut player, args.frames as usize, |frame| (&camera, frame as f32 / SEQUENCE as f32))?;

@@ -1,7 +1,7 @@
-//! The second seam: attribute codecs.
+//! The seam of attribute codecs: Gaussians to bytes and back.
 
 use crate::plugin::Plugin;
-use crate::{EventSink, HostGaussians, Limits, Result, Seed};
+use crate::{CodecContext, HostGaussians, Result};
 use serde::{Deserialize, Serialize};
 
 /// A named run of bytes. The size of a model is the sum of these lengths after the archive's compression, never an estimate.
@@ -22,21 +22,13 @@ pub struct DeclaredLoss {
     pub relative_rms: f64,
 }
 
-/// What a codec is handed besides the Gaussians.
-pub struct CodecContext<'a> {
-    /// The codec's own node of the seed tree.
-    pub seed: Seed,
-    /// What a decoder may believe.
-    pub limits: Limits,
-    /// Where progress goes.
-    pub events: &'a dyn EventSink,
-}
-
 /// Gaussians to bytes and back (paper Section IV-D for `cca`).
 pub trait AttributeCodec: Send + Sync {
-    /// Encodes all attributes. Must be deterministic in the Gaussians, the configuration and the seed.
+    /// Encodes all attributes. Must be deterministic in the Gaussians, the configuration, the seed and what else `context` holds.
+    ///
+    /// [`HostGaussians::extra`] must survive as far as each attribute asks for: bit for bit, or within its tolerance, and in the rows that are needed.
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>>;
-    /// Decodes what [`AttributeCodec::encode`] wrote. Bytes are hostile: an error, never a panic.
+    /// Decodes what [`AttributeCodec::encode`] wrote. Bytes are hostile: an error, never a panic. A player decodes without views, renderer and field.
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>;
     /// What is lost, per attribute; an attribute not named is bit-exact.
     fn losses(&self) -> Vec<DeclaredLoss>;

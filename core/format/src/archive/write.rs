@@ -4,7 +4,6 @@ use super::packing::pack;
 use super::{FORMAT_VERSION, MAGIC, Manifest, StreamKind};
 use crate::{Error, Result, Stream};
 use rayon::prelude::*;
-use std::io::Write;
 use std::path::Path;
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -75,8 +74,20 @@ impl ArchiveWriter {
 }
 
 /// Writes `bytes` to a temporary name in the folder of `path`, flushes them to the disk and renames. On any failure `path` is what it was before.
+///
+/// On `wasm32` there is no file system: the call is an error, and [`ArchiveWriter::to_bytes`] and its likes are what to use.
 pub fn write_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
-    let path = path.as_ref();
+    write_file(path.as_ref(), bytes)
+}
+
+#[cfg(target_arch = "wasm32")]
+fn write_file(path: &Path, _bytes: &[u8]) -> Result<()> {
+    Err(Error::unsupported(path.display().to_string(), "this build has no file system to write to", "Take the bytes with to_bytes() and store them"))
+}
+
+#[cfg(not(target_arch = "wasm32"))]
+fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
+    use std::io::Write;
     let folder = match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),

@@ -2,7 +2,7 @@
 
 use super::uniform;
 use crate::gaussians::sh_rest_len;
-use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, Result, Seed, Silent, Stream};
+use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, NeededRows, Result, Seed, Silent, Stream};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Name of the extra attribute that tells the Gaussians apart after a codec has reordered them.
@@ -10,8 +10,8 @@ const MARK: &str = "conformance-mark";
 /// Damaged versions of each stream that are tried.
 const DAMAGES: usize = 24;
 
-/// Holds a codec to its promises: unknown settings are refused; what comes back has the same Gaussians (in any order), the same extra attributes bit for bit,
-/// and loses of each column at most what is declared; the same input gives the same bytes; no Gaussians and a single one come back; Gaussians that are not
+/// Holds a codec to its promises: unknown settings are refused; what comes back has the same Gaussians (in any order), the same extra attributes (bit for bit,
+/// or as far as [`ExtraAttribute`] allows), and loses of each column at most what is declared; the same input gives the same bytes; no Gaussians and a single one come back; Gaussians that are not
 /// finite are refused; streams that are truncated, damaged or missing give an error or sound Gaussians, never a panic, and never more than the limits allow.
 ///
 /// `profile` is what follows the colon of `name:profile`; `settings` can make an expensive codec quick.
@@ -39,7 +39,7 @@ pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec
 }
 
 fn context() -> CodecContext<'static> {
-    CodecContext { seed: Seed::root(7).child("conformance"), limits: Limits::default(), events: &Silent }
+    CodecContext::new(Seed::root(7).child("conformance"), Limits::default(), &Silent)
 }
 
 /// Clustered Gaussians with colours that have some structure, marked by an extra attribute.
@@ -59,8 +59,13 @@ fn scene(count: usize, sh_degree: usize) -> HostGaussians {
         g.sh_rest.extend((0..rest).map(|c| 0.2 * (p[c % 3] + c as f32).sin() + 0.02 * draw(14 + c)));
         g.dynamic_scores.push(if i % 5 == 0 { 8.0 + draw(100) } else { 0.3 * draw(100) });
     }
-    g.extra.insert(MARK.into(), ExtraAttribute { width: 1, values: (0..count).map(|i| i as f32).collect() });
-    g.extra.insert("conformance-pair".into(), ExtraAttribute { width: 2, values: (0..2 * count).map(|i| 0.1 + i as f32).collect() });
+    g.extra.insert(MARK.into(), ExtraAttribute::exact(1, (0..count).map(|i| i as f32).collect()));
+    g.extra.insert("conformance-pair".into(), ExtraAttribute::exact(2, (0..2 * count).map(|i| 0.1 + i as f32).collect()));
+    let wave = || ExtraAttribute::exact(3, (0..3 * count).map(|i| (0.37 * i as f32).sin()).collect());
+    g.extra.insert("conformance-near".into(), wave().within(1e-3));
+    let moving = || (0..count).map(|i| i % 5 == 0).collect();
+    g.extra.insert("conformance-moving".into(), wave().needed_in(moving(), 0.25));
+    g.extra.insert("conformance-near-moving".into(), wave().within(0.02).needed_in(moving(), -0.5));
     g
 }
 
@@ -99,8 +104,13 @@ fn comes_back(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Optio
         return Ok(Some("extra attributes were changed".into()));
     }
     let expected = given.select(&order);
-    if expected.extra != found.extra {
-        return Ok(Some("extra attributes were changed or belong to other Gaussians".into()));
+    if !expected.extra.keys().eq(found.extra.keys()) {
+        return Ok(Some("extra attributes are missing, or there are more of them".into()));
+    }
+    for (name, before) in &expected.extra {
+        if let Some(finding) = attribute_changed(before, &found.extra[name]) {
+            return Ok(Some(format!("extra attribute '{name}' {finding}")));
+        }
     }
     let losses = codec.losses();
     for ((column, _, before), (_, _, after)) in expected.columns().into_iter().zip(found.columns()) {
@@ -115,6 +125,25 @@ fn comes_back(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Optio
         }
     }
     Ok(None)
+}
+
+/// What is wrong with `after`, given that `before` was to be kept.
+fn attribute_changed(before: &ExtraAttribute, after: &ExtraAttribute) -> Option<String> {
+    if after.width != before.width || after.values.len() != before.values.len() {
+        return Some("has another shape".into());
+    }
+    for (i, (a, b)) in before.values.iter().zip(&after.values).enumerate() {
+        let left_out = |needed: &NeededRows| !needed.rows[i / before.width] && b.to_bits() == needed.start.to_bits();
+        let kept = match before.tolerance {
+            None => a.to_bits() == b.to_bits(),
+            Some(tolerance) => (f64::from(*a) - f64::from(*b)).abs() <= f64::from(tolerance),
+        };
+        if !kept && !before.needed.as_ref().is_some_and(left_out) {
+            let allowed = before.tolerance.map_or("bit for bit".into(), |tolerance| format!("within {tolerance}"));
+            return Some(format!("became {b} where it was {a} and was to be kept {allowed}"));
+        }
+    }
+    None
 }
 
 fn repeats(codec: &dyn AttributeCodec) -> Result<Option<String>> {

@@ -3,43 +3,63 @@
 //! Uniform quantisers span percentiles of the values, a little widened; the few values beyond are kept exactly in a list of escapes, so that
 //! an outlier neither widens the steps of the others nor is clamped itself. An encoder that misses the loss it may cause takes more bits.
 
-use crate::mulaw;
-use cc4dgs_core::Result;
-use cc4dgs_core::archive::ByteReader;
+use super::mulaw;
+use crate::Result;
+use crate::archive::ByteReader;
+
+/// Share of the values at either end that [`encode_within`] may keep as escapes.
+const TAIL_WITHIN: f64 = 1e-3;
 
 /// How the codes of a column become numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Form {
+pub enum Form {
     /// The same number everywhere; no codes.
     Constant(f32),
     /// `2^bits` even steps from `low` to `high`.
-    Uniform { low: f32, high: f32, bits: u8 },
+    Uniform {
+        /// Value of code 0.
+        low: f32,
+        /// Value of the largest code.
+        high: f32,
+        /// Bits per code, 2 to 16.
+        bits: u8,
+    },
     /// Signed mu-law codes of value / `peak`.
-    MuLaw { peak: f32, bits: u8 },
+    MuLaw {
+        /// Largest magnitude.
+        peak: f32,
+        /// Bits per code, 2 to 16.
+        bits: u8,
+    },
     /// float32.
     Exact,
 }
 
 /// A column as it is stored.
-pub(crate) struct Column {
-    pub(crate) form: Form,
-    pub(crate) codes: Vec<u8>,
+pub struct Column {
+    /// How to read the codes.
+    pub form: Form,
+    /// One or two bytes per value; four for [`Form::Exact`], none for [`Form::Constant`].
+    pub codes: Vec<u8>,
     /// Values that the codes do not reach: (row, value), rows ascending.
-    pub(crate) escapes: Vec<(u32, f32)>,
+    pub escapes: Vec<(u32, f32)>,
 }
 
 /// The form to try first and the loss that is allowed (root-mean-square error over standard deviation).
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Target {
-    pub(crate) bits: u8,
-    pub(crate) mu_law: bool,
-    pub(crate) loss: f64,
+pub struct Target {
+    /// Bits per code, 2 to 16.
+    pub bits: u8,
+    /// Companded steps in place of even ones.
+    pub mu_law: bool,
+    /// Largest root-mean-square error over the standard deviation.
+    pub loss: f64,
     /// Share of the values at either end that may be escapes.
-    pub(crate) tail: f64,
+    pub tail: f64,
 }
 
 /// Encodes `values` (all finite) in the first form within the allowed loss: the wanted one, 16 uniform bits, exact.
-pub(crate) fn encode(values: &[f32], target: Target) -> Column {
+pub fn encode(values: &[f32], target: Target) -> Column {
     if let Some(column) = constant(values) {
         return column;
     }
@@ -58,8 +78,27 @@ pub(crate) fn encode(values: &[f32], target: Target) -> Column {
     quantise(values, Form::Exact)
 }
 
+/// Encodes `values` (all finite) so that none is off by more than `tolerance`: in the fewest bits whose steps are small enough, else exactly.
+pub fn encode_within(values: &[f32], tolerance: f32) -> Column {
+    if let Some(column) = constant(values) {
+        return column;
+    }
+    let Form::Uniform { low, high, .. } = uniform(values, 2, TAIL_WITHIN) else { return quantise(values, Form::Exact) };
+    let steps = (f64::from(high) - f64::from(low)) / (2.0 * f64::from(tolerance));
+    let bits = (2..=16u8).find(|&bits| f64::from((1u32 << bits) - 1) >= steps).unwrap_or(16);
+    // One bit more where rounding to float32 took a step over the tolerance.
+    for bits in [bits, (bits + 1).min(16)] {
+        let column = quantise(values, Form::Uniform { low, high, bits });
+        let decoded = dequantise(&column, values.len());
+        if values.iter().zip(&decoded).all(|(a, b)| (f64::from(*a) - f64::from(*b)).abs() <= f64::from(tolerance)) {
+            return column;
+        }
+    }
+    quantise(values, Form::Exact)
+}
+
 /// Encodes `values` without loss.
-pub(crate) fn encode_exact(values: &[f32]) -> Column {
+pub fn encode_exact(values: &[f32]) -> Column {
     constant(values).unwrap_or_else(|| quantise(values, Form::Exact))
 }
 
@@ -113,7 +152,7 @@ fn push_code(codes: &mut Vec<u8>, code: u16, bits: u8) {
 }
 
 /// What [`read`] will make of a column.
-pub(crate) fn dequantise(column: &Column, count: usize) -> Vec<f32> {
+pub fn dequantise(column: &Column, count: usize) -> Vec<f32> {
     // The codes were written just now, so they cannot be short.
     let mut reader = ByteReader::new("column", &column.codes);
     read(&mut reader, column.form, count, &column.escapes).unwrap_or_default()
@@ -121,7 +160,7 @@ pub(crate) fn dequantise(column: &Column, count: usize) -> Vec<f32> {
 
 impl Form {
     /// Appends the form to a meta stream.
-    pub(crate) fn write(&self, out: &mut Vec<u8>) {
+    pub fn write(&self, out: &mut Vec<u8>) {
         match *self {
             Self::Constant(value) => {
                 out.push(0);
@@ -140,7 +179,7 @@ impl Form {
         }
     }
     /// Reads a form; every number in it is checked.
-    pub(crate) fn read(reader: &mut ByteReader) -> Result<Self> {
+    pub fn read(reader: &mut ByteReader) -> Result<Self> {
         let kind = reader.u8()?;
         let form = match kind {
             0 => Self::Constant(reader.f32()?),
@@ -176,12 +215,12 @@ impl Form {
 }
 
 /// Bytes per code of the next `count` columns that `meta` describes.
-pub(crate) fn widths(mut meta: ByteReader, count: usize) -> Result<Vec<usize>> {
+pub fn widths(mut meta: ByteReader, count: usize) -> Result<Vec<usize>> {
     (0..count).map(|_| Ok(Form::read(&mut meta)?.bytes_per_code())).collect()
 }
 
 /// Decodes `count` values of `form` from `reader`. Both sides of the codec call this, so both see the same bits.
-pub(crate) fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &[(u32, f32)]) -> Result<Vec<f32>> {
+pub fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &[(u32, f32)]) -> Result<Vec<f32>> {
     if let Form::Exact = form {
         return reader.f32s(count);
     }
@@ -226,14 +265,14 @@ pub(crate) fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &
 }
 
 /// Appends an escape list to the escape stream: u32 count, rows, values.
-pub(crate) fn write_escapes(escapes: &[(u32, f32)], out: &mut Vec<u8>) {
+pub fn write_escapes(escapes: &[(u32, f32)], out: &mut Vec<u8>) {
     out.extend((escapes.len() as u32).to_le_bytes());
     escapes.iter().for_each(|(row, _)| out.extend(row.to_le_bytes()));
     escapes.iter().for_each(|(_, value)| out.extend(value.to_le_bytes()));
 }
 
 /// Reads what [`write_escapes`] wrote.
-pub(crate) fn read_escapes(reader: &mut ByteReader) -> Result<Vec<(u32, f32)>> {
+pub fn read_escapes(reader: &mut ByteReader) -> Result<Vec<(u32, f32)>> {
     let count = reader.u32()? as usize;
     let rows: Vec<u32> = reader.take(count.saturating_mul(4))?.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect();
     let values = reader.f32s(count)?;
@@ -241,7 +280,7 @@ pub(crate) fn read_escapes(reader: &mut ByteReader) -> Result<Vec<(u32, f32)>> {
 }
 
 /// Root-mean-square error over the standard deviation of the values; 0 when nothing differs, NaN when something is not finite.
-pub(crate) fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
+pub fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
     let n = values.len().max(1) as f64;
     let error: f64 = values.iter().zip(decoded).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>() / n;
     if error == 0.0 && values.len() == decoded.len() {

@@ -4,7 +4,7 @@
 //!
 //! ```text
 //!  0  magic      8 bytes   89 'C' 'C' '4' 'D' 0D 0A 1A
-//!  8  version    u32       1
+//!  8  version    u32       2
 //! 12  header     u32       bytes of the header
 //! 16  checksum   u64       XXH3-64 of the header
 //! 24  header:    u32 + JSON manifest, u32 stream count, then per stream
@@ -19,17 +19,14 @@
 mod bytes;
 mod manifest;
 mod packing;
-mod precision;
 mod read;
-mod weights;
 mod write;
+mod zstandard;
 
 pub use bytes::ByteReader;
 pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, Manifest, Provenance, RasterizerEntry};
 pub use packing::estimate_stored_len;
-pub use precision::WeightPrecision;
 pub use read::{Archive, StreamInfo};
-pub use weights::{WeightArray, decode_weights, encode_weights};
 pub use write::{ArchiveWriter, write_atomically};
 
 /// First bytes of every archive. The high bit, the line ends and the control character show transfers that mangled the file.

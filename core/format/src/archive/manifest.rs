@@ -1,20 +1,19 @@
 //! What an archive says of itself.
 
-use crate::raster::Rules;
-use crate::{DeformerContext, Error, Limits, Result};
+use crate::{DeformerContext, Error, Limits, Result, Rules};
 use serde::{Deserialize, Serialize};
 
 /// The archive version this build writes and reads.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 
-/// Which codec wrote the canonical streams.
+/// Which codec wrote some of the streams.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CodecEntry {
     /// Registry name.
     pub name: String,
     /// Profile, empty for the codec's default one.
     pub profile: String,
-    /// The codec's own version ([`crate::Plugin::version`]).
+    /// Version of the codec's stored form ([`crate::Plugin::version`]).
     pub version: String,
     /// The settings it was built with.
     pub settings: toml::Table,
@@ -31,6 +30,8 @@ pub struct DeformerEntry {
     pub settings: toml::Table,
     /// What it was told of the scene.
     pub context: DeformerContext,
+    /// The weight codec of the field streams. Weight codecs have no profiles.
+    pub weights: CodecEntry,
 }
 
 /// How the model wants to be drawn.

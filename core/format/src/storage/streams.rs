@@ -1,27 +1,29 @@
-//! What the codecs' streams have in common.
+//! The frame of a codec: which streams there are, and what every decoder reads and checks first.
 
-use cc4dgs_core::archive::ByteReader;
-use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, ExtraAttribute, HostGaussians, Limits, Result, Stream};
+use super::extra::{self, Attributes, extra_streams};
+use crate::archive::ByteReader;
+use crate::gaussians::sh_rest_len;
+use crate::{Error, HostGaussians, Limits, Result, Stream};
 
 /// The stream that says what the others hold.
-pub(crate) const META: &str = "meta";
+pub const META: &str = "meta";
 
-/// The stream with values beyond the steps.
-pub(crate) const ESCAPES: &str = "escapes";
+/// The stream with the values that lie beyond the steps of a quantiser.
+pub const ESCAPES: &str = "escapes";
 
 /// The streams handed to a decoder, by name.
-pub(crate) struct StreamSet<'a> {
+pub struct StreamSet<'a> {
     codec: &'static str,
     streams: &'a [Stream],
 }
 
 impl<'a> StreamSet<'a> {
-    pub(crate) fn new(codec: &'static str, streams: &'a [Stream]) -> Self {
+    /// The streams handed to the decoder of `codec`, which errors name.
+    pub fn new(codec: &'static str, streams: &'a [Stream]) -> Self {
         Self { codec, streams }
     }
     /// A reader over the stream `name`.
-    pub(crate) fn reader(&self, name: &str) -> Result<ByteReader<'a>> {
+    pub fn reader(&self, name: &str) -> Result<ByteReader<'a>> {
         match self.streams.iter().find(|s| s.name == name) {
             Some(stream) => Ok(ByteReader::new(format!("{} stream '{name}'", self.codec), &stream.bytes)),
             None => Err(Error::data(format!("{} stream '{name}'", self.codec), "it is missing", "The file is damaged or another codec wrote it")),
@@ -30,7 +32,7 @@ impl<'a> StreamSet<'a> {
 }
 
 /// What every decoder reads first: the streams by name, the meta stream behind its version and the shape, and the shape.
-pub(crate) fn open<'a>(codec: &'static str, streams: &'a [Stream], version: u8, limits: &Limits) -> Result<(StreamSet<'a>, ByteReader<'a>, Shape)> {
+pub fn open<'a>(codec: &'static str, streams: &'a [Stream], version: u8, limits: &Limits) -> Result<(StreamSet<'a>, ByteReader<'a>, Shape)> {
     let set = StreamSet::new(codec, streams);
     let mut meta = set.reader(META)?;
     let found = meta.u8()?;
@@ -41,17 +43,17 @@ pub(crate) fn open<'a>(codec: &'static str, streams: &'a [Stream], version: u8, 
     Ok((set, meta, shape))
 }
 
-/// All streams of an encoder that keeps `columns` of `gaussians` by name, what they are in `meta` and values beyond their steps in `escapes`.
-pub(crate) fn assemble(gaussians: &HostGaussians, meta: Vec<u8>, escapes: Vec<u8>, columns: Vec<Stream>) -> Vec<Stream> {
+/// All streams of a lossy encoder: `meta`, the `columns` by name, the extra attributes of `gaussians` as far as they must be kept, and `escapes`.
+pub fn assemble(gaussians: &HostGaussians, meta: Vec<u8>, escapes: Vec<u8>, columns: Vec<Stream>) -> Vec<Stream> {
     let mut streams = vec![Stream { name: META.into(), bytes: meta }];
     streams.extend(columns);
-    streams.extend(Shape::extra_streams(gaussians));
+    streams.extend(extra_streams(gaussians, Attributes::AsAllowed));
     streams.push(Stream { name: ESCAPES.into(), bytes: escapes });
     streams
 }
 
-/// What every decoder of [`assemble`] does last: `read` must have been read to the end; the plug-in attributes follow, and the whole must be sound.
-pub(crate) fn close(set: &StreamSet, shape: &Shape, read: [ByteReader; 2], mut out: HostGaussians, limits: &Limits) -> Result<HostGaussians> {
+/// What a decoder of [`assemble`] does last: `read` (meta and escapes) must have been read to the end, the extra attributes are read, and the whole is validated.
+pub fn close(set: &StreamSet, shape: &Shape, read: [ByteReader; 2], mut out: HostGaussians, limits: &Limits) -> Result<HostGaussians> {
     for reader in read {
         reader.finish()?;
     }
@@ -60,18 +62,24 @@ pub(crate) fn close(set: &StreamSet, shape: &Shape, read: [ByteReader; 2], mut o
     Ok(out)
 }
 
-/// Number of Gaussians, degree and plug-in attributes: the part of the meta stream both codecs share.
-pub(crate) struct Shape {
-    pub(crate) count: usize,
-    pub(crate) sh_degree: usize,
-    pub(crate) extra: Vec<(String, usize)>,
+/// Number of Gaussians, degree and extra attributes: what every meta stream holds.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Shape {
+    /// Gaussians.
+    pub count: usize,
+    /// Spherical-harmonics degree, 0 to 4.
+    pub sh_degree: usize,
+    /// Names of the extra attributes and floats per Gaussian of each.
+    pub extra: Vec<(String, usize)>,
 }
 
 impl Shape {
-    pub(crate) fn of(gaussians: &HostGaussians) -> Self {
+    /// The shape of `gaussians`.
+    pub fn of(gaussians: &HostGaussians) -> Self {
         Self { count: gaussians.len(), sh_degree: gaussians.sh_degree, extra: gaussians.extra.iter().map(|(n, a)| (n.clone(), a.width)).collect() }
     }
-    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<()> {
+    /// Appends the shape to a meta stream. Refuses names and widths that cannot be stored.
+    pub fn write(&self, out: &mut Vec<u8>) -> Result<()> {
         out.extend((self.count as u64).to_le_bytes());
         out.push(self.sh_degree as u8);
         out.extend((self.extra.len() as u16).to_le_bytes());
@@ -97,7 +105,7 @@ impl Shape {
         Ok(())
     }
     /// Reads and checks what the file claims against `limits`, before anything is allocated for it.
-    pub(crate) fn read(reader: &mut ByteReader, limits: &Limits) -> Result<Self> {
+    pub fn read(reader: &mut ByteReader, limits: &Limits) -> Result<Self> {
         let count = reader.u64()?;
         limits.check_gaussians("encoded Gaussians", count)?;
         let sh_degree = usize::from(reader.u8()?);
@@ -123,15 +131,10 @@ impl Shape {
         limits.check_bytes("decoded Gaussians", count.saturating_mul(4 * floats))?;
         Ok(Self { count: count as usize, sh_degree, extra })
     }
-    /// Streams of the plug-in attributes, exact.
-    pub(crate) fn extra_streams(gaussians: &HostGaussians) -> impl Iterator<Item = Stream> {
-        gaussians.extra.iter().map(|(name, a)| Stream { name: format!("extra.{name}"), bytes: to_planes(&a.values, a.width) })
-    }
-    /// Reads the plug-in attributes back.
-    pub(crate) fn read_extra(&self, set: &StreamSet, gaussians: &mut HostGaussians) -> Result<()> {
+    /// Reads the extra attributes back into `gaussians`.
+    pub fn read_extra(&self, set: &StreamSet, gaussians: &mut HostGaussians) -> Result<()> {
         for (name, width) in &self.extra {
-            let values = from_planes(set.reader(&format!("extra.{name}"))?, self.count, *width)?;
-            gaussians.extra.insert(name.clone(), ExtraAttribute { width: *width, values });
+            gaussians.extra.insert(name.clone(), extra::decode(set, name, *width, self.count)?);
         }
         Ok(())
     }
@@ -141,12 +144,12 @@ const MAX_EXTRA: usize = 256;
 const MAX_EXTRA_WIDTH: usize = 4096;
 
 /// Rows [N, width] as float32 columns, one after the other: neighbours in a stream then have alike bytes.
-pub(crate) fn to_planes(rows: &[f32], width: usize) -> Vec<u8> {
+pub fn to_planes(rows: &[f32], width: usize) -> Vec<u8> {
     (0..width).flat_map(|c| rows.iter().skip(c).step_by(width)).flat_map(|v| v.to_le_bytes()).collect()
 }
 
 /// Undoes [`to_planes`]; the stream must hold `count * width` finite floats and nothing else.
-pub(crate) fn from_planes(mut reader: ByteReader, count: usize, width: usize) -> Result<Vec<f32>> {
+pub fn from_planes(mut reader: ByteReader, count: usize, width: usize) -> Result<Vec<f32>> {
     let planes = reader.f32s(count.saturating_mul(width))?;
     reader.finish()?;
     let mut rows = vec![0.0; planes.len()];

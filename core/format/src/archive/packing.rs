@@ -1,10 +1,8 @@
 //! One stream's bytes, smaller: byte planes and Zstandard.
 
+use super::zstandard::{compress, decompress};
 use crate::{Error, Limits, Result};
-use std::io::Read;
 
-/// Zstandard's level for archives (paper Section IV-D names Zstandard; 19 is the highest level without long-window memory).
-const ZSTD_LEVEL: i32 = 19;
 /// The shuffle width is chosen on this many leading bytes of a stream: exact for short streams, cheap for long ones.
 const TRIAL_BYTES: usize = 1 << 20;
 /// Element sizes whose byte planes are tried.
@@ -71,29 +69,13 @@ fn best_shuffle(bytes: &[u8]) -> Result<(u8, Vec<u8>)> {
     Ok(best)
 }
 
-fn compress(bytes: &[u8]) -> Result<Vec<u8>> {
-    zstd::bulk::compress(bytes, ZSTD_LEVEL).map_err(|e| Error::backend("Zstandard", e.to_string(), "Free some memory and try again"))
-}
-
 /// Undoes [`pack`]: at most `decoded_len` bytes, which `limits` must allow; memory grows with the bytes that are really there.
 pub(super) fn unpack(object: &str, stored: Vec<u8>, encoding: Encoding, shuffle: u8, decoded_len: u64, limits: &Limits) -> Result<Vec<u8>> {
     limits.check_bytes(object, decoded_len)?;
     let damaged = |problem: String| Error::data(object, problem, "The file is damaged; fetch or write it again");
     let planes = match encoding {
         Encoding::Stored => stored,
-        Encoding::Zstd => {
-            let mut decoder = zstd::stream::read::Decoder::with_buffer(stored.as_slice()).map_err(|e| damaged(e.to_string()))?.single_frame();
-            // A frame may ask for no more window than its stream is long.
-            let window_log = (u64::BITS - decoded_len.leading_zeros() + 1).clamp(10, 31);
-            decoder.window_log_max(window_log).map_err(|e| damaged(e.to_string()))?;
-            let mut out = Vec::with_capacity(decoded_len.min(TRIAL_BYTES as u64) as usize);
-            decoder.by_ref().take(decoded_len.saturating_add(1)).read_to_end(&mut out).map_err(|e| damaged(format!("Zstandard says: {e}")))?;
-            let rest = decoder.finish();
-            if out.len() as u64 == decoded_len && !rest.is_empty() {
-                return Err(damaged(format!("{} bytes follow the Zstandard frame", rest.len())));
-            }
-            out
-        }
+        Encoding::Zstd => decompress(&stored, decoded_len).map_err(damaged)?,
     };
     if planes.len() as u64 != decoded_len {
         let seen = if planes.len() as u64 > decoded_len { "more".to_string() } else { planes.len().to_string() };

@@ -1,11 +1,12 @@
 //! Archives and PLY files that lie, end early or have flipped bits: an error that says what is wrong, never a panic, never a large allocation,
 //! never half a file left behind.
 //!
-//! `tests/bad` holds a corpus of them, made by the functions below. `CC4DGS_WRITE_BAD=1` writes it anew after the format changed.
+//! `tests/bad` at the root holds a corpus of them, made by the functions below. `CC4DGS_WRITE_BAD=1` writes it anew after the format changed. A program of its
+//! own, because it watches every allocation.
+#![allow(clippy::unwrap_used, reason = "tests: a failed helper is a failed test")]
 
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamKind, write_atomically};
-use cc4dgs_core::{Error, HostGaussians, Limits, Result, Stream};
-use cc4dgs_engine::ply;
+use cc4dgs_format::archive::{Archive, ArchiveWriter, CodecEntry, FORMAT_VERSION, Manifest, StreamKind, write_atomically};
+use cc4dgs_format::{Error, HostGaussians, Limits, Result, Stream, ply};
 use proptest::prelude::*;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::PathBuf;
@@ -131,7 +132,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
     let mut header_claim = sound();
     header_claim[12..16].copy_from_slice(&u32::MAX.to_le_bytes());
     let trailing = [sound(), b"more".to_vec()].concat();
-    let json = serde_json::to_string(&Manifest { format_version: 1, ..manifest() }).unwrap();
+    let json = serde_json::to_string(&Manifest { format_version: FORMAT_VERSION, ..manifest() }).unwrap();
     let deep = json.replace("\"extra\":{}", &format!("\"extra\":{{\"a\":{}{}}}", "[".repeat(500), "]".repeat(500)));
     let huge = json.replace("\"gaussian_count\":3", "\"gaussian_count\":18446744073709551615");
     let infinite = json.replace("\"dynamic_threshold\":0.0", "\"dynamic_threshold\":1e200");
@@ -200,7 +201,7 @@ fn attempt(name: &str, bytes: &[u8]) -> Result<()> {
 
 #[test]
 fn the_corpus_is_refused_with_the_reason() {
-    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("bad");
+    let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../tests/bad");
     let write = std::env::var_os("CC4DGS_WRITE_BAD").is_some();
     let files = bad_files();
     for (name, bytes, reason) in &files {

@@ -4,9 +4,9 @@
 //! coefficients of red, then green, then blue). With degree 3 that is 62 floats, 63 with Swift4D's `dynamic`. Properties are found by
 //! name, so their order does not matter and normals may be missing; the number of `f_rest` gives the degree (0, 9, 24, 45 or 72).
 
-use cc4dgs_core::archive::write_atomically;
-use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, HostGaussians, Limits, Result};
+use crate::archive::write_atomically;
+use crate::gaussians::sh_rest_len;
+use crate::{Error, HostGaussians, Limits, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 

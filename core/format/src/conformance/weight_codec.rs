@@ -1,0 +1,148 @@
+//! What a weight codec must keep to.
+
+use super::uniform;
+use crate::{CodecContext, Limits, Result, Seed, Silent, Stream, WeightArray, WeightCodec, WeightCodecPlugin};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// Damaged versions of each stream that are tried.
+const DAMAGES: usize = 48;
+
+/// Holds a weight codec to its promises: unknown settings are refused; names, shapes and order come back, and every value within the declared loss; equal
+/// weights give equal bytes; names that are taken, shapes that do not fit and values that are not finite are refused; damaged streams give an error or sound
+/// weights, never a panic.
+pub fn weight_codec(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Vec<String> {
+    let name = plugin.info.name;
+    let codec = match (plugin.build)(settings) {
+        Ok(codec) => codec,
+        Err(e) => return vec![format!("{name}: it cannot be built: {e}")],
+    };
+    let codec = codec.as_ref();
+    let mut findings = Vec::new();
+    let mut note = |check: &str, outcome: Result<Option<String>>| match outcome {
+        Ok(None) => {}
+        Ok(Some(finding)) => findings.push(format!("{name}, {check}: {finding}")),
+        Err(e) => findings.push(format!("{name}, {check}: {e}")),
+    };
+    note("settings", refuses_unknown_settings(plugin, settings));
+    note("weights", comes_back(codec, &weights()));
+    note("no weights", comes_back(codec, &[]));
+    note("repeats", repeats(codec));
+    note("unsound weights", refuses_unsound(codec));
+    note("damaged streams", survives_damage(codec));
+    findings
+}
+
+fn context() -> CodecContext<'static> {
+    CodecContext::new(Seed::root(8).child("conformance"), Limits::default(), &Silent)
+}
+
+/// Arrays of several sizes and magnitudes, one without values, one without dimensions.
+fn weights() -> Vec<WeightArray> {
+    let array = |name: &str, shape: &[usize], scale: f32| {
+        let seed = Seed::root(4).child(name);
+        let count = shape.iter().product();
+        WeightArray { name: name.into(), shape: shape.to_vec(), values: (0..count).map(|k| scale * uniform(seed, k)).collect() }
+    };
+    vec![
+        array("trunk.0.weight", &[24, 17], 0.1),
+        array("trunk.0.bias", &[17], 3.0),
+        array("table", &[3, 10, 10, 2], 1e-3),
+        array("scale", &[], 40.0),
+        array("none", &[0, 5], 1.0),
+        WeightArray { name: "zeros".into(), shape: vec![65], values: vec![0.0; 65] },
+    ]
+}
+
+fn refuses_unknown_settings(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Result<Option<String>> {
+    let mut settings = settings.clone();
+    settings.insert("no_such_setting".into(), 1.into());
+    Ok(match (plugin.build)(&settings) {
+        Ok(_) => Some("an unknown setting was accepted".into()),
+        Err(e) if !e.to_string().contains("no_such_setting") => Some(format!("the error does not name the unknown setting: {e}")),
+        Err(_) => None,
+    })
+}
+
+fn comes_back(codec: &dyn WeightCodec, given: &[WeightArray]) -> Result<Option<String>> {
+    let found = codec.decode(&codec.encode(given, &context())?, &context())?;
+    let shapes = |arrays: &[WeightArray]| arrays.iter().map(|a| (a.name.clone(), a.shape.clone(), a.values.len())).collect::<Vec<_>>();
+    if shapes(given) != shapes(&found) {
+        return Ok(Some(format!("names and shapes became {:?}", shapes(&found))));
+    }
+    for (before, after) in given.iter().zip(&found) {
+        let largest = before.values.iter().fold(0.0f64, |m, v| m.max(f64::from(v.abs())));
+        let worst = before.values.iter().zip(&after.values).map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).fold(0.0, f64::max);
+        let allowed = codec.loss() * largest;
+        let exact = before.values.iter().zip(&after.values).all(|(a, b)| a.to_bits() == b.to_bits());
+        // Written so that what is no number fails.
+        let kept = if allowed == 0.0 && largest > 0.0 { exact } else { worst <= allowed };
+        if !kept || after.values.iter().any(|v| !v.is_finite()) {
+            return Ok(Some(format!("'{}' is off by {worst:.2e}, {allowed:.2e} is declared", before.name)));
+        }
+    }
+    Ok(None)
+}
+
+fn repeats(codec: &dyn WeightCodec) -> Result<Option<String>> {
+    let (first, second) = (codec.encode(&weights(), &context())?, codec.encode(&weights(), &context())?);
+    if first != second {
+        return Ok(Some("two encodings of the same weights differ".into()));
+    }
+    let mut names: Vec<&str> = first.iter().map(|s| s.name.as_str()).collect();
+    names.sort_unstable();
+    Ok(names.windows(2).find(|w| w[0] == w[1]).map(|twice| format!("two streams are called {}", twice[0])))
+}
+
+fn refuses_unsound(codec: &dyn WeightCodec) -> Result<Option<String>> {
+    let with = |edit: fn(&mut Vec<WeightArray>)| {
+        let mut arrays = weights();
+        edit(&mut arrays);
+        codec.encode(&arrays, &context()).is_ok()
+    };
+    let cases: [(&str, fn(&mut Vec<WeightArray>)); 4] = [
+        ("a NaN", |arrays| arrays[0].values[3] = f32::NAN),
+        ("an infinity", |arrays| arrays[1].values[0] = f32::INFINITY),
+        ("a name that is taken", |arrays| arrays[1].name = arrays[0].name.clone()),
+        ("a shape that does not hold the values", |arrays| arrays[0].shape[0] += 1),
+    ];
+    Ok(cases.into_iter().find(|(_, edit)| with(*edit)).map(|(what, _)| format!("{what} was encoded")))
+}
+
+fn survives_damage(codec: &dyn WeightCodec) -> Result<Option<String>> {
+    let sound = codec.encode(&weights(), &context())?;
+    let mut tries: Vec<(String, Vec<Stream>)> = vec![("no streams".into(), Vec::new())];
+    for index in 0..sound.len() {
+        let (name, length) = (&sound[index].name, sound[index].bytes.len());
+        for k in 0..DAMAGES.min(2 * length) {
+            let mut damaged = sound.clone();
+            let bytes = &mut damaged[index].bytes;
+            let draw = Seed::root(6).index((index * DAMAGES + k) as u64).value();
+            // Every other damage hits the first bytes, where counts and shapes usually are.
+            let at = (draw >> 8) as usize % if k % 2 == 0 { length } else { length.min(64) };
+            let what = if k % 3 == 0 {
+                bytes.truncate(at);
+                "is cut short"
+            } else {
+                bytes[at] ^= 1 << (draw % 8);
+                "has a flipped bit"
+            };
+            tries.push((format!("'{name}' {what} at {at}"), damaged));
+        }
+        let mut longer = sound.clone();
+        longer[index].bytes.extend([255; 9]);
+        tries.push((format!("'{name}' goes on"), longer));
+    }
+    for (what, streams) in tries {
+        match catch_unwind(AssertUnwindSafe(|| codec.decode(&streams, &context()))) {
+            Err(_) => return Ok(Some(format!("it panics where {what}"))),
+            Ok(Err(_)) => {}
+            Ok(Ok(found)) => {
+                let sound = |a: &WeightArray| a.values.iter().all(|v| v.is_finite()) && a.shape.iter().product::<usize>() == a.values.len();
+                if !found.iter().all(sound) {
+                    return Ok(Some(format!("unsound weights came back where {what}")));
+                }
+            }
+        }
+    }
+    Ok(None)
+}

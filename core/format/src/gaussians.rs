@@ -1,0 +1,153 @@
+//! The canonical Gaussians as plain arrays, for codecs and files.
+//!
+//! All values are raw (before activation): scale = exp(log_scale), opacity = sigmoid(logit), rotation = normalise(quaternion).
+
+use crate::{Error, Limits, Result};
+use std::collections::BTreeMap;
+
+/// The number of spherical-harmonics coefficients above degree 0: (degree + 1)^2 - 1.
+pub const fn sh_rest_len(degree: usize) -> usize {
+    (degree + 1) * (degree + 1) - 1
+}
+
+/// A per-Gaussian attribute a plug-in brings along (an embedding, a second rotation): `width` floats per Gaussian.
+///
+/// `tolerance` and `needed` tell an encoder what it may lose. They are not stored: decoded attributes have neither.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct ExtraAttribute {
+    /// Floats per Gaussian.
+    pub width: usize,
+    /// Row-major values [N, width].
+    pub values: Vec<f32>,
+    /// The largest absolute error that a codec may make in a value; `None` keeps the values bit for bit.
+    pub tolerance: Option<f32>,
+    /// The rows that anybody reads; `None`: all of them.
+    pub needed: Option<NeededRows>,
+}
+
+/// The rows of an attribute that must be stored. A codec may leave the others out; they come back as `start`.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct NeededRows {
+    /// Whether each row is needed [N].
+    pub rows: Vec<bool>,
+    /// What every value of a row comes back as that was not stored.
+    pub start: f32,
+}
+
+impl ExtraAttribute {
+    /// An attribute of which every row is kept bit for bit.
+    pub fn exact(width: usize, values: Vec<f32>) -> Self {
+        Self { width, values, tolerance: None, needed: None }
+    }
+    /// The same values, of which a codec may change each by at most `tolerance`.
+    pub fn within(self, tolerance: f32) -> Self {
+        Self { tolerance: Some(tolerance), ..self }
+    }
+    /// The same values, of which only the rows that are true in `rows` [N] must be stored; the others may come back as `start`.
+    pub fn needed_in(self, rows: Vec<bool>, start: f32) -> Self {
+        Self { needed: Some(NeededRows { rows, start }), ..self }
+    }
+}
+
+/// Gaussians as plain row-major arrays.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct HostGaussians {
+    /// Spherical-harmonics degree of `sh_rest`, 0 to 4.
+    pub sh_degree: usize,
+    /// Centres in world units [N,3].
+    pub means: Vec<f32>,
+    /// Natural logarithm of the standard deviations [N,3].
+    pub log_scales: Vec<f32>,
+    /// Quaternions (w,x,y,z), not normalised [N,4].
+    pub quaternions: Vec<f32>,
+    /// Opacity before the sigmoid [N].
+    pub opacity_logits: Vec<f32>,
+    /// Degree-0 colour coefficients [N,3].
+    pub sh_dc: Vec<f32>,
+    /// Colour coefficients of degree 1 and up, coefficient-major [N, (d+1)^2-1, 3].
+    pub sh_rest: Vec<f32>,
+    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves iff its score is over the threshold [N].
+    pub dynamic_scores: Vec<f32>,
+    /// Attributes of plug-ins by name.
+    pub extra: BTreeMap<String, ExtraAttribute>,
+}
+
+impl HostGaussians {
+    /// The number of Gaussians N.
+    pub fn len(&self) -> usize {
+        self.opacity_logits.len()
+    }
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+    /// The named core arrays with their widths, in a fixed order.
+    pub fn columns(&self) -> [(&'static str, usize, &Vec<f32>); 7] {
+        [
+            ("means", 3, &self.means),
+            ("log_scales", 3, &self.log_scales),
+            ("quaternions", 4, &self.quaternions),
+            ("opacity_logits", 1, &self.opacity_logits),
+            ("sh_dc", 3, &self.sh_dc),
+            ("sh_rest", 3 * sh_rest_len(self.sh_degree), &self.sh_rest),
+            ("dynamic_scores", 1, &self.dynamic_scores),
+        ]
+    }
+    /// Mutable access to the same arrays in the same order.
+    pub fn columns_mut(&mut self) -> [(&'static str, usize, &mut Vec<f32>); 7] {
+        let rest = 3 * sh_rest_len(self.sh_degree);
+        [
+            ("means", 3, &mut self.means),
+            ("log_scales", 3, &mut self.log_scales),
+            ("quaternions", 4, &mut self.quaternions),
+            ("opacity_logits", 1, &mut self.opacity_logits),
+            ("sh_dc", 3, &mut self.sh_dc),
+            ("sh_rest", rest, &mut self.sh_rest),
+            ("dynamic_scores", 1, &mut self.dynamic_scores),
+        ]
+    }
+    /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite.
+    pub fn validate(&self, object: &str, limits: &Limits) -> Result<()> {
+        let n = self.len();
+        limits.check_gaussians(object, n as u64)?;
+        if self.sh_degree > 4 {
+            return Err(Error::data(object, format!("spherical-harmonics degree {} is over 4", self.sh_degree), "Convert the model to degree 4 or lower"));
+        }
+        let extra = self.extra.iter().map(|(name, a)| (name.as_str(), a.width, &a.values));
+        for (name, width, values) in self.columns().into_iter().chain(extra) {
+            if values.len() != n * width {
+                return Err(Error::data(
+                    object,
+                    format!("{name} holds {} values, {} Gaussians need {}", values.len(), n, n * width),
+                    "The file is damaged; fetch it again",
+                ));
+            }
+            if let Some(i) = values.iter().position(|v| !v.is_finite()) {
+                return Err(Error::data(object, format!("{name} of Gaussian {} is {}", i / width.max(1), values[i]), "Remove non-finite Gaussians first"));
+            }
+        }
+        for (name, a) in &self.extra {
+            let refuse = |problem: String, remedy: &str| Err(Error::parameter(format!("{object}: attribute {name}"), problem, remedy));
+            if let Some(tolerance) = a.tolerance.filter(|t| !(t.is_finite() && *t >= 0.0)) {
+                return refuse(format!("a tolerance of {tolerance}"), "Give a finite tolerance of at least 0, or none");
+            }
+            if let Some(needed) = a.needed.as_ref().filter(|needed| needed.rows.len() != n || !needed.start.is_finite()) {
+                return refuse(format!("{} rows and a start value of {} for {n} Gaussians", needed.rows.len(), needed.start), "Give one flag per Gaussian");
+            }
+        }
+        Ok(())
+    }
+    /// The Gaussians of `keep`, in that order.
+    pub fn select(&self, keep: &[usize]) -> Self {
+        let pick = |width: usize, values: &[f32]| keep.iter().flat_map(|&i| values[i * width..(i + 1) * width].iter().copied()).collect::<Vec<_>>();
+        let mut out = Self { sh_degree: self.sh_degree, ..Default::default() };
+        for ((_, width, from), (_, _, to)) in self.columns().into_iter().zip(out.columns_mut()) {
+            *to = pick(width, from);
+        }
+        for (name, a) in &self.extra {
+            let needed = a.needed.as_ref().map(|n| NeededRows { rows: keep.iter().map(|&i| n.rows[i]).collect(), start: n.start });
+            out.extra.insert(name.clone(), ExtraAttribute { width: a.width, values: pick(a.width, &a.values), tolerance: a.tolerance, needed });
+        }
+        out
+    }
+}

@@ -1,0 +1,41 @@
+//! 8-bit images.
+
+/// An 8-bit image, row-major, 3 (RGB) or 4 (RGBA, straight alpha) channels.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Image8 {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// 3 or 4.
+    pub channels: u32,
+    /// `width * height * channels` bytes.
+    pub data: Vec<u8>,
+}
+
+impl Image8 {
+    /// Linear planes [3,H,W] in 0..1, alpha composited over `background`.
+    pub fn to_planes(&self, background: [f32; 3]) -> Vec<f32> {
+        let pixels = (self.width * self.height) as usize;
+        let mut planes = vec![0.0f32; 3 * pixels];
+        let c = self.channels as usize;
+        for (i, px) in self.data.chunks_exact(c).enumerate() {
+            let a = if c == 4 { f32::from(px[3]) / 255.0 } else { 1.0 };
+            for k in 0..3 {
+                planes[k * pixels + i] = a * f32::from(px[k]) / 255.0 + (1.0 - a) * background[k];
+            }
+        }
+        planes
+    }
+    /// The RGB image of planes [3,H,W]: clamped to 0..1, `value * 255 + 0.5` truncated (the protocol of published tables).
+    pub fn from_planes(planes: &[f32], width: u32, height: u32) -> Self {
+        let pixels = (width * height) as usize;
+        let mut data = vec![0u8; 3 * pixels];
+        for (i, px) in data.chunks_exact_mut(3).enumerate() {
+            for k in 0..3 {
+                px[k] = (planes[k * pixels + i].clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
+            }
+        }
+        Self { width, height, channels: 3, data }
+    }
+}

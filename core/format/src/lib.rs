@@ -1,0 +1,40 @@
+//! The stored form of cc4dgs: Gaussians as plain arrays, the `.cc4d` archive, the codec seams, PLY and SPZ.
+//!
+//! This crate knows nothing of burn, and on `wasm32` nothing of C: it is all that a codec or a small player needs. The author of a codec implements
+//! [`AttributeCodec`] (or [`WeightCodec`]) and submits a [`CodecPlugin`] ([`WeightCodecPlugin`]) through `inventory::submit!`; [`storage`] has the parts that
+//! most codecs share, [`conformance`] the suites that every codec passes. inventory, serde and toml are re-exported in the versions that this crate uses.
+
+pub mod archive;
+mod camera;
+mod codec;
+mod codec_context;
+pub mod config;
+pub mod conformance;
+mod deformer_context;
+mod error;
+mod events;
+pub mod gaussians;
+mod image;
+mod limits;
+mod plugin;
+pub mod ply;
+mod rules;
+mod seed;
+pub mod spz;
+pub mod storage;
+mod weight_codec;
+
+pub use camera::Camera;
+pub use codec::{AttributeCodec, CodecPlugin, DeclaredLoss, Stream};
+pub use codec_context::{CodecContext, EvaluateDeformer, RenderModel, RenderedPlanes, TrainingViews};
+pub use deformer_context::DeformerContext;
+pub use error::{Error, Result};
+pub use events::{Event, EventSink, Fanout, Recorder, Silent};
+pub use gaussians::{ExtraAttribute, HostGaussians, NeededRows};
+pub use image::Image8;
+pub use limits::Limits;
+pub use plugin::{Entries, Plugin, PluginEntry, split_kind, unknown_name};
+pub use rules::Rules;
+pub use seed::Seed;
+pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin};
+pub use {inventory, serde, toml};

@@ -1,0 +1,16 @@
+//! The rules of projection and blending that a model was trained under.
+
+use serde::{Deserialize, Serialize};
+
+/// Which reference implementation's rules decide the corner cases of projection and blending.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rules {
+    /// gsplat 1.6: near 0.01, 3.33 sigma per axis, alpha cap 0.99 whose gradient is cut.
+    #[default]
+    Gsplat099,
+    /// gsplat up to 1.5.3: as above with the cap at 0.999.
+    Gsplat0999,
+    /// Inria: near 0.2, square of 3 sigma of the major axis, alpha cap 0.99 whose gradient passes.
+    Inria,
+}

@@ -1,0 +1,49 @@
+//! What most codecs need and nobody should write twice.
+//!
+//! * [`Shape`], [`StreamSet`], [`open`], [`assemble`], [`close`]: the frame of a codec. A `meta` stream holds a version, the number of Gaussians, the degree
+//!   and the extra attributes; a decoder reads and checks all that before it allocates anything.
+//! * [`extra_streams`], [`Shape::read_extra`]: the extra attributes of plug-ins, bit for bit or within their tolerance, in the rows that are needed.
+//! * [`column`], [`store`], [`load`], [`split`], [`interleave`]: numbers as columns of codes with few bits, outliers kept exactly beside them.
+//! * [`to_planes`], [`from_planes`]: float32 values, column by column.
+//! * [`write_shapes`], [`read_shapes`]: names and shapes of a field's weights.
+//!
+//! The smallest lossless codec:
+//!
+//! ```
+//! use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams, from_planes, open, to_planes};
+//! use cc4dgs_format::{CodecContext, HostGaussians, Result, Stream};
+//!
+//! fn encode(gaussians: &HostGaussians) -> Result<Vec<Stream>> {
+//!     let mut meta = vec![1];
+//!     Shape::of(gaussians).write(&mut meta)?;
+//!     let mut streams = vec![Stream { name: META.into(), bytes: meta }];
+//!     streams.extend(gaussians.columns().map(|(name, width, values)| Stream { name: name.into(), bytes: to_planes(values, width) }));
+//!     streams.extend(extra_streams(gaussians, Attributes::Exact));
+//!     Ok(streams)
+//! }
+//!
+//! fn decode(streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+//!     let (set, meta, shape) = open("mine", streams, 1, &context.limits)?;
+//!     meta.finish()?;
+//!     let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+//!     for (name, width, values) in out.columns_mut() {
+//!         *values = from_planes(set.reader(name)?, shape.count, width)?;
+//!     }
+//!     shape.read_extra(&set, &mut out)?;
+//!     out.validate("decoded Gaussians", &context.limits)?;
+//!     Ok(out)
+//! }
+//! ```
+
+pub mod column;
+mod extra;
+pub mod mulaw;
+mod rows;
+mod shapes;
+mod streams;
+
+pub use column::relative_rms;
+pub use extra::{Attributes, extra_streams};
+pub use rows::{interleave, load, split, store};
+pub use shapes::{read_shapes, value_count, write_shapes};
+pub use streams::{ESCAPES, META, Shape, StreamSet, assemble, close, from_planes, open, to_planes};

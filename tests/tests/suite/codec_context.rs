@@ -1,0 +1,145 @@
+//! What a codec is handed when a model is stored with its scene, and what it may lose of a field's attributes.
+
+use burn::tensor::Device;
+use cc4dgs_core::archive::Archive;
+use cc4dgs_core::{
+    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Event, ExtraAttribute, HostGaussians, Limits, Plugin, Recorder, Registry, Result,
+    Seed, Silent, Stream, inventory,
+};
+use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
+use cc4dgs_engine::codec_services::{ModelServices, SceneViews};
+use cc4dgs_engine::config::RenderConfig;
+use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_engine::model::{ArchiveOptions, Model, ModelDeformer, ModelSize};
+use cc4dgs_engine::play::Player;
+use cc4dgs_engine::train::Moving;
+use std::path::Path;
+
+/// `raw`, and a note of what the context held.
+struct Witness(Box<dyn AttributeCodec>);
+
+impl AttributeCodec for Witness {
+    fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        if let (Some(views), Some(renderer), Some(deformer)) = (context.views, context.renderer, context.deformer) {
+            let (camera, time_norm) = views.view(0);
+            let (image, drawn) = (views.image(0)?, renderer.render(gaussians, camera, time_norm)?.to_image());
+            let moved = deformer.deform(gaussians, time_norm)?;
+            let same_size = (image.width, image.height) == (drawn.width, drawn.height) && moved.len() == gaussians.len();
+            context.events.emit(&Event::Note { object: "codec witness".into(), message: format!("{} views, sizes agree: {same_size}", views.len()) });
+        }
+        self.0.encode(gaussians, context)
+    }
+    fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        self.0.decode(streams, context)
+    }
+    fn losses(&self) -> Vec<DeclaredLoss> {
+        self.0.losses()
+    }
+}
+
+inventory::submit! {
+    CodecPlugin {
+        info: Plugin { name: "witness", version: "1", summary: "raw, and a note of its context", paper: "a test", schema: "# no settings\n", capabilities: &["lossless"] },
+        build: |profile, settings| Ok(Box::new(Witness((Registry::collect()?.codec("raw")?.build)(profile, settings)?))),
+    }
+}
+
+const COUNT: usize = 90;
+
+/// Every third Gaussian moves, with attributes of its own.
+fn model(registry: &Registry) -> Model {
+    let draw = |i: usize, k: usize| (Seed::root(3).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+    let mut gaussians = HostGaussians::default();
+    for i in 0..COUNT {
+        gaussians.means.extend([draw(i, 0), draw(i, 1), draw(i, 2)]);
+        gaussians.log_scales.extend([-2.0, -2.2, -2.4]);
+        gaussians.quaternions.extend([1.0, 0.1 * draw(i, 3), 0.0, 0.0]);
+        gaussians.opacity_logits.push(1.0);
+        gaussians.sh_dc.extend([draw(i, 4), draw(i, 5), draw(i, 6)]);
+        gaussians.dynamic_scores.push(if i % 3 == 0 { 9.0 } else { 0.0 });
+    }
+    let device = Device::flex();
+    let section: toml::Table = "kind = \"native-4d\"\nduration = 0.5".parse().unwrap();
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 0, seed: Seed::root(3) };
+    let field = registry.build_deformer(&section, &context, &device).unwrap();
+    for spec in field.attributes() {
+        let values = (0..COUNT * spec.width).map(|i| spec.start + 0.1 * draw(i, 7)).collect();
+        gaussians.extra.insert(spec.name.clone(), ExtraAttribute::exact(spec.width, values));
+    }
+    Model {
+        gaussians,
+        field: Some(ModelDeformer { field, section, context }),
+        moving: Moving::Scored { zeta: 5.0 },
+        render: RenderConfig::default(),
+        background: Some([0.2, 0.4, 0.6]),
+        rasterizer: "kind = \"tile\"".parse().unwrap(),
+        frame_count: 10,
+        provenance: Default::default(),
+        size: ModelSize::default(),
+    }
+}
+
+fn scene() -> cc4dgs_core::Scene {
+    data::open(Path::new("procedural"), &SceneOptions { width: 40, height: 40, ..Default::default() }, &Limits::default()).unwrap()
+}
+
+#[test]
+fn a_codec_gets_views_renderer_and_field_only_with_a_scene() {
+    let registry = Registry::collect().unwrap();
+    let (model, scene, device) = (model(&registry), scene(), Device::flex());
+    let folder = tempfile::tempdir().unwrap();
+    let settings = toml::Table::new();
+    let notes = |scene: Option<&cc4dgs_core::Scene>| -> Vec<String> {
+        let events = Recorder::default();
+        let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", scene: scene.map(|s| (s, &device)) };
+        model.save_archive(&folder.path().join("m.cc4d"), &options, &registry, &Limits::default(), &events).unwrap();
+        events.events().into_iter().filter_map(|e| if let Event::Note { message, .. } = e { Some(message) } else { None }).collect()
+    };
+    assert!(notes(None).is_empty());
+    assert_eq!(notes(Some(&scene)), [format!("{} views, sizes agree: true", SceneViews::new(&scene).len())]);
+}
+
+#[test]
+fn services_move_and_draw_as_playback_does() {
+    let registry = Registry::collect().unwrap();
+    let (model, scene, device) = (model(&registry), scene(), Device::flex());
+    let services = ModelServices::new(&model, &registry, &device).unwrap();
+    let views = SceneViews::new(&scene);
+    let (camera, _) = views.view(0);
+    let drawn = services.render(&model.gaussians, camera, 0.8).unwrap();
+    let played = Player::new(&model, &registry, &device).unwrap().render(camera, 0.8).unwrap().0.planes.into_data().to_vec::<f32>().unwrap();
+    let worst = drawn.planes.iter().zip(&played).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(drawn.planes.len() == played.len() && worst < 1e-4, "off by {worst}");
+
+    let moved = services.deform(&model.gaussians, 0.8).unwrap();
+    for (i, (before, after)) in model.gaussians.means.chunks_exact(3).zip(moved.means.chunks_exact(3)).enumerate() {
+        assert_eq!(before == after, i % 3 != 0, "Gaussian {i}: {before:?} became {after:?}");
+    }
+}
+
+#[test]
+fn attributes_of_gaussians_that_stand_still_are_not_stored_by_lossy_codecs() {
+    let registry = Registry::collect().unwrap();
+    let model = model(&registry);
+    let folder = tempfile::tempdir().unwrap();
+    let (settings, limits) = (toml::Table::new(), Limits::default());
+    let mut sizes = Vec::new();
+    for codec in ["raw", "quantize"] {
+        let path = folder.path().join(format!("{codec}.cc4d"));
+        let options = ArchiveOptions { codec, settings: &settings, field_weights: "fp32", scene: None };
+        model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
+        let stored: u64 = Archive::open(&path, &limits).unwrap().stream_sizes().iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
+        sizes.push(stored);
+        let back = Model::open(&path, &registry, &Device::flex(), &limits, &Silent).unwrap();
+        // Codecs reorder; where a Gaussian moves tells it from one that does not, and its attributes must be among those that went in.
+        for spec in model.field.as_ref().unwrap().field.attributes() {
+            let given = &model.gaussians.extra[&spec.name].values;
+            for (row, score) in back.gaussians.extra[&spec.name].values.chunks_exact(spec.width).zip(&back.gaussians.dynamic_scores) {
+                let known = given.chunks_exact(spec.width).any(|g| g == row);
+                let at_start = row.iter().all(|v| *v == spec.start);
+                assert!(known && (*score > 5.0 || codec == "raw") || at_start && *score <= 5.0, "{codec}: {} of a score of {score}: {row:?}", spec.name);
+            }
+        }
+    }
+    assert!(2 * sizes[1] < sizes[0], "{sizes:?}: two thirds of the rows need no bytes");
+}
