@@ -75,7 +75,7 @@ fn main() -> Result<()> {
     let (registry, limits, device) = (Registry::collect()?, Limits::default(), parse_device("flex")?);
     let load = || Model::open(model.as_ref(), &registry, &device, &limits, &Silent);
     let plain = load()?;
-    let scene = open_as_trained(scene.as_ref(), &plain, &[], &limits)?;
+    let scene = open_as_trained(scene.as_ref(), &plain, &[], &registry, &limits)?;
     let score = |model: &Model| evaluate(model, &scene, Split::Test, views, &registry, &device, &Silent, &mut |_, _, _, _| Ok(()));
     let before = score(&plain)?;
     println!("{} moving Gaussians, field {} bytes as float32, {:.3} dB", before.dynamic_gaussians, plain.size.deform, before.psnr_db);

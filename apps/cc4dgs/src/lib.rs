@@ -32,9 +32,8 @@ pub use model::Model;
 pub use orbit::Orbit;
 pub use session::{Session, SessionBuilder};
 
-pub use cc4dgs_core::{Camera, Error, Event, EventSink, HostGaussians, Image8, Limits, Registry, Result, Scene, Split};
+pub use cc4dgs_core::{Camera, Error, Event, EventSink, HostGaussians, Image8, Limits, Registry, Result, Scene, SceneOptions, Split};
 pub use cc4dgs_engine::config::RunConfig;
-pub use cc4dgs_engine::data::SceneOptions;
 pub use cc4dgs_engine::images::write_png;
 pub use cc4dgs_engine::play::Player;
 

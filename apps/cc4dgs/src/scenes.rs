@@ -1,7 +1,7 @@
 //! Opening a dataset as a model was trained on it.
 
-use cc4dgs_core::{Error, Limits, Result, Scene, config};
-use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config};
+use cc4dgs_engine::data;
 use cc4dgs_engine::model::Model;
 use std::path::Path;
 
@@ -12,8 +12,8 @@ const OURS_ALONE: [&str; 3] = ["ffmpeg", "video_cache", "cache_mb"];
 ///
 /// # Errors
 /// [`Error::Parameter`] for an assignment that is no scene option, and whatever the reader reports.
-pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], limits: &Limits) -> Result<Scene> {
-    data::open(path, &options_as_trained(&model.provenance.config, sets)?, limits)
+pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], registry: &Registry, limits: &Limits) -> Result<Scene> {
+    data::open(path, &options_as_trained(&model.provenance.config, sets)?, registry, limits)
 }
 
 /// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. A model may come from anyone: what it says never chooses

@@ -4,9 +4,9 @@ use crate::Model;
 use crate::runs::{Existing, check_folder};
 use crate::{plugins, scenes};
 use burn::tensor::Device;
-use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, Silent, Split, parse_device};
+use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device};
 use cc4dgs_engine::config::RunConfig;
-use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_engine::data;
 use cc4dgs_engine::eval::{EvalReport, evaluate};
 use cc4dgs_engine::play::Player;
 use cc4dgs_engine::train::{CONFIG, TrainJob, train};
@@ -121,7 +121,7 @@ impl Session {
     /// # Errors
     /// What the reader reports: options without meaning, formats that are not known, broken files, claims over the limits.
     pub fn read_scene(&self, path: impl AsRef<Path>, options: &SceneOptions) -> Result<Scene> {
-        data::open(path.as_ref(), options, self.limits())
+        data::open(path.as_ref(), options, self.registry(), self.limits())
     }
     /// Opens the dataset at `path` as `model` was trained on it. What a stranger's model says never chooses programs to run, folders to write or memory to
     /// take.
@@ -129,7 +129,7 @@ impl Session {
     /// # Errors
     /// As [`Session::read_scene`].
     pub fn open_scene(&self, path: impl AsRef<Path>, model: &Model) -> Result<Scene> {
-        scenes::open_as_trained(path.as_ref(), model, &[], self.limits())
+        scenes::open_as_trained(path.as_ref(), model, &[], self.registry(), self.limits())
     }
     /// Trains on `scene`. With a folder, checkpoint and configuration are left there; it must not hold a run already.
     ///

@@ -1,9 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
-use crate::data::SceneOptions;
-use crate::presets;
 use burn::tensor::Tensor;
-use cc4dgs_core::{Error, Limits, Registry, RenderSettings, Result, Rules, Scene, config, split_kind};
+use cc4dgs_core::{Error, Limits, Registry, RenderSettings, Result, Rules, Scene, SceneOptions, config, split_kind};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -290,10 +288,6 @@ impl Default for GaussianRates {
 }
 
 impl RunConfig {
-    /// Names and summaries of the presets; see [`presets::methods`] for what may follow them.
-    pub fn presets() -> Vec<(&'static str, &'static str)> {
-        presets::families()
-    }
     /// Layers a preset, a TOML file and `key=value` overrides, in that order, and reads the result strictly.
     pub fn resolve(preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
         let mut table = toml::Table::new();
@@ -306,7 +300,7 @@ impl RunConfig {
         };
         let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
         if let Some(name) = preset.map(str::to_string).or(named) {
-            table = presets::table(&name)?;
+            table = Registry::collect()?.preset(&name)?;
         }
         config::merge(&mut table, &from_file);
         config::set_all(&mut table, sets)?;
@@ -411,10 +405,12 @@ fn filled(schema: &str, section: &toml::Table) -> Result<toml::Table> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::PresetRole;
 
     #[test]
     fn every_preset_parses_and_round_trips() {
-        for (name, _) in RunConfig::presets() {
+        for plugin in Registry::collect().unwrap().presets().filter(|p| p.role != PresetRole::Method) {
+            let name = plugin.info.name;
             let config = RunConfig::resolve(Some(name), None, &["train.iterations=7".into()]).unwrap();
             assert_eq!(config.train.iterations, 7);
             let text = config.to_toml().unwrap();

@@ -1,5 +1,7 @@
 //! 8-bit images.
 
+use crate::{Error, Result};
+
 /// An 8-bit image, row-major, 3 (RGB) or 4 (RGBA, straight alpha) channels.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Image8 {
@@ -14,6 +16,18 @@ pub struct Image8 {
 }
 
 impl Image8 {
+    /// Refuses an image without pixels, with other than 3 or 4 channels, or with another number of bytes than its size wants; `object` names it in the error.
+    pub fn validate(&self, object: &str) -> Result<()> {
+        let bytes = u64::from(self.width).saturating_mul(u64::from(self.height)).saturating_mul(u64::from(self.channels));
+        if bytes == 0 || !(3..=4).contains(&self.channels) || self.data.len() as u64 != bytes {
+            return Err(Error::data(
+                object,
+                format!("{} bytes for {}x{} pixels of {} channels", self.data.len(), self.width, self.height, self.channels),
+                "An image has 3 or 4 bytes per pixel; correct the program that made it",
+            ));
+        }
+        Ok(())
+    }
     /// Linear planes [3,H,W] in 0..1, alpha composited over `background`.
     pub fn to_planes(&self, background: [f32; 3]) -> Vec<f32> {
         let pixels = (self.width * self.height) as usize;

@@ -2,7 +2,8 @@
 
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, DensityControl, DensityPlugin,
-    Entries, LossPlugin, Optimizer, OptimizerPlugin, Plugin, Rasterizer, RasterizerPlugin, Result, WeightCodec, WeightCodecPlugin, split_kind,
+    Entries, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer, RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin,
+    split_kind,
 };
 use burn::tensor::Device;
 
@@ -16,6 +17,8 @@ pub struct Registry {
     appearances: Entries<AppearancePlugin>,
     optimizers: Entries<OptimizerPlugin>,
     weight_codecs: Entries<WeightCodecPlugin>,
+    readers: Entries<ReaderPlugin>,
+    presets: Entries<PresetPlugin>,
 }
 
 impl Registry {
@@ -30,13 +33,15 @@ impl Registry {
             appearances: Entries::collect()?,
             optimizers: Entries::collect()?,
             weight_codecs: Entries::collect()?,
+            readers: Entries::collect()?,
+            presets: Entries::collect()?,
         })
     }
     /// All entries as (kind, facts), sorted.
     pub fn plugins(&self) -> Vec<(&'static str, &'static Plugin)> {
         let model = self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts());
         let training = self.density.facts().chain(self.losses.facts()).chain(self.appearances.facts()).chain(self.optimizers.facts());
-        model.chain(training).collect()
+        model.chain(training).chain(self.readers.facts()).chain(self.presets.facts()).collect()
     }
     /// The deformer called `name`.
     pub fn deformer(&self, name: &str) -> Result<&'static DeformerPlugin> {
@@ -88,6 +93,21 @@ impl Registry {
     /// The weight codec called `name`.
     pub fn weight_codec(&self, name: &str) -> Result<&'static WeightCodecPlugin> {
         self.weight_codecs.get(name)
+    }
+    /// The reader called `name`.
+    pub fn reader(&self, name: &str) -> Result<&'static ReaderPlugin> {
+        self.readers.get(name)
+    }
+    /// All readers in the order in which they are asked whether a path is theirs.
+    pub fn readers(&self) -> Vec<&'static ReaderPlugin> {
+        let mut readers: Vec<_> = self.readers.iter().collect();
+        // Entries come sorted by name, and the sort is stable: equal orders are asked by name.
+        readers.sort_by_key(|r| r.order);
+        readers
+    }
+    /// All presets, families and methods, sorted by name; see [`Registry::preset`] for the settings of one.
+    pub fn presets(&self) -> impl Iterator<Item = &'static PresetPlugin> + '_ {
+        self.presets.iter()
     }
     /// Builds the deformer of a `[deformer]` section (`kind` and its settings).
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {

@@ -1,6 +1,7 @@
 //! What a codec is handed when a model is stored with its scene, and what it may lose of a field's attributes.
 
 use burn::tensor::Device;
+use cc4dgs_core::SceneOptions;
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Event, ExtraAttribute, HostGaussians, Limits, Plugin, Recorder, Registry, Result,
@@ -9,7 +10,7 @@ use cc4dgs_core::{
 use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
 use cc4dgs_engine::codec_services::{ModelServices, SceneViews};
 use cc4dgs_engine::config::RenderConfig;
-use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_engine::data;
 use cc4dgs_engine::model::{ArchiveOptions, Model, ModelDeformer, ModelSize};
 use cc4dgs_engine::play::Player;
 use cc4dgs_engine::train::Moving;
@@ -80,7 +81,8 @@ fn model(registry: &Registry) -> Model {
 }
 
 fn scene() -> cc4dgs_core::Scene {
-    data::open(Path::new("procedural"), &SceneOptions { width: 40, height: 40, ..Default::default() }, &Limits::default()).unwrap()
+    data::open(Path::new("procedural"), &SceneOptions { width: 40, height: 40, ..Default::default() }, &Registry::collect().unwrap(), &Limits::default())
+        .unwrap()
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
-use cc4dgs_core::{Error, Event, EventSink, Limits, Recorder, Registry, Scene, Silent, Split};
+use cc4dgs_core::{Error, Event, EventSink, Limits, PresetRole, Recorder, Registry, Scene, Silent, Split};
 use cc4dgs_engine::agreement::agreement;
 use cc4dgs_engine::config::RunConfig;
 use cc4dgs_engine::eval::{EvalReport, evaluate};
@@ -31,7 +31,7 @@ fn options<'a>(codec: &'a str, field_weights: &'a str) -> ArchiveOptions<'a> {
 }
 
 fn open(config: &RunConfig) -> Arc<Scene> {
-    Arc::new(cc4dgs_engine::data::open(Path::new("procedural"), &config.scene, &config.limits).unwrap())
+    Arc::new(cc4dgs_engine::data::open(Path::new("procedural"), &config.scene, &Registry::collect().unwrap(), &config.limits).unwrap())
 }
 
 fn run(config: &RunConfig, out: &Path, resume: bool, events: &dyn EventSink, stop: &AtomicBool) -> cc4dgs_core::Result<TrainReport> {
@@ -208,7 +208,7 @@ fn every_field_trains_resumes_plays_and_is_archived() {
     let registry = Registry::collect().unwrap();
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
-    for (method, _) in cc4dgs_engine::presets::methods() {
+    for method in registry.presets().filter(|p| p.role == PresetRole::Method).map(|p| p.info.name) {
         let sets: Vec<String> = ["scene.width=32", "scene.height=32", "train.iterations=40", "init.count=150", "train.log_every=5", "train.dynamic=all"]
             .iter()
             .map(ToString::to_string)

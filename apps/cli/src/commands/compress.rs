@@ -55,7 +55,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     config::set_all(&mut settings, &args.sets)?;
     // An unknown name is refused before the scene is read.
     context.registry.weight_codec(&args.field_weights)?;
-    let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.limits)).transpose()?;
+    let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?;
     let options = ArchiveOptions {
         codec: &args.codec,
         settings: &settings,

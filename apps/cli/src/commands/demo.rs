@@ -53,7 +53,7 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None };
     let packed = compress::compress(context, &loaded.model, &options, &archive, &events)?;
 
-    let scene = open_as_trained(scene_path, &loaded.model, &[], &context.limits)?;
+    let scene = open_as_trained(scene_path, &loaded.model, &[], &context.registry, &context.limits)?;
     let plain = Images::default();
     let before = measure(context, &args.out, &loaded, &scene, Split::Test, 0, &plain, &events)?;
     let images = Images { sheet: Some(args.out.join("sheet.png")), sheet_rows: 6, renders: None };

@@ -53,7 +53,7 @@ pub struct Images {
 pub fn run(context: &Context, args: &Eval) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.limits)?;
+    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.registry, &context.limits)?;
     let split = args.views.split.into();
     let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_file()));
     let images = Images { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };

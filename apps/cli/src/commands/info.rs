@@ -6,8 +6,8 @@ use super::{Context, megabytes};
 use crate::args::Info;
 use cc4dgs_core::archive::{Archive, DeformerEntry, StreamKind};
 use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, HostGaussians, Result, Silent, Split, parse_device};
-use cc4dgs_engine::data::{self, SceneOptions};
+use cc4dgs_core::{Error, HostGaussians, Result, SceneOptions, Silent, Split, parse_device};
+use cc4dgs_engine::data;
 use cc4dgs_engine::eval::SizeMb;
 use cc4dgs_engine::model::{Model, attribute_width};
 use cc4dgs_engine::source::{Source, SourceKind};
@@ -134,7 +134,7 @@ fn gaussians(host: &HostGaussians) -> Result<Value> {
 }
 
 fn scene(context: &Context, path: &Path) -> Result<Value> {
-    let scene = data::open(path, &SceneOptions::default(), &context.limits)?;
+    let scene = data::open(path, &SceneOptions::default(), &context.registry, &context.limits)?;
     let sizes: std::collections::BTreeSet<(u32, u32)> = scene.cameras.iter().map(|c| (c.width, c.height)).collect();
     let sizes: Vec<String> = sizes.into_iter().map(|(w, h)| format!("{w}x{h}")).collect();
     Ok(json!({

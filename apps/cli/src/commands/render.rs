@@ -88,7 +88,7 @@ fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) 
         let cameras = orbit.around(&model.gaussians)?;
         return Ok((cameras.into_iter().enumerate().map(|(i, camera)| (camera, orbit.time(i))).collect(), None));
     };
-    let scene = open_as_trained(path, model, &args.sets, &context.limits)?;
+    let scene = open_as_trained(path, model, &args.sets, &context.registry, &context.limits)?;
     let views = scene.split(args.split.into());
     if views.is_empty() {
         return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));

@@ -56,7 +56,7 @@ pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out:
     let stop = interrupt::stop_flag()?;
     check_folder(out, existing, "Go on with it (train --resume), start anew in its place (--overwrite), or choose another folder")?;
     plugins::check(config, &context.registry)?;
-    let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &config.limits)?);
+    let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &context.registry, &config.limits)?);
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let resume = existing == Existing::Resume;
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;

@@ -1,7 +1,6 @@
 //! Where a scene without points probably is, judged from its cameras alone.
 
-use super::raw::RawCamera;
-use cc4dgs_core::{Scene, Split};
+use cc4dgs_core::{RawCamera, Scene, Split};
 use glam::{DMat3, DVec3};
 
 /// A box in world units: around the point the training cameras look at, wide enough to hold what they see.
@@ -21,7 +20,7 @@ pub fn camera_box(scene: &Scene) -> ([f32; 3], [f32; 3]) {
 
 /// The box around what the cameras see between their near and far depths, from the raw numbers of a LLFF file. The far depth is the median one
 /// and at most eight times the median near one: a few points at the horizon must not spread the box over nothing. `None` if depths are unusable.
-pub(crate) fn frustum_box(cameras: &[RawCamera], depths: &[(f64, f64)]) -> Option<([f32; 3], [f32; 3])> {
+pub(crate) fn frustum_box(cameras: &[RawCamera], depths: &[(f64, f64)]) -> Option<[[f64; 3]; 2]> {
     let median = |mut v: Vec<f64>| {
         v.sort_by(f64::total_cmp);
         v.get(v.len() / 2).copied()
@@ -43,7 +42,7 @@ pub(crate) fn frustum_box(cameras: &[RawCamera], depths: &[(f64, f64)]) -> Optio
             }
         }
     }
-    (low.is_finite() && high.is_finite()).then(|| (low.as_vec3().to_array(), high.as_vec3().to_array()))
+    (low.is_finite() && high.is_finite()).then(|| [low.to_array(), high.to_array()])
 }
 
 /// Centre and half-width from camera centres and unit forward directions.

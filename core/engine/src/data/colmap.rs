@@ -1,17 +1,15 @@
-//! COLMAP models, text or binary, with their sparse points. Static scenes; every eighth picture is held out.
+//! COLMAP models, text or binary, with their sparse points. Static scenes; every eighth image is held out.
 
-use super::distortion::Distortion;
-use super::files::{file_name, read_bytes, read_text};
 use super::nerfstudio::HOLD_OUT_EVERY;
-use super::pose::{Matrix4, from_quaternion};
-use super::raw::{Picture, RawCamera, RawScene, RawView};
-use super::{Reader, SceneOptions, colmap_binary, colmap_text};
-use cc4dgs_core::{Error, Limits, PointCloud, Result, Split};
+use super::{colmap_binary, colmap_text};
+use cc4dgs_core::reader::files::{file_name, read_bytes, read_text};
+use cc4dgs_core::reader::pose::{Matrix4, from_quaternion};
+use cc4dgs_core::{
+    Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
+};
 use glam::DVec3;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-
-pub(crate) struct Colmap;
 
 /// A camera record: model, size in pixels, parameters.
 #[derive(Clone, Debug, PartialEq)]
@@ -21,7 +19,7 @@ pub(crate) struct ColmapCamera {
     pub parameters: Vec<f64>,
 }
 
-/// A picture record.
+/// An image record.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ColmapImage {
     pub camera: u32,
@@ -93,7 +91,7 @@ fn model_folder(path: &Path) -> Option<PathBuf> {
 struct ColmapModel {
     cameras: BTreeMap<u32, ColmapCamera>,
     images: Vec<ColmapImage>,
-    points: PointCloud,
+    points: RawPoints,
 }
 
 fn read_model(folder: &Path, limits: &Limits) -> Result<ColmapModel> {
@@ -104,55 +102,65 @@ fn read_model(folder: &Path, limits: &Limits) -> Result<ColmapModel> {
         let (c, i, p) = (file("cameras", "bin"), file("images", "bin"), file("points3D", "bin"));
         cameras = colmap_binary::cameras(&named(&c), &read_bytes(&c, limits)?)?;
         images = colmap_binary::images(&named(&i), &read_bytes(&i, limits)?)?;
-        points = if p.is_file() { colmap_binary::points(&named(&p), &read_bytes(&p, limits)?, limits)? } else { PointCloud::default() };
+        points = if p.is_file() { colmap_binary::points(&named(&p), &read_bytes(&p, limits)?, limits)? } else { RawPoints::default() };
     } else {
         let (c, i, p) = (file("cameras", "txt"), file("images", "txt"), file("points3D", "txt"));
         cameras = colmap_text::cameras(&named(&c), &read_text(&c, limits)?)?;
         images = colmap_text::images(&named(&i), &read_text(&i, limits)?)?;
-        points = if p.is_file() { colmap_text::points(&named(&p), &read_text(&p, limits)?, limits)? } else { PointCloud::default() };
+        points = if p.is_file() { colmap_text::points(&named(&p), &read_text(&p, limits)?, limits)? } else { RawPoints::default() };
     }
     Ok(ColmapModel { cameras, images, points })
 }
 
-impl Reader for Colmap {
-    fn name(&self) -> &'static str {
-        "colmap"
-    }
-    fn looks_for(&self) -> &'static str {
-        "sparse/0/cameras.bin or .txt, with images.* beside it and pictures in images/ (COLMAP)"
-    }
-    fn probe(&self, path: &Path) -> bool {
-        model_folder(path).is_some()
-    }
-    fn open(&self, path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
-        let folder = model_folder(path)
-            .ok_or_else(|| Error::data(path.display().to_string(), "it holds no cameras.bin or cameras.txt", "Point to the folder above sparse/"))?;
-        let object = folder.display().to_string();
-        let ColmapModel { cameras, mut images, points } = read_model(&folder, limits)?;
-        images.sort_by(|a, b| a.name.cmp(&b.name));
-        let mut scene = RawScene { name: file_name(path), points: Some(points), ..Default::default() };
-        let pictures = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()].into_iter().find(|f| f.is_dir());
-        let pictures = pictures.unwrap_or_else(|| path.join("images"));
-        let hold_out = images.len() > 1;
-        for (index, image) in images.iter().enumerate() {
-            let bad = |problem: String| Error::data(format!("{object}: picture {}", image.name), problem, "Export the model again");
-            let camera = cameras.get(&image.camera).ok_or_else(|| bad(format!("its camera {} is not in the model", image.camera)))?;
-            let (focal, principal, distortion) = camera.intrinsics();
-            let size = camera.size.map(|v| u32::try_from(v).unwrap_or(u32::MAX));
-            limits.check_pixels(&format!("{object}: camera {}", image.camera), camera.size[0], camera.size[1])?;
-            let world_to_camera: Matrix4 = from_quaternion(image.rotation, image.translation).map_err(bad)?;
-            scene.cameras.push(RawCamera { name: image.name.clone(), size, focal, principal, distortion, world_to_camera });
-            let split = if hold_out && index % HOLD_OUT_EVERY == 0 { Split::Test } else { Split::Train };
-            let picture = Picture::File { path: pictures.join(&image.name), mask: None };
-            scene.views.push(RawView { camera: index, frame: 0, time: Some(0.0), split, picture });
-        }
-        Ok(scene)
+inventory::submit! {
+    ReaderPlugin {
+        info: Plugin {
+            name: "colmap",
+            version: "1",
+            summary: "COLMAP models, static",
+            paper: "Structure-from-Motion Revisited (Schoenberger and Frahm 2016)",
+            schema: "",
+            capabilities: &[],
+        },
+        looks_for: "sparse/0/cameras.bin or .txt, with images.* beside it and images in images/ (COLMAP)",
+        order: 600,
+        probe,
+        open,
     }
 }
 
-/// The points of a COLMAP model beside another calibration, if both speak of the same world: every camera must have a picture of its name whose
+fn probe(path: &Path) -> bool {
+    model_folder(path).is_some()
+}
+
+fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let folder = model_folder(path)
+        .ok_or_else(|| Error::data(path.display().to_string(), "it holds no cameras.bin or cameras.txt", "Point to the folder above sparse/"))?;
+    let object = folder.display().to_string();
+    let ColmapModel { cameras, mut images, points } = read_model(&folder, limits)?;
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+    let mut scene = RawScene { name: file_name(path), points: Some(points), ..Default::default() };
+    let folders = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()];
+    let image_folder = folders.into_iter().find(|f| f.is_dir()).unwrap_or_else(|| path.join("images"));
+    let hold_out = images.len() > 1;
+    for (index, image) in images.iter().enumerate() {
+        let bad = |problem: String| Error::data(format!("{object}: image {}", image.name), problem, "Export the model again");
+        let camera = cameras.get(&image.camera).ok_or_else(|| bad(format!("its camera {} is not in the model", image.camera)))?;
+        let (focal, principal, distortion) = camera.intrinsics();
+        let size = camera.size.map(|v| u32::try_from(v).unwrap_or(u32::MAX));
+        limits.check_pixels(&format!("{object}: camera {}", image.camera), camera.size[0], camera.size[1])?;
+        let world_to_camera: Matrix4 = from_quaternion(image.rotation, image.translation).map_err(bad)?;
+        scene.cameras.push(RawCamera { name: image.name.clone(), size, focal, principal, distortion, world_to_camera });
+        let split = if hold_out && index % HOLD_OUT_EVERY == 0 { Split::Test } else { Split::Train };
+        let source = ImageSource::File { path: image_folder.join(&image.name), mask: None };
+        scene.views.push(RawView { camera: index, frame: 0, time: Some(0.0), split, image: source });
+    }
+    Ok(scene)
+}
+
+/// The points of a COLMAP model beside another calibration, if both use the same world: every camera must have an image of its name whose
 /// centre agrees to a thousandth of the rig.
-pub(crate) fn points_in_same_world(path: &Path, cameras: &[RawCamera], limits: &Limits) -> Result<Option<PointCloud>> {
+pub(crate) fn points_in_same_world(path: &Path, cameras: &[RawCamera], limits: &Limits) -> Result<Option<RawPoints>> {
     let Some(folder) = model_folder(path) else { return Ok(None) };
     let model = read_model(&folder, limits)?;
     let centers: BTreeMap<&str, DVec3> = model

@@ -1,7 +1,7 @@
 //! COLMAP's binary files. Every count is held against the bytes that are there before anything is allocated for it.
 
 use super::colmap::{ColmapCamera, ColmapImage, Model};
-use cc4dgs_core::{Error, Limits, PointCloud, Result};
+use cc4dgs_core::{Error, Limits, RawPoints, Result};
 use std::collections::BTreeMap;
 
 /// Bytes read from front to back.
@@ -83,15 +83,15 @@ pub(crate) fn cameras(object: &str, bytes: &[u8]) -> Result<BTreeMap<u32, Colmap
 pub(crate) fn images(object: &str, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
     let mut b = Bytes::new(object, bytes);
     let mut images = Vec::new();
-    for _ in 0..b.count("pictures", 73)? {
+    for _ in 0..b.count("images", 73)? {
         b.u32()?;
         let rotation = b.floats()?;
         let translation = b.floats()?;
         let camera = b.u32()?;
-        let end = b.rest.iter().position(|&c| c == 0).ok_or_else(|| b.bad("a picture's name has no end".into()))?;
+        let end = b.rest.iter().position(|&c| c == 0).ok_or_else(|| b.bad("an image's name has no end".into()))?;
         let name = String::from_utf8_lossy(b.take(end as u64)?).into_owned();
         b.take(1)?;
-        let points = b.count("points in a picture", 24)?;
+        let points = b.count("points in an image", 24)?;
         b.take(points * 24)?;
         images.push(ColmapImage { camera, name, rotation, translation });
     }
@@ -99,11 +99,11 @@ pub(crate) fn images(object: &str, bytes: &[u8]) -> Result<Vec<ColmapImage>> {
 }
 
 /// `points3D.bin`; tracks are passed over.
-pub(crate) fn points(object: &str, bytes: &[u8], limits: &Limits) -> Result<PointCloud> {
+pub(crate) fn points(object: &str, bytes: &[u8], limits: &Limits) -> Result<RawPoints> {
     let mut b = Bytes::new(object, bytes);
     let count = b.count("points", 51)?;
     limits.check_gaussians(object, count)?;
-    let mut cloud = PointCloud::default();
+    let mut cloud = RawPoints::default();
     for i in 0..count {
         b.u64()?;
         let p = b.floats::<3>()?;
@@ -111,8 +111,7 @@ pub(crate) fn points(object: &str, bytes: &[u8], limits: &Limits) -> Result<Poin
         b.floats::<1>()?;
         let track = b.count("track elements", 8)?;
         b.take(track * 8)?;
-        let p = p.map(|v| v as f32);
-        if p.iter().any(|v| !v.is_finite()) {
+        if p.iter().any(|v| !(*v as f32).is_finite()) {
             return Err(b.bad(format!("point {i} is at {p:?}")));
         }
         cloud.positions.push(p);

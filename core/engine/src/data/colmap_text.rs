@@ -1,7 +1,7 @@
 //! COLMAP's text files.
 
 use super::colmap::{ColmapCamera, ColmapImage, Model};
-use cc4dgs_core::{Error, Limits, PointCloud, Result};
+use cc4dgs_core::{Error, Limits, RawPoints, Result};
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
@@ -23,7 +23,7 @@ fn floats<const N: usize>(words: &mut std::str::SplitWhitespace, object: &str, l
     Ok(out)
 }
 
-/// Lines that are not comments, with their numbers. Empty lines count: a picture without points has one.
+/// Lines that are not comments, with their numbers. Empty lines count: an image without points has one.
 fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
     text.lines().enumerate().filter(|(_, l)| !l.starts_with('#'))
 }
@@ -49,7 +49,7 @@ pub(crate) fn cameras(object: &str, text: &str) -> Result<BTreeMap<u32, ColmapCa
     Ok(cameras)
 }
 
-/// `images.txt`: two lines a picture, IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME and its points.
+/// `images.txt`: two lines per image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME and its points.
 pub(crate) fn images(object: &str, text: &str) -> Result<Vec<ColmapImage>> {
     let mut images = Vec::new();
     let mut rows = lines(text);
@@ -64,7 +64,7 @@ pub(crate) fn images(object: &str, text: &str) -> Result<Vec<ColmapImage>> {
         let camera = next(&mut words, object, n)?;
         let name = words.collect::<Vec<_>>().join(" ");
         if name.is_empty() {
-            return Err(bad(object, n, "the picture has no name"));
+            return Err(bad(object, n, "the image has no name"));
         }
         images.push(ColmapImage { camera, name, rotation, translation });
         rows.next();
@@ -73,14 +73,14 @@ pub(crate) fn images(object: &str, text: &str) -> Result<Vec<ColmapImage>> {
 }
 
 /// `points3D.txt`: POINT3D_ID X Y Z R G B ERROR TRACK[].
-pub(crate) fn points(object: &str, text: &str, limits: &Limits) -> Result<PointCloud> {
-    let mut cloud = PointCloud::default();
+pub(crate) fn points(object: &str, text: &str, limits: &Limits) -> Result<RawPoints> {
+    let mut cloud = RawPoints::default();
     for (n, line) in lines(text).filter(|(_, l)| !l.trim().is_empty()) {
         let mut words = line.split_whitespace();
         next::<u64>(&mut words, object, n)?;
-        let p = floats::<3>(&mut words, object, n)?.map(|v| v as f32);
+        let p = floats::<3>(&mut words, object, n)?;
         let rgb: [u8; 3] = [next(&mut words, object, n)?, next(&mut words, object, n)?, next(&mut words, object, n)?];
-        if p.iter().any(|v| !v.is_finite()) {
+        if p.iter().any(|v| !(*v as f32).is_finite()) {
             return Err(bad(object, n, format!("the point is at {p:?}")));
         }
         cloud.positions.push(p);

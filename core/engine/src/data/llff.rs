@@ -1,75 +1,81 @@
-//! N3DV ("dynerf") and LLFF scenes: `poses_bounds.npy` with one row per camera, and per camera a video, a folder of frames, or one picture.
+//! N3DV ("dynerf") and LLFF scenes: `poses_bounds.npy` with one row per camera, and per camera a video, a folder of frames, or one image.
 
 use super::camera_box::frustum_box;
-use super::distortion::Distortion;
-use super::files::{file_name, has_extension, is_picture, list, picture_size, read_bytes};
 use super::npy::read_npy;
-use super::pose::world_to_camera;
-use super::raw::{Picture, RawCamera, RawScene, RawView};
-use super::{Reader, SceneOptions, colmap, video};
-use cc4dgs_core::{Error, Limits, Result, Split};
+use super::{colmap, video};
+use cc4dgs_core::reader::files::{file_name, has_extension, image_size, is_image, list, read_bytes};
+use cc4dgs_core::reader::pose::world_to_camera;
+use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use glam::{DMat3, DVec3};
 use std::path::{Path, PathBuf};
 
-pub(crate) struct Llff;
-
-/// The pictures of one camera in time order.
+/// The images of one camera in time order.
 struct Footage {
     name: String,
-    pictures: Vec<Picture>,
+    images: Vec<ImageSource>,
     size: [u32; 2],
 }
 
-impl Reader for Llff {
-    fn name(&self) -> &'static str {
-        "llff"
+inventory::submit! {
+    ReaderPlugin {
+        info: Plugin {
+            name: "llff",
+            version: "1",
+            summary: "Neural 3D Video and LLFF scenes",
+            paper: "Neural 3D Video Synthesis (Li et al. 2022); Local Light Field Fusion (Mildenhall et al. 2019)",
+            schema: "",
+            capabilities: &[],
+        },
+        looks_for: "poses_bounds.npy with cam*.mp4, cam*/ folders of frames, or images/ (N3DV, LLFF)",
+        order: 300,
+        probe,
+        open,
     }
-    fn looks_for(&self) -> &'static str {
-        "poses_bounds.npy with cam*.mp4, cam*/ folders of frames, or images/ (N3DV, LLFF)"
+}
+
+fn probe(path: &Path) -> bool {
+    path.join("poses_bounds.npy").is_file()
+}
+
+fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let file = path.join("poses_bounds.npy");
+    let object = file.display().to_string();
+    let array = read_npy(&object, &read_bytes(&file, limits)?, limits)?;
+    let bad = |problem: String, remedy: &str| Error::data(object.clone(), problem, remedy);
+    if array.shape.len() != 2 || array.shape[1] != 17 || array.shape[0] == 0 {
+        return Err(bad(format!("its shape is {:?}, not [cameras, 17]", array.shape), "Fetch the file again"));
     }
-    fn probe(&self, path: &Path) -> bool {
-        path.join("poses_bounds.npy").is_file()
+    if let Some(i) = array.values.iter().position(|v| !v.is_finite()) {
+        return Err(bad(format!("row {} holds {}", i / 17, array.values[i]), "Fetch the file again"));
     }
-    fn open(&self, path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
-        let file = path.join("poses_bounds.npy");
-        let object = file.display().to_string();
-        let array = read_npy(&object, &read_bytes(&file, limits)?, limits)?;
-        let bad = |problem: String, remedy: &str| Error::data(object.clone(), problem, remedy);
-        if array.shape.len() != 2 || array.shape[1] != 17 || array.shape[0] == 0 {
-            return Err(bad(format!("its shape is {:?}, not [cameras, 17]", array.shape), "Fetch the file again"));
-        }
-        if let Some(i) = array.values.iter().position(|v| !v.is_finite()) {
-            return Err(bad(format!("row {} holds {}", i / 17, array.values[i]), "Fetch the file again"));
-        }
-        let footage = footage(path, options, limits)?;
-        if footage.len() != array.shape[0] {
-            let problem = format!(
-                "it has {} rows, {} cameras were found ({})",
-                array.shape[0],
-                footage.len(),
-                footage.iter().map(|f| f.name.as_str()).collect::<Vec<_>>().join(", ")
-            );
-            return Err(bad(problem, "Remove the row together with the camera"));
-        }
-        let mut scene = RawScene { name: file_name(path), ..Default::default() };
-        let frames = footage.iter().map(|f| f.pictures.len()).min().unwrap_or(0);
-        if footage.iter().any(|f| f.pictures.len() != frames) {
-            scene.warnings.push(format!("cameras have different numbers of frames; the first {frames} of each are used"));
-        }
-        let mut depths = Vec::new();
-        for (index, (footage, row)) in footage.into_iter().zip(array.values.chunks_exact(17)).enumerate() {
-            scene.cameras.push(camera(row, &footage).map_err(|e| bad(format!("row {index}: {e}"), "Fetch the file again"))?);
-            depths.push((row[15], row[16]));
-            // The first camera in sorted order is held out (facts 8.1).
-            let split = if index == 0 { Split::Test } else { Split::Train };
-            for (frame, picture) in footage.pictures.into_iter().take(frames).enumerate() {
-                scene.views.push(RawView { camera: index, frame, time: None, split, picture });
-            }
-        }
-        scene.points = colmap::points_in_same_world(path, &scene.cameras, limits)?;
-        scene.init_box = frustum_box(&scene.cameras, &depths);
-        Ok(scene)
+    let footage = footage(path, options, limits)?;
+    if footage.len() != array.shape[0] {
+        let problem = format!(
+            "it has {} rows, {} cameras were found ({})",
+            array.shape[0],
+            footage.len(),
+            footage.iter().map(|f| f.name.as_str()).collect::<Vec<_>>().join(", ")
+        );
+        return Err(bad(problem, "Remove the row together with the camera"));
     }
+    let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    let frames = footage.iter().map(|f| f.images.len()).min().unwrap_or(0);
+    if footage.iter().any(|f| f.images.len() != frames) {
+        scene.warnings.push(format!("cameras have different numbers of frames; the first {frames} of each are used"));
+    }
+    let mut depths = Vec::new();
+    for (index, (footage, row)) in footage.into_iter().zip(array.values.chunks_exact(17)).enumerate() {
+        scene.cameras.push(camera(row, &footage).map_err(|e| bad(format!("row {index}: {e}"), "Fetch the file again"))?);
+        depths.push((row[15], row[16]));
+        // The first camera in sorted order is held out (the protocol of Neural 3D Video).
+        let split = if index == 0 { Split::Test } else { Split::Train };
+        for (frame, image) in footage.images.into_iter().take(frames).enumerate() {
+            scene.views.push(RawView { camera: index, frame, time: None, split, image });
+        }
+    }
+    scene.points = colmap::points_in_same_world(path, &scene.cameras, limits)?;
+    scene.init_box = frustum_box(&scene.cameras, &depths);
+    Ok(scene)
 }
 
 /// One row: a 3x5 matrix [R | t | (H, W, f)] with axes (down, right, backwards), then the near and far depth.
@@ -100,17 +106,17 @@ fn stem(path: &Path) -> String {
     path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// Per-camera folders of frames win over videos (someone extracted them), videos over single pictures.
+/// Per-camera folders of frames win over videos (someone extracted them), videos over single images.
 fn footage(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Vec<Footage>> {
     let mut found = Vec::new();
     let is_camera_folder = |p: &Path| p.is_dir() && file_name(p).starts_with("cam");
     for root in [path.to_path_buf(), path.join("frames")] {
         for folder in list_if(&root, is_camera_folder)? {
             let inner = folder.join("images");
-            let frames = list(if inner.is_dir() { &inner } else { &folder }, is_picture)?;
+            let frames = list(if inner.is_dir() { &inner } else { &folder }, is_image)?;
             if let Some(first) = frames.first() {
-                let (w, h) = picture_size(first, limits)?;
-                found.push(Footage { name: file_name(&folder), size: [w, h], pictures: files(frames) });
+                let (w, h) = image_size(first, limits)?;
+                found.push(Footage { name: file_name(&folder), size: [w, h], images: files(frames) });
             }
         }
         if !found.is_empty() {
@@ -125,27 +131,27 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Vec<F
                     .frames
                     .map_or(usize::MAX, |[start, count, stride]| if count == 0 { usize::MAX } else { start.saturating_add(count.saturating_mul(stride)) }),
             );
-            let pictures = (0..frames).map(|frame| Picture::Video { path: file.clone(), frame }).collect();
-            found.push(Footage { name: stem(&file), size: facts.size, pictures });
+            let images = (0..frames).map(|frame| ImageSource::Video { path: file.clone(), frame }).collect();
+            found.push(Footage { name: stem(&file), size: facts.size, images });
         }
         if !found.is_empty() {
             return Ok(found);
         }
     }
     let images = path.join("images");
-    for file in list_if(&images, is_picture)? {
-        let (w, h) = picture_size(&file, limits)?;
-        found.push(Footage { name: stem(&file), size: [w, h], pictures: files(vec![file]) });
+    for file in list_if(&images, is_image)? {
+        let (w, h) = image_size(&file, limits)?;
+        found.push(Footage { name: stem(&file), size: [w, h], images: files(vec![file]) });
     }
     if found.is_empty() {
         let remedy = "Put cam00.mp4 …, folders cam00/ … of frames, or images/ beside poses_bounds.npy";
-        return Err(Error::data(path.display().to_string(), "no videos, camera folders or pictures were found", remedy));
+        return Err(Error::data(path.display().to_string(), "no videos, camera folders or images were found", remedy));
     }
     Ok(found)
 }
 
-fn files(paths: Vec<PathBuf>) -> Vec<Picture> {
-    paths.into_iter().map(|path| Picture::File { path, mask: None }).collect()
+fn files(paths: Vec<PathBuf>) -> Vec<ImageSource> {
+    paths.into_iter().map(|path| ImageSource::File { path, mask: None }).collect()
 }
 
 fn list_if(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {

@@ -1,17 +1,12 @@
 //! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Usually static.
 
-use super::distortion::Distortion;
-use super::files::{file_name, has_extension, picture_size, read_json};
-use super::pose::{from_opengl_camera_to_world, matrix4};
-use super::raw::{Picture, RawCamera, RawScene, RawView};
-use super::{Reader, SceneOptions};
-use cc4dgs_core::{Error, Limits, Result, Split};
+use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_json};
+use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
+use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
-pub(crate) struct Nerfstudio;
-
-/// Every how many pictures one is held out where the file names no split, as is usual for static scenes.
+/// Where the file names no split, every eighth image is held out, as is usual for static scenes.
 pub(crate) const HOLD_OUT_EVERY: usize = 8;
 
 #[derive(Clone, Default, Deserialize)]
@@ -84,7 +79,7 @@ impl Intrinsics {
 }
 
 /// The file a JSON names, with the usual extensions tried where it names none.
-pub(crate) fn picture_path(folder: &Path, named: &str) -> PathBuf {
+pub(crate) fn image_path(folder: &Path, named: &str) -> PathBuf {
     let path = folder.join(named);
     if has_extension(&path, &["png", "jpg", "jpeg"]) || path.is_file() {
         return path;
@@ -93,81 +88,85 @@ pub(crate) fn picture_path(folder: &Path, named: &str) -> PathBuf {
     ["png", "jpg", "jpeg"].iter().map(|e| with(e)).find(|p| p.is_file()).unwrap_or_else(|| with("png"))
 }
 
-impl Reader for Nerfstudio {
-    fn name(&self) -> &'static str {
-        "nerfstudio"
-    }
-    fn looks_for(&self) -> &'static str {
-        "transforms.json (nerfstudio, instant-ngp), or the path of such a file"
-    }
-    fn probe(&self, path: &Path) -> bool {
-        path.join("transforms.json").is_file() || (path.is_file() && has_extension(path, &["json"]))
-    }
-    fn open(&self, path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
-        let file = if path.is_file() { path.to_path_buf() } else { path.join("transforms.json") };
-        let folder = file.parent().unwrap_or(Path::new("."));
-        let object = file.display().to_string();
-        let transforms: Transforms = read_json(&file, limits)?;
-        let mut scene = RawScene { name: file_name(path), ..Default::default() };
-        let mut frames: Vec<&Frame> = transforms.frames.iter().collect();
-        frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
-        let named_split = !transforms.train_filenames.is_empty() || !transforms.test_filenames.is_empty();
-        let mut missing = Vec::new();
-        let mut seen = 0;
-        let mut times = Vec::new();
-        for frame in frames {
-            let picture = picture_path(folder, &frame.file_path);
-            if !picture.is_file() {
-                missing.push(frame.file_path.clone());
-                continue;
-            }
-            let split = if named_split {
-                let held_out = transforms.test_filenames.contains(&frame.file_path);
-                let listed = held_out || transforms.train_filenames.is_empty() || transforms.train_filenames.contains(&frame.file_path);
-                if !listed && transforms.val_filenames.contains(&frame.file_path) {
-                    continue;
-                }
-                if held_out { Split::Test } else { Split::Train }
-            } else if seen % HOLD_OUT_EVERY == 0 && transforms.frames.len() > 1 {
-                Split::Test
-            } else {
-                Split::Train
-            };
-            seen += 1;
-            let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
-            scene.cameras.push(camera(frame, &transforms.shared, &picture, limits, &bad)?);
-            times.push(frame.time);
-            scene.views.push(RawView {
-                camera: scene.cameras.len() - 1,
-                frame: 0,
-                time: Some(0.0),
-                split,
-                picture: Picture::File { path: picture, mask: None },
-            });
-        }
-        if !missing.is_empty() {
-            let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
-            scene.warnings.push(format!(
-                "{} of {} pictures are missing and were skipped: {shown}{}",
-                missing.len(),
-                transforms.frames.len(),
-                if missing.len() > 3 { ", …" } else { "" }
-            ));
-        }
-        scene.rank_times(&times, &object)?;
-        Ok(scene)
+inventory::submit! {
+    ReaderPlugin {
+        info: Plugin {
+            name: "nerfstudio",
+            version: "1",
+            summary: "nerfstudio and instant-ngp scenes",
+            paper: "Nerfstudio (Tancik et al. 2023)",
+            schema: "",
+            capabilities: &[],
+        },
+        looks_for: "transforms.json (nerfstudio, instant-ngp), or the path of such a file",
+        order: 500,
+        probe,
+        open,
     }
 }
 
-fn camera(frame: &Frame, shared: &Intrinsics, picture: &Path, limits: &Limits, bad: &dyn Fn(String) -> Error) -> Result<RawCamera> {
+fn probe(path: &Path) -> bool {
+    path.join("transforms.json").is_file() || (path.is_file() && has_extension(path, &["json"]))
+}
+
+fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let file = if path.is_file() { path.to_path_buf() } else { path.join("transforms.json") };
+    let folder = file.parent().unwrap_or(Path::new("."));
+    let object = file.display().to_string();
+    let transforms: Transforms = read_json(&file, limits)?;
+    let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    let mut frames: Vec<&Frame> = transforms.frames.iter().collect();
+    frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
+    let named_split = !transforms.train_filenames.is_empty() || !transforms.test_filenames.is_empty();
+    let mut missing = Vec::new();
+    let mut seen = 0;
+    let mut times = Vec::new();
+    for frame in frames {
+        let path = image_path(folder, &frame.file_path);
+        if !path.is_file() {
+            missing.push(frame.file_path.clone());
+            continue;
+        }
+        let split = if named_split {
+            let held_out = transforms.test_filenames.contains(&frame.file_path);
+            let listed = held_out || transforms.train_filenames.is_empty() || transforms.train_filenames.contains(&frame.file_path);
+            if !listed && transforms.val_filenames.contains(&frame.file_path) {
+                continue;
+            }
+            if held_out { Split::Test } else { Split::Train }
+        } else if seen % HOLD_OUT_EVERY == 0 && transforms.frames.len() > 1 {
+            Split::Test
+        } else {
+            Split::Train
+        };
+        seen += 1;
+        let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
+        scene.cameras.push(camera(frame, &transforms.shared, &path, limits, &bad)?);
+        times.push(frame.time);
+        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image: ImageSource::File { path, mask: None } });
+    }
+    if !missing.is_empty() {
+        let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
+        scene.warnings.push(format!(
+            "{} of {} images are missing and were skipped: {shown}{}",
+            missing.len(),
+            transforms.frames.len(),
+            if missing.len() > 3 { ", …" } else { "" }
+        ));
+    }
+    scene.rank_times(&times, &object)?;
+    Ok(scene)
+}
+
+fn camera(frame: &Frame, shared: &Intrinsics, image: &Path, limits: &Limits, bad: &dyn Fn(String) -> Error) -> Result<RawCamera> {
     let intrinsics = frame.own.over(shared);
     let (w, h) = match (intrinsics.w, intrinsics.h) {
         (Some(w), Some(h)) if w >= 1.0 && h >= 1.0 && w <= 1e6 && h <= 1e6 => (w, h),
         (None, None) => {
-            let (w, h) = picture_size(picture, limits)?;
+            let (w, h) = image_size(image, limits)?;
             (f64::from(w), f64::from(h))
         }
-        (w, h) => return Err(bad(format!("picture size w {w:?}, h {h:?} is not a size"))),
+        (w, h) => return Err(bad(format!("image size w {w:?}, h {h:?} is not a size"))),
     };
     let world_to_camera = matrix4(&frame.transform_matrix).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
     Ok(RawCamera {

@@ -1,16 +1,11 @@
 //! PanopticSports (Dynamic 3D Gaussians): `train_meta.json` and `test_meta.json`, one folder of frames per camera, foreground masks.
 
-use super::distortion::Distortion;
-use super::files::{file_name, read_json};
-use super::pose::{Matrix4, matrix4};
-use super::raw::{Picture, RawCamera, RawScene, RawView};
-use super::{Reader, SceneOptions};
-use cc4dgs_core::{Error, Limits, Result, Split};
+use cc4dgs_core::reader::files::{file_name, read_json};
+use cc4dgs_core::reader::pose::{Matrix4, matrix4};
+use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
 use std::collections::HashMap;
 use std::path::Path;
-
-pub(crate) struct Panoptic;
 
 /// Everything is indexed by time, then by camera.
 #[derive(Deserialize)]
@@ -24,27 +19,37 @@ struct Meta {
     cam_id: Vec<Vec<i64>>,
 }
 
-impl Reader for Panoptic {
-    fn name(&self) -> &'static str {
-        "panoptic"
+inventory::submit! {
+    ReaderPlugin {
+        info: Plugin {
+            name: "panoptic",
+            version: "1",
+            summary: "PanopticSports as Dynamic 3D Gaussians prepares it",
+            paper: "Dynamic 3D Gaussians (Luiten et al. 2024)",
+            schema: "",
+            capabilities: &[],
+        },
+        looks_for: "train_meta.json and ims/ (PanopticSports)",
+        order: 100,
+        probe,
+        open,
     }
-    fn looks_for(&self) -> &'static str {
-        "train_meta.json and ims/ (PanopticSports)"
+}
+
+fn probe(path: &Path) -> bool {
+    path.join("train_meta.json").is_file()
+}
+
+fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    let mut known = HashMap::new();
+    read_meta(path, "train_meta.json", Split::Train, limits, &mut scene, &mut known)?;
+    if path.join("test_meta.json").is_file() {
+        read_meta(path, "test_meta.json", Split::Test, limits, &mut scene, &mut known)?;
+    } else {
+        scene.warnings.push("there is no test_meta.json; nothing is held out".into());
     }
-    fn probe(&self, path: &Path) -> bool {
-        path.join("train_meta.json").is_file()
-    }
-    fn open(&self, path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
-        let mut scene = RawScene { name: file_name(path), ..Default::default() };
-        let mut known = HashMap::new();
-        read_meta(path, "train_meta.json", Split::Train, limits, &mut scene, &mut known)?;
-        if path.join("test_meta.json").is_file() {
-            read_meta(path, "test_meta.json", Split::Test, limits, &mut scene, &mut known)?;
-        } else {
-            scene.warnings.push("there is no test_meta.json; nothing is held out".into());
-        }
-        Ok(scene)
-    }
+    Ok(scene)
 }
 
 /// A camera that does not move is one camera: the key is its id and the bits of its numbers.
@@ -81,7 +86,7 @@ fn read_meta(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &m
             });
             let path = folder.join("ims").join(&meta.files[t][c]);
             let mask = Some(folder.join("seg").join(&meta.files[t][c]).with_extension("png"));
-            scene.views.push(RawView { camera, frame: t, time: None, split, picture: Picture::File { path, mask } });
+            scene.views.push(RawView { camera, frame: t, time: None, split, image: ImageSource::File { path, mask } });
         }
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! Resizing pictures: exact area averages when shrinking, linear interpolation when growing.
+//! Resizing images: exact area averages when shrinking, linear interpolation when growing.
 
 use cc4dgs_core::Image8;
 
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn flat_pictures_stay_flat_at_any_size() {
+    fn flat_images_stay_flat_at_any_size() {
         for (w, h) in [(1, 1), (3, 5), (7, 2), (20, 31)] {
             assert!(resize(&gray(10, 9, |_, _| 77), w, h).data.iter().all(|&v| v == 77), "{w}x{h}");
         }

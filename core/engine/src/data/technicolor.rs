@@ -1,84 +1,85 @@
-//! Technicolor light-field videos as E-D3DGS uses them: a 4x4 rig, undistorted pictures, `cameras_parameters.txt`.
+//! Technicolor light-field videos as E-D3DGS uses them: a 4x4 rig, undistorted images, `cameras_parameters.txt`.
 
-use super::distortion::Distortion;
-use super::files::{file_name, is_picture, list, picture_size, read_text};
-use super::pose::from_quaternion;
-use super::raw::{Picture, RawCamera, RawScene, RawView};
-use super::{Reader, SceneOptions};
-use cc4dgs_core::{Error, Limits, Result, Split};
+use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_text};
+use cc4dgs_core::reader::pose::from_quaternion;
+use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-pub(crate) struct Technicolor;
-
-/// First frame of the 50 each of the five scenes is evaluated on (facts 8.2).
+/// First frame of the 50 each of the five scenes is evaluated on.
 const FIRST_FRAMES: [(&str, u32); 5] = [("Birthday", 151), ("Fabien", 51), ("Painter", 100), ("Theater", 51), ("Train", 151)];
 const FRAMES: u32 = 50;
 /// The held-out view.
 const TEST_CAMERA: u32 = 10;
 
-impl Reader for Technicolor {
-    fn name(&self) -> &'static str {
-        "technicolor"
+inventory::submit! {
+    ReaderPlugin {
+        info: Plugin {
+            name: "technicolor",
+            version: "1",
+            summary: "Technicolor light-field videos",
+            paper: "Dataset and Pipeline for Multi-View Light-Field Video (Sabater et al. 2017)",
+            schema: "",
+            capabilities: &[],
+        },
+        looks_for: "cameras_parameters.txt and <Scene>_undist_<frame>_<camera>.png (Technicolor)",
+        order: 200,
+        probe,
+        open,
     }
-    fn looks_for(&self) -> &'static str {
-        "cameras_parameters.txt and <Scene>_undist_<frame>_<camera>.png (Technicolor)"
-    }
-    fn probe(&self, path: &Path) -> bool {
-        path.join("cameras_parameters.txt").is_file()
-    }
-    fn open(&self, path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
-        let file = path.join("cameras_parameters.txt");
-        let rows = read_parameters(&file, limits)?;
-        let mut pictures: BTreeMap<(u32, u32), PathBuf> = BTreeMap::new();
-        let mut scene_name = String::new();
-        for picture in list(path, is_picture)? {
-            if let Some((name, frame, camera)) = parse_name(&picture) {
-                scene_name = name;
-                pictures.insert((frame, camera), picture);
-            }
+}
+
+fn probe(path: &Path) -> bool {
+    path.join("cameras_parameters.txt").is_file()
+}
+
+fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let file = path.join("cameras_parameters.txt");
+    let rows = read_parameters(&file, limits)?;
+    let mut images: BTreeMap<(u32, u32), PathBuf> = BTreeMap::new();
+    let mut scene_name = String::new();
+    for image in list(path, is_image)? {
+        if let Some((name, frame, camera)) = parse_name(&image) {
+            scene_name = name;
+            images.insert((frame, camera), image);
         }
-        // "Trains" and "Train" are both in use.
-        let range = FIRST_FRAMES.iter().find(|(name, _)| scene_name.starts_with(name)).map(|&(_, first)| first..first + FRAMES);
-        if let Some(range) = range {
-            pictures.retain(|(frame, _), _| range.contains(frame));
-        }
-        let mut frames: Vec<u32> = pictures.keys().map(|k| k.0).collect();
-        frames.dedup();
-        let Some(first) = pictures.values().next() else {
+    }
+    // "Trains" and "Train" are both in use.
+    let range = FIRST_FRAMES.iter().find(|(name, _)| scene_name.starts_with(name)).map(|&(_, first)| first..first + FRAMES);
+    if let Some(range) = range {
+        images.retain(|(frame, _), _| range.contains(frame));
+    }
+    let mut frames: Vec<u32> = images.keys().map(|k| k.0).collect();
+    frames.dedup();
+    let Some(first) = images.values().next() else {
+        return Err(Error::data(path.display().to_string(), "no image named <Scene>_undist_<frame>_<camera>.png lies in its frame range", "Check the path"));
+    };
+    let (w, h) = image_size(first, limits)?;
+    let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    for (index, row) in rows.iter().enumerate() {
+        let bad = |problem: String| Error::data(format!("{}: camera {index}", file.display()), problem, "Fetch the file again");
+        scene.cameras.push(RawCamera {
+            name: format!("cam{index:02}"),
+            size: [w, h],
+            focal: [row[0]; 2],
+            principal: [row[1], row[2]],
+            distortion: Distortion::None,
+            world_to_camera: from_quaternion([row[5], row[6], row[7], row[8]], [row[9], row[10], row[11]]).map_err(bad)?,
+        });
+    }
+    for ((frame, camera), path) in images {
+        if camera as usize >= rows.len() {
             return Err(Error::data(
-                path.display().to_string(),
-                "no picture named <Scene>_undist_<frame>_<camera>.png lies in its frame range",
-                "Check the path",
+                file.display().to_string(),
+                format!("it has {} cameras, {} is of camera {camera}", rows.len(), path.display()),
+                "Fetch the file again",
             ));
-        };
-        let (w, h) = picture_size(first, limits)?;
-        let mut scene = RawScene { name: file_name(path), ..Default::default() };
-        for (index, row) in rows.iter().enumerate() {
-            let bad = |problem: String| Error::data(format!("{}: camera {index}", file.display()), problem, "Fetch the file again");
-            scene.cameras.push(RawCamera {
-                name: format!("cam{index:02}"),
-                size: [w, h],
-                focal: [row[0]; 2],
-                principal: [row[1], row[2]],
-                distortion: Distortion::None,
-                world_to_camera: from_quaternion([row[5], row[6], row[7], row[8]], [row[9], row[10], row[11]]).map_err(bad)?,
-            });
         }
-        for ((frame, camera), path) in pictures {
-            if camera as usize >= rows.len() {
-                return Err(Error::data(
-                    file.display().to_string(),
-                    format!("it has {} cameras, {} is of camera {camera}", rows.len(), path.display()),
-                    "Fetch the file again",
-                ));
-            }
-            let split = if camera == TEST_CAMERA { Split::Test } else { Split::Train };
-            let frame = frames.partition_point(|&f| f < frame);
-            scene.views.push(RawView { camera: camera as usize, frame, time: None, split, picture: Picture::File { path, mask: None } });
-        }
-        Ok(scene)
+        let split = if camera == TEST_CAMERA { Split::Test } else { Split::Train };
+        let frame = frames.partition_point(|&f| f < frame);
+        scene.views.push(RawView { camera: camera as usize, frame, time: None, split, image: ImageSource::File { path, mask: None } });
     }
+    Ok(scene)
 }
 
 /// `Birthday_undist_00151_03.png` to ("Birthday", 151, 3).

@@ -1,9 +1,7 @@
 //! Frames of videos, through the `ffmpeg` command. A video is decoded once, on the first use of one of its frames, into a cache folder.
 
-use super::options::SceneOptions;
-use super::picture::Plan;
-use super::raw::{Picture, RawView};
-use cc4dgs_core::{Error, Result};
+use super::frames::Plan;
+use cc4dgs_core::{Error, ImageSource, RawView, Result, SceneOptions, Seed};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -29,7 +27,7 @@ struct Clip {
 
 /// All videos of a scene.
 #[derive(Default)]
-pub(crate) struct VideoFrames {
+pub(super) struct VideoFrames {
     clips: BTreeMap<PathBuf, Clip>,
     ffmpeg: String,
     cache: PathBuf,
@@ -72,10 +70,10 @@ pub(crate) fn probe(video: &Path, options: &SceneOptions) -> Result<VideoFacts> 
 
 impl VideoFrames {
     /// Collects which frames of which videos the views want.
-    pub(crate) fn new(views: &[RawView], plans: &[Plan], options: &SceneOptions) -> Result<Self> {
+    pub(super) fn new(views: &[RawView], plans: &[Plan], options: &SceneOptions) -> Result<Self> {
         let mut wanted: BTreeMap<PathBuf, (Vec<usize>, usize)> = BTreeMap::new();
         for view in views {
-            if let Picture::Video { path, frame } = &view.picture {
+            if let ImageSource::Video { path, frame } = &view.image {
                 wanted.entry(path.clone()).or_insert_with(|| (Vec::new(), view.camera)).0.push(*frame);
             }
         }
@@ -84,7 +82,7 @@ impl VideoFrames {
             frames.sort_unstable();
             frames.dedup();
             let (first, last) = (frames[0], frames[frames.len() - 1]);
-            // Gaps that are not a stride (scene.max_views) are extracted too: a few pictures too many instead of a long filter.
+            // Gaps that are not a stride (scene.max_views) are extracted too: a few images too many instead of a long filter.
             let stride = frames.windows(2).map(|w| w[1] - w[0]).min().unwrap_or(1);
             let stride = if frames.iter().all(|f| (f - first).is_multiple_of(stride)) { stride } else { 1 };
             clips.insert(path, Clip { first, stride, count: (last - first) / stride + 1, size: plan_size(&plans[camera]), busy: Mutex::new(()) });
@@ -93,21 +91,21 @@ impl VideoFrames {
         Ok(Self { clips, ffmpeg: options.ffmpeg.clone(), cache })
     }
     /// The size extracted frames have.
-    pub(crate) fn size(&self, plan: &Plan) -> [u32; 2] {
+    pub(super) fn size(&self, plan: &Plan) -> [u32; 2] {
         plan_size(plan)
     }
     /// The file of frame `frame` of `video`; decodes the video if that has not happened.
-    pub(crate) fn extract(&self, video: &Path, frame: usize) -> Result<PathBuf> {
+    pub(super) fn extract(&self, video: &Path, frame: usize) -> Result<PathBuf> {
         let bug = || Error::parameter(format!("video {}", video.display()), format!("frame {frame} was not asked for"), "Reopen the scene");
         let clip = self.clips.get(video).ok_or_else(bug)?;
-        let place = frame.checked_sub(clip.first).ok_or_else(bug)? / clip.stride;
+        let rank = frame.checked_sub(clip.first).ok_or_else(bug)? / clip.stride;
         let folder = self.folder(video, clip)?;
         // A poisoned lock only means that another extraction failed; this one may do better.
         let _guard = clip.busy.lock().unwrap_or_else(|e| e.into_inner());
         if !folder.is_dir() {
             self.decode(video, clip, &folder)?;
         }
-        let file = folder.join(format!("{:06}.png", place + 1));
+        let file = folder.join(format!("{:06}.png", rank + 1));
         if !file.is_file() {
             return Err(Error::data(format!("video {}", video.display()), format!("it has no frame {frame}"), "Shorten scene.frames"));
         }
@@ -120,7 +118,7 @@ impl VideoFrames {
         let meta = std::fs::metadata(&full).map_err(|e| Error::io(video, e))?;
         let modified = meta.modified().ok().and_then(|t| t.duration_since(std::time::UNIX_EPOCH).ok()).map(|d| d.as_nanos()).unwrap_or(0);
         let facts = format!("{}|{}|{modified}|{}|{}|{}|{:?}", full.display(), meta.len(), clip.first, clip.stride, clip.count, clip.size);
-        let mut key = cc4dgs_core::Seed::root(0);
+        let mut key = Seed::root(0);
         key = key.child(&facts);
         let stem = video.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
         Ok(self.cache.join(format!("{stem}-{:016x}", key.value())))

@@ -1,13 +1,17 @@
 //! Suites that every plug-in passes, ours and anyone's: call them from a test of your own crate.
 //!
-//! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data.
+//! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data, but for readers, which need a tiny dataset.
 
 mod deformer;
+mod preset;
 mod rasterizer;
+mod reader;
 
 pub use cc4dgs_format::conformance::{codec, weight_codec};
 pub use deformer::deformer;
+pub use preset::preset;
 pub use rasterizer::rasterizer;
+pub use reader::reader;
 
 use crate::Seed;
 use burn::tensor::{Device, Tensor, TensorData};

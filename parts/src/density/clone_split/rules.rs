@@ -120,7 +120,7 @@ mod tests {
             opacity_logits: vec![0.0; n],
             sh_dc: vec![0.0; 3 * n],
             dynamic_scores: vec![0.0; n],
-            extra: [("label".to_string(), ExtraAttribute { width: 1, values: (0..n).map(|i| i as f32).collect(), ..Default::default() })].into(),
+            extra: [("label".to_string(), ExtraAttribute::exact(1, (0..n).map(|i| i as f32).collect()))].into(),
             ..Default::default()
         }
     }

@@ -20,3 +20,33 @@ fn the_deformer_conforms() {
         assert!(findings.is_empty(), "{}", findings.join("\n"));
     }
 }
+
+/// A dataset of the reader `rig`: two cameras, one held out, two frames.
+fn write_rig(folder: &std::path::Path) {
+    let mut text = String::from("camera left 8 6 10  4 0 1  0 0 0\ncamera right 8 6 10  0 4 1  0 0 0\n");
+    for (camera, split) in [(0, "train"), (1, "test")] {
+        for frame in 0..2 {
+            let file = format!("{camera}-{frame}.ppm");
+            text += &format!("image {camera} {frame} {file} {split}\n");
+            std::fs::write(folder.join(file), format!("P3 8 6 255 {}", "10 20 30 ".repeat(48))).unwrap();
+        }
+    }
+    std::fs::write(folder.join("rig.txt"), text).unwrap();
+}
+
+#[test]
+fn the_reader_conforms() {
+    let folder = tempfile::tempdir().unwrap();
+    write_rig(folder.path());
+    let findings = conformance::reader(Registry::collect().unwrap().reader("rig").unwrap(), folder.path());
+    assert!(findings.is_empty(), "{}", findings.join("\n"));
+}
+
+#[test]
+fn the_presets_conform() {
+    let registry = Registry::collect().unwrap();
+    let findings: Vec<String> = registry.presets().flat_map(|p| conformance::preset(p, &registry)).collect();
+    assert!(findings.is_empty(), "{}", findings.join("\n"));
+    let settings = registry.preset("tiny+swaying").unwrap();
+    assert_eq!((settings["deformer"]["kind"].as_str(), settings["train"]["iterations"].as_integer()), (Some("sway"), Some(40)));
+}

@@ -1,7 +1,6 @@
 //! Writing tiny datasets.
 
-use cc4dgs_core::{Camera, Error, Limits, Scene};
-use cc4dgs_engine::data::{SceneOptions, open};
+use cc4dgs_core::{Camera, Error, Limits, Registry, Scene, SceneOptions};
 use std::path::{Path, PathBuf};
 
 pub fn options() -> SceneOptions {
@@ -12,14 +11,19 @@ pub fn load(path: &Path) -> Result<Scene, Error> {
     open(path, &options(), &Limits::default())
 }
 
-/// A picture whose pixel (x, y) is [x, y, marker] (and alpha).
-pub fn picture(path: &Path, width: u32, height: u32, marker: u8) {
+/// Opens with everything that is linked into the tests.
+pub fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Scene, Error> {
+    cc4dgs_engine::data::open(path, options, &Registry::collect().unwrap(), limits)
+}
+
+/// An image whose pixel (x, y) is [x, y, marker] (and alpha).
+pub fn write_image(path: &Path, width: u32, height: u32, marker: u8) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     let pixels = image::RgbImage::from_fn(width, height, |x, y| image::Rgb([x as u8, y as u8, marker]));
     pixels.save(path).unwrap();
 }
 
-pub fn rgba_picture(path: &Path, width: u32, height: u32, pixel: [u8; 4]) {
+pub fn write_rgba_image(path: &Path, width: u32, height: u32, pixel: [u8; 4]) {
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
     image::RgbaImage::from_pixel(width, height, image::Rgba(pixel)).save(path).unwrap();
 }
@@ -74,7 +78,7 @@ pub fn npy(shape: &[usize], values: &[f64]) -> Vec<u8> {
     out
 }
 
-/// A D-NeRF scene: `train` and `test` views, RGBA pictures of `size` pixels.
+/// A D-NeRF scene: `train` and `test` views, RGBA images of `size` pixels.
 pub fn write_dnerf(root: &Path, train: usize, test: usize, size: u32) -> Vec<Camera> {
     let cameras = ring(train + test, size, size);
     for (name, range) in [("train", 0..train), ("test", train..train + test)] {
@@ -82,7 +86,7 @@ pub fn write_dnerf(root: &Path, train: usize, test: usize, size: u32) -> Vec<Cam
             .clone()
             .map(|i| {
                 let place = i - range.start;
-                rgba_picture(&root.join(name).join(format!("r_{place:03}.png")), size, size, [10, 20, 30, 255]);
+                write_rgba_image(&root.join(name).join(format!("r_{place:03}.png")), size, size, [10, 20, 30, 255]);
                 let time = place as f64 / (range.len().max(2) - 1) as f64;
                 serde_json::json!({"file_path": format!("./{name}/r_{place:03}"), "time": time, "transform_matrix": opengl_camera_to_world(&cameras[i])})
             })
@@ -110,7 +114,7 @@ pub fn write_panoptic(root: &Path, train: usize, frames: usize) -> Vec<Camera> {
         std::fs::write(root.join(format!("{name}_meta.json")), document.to_string()).unwrap();
         for t in 0..frames {
             for c in range.clone() {
-                picture(&root.join(format!("ims/{c}/{t:06}.png")), 16, 12, (10 * c + t) as u8);
+                write_image(&root.join(format!("ims/{c}/{t:06}.png")), 16, 12, (10 * c + t) as u8);
             }
         }
     }
@@ -132,7 +136,7 @@ pub fn llff_rows(cameras: &[Camera]) -> Vec<f64> {
     values
 }
 
-/// COLMAP binary files for pinhole cameras, one per picture, and a few points; returns (cameras, images, points3D).
+/// COLMAP binary files for pinhole cameras, one per image, and a few points; returns (cameras, images, points3D).
 pub fn colmap_binary(cameras: &[Camera], names: &[String]) -> [Vec<u8>; 3] {
     let n = (cameras.len() as u64).to_le_bytes();
     let (mut c, mut i, mut p) = (n.to_vec(), n.to_vec(), 2u64.to_le_bytes().to_vec());
@@ -160,6 +164,51 @@ pub fn colmap_binary(cameras: &[Camera], names: &[String]) -> [Vec<u8>; 3] {
         p.extend([0u8; 8]);
     }
     [c, i, p]
+}
+
+/// A COLMAP scene of three images, in binary form.
+pub fn write_colmap(root: &Path) {
+    let cameras = ring(3, 16, 12);
+    let names: Vec<String> = (0..3).map(|i| format!("{i}.png")).collect();
+    names.iter().for_each(|n| write_image(&root.join("images").join(n), 16, 12, 0));
+    std::fs::create_dir_all(root.join("sparse/0")).unwrap();
+    for (file, bytes) in ["cameras", "images", "points3D"].iter().zip(colmap_binary(&cameras, &names)) {
+        std::fs::write(root.join(format!("sparse/0/{file}.bin")), bytes).unwrap();
+    }
+}
+
+/// A LLFF scene of three images.
+pub fn write_llff(root: &Path) {
+    std::fs::write(root.join("poses_bounds.npy"), npy(&[3, 17], &llff_rows(&ring(3, 16, 12)))).unwrap();
+    (0..3).for_each(|c| write_image(&root.join(format!("images/{c}.png")), 16, 12, 0));
+}
+
+/// A nerfstudio scene of `count` images.
+pub fn write_nerfstudio(root: &Path, count: usize) -> Vec<Camera> {
+    let cameras = ring(count, 16, 12);
+    let frame = |(i, camera): (usize, &Camera)| {
+        write_image(&root.join(format!("images/{i:04}.png")), 16, 12, i as u8);
+        serde_json::json!({"file_path": format!("images/{i:04}.png"), "transform_matrix": opengl_camera_to_world(camera)})
+    };
+    let frames: Vec<_> = cameras.iter().enumerate().map(frame).collect();
+    let document = serde_json::json!({"fl_x": cameras[0].fx, "fl_y": cameras[0].fy, "cx": 8.0, "cy": 6.0, "w": 16, "h": 12, "frames": frames});
+    std::fs::write(root.join("transforms.json"), document.to_string()).unwrap();
+    cameras
+}
+
+/// A Technicolor scene called Painter with the given frames.
+pub fn write_technicolor(root: &Path, count: u8, frames: &[u32]) -> Vec<Camera> {
+    let cameras = ring(usize::from(count), 16, 12);
+    let mut text = "header line\n".to_string();
+    for camera in &cameras {
+        let (q, t) = quaternion(camera);
+        text += &format!("{} 8.5 5.25 0 0 {} {} {} {} {} {} {}\n", camera.fx, q[0], q[1], q[2], q[3], t[0], t[1], t[2]);
+    }
+    std::fs::write(root.join("cameras_parameters.txt"), text).unwrap();
+    for frame in frames {
+        (0..count).for_each(|c| write_image(&root.join(format!("Painter_undist_{frame:05}_{c:02}.png")), 16, 12, c));
+    }
+    cameras
 }
 
 /// A folder of real data, from `CC4DGS_DATA` or beside the repository; `None` with a note if absent.

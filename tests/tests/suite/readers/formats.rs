@@ -1,8 +1,7 @@
 //! Every format on a tiny scene: poses come back, splits and times follow the convention of the dataset.
 
 use super::common::*;
-use cc4dgs_core::{Limits, Split};
-use cc4dgs_engine::data::{SceneOptions, open, readers};
+use cc4dgs_core::{Limits, Registry, SceneOptions, Split};
 
 fn train_count(scene: &cc4dgs_core::Scene) -> (usize, usize) {
     (scene.split(Split::Train).len(), scene.split(Split::Test).len())
@@ -36,7 +35,7 @@ fn panoptic() {
     for (view, v) in scene.views.iter().enumerate() {
         let c: usize = scene.camera(view).name.parse().unwrap();
         same_pose(scene.camera(view), &cameras[c]);
-        assert_eq!(scene.frame(view).unwrap().data[2], (10 * c + v.frame) as u8, "each view shows its own picture");
+        assert_eq!(scene.frame(view).unwrap().data[2], (10 * c + v.frame) as u8, "each view shows its own image");
         assert!((v.time_norm - v.frame as f32 / 3.0).abs() < 1e-6);
     }
     let (low, high) = scene.init_box.unwrap();
@@ -67,7 +66,7 @@ fn llff_with_frame_folders() {
     std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[3, 17], &llff_rows(&cameras))).unwrap();
     for c in 0..3 {
         for t in 0..4 {
-            picture(&dir.path().join(format!("cam{c:02}/images/{t:04}.png")), 16, 12, (10 * c + t) as u8);
+            write_image(&dir.path().join(format!("cam{c:02}/images/{t:04}.png")), 16, 12, (10 * c + t) as u8);
         }
     }
     let scene = load(dir.path()).unwrap();
@@ -86,7 +85,7 @@ fn llff_with_frame_folders() {
 fn llff_refuses_a_camera_too_many() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[2, 17], &llff_rows(&ring(2, 16, 12)))).unwrap();
-    (0..3).for_each(|c| picture(&dir.path().join(format!("images/{c}.png")), 16, 12, 0));
+    (0..3).for_each(|c| write_image(&dir.path().join(format!("images/{c}.png")), 16, 12, 0));
     let message = load(dir.path()).err().unwrap().to_string();
     assert!(message.contains("2 rows") && message.contains("3 cameras"), "{message}");
 }
@@ -101,7 +100,7 @@ fn llff_with_videos() {
     std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[2, 17], &llff_rows(&ring(2, 16, 12)))).unwrap();
     for c in 0..2u8 {
         std::fs::write(dir.path().join(format!("cam{c:02}.mp4")), "not a video").unwrap();
-        (0..6u8).for_each(|t| picture(&tools.path().join(format!("cam{c:02}/{t}.png")), 16, 12, 10 * c + t));
+        (0..6u8).for_each(|t| write_image(&tools.path().join(format!("cam{c:02}/{t}.png")), 16, 12, 10 * c + t));
     }
     let script = |name: &str, text: String| {
         let path = tools.path().join(name);
@@ -144,16 +143,7 @@ fn videos_without_ffmpeg_say_what_to_do() {
 #[test]
 fn technicolor() {
     let dir = tempfile::tempdir().unwrap();
-    let cameras = ring(12, 16, 12);
-    let mut text = "header line\n".to_string();
-    for camera in &cameras {
-        let (q, t) = quaternion(camera);
-        text += &format!("{} 8.5 5.25 0 0 {} {} {} {} {} {} {}\n", camera.fx, q[0], q[1], q[2], q[3], t[0], t[1], t[2]);
-    }
-    std::fs::write(dir.path().join("cameras_parameters.txt"), text).unwrap();
-    for frame in [99, 100, 101, 149, 150] {
-        (0..12u8).for_each(|c| picture(&dir.path().join(format!("Painter_undist_{frame:05}_{c:02}.png")), 16, 12, c));
-    }
+    let cameras = write_technicolor(dir.path(), 12, &[99, 100, 101, 149, 150]);
     let scene = load(dir.path()).unwrap();
     // Frames 99 and 150 lie outside the 50 of Painter.
     assert_eq!((scene.frame_count, train_count(&scene)), (3, (33, 3)));
@@ -186,7 +176,7 @@ fn colmap_in_both_forms() {
     let cameras = ring(9, 16, 12);
     let names = colmap_names();
     let dir = tempfile::tempdir().unwrap();
-    names.iter().enumerate().for_each(|(i, n)| picture(&dir.path().join("images").join(n), 16, 12, i as u8));
+    names.iter().enumerate().for_each(|(i, n)| write_image(&dir.path().join("images").join(n), 16, 12, i as u8));
     let model = dir.path().join("sparse/0");
     std::fs::create_dir_all(&model).unwrap();
     for (file, bytes) in ["cameras", "images", "points3D"].iter().zip(colmap_binary(&cameras, &names)) {
@@ -199,7 +189,7 @@ fn colmap_in_both_forms() {
     for (index, (camera, name)) in cameras.iter().zip(&names).enumerate() {
         let (q, t) = quaternion(camera);
         c += &format!("{index} PINHOLE 16 12 {} {} 8 6\n", camera.fx, camera.fy);
-        // One picture has points, the next has an empty line for none.
+        // One image has points, the next has an empty line for none.
         let points = if index % 2 == 0 { "1.0 2.0 -1" } else { "" };
         i += &format!("{index} {} {} {} {} {} {} {} {index} {name}\n{points}\n", q[0], q[1], q[2], q[3], t[0], t[1], t[2]);
     }
@@ -221,7 +211,7 @@ fn colmap_lenses_are_undone() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("cameras.txt"), format!("1 {model} 64 48 {parameters}\n")).unwrap();
         std::fs::write(dir.path().join("images.txt"), "1 1 0 0 0 0 0 0 1 a.png\n\n").unwrap();
-        picture(&dir.path().join("a.png"), 64, 48, 9);
+        write_image(&dir.path().join("a.png"), 64, 48, 9);
         let scene = load(dir.path()).unwrap();
         let (camera, image) = (scene.camera(0), scene.frame(0).unwrap());
         assert_eq!((camera.width, camera.height), (image.width, image.height), "{model}");
@@ -241,7 +231,7 @@ fn nerfstudio_with_shared_and_own_intrinsics_and_gaps() {
         .enumerate()
         .map(|(i, c)| {
             if i != 4 {
-                picture(&dir.path().join(format!("images/{i:04}.jpg")), 32, 24, 0);
+                write_image(&dir.path().join(format!("images/{i:04}.jpg")), 32, 24, 0);
             }
             let mut frame = serde_json::json!({"file_path": format!("images/{i:04}.jpg"), "transform_matrix": opengl_camera_to_world(c)});
             if i == 5 {
@@ -264,8 +254,8 @@ fn nerfstudio_with_shared_and_own_intrinsics_and_gaps() {
 fn the_right_reader_answers_or_all_are_named() {
     let dir = tempfile::tempdir().unwrap();
     let message = load(dir.path()).err().unwrap().to_string();
-    for (name, looks_for) in readers() {
-        assert!(message.contains(name) && message.contains(looks_for), "{message}");
+    for reader in Registry::collect().unwrap().readers() {
+        assert!(message.contains(reader.info.name) && message.contains(reader.looks_for), "{message}");
     }
     let missing = load(&dir.path().join("nothing")).err().unwrap();
     assert_eq!(missing.exit_code(), 2, "{missing}");

@@ -12,7 +12,7 @@ fn limits() -> Limits {
 }
 
 fn open(path: &Path) -> Result<Scene> {
-    cc4dgs_engine::data::open(path, &options(), &limits())
+    super::common::open(path, &options(), &limits())
 }
 
 /// Whatever opens must also be sound.
@@ -73,21 +73,6 @@ impl Victim {
         std::fs::write(&self.file, bytes).unwrap();
         check(open(self.root.path()));
     }
-}
-
-fn write_colmap(root: &Path) {
-    let cameras = ring(3, 16, 12);
-    let names: Vec<String> = (0..3).map(|i| format!("{i}.png")).collect();
-    names.iter().for_each(|n| picture(&root.join("images").join(n), 16, 12, 0));
-    std::fs::create_dir_all(root.join("sparse/0")).unwrap();
-    for (file, bytes) in ["cameras", "images", "points3D"].iter().zip(colmap_binary(&cameras, &names)) {
-        std::fs::write(root.join(format!("sparse/0/{file}.bin")), bytes).unwrap();
-    }
-}
-
-fn write_llff(root: &Path) {
-    std::fs::write(root.join("poses_bounds.npy"), npy(&[3, 17], &llff_rows(&ring(3, 16, 12)))).unwrap();
-    (0..3).for_each(|c| picture(&root.join(format!("images/{c}.png")), 16, 12, 0));
 }
 
 fn dnerf(root: &Path) {
@@ -209,5 +194,5 @@ damaged! {
     damaged_poses_bounds: write_llff, "poses_bounds.npy";
     damaged_transforms: dnerf, "transforms_train.json";
     damaged_meta: panoptic, "train_meta.json";
-    damaged_picture: dnerf, "train/r_000.png";
+    damaged_image: dnerf, "train/r_000.png";
 }

@@ -1,10 +1,10 @@
-//! The built-in scene and the points made from pictures, against the known truth.
+//! The built-in scene and the points made from images, against the known truth.
 
 use super::common::*;
-use cc4dgs_core::{Limits, Scene, Seed, Split};
+use cc4dgs_core::{Limits, Scene, SceneOptions, Seed, Split};
+use cc4dgs_engine::data::assemble;
 use cc4dgs_engine::data::init::photo_points;
-use cc4dgs_engine::data::procedural::{NAMES, ProceduralScene, build};
-use cc4dgs_engine::data::{SceneOptions, open};
+use cc4dgs_engine::data::procedural::{NAMES, ProceduralScene};
 use glam::DVec3;
 use rand::Rng;
 use std::path::Path;
@@ -27,7 +27,7 @@ fn the_default_is_as_described() {
 }
 
 #[test]
-fn pictures_are_the_same_on_any_number_of_threads() {
+fn images_are_the_same_on_any_number_of_threads() {
     let render = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
@@ -106,10 +106,10 @@ fn distance(truth: &ProceduralScene, p: DVec3) -> f64 {
 }
 
 #[test]
-fn points_from_pictures_lie_on_the_truth() {
-    // Cameras as near to each other as in a capture, and pictures large enough to match.
+fn points_from_images_lie_on_the_truth() {
+    // Cameras as near to each other as in a capture, and images large enough to match.
     let truth = ProceduralScene { width: 240, height: 200, train_cameras: 20, frames: 1, ..ProceduralScene::named("default").unwrap() };
-    let scene = build(truth.clone(), &options(), "truth".into()).unwrap();
+    let scene = assemble(truth.clone().into_raw("truth".into()), &options(), &Limits::default()).unwrap();
     let start = std::time::Instant::now();
     let cloud = photo_points(&scene, 5000, Seed::root(3)).unwrap();
     eprintln!("{} points in {:.2} s", cloud.positions.len(), start.elapsed().as_secs_f64());
@@ -132,7 +132,7 @@ fn points_from_pictures_lie_on_the_truth() {
 }
 
 #[test]
-fn points_from_pictures_do_not_depend_on_threads() {
+fn points_from_images_do_not_depend_on_threads() {
     let make = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| photo_points(&builtin("tiny", &SceneOptions { width: 80, ..Default::default() }), 500, Seed::root(1)).unwrap())

@@ -1,8 +1,8 @@
-//! The options all readers share: frames, held-out cameras, sizes, missing and misfit pictures.
+//! The options all readers share: frames, held-out cameras, sizes, missing and misfit images.
 
 use super::common::*;
-use cc4dgs_core::{Limits, Split};
-use cc4dgs_engine::data::{Background, CameraRef, SceneOptions, open};
+use cc4dgs_core::reader::files::read_png_or_jpeg;
+use cc4dgs_core::{Background, CameraRef, Limits, SceneOptions, Split};
 
 #[test]
 fn frames_are_chosen_and_renumbered() {
@@ -35,7 +35,7 @@ fn held_out_cameras_and_caps() {
     let wrong = SceneOptions { test_cameras: Some(vec![CameraRef::Name("cam7".into())]), ..Default::default() };
     assert!(open(dir.path(), &wrong, &Limits::default()).err().unwrap().to_string().contains("cam7"));
     let all = SceneOptions { test_cameras: Some((0..5).map(CameraRef::Index).collect()), ..Default::default() };
-    assert!(open(dir.path(), &all, &Limits::default()).err().unwrap().to_string().contains("no training picture"));
+    assert!(open(dir.path(), &all, &Limits::default()).err().unwrap().to_string().contains("no training image"));
 }
 
 #[test]
@@ -54,7 +54,7 @@ fn sizes_follow_the_options() {
 }
 
 #[test]
-fn missing_pictures_are_skipped_and_named() {
+fn missing_images_are_skipped_and_named() {
     let dir = tempfile::tempdir().unwrap();
     write_dnerf(dir.path(), 4, 1, 8);
     std::fs::remove_file(dir.path().join("train/r_002.png")).unwrap();
@@ -62,14 +62,14 @@ fn missing_pictures_are_skipped_and_named() {
     assert_eq!(scene.split(Split::Train).len(), 3);
     assert!(scene.warnings.iter().any(|w| w.contains("r_002.png")), "{:?}", scene.warnings);
     std::fs::remove_dir_all(dir.path().join("train")).unwrap();
-    assert!(load(dir.path()).err().unwrap().to_string().contains("none of its 4 pictures"));
+    assert!(load(dir.path()).err().unwrap().to_string().contains("none of its 4 images"));
 }
 
 #[test]
-fn misfit_and_broken_pictures_are_errors_that_name_them() {
+fn misfit_and_broken_images_are_errors_that_name_them() {
     let dir = tempfile::tempdir().unwrap();
     write_panoptic(dir.path(), 2, 2);
-    picture(&dir.path().join("ims/0/000001.png"), 10, 10, 0);
+    write_image(&dir.path().join("ims/0/000001.png"), 10, 10, 0);
     let scene = load(dir.path()).unwrap();
     let view = (0..scene.views.len()).find(|&v| scene.camera(v).name == "0" && scene.views[v].frame == 1).unwrap();
     let message = scene.frame(view).err().unwrap().to_string();
@@ -80,13 +80,13 @@ fn misfit_and_broken_pictures_are_errors_that_name_them() {
     let bytes = std::fs::read(&jpeg).unwrap();
     let read = |bytes: &[u8]| {
         std::fs::write(&jpeg, bytes).unwrap();
-        cc4dgs_engine::data::read_png_or_jpeg(&jpeg, &Limits::default())
+        read_png_or_jpeg(&jpeg, &Limits::default())
     };
     assert!(read(&bytes).is_ok());
     for keep in [0, 1, 3, bytes.len() / 2, bytes.len() - 3] {
         assert!(read(&bytes[..keep]).is_err(), "a JPEG cut to {keep} of {} bytes", bytes.len());
     }
-    // A PNG header that claims a gigantic picture.
+    // A PNG header that claims a gigantic image.
     let png = dir.path().join("ims/0/000000.png");
     let mut bytes = std::fs::read(&png).unwrap();
     bytes[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff]);

@@ -32,7 +32,7 @@ pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
     let Some((_, _, first)) = models.first() else {
         return Err(Error::parameter("--devices", "none is named", "Give at least two, such as flex,wgpu"));
     };
-    let scene = open_as_trained(&args.views.scene, first, &args.views.sets, &context.limits)?;
+    let scene = open_as_trained(&args.views.scene, first, &args.views.sets, &context.registry, &context.limits)?;
     let views = scene.split(args.views.split.into());
     let wanted = if args.max_views == 0 { views.len() } else { args.max_views };
     let views: Vec<usize> = evenly(views.len(), wanted).into_iter().map(|i| views[i]).collect();

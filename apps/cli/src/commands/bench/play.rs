@@ -28,7 +28,7 @@ struct PlayReport<'a> {
 pub fn play(context: &Context, args: &BenchPlay) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.limits)?;
+    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.registry, &context.limits)?;
     let moments: Vec<(Camera, f32)> = scene.split(args.views.split.into()).into_iter().map(|v| (scene.camera(v).clone(), scene.views[v].time_norm)).collect();
     let Some((camera, _)) = moments.first() else {
         return Err(Error::parameter("--split", format!("{} has no view of this split", scene.name), "Play the other split"));

@@ -1,6 +1,6 @@
-//! Initial points from the pictures alone, for scenes that come without any.
+//! Initial points from the images alone, for scenes that come without any.
 //!
-//! Multi-view stereo on small pictures: plane-swept depth with normalised cross-correlation, refined coarse to fine, kept where several views agree;
+//! Multi-view stereo on small images: plane-swept depth with normalised cross-correlation, refined coarse to fine, kept where several views agree;
 //! a share of points for texture-poor surfaces between them; and, where the dataset has foreground masks, the surface of the visual hull.
 
 mod fuse;
@@ -32,7 +32,7 @@ struct Candidate {
 /// Up to `count` coloured points on the surfaces of `scene` at its first instant with enough training cameras, in world units.
 ///
 /// Deterministic in the scene and `seed`, whatever the number of threads. Errors: [`Error::Unsupported`] for scenes with fewer than four training
-/// cameras at every instant (a single moving camera), [`Error::Data`] if hardly anything matches, and whatever decoding the pictures meets.
+/// cameras at every instant (a single moving camera), [`Error::Data`] if hardly anything matches, and whatever decoding the images meets.
 pub fn photo_points(scene: &Scene, count: usize, seed: Seed) -> Result<PointCloud> {
     let set = WorkSet::load(scene, MIN_VIEWS)?;
     let maps = sweep::depth_maps(&set);

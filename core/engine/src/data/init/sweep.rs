@@ -66,8 +66,8 @@ fn upsample(from: &Level, to: &Level, inverse: &[f32], score: &[f32]) -> Vec<f32
             spread[y * from.width + x] = inverse[best.1];
         }
     }
-    let place = |i: usize, n_to: usize, n_from: usize| ((i * 2 + 1) * n_from / (2 * n_to)).min(n_from - 1);
-    (0..to.width * to.height).map(|p| spread[place(p / to.width, to.height, from.height) * from.width + place(p % to.width, to.width, from.width)]).collect()
+    let source = |i: usize, n_to: usize, n_from: usize| ((i * 2 + 1) * n_from / (2 * n_to)).min(n_from - 1);
+    (0..to.width * to.height).map(|p| spread[source(p / to.width, to.height, from.height) * from.width + source(p % to.width, to.width, from.width)]).collect()
 }
 
 struct Sweep<'a> {
@@ -115,15 +115,15 @@ impl Sweep<'_> {
         for p in 0..n {
             let at = |plane: usize| volume[plane * n + p];
             let best = (0..planes).fold(0, |b, k| if at(k) > at(b) { k } else { b });
-            let mut place = best as f32 - reach as f32;
+            let mut offset = best as f32 - reach as f32;
             if best > 0 && best + 1 < planes {
                 let (l, c, r) = (at(best - 1), at(best), at(best + 1));
                 let curve = l - 2.0 * c + r;
                 if curve < -1e-6 {
-                    place += (0.5 * (l - r) / curve).clamp(-0.5, 0.5);
+                    offset += (0.5 * (l - r) / curve).clamp(-0.5, 0.5);
                 }
             }
-            inverse[p] = (base[p] + place * step).clamp(self.range[0], self.range[1]);
+            inverse[p] = (base[p] + offset * step).clamp(self.range[0], self.range[1]);
             score[p] = at(best);
         }
         (inverse, score)

@@ -1,4 +1,4 @@
-//! The training pictures of one instant at several small sizes, with the geometry the sweep needs.
+//! The training images of one instant at several small sizes, with the geometry the sweep needs.
 
 use super::super::camera_box::camera_box;
 use super::super::resample::resize;
@@ -6,16 +6,16 @@ use cc4dgs_core::{Camera, Error, Image8, Result, Scene, Split};
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
-/// Pixels per picture at each level, coarse to fine.
+/// Pixels per image at each level, coarse to fine.
 const LEVEL_PIXELS: [f64; 3] = [6_000.0, 24_000.0, 96_000.0];
-/// The most pictures that get a depth map.
+/// The most images that get a depth map.
 const MAX_VIEWS: usize = 40;
-/// Neighbours a picture is matched with.
+/// Neighbours an image is matched with.
 const NEIGHBOURS: usize = 4;
 /// The angle between viewing directions that matches best: wide enough for depth, narrow enough to look alike.
 const BEST_ANGLE_RAD: f64 = 0.2;
 
-/// One picture at one size.
+/// One image at one size.
 pub(super) struct Level {
     pub width: usize,
     pub height: usize,
@@ -39,7 +39,7 @@ pub(super) struct WorkView {
     pub depth_range: [f64; 2],
     /// Foreground, at the finest level.
     pub mask: Option<Vec<bool>>,
-    /// Opaque pixels of pictures with alpha, at the finest level.
+    /// Opaque pixels of images with alpha, at the finest level.
     pub opaque: Option<Vec<bool>>,
 }
 
@@ -101,7 +101,7 @@ impl WorkSet {
         let most = by_frame.iter().map(Vec::len).max().unwrap_or(0);
         let Some(mut chosen) = by_frame.into_iter().find(|v| v.len() >= min_views) else {
             return Err(Error::unsupported(
-                format!("points from the pictures of {}", scene.name),
+                format!("points from the images of {}", scene.name),
                 format!("at no instant there are {min_views} training cameras, the most is {most}"),
                 "Start from random points",
             ));

@@ -1,7 +1,7 @@
 //! The built-in scene: analytic objects, some of them moving, ray-traced from a ring of cameras.
 //!
 //! Nothing here is made of Gaussians, and everything is known: positions, motion and surfaces are functions of time, so that a reconstruction can be
-//! compared with the truth and not only with pictures.
+//! compared with the truth and not only with images.
 
 mod objects;
 mod trace;
@@ -9,10 +9,10 @@ mod trace;
 pub use objects::{Material, Motion, Object, Pose, Shape, Texture};
 pub use trace::{Hit, Tracer};
 
-use super::SceneOptions;
-use super::distortion::Distortion;
-use super::raw::{Picture, RawCamera, RawScene, RawView};
-use cc4dgs_core::{Camera, Error, FrameSource, Image8, Limits, PointCloud, Result, Scene, Seed, Split, unknown_name};
+use cc4dgs_core::{
+    Camera, Distortion, Error, FrameSource, Image8, ImageSource, Limits, Plugin, PointCloud, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result,
+    SceneOptions, Seed, Split, inventory, unknown_name,
+};
 use glam::DVec3;
 use rand::Rng;
 use std::path::Path;
@@ -21,9 +21,9 @@ use std::sync::Arc;
 /// What the built-in scene consists of.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ProceduralScene {
-    /// Picture width in pixels.
+    /// Image width in pixels.
     pub width: u32,
-    /// Picture height in pixels.
+    /// Image height in pixels.
     pub height: u32,
     /// Training cameras, on two rings around the scene.
     pub train_cameras: usize,
@@ -35,7 +35,7 @@ pub struct ProceduralScene {
     pub supersampling: u32,
     /// Surface samples handed out as initial points.
     pub points: usize,
-    /// Standard deviation of the noise on those points, in world units (the room is 4 wide).
+    /// Standard deviation of the noise on those points, in world units (the scene is 4 wide).
     pub point_noise: f64,
     /// Node of the seed tree for the points.
     pub seed: Seed,
@@ -125,44 +125,73 @@ impl ProceduralScene {
     /// All cameras with their side of the split. World axes: z up, the floor at 0.
     pub fn cameras(&self) -> Vec<(Camera, Split)> {
         let target = [0.0, 0.0, 0.55];
-        let place = |name: String, turn: f64, height: f64, radius: f64| {
+        let camera = |name: String, turn: f64, height: f64, radius: f64| {
             let (s, c) = (turn * std::f64::consts::TAU).sin_cos();
             Camera::look_at(&name, (self.width, self.height), 0.85, [radius * c, radius * s, height], target, [0.0, 0.0, 1.0])
         };
         let mut cameras = Vec::new();
         for i in 0..self.train_cameras {
             let (height, radius) = if i % 2 == 0 { (1.3, 4.2) } else { (2.5, 3.8) };
-            cameras.push((place(format!("train{i:02}"), i as f64 / self.train_cameras as f64, height, radius), Split::Train));
+            cameras.push((camera(format!("train{i:02}"), i as f64 / self.train_cameras as f64, height, radius), Split::Train));
         }
         for i in 0..self.test_cameras {
             let turn = (i as f64 + 0.5) / self.test_cameras as f64 + 0.5 / self.train_cameras.max(1) as f64;
-            cameras.push((place(format!("test{i:02}"), turn, 1.9, 4.0), Split::Test));
+            cameras.push((camera(format!("test{i:02}"), turn, 1.9, 4.0), Split::Test));
         }
         cameras
     }
-    /// Renders one picture; `time_norm` in 0..1.
+    /// Renders one image; `time_norm` in 0..1.
     pub fn render(&self, camera: &Camera, time_norm: f64) -> Image8 {
         self.tracer(time_norm).render(camera, self.supersampling)
     }
 }
 
-/// Frames traced when they are asked for.
+/// Images traced when they are asked for; the index counts cameras first, then frames.
 struct TracedFrames {
     scene: ProceduralScene,
-    jobs: Vec<(Camera, f64)>,
+    cameras: Vec<Camera>,
 }
 
 impl FrameSource for TracedFrames {
-    fn load(&self, view: usize) -> Result<Image8> {
-        let count = self.jobs.len();
-        let missing = || Error::parameter(format!("view {view}"), format!("the scene has {count} views"), "Ask for a view that exists");
-        let (camera, time) = self.jobs.get(view).ok_or_else(missing)?;
-        Ok(self.scene.render(camera, *time))
+    fn load(&self, index: usize) -> Result<Image8> {
+        let count = self.cameras.len() * self.scene.frames;
+        if index >= count {
+            return Err(Error::parameter(format!("image {index}"), format!("the procedural scene has {count}"), "Ask for an image that exists"));
+        }
+        Ok(self.scene.render(&self.cameras[index % self.cameras.len()], self.scene.time(index / self.cameras.len())))
     }
 }
 
-/// Opens the built-in scene called `name`. `scene.frames = [0, COUNT, 1]` with more frames than the scene has samples its motion more finely.
-pub fn open(name: &str, options: &SceneOptions, limits: &Limits) -> Result<Scene> {
+inventory::submit! {
+    ReaderPlugin {
+        info: Plugin {
+            name: "procedural",
+            version: "1",
+            summary: "the built-in ray-traced scene, whose motion is known",
+            paper: "this project",
+            schema: "",
+            capabilities: &[],
+        },
+        looks_for: "the word procedural or procedural:NAME (default, static, tiny, frequencies)",
+        order: 0,
+        probe,
+        open,
+    }
+}
+
+fn probe(path: &Path) -> bool {
+    name_of(path).is_some()
+}
+
+/// `scene.frames = [0, COUNT, 1]` with more frames than the scene has samples its motion more finely.
+fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let Some(name) = name_of(path) else {
+        return Err(Error::parameter(
+            format!("scene {}", path.display()),
+            "it is not a procedural scene",
+            format!("Write procedural:NAME, one of {}", NAMES.join(", ")),
+        ));
+    };
     let mut scene = ProceduralScene::named(name)?;
     (scene.width, scene.height) = options.target_size((scene.width, scene.height));
     limits.check_pixels(&format!("procedural scene {name}"), u64::from(scene.width), u64::from(scene.height))?;
@@ -170,44 +199,46 @@ pub fn open(name: &str, options: &SceneOptions, limits: &Limits) -> Result<Scene
         scene.background = background.rgb()?;
     }
     if let Some([0, count, 1]) = options.frames.filter(|f| f[1] > 0) {
-        // As many pictures as bytes may be read is a generous cap, and one all the same.
+        // As many images as bytes may be read is a generous cap, and one all the same.
         limits.check_bytes(&format!("procedural scene {name}: frames"), (count as u64).saturating_mul(1 << 16))?;
         scene.frames = count;
     }
-    build(scene, options, format!("procedural:{name}"))
+    Ok(scene.into_raw(format!("procedural:{name}")))
 }
 
-/// A [`Scene`] over any procedural scene; the options choose frames, held-out cameras and the cache.
-pub fn build(procedural: ProceduralScene, options: &SceneOptions, name: String) -> Result<Scene> {
-    let mut raw = RawScene { name, ..Default::default() };
-    let rig = procedural.cameras();
-    for (camera, _) in &rig {
-        raw.cameras.push(RawCamera {
+impl ProceduralScene {
+    /// The scene as a reader hands it over; [`super::assemble`] makes a [`cc4dgs_core::Scene`] of it. Its images already have their final size.
+    pub fn into_raw(self, name: String) -> RawScene {
+        let rig = self.cameras();
+        let camera = |camera: &Camera| RawCamera {
             name: camera.name.clone(),
             size: [camera.width, camera.height],
             focal: [camera.fx, camera.fy],
             principal: [camera.cx, camera.cy],
             distortion: Distortion::None,
             world_to_camera: camera.world_to_camera,
-        });
-    }
-    for frame in 0..procedural.frames {
-        for (camera, (_, split)) in rig.iter().enumerate() {
-            raw.views.push(RawView { camera, frame, time: Some(procedural.time(frame)), split: *split, picture: Picture::Traced });
+        };
+        let cameras = rig.iter().map(|(c, _)| camera(c)).collect();
+        let points = self.surface_samples(self.points).0;
+        let times: Vec<f64> = (0..self.frames).map(|frame| self.time(frame)).collect();
+        let background = self.background;
+        let source: Arc<dyn FrameSource> = Arc::new(TracedFrames { scene: self, cameras: rig.iter().map(|(c, _)| c.clone()).collect() });
+        let mut views = Vec::with_capacity(times.len() * rig.len());
+        for (frame, &time) in times.iter().enumerate() {
+            for (camera, (_, split)) in rig.iter().enumerate() {
+                let image = ImageSource::Frames { source: source.clone(), index: frame * rig.len() + camera };
+                views.push(RawView { camera, frame, time: Some(time), split: *split, image });
+            }
+        }
+        RawScene {
+            name,
+            cameras,
+            views,
+            points: Some(RawPoints { positions: points.positions.iter().map(|p| p.map(f64::from)).collect(), colors: points.colors }),
+            init_box: Some([[-2.0, -2.0, -0.1], [2.0, 2.0, 2.2]]),
+            background: Some(background),
+            resized: true,
+            warnings: Vec::new(),
         }
     }
-    let views = raw.select(options)?;
-    let by_name = |name: &str| rig.iter().find(|(c, _)| c.name == name).map(|(c, _)| c.clone());
-    let cameras: Vec<Camera> = raw.cameras.iter().filter_map(|c| by_name(&c.name)).collect();
-    // Exact times, not the f32 of the views, so that equal frames of different subsets are equal pictures.
-    let jobs = raw.views.iter().map(|v| (cameras[v.camera].clone(), v.time.unwrap_or(0.0))).collect();
-    let points = procedural.surface_samples(procedural.points).0;
-    let background = procedural.background;
-    let source = Arc::new(TracedFrames { scene: procedural, jobs });
-    let mut scene = Scene::new(raw.name, cameras, views, source, options.cache_mb.saturating_mul(1_000_000))?;
-    scene.points = Some(points).filter(|p| !p.positions.is_empty());
-    scene.init_box = Some(([-2.0, -2.0, -0.1], [2.0, 2.0, 2.2]));
-    scene.background = Some(background);
-    scene.warnings = raw.warnings;
-    Ok(scene)
 }

@@ -1,4 +1,4 @@
-//! Rays against the objects at one instant, and pictures made of them.
+//! Rays against the objects at one instant, and images made of them.
 
 use super::objects::{Object, Pose};
 use cc4dgs_core::{Camera, Image8};
@@ -76,7 +76,7 @@ impl Tracer {
             None => self.background.map(f64::from),
         }
     }
-    /// A picture with `supersampling` x `supersampling` rays per pixel on a regular grid.
+    /// An image with `supersampling` x `supersampling` rays per pixel on a regular grid.
     pub fn render(&self, camera: &Camera, supersampling: u32) -> Image8 {
         let n = supersampling.max(1);
         let mut data = vec![0u8; camera.width as usize * camera.height as usize * 3];

@@ -1,6 +1,6 @@
 //! The `[scene]` section: how a dataset is opened.
 
-use cc4dgs_core::{Error, Result};
+use crate::{Error, Result, unknown_name};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -22,7 +22,7 @@ impl Background {
                 "white" => Ok([1.0; 3]),
                 "black" => Ok([0.0; 3]),
                 "grey" | "gray" => Ok([0.5; 3]),
-                other => Err(cc4dgs_core::unknown_name("scene.background", other, ["white", "black", "grey"].into_iter())),
+                other => Err(unknown_name("scene.background", other, ["white", "black", "grey"].into_iter())),
             },
             Self::Rgb(c) if c.iter().all(|v| (0.0..=1.0).contains(v)) => Ok(*c),
             Self::Rgb(c) => Err(Error::parameter("scene.background", format!("{c:?} is outside 0..1"), "Write three numbers between 0 and 1")),
@@ -30,7 +30,7 @@ impl Background {
     }
 }
 
-/// A camera by its place or its name.
+/// A camera by its index or its name.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum CameraRef {
@@ -55,7 +55,7 @@ pub struct SceneOptions {
     /// First frame, number of frames (0: all that follow) and stride, by frame index of the dataset.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frames: Option<[usize; 3]>,
-    /// Background the pictures are composited over and the renders start from; the dataset's own if absent.
+    /// Background the images are composited over and the renders start from; the dataset's own if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub background: Option<Background>,
     /// Memory for decoded frames, in megabytes (10^6 bytes).
@@ -97,7 +97,7 @@ impl SceneOptions {
     /// Refuses contradictions and values without meaning.
     pub fn validate(&self) -> Result<()> {
         if !(self.downscale.is_finite() && self.downscale > 0.0) {
-            return Err(Error::parameter("scene.downscale", format!("{} is not a positive number", self.downscale), "Write 2 to halve the pictures"));
+            return Err(Error::parameter("scene.downscale", format!("{} is not a positive number", self.downscale), "Write 2 to halve the images"));
         }
         if self.downscale != 1.0 && (self.width > 0 || self.height > 0) {
             return Err(Error::parameter("scene.downscale", "given together with scene.width or scene.height", "Keep one of them"));
@@ -110,8 +110,8 @@ impl SceneOptions {
         }
         Ok(())
     }
-    /// The size pictures of `native` pixels are brought to.
-    pub(crate) fn target_size(&self, native: (u32, u32)) -> (u32, u32) {
+    /// The size images of `native` pixels are brought to.
+    pub fn target_size(&self, native: (u32, u32)) -> (u32, u32) {
         let (w, h) = (f64::from(native.0), f64::from(native.1));
         let pixels = |v: f64| v.round().clamp(1.0, f64::from(u32::MAX)) as u32;
         match (self.width, self.height) {
@@ -149,7 +149,7 @@ mod tests {
 
     #[test]
     fn toml_forms_are_read_and_unknown_keys_refused() {
-        let read = |text: &str| cc4dgs_core::config::parse_table("t", text).and_then(|t| cc4dgs_core::config::parse_section::<SceneOptions>("scene", &t));
+        let read = |text: &str| crate::config::parse_table("t", text).and_then(|t| crate::config::parse_section::<SceneOptions>("scene", &t));
         let options = read("background = \"black\"\nframes = [0, 30, 5]\ntest_cameras = [0, \"cam10\"]").unwrap();
         assert_eq!(options.background.unwrap().rgb().unwrap(), [0.0; 3]);
         assert_eq!(options.test_cameras.unwrap(), vec![CameraRef::Index(0), CameraRef::Name("cam10".into())]);

@@ -1,106 +1,9 @@
-//! Lens distortion and its removal. Scenes hold pinhole cameras only; the readers resample their pictures.
+//! Removal of lens distortion: images of distorted cameras become pinhole images.
 
-use cc4dgs_core::{Error, Image8, Result};
+use cc4dgs_core::{Distortion, Error, Image8, Result};
 use rayon::prelude::*;
 
-/// How a lens bends normalised image coordinates (x/z, y/z).
-#[derive(Clone, Debug, PartialEq)]
-pub enum Distortion {
-    /// A pinhole.
-    None,
-    /// Brown-Conrady as in OpenCV: radial polynomial in r^2 .. r^8 and tangential terms.
-    Brown {
-        /// k1..k4.
-        radial: [f64; 4],
-        /// p1, p2.
-        tangential: [f64; 2],
-    },
-    /// Equidistant fisheye as in OpenCV: polynomial in the angle.
-    Fisheye {
-        /// k1..k4.
-        radial: [f64; 4],
-    },
-}
-
-impl Distortion {
-    /// Whether nothing is bent.
-    pub fn is_identity(&self) -> bool {
-        match self {
-            Self::None => true,
-            Self::Brown { radial, tangential } => radial.iter().chain(tangential).all(|&k| k == 0.0),
-            Self::Fisheye { .. } => false,
-        }
-    }
-    /// Where the lens puts the ideal point (x, y).
-    pub fn distort(&self, x: f64, y: f64) -> (f64, f64) {
-        match self {
-            Self::None => (x, y),
-            Self::Brown { radial: [k1, k2, k3, k4], tangential: [p1, p2] } => {
-                let r2 = x * x + y * y;
-                let f = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)));
-                (x * f + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * f + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y)
-            }
-            Self::Fisheye { radial: [k1, k2, k3, k4] } => {
-                let r = x.hypot(y);
-                if r < 1e-12 {
-                    return (x, y);
-                }
-                let t = r.atan();
-                let t2 = t * t;
-                let f = t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r;
-                (x * f, y * f)
-            }
-        }
-    }
-    /// The ideal point the lens puts at (x, y), by Newton's method; `None` where there is none.
-    pub fn undistort(&self, x: f64, y: f64) -> Option<(f64, f64)> {
-        if let Self::Fisheye { .. } = self {
-            // An angle of 90 degrees or more has no place in a pinhole picture.
-            if x.hypot(y) >= 0.5 * std::f64::consts::PI * 1.5 {
-                return None;
-            }
-        }
-        let (mut u, mut v) = (x, y);
-        for _ in 0..50 {
-            let h = 1e-6 * (1.0 + u.abs().max(v.abs()));
-            let (fx, fy) = self.distort(u, v);
-            let (ax, ay) = self.distort(u + h, v);
-            let (bx, by) = self.distort(u, v + h);
-            let (ex, ey) = (fx - x, fy - y);
-            if ex.abs().max(ey.abs()) < 1e-10 {
-                return Some((u, v));
-            }
-            let (a, b, c, d) = ((ax - fx) / h, (bx - fx) / h, (ay - fy) / h, (by - fy) / h);
-            let det = a * d - b * c;
-            if !(det.is_finite() && det > 1e-9) {
-                return None;
-            }
-            u -= (d * ex - b * ey) / det;
-            v -= (a * ey - c * ex) / det;
-        }
-        let (fx, fy) = self.distort(u, v);
-        ((fx - x).abs().max((fy - y).abs()) < 1e-6).then_some((u, v))
-    }
-    /// The ideal radius up to which the radial mapping grows; beyond, the polynomial folds back and means nothing.
-    fn fold_radius(&self, largest: f64) -> f64 {
-        const STEPS: usize = 512;
-        let mut before = 0.0;
-        for i in 1..=STEPS {
-            let r = largest * i as f64 / STEPS as f64;
-            let image = match self {
-                Self::Brown { radial, .. } => Self::Brown { radial: *radial, tangential: [0.0; 2] }.distort(r, 0.0).0,
-                other => other.distort(r, 0.0).0,
-            };
-            if image <= before {
-                return largest * (i - 1) as f64 / STEPS as f64;
-            }
-            before = image;
-        }
-        largest
-    }
-}
-
-/// The plan that turns pictures of one distorted camera into pinhole pictures of the same focal length: the largest upright rectangle around
+/// The plan that turns images of one distorted camera into pinhole images of the same focal length: the largest upright rectangle around
 /// the principal point that has data everywhere.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Undistort {
@@ -115,9 +18,9 @@ pub struct Undistort {
 }
 
 impl Undistort {
-    /// Plans for pictures of `size` pixels with the given focal lengths and principal point in pixels; `object` names the camera in errors.
+    /// Plans for images of `size` pixels with the given focal lengths and principal point in pixels; `object` names the camera in errors.
     pub fn plan(object: &str, distortion: &Distortion, size: [u32; 2], focal: [f64; 2], principal: [f64; 2]) -> Result<Self> {
-        let bad = |problem: String| Error::data(object, problem, "Check the distortion coefficients, or undistort the pictures first");
+        let bad = |problem: String| Error::data(object, problem, "Check the distortion coefficients, or undistort the images first");
         let coefficients: Vec<f64> = match distortion {
             Distortion::None => vec![],
             Distortion::Brown { radial, tangential } => radial.iter().chain(tangential).copied().collect(),
@@ -171,11 +74,11 @@ impl Undistort {
         }
         Ok(Self { distortion: distortion.clone(), focal, principal, origin: [left as u32, top as u32], size: [(right - left) as u32, (bottom - top) as u32] })
     }
-    /// The principal point of the pinhole picture, in pixels.
+    /// The principal point of the pinhole image, in pixels.
     pub fn principal_point(&self) -> [f64; 2] {
         [self.principal[0] - f64::from(self.origin[0]), self.principal[1] - f64::from(self.origin[1])]
     }
-    /// Resamples one picture, bilinearly and weighted by alpha.
+    /// Resamples one image, bilinearly and weighted by alpha.
     pub fn apply(&self, image: &Image8) -> Image8 {
         let c = image.channels as usize;
         let [width, height] = self.size;
@@ -228,18 +131,7 @@ mod tests {
         Distortion::Fisheye { radial: [0.02, -0.01, 0.003, -0.0005] },
     ];
 
-    #[test]
-    fn the_inverse_undoes_the_lens() {
-        for lens in &LENSES {
-            for (x, y) in [(0.0, 0.0), (0.3, -0.2), (-0.6, 0.5), (0.0, 0.7)] {
-                let (xd, yd) = lens.distort(x, y);
-                let (u, v) = lens.undistort(xd, yd).unwrap();
-                assert!((u - x).abs() < 1e-8 && (v - y).abs() < 1e-8, "{lens:?} at ({x}, {y}): ({u}, {v})");
-            }
-        }
-    }
-
-    /// A picture whose colours are the ideal coordinates, as the lens would take it, comes back with colours equal to its pinhole coordinates.
+    /// An image whose colours are the ideal coordinates, as the lens would take it, comes back with colours equal to its pinhole coordinates.
     #[test]
     fn straight_gradients_come_back() {
         let (w, h, f) = (160u32, 120u32, 110.0);
@@ -269,7 +161,7 @@ mod tests {
         for k in [f64::NAN, f64::INFINITY, 1e300, -1e5] {
             assert!(Undistort::plan("t", &Distortion::Brown { radial: [k, 0.0, 0.0, 0.0], tangential: [0.0; 2] }, [64, 64], [50.0; 2], [32.0; 2]).is_err());
         }
-        // Folds at r = 0.58, inside the picture.
+        // Folds at r = 0.58, inside the image.
         if let Ok(plan) = Undistort::plan("t", &Distortion::Brown { radial: [-1.0, 0.0, 0.0, 0.0], tangential: [0.0; 2] }, [64, 64], [50.0; 2], [32.0; 2]) {
             let half = f64::from(plan.size[0]) / 2.0 / 50.0;
             assert!(half * 2f64.sqrt() < 0.6, "kept {:?}", plan.size);

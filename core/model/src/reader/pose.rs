@@ -1,12 +1,12 @@
-//! Conventions of camera poses, all brought to rigid OpenCV world-to-camera transforms.
+//! Conventions of camera poses, all brought to rigid OpenCV world-to-camera transforms. Errors are sentences; the reader adds file and frame.
 
 use glam::{DMat3, DQuat, DVec3};
 
 /// Row-major 4x4.
-pub(crate) type Matrix4 = [[f64; 4]; 4];
+pub type Matrix4 = [[f64; 4]; 4];
 
 /// A JSON matrix of 3 or 4 rows with 4 columns.
-pub(crate) fn matrix4(rows: &[Vec<f64>]) -> Result<Matrix4, String> {
+pub fn matrix4(rows: &[Vec<f64>]) -> Result<Matrix4, String> {
     if !(rows.len() == 3 || rows.len() == 4) || rows.iter().any(|r| r.len() != 4) {
         return Err(format!("the matrix has {} rows of {:?} columns, not 4x4", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>()));
     }
@@ -18,20 +18,20 @@ pub(crate) fn matrix4(rows: &[Vec<f64>]) -> Result<Matrix4, String> {
 }
 
 /// World-to-camera from the camera's axes (columns: right, down, forward) and centre in the world.
-pub(crate) fn world_to_camera(axes: DMat3, center: DVec3) -> Matrix4 {
+pub fn world_to_camera(axes: DMat3, center: DVec3) -> Matrix4 {
     let row = |a: DVec3| [a.x, a.y, a.z, -a.dot(center)];
     [row(axes.x_axis), row(axes.y_axis), row(axes.z_axis), [0.0, 0.0, 0.0, 1.0]]
 }
 
 /// Camera-to-world in OpenGL axes (x right, y up, z backwards) to OpenCV world-to-camera: the y and z columns change sign, then the inverse.
-pub(crate) fn from_opengl_camera_to_world(m: &Matrix4) -> Result<Matrix4, String> {
+pub fn from_opengl_camera_to_world(m: &Matrix4) -> Result<Matrix4, String> {
     let column = |j: usize| DVec3::new(m[0][j], m[1][j], m[2][j]);
     let axes = orthonormal(DMat3::from_cols(column(0), -column(1), -column(2)))?;
     Ok(world_to_camera(axes, column(3)))
 }
 
 /// World-to-camera from a quaternion (w,x,y,z) and a translation, both world to camera.
-pub(crate) fn from_quaternion(wxyz: [f64; 4], t: [f64; 3]) -> Result<Matrix4, String> {
+pub fn from_quaternion(wxyz: [f64; 4], t: [f64; 3]) -> Result<Matrix4, String> {
     let q = DQuat::from_xyzw(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
     if !(q.length().is_finite() && q.length() > 1e-8) {
         return Err(format!("quaternion {wxyz:?} has no direction"));

@@ -1,6 +1,6 @@
 //! Reading files that may be hostile: sizes are checked before anything is allocated for them.
 
-use cc4dgs_core::{Error, Image8, Limits, Result};
+use crate::{Error, Image8, Limits, Result};
 use image::{DynamicImage, ImageReader};
 use serde::de::DeserializeOwned;
 use std::fs::File;
@@ -8,7 +8,7 @@ use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
 /// The whole of a regular file, refused over `limits.max_bytes`.
-pub(crate) fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
+pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     let object = path.display().to_string();
     let meta = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
     if !meta.is_file() {
@@ -23,13 +23,13 @@ pub(crate) fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
 }
 
 /// The file as UTF-8 text.
-pub(crate) fn read_text(path: &Path, limits: &Limits) -> Result<String> {
+pub fn read_text(path: &Path, limits: &Limits) -> Result<String> {
     String::from_utf8(read_bytes(path, limits)?)
         .map_err(|e| Error::data(path.display().to_string(), format!("byte {} is not UTF-8 text", e.utf8_error().valid_up_to()), "Fetch the file again"))
 }
 
 /// The JSON document of a file.
-pub(crate) fn read_json<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T> {
+pub fn read_json<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T> {
     let text = read_text(path, limits)?;
     let object = path.display().to_string();
     limits_depth(&text, &object, limits)?;
@@ -60,7 +60,7 @@ fn limits_depth(text: &str, object: &str, limits: &Limits) -> Result<()> {
 }
 
 /// Sorted entries of a folder that satisfy `keep`.
-pub(crate) fn list(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
+pub fn list(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
         let path = entry.map_err(|e| Error::io(folder, e))?.path();
@@ -72,30 +72,30 @@ pub(crate) fn list(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Pa
     Ok(found)
 }
 
-/// Whether the extension is that of a picture this build decodes.
-pub(crate) fn is_picture(path: &Path) -> bool {
+/// Whether the extension is that of an image this build decodes, and the file exists.
+pub fn is_image(path: &Path) -> bool {
     has_extension(path, &["png", "jpg", "jpeg"]) && path.is_file()
 }
 
 /// Whether the extension, in lower case, is one of `known`.
-pub(crate) fn has_extension(path: &Path, known: &[&str]) -> bool {
+pub fn has_extension(path: &Path, known: &[&str]) -> bool {
     path.extension().and_then(|e| e.to_str()).is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()))
 }
 
 /// The last part of a path as text.
-pub(crate) fn file_name(path: &Path) -> String {
+pub fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_else(|| path.display().to_string())
 }
 
-fn picture_error(path: &Path, e: impl std::fmt::Display) -> Error {
-    Error::data(path.display().to_string(), format!("not a readable picture: {e}"), "Fetch the file again, or remove it from the dataset")
+fn image_error(path: &Path, e: impl std::fmt::Display) -> Error {
+    Error::data(path.display().to_string(), format!("not a readable image: {e}"), "Fetch the file again, or remove it from the dataset")
 }
 
-/// Width and height from a picture's header.
-pub(crate) fn picture_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
+/// Width and height from an image's header.
+pub fn image_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
     let reader = ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(|e| Error::io(path, e))?;
-    let (w, h) = reader.into_dimensions().map_err(|e| picture_error(path, e))?;
+    let (w, h) = reader.into_dimensions().map_err(|e| image_error(path, e))?;
     limits.check_pixels(&path.display().to_string(), u64::from(w), u64::from(h))?;
     Ok((w, h))
 }
@@ -104,16 +104,16 @@ pub(crate) fn picture_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
 pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
     let bytes = read_bytes(path, limits)?;
     if bytes.starts_with(&[0xff, 0xd8]) && jpeg_is_cut(&bytes) {
-        return Err(picture_error(path, "the JPEG ends before its end marker"));
+        return Err(image_error(path, "the JPEG ends before its end marker"));
     }
     let mut reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?;
     let (w, h) =
-        ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?.into_dimensions().map_err(|e| picture_error(path, e))?;
+        ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?.into_dimensions().map_err(|e| image_error(path, e))?;
     limits.check_pixels(&path.display().to_string(), u64::from(w), u64::from(h))?;
     let mut caps = image::Limits::default();
     caps.max_alloc = Some(limits.max_bytes);
     reader.limits(caps);
-    let decoded = reader.decode().map_err(|e| picture_error(path, e))?;
+    let decoded = reader.decode().map_err(|e| image_error(path, e))?;
     let (width, height) = (decoded.width(), decoded.height());
     let (channels, data) = match decoded {
         DynamicImage::ImageRgb8(i) => (3, i.into_raw()),
@@ -122,7 +122,7 @@ pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
         other => (3, other.into_rgb8().into_raw()),
     };
     if width == 0 || height == 0 {
-        return Err(picture_error(path, "it has no pixels"));
+        return Err(image_error(path, "it has no pixels"));
     }
     Ok(Image8 { width, height, channels, data })
 }

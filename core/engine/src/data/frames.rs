@@ -1,0 +1,66 @@
+//! The images of a scene: load, undo distortion, resize.
+
+use super::resample::resize;
+use super::undistort::Undistort;
+use super::video::VideoFrames;
+use cc4dgs_core::reader::files::read_png_or_jpeg;
+use cc4dgs_core::{Error, FrameSource, Image8, ImageSource, Limits, Result};
+
+/// What happens to every image of one camera.
+#[derive(Clone, Debug)]
+pub(super) struct Plan {
+    /// Size the images must have.
+    pub native: [u32; 2],
+    /// Lens to undo.
+    pub undistort: Option<Undistort>,
+    /// Size of the result.
+    pub output: (u32, u32),
+}
+
+/// One image to load.
+pub(super) struct Job {
+    /// Where it comes from; `None` where the dataset has none (a view without a mask).
+    pub image: Option<ImageSource>,
+    /// Index of its camera's plan.
+    pub plan: usize,
+}
+
+/// A [`FrameSource`] over the images of a dataset.
+pub(super) struct SceneFrames {
+    pub jobs: Vec<Job>,
+    pub plans: Vec<Plan>,
+    pub videos: VideoFrames,
+    pub limits: Limits,
+}
+
+impl FrameSource for SceneFrames {
+    fn load(&self, view: usize) -> Result<Image8> {
+        let object = || format!("view {view}");
+        let Some(job) = self.jobs.get(view) else {
+            return Err(Error::parameter(object(), format!("the scene has {} views", self.jobs.len()), "Ask for a view that exists"));
+        };
+        let plan = &self.plans[job.plan];
+        let (name, image, expected) = match &job.image {
+            Some(ImageSource::File { path, .. }) => (path.display().to_string(), read_png_or_jpeg(path, &self.limits)?, plan.native),
+            Some(ImageSource::Video { path, frame }) => {
+                let file = self.videos.extract(path, *frame)?;
+                (file.display().to_string(), read_png_or_jpeg(&file, &self.limits)?, self.videos.size(plan))
+            }
+            Some(ImageSource::Frames { source, index }) => (object(), source.load(*index)?, plan.native),
+            None => return Err(Error::unsupported(object(), "the dataset has no image of this kind for it", "Use another view")),
+        };
+        if [image.width, image.height] != expected {
+            return Err(Error::data(
+                name,
+                format!("{}x{} pixels where {}x{} are expected", image.width, image.height, expected[0], expected[1]),
+                "All images of a camera must have one size; remove or replace this one",
+            ));
+        }
+        image.validate(&name)?;
+        let image = match &plan.undistort {
+            Some(undistort) => undistort.apply(&image),
+            None => image,
+        };
+        Ok(resize(&image, plan.output.0, plan.output.1))
+    }
+}

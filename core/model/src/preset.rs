@@ -1,0 +1,82 @@
+//! Presets: layers of settings by name.
+
+use crate::{Error, Plugin, Registry, Result, config, plugin_kind, unknown_name};
+
+/// What a preset's layer is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PresetRole {
+    /// Settings for a family of datasets: a whole configuration.
+    Family {
+        /// Table of a method's layer that is for this family (`dnerf` for `dnerf` and `dnerf-cpu`).
+        dataset: &'static str,
+        /// Whether its sizes are for two cores, so that a method's `cpu` table is for it too.
+        small: bool,
+    },
+    /// What a method changes in a family. The layer has one table for `all` families, one per dataset that differs, and one for `cpu` sizes.
+    Method,
+}
+
+/// A registered preset: `demo` is a family, `hexplane` a method, `demo+hexplane` both.
+pub struct PresetPlugin {
+    /// Facts for lists; `info.schema` is the layer itself, as TOML text with comments.
+    pub info: Plugin,
+    /// What the layer is for.
+    pub role: PresetRole,
+}
+
+plugin_kind!(PresetPlugin, "preset");
+
+impl PresetPlugin {
+    /// The layer as a table.
+    pub fn layer(&self) -> Result<toml::Table> {
+        config::parse_table(&format!("preset {}", self.info.name), self.info.schema)
+    }
+}
+
+impl Registry {
+    /// The settings called `name`: a family, or a family and a method joined by `+`.
+    ///
+    /// Errors: [`Error::Parameter`] for an unknown family or method and for a method in a family's place, [`Error::Parameter`] for a layer that is no TOML.
+    pub fn preset(&self, name: &str) -> Result<toml::Table> {
+        let (family, method) = name.split_once('+').map_or((name, None), |(family, method)| (family, Some(method)));
+        let plugin = self.presets().find(|p| p.info.name == family && p.role != PresetRole::Method);
+        let Some((plugin, PresetRole::Family { dataset, small })) = plugin.map(|p| (p, p.role)) else {
+            if self.presets().any(|p| p.info.name == family) {
+                return Err(Error::parameter(
+                    format!("preset '{family}'"),
+                    "it is a method, which changes a family",
+                    format!("Write FAMILY+{family}, such as demo+{family}"),
+                ));
+            }
+            return Err(unknown_name("preset", family, self.preset_names(|role| role != PresetRole::Method)));
+        };
+        let mut settings = plugin.layer()?;
+        if let Some(method) = method {
+            let Some(plugin) = self.presets().find(|p| p.info.name == method && p.role == PresetRole::Method) else {
+                return Err(unknown_name("preset method", method, self.preset_names(|role| role == PresetRole::Method)));
+            };
+            let layers = plugin.layer()?;
+            for layer in ["all", dataset, "cpu"] {
+                if layer == "cpu" && !small {
+                    continue;
+                }
+                match layers.get(layer) {
+                    Some(toml::Value::Table(over)) => config::merge(&mut settings, over),
+                    Some(_) => {
+                        return Err(Error::parameter(
+                            format!("preset method {method}"),
+                            format!("{layer} is not a table"),
+                            "Write the settings under a table header",
+                        ));
+                    }
+                    None => {}
+                }
+            }
+        }
+        settings.insert("preset".into(), name.into());
+        Ok(settings)
+    }
+    fn preset_names(&self, keep: fn(PresetRole) -> bool) -> impl Iterator<Item = &'static str> + '_ {
+        self.presets().filter(move |p| keep(p.role)).map(|p| p.info.name)
+    }
+}

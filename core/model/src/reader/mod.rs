@@ -1,0 +1,60 @@
+//! The reader seam: a dataset format as a plug-in.
+//!
+//! A reader parses the index files of a dataset into a [`RawScene`]: calibrated cameras, views, and where the image of each view comes from. What all scenes
+//! share (choosing frames and cameras, resizing, undoing lens distortion, the frame cache) happens afterwards, once, for every reader.
+//!
+//! ```
+//! use cc4dgs_core::reader::{RawScene, ReaderPlugin, SceneOptions, files};
+//! use cc4dgs_core::{Limits, Plugin, Result, inventory};
+//! use std::path::Path;
+//!
+//! fn probe(path: &Path) -> bool {
+//!     path.join("rig.txt").is_file()
+//! }
+//! fn open(path: &Path, _options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+//!     let _text = files::read_text(&path.join("rig.txt"), limits)?;
+//!     Ok(RawScene { name: files::file_name(path), ..RawScene::default() })
+//! }
+//! inventory::submit! {
+//!     ReaderPlugin {
+//!         info: Plugin { name: "rig", version: "1", summary: "my rig", paper: "", schema: "", capabilities: &[] },
+//!         looks_for: "rig.txt",
+//!         order: 1000,
+//!         probe,
+//!         open,
+//!     }
+//! }
+//! ```
+//!
+//! [`files`] reads files that may be hostile, [`pose`] converts the usual conventions of camera poses. `conformance::reader` is the suite a reader passes.
+
+pub mod files;
+mod lens;
+mod options;
+pub mod pose;
+mod raw;
+
+pub use lens::Distortion;
+pub use options::{Background, CameraRef, SceneOptions};
+pub use raw::{ImageSource, RawCamera, RawPoints, RawScene, RawView};
+
+use crate::{Limits, Plugin, Result, plugin_kind};
+use std::path::Path;
+
+/// A registered dataset format.
+pub struct ReaderPlugin {
+    /// Facts for lists; `info.name` is the value of `scene.reader`.
+    pub info: Plugin,
+    /// What [`ReaderPlugin::probe`] looks for, for people: `transforms.json (nerfstudio)`.
+    pub looks_for: &'static str,
+    /// Readers are asked in ascending order, equal ones by name. The more specific a format's mark, the lower; built-in readers use multiples of 100 up to 700.
+    pub order: u32,
+    /// Whether a path looks like this format. It reads directory entries and at most the beginning of a file, and never fails.
+    pub probe: fn(&Path) -> bool,
+    /// Parses the index files at a path. No image is decoded. The path need not exist for a reader that computes its scenes.
+    ///
+    /// Errors: [`crate::Error::Data`] for broken files, [`crate::Error::Limit`] for claims over the limits, [`crate::Error::Parameter`] for options it cannot follow.
+    pub open: fn(&Path, &SceneOptions, &Limits) -> Result<RawScene>,
+}
+
+plugin_kind!(ReaderPlugin, "reader");

@@ -1,0 +1,185 @@
+//! What a reader hands over.
+
+use super::lens::Distortion;
+use super::pose::Matrix4;
+use crate::{Camera, Error, FrameSource, Result, Split};
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+/// How far from the origin a camera may be, in the dataset's units: squares of distances must stay within f32.
+const FARTHEST: f64 = 1e12;
+
+/// A calibrated camera with its lens, at the image size its calibration is for.
+#[derive(Clone, Debug)]
+pub struct RawCamera {
+    /// Name as the dataset has it.
+    pub name: String,
+    /// Width and height in pixels the calibration is for.
+    pub size: [u32; 2],
+    /// Focal lengths in pixels.
+    pub focal: [f64; 2],
+    /// Principal point in pixels; the centre of the first pixel is at 0.5.
+    pub principal: [f64; 2],
+    /// The lens.
+    pub distortion: Distortion,
+    /// Rigid transform of world points to camera points, OpenCV axes (x right, y down, z forward), row-major.
+    pub world_to_camera: Matrix4,
+}
+
+impl RawCamera {
+    /// The same camera without its lens.
+    pub fn pinhole(&self) -> Camera {
+        Camera {
+            name: self.name.clone(),
+            width: self.size[0],
+            height: self.size[1],
+            fx: self.focal[0],
+            fy: self.focal[1],
+            cx: self.principal[0],
+            cy: self.principal[1],
+            world_to_camera: self.world_to_camera,
+        }
+    }
+}
+
+/// Where the image of a view comes from.
+#[derive(Clone)]
+pub enum ImageSource {
+    /// A PNG or JPEG file, and a foreground mask of the same size if there is one.
+    File {
+        /// The image.
+        path: PathBuf,
+        /// White where the foreground is. The file may be missing.
+        mask: Option<PathBuf>,
+    },
+    /// A frame of a video, decoded by `ffmpeg`.
+    Video {
+        /// The video.
+        path: PathBuf,
+        /// Frame of the video, 0-based.
+        frame: usize,
+    },
+    /// Whatever the reader brings: computed images, another container, a network.
+    Frames {
+        /// Loads images of the size of their [`RawCamera`], with its lens still in them.
+        source: Arc<dyn FrameSource>,
+        /// What `source` is asked for.
+        index: usize,
+    },
+}
+
+impl fmt::Debug for ImageSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File { path, mask } => f.debug_struct("File").field("path", path).field("mask", mask).finish(),
+            Self::Video { path, frame } => f.debug_struct("Video").field("path", path).field("frame", frame).finish(),
+            Self::Frames { index, .. } => f.debug_struct("Frames").field("index", index).finish_non_exhaustive(),
+        }
+    }
+}
+
+/// One image of one camera.
+#[derive(Clone, Debug)]
+pub struct RawView {
+    /// Index into the cameras.
+    pub camera: usize,
+    /// Frame index in the dataset, 0-based.
+    pub frame: usize,
+    /// The dataset's own time, 0..1; views without one get frame index / number of frames.
+    pub time: Option<f64>,
+    /// The dataset's own split.
+    pub split: Split,
+    /// Its image.
+    pub image: ImageSource,
+}
+
+/// Points of a dataset, as structure from motion leaves them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RawPoints {
+    /// Positions in the dataset's units.
+    pub positions: Vec<[f64; 3]>,
+    /// Colours in 0..1, one per position.
+    pub colors: Vec<[f32; 3]>,
+}
+
+/// A parsed dataset.
+#[derive(Clone, Debug, Default)]
+pub struct RawScene {
+    /// A name for people.
+    pub name: String,
+    /// All cameras; a moving camera is one entry per pose.
+    pub cameras: Vec<RawCamera>,
+    /// All views, in any order.
+    pub views: Vec<RawView>,
+    /// Points to start from, if the dataset has any.
+    pub points: Option<RawPoints>,
+    /// Lower and upper corner of the box the scene is in, in the dataset's units, if the dataset says. Else it is judged from the cameras.
+    pub init_box: Option<[[f64; 3]; 2]>,
+    /// The background the dataset's RGBA images want, RGB in 0..1.
+    pub background: Option<[f32; 3]>,
+    /// Whether the reader has already followed `scene.width`, `scene.height` and `scene.downscale`, as one that computes its images can.
+    pub resized: bool,
+    /// What was odd and left out.
+    pub warnings: Vec<String>,
+}
+
+impl RawScene {
+    /// Sets frame and time of each view from the dataset's times, one per view: the frame is the rank among the distinct times; times over 1 are
+    /// divided by the largest. `object` names the file in errors, which are about times that are negative or not finite.
+    pub fn rank_times(&mut self, times: &[Option<f64>], object: &str) -> Result<()> {
+        if let Some(t) = times.iter().flatten().find(|t| !t.is_finite() || **t < 0.0) {
+            return Err(Error::data(object, format!("time {t} is not a number from 0 up"), "Correct the times in the file"));
+        }
+        let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
+        let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
+        distinct.sort_by(f64::total_cmp);
+        distinct.dedup();
+        for (view, time) in self.views.iter_mut().zip(times) {
+            let t = time.unwrap_or(0.0);
+            view.frame = distinct.partition_point(|&d| d < t);
+            view.time = Some(t / largest);
+        }
+        Ok(())
+    }
+
+    /// Refuses views of cameras that do not exist, times outside 0..1, cameras with shown views that are not rigid or not finite or absurdly far away, and
+    /// points or a background that are not sound.
+    pub fn validate(&self) -> Result<()> {
+        let bad = |problem: String| Err(Error::data(&self.name, problem, "Check the dataset's index files"));
+        let mut used = vec![false; self.cameras.len()];
+        for view in &self.views {
+            match used.get_mut(view.camera) {
+                Some(slot) => *slot = true,
+                None => return bad(format!("a view names camera {} of {}", view.camera, self.cameras.len())),
+            }
+            if let Some(t) = view.time.filter(|t| !(0.0..=1.0).contains(t)) {
+                return bad(format!("a view of frame {} is at time {t}, outside 0..1", view.frame));
+            }
+        }
+        for camera in self.cameras.iter().zip(&used).filter(|(_, used)| **used).map(|(camera, _)| camera) {
+            let pinhole = camera.pinhole();
+            pinhole.validate()?;
+            let center = pinhole.center_world();
+            if center.iter().any(|v| v.abs() > FARTHEST) {
+                return Err(Error::data(
+                    format!("camera {}", camera.name),
+                    format!("its centre {center:?} is over {FARTHEST:e} units away"),
+                    "Check the dataset's calibration file",
+                ));
+            }
+        }
+        if let Some(points) = &self.points {
+            if points.positions.len() != points.colors.len() {
+                return bad(format!("{} points have {} colours", points.positions.len(), points.colors.len()));
+            }
+            if let Some(p) = points.positions.iter().find(|p| p.iter().any(|v| !(*v as f32).is_finite())) {
+                return bad(format!("a point is at {p:?}"));
+            }
+        }
+        if let Some(c) = self.background.filter(|c| !c.iter().all(|v| (0.0..=1.0).contains(v))) {
+            return bad(format!("its background {c:?} is outside 0..1"));
+        }
+        Ok(())
+    }
+}
