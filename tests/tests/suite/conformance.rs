@@ -38,6 +38,30 @@ fn every_deformer_conforms() {
 }
 
 #[test]
+fn every_loss_conforms() {
+    let registry = Registry::collect().unwrap();
+    let names: Vec<&str> = registry.losses().map(|p| p.info.name).collect();
+    assert!(names.len() >= 3, "{names:?}");
+    let all = |device: &burn::tensor::Device| names.iter().flat_map(|n| conformance::loss(registry.loss(n).unwrap(), &small(n), device)).collect::<Vec<_>>();
+    let findings: Vec<String> = devices().iter().flat_map(|(_, device)| all(device)).collect();
+    assert!(findings.is_empty(), "{}", findings.join("\n"));
+}
+
+#[test]
+fn every_density_control_conforms() {
+    let registry = Registry::collect().unwrap();
+    let names: Vec<&str> = registry.plugins().into_iter().filter(|(kind, _)| *kind == "density").map(|(_, p)| p.name).collect();
+    assert!(names.len() >= 2, "{names:?}");
+    let mut findings = Vec::new();
+    for (_, device) in devices() {
+        for name in &names {
+            findings.extend(conformance::density(registry.density(name).unwrap(), &toml::Table::new(), &device));
+        }
+    }
+    assert!(findings.is_empty(), "{}", findings.join("\n"));
+}
+
+#[test]
 fn every_codec_conforms() {
     let registry = Registry::collect().unwrap();
     let mut findings = Vec::new();

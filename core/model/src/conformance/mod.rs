@@ -3,12 +3,16 @@
 //! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data, but for readers, which need a tiny dataset.
 
 mod deformer;
+mod density;
+mod loss;
 mod preset;
 mod rasterizer;
 mod reader;
 
 pub use cc4dgs_format::conformance::{codec, weight_codec};
 pub use deformer::deformer;
+pub use density::density;
+pub use loss::loss;
 pub use preset::preset;
 pub use rasterizer::rasterizer;
 pub use reader::reader;
