@@ -52,10 +52,12 @@ impl LevelHash {
         self.b.len()
     }
     /// A's three rows `[k]` each, then b [k]: the constants as other devices read them.
+    #[cfg(feature = "cube")]
     pub(crate) fn constants(&self) -> Vec<u32> {
         self.a.iter().chain([&self.b]).flatten().copied().collect()
     }
     /// m.
+    #[cfg(feature = "cube")]
     pub(crate) fn modulus(&self) -> u32 {
         self.modulus
     }

@@ -153,12 +153,12 @@ pub trait Rasterizer: Send + Sync {
     /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn. Every tensor of `splats` that tracks gradients receives one in the
     /// backward pass, the probes included; no probe may change the planes or another gradient.
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput>;
-    /// Planes [3,H,W] in 0..1 of an 8-bit image on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
+    /// Planes `[3,H,W]` in 0..1 of an 8-bit image on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
     fn upload(&self, image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
         let shape = [3, image.height as usize, image.width as usize];
         Tensor::from_data(TensorData::new(image.to_planes(background), shape), device)
     }
-    /// The 8-bit RGB image of planes [C,H,W] of which the first three are red, green and blue; the same rule as [`Image8::from_planes`].
+    /// The 8-bit RGB image of planes `[C,H,W]` of which the first three are red, green and blue; the same rule as [`Image8::from_planes`].
     fn download(&self, planes: Tensor<3>) -> Result<Image8> {
         let [channels, height, width] = planes.dims();
         if channels < 3 || height == 0 || width == 0 {

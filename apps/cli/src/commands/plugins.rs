@@ -29,23 +29,21 @@ fn list(context: &Context) -> Result<()> {
     })
 }
 
-/// The settings that presets come to together, such as `dnerf+hexplane`.
-fn show_layers(context: &Context, name: &str) -> Result<()> {
-    let settings = context.registry.preset(name)?;
-    let text = settings.to_string();
+/// The settings of a combined preset, such as `dnerf+hexplane`.
+fn show_preset(context: &Context, name: &str, settings: &toml::Table) -> Result<()> {
     let array = [json!({ "kind": "preset", "name": name, "settings": settings })];
-    context.output.result(&array, || format!("preset {name}\n\n{text}"))
+    context.output.result(&array, || format!("preset {name}\n\n{settings}"))
 }
 
 /// Everything of the name, whatever its kind: a codec and a deformer may share one.
 fn show(context: &Context, name: &str) -> Result<()> {
     let plugins = context.registry.plugins();
     let found: Vec<_> = plugins.iter().filter(|(_, p)| p.name == name).collect();
-    if found.is_empty() && name.contains('+') {
-        return show_layers(context, name);
-    }
     if found.is_empty() {
-        return Err(unknown_name("plug-in", name, plugins.iter().map(|(_, p)| p.name)));
+        return match context.registry.preset(name) {
+            Ok(settings) => show_preset(context, name, &settings),
+            Err(_) => Err(unknown_name("plug-in or preset", name, plugins.iter().map(|(_, p)| p.name))),
+        };
     }
     let full = |(kind, p): &&(&str, &cc4dgs_core::Plugin)| json!({ "kind": kind, "name": p.name, "version": p.version, "summary": p.summary, "paper": p.paper, "capabilities": p.capabilities, "schema": p.schema });
     let array: Vec<_> = found.iter().map(full).collect();

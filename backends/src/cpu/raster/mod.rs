@@ -1,8 +1,8 @@
 //! Tile rasterizer for CPUs: projection, binning, blending, and the derivative of each.
 //!
 //! Every kernel is deterministic: tasks own what they write and all sums have a fixed order, so the bytes do not depend on the number of
-//! threads. Order of work: [`project`] (per Gaussian), [`tiles`] (depth order, lists), [`blend`] (per tile); backwards
-//! [`blend_backward`] (per tile, one record per Gaussian and tile), [`gradient`] (per Gaussian).
+//! threads. Order of work: `project` (per Gaussian), `tiles` (depth order, lists), `blend` (per tile); backwards
+//! `blend_backward` (per tile, one record per Gaussian and tile), `gradient` (per Gaussian).
 
 // Staged columns are indexed by row and lane; iterators over one of the two hide the other.
 #![allow(clippy::needless_range_loop)]
@@ -83,7 +83,7 @@ pub struct ScreenSplat {
 
 /// What a forward pass returns.
 pub struct Forward {
-    /// Planes [5,H,W]: red, green, blue, alpha, depth.
+    /// Planes `[5,H,W]`: red, green, blue, alpha, depth.
     pub planes: Vec<f32>,
     /// Screen radius in pixels, 0 where culled `[N]`.
     pub radii: Vec<i64>,

@@ -114,7 +114,7 @@ impl Buffers {
     }
 }
 
-/// [`Buffers`] on loan from the pool.
+/// Buffers on loan from the pool.
 #[derive(Default)]
 pub struct Workspace {
     buffers: Buffers,

@@ -205,12 +205,12 @@ pub struct RasterInputs {
 
 /// An error for a device without the operation.
 fn check_device(device: &Device, method: Method) -> Result<()> {
-    match device.clone().without_autodiff().as_dispatch() {
-        DispatchDevice::Flex(_) | DispatchDevice::NdArray(_) => Ok(()),
+    match (device.clone().without_autodiff().as_dispatch(), method) {
+        (DispatchDevice::Flex(_) | DispatchDevice::NdArray(_), _) => Ok(()),
         #[cfg(feature = "cube")]
-        DispatchDevice::Cube(_) if method == Method::Tiles => Ok(()),
+        (DispatchDevice::Cube(_), Method::Tiles) => Ok(()),
         #[cfg(feature = "cube")]
-        DispatchDevice::Cube(_) => Err(Error::unsupported(
+        (DispatchDevice::Cube(_), Method::Reference) => Err(Error::unsupported(
             format!("rasterizer reference on {device:?}"),
             "it computes in float64 on the processor",
             "Use --device flex, or the rasterizer tile",
