@@ -171,7 +171,7 @@ impl Suite<'_> {
         let two = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, [n, 2]), self.device);
         let asked = |statistic: Statistic| wanted.contains(&statistic).then_some(());
         let weights: Vec<f32> = random(3, 1, 0.5).into_iter().map(|v| v + 0.5).collect();
-        let radii: Vec<i64> = (0..n).map(|i| if (i + index) % 3 == 0 { 0 } else { 4 }).collect();
+        let radii: Vec<i64> = (0..n).map(|i| if (i + index).is_multiple_of(3) { 0 } else { 4 }).collect();
         ViewStatistics {
             radii: Tensor::from_data(TensorData::new(radii, [n]), self.device),
             screen_gradient: asked(Statistic::ScreenGradient).map(|()| gradient.clone().unwrap_or_else(|| two(random(1, 2, 2e-5)))),
