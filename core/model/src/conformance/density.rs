@@ -1,47 +1,35 @@
 //! What a density control must keep to.
 
-use super::uniform;
-use crate::gaussians::to_vec;
-use crate::{DensityControl, DensityPlan, DensityPlugin, Gaussians, HostGaussians, Result, Schedule, Seed, Stage, Statistic, ViewStatistics, config};
-use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_format::ExtraAttribute;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use super::{guarded, schema_is_the_default, uniform};
+use crate::{
+    DensityControl, DensityPlan, DensityPlugin, Error, ExtraAttribute, Gaussians, HostGaussians, Result, Schedule, Seed, Stage, Statistic, ViewStatistics,
+};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 
-const GAUSSIANS: usize = 40;
-/// Iterations of a simulated stage, long enough for rounds of any interval that shrinks with the run.
-const LENGTH: usize = 120;
-/// Where a simulated run is interrupted: between two rounds.
-const INTERRUPTED: usize = 67;
-const VIEWS: usize = 2;
-const SIZE: (u32, u32) = (64, 48);
+/// Gaussians at the start.
+const COUNT: usize = 40;
+/// More Gaussians than this, from [`COUNT`], are no answer to anything.
+const MOST: usize = 100 * COUNT;
+/// Iterations of the suite's stages.
+const ITERATIONS: usize = 320;
+/// Name of the extra attribute that tells the Gaussians apart.
+const LABEL: &str = "conformance-label";
 
-/// Holds a density control to its promises on `device`, in simulated stages whose plans are carried out:
-/// - unknown settings are refused, and the schema builds what no settings build;
-/// - plans name rows and attributes that exist and leave something; noise has the shape of its attribute and is finite; attributes of plug-ins are carried along;
-/// - equal seeds give equal plans;
-/// - a control restored from its state goes on as if it had not been interrupted, and a damaged state is refused;
-/// - sets without Gaussians, and statistics that are not numbers, are answered.
-///
-/// `settings` is the `[density]` section without `kind`. Each finding is a line; an empty list is a pass.
-pub fn density<'a>(plugin: &'a DensityPlugin, settings: &'a toml::Table, device: &'a Device) -> Vec<String> {
+/// Holds a density control to its promises on `device`, over a coarse and a main stage of random statistics: its schema is TOML and states the defaults;
+/// unknown settings are refused; plans name rows and attributes that there are, set finite values, and never remove everything; equal seeds give equal
+/// plans; what is stored after any iteration continues to the same plans; stored state of another size is an error; Gaussians without any statistics, one
+/// Gaussian, and values that are not finite are answered; nothing panics.
+pub fn density(plugin: &DensityPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
-    let checks: [(&str, Check<'a>); 6] = [
-        ("settings", Suite::refuses_unknown_settings),
-        ("schema", Suite::schema_states_the_defaults),
-        ("plans", Suite::plans_repeat),
-        ("checkpoints", Suite::state_carries_everything),
-        ("damaged state", Suite::damaged_state_is_refused),
-        ("odd inputs", Suite::odd_inputs_are_answered),
-    ];
-    let found = checks.into_iter().filter_map(|(name, check)| {
-        let finding = match catch_unwind(AssertUnwindSafe(|| check(&suite))) {
-            Ok(Ok(finding)) => finding?,
-            Ok(Err(e)) => e.to_string(),
-            Err(_) => "it panics".to_string(),
-        };
-        Some(format!("{} on {device:?}, {name}: {finding}", plugin.info.name))
-    });
-    found.collect()
+    guarded(
+        &format!("{} on {device:?}", plugin.info.name),
+        vec![
+            ("settings", Box::new(|| suite.settings_are_read())),
+            ("plans", Box::new(|| suite.plans_are_sound())),
+            ("state", Box::new(|| suite.state_continues())),
+            ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
+        ],
+    )
 }
 
 struct Suite<'a> {
@@ -50,169 +38,162 @@ struct Suite<'a> {
     device: &'a Device,
 }
 
-/// One check: what it found, if anything.
-type Check<'a> = fn(&Suite<'a>) -> Result<Option<String>>;
-
-/// A stage under way.
+/// What a run saw: the plan of every iteration, and the Gaussians at its end.
 struct Run {
-    control: Box<dyn DensityControl>,
-    set: HostGaussians,
-    plans: Vec<(usize, DensityPlan)>,
+    plans: Vec<Option<DensityPlan>>,
+    end: Gaussians,
 }
 
 impl Suite<'_> {
-    fn refuses_unknown_settings(&self) -> Result<Option<String>> {
-        let mut settings = self.settings.clone();
-        settings.insert("no_such_setting".into(), 1.into());
-        Ok(match (self.plugin.build)(&settings) {
-            Ok(_) => Some("an unknown setting was accepted".into()),
-            Err(e) if !e.to_string().contains("no_such_setting") => Some(format!("the error does not name the unknown setting: {e}")),
-            Err(_) => None,
-        })
+    fn build(&self) -> Result<Box<dyn DensityControl>> {
+        (self.plugin.build)(self.settings)
     }
-    /// `config.toml` is written in full from the schema, so that it must build what no settings build.
-    fn schema_states_the_defaults(&self) -> Result<Option<String>> {
-        let stated = config::parse_table(&format!("schema of density {}", self.plugin.info.name), self.plugin.info.schema)?;
-        let (plain, full) = (self.stage(Stage::Coarse, &toml::Table::new(), LENGTH)?, self.stage(Stage::Coarse, &stated, LENGTH)?);
-        Ok((plain.plans != full.plans).then(|| "the settings it states give other plans than no settings".to_string()))
-    }
-    fn plans_repeat(&self) -> Result<Option<String>> {
-        for stage in [Stage::Coarse, Stage::Main] {
-            let (first, second) = (self.stage(stage, self.settings, LENGTH)?, self.stage(stage, self.settings, LENGTH)?);
-            if first.plans != second.plans || first.set != second.set {
-                return Ok(Some(format!("equal seeds give other plans in the {} stage", stage.name())));
-            }
+    fn settings_are_read(&self) -> Result<Option<String>> {
+        let mut odd = self.settings.clone();
+        odd.insert("no_such_setting".into(), 1.into());
+        match (self.plugin.build)(&odd) {
+            Ok(_) => return Ok(Some("an unknown setting was accepted".into())),
+            Err(e) if !e.to_string().contains("no_such_setting") => return Ok(Some(format!("the error does not name the unknown setting: {e}"))),
+            Err(_) => {}
         }
-        Ok(None)
+        schema_is_the_default("density", &self.plugin.info, |settings| (self.plugin.build)(settings).map(drop))
     }
-    fn state_carries_everything(&self) -> Result<Option<String>> {
-        let whole = self.stage(Stage::Main, self.settings, LENGTH)?;
-        let mut parts = self.stage(Stage::Main, self.settings, INTERRUPTED)?;
-        let (state, count) = (parts.control.state(), parts.set.len());
-        parts.control = (self.plugin.build)(self.settings)?;
-        parts.control.restore(state, count)?;
-        self.advance(&mut parts, Stage::Main, INTERRUPTED + 1, LENGTH)?;
-        Ok((whole.plans != parts.plans || whole.set != parts.set).then(|| "a restored control goes on differently".to_string()))
+    fn gaussians(&self, count: usize) -> Gaussians {
+        let seed = Seed::root(41);
+        let mut g = HostGaussians { sh_degree: 1, ..Default::default() };
+        for i in 0..count {
+            let draw = |k: usize| uniform(seed.index(i as u64), k);
+            g.means.extend([draw(0), draw(1), draw(2)]);
+            g.log_scales.extend([-4.0 + 2.0 * draw(3), -4.0 + 2.0 * draw(4), -4.0 + 2.0 * draw(5)]);
+            g.quaternions.extend([1.0 + 0.3 * draw(6), draw(7), draw(8), draw(9)]);
+            g.opacity_logits.push(5.0 * draw(10));
+            g.sh_dc.extend([draw(11), draw(12), draw(13)]);
+            g.sh_rest.extend((0..9).map(|c| 0.1 * draw(14 + c)));
+            g.dynamic_scores.push(draw(30));
+        }
+        g.extra.insert(LABEL.into(), ExtraAttribute::exact(1, (0..count).map(|i| i as f32).collect()));
+        Gaussians::from_host(&g, self.device)
     }
-    fn damaged_state_is_refused(&self) -> Result<Option<String>> {
-        let run = self.stage(Stage::Main, self.settings, INTERRUPTED)?;
-        for index in 0..run.control.state().len() {
-            let (mut shortened, mut missing) = (run.control.state(), run.control.state());
-            let (name, values) = shortened[index].clone();
-            missing.remove(index);
-            if values.dims()[0] < 2 {
-                continue;
-            }
-            shortened[index].1 = values.narrow(0, 0, 1);
-            for (state, problem) in [(shortened, "one value in place of all"), (missing, "the array missing")] {
-                if (self.plugin.build)(self.settings)?.restore(state, run.set.len()).is_ok() {
-                    return Ok(Some(format!("a state with {problem} of '{name}' was accepted")));
+    fn schedule(stage: Stage, iteration: usize) -> Schedule {
+        Schedule { stage, iteration, total: 2 * ITERATIONS, ..Schedule::main(ITERATIONS) }
+    }
+    /// Statistics of a view of `count` Gaussians, with what was asked for.
+    fn view(&self, count: usize, wanted: &[Statistic], seed: Seed) -> ViewStatistics {
+        let draw = |k: usize| uniform(seed, k);
+        let radii: Vec<i64> = (0..count).map(|i| if draw(i) > -0.6 { 1 + (4.0 * (draw(i) + 1.0)) as i64 } else { 0 }).collect();
+        let pair = |shift: usize, absolute: bool| {
+            let values: Vec<f32> = (0..2 * count).map(|k| 2e-5 * draw(shift + k)).map(|v| if absolute { v.abs() } else { v }).collect();
+            Tensor::<2>::from_data(TensorData::new(values, [count, 2]), self.device)
+        };
+        let weights: Vec<f32> = (0..count).map(|i| 0.5 + 0.5 * draw(7 * count + i)).collect();
+        ViewStatistics {
+            radii: Tensor::<1, Int>::from_data(TensorData::new(radii, [count]), self.device),
+            screen_gradient: wanted.contains(&Statistic::ScreenGradient).then(|| pair(2 * count, false)),
+            absolute_screen_gradient: wanted.contains(&Statistic::AbsoluteScreenGradient).then(|| pair(4 * count, true)),
+            max_weights: wanted.contains(&Statistic::MaxWeight).then(|| Tensor::from_data(TensorData::new(weights, [count]), self.device)),
+            size: (640, 360),
+            views: 2,
+        }
+    }
+    /// One iteration: statistics, noise, plan. Returns the plan and the Gaussians after it.
+    fn iterate(&self, control: &mut dyn DensityControl, gaussians: Gaussians, schedule: &Schedule) -> Result<(Option<DensityPlan>, Gaussians)> {
+        let seed = Seed::root(43).child(schedule.stage.name()).index(schedule.iteration as u64);
+        let wanted = control.statistics(schedule);
+        for view in 0..2 {
+            control.observe(&self.view(gaussians.len(), &wanted, seed.index(view)))?;
+        }
+        let mut gaussians = gaussians;
+        for (name, values) in control.after_step(&gaussians, schedule, seed.child("noise"))? {
+            gaussians = replaced(&gaussians, &name, values)?;
+        }
+        let plan = control.plan(&gaussians, schedule, seed.child("plan"))?;
+        if let Some(plan) = &plan {
+            plan.check(self.plugin.info.name, &gaussians)?;
+            gaussians = plan.apply(&gaussians)?;
+        }
+        Ok((plan, gaussians))
+    }
+    /// Both stages. With `stored_at`, state and control are stored and rebuilt after that iteration of the main stage.
+    fn run(&self, stored_at: Option<usize>) -> Result<Run> {
+        let mut control = self.build()?;
+        let mut run = Run { plans: Vec::new(), end: self.gaussians(COUNT) };
+        for stage in [Stage::Coarse, Stage::Main] {
+            control.begin_stage(run.end.len(), self.device);
+            for iteration in 1..=ITERATIONS {
+                let (plan, next) = self.iterate(control.as_mut(), run.end, &Self::schedule(stage, iteration))?;
+                (run.end, _) = (next, run.plans.push(plan));
+                if stage == Stage::Main && stored_at == Some(iteration) {
+                    let state = control.state();
+                    control = self.build()?;
+                    control.restore(state, run.end.len())?;
                 }
             }
         }
-        Ok(None)
-    }
-    fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
-        let mut empty = Run { control: (self.plugin.build)(self.settings)?, set: gaussians(0), plans: Vec::new() };
-        empty.control.begin_stage(0, self.device);
-        self.advance(&mut empty, Stage::Coarse, 1, LENGTH)?;
-        let mut run = self.stage(Stage::Coarse, self.settings, 5)?;
-        let n = run.set.len();
-        let numberless = Tensor::<2>::full([n, 2], f32::NAN, self.device);
-        let schedule = schedule(Stage::Coarse, 6);
-        let wanted = run.control.statistics(&schedule);
-        run.control.observe(&self.view(n, &wanted, 0, Some(numberless)))?;
-        self.advance(&mut run, Stage::Coarse, 6, LENGTH)?;
-        Ok(None)
-    }
-    /// The first `iterations` of a stage.
-    fn stage(&self, stage: Stage, settings: &toml::Table, iterations: usize) -> Result<Run> {
-        let mut run = Run { control: (self.plugin.build)(settings)?, set: gaussians(GAUSSIANS), plans: Vec::new() };
-        run.control.begin_stage(run.set.len(), self.device);
-        self.advance(&mut run, stage, 1, iterations)?;
         Ok(run)
     }
-    /// Iterations `from` to `to` of a stage, both included, as the trainer runs them. Findings are errors.
-    fn advance(&self, run: &mut Run, stage: Stage, from: usize, to: usize) -> Result<()> {
-        for iteration in from..=to {
-            let (schedule, seed) = (schedule(stage, iteration), Seed::root(41).index(iteration as u64));
-            let wanted = run.control.statistics(&schedule);
-            for view in 0..VIEWS {
-                run.control.observe(&self.view(run.set.len(), &wanted, iteration * VIEWS + view, None))?;
-            }
-            let tensors = Gaussians::from_host(&run.set, self.device);
-            for (name, values) in run.control.after_step(&tensors, &schedule, seed.child("noise"))? {
-                let wanted = tensors.attribute(&name).map(|a| a.dims());
-                let dims = values.dims();
-                let values = to_vec(values, &name)?;
-                if wanted != Some(dims) || values.iter().any(|v| !v.is_finite()) {
-                    let problem = format!("after_step gives '{name}' the shape {dims:?} in place of {wanted:?}, or values that are not finite");
-                    return Err(crate::Error::backend(format!("density {}", self.plugin.info.name), problem, "Correct it"));
-                }
-                set_rows(&mut run.set, &name, &(0..dims[0]).collect::<Vec<_>>(), &values);
-            }
-            let tensors = Gaussians::from_host(&run.set, self.device);
-            if let Some(plan) = run.control.plan(&tensors, &schedule, seed.child("plan"))? {
-                plan.check(self.plugin.info.name, &tensors)?;
-                run.set = run.set.select(plan.parents());
-                for values in plan.values() {
-                    set_rows(&mut run.set, &values.attribute, &values.rows, &values.values);
-                }
-                run.plans.push((iteration, plan));
+    fn plans_are_sound(&self) -> Result<Option<String>> {
+        let (first, second) = (self.run(None)?, self.run(None)?);
+        if first.plans != second.plans {
+            return Ok(Some("two runs with equal seeds give other plans".into()));
+        }
+        if first.end.len() > MOST {
+            return Ok(Some(format!("{COUNT} Gaussians became {} in {} iterations", first.end.len(), 2 * ITERATIONS)));
+        }
+        let host = first.end.to_host()?;
+        if let Err(e) = host.validate("Gaussians after all plans", &crate::Limits::default()) {
+            return Ok(Some(e.to_string()));
+        }
+        let labels = host.extra.get(LABEL).map(|a| a.values.clone()).unwrap_or_default();
+        let inherited = labels.len() == host.len() && labels.iter().all(|&l| l.fract() == 0.0 && (0.0..COUNT as f32).contains(&l));
+        Ok((!inherited).then(|| "attributes of other plug-ins were changed".into()))
+    }
+    fn state_continues(&self) -> Result<Option<String>> {
+        let whole = self.run(None)?;
+        for at in [1, ITERATIONS / 3, ITERATIONS - 1] {
+            if self.run(Some(at))?.plans != whole.plans {
+                return Ok(Some(format!("stored after iteration {at} of the main stage, it goes on with other plans")));
             }
         }
-        Ok(())
-    }
-    /// Statistics of one view: those that were asked for. `gradient` replaces the random ones.
-    fn view(&self, n: usize, wanted: &[Statistic], index: usize, gradient: Option<Tensor<2>>) -> ViewStatistics {
-        let seed = Seed::root(42).index(index as u64);
-        // Gradients about as large as those that ask for more Gaussians.
-        let random = |salt: u64, width: usize, scale: f32| -> Vec<f32> { (0..n * width).map(|k| scale * uniform(seed.index(salt), k)).collect() };
-        let two = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, [n, 2]), self.device);
-        let asked = |statistic: Statistic| wanted.contains(&statistic).then_some(());
-        let weights: Vec<f32> = random(3, 1, 0.5).into_iter().map(|v| v + 0.5).collect();
-        let radii: Vec<i64> = (0..n).map(|i| if (i + index).is_multiple_of(3) { 0 } else { 4 }).collect();
-        ViewStatistics {
-            radii: Tensor::from_data(TensorData::new(radii, [n]), self.device),
-            screen_gradient: asked(Statistic::ScreenGradient).map(|()| gradient.clone().unwrap_or_else(|| two(random(1, 2, 2e-5)))),
-            absolute_screen_gradient: asked(Statistic::AbsoluteScreenGradient)
-                .map(|()| gradient.unwrap_or_else(|| two(random(2, 2, 4e-5).into_iter().map(f32::abs).collect()))),
-            max_weights: asked(Statistic::MaxWeight).map(|()| Tensor::from_data(TensorData::new(weights, [n]), self.device)),
-            size: SIZE,
-            views: VIEWS,
+        let mut control = self.build()?;
+        control.begin_stage(COUNT, self.device);
+        let state = control.state();
+        if let Some((name, values)) = state.iter().find(|(_, values)| values.dims()[0] > 0) {
+            let shorter: Vec<_> =
+                state.iter().map(|(n, v)| (n.clone(), if n == name { v.clone().narrow(0, 0, values.dims()[0] - 1) } else { v.clone() })).collect();
+            if self.build()?.restore(shorter, COUNT).is_ok() {
+                return Ok(Some(format!("stored state '{name}' of another length was accepted")));
+            }
         }
+        let mut renamed = state;
+        renamed.push(("conformance-no-such-array".into(), Tensor::zeros([COUNT], self.device)));
+        Ok(self.build()?.restore(renamed, COUNT).is_ok().then(|| "stored state with an array it does not know was accepted".into()))
+    }
+    fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
+        let mut odd = self.gaussians(3);
+        odd.means = Tensor::from_floats([[f32::NAN, 0.0, 0.0], [f32::INFINITY, 0.0, 0.0], [0.0, 0.0, 0.0]], self.device);
+        for gaussians in [self.gaussians(1), odd] {
+            let mut control = self.build()?;
+            let mut gaussians = gaussians;
+            control.begin_stage(gaussians.len(), self.device);
+            for iteration in 1..=ITERATIONS {
+                let schedule = Self::schedule(Stage::Main, iteration);
+                // No view saw anything.
+                let Some(plan) = control.plan(&gaussians, &schedule, Seed::root(47).index(iteration as u64))? else { continue };
+                plan.check(self.plugin.info.name, &gaussians)?;
+                gaussians = plan.apply(&gaussians)?;
+            }
+        }
+        Ok(None)
     }
 }
 
-fn schedule(stage: Stage, iteration: usize) -> Schedule {
-    Schedule { stage, iteration, total: 2 * LENGTH, sh_degree: 0, extent: 3.0, ..Schedule::main(LENGTH) }
-}
-
-/// Gaussians from faint to opaque, with an attribute of a plug-in.
-fn gaussians(n: usize) -> HostGaussians {
-    let random = |salt: u64, width: usize, middle: f32, half: f32| -> Vec<f32> {
-        (0..n * width).map(|k| middle + half * uniform(Seed::root(43).index(salt), k)).collect()
+/// `gaussians` with other values of one attribute.
+fn replaced(gaussians: &Gaussians, name: &str, values: Tensor<2>) -> Result<Gaussians> {
+    let Some(old) = gaussians.attribute(name).filter(|old| old.dims() == values.dims()) else {
+        let problem = format!("after_step returns '{name}' {:?}, which is no attribute of this shape", values.dims());
+        return Err(Error::backend("conformance", problem, "Return attributes that there are, for all rows"));
     };
-    HostGaussians {
-        means: random(0, 3, 0.0, 1.0),
-        log_scales: random(1, 3, -3.0, 1.5),
-        quaternions: random(2, 4, 0.2, 1.0),
-        opacity_logits: random(3, 1, -2.0, 5.0),
-        sh_dc: random(4, 3, 0.0, 1.0),
-        dynamic_scores: random(5, 1, 0.5, 0.5),
-        extra: [("conformance".to_string(), ExtraAttribute::exact(2, random(6, 2, 0.0, 1.0)))].into(),
-        ..Default::default()
-    }
-}
-
-/// Gives `rows` of an attribute other values; names and widths were checked before.
-fn set_rows(set: &mut HostGaussians, attribute: &str, rows: &[usize], values: &[f32]) {
-    let column = match set.extra.get_mut(attribute) {
-        Some(extra) => Some((extra.width, &mut extra.values)),
-        None => set.columns_mut().into_iter().find(|(name, _, _)| *name == attribute).map(|(_, width, values)| (width, values)),
-    };
-    let Some((width, column)) = column else { return };
-    for (&row, new) in rows.iter().zip(values.chunks_exact(width.max(1))) {
-        column[row * width..(row + 1) * width].copy_from_slice(new);
-    }
+    drop(old);
+    let all = gaussians.attribute_names().into_iter().filter_map(|n| Some((gaussians.attribute(&n)?, n)));
+    Gaussians::from_attributes(gaussians.sh_degree, all.map(|(t, n)| if n == name { (n, values.clone()) } else { (n, t) }).collect::<Vec<_>>())
 }

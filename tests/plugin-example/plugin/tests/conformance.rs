@@ -35,7 +35,7 @@ fn the_density_control_conforms() {
 #[test]
 fn the_loss_conforms() {
     let registry = Registry::collect().unwrap();
-    assert_eq!(findings(|device| conformance::loss(registry.loss("faint").unwrap(), &Table::new(), device)), "");
+    assert_eq!(findings(|device| conformance::loss(registry.loss("faint").unwrap(), &Table::new(), &registry, device)), "");
 }
 
 /// A dataset of the reader `rig`: two cameras, one held out, two frames.
