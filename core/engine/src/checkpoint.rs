@@ -280,8 +280,11 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
     Ok(Checkpoint { header, host, deformer, training, device: device.clone() })
 }
 
+/// The array of a name and a length; `None` is a length that does not fit into memory.
+type ReadArray<'a> = dyn Fn(&str, Option<usize>) -> Result<Vec<f32>> + 'a;
+
 /// The Gaussians of a checkpoint, checked.
-fn gaussians(header: &ModelHeader, object: &str, limits: &Limits, array: &dyn Fn(&str, Option<usize>) -> Result<Vec<f32>>) -> Result<HostGaussians> {
+fn gaussians(header: &ModelHeader, object: &str, limits: &Limits, array: &ReadArray) -> Result<HostGaussians> {
     if header.sh_degree > 4 {
         return Err(Error::data(object, format!("spherical-harmonics degree {} is over 4", header.sh_degree), "Use another checkpoint"));
     }

@@ -4,6 +4,7 @@ use cc4dgs_backends as _;
 use cc4dgs_codecs as _;
 use cc4dgs_core::{Registry, config, conformance};
 use cc4dgs_deformers as _;
+use cc4dgs_parts as _;
 use cc4dgs_tests::devices;
 
 /// Sizes that keep the suite quick, for the fields that have sizes.
@@ -74,4 +75,33 @@ fn every_rasterizer_conforms() {
         }
     }
     assert!(findings.is_empty() && names.len() >= 2, "{names:?}\n{}", findings.join("\n"));
+}
+
+/// Runs a suite for every plug-in of `kind` on every device.
+fn on_every_device(kind: &str, least: usize, suite: impl Fn(&Registry, &str, &burn::tensor::Device) -> Vec<String>) {
+    let registry = Registry::collect().unwrap();
+    let names: Vec<&str> = registry.plugins().into_iter().filter(|(k, _)| *k == kind).map(|(_, p)| p.name).collect();
+    let findings: Vec<String> =
+        devices().iter().flat_map(|(_, device)| names.iter().flat_map(|name| suite(&registry, name, device)).collect::<Vec<_>>()).collect();
+    assert!(findings.is_empty() && names.len() >= least, "{names:?}\n{}", findings.join("\n"));
+}
+
+#[test]
+fn every_density_control_conforms() {
+    on_every_device("density", 2, |registry, name, device| conformance::density(registry.density(name).unwrap(), &toml::Table::new(), device));
+}
+
+#[test]
+fn every_loss_term_conforms() {
+    on_every_device("loss", 5, |registry, name, device| conformance::loss(registry.loss(name).unwrap(), &toml::Table::new(), registry, device));
+}
+
+#[test]
+fn every_appearance_model_conforms() {
+    on_every_device("appearance", 2, |registry, name, device| conformance::appearance(registry.appearance(name).unwrap(), &toml::Table::new(), device));
+}
+
+#[test]
+fn every_optimizer_conforms() {
+    on_every_device("optimizer", 1, |registry, name, device| conformance::optimizer(registry.optimizer(name).unwrap(), &toml::Table::new(), device));
 }

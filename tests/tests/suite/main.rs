@@ -16,6 +16,7 @@ mod golden_raster;
 mod golden_training;
 mod image;
 mod lookup;
+mod planted;
 mod raster;
 mod raster_fixtures;
 mod raster_probes;

@@ -67,9 +67,10 @@ fn a_stopped_training_leaves_a_checkpoint_and_resumes() {
     let folder = tempfile::tempdir().unwrap();
     let handle: Arc<std::sync::OnceLock<Session>> = Arc::default();
     let inside = handle.clone();
-    let session = Session::builder().device("flex").on_event(move |event| match (event, inside.get()) {
-        (Event::StageFinished { .. }, Some(session)) => session.stop(),
-        _ => {}
+    let session = Session::builder().device("flex").on_event(move |event| {
+        if let (Event::StageFinished { .. }, Some(session)) = (event, inside.get()) {
+            session.stop();
+        }
     });
     let session = session.build().unwrap();
     assert!(handle.set(session.clone()).is_ok());

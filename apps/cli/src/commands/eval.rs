@@ -107,7 +107,7 @@ pub fn measure(
             comparisons.push(Comparison { caption, reference: truth.clone(), render: render.clone() });
         }
         if let Some(folder) = &images.renders {
-            write_png(&folder.join(format!("{index:05}.png")), render)?;
+            write_png(folder.join(format!("{index:05}.png")), render)?;
         }
         index += 1;
         Ok(())

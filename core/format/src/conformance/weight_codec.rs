@@ -93,13 +93,16 @@ fn repeats(codec: &dyn WeightCodec) -> Result<Option<String>> {
     Ok(names.windows(2).find(|w| w[0] == w[1]).map(|twice| format!("two streams are called {}", twice[0])))
 }
 
+/// Makes sound weights unsound.
+type Edit = fn(&mut Vec<WeightArray>);
+
 fn refuses_unsound(codec: &dyn WeightCodec) -> Result<Option<String>> {
-    let with = |edit: fn(&mut Vec<WeightArray>)| {
+    let with = |edit: Edit| {
         let mut arrays = weights();
         edit(&mut arrays);
         codec.encode(&arrays, &context()).is_ok()
     };
-    let cases: [(&str, fn(&mut Vec<WeightArray>)); 4] = [
+    let cases: [(&str, Edit); 4] = [
         ("a NaN", |arrays| arrays[0].values[3] = f32::NAN),
         ("an infinity", |arrays| arrays[1].values[0] = f32::INFINITY),
         ("a name that is taken", |arrays| arrays[1].name = arrays[0].name.clone()),

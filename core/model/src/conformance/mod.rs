@@ -2,20 +2,54 @@
 //!
 //! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data, but for readers, which need a tiny dataset.
 
+mod appearance;
 mod deformer;
+mod density;
+mod loss;
+mod optimizer;
 mod preset;
 mod rasterizer;
 mod reader;
 
+pub use appearance::appearance;
 pub use cc4dgs_format::conformance::{codec, weight_codec};
 pub use deformer::deformer;
+pub use density::density;
+pub use loss::loss;
+pub use optimizer::optimizer;
 pub use preset::preset;
 pub use rasterizer::rasterizer;
 pub use reader::reader;
 
-use crate::Seed;
+use crate::{Plugin, Result, Seed, config};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_format::conformance::uniform;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// One check by name: what it found, if anything.
+type Check<'a> = (&'static str, Box<dyn Fn() -> Result<Option<String>> + 'a>);
+
+/// Runs all checks of `subject`; errors and panics are findings too.
+fn guarded(subject: &str, checks: Vec<Check>) -> Vec<String> {
+    let mut findings = Vec::new();
+    for (name, check) in checks {
+        let finding = match catch_unwind(AssertUnwindSafe(check)) {
+            Ok(Ok(None)) => continue,
+            Ok(Ok(Some(finding))) => finding,
+            Ok(Err(e)) => e.to_string(),
+            Err(_) => "it panics".to_string(),
+        };
+        findings.push(format!("{subject}, {name}: {finding}"));
+    }
+    findings
+}
+
+/// `config.toml` is written in full from a plug-in's schema: it must be TOML that the plug-in accepts.
+fn schema_is_the_default(kind: &str, info: &Plugin, build: impl Fn(&toml::Table) -> Result<()>) -> Result<Option<String>> {
+    let stated = config::parse_table(&format!("schema of {kind} {}", info.name), info.schema)?;
+    build(&toml::Table::new())?;
+    Ok(build(&stated).err().map(|e| format!("it refuses the settings that its schema states: {e}")))
+}
 
 /// [rows, width] uniform in -1..1.
 fn matrix(seed: Seed, rows: usize, width: usize, device: &Device) -> Tensor<2> {

@@ -2,11 +2,10 @@
 
 mod gradients;
 
-use super::{matrix, uniform};
+use super::{guarded, matrix, uniform};
 use crate::gaussians::to_vec;
 use crate::{Deformer, DeformerContext, DeformerPlugin, Error, Offsets, Result, Seed, SpatialInput, check_attributes, config};
 use burn::tensor::{Device, Tensor, TensorData};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Largest difference of offsets from packed features, as a share of the largest offset: sums may run in another order.
 const PACKED_TOLERANCE: f32 = 1e-5;
@@ -28,34 +27,26 @@ const CENTRES: usize = 48;
 /// - centres that are none, one or not finite are answered, and missing attributes and times that are not numbers are refused.
 ///
 /// `settings` is the `[deformer]` section without `kind`; small sizes make the suite quick. Each finding is a line; an empty list is a pass.
-pub fn deformer<'a>(plugin: &'a DeformerPlugin, settings: &'a toml::Table, device: &'a Device) -> Vec<String> {
+pub fn deformer(plugin: &DeformerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
-    let checks: [(&str, Check<'a>); 13] = [
-        ("settings", Suite::refuses_unknown_settings),
-        ("schema", Suite::schema_states_the_defaults),
-        ("attributes", Suite::attributes_are_sound),
-        ("seeds", Suite::equal_seeds_equal_weights),
-        ("start", Suite::starts_as_declared),
-        ("shapes", Suite::offsets_are_sound),
-        ("gradients", Suite::gradients_are_slopes),
-        ("regularizer", Suite::regularizer_is_sound),
-        ("progress", Suite::progress_is_followed),
-        ("weights", Suite::weights_carry_everything),
-        ("packed", Suite::packing_changes_nothing),
-        ("simplified", Suite::simplified_does_the_same),
-        ("odd inputs", Suite::odd_inputs_are_answered),
-    ];
-    let mut findings = Vec::new();
-    for (name, check) in checks {
-        let finding = match catch_unwind(AssertUnwindSafe(|| check(&suite))) {
-            Ok(Ok(None)) => continue,
-            Ok(Ok(Some(finding))) => finding,
-            Ok(Err(e)) => e.to_string(),
-            Err(_) => "it panics".to_string(),
-        };
-        findings.push(format!("{} on {device:?}, {name}: {finding}", plugin.info.name));
-    }
-    findings
+    guarded(
+        &format!("{} on {device:?}", plugin.info.name),
+        vec![
+            ("settings", Box::new(|| suite.refuses_unknown_settings())),
+            ("schema", Box::new(|| suite.schema_states_the_defaults())),
+            ("attributes", Box::new(|| suite.attributes_are_sound())),
+            ("seeds", Box::new(|| suite.equal_seeds_equal_weights())),
+            ("start", Box::new(|| suite.starts_as_declared())),
+            ("shapes", Box::new(|| suite.offsets_are_sound())),
+            ("gradients", Box::new(|| suite.gradients_are_slopes())),
+            ("regularizer", Box::new(|| suite.regularizer_is_sound())),
+            ("progress", Box::new(|| suite.progress_is_followed())),
+            ("weights", Box::new(|| suite.weights_carry_everything())),
+            ("packed", Box::new(|| suite.packing_changes_nothing())),
+            ("simplified", Box::new(|| suite.simplified_does_the_same())),
+            ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
+        ],
+    )
 }
 
 struct Suite<'a> {
@@ -65,8 +56,6 @@ struct Suite<'a> {
 }
 
 type Built = Box<dyn Deformer>;
-/// One check: what it found, if anything.
-type Check<'a> = fn(&Suite<'a>) -> Result<Option<String>>;
 
 impl Suite<'_> {
     fn context(&self) -> DeformerContext {

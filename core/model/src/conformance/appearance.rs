@@ -1,0 +1,158 @@
+//! What an appearance model must keep to.
+
+use super::{guarded, schema_is_the_default, uniform};
+use crate::gaussians::to_vec;
+use crate::{Appearance, AppearanceContext, AppearancePlugin, Result, Seed};
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// Planes of the suite [5,H,W].
+const SHAPE: [usize; 3] = [5, 7, 9];
+/// Training cameras.
+const CAMERAS: usize = 4;
+/// Largest relative difference between a slope by finite differences and the gradient along itself.
+const SLOPE_TOLERANCE: f64 = 0.02;
+/// Size of the random changes of the weights.
+const SHAKE: f32 = 0.1;
+
+/// Holds an appearance model to its promises on `device`: its schema is TOML and states the defaults; unknown settings are refused; a fresh model changes
+/// nothing; a camera that was not trained on sees the rendered planes bit for bit, whatever the weights; alpha and depth stay; planes keep their shape and
+/// are finite; gradients by weights and planes agree with finite differences; parameters have sound names, shapes and groups; nothing panics.
+pub fn appearance(plugin: &AppearancePlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
+    let suite = Suite { plugin, settings, device };
+    guarded(
+        &format!("{} on {device:?}", plugin.info.name),
+        vec![
+            ("settings", Box::new(|| suite.settings_are_read())),
+            ("parameters", Box::new(|| suite.parameters_are_sound())),
+            ("identity", Box::new(|| suite.identity_where_promised())),
+            ("gradients", Box::new(|| suite.gradients_are_slopes())),
+        ],
+    )
+}
+
+struct Suite<'a> {
+    plugin: &'a AppearancePlugin,
+    settings: &'a toml::Table,
+    device: &'a Device,
+}
+
+fn context() -> AppearanceContext {
+    AppearanceContext { cameras: CAMERAS, seed: Seed::root(61) }
+}
+
+fn values(shift: usize) -> Vec<f32> {
+    (0..SHAPE.iter().product()).map(|k| 0.5 + 0.4 * uniform(Seed::root(63).index(shift as u64), k)).collect()
+}
+
+impl Suite<'_> {
+    fn settings_are_read(&self) -> Result<Option<String>> {
+        let mut odd = self.settings.clone();
+        odd.insert("no_such_setting".into(), 1.into());
+        match (self.plugin.build)(&odd, &context(), self.device) {
+            Ok(_) => return Ok(Some("an unknown setting was accepted".into())),
+            Err(e) if !e.to_string().contains("no_such_setting") => return Ok(Some(format!("the error does not name the unknown setting: {e}"))),
+            Err(_) => {}
+        }
+        schema_is_the_default("appearance", &self.plugin.info, |settings| (self.plugin.build)(settings, &context(), self.device).map(drop))
+    }
+    fn fresh(&self, device: &Device) -> Result<Box<dyn Appearance>> {
+        (self.plugin.build)(self.settings, &context(), device)
+    }
+    fn shaken(&self, device: &Device) -> Result<Box<dyn Appearance>> {
+        let mut built = self.fresh(device)?;
+        for (index, parameter) in built.parameters_mut().into_iter().enumerate() {
+            let seed = Seed::root(65).index(index as u64);
+            let moved: Vec<f32> = to_vec(parameter.value.clone(), "weights")?.iter().enumerate().map(|(k, v)| v + SHAKE * uniform(seed, k)).collect();
+            let n = moved.len();
+            let value = Tensor::<1>::from_data(TensorData::new(moved, [n]), device);
+            parameter.value = if value.is_autodiff() { value.require_grad() } else { value };
+        }
+        Ok(built)
+    }
+    fn planes(&self, values: Vec<f32>, device: &Device) -> Tensor<3> {
+        Tensor::from_data(TensorData::new(values, SHAPE), device)
+    }
+    fn parameters_are_sound(&self) -> Result<Option<String>> {
+        let built = self.fresh(self.device)?;
+        let mut names = Vec::new();
+        for p in built.parameters() {
+            if p.value.dims()[0] != p.shape.iter().product::<usize>() || p.group >= built.groups().len() {
+                return Ok(Some(format!("{}: {} weights for shape {:?}, group {} of {}", p.name, p.value.dims()[0], p.shape, p.group, built.groups().len())));
+            }
+            names.push(p.name.clone());
+        }
+        names.sort_unstable();
+        Ok(names.windows(2).find(|w| w[0] == w[1]).map(|w| format!("two parameters are called {}", w[0])))
+    }
+    fn identity_where_promised(&self) -> Result<Option<String>> {
+        let rendered = values(0);
+        let apply = |model: &dyn Appearance, camera| to_vec(model.apply(self.planes(rendered.clone(), self.device), camera)?, "planes");
+        let fresh = self.fresh(self.device)?;
+        for camera in 0..CAMERAS {
+            if apply(fresh.as_ref(), Some(camera))?.iter().zip(&rendered).any(|(a, b)| (a - b).abs() > 1e-6) {
+                return Ok(Some(format!("a fresh model changes the image of camera {camera}")));
+            }
+        }
+        let shaken = self.shaken(self.device)?;
+        if apply(shaken.as_ref(), None)? != rendered {
+            return Ok(Some("a camera that was not trained on does not see the rendered planes".into()));
+        }
+        for camera in 0..CAMERAS {
+            let recorded = apply(shaken.as_ref(), Some(camera))?;
+            let colour = 3 * SHAPE[1] * SHAPE[2];
+            if recorded.len() != rendered.len() || recorded[colour..] != rendered[colour..] || !recorded.iter().all(|v| v.is_finite()) {
+                return Ok(Some(format!("camera {camera}: alpha or depth changed, or planes of another shape or not finite")));
+            }
+        }
+        Ok(None)
+    }
+    fn gradients_are_slopes(&self) -> Result<Option<String>> {
+        let device = self.device.clone().autodiff();
+        let mut built = self.shaken(&device)?;
+        let weights = Tensor::<3>::from_inner(self.planes(values(1), self.device));
+        let measure = |model: &dyn Appearance, planes: Tensor<3>| -> Result<Tensor<1>> {
+            let loss = (model.apply(planes, Some(1))? * weights.clone()).sum();
+            Ok(match model.regularizer()? {
+                Some(term) => loss + term,
+                None => loss,
+            })
+        };
+        let planes = self.planes(values(0), &device).require_grad();
+        let gradients = measure(built.as_ref(), planes.clone())?.backward();
+        let slope = |ends: [f64; 2], step: f64| (ends[0] - ends[1]) / (2.0 * step);
+        let number = |t: Tensor<1>| -> Result<f64> { Ok(to_vec(t, "value")?.first().map_or(f64::NAN, |v| f64::from(*v))) };
+        let step = 2e-2;
+        for index in 0..built.parameters().len() {
+            let (name, start, gradient) = {
+                let p = built.parameters()[index];
+                let Some(gradient) = p.value.grad(&gradients) else { return Ok(Some(format!("no gradient reaches {}", p.name))) };
+                (p.name.clone(), to_vec(p.value.clone(), "weights")?, to_vec(gradient, "gradient")?)
+            };
+            let norm = gradient.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            let mut ends = [0.0; 2];
+            for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
+                let moved: Vec<f32> = start.iter().zip(&gradient).map(|(s, g)| s + (sign * step * f64::from(*g) / norm) as f32).collect();
+                let count = moved.len();
+                built.parameters_mut()[index].value = Tensor::from_data(TensorData::new(moved, [count]), &device);
+                *end = number(measure(built.as_ref(), planes.clone())?)?;
+            }
+            let count = start.len();
+            built.parameters_mut()[index].value = Tensor::from_data(TensorData::new(start, [count]), &device);
+            let found = slope(ends, step);
+            if norm == 0.0 || !norm.is_finite() || (found / norm - 1.0).abs() > SLOPE_TOLERANCE {
+                return Ok(Some(format!("{name}: the loss rises by {found:.5} per unit along its gradient of norm {norm:.5}")));
+            }
+        }
+        let Some(gradient) = planes.grad(&gradients) else { return Ok(Some("no gradient reaches the planes".into())) };
+        let gradient = to_vec(gradient, "gradient")?;
+        let norm = gradient.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+        let mut ends = [0.0; 2];
+        for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
+            let moved = values(0).iter().zip(&gradient).map(|(s, g)| s + (sign * step * f64::from(*g) / norm) as f32).collect();
+            *end = number(measure(built.as_ref(), self.planes(moved, &device))?)?;
+        }
+        let found = slope(ends, step);
+        Ok(((found / norm - 1.0).abs() > SLOPE_TOLERANCE)
+            .then(|| format!("planes: the loss rises by {found:.5} per unit along its gradient of norm {norm:.5}")))
+    }
+}

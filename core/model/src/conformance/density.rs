@@ -1,0 +1,199 @@
+//! What a density control must keep to.
+
+use super::{guarded, schema_is_the_default, uniform};
+use crate::{
+    DensityControl, DensityPlan, DensityPlugin, Error, ExtraAttribute, Gaussians, HostGaussians, Result, Schedule, Seed, Stage, Statistic, ViewStatistics,
+};
+use burn::tensor::{Device, Int, Tensor, TensorData};
+
+/// Gaussians at the start.
+const COUNT: usize = 40;
+/// More Gaussians than this, from [`COUNT`], are no answer to anything.
+const MOST: usize = 100 * COUNT;
+/// Iterations of the suite's stages.
+const ITERATIONS: usize = 320;
+/// Name of the extra attribute that tells the Gaussians apart.
+const LABEL: &str = "conformance-label";
+
+/// Holds a density control to its promises on `device`, over a coarse and a main stage of random statistics: its schema is TOML and states the defaults;
+/// unknown settings are refused; plans name rows and attributes that there are, set finite values, and never remove everything; equal seeds give equal
+/// plans; what is stored after any iteration continues to the same plans; stored state of another size is an error; Gaussians without any statistics, one
+/// Gaussian, and values that are not finite are answered; nothing panics.
+pub fn density(plugin: &DensityPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
+    let suite = Suite { plugin, settings, device };
+    guarded(
+        &format!("{} on {device:?}", plugin.info.name),
+        vec![
+            ("settings", Box::new(|| suite.settings_are_read())),
+            ("plans", Box::new(|| suite.plans_are_sound())),
+            ("state", Box::new(|| suite.state_continues())),
+            ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
+        ],
+    )
+}
+
+struct Suite<'a> {
+    plugin: &'a DensityPlugin,
+    settings: &'a toml::Table,
+    device: &'a Device,
+}
+
+/// What a run saw: the plan of every iteration, and the Gaussians at its end.
+struct Run {
+    plans: Vec<Option<DensityPlan>>,
+    end: Gaussians,
+}
+
+impl Suite<'_> {
+    fn build(&self) -> Result<Box<dyn DensityControl>> {
+        (self.plugin.build)(self.settings)
+    }
+    fn settings_are_read(&self) -> Result<Option<String>> {
+        let mut odd = self.settings.clone();
+        odd.insert("no_such_setting".into(), 1.into());
+        match (self.plugin.build)(&odd) {
+            Ok(_) => return Ok(Some("an unknown setting was accepted".into())),
+            Err(e) if !e.to_string().contains("no_such_setting") => return Ok(Some(format!("the error does not name the unknown setting: {e}"))),
+            Err(_) => {}
+        }
+        schema_is_the_default("density", &self.plugin.info, |settings| (self.plugin.build)(settings).map(drop))
+    }
+    fn gaussians(&self, count: usize) -> Gaussians {
+        let seed = Seed::root(41);
+        let mut g = HostGaussians { sh_degree: 1, ..Default::default() };
+        for i in 0..count {
+            let draw = |k: usize| uniform(seed.index(i as u64), k);
+            g.means.extend([draw(0), draw(1), draw(2)]);
+            g.log_scales.extend([-4.0 + 2.0 * draw(3), -4.0 + 2.0 * draw(4), -4.0 + 2.0 * draw(5)]);
+            g.quaternions.extend([1.0 + 0.3 * draw(6), draw(7), draw(8), draw(9)]);
+            g.opacity_logits.push(5.0 * draw(10));
+            g.sh_dc.extend([draw(11), draw(12), draw(13)]);
+            g.sh_rest.extend((0..9).map(|c| 0.1 * draw(14 + c)));
+            g.dynamic_scores.push(draw(30));
+        }
+        g.extra.insert(LABEL.into(), ExtraAttribute::exact(1, (0..count).map(|i| i as f32).collect()));
+        Gaussians::from_host(&g, self.device)
+    }
+    fn schedule(stage: Stage, iteration: usize) -> Schedule {
+        Schedule { stage, iteration, total: 2 * ITERATIONS, ..Schedule::main(ITERATIONS) }
+    }
+    /// Statistics of a view of `count` Gaussians, with what was asked for.
+    fn view(&self, count: usize, wanted: &[Statistic], seed: Seed) -> ViewStatistics {
+        let draw = |k: usize| uniform(seed, k);
+        let radii: Vec<i64> = (0..count).map(|i| if draw(i) > -0.6 { 1 + (4.0 * (draw(i) + 1.0)) as i64 } else { 0 }).collect();
+        let pair = |shift: usize, absolute: bool| {
+            let values: Vec<f32> = (0..2 * count).map(|k| 2e-5 * draw(shift + k)).map(|v| if absolute { v.abs() } else { v }).collect();
+            Tensor::<2>::from_data(TensorData::new(values, [count, 2]), self.device)
+        };
+        let weights: Vec<f32> = (0..count).map(|i| 0.5 + 0.5 * draw(7 * count + i)).collect();
+        ViewStatistics {
+            radii: Tensor::<1, Int>::from_data(TensorData::new(radii, [count]), self.device),
+            screen_gradient: wanted.contains(&Statistic::ScreenGradient).then(|| pair(2 * count, false)),
+            absolute_screen_gradient: wanted.contains(&Statistic::AbsoluteScreenGradient).then(|| pair(4 * count, true)),
+            max_weights: wanted.contains(&Statistic::MaxWeight).then(|| Tensor::from_data(TensorData::new(weights, [count]), self.device)),
+            size: (640, 360),
+            views: 2,
+        }
+    }
+    /// One iteration: statistics, noise, plan. Returns the plan and the Gaussians after it.
+    fn iterate(&self, control: &mut dyn DensityControl, gaussians: Gaussians, schedule: &Schedule) -> Result<(Option<DensityPlan>, Gaussians)> {
+        let seed = Seed::root(43).child(schedule.stage.name()).index(schedule.iteration as u64);
+        let wanted = control.statistics(schedule);
+        for view in 0..2 {
+            control.observe(&self.view(gaussians.len(), &wanted, seed.index(view)))?;
+        }
+        let mut gaussians = gaussians;
+        for (name, values) in control.after_step(&gaussians, schedule, seed.child("noise"))? {
+            gaussians = replaced(&gaussians, &name, values)?;
+        }
+        let plan = control.plan(&gaussians, schedule, seed.child("plan"))?;
+        if let Some(plan) = &plan {
+            plan.check(self.plugin.info.name, &gaussians)?;
+            gaussians = plan.apply(&gaussians)?;
+        }
+        Ok((plan, gaussians))
+    }
+    /// Both stages. With `stored_at`, state and control are stored and rebuilt after that iteration of the main stage.
+    fn run(&self, stored_at: Option<usize>) -> Result<Run> {
+        let mut control = self.build()?;
+        let mut run = Run { plans: Vec::new(), end: self.gaussians(COUNT) };
+        for stage in [Stage::Coarse, Stage::Main] {
+            control.begin_stage(run.end.len(), self.device);
+            for iteration in 1..=ITERATIONS {
+                let (plan, next) = self.iterate(control.as_mut(), run.end, &Self::schedule(stage, iteration))?;
+                (run.end, _) = (next, run.plans.push(plan));
+                if stage == Stage::Main && stored_at == Some(iteration) {
+                    let state = control.state();
+                    control = self.build()?;
+                    control.restore(state, run.end.len())?;
+                }
+            }
+        }
+        Ok(run)
+    }
+    fn plans_are_sound(&self) -> Result<Option<String>> {
+        let (first, second) = (self.run(None)?, self.run(None)?);
+        if first.plans != second.plans {
+            return Ok(Some("two runs with equal seeds give other plans".into()));
+        }
+        if first.end.len() > MOST {
+            return Ok(Some(format!("{COUNT} Gaussians became {} in {} iterations", first.end.len(), 2 * ITERATIONS)));
+        }
+        let host = first.end.to_host()?;
+        if let Err(e) = host.validate("Gaussians after all plans", &crate::Limits::default()) {
+            return Ok(Some(e.to_string()));
+        }
+        let labels = host.extra.get(LABEL).map(|a| a.values.clone()).unwrap_or_default();
+        let inherited = labels.len() == host.len() && labels.iter().all(|&l| l.fract() == 0.0 && (0.0..COUNT as f32).contains(&l));
+        Ok((!inherited).then(|| "attributes of other plug-ins were changed".into()))
+    }
+    fn state_continues(&self) -> Result<Option<String>> {
+        let whole = self.run(None)?;
+        for at in [1, ITERATIONS / 3, ITERATIONS - 1] {
+            if self.run(Some(at))?.plans != whole.plans {
+                return Ok(Some(format!("stored after iteration {at} of the main stage, it goes on with other plans")));
+            }
+        }
+        let mut control = self.build()?;
+        control.begin_stage(COUNT, self.device);
+        let state = control.state();
+        if let Some((name, values)) = state.iter().find(|(_, values)| values.dims()[0] > 0) {
+            let shorter: Vec<_> =
+                state.iter().map(|(n, v)| (n.clone(), if n == name { v.clone().narrow(0, 0, values.dims()[0] - 1) } else { v.clone() })).collect();
+            if self.build()?.restore(shorter, COUNT).is_ok() {
+                return Ok(Some(format!("stored state '{name}' of another length was accepted")));
+            }
+        }
+        let mut renamed = state;
+        renamed.push(("conformance-no-such-array".into(), Tensor::zeros([COUNT], self.device)));
+        Ok(self.build()?.restore(renamed, COUNT).is_ok().then(|| "stored state with an array it does not know was accepted".into()))
+    }
+    fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
+        let mut odd = self.gaussians(3);
+        odd.means = Tensor::from_floats([[f32::NAN, 0.0, 0.0], [f32::INFINITY, 0.0, 0.0], [0.0, 0.0, 0.0]], self.device);
+        for gaussians in [self.gaussians(1), odd] {
+            let mut control = self.build()?;
+            let mut gaussians = gaussians;
+            control.begin_stage(gaussians.len(), self.device);
+            for iteration in 1..=ITERATIONS {
+                let schedule = Self::schedule(Stage::Main, iteration);
+                // No view saw anything.
+                let Some(plan) = control.plan(&gaussians, &schedule, Seed::root(47).index(iteration as u64))? else { continue };
+                plan.check(self.plugin.info.name, &gaussians)?;
+                gaussians = plan.apply(&gaussians)?;
+            }
+        }
+        Ok(None)
+    }
+}
+
+/// `gaussians` with other values of one attribute.
+fn replaced(gaussians: &Gaussians, name: &str, values: Tensor<2>) -> Result<Gaussians> {
+    let Some(old) = gaussians.attribute(name).filter(|old| old.dims() == values.dims()) else {
+        let problem = format!("after_step returns '{name}' {:?}, which is no attribute of this shape", values.dims());
+        return Err(Error::backend("conformance", problem, "Return attributes that there are, for all rows"));
+    };
+    drop(old);
+    let all = gaussians.attribute_names().into_iter().filter_map(|n| Some((gaussians.attribute(&n)?, n)));
+    Gaussians::from_attributes(gaussians.sh_degree, all.map(|(t, n)| if n == name { (n, values.clone()) } else { (n, t) }).collect::<Vec<_>>())
+}

@@ -1,0 +1,185 @@
+//! What a loss term must keep to.
+
+use super::{guarded, schema_is_the_default, uniform};
+use crate::gaussians::to_vec;
+use crate::{Gaussians, HostGaussians, LossInput, LossPlugin, LossTerm, Registry, Result, Schedule, Seed};
+use burn::tensor::{Device, Int, Tensor, TensorData};
+
+/// Image size of the suite.
+const SIZE: [usize; 2] = [17, 23];
+/// Gaussians of the suite.
+const COUNT: usize = 6;
+/// Largest relative difference between a slope by finite differences and the gradient along itself.
+const SLOPE_TOLERANCE: f64 = 0.05;
+/// Largest relative difference between a fused term and the sum of its parts.
+const FUSED_TOLERANCE: f64 = 1e-4;
+
+/// Holds a loss term to its promises on `device`: its schema is TOML and states the defaults; unknown settings are refused; the value is one finite number and
+/// repeats bit for bit; gradients by the planes and by the Gaussians agree with finite differences; images of one pixel and sets without Gaussians are
+/// answered; a term that stands in for others (looked up in `registry`) is their weighted sum; nothing panics.
+pub fn loss(plugin: &LossPlugin, settings: &toml::Table, registry: &Registry, device: &Device) -> Vec<String> {
+    let suite = Suite { plugin, settings, registry, device };
+    guarded(
+        &format!("{} on {device:?}", plugin.info.name),
+        vec![
+            ("settings", Box::new(|| suite.settings_are_read())),
+            ("value", Box::new(|| suite.value_is_a_number())),
+            ("gradients", Box::new(|| suite.gradients_are_slopes())),
+            ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
+            ("fusion", Box::new(|| suite.fused_is_the_sum())),
+        ],
+    )
+}
+
+struct Suite<'a> {
+    plugin: &'a LossPlugin,
+    settings: &'a toml::Table,
+    registry: &'a Registry,
+    device: &'a Device,
+}
+
+/// Values of one input, row-major.
+#[derive(Clone)]
+struct Inputs {
+    /// [5,H,W].
+    planes: Vec<f32>,
+    /// [3,H,W].
+    target: Vec<f32>,
+    gaussians: HostGaussians,
+    size: [usize; 2],
+}
+
+fn inputs(size: [usize; 2], count: usize) -> Inputs {
+    let (seed, pixels) = (Seed::root(51), size[0] * size[1]);
+    let draw = |shift: usize, k: usize| 0.5 + 0.45 * uniform(seed, 1_000_000 * shift + k);
+    let columns = |width: usize, shift: usize, centre: f32| (0..count * width).map(|k| centre + uniform(seed, 2_000_000 * shift + k)).collect::<Vec<f32>>();
+    Inputs {
+        planes: (0..5 * pixels).map(|k| draw(1, k)).collect(),
+        target: (0..3 * pixels).map(|k| draw(2, k)).collect(),
+        gaussians: HostGaussians {
+            sh_degree: 1,
+            means: columns(3, 3, 0.0),
+            log_scales: columns(3, 4, -2.0),
+            quaternions: columns(4, 5, 1.5),
+            opacity_logits: columns(1, 6, 0.0),
+            sh_dc: columns(3, 7, 0.0),
+            sh_rest: columns(9, 8, 0.0),
+            dynamic_scores: columns(1, 9, 0.0),
+            ..Default::default()
+        },
+        size,
+    }
+}
+
+impl Suite<'_> {
+    fn settings_are_read(&self) -> Result<Option<String>> {
+        let mut odd = self.settings.clone();
+        odd.insert("no_such_setting".into(), 1.into());
+        match (self.plugin.build)(&odd) {
+            Ok(_) => return Ok(Some("an unknown setting was accepted".into())),
+            Err(e) if !e.to_string().contains("no_such_setting") => return Ok(Some(format!("the error does not name the unknown setting: {e}"))),
+            Err(_) => {}
+        }
+        schema_is_the_default("loss", &self.plugin.info, |settings| (self.plugin.build)(settings).map(drop))
+    }
+    fn term(&self) -> Result<Box<dyn LossTerm>> {
+        (self.plugin.build)(self.settings)
+    }
+    /// The value, and the tracked inputs if `track`: planes and Gaussians.
+    fn value(&self, term: &dyn LossTerm, inputs: &Inputs, track: bool) -> Result<(Option<Tensor<1>>, Tensor<3>, Gaussians)> {
+        let device = self.device.clone().autodiff();
+        let [h, w] = inputs.size;
+        let leaf = |values: &[f32], shape: [usize; 3]| Tensor::<3>::from_data(TensorData::new(values.to_vec(), shape), &device);
+        let (mut planes, target) = (leaf(&inputs.planes, [5, h, w]), Tensor::<3>::from_inner(leaf(&inputs.target, [3, h, w]).inner()));
+        let mut g = Gaussians::from_host(&inputs.gaussians, &device);
+        if track {
+            planes = planes.require_grad();
+            g.means = g.means.require_grad();
+            g.log_scales = g.log_scales.require_grad();
+            g.quaternions = g.quaternions.require_grad();
+            g.opacity_logits = g.opacity_logits.require_grad();
+            g.sh_dc = g.sh_dc.require_grad();
+        }
+        let radii = Tensor::<1, Int>::ones([inputs.gaussians.len()], self.device);
+        let schedule = Schedule::main(100);
+        let input = LossInput { planes: &planes, target: &target, gaussians: &g, radii: &radii, time_norm: 0.4, schedule: &schedule };
+        Ok((term.value(&input)?, planes, g))
+    }
+    fn number(&self, term: &dyn LossTerm, inputs: &Inputs) -> Result<f64> {
+        let value = self.value(term, inputs, false)?.0;
+        Ok(value.map_or(Ok(vec![0.0]), |v| to_vec(v, "value"))?.first().map_or(f64::NAN, |v| f64::from(*v)))
+    }
+    fn value_is_a_number(&self) -> Result<Option<String>> {
+        let (term, inputs) = (self.term()?, inputs(SIZE, COUNT));
+        let Some(value) = self.value(term.as_ref(), &inputs, true)?.0 else { return Ok(Some("it has no value for an ordinary view".into())) };
+        if value.dims() != [1] {
+            return Ok(Some(format!("its value has shape {:?} in place of [1]", value.dims())));
+        }
+        let (first, second) = (self.number(term.as_ref(), &inputs)?, self.number(term.as_ref(), &inputs)?);
+        Ok((!first.is_finite() || first != second).then(|| format!("two values of one input are {first} and {second}")))
+    }
+    fn gradients_are_slopes(&self) -> Result<Option<String>> {
+        let (term, inputs) = (self.term()?, inputs(SIZE, COUNT));
+        let (value, planes, g) = self.value(term.as_ref(), &inputs, true)?;
+        let Some(value) = value else { return Ok(None) };
+        let gradients = value.backward();
+        let flat = |t: Option<Tensor<2>>| t.map(|t| to_vec(t, "gradient")).transpose();
+        type Slot = fn(&mut Inputs) -> &mut Vec<f32>;
+        let found: [(&str, Option<Vec<f32>>, Slot); 6] = [
+            ("planes", planes.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.planes),
+            ("means", flat(g.means.grad(&gradients))?, |i| &mut i.gaussians.means),
+            ("log_scales", flat(g.log_scales.grad(&gradients))?, |i| &mut i.gaussians.log_scales),
+            ("quaternions", flat(g.quaternions.grad(&gradients))?, |i| &mut i.gaussians.quaternions),
+            ("opacity_logits", g.opacity_logits.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.gaussians.opacity_logits),
+            ("sh_dc", flat(g.sh_dc.grad(&gradients))?, |i| &mut i.gaussians.sh_dc),
+        ];
+        let mut reached = 0;
+        for (name, gradient, slot) in found {
+            let Some(gradient) = gradient else { continue };
+            let norm = gradient.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            if !norm.is_finite() {
+                return Ok(Some(format!("the gradient of {name} has norm {norm}")));
+            }
+            if norm == 0.0 {
+                continue;
+            }
+            reached += 1;
+            // The first steps may drown in rounding where the last cross kinks.
+            let mut slopes = Vec::new();
+            for step in [3e-3, 1e-2, 3e-2] {
+                let mut ends = [0.0; 2];
+                for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
+                    let mut moved = inputs.clone();
+                    slot(&mut moved).iter_mut().zip(&gradient).for_each(|(v, d)| *v += (sign * step * f64::from(*d) / norm) as f32);
+                    *end = self.number(term.as_ref(), &moved)?;
+                }
+                slopes.push((ends[0] - ends[1]) / (2.0 * step));
+            }
+            if !slopes.iter().any(|slope| (slope / norm - 1.0).abs() <= SLOPE_TOLERANCE) {
+                return Ok(Some(format!("{name}: the loss rises by {slopes:.6?} per unit along its gradient of norm {norm:.6}")));
+            }
+        }
+        Ok((reached == 0).then(|| "no gradient reaches the planes or the Gaussians".into()))
+    }
+    fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
+        let term = self.term()?;
+        for (what, inputs) in [("one pixel", inputs([1, 1], COUNT)), ("no Gaussians", inputs(SIZE, 0)), ("one row", inputs([1, 30], 1))] {
+            let value = self.number(term.as_ref(), &inputs)?;
+            if !value.is_finite() {
+                return Ok(Some(format!("with {what} the value is {value}")));
+            }
+        }
+        Ok(None)
+    }
+    fn fused_is_the_sum(&self) -> Result<Option<String>> {
+        let Some(fusion) = &self.plugin.fuses else { return Ok(None) };
+        let inputs = inputs(SIZE, COUNT);
+        let weights: Vec<f64> = (0..fusion.kinds.len()).map(|k| 0.3 + 0.9 * k as f64).collect();
+        let fused = self.number((fusion.build)(&weights)?.as_ref(), &inputs)?;
+        let mut sum = 0.0;
+        for (kind, weight) in fusion.kinds.iter().zip(&weights) {
+            sum += weight * self.number((self.registry.loss(kind)?.build)(&toml::Table::new())?.as_ref(), &inputs)?;
+        }
+        Ok(((fused - sum).abs() > FUSED_TOLERANCE * sum.abs()).then(|| format!("with weights {weights:?} it is {fused}, its parts sum to {sum}")))
+    }
+}

@@ -1,0 +1,132 @@
+//! What an optimizer must keep to.
+
+use super::{guarded, matrix, schema_is_the_default};
+use crate::gaussians::to_vec;
+use crate::{Optimizer, OptimizerPlugin, Result, Seed, StepSettings};
+use burn::tensor::{Device, Int, Tensor};
+
+/// Rows and width of the suite's array.
+const SHAPE: [usize; 2] = [12, 3];
+/// Steps within which a quadratic must be at most a tenth of what it was.
+const STEPS: usize = 400;
+
+/// Holds an optimizer to its promises on `device`: its schema is TOML and states the defaults; unknown settings are refused; it lowers a quadratic; rows that
+/// are not visible keep their values and their state; rows follow their parents, and fresh ones start from nothing; forgetting state, and storing and
+/// restoring it, lead to the same bytes as never having had it and as never having stored it; broken state is an error; nothing panics.
+pub fn optimizer(plugin: &OptimizerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
+    let suite = Suite { plugin, settings, device };
+    guarded(
+        &format!("{} on {device:?}", plugin.info.name),
+        vec![
+            ("settings", Box::new(|| suite.settings_are_read())),
+            ("descent", Box::new(|| suite.lowers_a_quadratic())),
+            ("visible rows", Box::new(|| suite.leaves_hidden_rows())),
+            ("rows", Box::new(|| suite.rows_follow_their_parents())),
+            ("state", Box::new(|| suite.state_continues())),
+        ],
+    )
+}
+
+struct Suite<'a> {
+    plugin: &'a OptimizerPlugin,
+    settings: &'a toml::Table,
+    device: &'a Device,
+}
+
+const NAME: &str = "gaussians/means";
+
+impl Suite<'_> {
+    fn build(&self) -> Result<Box<dyn Optimizer>> {
+        (self.plugin.build)(self.settings)
+    }
+    fn settings_are_read(&self) -> Result<Option<String>> {
+        let mut odd = self.settings.clone();
+        odd.insert("no_such_setting".into(), 1.into());
+        if (self.plugin.build)(&odd).is_ok() {
+            return Ok(Some("an unknown setting was accepted".into()));
+        }
+        schema_is_the_default("optimizer", &self.plugin.info, |settings| (self.plugin.build)(settings).map(drop))
+    }
+    fn start(&self) -> Tensor<2> {
+        matrix(Seed::root(71), SHAPE[0], SHAPE[1], self.device)
+    }
+    /// `steps` steps down a quadratic whose minimum is at zero.
+    fn descend(&self, optimizer: &mut dyn Optimizer, mut value: Tensor<2>, steps: usize) -> Result<Tensor<2>> {
+        for _ in 0..steps {
+            let gradient = value.clone().mul_scalar(2.0);
+            value = optimizer.step(NAME, value, gradient, &StepSettings::new(0.02))?;
+        }
+        Ok(value)
+    }
+    fn lowers_a_quadratic(&self) -> Result<Option<String>> {
+        let squares = |t: Tensor<2>| -> Result<f64> { Ok(to_vec(t, "values")?.iter().map(|v| f64::from(*v).powi(2)).sum()) };
+        let before = squares(self.start())?;
+        let after = squares(self.descend(self.build()?.as_mut(), self.start(), STEPS)?)?;
+        Ok((after.is_nan() || after > 0.1 * before).then(|| format!("a sum of squares of {before:.3} is {after:.3} after {STEPS} steps")))
+    }
+    fn leaves_hidden_rows(&self) -> Result<Option<String>> {
+        let (mut masked, mut whole) = (self.build()?, self.build()?);
+        let visible: Vec<i64> = (0..SHAPE[0] as i64).map(|i| i % 2).collect();
+        let visible = Tensor::<1, Int>::from_data(burn::tensor::TensorData::new(visible, [SHAPE[0]]), self.device);
+        let gradient = self.start().mul_scalar(2.0);
+        let settings = StepSettings { visible: Some(&visible), ..StepSettings::new(0.02) };
+        let a = to_vec(masked.step(NAME, self.start(), gradient.clone(), &settings)?, "values")?;
+        let b = to_vec(whole.step(NAME, self.start(), gradient, &StepSettings::new(0.02))?, "values")?;
+        let start = to_vec(self.start(), "values")?;
+        for row in 0..SHAPE[0] {
+            let span = row * SHAPE[1]..(row + 1) * SHAPE[1];
+            let wanted = if row % 2 == 1 { &b[span.clone()] } else { &start[span.clone()] };
+            if a[span.clone()] != *wanted {
+                return Ok(Some(format!("row {row} with visibility {} is {:?}, expected {wanted:?}", row % 2, &a[span])));
+            }
+        }
+        Ok(None)
+    }
+    fn rows_follow_their_parents(&self) -> Result<Option<String>> {
+        let mut optimizer = self.build()?;
+        let value = self.descend(optimizer.as_mut(), self.start(), 5)?;
+        // Reversed, and the last row is a fresh copy of the first.
+        let parents: Vec<usize> = (0..SHAPE[0]).rev().chain([0]).collect();
+        let fresh: Vec<bool> = (0..SHAPE[0]).map(|_| false).chain([true]).collect();
+        let rows: Vec<i64> = parents.iter().map(|&p| p as i64).collect();
+        let rows = Tensor::<1, Int>::from_data(burn::tensor::TensorData::new(rows, [parents.len()]), self.device);
+        let gradient = self.start().mul_scalar(0.5);
+        let (moved, moved_gradient) = (value.clone().select(0, rows.clone()), gradient.clone().select(0, rows));
+        let mut reordered = self.build()?;
+        reordered.restore(optimizer.state())?;
+        reordered.select_rows("gaussians/", &parents, &fresh)?;
+        let plain = to_vec(optimizer.step(NAME, value.clone(), gradient, &StepSettings::new(0.02))?, "values")?;
+        let after = to_vec(reordered.step(NAME, moved, moved_gradient, &StepSettings::new(0.02))?, "values")?;
+        for (row, &parent) in parents.iter().enumerate().take(SHAPE[0]) {
+            if after[row * SHAPE[1]..(row + 1) * SHAPE[1]] != plain[parent * SHAPE[1]..(parent + 1) * SHAPE[1]] {
+                return Ok(Some(format!("row {row}, which was row {parent}, takes another step")));
+            }
+        }
+        if reordered.select_rows("gaussians/", &[SHAPE[0] + 5], &[false]).is_ok() {
+            return Ok(Some("a row that there is not was selected".into()));
+        }
+        Ok(None)
+    }
+    fn state_continues(&self) -> Result<Option<String>> {
+        let mut whole = self.build()?;
+        let middle = self.descend(whole.as_mut(), self.start(), 7)?;
+        let (mut copy, mut forgetful) = (self.build()?, self.build()?);
+        copy.restore(whole.state())?;
+        forgetful.restore(whole.state())?;
+        forgetful.restart("gaussians/");
+        let step = |o: &mut dyn Optimizer| to_vec(self.descend(o, middle.clone(), 3)?, "values");
+        if step(whole.as_mut())? != step(copy.as_mut())? {
+            return Ok(Some("after its state is restored it takes other steps".into()));
+        }
+        if step(forgetful.as_mut())? != step(self.build()?.as_mut())? {
+            return Ok(Some("after its state is forgotten it takes other steps than a new one".into()));
+        }
+        let mut state = whole.state();
+        let Some(name) = state.arrays.keys().next().cloned() else { return Ok(None) };
+        if !name.starts_with(NAME) {
+            return Ok(Some(format!("the state array '{name}' does not begin with the name of its array")));
+        }
+        state.arrays.remove(&name);
+        Ok(self.build()?.restore(state).is_ok().then(|| format!("state without '{name}' was accepted")))
+    }
+}

@@ -1,0 +1,111 @@
+//! Mistakes that a conformance suite must find: a deformer that keeps all it learns per Gaussian, right once and wrong in many ways.
+
+use burn::tensor::{Device, Tensor};
+use cc4dgs_core::{
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures,
+    SpatialInput, conformance,
+};
+
+/// What is wrong with [`Velocities`].
+#[derive(Clone, Copy, PartialEq)]
+enum Mistake {
+    None,
+    DoubledGradient,
+    DetachedGradient,
+    NameTwice,
+    WrongShape,
+    Panic,
+    TimeNotChecked,
+    MissingAttributes,
+    NotFinite,
+}
+
+/// A velocity per Gaussian.
+struct Velocities(Mistake);
+
+impl Deformer for Velocities {
+    fn attributes(&self) -> Vec<AttributeSpec> {
+        let velocity = AttributeSpec::new("velocity", 3, 0.0, 1e-3);
+        if self.0 == Mistake::NameTwice { vec![velocity.clone(), velocity] } else { vec![velocity] }
+    }
+    fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
+        if self.0 != Mistake::MissingAttributes {
+            input.check("velocities", &self.attributes())?;
+        }
+        let velocity = input.attributes.first().cloned().unwrap_or_else(|| Tensor::zeros([input.len(), 3], &input.means_world.device()));
+        let values = match self.0 {
+            Mistake::DoubledGradient => velocity.clone().mul_scalar(2.0) - velocity.detach(),
+            Mistake::DetachedGradient => velocity.detach(),
+            _ => velocity,
+        };
+        Ok(SpatialFeatures { values, work: DeformerWork::default() })
+    }
+    fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
+        if !time_norm.is_finite() && self.0 != Mistake::TimeNotChecked {
+            return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
+        }
+        let means = features.mul_scalar(time_norm);
+        let means = match self.0 {
+            Mistake::WrongShape => means.narrow(1, 0, 2),
+            Mistake::NotFinite => means.div_scalar(0.0),
+            Mistake::Panic if time_norm > 0.5 => panic!("a mistake"),
+            _ => means,
+        };
+        Ok(Offsets { means: Some(means), ..Offsets::default() })
+    }
+    fn parameters(&self) -> Vec<&Parameter> {
+        Vec::new()
+    }
+    fn parameters_mut(&mut self) -> Vec<&mut Parameter> {
+        Vec::new()
+    }
+    fn groups(&self) -> Vec<ParameterGroup> {
+        Vec::new()
+    }
+}
+
+#[derive(serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoSettings {}
+
+type Build = fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>;
+
+fn findings(build: Build, schema: &'static str) -> String {
+    let info = Plugin { name: "velocities", version: "1", summary: "a test", paper: "", schema, capabilities: &["starts-as-identity"] };
+    conformance::deformer(&DeformerPlugin { info, build }, &toml::Table::new(), &Device::flex()).join("\n")
+}
+
+/// A build function per mistake, which function pointers cannot carry.
+macro_rules! with {
+    ($mistake:ident) => {
+        |settings, _, _| {
+            let NoSettings {} = cc4dgs_core::config::parse_section("deformer velocities", settings)?;
+            Ok(Box::new(Velocities(Mistake::$mistake)))
+        }
+    };
+}
+
+#[test]
+fn a_deformer_that_lives_in_its_attributes_conforms() {
+    assert_eq!(findings(with!(None), "# no settings\n"), "");
+}
+
+#[test]
+fn mistakes_are_found() {
+    let cases: [(Build, &str); 8] = [
+        (with!(DoubledGradient), "attribute velocity: the value rises"),
+        (with!(DetachedGradient), "no gradient reaches attribute velocity"),
+        (with!(NameTwice), "the name is used twice"),
+        (with!(WrongShape), "head means"),
+        (with!(Panic), "it panics"),
+        (with!(TimeNotChecked), "a time that is not a number was accepted"),
+        (with!(MissingAttributes), "without its attributes were accepted"),
+        (with!(NotFinite), "offsets are not finite"),
+    ];
+    for (build, wanted) in cases {
+        let found = findings(build, "# no settings\n");
+        assert!(found.contains(wanted), "expected '{wanted}' among:\n{found}");
+    }
+    let found = findings(with!(None), "speed = 1.0");
+    assert!(found.contains("schema"), "a schema that is not the default's TOML:\n{found}");
+}
