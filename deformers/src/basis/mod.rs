@@ -153,7 +153,11 @@ impl CdfBasis {
         within("learned", settings.learned, 0, 256)?;
         within("splines", settings.splines, 0, 1024)?;
         if (1..4).contains(&settings.splines) {
-            return Err(Error::parameter("deformer.splines", format!("{} splines are too few; cubic splines need 4", settings.splines), "Give 0 (none) or at least 4"));
+            return Err(Error::parameter(
+                "deformer.splines",
+                format!("{} splines are too few; cubic splines need 4", settings.splines),
+                "Give 0 (none) or at least 4",
+            ));
         }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
         if !(0.0..=4.0).contains(&settings.falloff) {
