@@ -43,11 +43,7 @@ pub struct RasterizerEntry {
     pub rules: Rules,
     /// Whether the antialiasing compensation was on.
     pub antialiased: bool,
-<<<<<<< HEAD
-    /// Smallest camera depth drawn, units of the model, where the rules' own was not used.
-=======
-    /// Smallest camera depth drawn, world units; absent if the rules' default was used.
->>>>>>> words
+    /// Smallest camera depth drawn, units of the model; absent if the rules' default was used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
     /// Its settings, without `kind`.
