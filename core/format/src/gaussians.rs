@@ -10,14 +10,10 @@ pub const fn sh_rest_len(degree: usize) -> usize {
     (degree + 1) * (degree + 1) - 1
 }
 
-<<<<<<< HEAD
 /// Names of the attributes every Gaussian has, in the order of [`HostGaussians::columns`].
 pub const CORE_ATTRIBUTES: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
 
-/// A per-Gaussian attribute a plug-in brings along (an embedding, a second rotation): `width` floats per Gaussian.
-=======
 /// A per-Gaussian attribute of a plug-in (an embedding, a second rotation): `width` floats per Gaussian.
->>>>>>> words
 ///
 /// `tolerance` and `needed` tell an encoder which errors are allowed. They are not stored; decoded attributes have neither.
 #[derive(Clone, Debug, PartialEq, Default)]
@@ -50,11 +46,7 @@ impl ExtraAttribute {
     pub fn within(self, tolerance: f32) -> Self {
         Self { tolerance: Some(tolerance), ..self }
     }
-<<<<<<< HEAD
-    /// The same values, of which only the rows that are true in `rows` `[N]` must be stored; the others may come back as `start`.
-=======
-    /// The same values. Only rows whose flag in `rows` [N] is set must be stored; others may be decoded as `start`.
->>>>>>> words
+    /// The same values. Only rows whose flag in `rows` `[N]` is set must be stored; others may be decoded as `start`.
     pub fn needed_in(self, rows: Vec<bool>, start: f32) -> Self {
         Self { needed: Some(NeededRows { rows, start }), ..self }
     }
@@ -77,11 +69,7 @@ pub struct HostGaussians {
     pub sh_dc: Vec<f32>,
     /// Colour coefficients of degree 1 and up, coefficient-major `[N, (d+1)^2-1, 3]`.
     pub sh_rest: Vec<f32>,
-<<<<<<< HEAD
-    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves iff its score is over the threshold `[N]`.
-=======
-    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves if and only if its score is above the threshold [N].
->>>>>>> words
+    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves if and only if its score is above the threshold `[N]`.
     pub dynamic_scores: Vec<f32>,
     /// Attributes of plug-ins by name.
     pub extra: BTreeMap<String, ExtraAttribute>,
