@@ -15,7 +15,7 @@ pub struct AppearanceContext {
 
 /// Turns rendered planes into those a camera records. Used in training only: held-out cameras and playback see the rendered image.
 pub trait Appearance: Send {
-    /// The planes [5,H,W] as training camera `camera` (0-based) records them; `None` is a camera that was not trained on, for which it must be the identity.
+    /// The planes `[5,H,W]` as training camera `camera` (0-based) records them; `None` is a camera that was not trained on, for which it must be the identity.
     /// Alpha and depth stay.
     fn apply(&self, planes: Tensor<3>, camera: Option<usize>) -> Result<Tensor<3>>;
     /// The weights, in a fixed order.
@@ -30,7 +30,7 @@ pub trait Appearance: Send {
     fn groups(&self) -> Vec<ParameterGroup> {
         Vec::new()
     }
-    /// A loss term [1] of its own.
+    /// A loss term `[1]` of its own.
     fn regularizer(&self) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }

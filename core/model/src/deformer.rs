@@ -24,7 +24,7 @@ pub struct Parameter {
     pub part: Part,
     /// The logical shape; `value` is flat.
     pub shape: Vec<usize>,
-    /// The weights, flat [product of shape].
+    /// The weights, flat `[product of shape]`.
     pub value: Tensor<1>,
     /// Index into [`Deformer::groups`].
     pub group: usize,
@@ -70,7 +70,7 @@ pub struct DeformerWork {
 /// Time-invariant features of M Gaussians and what they cost.
 #[derive(Clone, Debug)]
 pub struct SpatialFeatures {
-    /// Features [M, F]. Only the field itself reads them; what lies where is its own affair.
+    /// Features `[M, F]`. Only the field itself reads them; what lies where is its own affair.
     pub values: Tensor<2>,
     /// The work done for them.
     pub work: DeformerWork,
@@ -79,9 +79,9 @@ pub struct SpatialFeatures {
 /// What the time-invariant half of a deformer is computed from: M Gaussians.
 #[derive(Clone, Debug)]
 pub struct SpatialInput {
-    /// Canonical centres in world units [M,3]. They are constants: no gradient flows to them.
+    /// Canonical centres in world units `[M,3]`. They are constants: no gradient flows to them.
     pub means_world: Tensor<2>,
-    /// Values [M,width] of [`Deformer::attributes`], in that order. Gradients flow through them.
+    /// Values `[M,width]` of [`Deformer::attributes`], in that order. Gradients flow through them.
     pub attributes: Vec<Tensor<2>>,
 }
 
@@ -104,7 +104,7 @@ impl SpatialInput {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// The Gaussians `rows` [K] of these.
+    /// The Gaussians `rows` `[K]` of these.
     pub fn select(&self, rows: &Tensor<1, Int>) -> Self {
         self.map(|values| values.clone().select(0, rows.clone()))
     }
@@ -191,7 +191,7 @@ pub trait Deformer: Send {
     fn attributes(&self) -> Vec<AttributeSpec> {
         Vec::new()
     }
-    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F]; the same heads at every time.
+    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` `[M,F]`; the same heads at every time.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
     /// The same features as [`Deformer::deform`] reads them fastest. Playback asks for this once per spatial pass.
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
@@ -211,13 +211,13 @@ pub trait Deformer: Send {
     fn is_static(&self) -> bool {
         false
     }
-    /// A loss term [1] of the deformer's own, for the moving Gaussians at a time, at `progress` in 0..1 of the main stage.
+    /// A loss term `[1]` of the deformer's own, for the moving Gaussians at a time, at `progress` in 0..1 of the main stage.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
     /// How far the main stage of training is, 0 to 1; called before every step. Default: progress 1, as after training.
     fn set_progress(&mut self, _progress: f32) {}
-    /// After training, a smaller field that does nearly the same: without what this scene does not use. `features` [M,F] are those of all Gaussians that move,
+    /// After training, a smaller field that does nearly the same: without what this scene does not use. `features` `[M,F]` are those of all Gaussians that move,
     /// `times` the normalised times of the frames.
     fn simplified(&self, _features: Tensor<2>, _times: &[f32]) -> Result<Option<Simplified>> {
         Ok(None)

@@ -22,13 +22,13 @@ pub enum Statistic {
 /// What one rendered view says of N Gaussians. Fields that were not asked for are `None`.
 #[derive(Clone, Debug)]
 pub struct ViewStatistics {
-    /// Screen radius in pixels [N]; 0 where the Gaussian was culled.
+    /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
     pub radii: Tensor<1, Int>,
-    /// [`Statistic::ScreenGradient`] per pixel of x and y [N,2].
+    /// [`Statistic::ScreenGradient`] per pixel of x and y `[N,2]`.
     pub screen_gradient: Option<Tensor<2>>,
-    /// [`Statistic::AbsoluteScreenGradient`] per pixel of x and y [N,2].
+    /// [`Statistic::AbsoluteScreenGradient`] per pixel of x and y `[N,2]`.
     pub absolute_screen_gradient: Option<Tensor<2>>,
-    /// [`Statistic::MaxWeight`] in 0..1 [N].
+    /// [`Statistic::MaxWeight`] in 0..1 `[N]`.
     pub max_weights: Option<Tensor<1>>,
     /// Image size in pixels.
     pub size: (u32, u32),
@@ -205,7 +205,7 @@ pub trait DensityControl: Send {
     /// After the optimizer step of an iteration: what is due now, `None` for nothing. The trainer carries the plan out before the next iteration; the control's own statistics must
     /// fit the new set when this returns. Everything random comes from `seed`, which is another one in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
-    /// After every optimizer step: attributes with new values of all rows [N,width], which keep their optimizer state (the noise of 3DGS-MCMC).
+    /// After every optimizer step: attributes with new values of all rows `[N,width]`, which keep their optimizer state (the noise of 3DGS-MCMC).
     fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         Ok(Vec::new())
     }

@@ -12,7 +12,7 @@ type Regularizer<M> = Box<dyn Fn(&M, &SpatialInput, f32, f32) -> Result<Option<T
 /// Changes a module, weights excepted, as training advances.
 type Progress<M> = Box<dyn Fn(&mut M, f32) + Send>;
 
-/// A [`Deformer`] made of a module `M`: `spatial(module, input)` gives features [M,F], `deform(module, features, time_norm)` offsets.
+/// A [`Deformer`] made of a module `M`: `spatial(module, input)` gives features `[M,F]`, `deform(module, features, time_norm)` offsets.
 ///
 /// Both functions see the weights of the current step; gradients flow through them. Register it like any deformer: `build` returns it in a box.
 pub struct ModuleDeformer<M, S, D> {
@@ -54,7 +54,7 @@ where
         self.attributes = attributes;
         self
     }
-    /// A loss term [1] of its own: `term(module, input, time_norm, progress)`.
+    /// A loss term `[1]` of its own: `term(module, input, time_norm, progress)`.
     pub fn with_regularizer(mut self, term: impl Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send + 'static) -> Self {
         self.regularizer = Some(Box::new(term));
         self

@@ -18,23 +18,23 @@ const LEAST_NORM: f32 = 1e-12;
 /// Offsets are added to the raw parameters, before activation (paper Section IV-B; Swift4D, 4DGS, E-D3DGS), except where a field says otherwise.
 #[derive(Clone, Debug, Default)]
 pub struct Offsets {
-    /// Change of the centres in world units [M,3].
+    /// Change of the centres in world units `[M,3]`.
     pub means: Option<Tensor<2>>,
-    /// Change of the log-scales [M,3].
+    /// Change of the log-scales `[M,3]`.
     pub log_scales: Option<Tensor<2>>,
-    /// Change of the scales after activation, world units [M,3] (Deformable 3DGS, Grid4D). Results stay positive.
+    /// Change of the scales after activation, world units `[M,3]` (Deformable 3DGS, Grid4D). Results stay positive.
     pub scales: Option<Tensor<2>>,
-    /// Change of the raw quaternions [M,4].
+    /// Change of the raw quaternions `[M,4]`.
     pub quaternions: Option<Tensor<2>>,
-    /// Rotations in front of the canonical ones, axis times angle in radians, world axes [M,3]. Unlike sums of quaternions they compose, however far they turn.
+    /// Rotations in front of the canonical ones, axis times angle in radians, world axes `[M,3]`. Unlike sums of quaternions they compose, however far they turn.
     pub rotation_vectors: Option<Tensor<2>>,
     /// Whether quaternions are normalised before they are changed (Deformable 3DGS, Grid4D).
     pub unit_quaternions: bool,
-    /// Change of the opacity logits [M].
+    /// Change of the opacity logits `[M]`.
     pub opacity_logits: Option<Tensor<1>>,
-    /// Logarithm of a factor of the opacity after its activation, at most 0 [M] (Gaussians that come and go).
+    /// Logarithm of a factor of the opacity after its activation, at most 0 `[M]` (Gaussians that come and go).
     pub opacity_log_factor: Option<Tensor<1>>,
-    /// Change of all spherical-harmonics coefficients, degree 0 first [M, (d+1)^2, 3].
+    /// Change of all spherical-harmonics coefficients, degree 0 first `[M, (d+1)^2, 3]`.
     pub sh: Option<Tensor<3>>,
 }
 
@@ -96,7 +96,7 @@ impl Offsets {
         }
         Ok(())
     }
-    /// Applies the offsets to the Gaussians `rows` [M]; `None` means that row i of the offsets belongs to Gaussian i, for the first M.
+    /// Applies the offsets to the Gaussians `rows` `[M]`; `None` means that row i of the offsets belongs to Gaussian i, for the first M.
     /// Everything else is returned as it came.
     ///
     /// # Errors
@@ -159,7 +159,7 @@ impl Offsets {
         }
         moved
     }
-    /// Applies the offsets to `moving` [M] and writes the results over the first M Gaussians of `frame` [N >= M]: in place where nobody else holds them, and
+    /// Applies the offsets to `moving` `[M]` and writes the results over the first M Gaussians of `frame` [N >= M]: in place where nobody else holds them, and
     /// without touching what no head changes or the Gaussians behind.
     ///
     /// # Errors
@@ -190,7 +190,7 @@ impl Offsets {
         }
         Ok(frame)
     }
-    /// All heads side by side as one matrix [M, total width], for regularisers; `None` when every head is off.
+    /// All heads side by side as one matrix `[M, total width]`, for regularisers; `None` when every head is off.
     pub fn concatenated(&self) -> Option<Tensor<2>> {
         let mut parts: Vec<Tensor<2>> = Vec::new();
         parts.extend(self.means.clone());
@@ -205,7 +205,7 @@ impl Offsets {
     }
 }
 
-/// Quaternions [M,4] with the rotations `vectors` [M,3] in front of them; their lengths stay.
+/// Quaternions `[M,4]` with the rotations `vectors` `[M,3]` in front of them; their lengths stay.
 fn turned(quaternions: Tensor<2>, vectors: Tensor<2>) -> Tensor<2> {
     let angle = (vectors.clone() * vectors.clone()).sum_dim(1).add_scalar(LEAST_SQUARED_ANGLE).sqrt();
     let half = angle.clone().mul_scalar(0.5);
@@ -240,7 +240,7 @@ fn select<const D: usize>(values: &Tensor<D>, rows: Option<&Tensor<1, Int>>, cou
     }
 }
 
-/// `base` [N,…] with its first rows replaced by `first` [M,…].
+/// `base` `[N,…]` with its first rows replaced by `first` `[M,…]`.
 fn over<const D: usize>(base: Tensor<D>, first: Tensor<D>) -> Tensor<D> {
     let (dims, len) = (base.dims(), first.dims().iter().product::<usize>());
     if len == 0 || first.dims() == dims {

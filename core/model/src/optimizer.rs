@@ -12,7 +12,7 @@ pub struct StepSettings<'a> {
     pub lr: f64,
     /// Added to the denominator, where the optimizer has one.
     pub epsilon: f64,
-    /// Rows [N] that are 0 keep values and state; `None` steps all rows.
+    /// Rows `[N]` that are 0 keep values and state; `None` steps all rows.
     pub visible: Option<&'a Tensor<1, Int>>,
 }
 
@@ -26,7 +26,7 @@ impl StepSettings<'_> {
 /// What an optimizer keeps between steps, for checkpoints.
 #[derive(Clone, Debug, Default)]
 pub struct OptimizerState {
-    /// Arrays [N,W] by name; the name begins with that of the array they belong to and a slash.
+    /// Arrays `[N,W]` by name; the name begins with that of the array they belong to and a slash.
     pub arrays: BTreeMap<String, Tensor<2>>,
     /// Step counts by name of the array they belong to.
     pub steps: BTreeMap<String, u64>,
@@ -34,7 +34,7 @@ pub struct OptimizerState {
 
 /// Steps named arrays along their gradients.
 pub trait Optimizer: Send {
-    /// The values after one step. `value` and `gradient` are [N,W], plain tensors; an array that was not seen before starts with empty state.
+    /// The values after one step. `value` and `gradient` are `[N,W]`, plain tensors; an array that was not seen before starts with empty state.
     fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>>;
     /// Forgets the state of all arrays whose names begin with `prefix`.
     fn restart(&mut self, prefix: &str);

@@ -2,7 +2,7 @@
 
 use crate::{Error, Image8, Result};
 
-/// A picture as planes [C,H,W] of finite float64 values; 0..1 spans black to white.
+/// A picture as planes `[C,H,W]` of finite float64 values; 0..1 spans black to white.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Planes {
     width: usize,
@@ -12,7 +12,7 @@ pub struct Planes {
 }
 
 impl Planes {
-    /// Planes [channels, height, width]. Refuses empty pictures, a length that does not fit, and values that are not finite.
+    /// Planes `[channels, height, width]`. Refuses empty pictures, a length that does not fit, and values that are not finite.
     pub fn new(values: Vec<f64>, channels: usize, height: usize, width: usize) -> Result<Self> {
         let expected = channels.checked_mul(height).and_then(|n| n.checked_mul(width));
         if values.is_empty() || expected != Some(values.len()) {
@@ -24,7 +24,7 @@ impl Planes {
         }
         Ok(Self { width, height, channels, values })
     }
-    /// Float32 planes [channels, height, width] as they are.
+    /// Float32 planes `[channels, height, width]` as they are.
     pub fn from_f32(values: &[f32], channels: usize, height: usize, width: usize) -> Result<Self> {
         Self::new(values.iter().map(|&v| f64::from(v)).collect(), channels, height, width)
     }
@@ -68,7 +68,7 @@ impl Planes {
         let pixels = self.width * self.height;
         &self.values[channel * pixels..(channel + 1) * pixels]
     }
-    /// Refuses a pair of different shapes and a mask that is not [H,W].
+    /// Refuses a pair of different shapes and a mask that is not `[H,W]`.
     pub(super) fn check_pair(&self, other: &Self, mask: Option<&[bool]>) -> Result<()> {
         let shape = |p: &Self| (p.channels, p.height, p.width);
         if shape(self) != shape(other) {

@@ -121,7 +121,7 @@ impl Metric {
     pub fn protocol(&self) -> &Protocol {
         &self.protocol
     }
-    /// The score of `render` against `reference`, both planes [channels, height, width] in 0..1. A masked metric needs a mask [H,W], a whole one takes none.
+    /// The score of `render` against `reference`, both planes `[channels, height, width]` in 0..1. A masked metric needs a mask `[H,W]`, a whole one takes none.
     pub fn score(&self, reference: &[f32], render: &[f32], shape: [usize; 3], mask: Option<&[bool]>) -> Result<f64> {
         let [channels, height, width] = shape;
         let planes = |values: &[f32]| match self.protocol.rounding {

@@ -30,7 +30,7 @@ impl SsimConvention {
     }
 }
 
-/// SSIM of two pictures of data range 1, mean over windows and channels. With a mask [H,W], only windows centred on set pixels count.
+/// SSIM of two pictures of data range 1, mean over windows and channels. With a mask `[H,W]`, only windows centred on set pixels count.
 pub fn ssim(a: &Planes, b: &Planes, convention: SsimConvention, mask: Option<&[bool]>) -> Result<f64> {
     a.check_pair(b, mask)?;
     let means = channel_means(a, b, convention.padding(), mask)?;
