@@ -1,52 +1,54 @@
-//! Sorting Gaussians into a square so that neighbours in the square are alike (self-organising Gaussian grids, Morgenstern et al. 2024): a picture made of
-//! one of their numbers is then smooth, and pictures are what picture coders are good at.
+//! Sorts Gaussians into a square grid so that neighbours are similar (self-organising Gaussian grids, Morgenstern et al. 2024). An image of one of their
+//! components is then smooth and compresses well.
 //!
-//! From a start along a space-filling curve, pairs of places swap contents wherever both come closer to what lies around, looked at ever more closely.
+//! The initial order follows a space-filling curve. Then pairs of cells swap their Gaussians if that brings both closer to the blurred features around them. The
+//! radius of the blur shrinks from round to round.
 
 use cc4dgs_format::{HostGaussians, Seed};
 
-/// Numbers compared per Gaussian: centre, log-scales, colour.
+/// Features compared per Gaussian: centre, log-scales, colour.
 const FEATURES: usize = 9;
-/// Numbers beyond so many deviations count as that.
+/// Features are clamped to this many standard deviations.
 const FARTHEST: f32 = 3.0;
 /// Rounds of swaps per radius.
 const ROUNDS: u64 = 12;
-/// Each radius is so much of the one before.
+/// Each radius over the one before.
 const SHRINK: f32 = 0.8;
-/// Side of the blocks that the start is laid out in.
+/// Side of the blocks of the initial order, in cells.
 const BLOCK: usize = 8;
 
 type Feature = [f32; FEATURES];
 
-/// Side of the square that holds `count`.
+/// Side of the smallest square with at least `count` cells.
 pub(crate) fn side_of(count: usize) -> usize {
     let side = (count as f64).sqrt().ceil() as usize;
-    // Never one too small by rounding.
+    // The square root may be rounded down.
     if side * side < count { side + 1 } else { side }
 }
 
-/// An order of the Gaussians for a square of [`side_of`] places a side, row by row; what is over stays empty at its end. `by_curve` lists them along a curve.
+/// An order of the Gaussians for a square with sides of [`side_of`] cells, row by row; the last cells stay empty. `by_curve` lists the Gaussians along a
+/// space-filling curve.
 pub(crate) fn square_order(gaussians: &HostGaussians, by_curve: &[usize], seed: Seed) -> Vec<usize> {
     let count = gaussians.len();
     let side = side_of(count);
     let features = features(gaussians);
-    let mut places = laid_out(by_curve, side);
+    let mut square = laid_out(by_curve, side);
     let mut radius = side as f32 / 4.0;
     let mut turn = 0u64;
     while radius >= 1.0 {
-        let around = blurred(&places, &features, side, radius as usize);
+        let around = blurred(&square, &features, side, radius as usize);
         for _ in 0..ROUNDS {
             let number = seed.index(turn).value();
             let distance = 1 + (number >> 8) as usize % (radius as usize);
-            swap_round(&mut places, &features, &around, side, distance, number & 1 == 0);
+            swap_round(&mut square, &features, &around, side, distance, number & 1 == 0);
             turn += 1;
         }
         radius *= SHRINK;
     }
-    places
+    square
 }
 
-/// Standardised numbers.
+/// Standardised features: mean 0, standard deviation 1, clamped.
 fn features(gaussians: &HostGaussians) -> Vec<Feature> {
     let mut out = vec![[0.0; FEATURES]; gaussians.len()];
     for (part, values) in [&gaussians.means, &gaussians.log_scales, &gaussians.sh_dc].into_iter().enumerate() {
@@ -64,7 +66,7 @@ fn features(gaussians: &HostGaussians) -> Vec<Feature> {
     out
 }
 
-/// The curve laid into the square block by block, every other line of blocks backwards, so that far places of the square are far on the curve.
+/// Fills the square with the curve, block by block, every other row of blocks in reverse, so that neighbouring cells are near on the curve.
 fn laid_out(by_curve: &[usize], side: usize) -> Vec<usize> {
     let mut cells: Vec<(usize, usize)> = (0..side * side).filter(|&p| p < by_curve.len()).map(|p| (p / side, p % side)).collect();
     cells.sort_by_key(|&(row, column)| {
@@ -72,22 +74,22 @@ fn laid_out(by_curve: &[usize], side: usize) -> Vec<usize> {
         let block = if line.is_multiple_of(2) { column / BLOCK } else { side / BLOCK - column / BLOCK };
         (line, block, row, column)
     });
-    let mut places = vec![0; by_curve.len()];
+    let mut square = vec![0; by_curve.len()];
     for (cell, gaussian) in cells.into_iter().zip(by_curve) {
-        places[cell.0 * side + cell.1] = *gaussian;
+        square[cell.0 * side + cell.1] = *gaussian;
     }
-    places
+    square
 }
 
-/// Per place, the mean of the features within `radius` along both axes.
-fn blurred(places: &[usize], features: &[Feature], side: usize, radius: usize) -> Vec<Feature> {
-    let rows = places.len().div_ceil(side);
-    let mut along_rows = Vec::with_capacity(places.len());
-    for line in places.chunks(side) {
+/// For each cell, the mean of the features within `radius` along both axes.
+fn blurred(square: &[usize], features: &[Feature], side: usize, radius: usize) -> Vec<Feature> {
+    let rows = square.len().div_ceil(side);
+    let mut along_rows = Vec::with_capacity(square.len());
+    for line in square.chunks(side) {
         let values: Vec<&Feature> = line.iter().map(|&g| &features[g]).collect();
         along_rows.extend(means(&values, radius));
     }
-    let mut out = vec![[0.0; FEATURES]; places.len()];
+    let mut out = vec![[0.0; FEATURES]; square.len()];
     for column in 0..side {
         let values: Vec<&Feature> = (0..rows).filter_map(|row| along_rows.get(row * side + column)).collect();
         for (row, mean) in means(&values, radius).enumerate() {
@@ -97,7 +99,7 @@ fn blurred(places: &[usize], features: &[Feature], side: usize, radius: usize) -
     out
 }
 
-/// Means over windows from i - radius to i + radius, cut at the ends.
+/// Means over windows from i - radius to i + radius, clipped at the ends.
 fn means<'a>(values: &'a [&'a Feature], radius: usize) -> impl Iterator<Item = Feature> + 'a {
     let mut sum = [0.0f64; FEATURES];
     let (mut from, mut to) = (0, 0);
@@ -114,19 +116,20 @@ fn means<'a>(values: &'a [&'a Feature], radius: usize) -> impl Iterator<Item = F
     })
 }
 
-/// Every place meets the one `distance` to the right (or below), each at most once; they swap if that brings both together closer to what lies around.
-fn swap_round(places: &mut [usize], features: &[Feature], around: &[Feature], side: usize, distance: usize, sideways: bool) {
+/// Pairs every cell with the one `distance` to the right (or below), each cell at most once. A pair swaps if that lowers the sum of its squared distances from
+/// `around`.
+fn swap_round(square: &mut [usize], features: &[Feature], around: &[Feature], side: usize, distance: usize, sideways: bool) {
     let apart = |a: &Feature, b: &Feature| a.iter().zip(b).map(|(x, y)| (x - y) * (x - y)).sum::<f32>();
-    for here in 0..places.len() {
+    for here in 0..square.len() {
         let (row, column) = (here / side, here % side);
         let (along, there) = if sideways { (column, here + distance) } else { (row, here + distance * side) };
-        if (along / distance) % 2 == 1 || there >= places.len() || (sideways && column + distance >= side) {
+        if (along / distance) % 2 == 1 || there >= square.len() || (sideways && column + distance >= side) {
             continue;
         }
-        let (a, b) = (&features[places[here]], &features[places[there]]);
+        let (a, b) = (&features[square[here]], &features[square[there]]);
         let (at_a, at_b) = (&around[here], &around[there]);
         if apart(a, at_b) + apart(b, at_a) < apart(a, at_a) + apart(b, at_b) {
-            places.swap(here, there);
+            square.swap(here, there);
         }
     }
 }

@@ -4,9 +4,9 @@ use cc4dgs_format::Seed;
 use rand::Rng;
 use rayon::prelude::*;
 
-/// Points per unit of parallel work. Sums are taken within a unit and then over units in order, so threads do not show in the result.
-const UNIT: usize = 2048;
-/// Centres compared side by side.
+/// Points per task. Sums are taken within a task and then over tasks in order, so the result does not depend on the number of threads.
+const TASK: usize = 2048;
+/// Centres compared per SIMD block.
 const LANES: usize = 16;
 
 /// The nearest centre of each point.
@@ -42,7 +42,7 @@ pub fn cluster(points: &[f32], width: usize, k: usize, iterations: usize, seed: 
 /// The nearest of `centers` `[K,width]`, K at least 1, for each of `points` `[N,width]`.
 pub fn assign(points: &[f32], width: usize, centers: &[f32]) -> Assignment {
     let k = centers.len() / width;
-    // Blocks of LANES centres, dimension by dimension. The padding is infinitely far away.
+    // Blocks of LANES centres, one dimension after the other. Padding centres are infinitely far away.
     let mut blocks = vec![[f32::INFINITY; LANES]; k.div_ceil(LANES) * width];
     for (i, center) in centers.chunks_exact(width).enumerate() {
         center.iter().enumerate().for_each(|(d, &v)| blocks[(i / LANES) * width + d][i % LANES] = v);
@@ -73,8 +73,8 @@ pub fn assign(points: &[f32], width: usize, centers: &[f32]) -> Assignment {
 pub fn update(points: &[f32], width: usize, assignment: &Assignment, centers: &[f32]) -> Vec<f32> {
     let k = centers.len() / width;
     let partial: Vec<(Vec<f64>, Vec<u64>)> = points
-        .par_chunks(UNIT * width)
-        .zip(assignment.labels.par_chunks(UNIT))
+        .par_chunks(TASK * width)
+        .zip(assignment.labels.par_chunks(TASK))
         .map(|(points, labels)| {
             let (mut sums, mut counts) = (vec![0.0f64; k * width], vec![0u64; k]);
             for (point, &label) in points.chunks_exact(width).zip(labels) {
@@ -115,7 +115,7 @@ fn plus_plus(points: &[f32], width: usize, k: usize, seed: Seed) -> Vec<f32> {
     let mut nearest = vec![f32::INFINITY; n];
     loop {
         let center = points[chosen * width..(chosen + 1) * width].to_vec();
-        nearest.par_iter_mut().zip(points.par_chunks_exact(width)).with_min_len(UNIT).for_each(|(best, point)| {
+        nearest.par_iter_mut().zip(points.par_chunks_exact(width)).with_min_len(TASK).for_each(|(best, point)| {
             *best = best.min(squared_distance(point, &center));
         });
         centers.extend(center);
@@ -124,7 +124,7 @@ fn plus_plus(points: &[f32], width: usize, k: usize, seed: Seed) -> Vec<f32> {
             return centers;
         }
         let mut left = rng.random::<f64>() * total;
-        // Rounding may leave a rest at the end; the last point that is not a centre yet takes it.
+        // Rounding may leave a remainder at the end; then the last point that is not yet a centre is drawn.
         let fallback = nearest.iter().rposition(|&d| d > 0.0).unwrap_or(0);
         chosen = nearest
             .iter()
@@ -150,7 +150,7 @@ fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
 
 /// A float64 sum whose order does not depend on threads.
 fn ordered_sum(values: &[f32]) -> f64 {
-    let units: Vec<f64> = values.par_chunks(UNIT).map(|c| c.iter().map(|&v| f64::from(v)).sum()).collect();
+    let units: Vec<f64> = values.par_chunks(TASK).map(|c| c.iter().map(|&v| f64::from(v)).sum()).collect();
     units.iter().sum()
 }
 

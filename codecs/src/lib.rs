@@ -1,14 +1,13 @@
 //! Attribute codecs: Gaussians to bytes and back.
 //!
-//! * `raw`: float32, nothing lost; the base line of every size table.
+//! * `raw`: float32, lossless; the baseline of size tables.
 //! * `cca`: the compression of canonical attributes of CC-4DGS (paper Section IV-D).
-//!
-//! * `quantize`: every component by itself, in so many bits; the honest simple one.
-//! * `vq`: codebooks for shape and colour, as CompGS has them.
+//! * `quantize`: each component quantised separately; the baseline for lossy codecs.
+//! * `vq`: codebooks for shape and colour, as in CompGS.
 //! * `sorted-image`: Gaussians sorted into a square, their columns stored as images.
 //! * `spz`: Niantic's format, which viewers read.
 //!
-//! And weight codecs for the weights of deformation fields: `fp32`, `fp16`, `int8`.
+//! Weight codecs for the weights of deformers: `fp32`, `fp16`, `int8`.
 //!
 //! All register themselves; link this crate (`use cc4dgs_codecs as _;`, or [`link`] on wasm32) and look them up with [`cc4dgs_format::Entries`].
 
@@ -23,8 +22,8 @@ mod spz;
 mod vq;
 mod weights;
 
-/// Keeps every plug-in of this crate in the program. Linkers for wasm32 drop object files that nothing refers to, and plug-ins are found without being
-/// referred to; elsewhere `use cc4dgs_codecs as _;` is enough.
+/// Keeps every plug-in of this crate in the program. Linkers for wasm32 drop object files that nothing refers to, and no code refers to a plug-in. On other
+/// targets `use cc4dgs_codecs as _;` is enough.
 pub fn link() {
     let codecs = [cca::build, quantize::build, raw::build, sorted_image::build, spz::build, vq::build];
     std::hint::black_box((codecs, weights::build_fp32 as fn(&_) -> _));

@@ -2,10 +2,10 @@
 
 use rayon::prelude::*;
 
-/// Cells per axis, as bits.
+/// Bits per axis: 2^BITS cells.
 const BITS: u32 = 21;
 
-/// The indices of the points `[N,3]` along the Z-curve of their bounding box; equal cells keep their order.
+/// The indices `[N]` of the points `means` `[N,3]` along the Z-curve of their bounding box. Points of the same cell keep their order.
 pub fn order(means: &[f32]) -> Vec<usize> {
     let mut low = [f64::INFINITY; 3];
     let mut high = [f64::NEG_INFINITY; 3];
@@ -55,7 +55,7 @@ mod tests {
     fn octants_come_one_after_the_other() {
         let corners: Vec<f32> = (0..8).rev().flat_map(|i| [(i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32]).collect();
         assert_eq!(order(&corners), (0..8).rev().collect::<Vec<_>>());
-        assert_eq!(order(&[1.0; 9]), [0, 1, 2], "points in one place keep their order");
+        assert_eq!(order(&[1.0; 9]), [0, 1, 2], "equal points keep their order");
         assert!(order(&[]).is_empty());
     }
 }

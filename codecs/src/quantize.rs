@@ -1,4 +1,4 @@
-//! `quantize`: each component of each attribute by itself, in even steps between percentiles. No model, no training; what a cleverer codec must beat.
+//! `quantize`: each component of each attribute quantised separately and uniformly between percentiles. No training; the baseline for lossy codecs.
 
 use crate::morton;
 use cc4dgs_format::storage::{
@@ -11,13 +11,13 @@ use serde::Deserialize;
 
 /// Version of the stored form.
 const VERSION: u8 = 2;
-/// Share of the values at either end that may be kept exactly, beside the steps.
+/// Share of the values at either end that may be stored exactly, as outliers.
 const TAIL: f64 = 1e-3;
-/// A step is at most so many standard deviations times 2^-bits wide, or more bits are taken: percentiles of long-tailed values lie some ten deviations apart.
+/// Upper bound on the step, in standard deviations times 2^-bits; a wider step takes more bits. Percentiles of long-tailed values lie some ten deviations apart.
 const SPREAD: f64 = 8.0;
 
 pub(crate) const SCHEMA: &str = "\
-means = 16               # bits of a coordinate of a centre; 32 keeps float32 anywhere below
+means = 16               # bits per coordinate of a centre; here and below, 32 stores float32
 log_scales = 8
 quaternions = 8
 opacity_logits = 8
@@ -26,7 +26,7 @@ sh_rest = 6
 dynamic_scores = 8
 ";
 
-/// The settings, which are the columns of [`HostGaussians`].
+/// The names of the settings: the columns of [`HostGaussians`].
 const COLUMNS: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
 
 /// Bits per component of each attribute.
@@ -49,7 +49,7 @@ impl Default for Bits {
 }
 
 impl Bits {
-    /// By the name of a column of [`HostGaussians`].
+    /// The bits of a column of [`HostGaussians`], by name.
     fn of(&self, column: &str) -> u8 {
         match column {
             "means" => self.means,
@@ -61,7 +61,7 @@ impl Bits {
             _ => self.dynamic_scores,
         }
     }
-    /// A component of the column `name`.
+    /// Encodes one component of the column `name`.
     pub(crate) fn encode(&self, name: &str, values: &[f32]) -> Column {
         match self.of(name) {
             32 => column::encode_exact(values),
@@ -72,7 +72,7 @@ impl Bits {
         let lossy = COLUMNS.into_iter().filter(|c| self.of(c) != 32);
         lossy.map(|c| DeclaredLoss { attribute: c.into(), relative_rms: loss(self.of(c)) }).collect()
     }
-    /// The bits of a profile with `settings` on top, for `codec`.
+    /// The bits of a profile, overridden by `settings`; `codec` is the name in errors.
     pub(crate) fn from_settings(codec: &str, profile: &str, settings: &toml::Table) -> Result<Self> {
         let base = match profile {
             "" | "default" => Self::default(),
@@ -95,7 +95,7 @@ impl Bits {
     }
 }
 
-/// Largest relative error of a column in so many bits; 32 is exact.
+/// Largest root-mean-square error of a column at `bits` bits, over its standard deviation; 32 bits are exact.
 fn loss(bits: u8) -> f64 {
     if bits == 32 { 0.0 } else { SPREAD / f64::from(1u32 << bits) }
 }
@@ -107,7 +107,7 @@ struct Quantize {
 impl AttributeCodec for Quantize {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
         gaussians.validate("Gaussians to encode", &context.limits)?;
-        // Neighbours in space are neighbours in the streams, which Zstandard likes.
+        // In Morton order neighbours in the streams are similar, which Zstandard exploits.
         let sorted = gaussians.select(&morton::order(&gaussians.means));
         let (mut meta, mut escapes) = (vec![VERSION], Vec::new());
         Shape::of(&sorted).write(&mut meta)?;
@@ -143,8 +143,8 @@ inventory::submit! {
         info: Plugin {
             name: "quantize",
             version: "2",
-            summary: "every component by itself in 6 to 16 bits, no training",
-            paper: "the simple base line",
+            summary: "each component quantised separately to 6 to 16 bits, no training",
+            paper: "uniform quantisation",
             schema: SCHEMA,
             capabilities: &["lossy", "reorders", "profiles=default,high"],
         },

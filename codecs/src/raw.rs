@@ -55,7 +55,7 @@ inventory::submit! {
             name: "raw",
             version: "2",
             summary: "float32, bit-exact",
-            paper: "the uncompressed base line",
+            paper: "the uncompressed baseline",
             schema: "# no settings\n",
             capabilities: &["lossless", "profiles=default"],
         },

@@ -1,6 +1,6 @@
-//! `sorted-image`: Gaussians sorted into a square, each component a picture of the square (as gsplat's PNG compression and SOG do), in PNG.
+//! `sorted-image`: Gaussians sorted into a square, each component stored as a PNG image of the square (as in gsplat's PNG compression and SOG).
 //!
-//! Steps are those of `quantize`; only the order and the coder differ, so that the two codecs measure what pictures are worth.
+//! The quantisation is that of `quantize`; only the order and the coder differ. So comparing the two codecs measures the gain of image compression.
 
 use crate::grid_sort::{side_of, square_order};
 use crate::morton;
@@ -25,8 +25,8 @@ struct SortedImage {
     bits: Bits,
 }
 
-/// Bytes of codes as planes of one byte each, the low bytes of all codes before the high ones: a plane of a 16-bit code's high bytes is smooth, one of low
-/// bytes is noise, and mixed they are both noise to a picture coder.
+/// Codes as byte planes, the low bytes of all codes before the high ones. The high bytes of 16-bit codes form a smooth plane and the low bytes a noisy one; mixed,
+/// both would look like noise to an image coder.
 fn planes(columns: &[Column], count: usize) -> Vec<u8> {
     let mut out = Vec::new();
     for column in columns {
@@ -54,31 +54,31 @@ fn codes(planes: &[u8], widths: &[usize], count: usize) -> Vec<u8> {
 fn to_png(planes: &[u8], count: usize) -> Result<Vec<u8>> {
     let side = side_of(count);
     let failed = |e: png::EncodingError| Error::backend("PNG", e.to_string(), "Report this as a defect");
-    let mut picture = Vec::new();
+    let mut image = Vec::new();
     for plane in planes.chunks(count.max(1)) {
-        picture.extend(plane);
-        // What is over repeats the last, which costs next to nothing.
-        picture.extend(std::iter::repeat_n(plane[plane.len() - 1], side * side - plane.len()));
+        image.extend(plane);
+        // The last code fills the remaining cells; a run costs almost no bytes.
+        image.extend(std::iter::repeat_n(plane[plane.len() - 1], side * side - plane.len()));
     }
     let mut out = Vec::new();
-    let mut encoder = Encoder::new(&mut out, side as u32, (picture.len() / side) as u32);
+    let mut encoder = Encoder::new(&mut out, side as u32, (image.len() / side) as u32);
     encoder.set_color(ColorType::Grayscale);
     encoder.set_depth(BitDepth::Eight);
     encoder.set_filter(Filter::Adaptive);
     encoder.set_compression(png::Compression::High);
     let mut writer = encoder.write_header().map_err(failed)?;
-    writer.write_image_data(&picture).map_err(failed)?;
+    writer.write_image_data(&image).map_err(failed)?;
     writer.finish().map_err(failed)?;
     Ok(out)
 }
 
-/// The planes of a picture that must hold `wanted` of them.
+/// The planes of a PNG image, which must hold `wanted` planes of `count` codes.
 fn from_png(object: &str, bytes: &[u8], count: usize, wanted: usize) -> Result<Vec<u8>> {
     let damaged = |problem: String| Error::data(object, problem, "The file is damaged");
     let side = side_of(count);
-    // Decoders of pictures are content with less, and with more.
+    // PNG decoders accept missing and trailing bytes.
     if !bytes.ends_with(&END) {
-        return Err(damaged("the picture does not end where it should".into()));
+        return Err(damaged("the image stream has trailing bytes or ends early".into()));
     }
     let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), PngLimits { bytes: (4 * side * side * wanted).max(1 << 20) });
     decoder.set_transformations(png::Transformations::IDENTITY);
@@ -87,11 +87,11 @@ fn from_png(object: &str, bytes: &[u8], count: usize, wanted: usize) -> Result<V
     let fits =
         (info.width as usize, info.height as usize) == (side, side * wanted) && info.color_type == ColorType::Grayscale && info.bit_depth == BitDepth::Eight;
     if !fits {
-        return Err(damaged(format!("a picture of {}x{} where gray {side}x{} is due", info.width, info.height, side * wanted)));
+        return Err(damaged(format!("the image is {}x{}, expected 8-bit grey of {side}x{}", info.width, info.height, side * wanted)));
     }
-    let mut picture = vec![0; side * side * wanted];
-    reader.next_frame(&mut picture).and_then(|_| reader.finish()).map_err(|e| damaged(e.to_string()))?;
-    Ok(picture.chunks(side * side).flat_map(|plane| &plane[..count]).copied().collect())
+    let mut image = vec![0; side * side * wanted];
+    reader.next_frame(&mut image).and_then(|_| reader.finish()).map_err(|e| damaged(e.to_string()))?;
+    Ok(image.chunks(side * side).flat_map(|plane| &plane[..count]).copied().collect())
 }
 
 impl AttributeCodec for SortedImage {
@@ -107,7 +107,7 @@ impl AttributeCodec for SortedImage {
             let columns: Vec<Column> = split(values, width).iter().map(|c| self.bits.encode(name, c)).collect();
             store(&columns, &mut meta, &mut escapes);
             let planes = planes(&columns, count);
-            // Columns of one value have no codes, and pictures have at least one plane.
+            // Constant columns have no codes, and an image needs at least one plane.
             let bytes = if planes.is_empty() { Vec::new() } else { to_png(&planes, count)? };
             streams.push(Stream { name: name.into(), bytes });
         }
@@ -121,13 +121,13 @@ impl AttributeCodec for SortedImage {
         for (name, width, values) in out.columns_mut() {
             let widths = column::widths(meta.clone(), width)?;
             let wanted: usize = widths.iter().sum();
-            let picture = set.reader(name)?;
+            let image = set.reader(name)?;
             let object = format!("sorted-image stream '{name}'");
             let planes = if wanted * shape.count == 0 {
-                picture.finish()?;
+                image.finish()?;
                 Vec::new()
             } else {
-                from_png(&object, picture.rest(), shape.count, wanted)?
+                from_png(&object, image.rest(), shape.count, wanted)?
             };
             let codes = codes(&planes, &widths, shape.count);
             *values = interleave(&load(ByteReader::new(object, &codes), shape.count, width, &mut meta, &mut escapes)?, shape.count);
@@ -149,7 +149,7 @@ inventory::submit! {
         info: Plugin {
             name: "sorted-image",
             version: "2",
-            summary: "Gaussians sorted into a square, every component a PNG picture of it",
+            summary: "Gaussians sorted into a square, each component stored as a PNG image",
             paper: "Self-Organizing Gaussian Grids (Morgenstern et al. 2024); gsplat's PNG compression",
             schema: crate::quantize::SCHEMA,
             capabilities: &["lossy", "reorders", "profiles=default,high"],

@@ -1,22 +1,22 @@
-//! `spz`: Niantic's format as a codec. The file itself is [`cc4dgs_format::spz`]; what it cannot hold lies beside it.
+//! `spz`: Niantic's format as a codec. The file itself is [`cc4dgs_format::spz`]; additional streams hold what SPZ cannot.
 
 use cc4dgs_format::spz::{LARGEST, from_spz, to_spz};
 use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams, open, relative_rms};
 use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
 
-/// Index of the dynamic scores among the columns, the last.
+/// Index of the dynamic scores, the last column.
 const SCORES: usize = 6;
 /// Version of the streams around the file.
 const VERSION: u8 = 2;
 /// The stream that is an SPZ file.
 const FILE: &str = "spz";
-/// The stream of columns that SPZ cannot hold: dynamic scores always, others where it would lose more than is declared.
+/// The stream of columns that SPZ cannot hold: always the dynamic scores, and any column whose loss in SPZ is larger than declared.
 const BESIDE: &str = "beside";
 
 const SCHEMA: &str = "\
-sh1_bits = 5             # of the harmonics' coefficients of degree 1 (Niantic: 5), 1 to 8
-sh_rest_bits = 4         # and of those above (Niantic: 4)
+sh1_bits = 5             # bits per spherical-harmonics coefficient of degree 1 (Niantic: 5), 1 to 8
+sh_rest_bits = 4         # bits per coefficient of higher degrees (Niantic: 4), 1 to 8
 ";
 
 #[derive(Clone, Copy, Debug, Deserialize)]
@@ -37,12 +37,12 @@ impl AttributeCodec for Spz {
         let found = from_spz("SPZ just written", &file, &context.limits)?;
         let losses = self.losses();
         let mut beside = Vec::new();
-        for (place, ((name, _, before), (_, _, after))) in gaussians.columns().into_iter().zip(found.columns()).enumerate() {
+        for (index, ((name, _, before), (_, _, after))) in gaussians.columns().into_iter().zip(found.columns()).enumerate() {
             let allowed = losses.iter().find(|l| l.attribute == name).map_or(0.0, |l| l.relative_rms);
-            // Not within the bounds is also what compares with nothing.
+            // NaN is not within the bounds either.
             let within = relative_rms(before, after) <= allowed;
             if allowed == 0.0 || !within {
-                beside.push(place as u8);
+                beside.push(index as u8);
                 beside.extend(before.iter().flat_map(|v| v.to_le_bytes()));
             }
         }
@@ -62,12 +62,12 @@ impl AttributeCodec for Spz {
         let mut beside = set.reader(BESIDE)?;
         let mut next = 0;
         while beside.remaining() > 0 {
-            let place = usize::from(beside.u8()?);
-            let Some((_, width, values)) = out.columns_mut().into_iter().nth(place).filter(|_| place >= next) else {
-                return Err(beside.error(format!("column {place} is unknown or there twice")));
+            let index = usize::from(beside.u8()?);
+            let Some((_, width, values)) = out.columns_mut().into_iter().nth(index).filter(|_| index >= next) else {
+                return Err(beside.error(format!("column {index} is unknown or appears twice")));
             };
             *values = beside.f32s(shape.count * width)?;
-            next = place + 1;
+            next = index + 1;
         }
         if next != SCORES + 1 {
             return Err(beside.error("the dynamic scores are missing"));
@@ -77,7 +77,7 @@ impl AttributeCodec for Spz {
         Ok(out)
     }
     fn losses(&self) -> Vec<DeclaredLoss> {
-        // Of the harmonics, half a step over a deviation of some hundredths. Quaternions lose their length and sign, which nothing depends on.
+        // Harmonics: half a step over a standard deviation of some hundredths. Quaternions lose their length and sign, which do not change the rotation.
         let harmonics = 16.0 * f64::from(1u32 << (8 - self.sh_rest_bits.min(self.sh1_bits))) / 256.0;
         [("means", 1e-3), ("log_scales", 0.1), ("quaternions", 2.5), ("opacity_logits", 1.0), ("sh_dc", 0.1), ("sh_rest", harmonics)]
             .map(|(attribute, relative_rms)| DeclaredLoss { attribute: attribute.into(), relative_rms })
@@ -110,7 +110,7 @@ inventory::submit! {
         info: Plugin {
             name: "spz",
             version: "2",
-            summary: "Niantic's SPZ, which most viewers of static Gaussians read; scores and plug-in attributes beside it",
+            summary: "Niantic's SPZ, which most viewers of static Gaussians read; scores and plug-in attributes in additional streams",
             paper: "Niantic SPZ 3",
             schema: SCHEMA,
             capabilities: &["lossy", "profiles=default,high"],

@@ -1,7 +1,6 @@
-//! `vq`: codebooks for scales, rotations and higher colour coefficients, even steps for the rest (the idea of CompGS, Navaneet et al. 2024).
+//! `vq`: codebooks for scales, rotations and higher colour coefficients, uniform quantisation for the rest (after CompGS, Navaneet et al. 2024).
 //!
-//! A codebook is worth its bytes only where rows resemble each other. Where the best codebook loses more than is declared, the attribute is stored in even
-//! steps instead.
+//! A codebook saves bytes only if rows are similar. If the best codebook loses more than is declared, the attribute is quantised uniformly instead.
 
 use crate::{kmeans, morton};
 use cc4dgs_format::storage::{
@@ -19,18 +18,18 @@ use serde::Deserialize;
 const VERSION: u8 = 2;
 /// The attributes that get codebooks.
 const BOOKS: [&str; 3] = ["log_scales", "quaternions", "sh_rest"];
-/// What the others may lose, by their bits.
+/// The other attributes: name, bits, largest root-mean-square error over the standard deviation.
 const STEPS: [(&str, u8, f64); 4] = [("means", 16, 2e-4), ("opacity_logits", 8, 0.03), ("sh_dc", 8, 0.03), ("dynamic_scores", 8, 0.03)];
-/// What a codebook may lose of an attribute.
+/// Largest root-mean-square error of a codebook, over the attribute's standard deviation.
 const BOOK_LOSS: f64 = 0.5;
-/// Bits of the even steps that replace a codebook, and the share of outliers kept beside steps.
+/// Bits of the uniform quantiser that replaces a codebook, and the share of values that may be stored as outliers.
 const REPLACEMENT_BITS: u8 = 8;
 const TAIL: f64 = 1e-3;
 
 const SCHEMA: &str = "\
 codebook = 4096          # rows of a codebook, at most 65536
-iterations = 8           # of K-means
-sample = 32768           # rows it looks at while it learns
+iterations = 8           # k-means iterations
+sample = 32768           # rows that k-means is trained on
 ";
 
 #[derive(Clone, Copy, Debug, Deserialize)]
@@ -50,7 +49,7 @@ impl Default for Settings {
 struct Vq(Settings);
 
 impl Vq {
-    /// A codebook for `rows` `[N,width]` and which of its rows each is; `None` where it would lose too much.
+    /// A codebook for `rows` `[N,width]` and the codebook index of each row; `None` if its error is over the limit.
     fn book(&self, rows: &[f32], width: usize, seed: Seed) -> Option<(Vec<f32>, Vec<u32>)> {
         let n = rows.len().checked_div(width).unwrap_or(0);
         if n == 0 {
@@ -165,7 +164,7 @@ inventory::submit! {
         info: Plugin {
             name: "vq",
             version: "2",
-            summary: "codebooks for scales, rotations and colours, even steps for the rest",
+            summary: "codebooks for scales, rotations and colours, uniform quantisation for the rest",
             paper: "CompGS (Navaneet et al. 2024)",
             schema: SCHEMA,
             capabilities: &["lossy", "reorders", "profiles=default"],

@@ -1,4 +1,4 @@
-//! Weight codecs: a field's weights as float32, as 16-bit floats, or as 8-bit integers with a scale per row.
+//! Weight codecs: a deformer's weights as float32, as 16-bit floats, or as 8-bit integers with a scale per row.
 
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::storage::{StreamSet, read_shapes, value_count, write_shapes};
@@ -6,7 +6,7 @@ use cc4dgs_format::{CodecContext, Error, Plugin, Result, Stream, WeightArray, We
 use half::f16;
 use serde::Deserialize;
 
-/// Values that share a scale in `int8`.
+/// Values per scale in `int8`.
 const ROW: usize = 64;
 /// Largest 8-bit code.
 const PEAK: f32 = 127.0;
@@ -32,7 +32,7 @@ impl Precision {
             Self::Int8 => "int8",
         }
     }
-    /// Bytes that `count` values take; `None` where no memory could hold them.
+    /// Bytes of `count` values; `None` on overflow.
     fn bytes(self, count: usize) -> Option<usize> {
         match self {
             Self::Fp32 => count.checked_mul(4),
@@ -45,7 +45,7 @@ impl Precision {
             Self::Fp32 => out.extend(values.iter().flat_map(|v| v.to_le_bytes())),
             Self::Fp16 => {
                 if let Some(v) = values.iter().find(|v| !f16::from_f32(**v).is_finite()) {
-                    return Err(Error::parameter(format!("weights '{name}'"), format!("{v} is beyond what fp16 holds (65,504)"), "Store the field as fp32"));
+                    return Err(Error::parameter(format!("weights '{name}'"), format!("{v} is over the limit of fp16 (65,504)"), "Store the weights as fp32"));
                 }
                 out.extend(values.iter().flat_map(|v| f16::from_f32(*v).to_le_bytes()));
             }
@@ -53,7 +53,7 @@ impl Precision {
                 for row in values.chunks(ROW) {
                     let scale = row.iter().fold(0.0f32, |m, v| m.max(v.abs())) / PEAK;
                     out.extend(scale.to_le_bytes());
-                    // A scale that underflows to 0 stands for zeros.
+                    // A scale that underflows to 0 means that all values are zero.
                     out.extend(row.iter().map(|v| if scale > 0.0 { (v / scale).round().clamp(-PEAK, PEAK) as i8 as u8 } else { 0 }));
                 }
             }
@@ -67,7 +67,7 @@ impl Precision {
                 let bytes = reader.take(2 * count)?;
                 let values: Vec<f32> = bytes.as_chunks::<2>().0.iter().map(|b| f16::from_le_bytes(*b).to_f32()).collect();
                 match values.iter().find(|v| !v.is_finite()) {
-                    Some(v) => Err(reader.error(format!("a weight is {v}"))),
+                    Some(v) => Err(reader.error(format!("a weight is {v}, which is not finite"))),
                     None => Ok(values),
                 }
             }
@@ -77,7 +77,7 @@ impl Precision {
                     let scale = reader.f32()?;
                     let row = reader.take(ROW.min(count - values.len()))?;
                     if !(0.0..=f32::MAX / 128.0).contains(&scale) {
-                        return Err(reader.error(format!("a row of weights has scale {scale}")));
+                        return Err(reader.error(format!("a row of weights has the scale {scale}, expected a finite number of at least 0")));
                     }
                     values.extend(row.iter().map(|&b| f32::from(b as i8) * scale));
                 }
@@ -96,7 +96,7 @@ impl WeightCodec for Precision {
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<Vec<WeightArray>> {
         let mut reader = StreamSet::new(self.name(), streams).reader(WEIGHTS)?;
-        context.limits.check_bytes("field weights", reader.remaining() as u64)?;
+        context.limits.check_bytes("deformer weights", reader.remaining() as u64)?;
         let mut arrays = read_shapes(&mut reader)?;
         for array in &mut arrays {
             let fits = |n: &usize| self.bytes(*n).is_some_and(|bytes| bytes <= reader.remaining());
@@ -111,9 +111,9 @@ impl WeightCodec for Precision {
     fn loss(&self) -> f64 {
         match self {
             Self::Fp32 => 0.0,
-            // Eleven bits of mantissa, rounded.
+            // The rounding of an 11-bit significand.
             Self::Fp16 => 1.0 / 2048.0,
-            // Half a step, and the rounding of the scale.
+            // Half a step, plus the rounding of the scale.
             Self::Int8 => 0.5 / 127.0 + 1e-5,
         }
     }
@@ -139,7 +139,7 @@ inventory::submit! {
             name: "fp32",
             version: "1",
             summary: "float32, bit-exact",
-            paper: "the uncompressed base line",
+            paper: "the uncompressed baseline",
             schema: "# no settings\n",
             capabilities: &["lossless"],
         },
@@ -192,7 +192,7 @@ mod tests {
             assert!(worst <= allowed, "{}: {worst}", precision.name());
         }
         assert!(Precision::Fp16.write("w", &[1e6], &mut Vec::new()).is_err());
-        assert!(Precision::Int8.read(&mut ByteReader::new("w", &[0, 0, 192, 127, 5]), 1).is_err(), "a scale that is no number");
+        assert!(Precision::Int8.read(&mut ByteReader::new("w", &[0, 0, 192, 127, 5]), 1).is_err(), "a scale that is not a number");
     }
 
     #[test]

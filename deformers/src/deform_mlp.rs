@@ -1,4 +1,4 @@
-//! Deformable-3DGS's field: a network of eight layers on positionally encoded centre and time (Yang et al. 2024).
+//! The deformer of Deformable-3DGS: a network of eight layers on positionally encoded centre and time (Yang et al. 2024).
 //!
 //! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code.
 
@@ -17,10 +17,10 @@ use std::sync::Arc;
 
 const SCHEMA: &str = r#"width = 256
 layers = 8
-skip = 5                 # the input joins again after so many layers
+skip = 5                 # the input is concatenated again after this many layers
 position_bands = 10      # sines and cosines of x * 2^0 ... 2^9
-time_bands = 10          # of t; the published code takes 6 on synthetic scenes
-time_network = false     # a network of its own for time (256 wide, 30 numbers), as on synthetic scenes
+time_bands = 10          # of t; the published code uses 6 on synthetic scenes
+time_network = false     # a separate network for time (256 wide, 30 outputs), as on synthetic scenes
 lr_start = 8e-4          # Adam, log-linear to lr_end
 lr_end = 1.6e-6
 "#;
@@ -49,7 +49,7 @@ impl Default for Settings {
     }
 }
 
-/// Parameters: layers before the skip, layers after it with the heads, the time network if there is one.
+/// Parameters: layers before the skip, layers after it with the heads, the optional time network.
 struct DeformMlp {
     settings: Settings,
     before: Arc<ReluShape>,
@@ -124,7 +124,7 @@ impl Deformer for DeformMlp {
             mlp_relu(Tensor::cat(vec![input, hidden], 1), self.parameters[1].value.clone(), &self.after)?
         };
         let [means, rotation, scales]: [Tensor<2>; 3] =
-            outputs.try_into().map_err(|_| Error::backend("deformer deform-mlp", "it has another number of heads", "Report this as a defect"))?;
+            outputs.try_into().map_err(|_| Error::backend("deformer deform-mlp", "the network returned another number of heads", "Report this as a defect"))?;
         Ok(Offsets { means: Some(means), quaternions: Some(rotation), unit_quaternions: true, scales: Some(scales), ..Offsets::default() })
     }
     fn parameters(&self) -> Vec<&Parameter> {

@@ -1,7 +1,7 @@
-//! E-D3DGS's field: no coordinates, but a learned vector per Gaussian and one per time, into a coarse and a fine network (Bae et al. 2024).
+//! The deformer of E-D3DGS: a learned vector per Gaussian and one per time, instead of coordinates, feed a coarse and a fine network (Bae et al. 2024).
 //!
-//! The table of times is read by linear interpolation, resized first: the coarse network sees few rows, the fine one all of it. The
-//! published code's time offsets per camera are left out; a model here has no cameras.
+//! The table of times is resized and then read by linear interpolation: the coarse network sees few rows, the fine one all of them. The
+//! published code's time offsets per camera are omitted, because a model here has no cameras.
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
@@ -17,20 +17,20 @@ use cc4dgs_core::{
 use serde::Deserialize;
 use std::sync::Arc;
 
-const SCHEMA: &str = r#"gaussian_features = 32   # learned per Gaussian
-time_features = 256      # learned per time
+const SCHEMA: &str = r#"gaussian_features = 32   # width of the learned vector per Gaussian
+time_features = 256      # width of the learned vector per time
 time_rows = 150          # rows of the table of times (published: 150, Technicolor 25)
-coarse_rows = 30         # what the coarse network sees of it (30; Technicolor 5)
-rows_grow = 0.125        # share of training over which the fine network's rows grow from those of the coarse one to all (10,000 of 80,000 iterations)
-fade_in = 0.0125         # share of training over which changes come in; opacity, colour and scale five such shares later (1,000 of 80,000)
+coarse_rows = 30         # rows that the coarse network sees (published: 30, Technicolor 5)
+rows_grow = 0.125        # share of training over which the fine network's rows grow from the coarse network's number to all (10,000 of 80,000 iterations)
+fade_in = 0.0125         # share of training over which offsets are faded in; opacity, colour and scale start five such shares later (1,000 of 80,000)
 width = 128
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
-gaussian_lr = 2.5e-3     # Adam on what is learned per Gaussian
-lr_start = 1.6e-4        # and on the rest, times the extent of the cameras, log-linear to lr_end
+gaussian_lr = 2.5e-3     # Adam on the vectors of Gaussians
+lr_start = 1.6e-4        # Adam on everything else, times the extent of the cameras, log-linear to lr_end
 lr_end = 1.6e-5
 "#;
 
-/// Name of the attribute among the Gaussians' extras.
+/// Name of the extra attribute.
 const ATTRIBUTE: &str = "embedding";
 
 #[derive(Clone, Debug, Deserialize)]
@@ -73,7 +73,7 @@ struct Embedding {
     sh_degree: usize,
     network: Arc<ReluShape>,
     parameters: Vec<Parameter>,
-    /// How far training is.
+    /// Progress of the main stage, 0..1.
     progress: f32,
 }
 
@@ -86,14 +86,14 @@ impl Embedding {
         within("width", settings.width, 1, 4096)?;
         for (name, share) in [("rows_grow", settings.rows_grow), ("fade_in", settings.fade_in)] {
             if !(0.0..=1.0).contains(&share) {
-                return Err(Error::parameter(format!("deformer.{name}"), format!("{share} is no share"), "Give 0 to 1"));
+                return Err(Error::parameter(format!("deformer.{name}"), format!("{share} is not in 0..1"), "Give a share from 0 to 1"));
             }
         }
         heads::check(&settings.heads)?;
         let (w, input) = (settings.width, settings.gaussian_features + settings.time_features);
         let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
         let seed = context.seed;
-        // Normal with deviation 0.01 / sqrt(width), by its uniform counterpart.
+        // Uniform with the standard deviation of the published normal: 0.01 / sqrt(width).
         let bound = 0.01 * 3f32.sqrt() / (settings.time_features as f32).sqrt();
         let times = weights::uniform(seed.child("times"), settings.time_rows * settings.time_features, bound);
         let mut parameters = vec![parameter("grid.times".into(), Part::Grid, 0, times, device)];
@@ -108,7 +108,7 @@ impl Embedding {
         }
         Ok(Self { sh_degree: context.sh_degree, network: Arc::new(network), parameters, settings, progress: 1.0 })
     }
-    /// The row [1, F] at a time of the table resized to `rows` rows, corners aligned.
+    /// The row [1, F] at `time_norm` of the table resized to `rows` rows, corners aligned.
     fn time_row(&self, time_norm: f32, rows: usize) -> Tensor<2> {
         let s = &self.settings;
         let table = self.parameters[0].value.clone().reshape([s.time_rows, s.time_features]);
@@ -116,7 +116,7 @@ impl Embedding {
             let low = (position.floor() as usize).min(last.saturating_sub(1));
             (low, (position - low as f64) as f32)
         };
-        // Two rows of the small table, each a mixture of two rows of the stored one: four weights.
+        // Two rows of the resized table, each interpolated from two rows of the stored one: four weights.
         let mut mixture = vec![0.0f32; s.time_rows];
         let (low, part) = between(f64::from(time_norm.clamp(0.0, 1.0)) * (rows - 1) as f64, rows - 1);
         for (row, share) in [(low, 1.0 - part), (low + 1, part)] {
@@ -127,7 +127,7 @@ impl Embedding {
         let mixture = Tensor::<2>::from_data(TensorData::new(mixture, [1, s.time_rows]), &table.device());
         mixture.matmul(table)
     }
-    /// Rows of the table of times that the fine network sees by now.
+    /// Rows of the table of times that the fine network sees at the current progress.
     fn fine_rows(&self) -> usize {
         let s = &self.settings;
         if self.progress >= s.rows_grow {
@@ -136,7 +136,8 @@ impl Embedding {
         let part = self.progress / s.rows_grow;
         (s.coarse_rows + ((s.time_rows - s.coarse_rows) as f32 * part) as usize).clamp(2, s.time_rows)
     }
-    /// How much of a head's change counts by now. Published are 1,000 iterations, and 1,000 after the first 5,000 for what changes looks.
+    /// Fade-in factor of a head at the current progress, 0..1. The published code fades in over 1,000 iterations; opacity, colour and scale over 1,000 after the
+    /// first 5,000.
     fn share_of(&self, head: Head) -> f32 {
         let fade = self.settings.fade_in;
         let begun = match head {
@@ -206,7 +207,7 @@ mod tests {
         let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
         let settings = Settings { time_rows: 90, coarse_rows: 10, ..Settings::default() };
         let mut field = Embedding::new(settings, &context, &Device::flex()).unwrap();
-        assert_eq!((field.fine_rows(), field.share_of(Head::Sh)), (90, 1.0), "a field that was never told is trained");
+        assert_eq!((field.fine_rows(), field.share_of(Head::Sh)), (90, 1.0), "the default progress is that of a trained deformer");
         for (progress, rows, means, colors) in
             [(0.0, 10, 0.0, 0.0), (0.00625, 14, 0.5, 0.0), (0.0625, 50, 1.0, 0.0), (0.06875, 54, 1.0, 0.5), (0.5, 90, 1.0, 1.0)]
         {

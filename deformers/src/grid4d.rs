@@ -1,7 +1,7 @@
-//! Grid4D's field: a spatial hash grid whose features, turned into attention, weigh those of three grids over pairs of axes and time (Xu et al. 2024).
+//! The deformer of Grid4D: a spatial hash grid whose features, turned into attention, weigh those of three grids over pairs of axes and time (Xu et al. 2024).
 //!
-//! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are taken
-//! from the field's box rather than from a fixed bound per dataset. R(q) passes no gradient to the canonical centre.
+//! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are normalised
+//! by the deformer's box rather than by a fixed bound per dataset. R(q) passes no gradient to the canonical centre.
 
 use crate::parts::centres::{check_time, column, finite, in_box};
 use crate::parts::settings::within;
@@ -19,32 +19,32 @@ use rand::Rng;
 use serde::Deserialize;
 use std::sync::Arc;
 
-const SCHEMA: &str = r#"log2_rows = 19           # most rows of a level's table
-space_levels = 16        # of the spatial grid,
-space_base = 16          # from so many
-space_final = 2048       # to so many vertices per axis
-time_levels = 32         # of the three grids with time,
-time_base = [8, 8, 8]    # from so many
-time_final = [32, 32, 16]    # to so many vertices (published: [512, 512, 128] or [64, 64, 128] on N3DV)
+const SCHEMA: &str = r#"log2_rows = 19           # upper bound on the rows of a level's table, as a power of two
+space_levels = 16        # levels of the spatial grid
+space_base = 16          # vertices per axis of its first level
+space_final = 2048       # vertices per axis of its last level
+time_levels = 32         # levels of the three grids with time
+time_base = [8, 8, 8]    # vertices per axis of their first level
+time_final = [32, 32, 16]    # vertices per axis of their last level (published: [512, 512, 128] or [64, 64, 128] on N3DV)
 features = 2             # per level
 width = 256
 depth = 0                # hidden layers after the attention
-smooth_weight = 0.5      # of the squared difference of features at perturbed centres
+smooth_weight = 0.5      # weight of the squared difference of features at perturbed centres
 smooth_delta = 5e-3      # the perturbation, as a share of the box
 lr_grid_start = 8e-3     # Adam on the tables
 lr_grid_end = 8e-5
-lr_start = 8e-4          # and on the network
+lr_start = 8e-4          # Adam on the network
 lr_end = 1.6e-6
 "#;
 
 /// The axes of the three grids with time (3).
 const PLANES: [[usize; 3]; 3] = [[0, 1, 3], [1, 2, 3], [0, 2, 3]];
 const NAMES: [&str; 3] = ["xyt", "yzt", "xzt"];
-/// Times take up this middle part of their axis.
+/// Times are mapped to the middle of their axis, to this share of its length.
 const TIME_SHARE: f32 = 0.9;
-/// Table entries start uniform in ± this.
+/// Initial table entries are uniform in ± this.
 const TABLE: f32 = 1e-4;
-/// Rotation and translation, quaternion, scales.
+/// Widths of the heads: rotation and translation, quaternion, scales.
 const OUTPUTS: [usize; 3] = [7, 4, 3];
 /// Parameter groups by index.
 const NET: usize = 0;
@@ -105,7 +105,7 @@ fn grid(levels: usize, features: usize, base: [u32; 3], last: [u32; 3], log2_row
     shape
 }
 
-/// Parameters: four tables, attention layer, temporal layer, what follows them.
+/// Parameters: four tables, attention layer, temporal layer, layers behind the attention with the heads.
 struct Grid4d {
     settings: Settings,
     context: DeformerContext,
@@ -156,7 +156,7 @@ impl Grid4d {
     fn weight(&self, place: usize) -> Tensor<1> {
         self.parameters[place].value.clone()
     }
-    /// Features of the three grids with time at positions [M,3] in the box, side by side.
+    /// Features of the three grids with time at positions [M,3] in 0..1 of the box, concatenated.
     fn with_time(&self, position: &Tensor<2>, time_norm: f32) -> Result<Tensor<2>> {
         let time = column(position, 0.5 + TIME_SHARE * (time_norm - 0.5));
         let points = Tensor::cat(vec![position.clone(), time], 1);
@@ -213,7 +213,7 @@ impl Deformer for Grid4d {
         let temporal = only(mlp_relu(self.with_time(&position, time_norm)?, self.weight(5), &self.temporal)?)?;
         let outputs = mlp_relu(attention * temporal, self.weight(6), &self.network)?;
         let [motion, quaternions, scales]: [Tensor<2>; 3] =
-            outputs.try_into().map_err(|_| Error::backend("deformer grid4d", "it has another number of heads", "Report this as a defect"))?;
+            outputs.try_into().map_err(|_| Error::backend("deformer grid4d", "the network returned another number of heads", "Report this as a defect"))?;
         let identity = Tensor::<2>::from_data(TensorData::new(vec![1.0f32, 0.0, 0.0, 0.0], [1, 4]), &motion.device());
         let turned = rotate(motion.clone().narrow(1, 0, 4) + identity, x.clone());
         let means = turned - x + motion.narrow(1, 4, 3);
@@ -229,7 +229,7 @@ impl Deformer for Grid4d {
         let s = &self.settings;
         vec![ParameterGroup::plain("grid4d net", s.lr_start, s.lr_end), ParameterGroup::plain("grid4d tables", s.lr_grid_start, s.lr_grid_end)]
     }
-    /// Features at slightly other places shall be alike: squared differences, summed over channels and averaged over centres.
+    /// Smoothness: squared differences of features at centres and at slightly perturbed centres, summed over channels and averaged over centres.
     fn regularizer(&self, input: &SpatialInput, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let m = input.len();

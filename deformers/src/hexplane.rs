@@ -1,6 +1,6 @@
-//! 4DGS's field: six planes of features over the pairs of x, y, z and t at two resolutions, multiplied, then five heads (Wu et al. 2024).
+//! The deformer of 4DGS: six planes of features over the pairs of x, y, z and t at two resolutions, multiplied, then five heads (Wu et al. 2024).
 //!
-//! Its published code feeds times of 0..1 to planes that expect -1..1, so that half of the time axis is never read; `half_time` does the same.
+//! The published code feeds times of 0..1 to planes that expect -1..1, so that half of the time axis is never read; `half_time` reproduces that.
 
 use crate::parts::centres::{check_time, column, in_box};
 use crate::parts::heads::{self, Head};
@@ -19,21 +19,21 @@ use serde::Deserialize;
 use std::sync::Arc;
 
 const SCHEMA: &str = r#"resolution = 64          # vertices per spatial axis of the first resolution
-multires = [1, 2]        # factors of the spatial axes; time keeps its vertices
+multires = [1, 2]        # factors of the spatial axes; the time axis is not scaled
 time_resolution = 150    # vertices of the time axis
 features = 16            # per plane
-width = 128              # of the network
+width = 128              # width of the network
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
 half_time = false        # read only the upper half of the time axis, as the published code does
-tv_space = 2e-4          # weight of the squared second differences of spatial planes,
-tv_time = 1e-3           # of the others along time,
-time_one = 1e-4          # and of the distance of the others from 1
+tv_space = 2e-4          # weight of the squared second differences of spatial planes
+tv_time = 1e-3           # the same for planes with time, along time
+time_one = 1e-4          # weight of the distance from 1 of planes with time
 lr_start = 1.6e-4        # Adam on the network, times the extent of the cameras, log-linear to lr_end
 lr_end = 1.6e-5
-grid_rate = 10.0         # the planes' rate is this much higher
+grid_rate = 10.0         # learning rate of the planes, as a multiple
 "#;
 
-/// The axes of each plane; those with axis 3 see time.
+/// The axes of each plane; axis 3 is time.
 const PLANES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 const TIME: usize = 3;
 /// Parameter groups by index.
@@ -151,7 +151,7 @@ impl Deformer for HexPlane {
         if m == 0 {
             return Ok(SpatialFeatures { values: Tensor::zeros([0, 3 + self.network.input], &position.device()), work });
         }
-        // Half of the planes do not see time.
+        // Three of the six planes do not depend on time.
         let still = Tensor::cat(vec![position.clone(), column(&position, 0.0)], 1);
         let product = self.product(&still, |axes| axes[1] != TIME)?;
         Ok(SpatialFeatures { values: Tensor::cat(std::iter::once(position).chain(product).collect(), 1), work })
@@ -184,8 +184,8 @@ impl Deformer for HexPlane {
         let group = |name, factor| ParameterGroup { times_extent: true, ..ParameterGroup::plain(name, s.lr_start * factor, s.lr_end * factor) };
         vec![group("hexplane net", 1.0), group("hexplane planes", s.grid_rate)]
     }
-    /// Smooth planes, and planes of time near 1 (weights of the published code): squared second differences along a plane's second axis, which is time
-    /// where it has one.
+    /// Smoothness of all planes, and closeness to 1 of planes with time (weights of the published code): squared second differences along a plane's second axis,
+    /// which is time if the plane has it.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let mut total: Option<Tensor<1>> = None;

@@ -1,4 +1,4 @@
-//! Deformation fields. Each registers itself; link this crate and name one in the configuration.
+//! Deformers (deformation fields). Each registers itself; link this crate and name one in the configuration.
 
 pub mod basis;
 pub mod cdf;

@@ -1,9 +1,9 @@
-//! Gaussians of space and time (4D-GS, Yang et al. 2024), as seen at one moment.
+//! Gaussians of space and time (4D-GS, Yang et al. 2024), conditioned on a time.
 //!
 //! A Gaussian over (x, y, z, t) with covariance S, conditioned on a time s, is a Gaussian over space: its centre moves by S_xt / S_tt (s - t), its covariance
 //! is the Schur complement S_xx - S_xt S_tx / S_tt at all times, and its weight is exp(-(s - t)^2 / 2 S_tt). The map from S to (Schur complement, S_xt / S_tt,
 //! S_tt) is one to one, so nothing is lost by learning those three: an ordinary Gaussian, a velocity and a duration. The published code learns a rotation and
-//! scales in four dimensions instead; the family of models is the same, the paths of the optimizer are not.
+//! scales in four dimensions instead. Both represent the same Gaussians, but the optimizer takes other steps.
 
 use crate::parts::centres::check_time;
 use crate::parts::settings::within;
@@ -17,17 +17,17 @@ use std::f32::consts::TAU;
 
 const SCHEMA: &str = "\
 duration = 0.1414        # standard deviation in time of a new Gaussian, as a share of the sequence (published: sqrt(2) of 10 s)
-hidden_below = 0.05      # of this factor of the opacity a Gaussian is left out
-harmonics = 2            # cosines of time by which colours change (4D spherical harmonics); 0 for colours that stay
+hidden_below = 0.05      # a Gaussian whose opacity factor is below this is hidden
+harmonics = 2            # number of cosines of time by which colours change (4D spherical harmonics); 0 for constant colours
 time_lr = 1.6e-5         # Adam on the centre in time, times the extent of the cameras (published: 1.6e-4 of seconds, 10 s)
-duration_lr = 5e-3       # on the logarithm of the duration
-velocity_lr = 1e-3       # on the velocity in world units per sequence, times the extent of the cameras
-color_lr = 1.25e-4       # on the cosines' coefficients
+duration_lr = 5e-3       # Adam on the logarithm of the duration
+velocity_lr = 1e-3       # Adam on the velocity in world units per sequence, times the extent of the cameras
+color_lr = 1.25e-4       # Adam on the cosines' coefficients
 ";
 
-/// Attributes by place.
+/// Names of the attributes, in order.
 const NAMES: [&str; 4] = ["time_center", "log_duration", "velocity", "sh_time"];
-/// Stands for an opacity of nothing: e^-30.
+/// Logarithm of the opacity factor of a hidden Gaussian.
 const HIDDEN: f32 = -30.0;
 
 #[derive(Clone, Debug, Deserialize)]
@@ -48,7 +48,7 @@ impl Default for Settings {
     }
 }
 
-/// No weights: all that is learned belongs to the Gaussians.
+/// It has no weights: everything learned is an attribute of Gaussians.
 struct Native4d {
     settings: Settings,
     /// Coefficients of the spherical harmonics per channel.
@@ -76,7 +76,7 @@ impl Native4d {
 impl Deformer for Native4d {
     fn attributes(&self) -> Vec<AttributeSpec> {
         let s = &self.settings;
-        // Centres in time lie a tenth beyond either end, as published.
+        // Initial centres in time reach a tenth of the sequence beyond either end, as in the published code.
         let starts = [(0.5, 0.6), (s.duration.ln(), 0.0), (0.0, 0.0), (0.0, 0.0)];
         let rates = [(s.time_lr, true), (s.duration_lr, false), (s.velocity_lr, true), (s.color_lr, false)];
         let all = NAMES.into_iter().zip(self.widths()).zip(starts).zip(rates);
@@ -125,7 +125,7 @@ inventory::submit! {
         info: Plugin {
             name: "native-4d",
             version: "1",
-            summary: "Gaussians of space and time, conditioned on the moment: a velocity, a duration and colours that change, per Gaussian",
+            summary: "Gaussians of space and time, conditioned on time: a velocity, a duration and changing colours per Gaussian",
             paper: "4D-GS (Yang et al. 2024)",
             schema: SCHEMA,
             capabilities: &["differentiable", "per-gaussian-attributes"],

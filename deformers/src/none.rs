@@ -1,4 +1,4 @@
-//! No deformation: a static scene, and the base line of every dynamic one.
+//! No deformation: a static scene, and the baseline for dynamic ones.
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{

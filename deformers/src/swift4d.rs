@@ -1,7 +1,7 @@
-//! Swift4D's field: one joint 4D hash grid over position and time, an encoder, five heads, no biases (Wu et al. 2025, facts of its published code).
+//! The deformer of Swift4D: one joint 4D hash grid over position and time, an encoder, five heads, no biases (Wu et al. 2025 and its published code).
 //!
-//! Gaussians outside the box find nothing in the grid, and without biases nothing becomes nothing: they stay where they are. Swift4D's box spans all
-//! Gaussians, ours those that move; its time ends just before 1, ours at 1.
+//! Outside the box the grid's features are zero, and without biases the offsets are zero too: Gaussians outside do not move. Swift4D's box contains all
+//! Gaussians, this one those that move. Swift4D's time ends just before 1, here it ends at 1.
 
 use crate::parts::centres::{check_time, column, in_box};
 use crate::parts::heads::{self, Head};
@@ -20,9 +20,9 @@ use std::sync::Arc;
 
 const SCHEMA: &str = r#"log2_rows = 15           # rows of a level's table: 15 (9.2 MB) or 19 (127.7 MB), per scene
 levels = 16
-features = 4             # per level
+features = 4             # features per level
 base = 16                # vertices per axis of the first level; each level doubles them
-width = 128              # of encoder and heads
+width = 128              # width of encoder and heads
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
 lr_start = 2e-4          # Adam, times the extent of the cameras, log-linear to lr_end
 lr_end = 2e-6
@@ -30,7 +30,7 @@ lr_end = 2e-6
 
 /// Heads are padded to this many columns, as the published weights are.
 const PADDED: usize = 16;
-/// Table entries start uniform in ± this.
+/// Initial table entries are uniform in ± this.
 const TABLE: f32 = 1e-4;
 
 #[derive(Clone, Debug, Deserialize)]
@@ -85,7 +85,7 @@ impl Swift4d {
         };
         let table = weights::uniform(seed.child("table"), grid.parameter_count(), TABLE);
         let mut parameters = vec![parameter("grid.table".into(), Part::Grid, 0, table, device)];
-        // The encoder counts towards the grid in the paper's tables.
+        // The paper's size tables count the encoder as grid.
         parameters.push(parameter("grid.encoder".into(), Part::Grid, 0, matrices(seed.child("encoder"), &[grid.width(), w, w]), device));
         for (head, &out) in settings.heads.iter().zip(&outputs) {
             let values = matrices(seed.child(head.name()), &[w, w, w, out]);

@@ -1,4 +1,4 @@
-//! The exchangeable parts of the trainer, one file each: density controls, loss terms, appearance models and optimizers. Nobody names them in code; they are found in the
+//! The exchangeable parts of the trainer, one file each: density controls, loss terms, appearance models and optimizers. No code refers to them; they are found in the
 //! registry by the names that configurations use.
 
 mod appearance;

@@ -6,6 +6,9 @@ use cc4dgs_play::ArchiveOptions;
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
 
+/// The weight codec of [`Model::save`]: exact.
+const FIELD_WEIGHTS: &str = "fp32";
+
 /// A model: its Gaussians, the deformer that moves them, and how they want to be drawn. Everything of [`cc4dgs_play::model::Model`] is there as well.
 pub struct Model {
     inner: cc4dgs_play::model::Model,
@@ -22,9 +25,9 @@ impl Model {
     /// # Errors
     /// [`Error::Parameter`](crate::Error::Parameter) for unknown codecs and profiles, and what codec and disk report.
     pub fn save(&self, path: impl AsRef<Path>, codec: &str) -> Result<u64> {
-        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: "fp32", scene: None })
+        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None })
     }
-    /// As [`Model::save`], with settings of the codec, a codec of the field's weights, and a scene that codecs may use.
+    /// As [`Model::save`], with settings of the codec, a weight codec for the deformer, and the scene for codecs that make use of it.
     ///
     /// # Errors
     /// As [`Model::save`], and for settings the codec does not have.

@@ -16,8 +16,8 @@ pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], registry: &R
     data::open_in(path, &options_as_trained(&model.provenance.config, sets)?, &model.normalisation, registry, limits)
 }
 
-/// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. A model may come from anyone: what it says never chooses
-/// programs to run, folders to write or memory to take.
+/// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. Models may come from untrusted sources: their configuration never
+/// chooses programs to run, folders to write or memory to take.
 ///
 /// # Errors
 /// [`Error::Parameter`] for an assignment that is no scene option, and for stored options of another version.

@@ -1,11 +1,10 @@
-//! The front door: a session holds what every call needs, so that programs pass it once.
+//! A session holds what most calls need (plug-ins, limits, events, the device), so that a program states it once.
 
 use crate::Model;
 use crate::runs::{Existing, check_folder};
 use crate::{plugins, scenes};
 use burn::tensor::Device;
-use cc4dgs_core::SceneOptions;
-use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, Silent, Split, parse_device};
+use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::data;
@@ -43,17 +42,17 @@ impl SessionBuilder {
         self.device = name.into();
         self
     }
-    /// What readers accept of files; the default is generous for trusted files of this field.
+    /// Upper bounds for what readers accept of files.
     pub fn limits(mut self, limits: Limits) -> Self {
         self.limits = limits;
         self
     }
-    /// Who hears what happens; by default nobody.
+    /// Receives all events; by default they are dropped.
     pub fn events(mut self, sink: impl EventSink + 'static) -> Self {
         self.events = Arc::new(sink);
         self
     }
-    /// Calls `listener` for everything that happens, from any thread.
+    /// Calls `listener` with every event, from any thread.
     pub fn on_event(self, listener: impl Fn(&Event) + Send + Sync + 'static) -> Self {
         self.events(Listener(listener))
     }
@@ -93,11 +92,11 @@ impl Session {
     pub fn registry(&self) -> &Registry {
         &self.shared.registry
     }
-    /// What readers accept of files.
+    /// Upper bounds for what readers accept of files.
     pub fn limits(&self) -> &Limits {
         &self.shared.limits
     }
-    /// Who hears what happens.
+    /// Receives all events.
     pub fn events(&self) -> &dyn EventSink {
         self.shared.events.as_ref()
     }
@@ -124,8 +123,8 @@ impl Session {
     pub fn read_scene(&self, path: impl AsRef<Path>, options: &SceneOptions) -> Result<Scene> {
         data::open(path.as_ref(), options, self.registry(), self.limits())
     }
-    /// Opens the dataset at `path` as `model` was trained on it. What a stranger's model says never chooses programs to run, folders to write or memory to
-    /// take.
+    /// Opens the dataset at `path` as `model` was trained on it. The configuration stored in a model never chooses programs to run, folders to write or memory
+    /// to take.
     ///
     /// # Errors
     /// As [`Session::read_scene`].

@@ -1,4 +1,4 @@
-//! The colour coefficients above degree 0: conditional autoencoder and residual codebook, or plain quantisation where that is better.
+//! The colour coefficients above degree 0: conditional autoencoder and residual codebook, or plain quantisation if that is smaller or more accurate.
 
 use super::geometry::{CONDITIONS, Normalisation};
 use super::network::{Decoder, Scratch, decoder_len, latents};
@@ -17,7 +17,7 @@ use cc4dgs_format::{CodecContext, Event, HostGaussians, Result, Stream};
 use half::f16;
 use rayon::prelude::*;
 
-/// How the coefficients are stored.
+/// Stored forms of the coefficients.
 const DIRECT: u8 = 0;
 const AUTOENCODER: u8 = 1;
 
@@ -27,15 +27,15 @@ const DECODER: &str = "sh_rest.decoder";
 const CODEBOOK: &str = "sh_rest.codebook";
 const RESIDUALS: &str = "sh_rest.residuals";
 
-/// Share of a latent's values at either end beyond its quantiser.
+/// Share of a latent's values at either end outside its quantiser's range.
 const LATENT_TAIL: f64 = 1e-4;
 /// Samples and iterations of the residual codebook.
 const CODEBOOK_SAMPLES: usize = 50_000;
 const CODEBOOK_ITERATIONS: usize = 25;
-/// A Gaussian counts at least and at most this many times the average one in training.
+/// Smallest and largest training weight of a Gaussian, relative to the average.
 const ROW_WEIGHTS: (f64, f64) = (0.2, 5.0);
 
-/// Encodes the coefficients of `gaussians`; `known` is what the decoder will have by then.
+/// Encodes the coefficients of `gaussians`; `known` holds the attributes that the decoder has already decoded.
 pub(super) fn encode(
     gaussians: &HostGaussians,
     known: &HostGaussians,
@@ -50,24 +50,21 @@ pub(super) fn encode(
         return Ok(Vec::new());
     }
     let (quantised, exact) = (direct(&gaussians.sh_rest, width, Some(profile.appearance_loss))?, direct(&gaussians.sh_rest, width, None)?);
-    // Colours that were quantised before may compress better as they are.
+    // Colours that were quantised before may compress better unchanged.
     let (direct_len, mut best) = if exact.0 < quantised.0 { exact } else { quantised };
-    // Decoder and codebook alone may outweigh a few coefficients or many that are all alike.
+    // For few or very similar coefficients, decoder and codebook alone may be larger than direct storage.
     let fixed = 2 * decoder_len(width) + 4 * width * profile.codebook.min(gaussians.len());
     if direct_len > fixed as u64
         && let Some((coded, loss)) = autoencode(gaussians, known, profile, settings, context)?
         && coded.stored_len()? < direct_len
     {
-        // A NaN fails this comparison, as it must.
+        // NaN fails this comparison, so a diverged autoencoder is not used.
         if loss <= profile.appearance_loss {
             best = coded;
         } else {
             context.events.emit(&Event::Warning {
                 object: "codec cca".into(),
-                message: format!(
-                    "the autoencoder would lose {loss:.2} of the colours' deviation, over {}; they are stored without it",
-                    profile.appearance_loss
-                ),
+                message: format!("the autoencoder's relative error {loss:.2} is over the limit of {}; colours are stored without it", profile.appearance_loss),
             });
         }
     }
@@ -76,7 +73,7 @@ pub(super) fn encode(
     Ok(best.streams)
 }
 
-/// The columns at 16 bits (within the loss, if one is given) or exact, and about how many bytes they take.
+/// The columns at 16 bits (within `loss`, if given) or exact, and their approximate stored size in bytes.
 fn direct(rows: &[f32], width: usize, loss: Option<f64>) -> Result<(u64, Form)> {
     let encode = |c: &Vec<f32>| match loss {
         Some(loss) => column::encode(c, Target { bits: 16, mu_law: false, loss, tail: 5e-4 }),
@@ -106,7 +103,7 @@ impl Form {
     }
 }
 
-/// Mean and scale of each coefficient; both sides turn normalised values back with [`Statistics::value`].
+/// Mean and scale of each coefficient. Encoder and decoder both undo the normalisation with [`Statistics::value`].
 struct Statistics {
     mean: Vec<f32>,
     scale: Vec<f32>,
@@ -129,7 +126,7 @@ impl Statistics {
     }
 }
 
-/// The coefficients through the autoencoder, and their relative root-mean-square error. None where it cannot be trained.
+/// The coefficients encoded by the autoencoder, and their relative root-mean-square error. `None` if it cannot be trained.
 fn autoencode(gaussians: &HostGaussians, known: &HostGaussians, profile: &Profile, settings: &Settings, context: &CodecContext) -> Result<Option<(Form, f64)>> {
     let rows = &gaussians.sh_rest;
     let width = rows.len() / gaussians.len().max(1);
@@ -147,7 +144,7 @@ fn autoencode(gaussians: &HostGaussians, known: &HostGaussians, profile: &Profil
             *v = if scale > 0.0 { ((f64::from(*v) - f64::from(statistics.mean[c])) / f64::from(scale)) as f32 } else { 0.0 };
         }
     });
-    // Errors count in units of colour, not of each coefficient's own deviation.
+    // Errors are weighted in units of colour, not of each coefficient's own deviation.
     let column_weights: Vec<f32> = statistics.scale.iter().map(|&s| (f64::from(s).powi(2) / pooled) as f32).collect();
     let data = Data { width, targets: &targets, conditions: &conditions, row_weights: &row_weights(gaussians), column_weights: &column_weights };
     let (encoder, decoder) = train::train(&data, profile.latent_bits, settings, context.seed.child("autoencoder"), context.events);
@@ -159,7 +156,7 @@ fn autoencode(gaussians: &HostGaussians, known: &HostGaussians, profile: &Profil
     let target = Target { bits: profile.latent_bits, mu_law: false, loss: f64::INFINITY, tail: LATENT_TAIL };
     let columns: Vec<Column> = split(&train::encode_all(&data, &encoder), latent).par_iter().map(|c| column::encode(c, target)).collect();
 
-    // From here on only what the decoder will have: half-precision weights, dequantised latents, conditions.
+    // From here on only what the decoder has: half-precision weights, dequantised latents, conditions.
     let network = Decoder::new(width, &decoder.iter().map(|w| w.to_f32()).collect::<Vec<_>>());
     let z = interleave(&columns.iter().map(|c| column::dequantise(c, known.len())).collect::<Vec<_>>(), known.len());
     let base = reconstruct(&network, &statistics, &normalisation, known, &z, None);
@@ -188,7 +185,7 @@ fn autoencode(gaussians: &HostGaussians, known: &HostGaussians, profile: &Profil
     Ok(Some((form, loss)))
 }
 
-/// How much each Gaussian's colour is seen: opacity times the mean area of its three sides, relative to the average and clipped.
+/// Visibility of each Gaussian's colour: opacity times the mean area of its three faces, relative to the average and clipped.
 fn row_weights(gaussians: &HostGaussians) -> Vec<f32> {
     let seen = |(logit, s): (&f32, &[f32])| {
         let side = |a: usize, b: usize| libm::exp((f64::from(s[a]) + f64::from(s[b])).clamp(-60.0, 60.0));
@@ -199,7 +196,8 @@ fn row_weights(gaussians: &HostGaussians) -> Vec<f32> {
     raw.iter().map(|w| (w / mean.max(f64::MIN_POSITIVE)).clamp(ROW_WEIGHTS.0, ROW_WEIGHTS.1) as f32).collect()
 }
 
-/// Coefficients `[N,width]` from latents `z` `[N,latents]`, the conditions and, if given, the codebook. Encoder and decoder both call this.
+/// Coefficients `[N,width]` from latents `z` `[N,latents]`, the conditions and, if given, the codebook. Encoder and decoder both call this, so that they
+/// compute the same bits.
 fn reconstruct(
     network: &Decoder,
     statistics: &Statistics,
@@ -228,7 +226,7 @@ fn reconstruct(
     out
 }
 
-/// Decodes the coefficients of `count` Gaussians; `known` holds everything else already.
+/// Decodes the coefficients of `count` Gaussians; `known` holds all other attributes.
 pub(super) fn decode(set: &StreamSet, known: &HostGaussians, count: usize, meta: &mut ByteReader, escapes: &mut ByteReader) -> Result<Vec<f32>> {
     let width = 3 * sh_rest_len(known.sh_degree);
     if width == 0 {
@@ -244,13 +242,13 @@ pub(super) fn decode(set: &StreamSet, known: &HostGaussians, count: usize, meta:
             let mut reader = set.reader(RESIDUALS)?;
             let labels = reader.take(count)?;
             if let Some(label) = labels.iter().find(|&&l| usize::from(l) >= entries) {
-                return Err(reader.error(format!("a residual names entry {label} of {entries}")));
+                return Err(reader.error(format!("a residual refers to codebook entry {label} of {entries}")));
             }
             reader.finish()?;
             let mut reader = set.reader(DECODER)?;
             let weights: Vec<f32> = reader.take(2 * decoder_len(width))?.chunks_exact(2).map(|c| f16::from_le_bytes([c[0], c[1]]).to_f32()).collect();
             if weights.iter().any(|w| !w.is_finite()) {
-                return Err(reader.error("a weight is not finite"));
+                return Err(reader.error("a decoder weight is not finite"));
             }
             reader.finish()?;
             let mut reader = set.reader(CODEBOOK)?;
@@ -258,6 +256,6 @@ pub(super) fn decode(set: &StreamSet, known: &HostGaussians, count: usize, meta:
             reader.finish()?;
             Ok(reconstruct(&Decoder::new(width, &weights), &statistics, &normalisation, known, &z, Some((labels, &codebook))))
         }
-        other => Err(meta.error(format!("colours are stored in the unknown form {other}"))),
+        other => Err(meta.error(format!("unknown storage form {other} of colours"))),
     }
 }

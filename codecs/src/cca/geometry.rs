@@ -1,4 +1,4 @@
-//! The quantised path: log-scales, opacity logits, quaternions, dynamic scores; and the conditions made of them.
+//! The quantised attributes (log-scales, opacity logits, quaternions, dynamic scores), and the autoencoder's conditions computed from them.
 
 use super::profile::Profile;
 use cc4dgs_format::archive::ByteReader;
@@ -9,7 +9,7 @@ use cc4dgs_format::storage::{
 };
 use cc4dgs_format::{HostGaussians, Result, Stream};
 
-/// Share of a scalar column's values at either end that may be kept as outliers.
+/// Share of a scalar column's values at either end that may be stored as outliers.
 const TAIL: f64 = 5e-4;
 /// Condition channels of a Gaussian: position 3, log-scales 3, opacity 1, rotation 4, dynamic score 1 (paper Section IV-D).
 pub(super) const CONDITIONS: usize = 12;
@@ -18,7 +18,7 @@ const CLIP: f64 = 4.0;
 
 const QUATERNIONS: &str = "quaternions";
 
-/// Encodes the quantised attributes; returns the streams and what a decoder makes of them (with the exact positions).
+/// Encodes the quantised attributes. Returns the streams and the decoded attributes (with exact positions).
 pub(super) fn encode(gaussians: &HostGaussians, profile: &Profile, meta: &mut Vec<u8>, escapes: &mut Vec<u8>) -> (Vec<Stream>, HostGaussians) {
     let scalar = Target { bits: profile.scalar_bits, mu_law: false, loss: profile.scalar_loss, tail: TAIL };
     let score = Target { bits: profile.dynamic_bits, mu_law: true, loss: profile.dynamic_loss, tail: TAIL };
@@ -38,7 +38,7 @@ pub(super) fn encode(gaussians: &HostGaussians, profile: &Profile, meta: &mut Ve
         put(QUATERNIONS, columns);
         known.quaternions = product;
     } else {
-        // Norms so spread out that their errors swamp the small ones: the raw components, and norms of one (log 0).
+        // Norms span so many magnitudes that quantisation would ruin the small ones: store the raw components, and norms of one (log 0).
         let mut columns: Vec<Column> = split(&gaussians.quaternions, 4).iter().map(|c| column::encode(c, scalar)).collect();
         columns.push(column::encode(&vec![0.0; n], scalar));
         known.quaternions = times_norm(&columns.iter().map(|c| column::dequantise(c, n)).collect::<Vec<_>>(), n);
@@ -65,7 +65,7 @@ fn unit_and_norm(quaternions: &[f32]) -> [Vec<f32>; 5] {
         let norm = q.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>().sqrt();
         let unit = if norm > 0.0 { q.iter().map(|&v| (f64::from(v) / norm) as f32).collect() } else { vec![1.0, 0.0, 0.0, 0.0] };
         unit.iter().zip(&mut out).for_each(|(&v, column)| column.push(v));
-        // One is told from almost one here, so that unit quaternions have one norm in spite of rounding.
+        // Norms within rounding of 1 are set to 1, so that unit quaternions have a constant norm.
         let log = if (norm - 1.0).abs() < 1e-6 { 0.0 } else { libm::log(norm.max(f64::from(f32::MIN_POSITIVE))) };
         out[4].push(log as f32);
     }
@@ -88,7 +88,7 @@ pub(super) struct Normalisation {
 }
 
 impl Normalisation {
-    /// Positions: the box of the 1st to 99th percentile becomes -1..1. Rotations stay as they are. The rest: mean 0, deviation 1.
+    /// Positions: the box of the 1st to 99th percentile is mapped to -1..1. Rotations are unchanged. All others: mean 0, standard deviation 1.
     pub(super) fn of(known: &HostGaussians) -> Self {
         let n = known.len().max(1) as f64;
         let mut out = Self { shift: [0.0; CONDITIONS], scale: [1.0; CONDITIONS] };
@@ -121,7 +121,7 @@ impl Normalisation {
         }
         Ok(out)
     }
-    /// The conditions of Gaussian `i`, from values both sides have: exact positions, everything else as decoded. Rotations are unit
+    /// The conditions of Gaussian `i`, from values that encoder and decoder have: exact positions, everything else as decoded. Rotations are unit
     /// quaternions with w >= 0, since q and -q are one rotation.
     pub(super) fn conditions(&self, known: &HostGaussians, i: usize) -> [f32; CONDITIONS] {
         let mut raw = [0.0f64; CONDITIONS];

@@ -1,16 +1,16 @@
-//! `cca`: compression of canonical attributes (paper Section IV-D; numbers that the paper leaves open are chosen here).
+//! `cca`: compression of canonical attributes (paper Section IV-D). Values that the paper does not state are chosen here.
 //!
 //! Three paths. Positions and degree-0 colours stay float32. Log-scales, opacity logits and quaternions are quantised per component, dynamic
-//! scores after mu-law companding. The higher colour coefficients pass through a conditional autoencoder whose latents are quantised; what it
-//! misses is matched with a k-means codebook. The autoencoder is trained on the very Gaussians it encodes, its decoder travels with them.
+//! scores after mu-law companding. The higher colour coefficients pass through a conditional autoencoder whose latents are quantised; a k-means
+//! codebook approximates the residuals. The autoencoder is trained on the Gaussians it encodes, and its decoder is stored with them.
 //!
-//! Departures from the plainest reading of the paper, all of them lossless or better:
+//! Differences from the paper's text; none of them adds error:
 //! * Gaussians are stored in Morton order of their positions; their order carries no meaning and neighbours compress together.
-//! * Quaternions are split into a unit part, whose sign is kept, and a norm, because deformation offsets are added before normalisation and
-//!   so both matter. A model with unit quaternions pays nothing for the norms.
-//! * Quantisers keep outliers exactly instead of clamping them (see [`cc4dgs_format::storage::column`]).
-//! * Coefficients go without autoencoder, at 16 bits each or exactly, where that takes fewer bytes (few Gaussians, low degrees) or where the
-//!   autoencoder would lose more than [`AttributeCodec::losses`] declares.
+//! * Quaternions are split into a unit part, with its sign, and a norm. Both matter, because deformation offsets are added before
+//!   normalisation. In a model with unit quaternions the norms take no bytes.
+//! * Outliers are stored exactly instead of clamping them (see [`cc4dgs_format::storage::column`]).
+//! * Coefficients are stored without autoencoder, at 16 bits each or exactly, if that takes fewer bytes (few Gaussians, low degrees) or if the
+//!   autoencoder's error is larger than [`AttributeCodec::losses`] declares.
 
 mod appearance;
 mod geometry;
@@ -44,7 +44,7 @@ impl AttributeCodec for Cca {
         let mut escapes = Vec::new();
         let mut streams =
             vec![Stream { name: "means".into(), bytes: to_planes(&sorted.means, 3) }, Stream { name: "sh_dc".into(), bytes: to_planes(&sorted.sh_dc, 3) }];
-        // What the decoder will know when it meets the colours.
+        // The attributes that the decoder has before it decodes colours.
         let (geometry, known) = geometry::encode(&sorted, &self.profile, &mut meta, &mut escapes);
         streams.extend(geometry);
         streams.extend(appearance::encode(&sorted, &known, &self.profile, &self.settings, context, &mut meta, &mut escapes)?);

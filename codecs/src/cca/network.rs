@@ -1,16 +1,16 @@
-//! The networks of the autoencoder and the inference both sides of the codec share.
+//! The networks of the autoencoder, and the inference code that encoder and decoder share.
 //!
 //! Encoder: coefficients and conditions, two hidden layers, latents. Decoder: latents and conditions, two hidden layers, coefficients; GELU
 //! after each hidden layer (paper Section IV-D, which leaves the widths open).
 //!
-//! The decoder must give the same bits wherever it runs, because the residual codebook is made from its output. So it is plain float32:
+//! The decoder must give the same bits on every machine, because the residual codebook is computed from its output. So it is plain float32:
 //! each sum runs over its inputs in order, nothing is contracted or reassociated, and the exponential is a polynomial of such operations.
 
 use super::geometry::CONDITIONS;
 
-/// Layers of either half.
+/// Layers of the encoder, and of the decoder.
 pub(super) const HALF: usize = 3;
-/// Outputs computed side by side; each keeps its own sum, so the number of lanes does not show in the result.
+/// Outputs computed per SIMD block. Each output has its own sum, so the result does not depend on the number of lanes.
 const LANES: usize = 16;
 
 /// One linear layer inside the flat parameters.
@@ -18,7 +18,7 @@ const LANES: usize = 16;
 pub(super) struct Layer {
     pub(super) inputs: usize,
     pub(super) outputs: usize,
-    /// Where the weights [inputs, outputs] begin; the biases [outputs] follow them.
+    /// Index of the first weight [inputs, outputs]; the biases [outputs] follow.
     pub(super) at: usize,
 }
 
@@ -31,7 +31,7 @@ impl Layer {
     }
 }
 
-/// The number of latents for `width` coefficients: the 24 of 45 of degree 3, in proportion for other degrees.
+/// The number of latents for `width` coefficients: 24 for the 45 of degree 3, in proportion for other degrees.
 pub(super) fn latents(width: usize) -> usize {
     (24 * width + 22) / 45
 }
@@ -45,7 +45,7 @@ fn layers(widths: [usize; HALF + 1]) -> [Layer; HALF] {
     })
 }
 
-/// The encoder's layers for `width` coefficients. The second hidden layer has room for every latent and its negative (see `principal`).
+/// The encoder's layers for `width` coefficients. The second hidden layer is wide enough for every latent and its negative (see `principal`).
 pub(super) fn encoder(width: usize) -> [Layer; HALF] {
     layers([width + CONDITIONS, 128, 64.max(2 * latents(width)), latents(width)])
 }
@@ -63,12 +63,12 @@ pub(super) fn decoder_len(width: usize) -> usize {
 /// e^x in float32 from additions and multiplications alone (error below 2e-7), for x clamped to the finite range.
 #[inline(always)]
 fn exp(x: f32) -> f32 {
-    // Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits.
+    // Adding 1.5 * 2^23 rounds to an integer, which is then in the low mantissa bits.
     const ROUND: f32 = 12_582_912.0;
     let x = x.clamp(-87.0, 88.0);
     let shifted = x * std::f32::consts::LOG2_E + ROUND;
     let k = shifted - ROUND;
-    // ln 2 in two pieces keeps the remainder exact.
+    // ln 2 as a sum of two constants makes the remainder exact.
     let r = (x - k * 0.693_359_4) + k * 2.121_944_4e-4;
     let p = 1.0 + r * (1.0 + r * (0.5 + r * (0.166_666_66 + r * (0.041_666_66 + r * (8.333_452e-3 + r * 1.398_2e-3)))));
     p * f32::from_bits((shifted.to_bits() << 23).wrapping_add(0x3f80_0000))
@@ -84,7 +84,7 @@ pub(super) fn gelu(x: f32) -> f32 {
     x / (1.0 + exp(-SLOPE * (x + CUBIC * x * x * x)))
 }
 
-/// [`gelu`] of `values` in place; its derivative goes to `slopes`.
+/// Applies [`gelu`] to `values` in place and writes its derivatives to `slopes`.
 pub(super) fn gelu_with_slopes(values: &mut [f32], slopes: &mut [f32]) {
     for (v, slope) in values.iter_mut().zip(slopes) {
         let x = *v;
@@ -94,7 +94,7 @@ pub(super) fn gelu_with_slopes(values: &mut [f32], slopes: &mut [f32]) {
     }
 }
 
-/// The decoder, its weights laid out for [`Decoder::run`].
+/// The decoder, with its weights in the layout of [`Decoder::run`].
 pub(super) struct Decoder {
     layers: Vec<Packed>,
 }

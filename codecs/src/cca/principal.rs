@@ -1,7 +1,7 @@
-//! Principal components, and networks that begin as them.
+//! Principal components, and networks initialised with them.
 //!
-//! gelu(a) - gelu(-a) = a, so a layer that holds a value and its negative passes it on exactly. An autoencoder that starts as the best
-//! linear one has nothing to forget and is useful after any number of training steps, even none.
+//! gelu(a) - gelu(-a) = a, so a layer that holds a value and its negative passes the value on exactly. An autoencoder that is initialised with the best
+//! linear one is useful after any number of training steps, even none.
 
 use super::network::{HALF, Layer};
 use cc4dgs_format::Seed;
@@ -52,12 +52,12 @@ pub(super) fn eigen(mut a: Vec<f64>, n: usize) -> (Vec<f64>, Vec<f64>) {
 }
 
 /// Fills one half of the autoencoder so that it maps its first inputs linearly: latent j = sum over i of `into[i * pairs + j]` x input i
-/// (encoder), or output i = sum over j of latent j x `out[j * outputs + i]` (decoder). Units that the linear map leaves free get random
-/// weights and no say in the output, until training gives them one.
+/// (encoder), or output i = sum over j of latent j x `out[j * outputs + i]` (decoder). Hidden units that the linear map does not need get
+/// random input weights and zero output weights.
 pub(super) fn linear_half(parameters: &mut [f32], layers: &[Layer; HALF], pairs: usize, into: &[f32], out: &[f32], seed: Seed) {
     let mut rng = seed.rng();
     for layer in &layers[..HALF - 1] {
-        // He's uniform initialisation for the free units.
+        // He's uniform initialisation for the remaining hidden units.
         let bound = (6.0 / layer.inputs as f32).sqrt();
         parameters[layer.at..layer.bias_at()].iter_mut().for_each(|w| *w = rng.random_range(-bound..bound));
     }

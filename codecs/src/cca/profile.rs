@@ -3,10 +3,10 @@
 use cc4dgs_format::{Error, Result, config, unknown_name};
 use serde::Deserialize;
 
-/// Bits per quantised value, codebook size, and the loss that is allowed to each attribute.
+/// Bits per quantised value, codebook size, and the largest loss of each attribute.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Profile {
-    /// The name after the colon of `cca:NAME`.
+    /// The profile's name, as in `cca:NAME`.
     pub name: &'static str,
     /// Bits of an autoencoder latent.
     pub latent_bits: u8,
@@ -16,12 +16,12 @@ pub struct Profile {
     pub scalar_bits: u8,
     /// Bits of a dynamic score.
     pub dynamic_bits: u8,
-    /// Relative root-mean-square error allowed to log-scales, opacity logits and quaternions.
+    /// Largest root-mean-square error of log-scales, opacity logits and quaternions, over their standard deviation.
     pub scalar_loss: f64,
     /// The same for dynamic scores.
     pub dynamic_loss: f64,
-    /// The same for colour coefficients. Colours without any structure keep about 24 of 45 dimensions, an error of sqrt(21/45) = 0.68
-    /// before the codebook; whatever a scene holds must do better, or is stored without the autoencoder.
+    /// The same for colour coefficients. Of white noise, 24 latents represent 24 of 45 dimensions: an error of sqrt(21/45) = 0.68
+    /// before the codebook. A scene with a larger error than this limit is stored without the autoencoder.
     pub appearance_loss: f64,
 }
 
@@ -49,19 +49,19 @@ impl Profile {
     }
 }
 
-/// Settings with their defaults, for people.
+/// Settings with their defaults, as shown to users.
 pub(super) const SCHEMA: &str = "\
-epochs = 60              # passes of the autoencoder over the Gaussians, at most
-sample_budget = 3000000  # Gaussians shown to it in all, at most; bounds the encoding time
+epochs = 60              # upper bound on the passes of autoencoder training over the Gaussians
+sample_budget = 3000000  # upper bound on the training samples in total; bounds the encoding time
 ";
 
-/// How long the autoencoder is trained. Nothing here is needed to decode.
+/// How long the autoencoder is trained. Decoding does not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Passes over the Gaussians, at most.
+    /// Upper bound on the passes over the Gaussians.
     pub epochs: usize,
-    /// Gaussians shown in all, at most.
+    /// Upper bound on the training samples in total.
     pub sample_budget: usize,
 }
 

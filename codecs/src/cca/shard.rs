@@ -1,4 +1,4 @@
-//! The autoencoder on one shard of Gaussians: forwards, and the hand-written gradient.
+//! The autoencoder on one shard of Gaussians: forward pass and hand-written gradient.
 
 use super::geometry::CONDITIONS;
 use super::network::{HALF, Layer, decoder, encoder, gelu_with_slopes, latents};
@@ -9,7 +9,7 @@ use rand::Rng;
 /// Gaussians per shard.
 pub(super) const SHARD: usize = 256;
 
-/// What is to be learnt.
+/// Training data.
 pub(super) struct Data<'a> {
     /// Coefficients per Gaussian.
     pub(super) width: usize,
@@ -17,9 +17,9 @@ pub(super) struct Data<'a> {
     pub(super) targets: &'a [f32],
     /// Conditions `[N]`.
     pub(super) conditions: &'a [[f32; CONDITIONS]],
-    /// How much each Gaussian counts `[N]`.
+    /// Weight of each Gaussian `[N]`.
     pub(super) row_weights: &'a [f32],
-    /// How much an error of each normalised coefficient counts `[width]`.
+    /// Weight of an error of each normalised coefficient `[width]`.
     pub(super) column_weights: &'a [f32],
 }
 
@@ -29,7 +29,7 @@ impl Data<'_> {
     }
 }
 
-/// All layers over one flat array: encoder, then decoder.
+/// All layers, whose weights lie in one flat array: encoder, then decoder.
 pub(super) struct Net {
     pub(super) layers: Vec<Layer>,
     pub(super) encoder_len: usize,
@@ -93,7 +93,7 @@ pub(super) fn half(layers: &[Layer], parameters: &[f32], data: &Data, shard: &mu
     }
 }
 
-/// The whole network; `jitter` adds uniform noise of the given steps to the latents. Leaves the loss and d loss / d output behind.
+/// The whole network; `jitter` adds uniform noise of the given steps to the latents. Stores the loss and d loss / d output in `shard`.
 pub(super) fn forward(net: &Net, parameters: &[f32], data: &Data, shard: &mut Shard, jitter: Option<(Seed, &[f32])>) {
     half(&net.layers[..HALF], parameters, data, shard);
     let latents = net.latents;
@@ -150,7 +150,7 @@ pub(super) fn backward(net: &Net, parameters: &[f32], data: &Data, shard: &mut S
         matmul([rows, layer.inputs, layer.outputs], (&shard.delta, false), (weights, true), &mut shard.back, false);
         shard.delta.clear();
         if l == HALF {
-            // The conditions are given; only the latents pass a gradient on.
+            // The conditions are constants; only the latents pass a gradient on.
             shard.back.chunks_exact(layer.inputs).for_each(|row| shard.delta.extend_from_slice(&row[..net.latents]));
         } else {
             shard.delta.extend(shard.back.iter().zip(&shard.slopes[l - 1]).map(|(b, s)| b * s));
@@ -158,12 +158,12 @@ pub(super) fn backward(net: &Net, parameters: &[f32], data: &Data, shard: &mut S
     }
 }
 
-/// out [m,n] (+)= a [m,k] b [k,n], all row-major; a flag says that the array holds the transpose.
+/// out [m,n] (+)= a [m,k] b [k,n], all row-major; a flag is set if the array holds the transpose.
 fn matmul([m, n, k]: [usize; 3], (a, a_transposed): (&[f32], bool), (b, b_transposed): (&[f32], bool), out: &mut [f32], accumulate: bool) {
     assert!(a.len() == m * k && b.len() == k * n && out.len() == m * n, "matrix sizes");
     let strides = |rows: usize, columns: usize, transposed: bool| if transposed { (1, rows as isize) } else { (columns as isize, 1) };
     let ((a_rs, a_cs), (b_rs, b_cs)) = (strides(m, k, a_transposed), strides(k, n, b_transposed));
-    // SAFETY: the assertion above holds every element the strides reach inside its slice, and `out` is borrowed uniquely.
+    // SAFETY: the assertion above ensures that every element the strides reach lies inside its slice, and `out` is borrowed uniquely.
     unsafe {
         gemm::gemm(
             m,

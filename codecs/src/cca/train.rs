@@ -1,6 +1,6 @@
-//! Training the autoencoder on the Gaussians it is to encode: minibatches, hand-written gradients, Adam.
+//! Training of the autoencoder on the Gaussians it encodes: minibatches, hand-written gradients, Adam.
 //!
-//! A batch is cut into shards of fixed size; each has its own gradient and the gradients are added in order, so the result is the same for
+//! A batch is split into shards of fixed size. Each has its own gradient, and the gradients are added in order, so the result is the same for
 //! any number of threads.
 
 use super::network::{HALF, decoder, encoder};
@@ -11,7 +11,7 @@ use cc4dgs_format::{Event, EventSink, Seed};
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
 
-/// Steps wanted, and the least; the batch follows from them and the samples there are.
+/// Target and least number of steps; the batch size follows from them and the number of samples.
 const STEPS_WANTED: usize = 1500;
 const STEPS_LEAST: usize = 400;
 const BATCH_LEAST: usize = 128;
@@ -21,11 +21,11 @@ const RATE: f64 = 1e-3;
 const WARM_UP: f64 = 0.05;
 const BETA: (f32, f32) = (0.9, 0.999);
 const EPSILON: f32 = 1e-8;
-/// Gaussians looked at for the principal components.
+/// Gaussians used for the principal components.
 const COVARIANCE_ROWS: usize = 100_000;
 
-/// Trains on `data` (not empty) and returns the flat parameters of encoder and decoder. `bits` is the latents' width: training sees the
-/// noise their quantisation will add.
+/// Trains on `data` (not empty) and returns the flat parameters of encoder and decoder. `bits` is the width of the latents: training adds
+/// the noise of their quantisation.
 pub(super) fn train(data: &Data, bits: u8, settings: &Settings, seed: Seed, events: &dyn EventSink) -> (Vec<f32>, Vec<f32>) {
     let net = Net::new(data.width);
     let n = data.len();
@@ -63,7 +63,7 @@ pub(super) fn train(data: &Data, bits: u8, settings: &Settings, seed: Seed, even
             events.emit(&Event::Progress { task: "cca autoencoder".into(), done: step as u64 + 1, total: steps as u64 });
         }
     }
-    // Training must not make things worse; a diverged network (NaN) compares as worse.
+    // If training did not improve the network, keep the initial one; NaN counts as worse.
     let improved = total_loss(&net, &parameters, data) < total_loss(&net, &start, data);
     if !improved {
         parameters = start;
@@ -85,7 +85,7 @@ pub(super) fn encode_all(data: &Data, encoder: &[f32]) -> Vec<f32> {
     out
 }
 
-/// Gaussians in a new random order each time all have been seen.
+/// Random orders of the Gaussians, a new one per epoch.
 struct Order {
     rows: Vec<u32>,
     next: usize,
@@ -108,7 +108,7 @@ impl Order {
     }
 }
 
-/// The best linear autoencoder of the weighted coefficients, inside the network.
+/// The best linear autoencoder of the weighted coefficients, as parameters of the network.
 fn principal_start(data: &Data, net: &Net, seed: Seed) -> Vec<f32> {
     let (c, latents) = (data.width, net.latents);
     let root: Vec<f64> = data.column_weights.iter().map(|&w| f64::from(w).sqrt()).collect();
@@ -135,7 +135,7 @@ fn principal_start(data: &Data, net: &Net, seed: Seed) -> Vec<f32> {
     let (mut into, mut out) = (vec![0.0f32; c * latents], vec![0.0f32; latents * c]);
     for j in 0..latents {
         let deviation = values[j].max(0.0).sqrt();
-        // Directions without variance carry noise of the arithmetic only.
+        // Directions without variance contain only rounding noise.
         if deviation > 1e-5 * values[0].max(0.0).sqrt() {
             for k in 0..c {
                 let v = vectors[j * c + k];
@@ -237,7 +237,7 @@ mod tests {
             pool.install(|| train(&data, 14, &settings, Seed::root(9), &Silent))
         };
         let (one, three) = (run(1), run(3));
-        assert!(one == three, "the number of threads shows in the weights");
+        assert!(one == three, "the weights depend on the number of threads");
         let net = Net::new(width);
         let start = total_loss(&net, &principal_start(&data, &net, Seed::root(9).child("start")), &data);
         let trained: Vec<f32> = one.0.into_iter().chain(one.1).collect();

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 /// A calibrated camera. Lens distortion is undone by the readers, so none is stored.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
-    /// A name for people, as the dataset has it.
+    /// Display name, as in the dataset.
     pub name: String,
     /// Image width in pixels.
     pub width: u32,
@@ -42,7 +42,8 @@ impl Camera {
         let m = &self.world_to_camera;
         [m[2][0], m[2][1], m[2][2]]
     }
-    /// A camera at `eye_world` looking at `target_world`; `up_world` points up in the image.
+    /// A camera at `eye_world` that looks at `target_world`; `up_world` points up in the image. `size` is width and height in pixels, `fov_x_rad` the full
+    /// horizontal angle.
     pub fn look_at(name: &str, size: (u32, u32), fov_x_rad: f64, eye_world: [f64; 3], target_world: [f64; 3], up_world: [f64; 3]) -> Self {
         let eye = DVec3::from(eye_world);
         let forward = (DVec3::from(target_world) - eye).normalize();
@@ -61,12 +62,15 @@ impl Camera {
             world_to_camera: [row(right), row(down), row(forward), [0.0, 0.0, 0.0, 1.0]],
         }
     }
-    /// The same camera for an image of another size (the whole picture, resampled).
+    /// The same camera for its whole image resampled to `width` x `height` pixels.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
         Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy, ..self.clone() }
     }
     /// Refuses non-finite numbers, empty images, focal lengths that are not positive, and transforms that are not rigid.
+    ///
+    /// # Errors
+    /// [`Error::Data`] that names the camera.
     pub fn validate(&self) -> Result<()> {
         let bad = |problem: String| Err(Error::data(format!("camera {}", self.name), problem, "Check the dataset's calibration file"));
         if self.width == 0 || self.height == 0 {

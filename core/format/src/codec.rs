@@ -1,10 +1,10 @@
-//! The seam of attribute codecs: Gaussians to bytes and back.
+//! The attribute codec trait: Gaussians to bytes and back.
 
 use crate::plugin::Plugin;
 use crate::{CodecContext, HostGaussians, Result};
 use serde::{Deserialize, Serialize};
 
-/// A named run of bytes. The size of a model is the sum of these lengths after the archive's compression, never an estimate.
+/// A named array of bytes. The size of a model is the size of its archive file, in which streams are compressed; it is never an estimate.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Stream {
     /// Unique within the codec.
@@ -13,32 +13,32 @@ pub struct Stream {
     pub bytes: Vec<u8>,
 }
 
-/// What a codec may lose of one attribute; the conformance suite holds it to that.
+/// The largest error of one attribute; the conformance suite checks it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DeclaredLoss {
     /// Name of a column of [`HostGaussians`].
     pub attribute: String,
-    /// `0` is bit-exact. Otherwise the largest root-mean-square error over the attribute's own standard deviation.
+    /// The largest root-mean-square error, divided by the attribute's standard deviation. `0` is bit-exact.
     pub relative_rms: f64,
 }
 
 /// Gaussians to bytes and back (paper Section IV-D for `cca`).
 pub trait AttributeCodec: Send + Sync {
-    /// Encodes all attributes. Must be deterministic in the Gaussians, the configuration, the seed and what else `context` holds.
+    /// Encodes all attributes. Deterministic: equal Gaussians, settings and `context` give equal bytes.
     ///
-    /// [`HostGaussians::extra`] must survive as far as each attribute asks for: bit for bit, or within its tolerance, and in the rows that are needed.
+    /// Of [`HostGaussians::extra`], the needed rows must be kept, bit for bit or within each attribute's tolerance.
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>>;
-    /// Decodes what [`AttributeCodec::encode`] wrote. Bytes are hostile: an error, never a panic. A player decodes without views, renderer and field.
+    /// Decodes what [`AttributeCodec::encode`] wrote. Bytes are untrusted: an error, never a panic. `context` has no views, renderer and deformer.
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>;
-    /// What is lost, per attribute; an attribute not named is bit-exact.
+    /// The largest error of each attribute. Attributes that are not listed are bit-exact.
     fn losses(&self) -> Vec<DeclaredLoss>;
 }
 
 /// An attribute codec in the registry.
 pub struct CodecPlugin {
-    /// Facts for people, tables and checks.
+    /// Name, version and other facts.
     pub info: Plugin,
-    /// Builds the codec. The string is the profile after the colon of `name:profile` (empty: the default one); the table holds its settings.
+    /// Builds the codec. The string is the profile after the colon of `name:profile` (empty: the default profile); the table holds its settings.
     pub build: fn(&str, &toml::Table) -> Result<Box<dyn AttributeCodec>>,
 }
 crate::plugin_kind!(CodecPlugin, "codec");

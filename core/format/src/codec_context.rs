@@ -1,32 +1,32 @@
-//! What a codec is handed besides what it encodes.
+//! The context of a codec: everything but the Gaussians or weights.
 
 use crate::{Camera, EventSink, HostGaussians, Image8, Limits, Result, Seed};
 
-/// What a codec is handed besides the Gaussians or the weights. The optional parts are there when a model is compressed with its scene at hand; a codec that
-/// can use them does better with them, and still works without. They are never there for decoding.
+/// The context of a codec. The optional parts are set if a model is encoded together with its scene. A codec may use them for a better result, but must work
+/// without them. They are never set for decoding.
 pub struct CodecContext<'a> {
-    /// The codec's own node of the seed tree.
+    /// The codec's node of the seed tree.
     pub seed: Seed,
-    /// What a decoder may believe.
+    /// Limits on what a decoder accepts.
     pub limits: Limits,
-    /// Where progress goes.
+    /// Receives progress and warnings.
     pub events: &'a dyn EventSink,
     /// The views that the model was trained on.
     pub views: Option<&'a dyn TrainingViews>,
-    /// Draws the model with Gaussians of the codec's choice.
+    /// Renders the model with other Gaussians.
     pub renderer: Option<&'a dyn RenderModel>,
-    /// The deformation field of the model; absent for static models.
+    /// The deformer of the model; `None` for static models.
     pub deformer: Option<&'a dyn EvaluateDeformer>,
 }
 
 impl<'a> CodecContext<'a> {
-    /// A context without scene, renderer and field, as decoders get it.
+    /// A context without scene, renderer and deformer, as for decoding.
     pub fn new(seed: Seed, limits: Limits, events: &'a dyn EventSink) -> Self {
         Self { seed, limits, events, views: None, renderer: None, deformer: None }
     }
 }
 
-/// The training views of a scene: cameras and times at once, images on demand. Held-out views are not among them.
+/// The training views of a scene. Images are decoded on demand. Held-out views are not included.
 pub trait TrainingViews {
     /// The number of views.
     fn len(&self) -> usize;
@@ -34,21 +34,21 @@ pub trait TrainingViews {
     fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// Camera and time (0..1) of the view `index`, which must be under [`TrainingViews::len`].
+    /// Camera and time (0..1) of the view `index`, which must be below [`TrainingViews::len`].
     fn view(&self, index: usize) -> (&Camera, f32);
     /// The recorded image of the view `index`, at the size of its camera.
     fn image(&self, index: usize) -> Result<Image8>;
 }
 
-/// Draws a model: its deformation field, rasterizer, rules and background are fixed, its canonical Gaussians are given.
+/// Renders a model with other canonical Gaussians; its deformer, rasterizer, rules and background are fixed.
 pub trait RenderModel {
-    /// Draws `gaussians`, moved to `time_norm` (0..1), through `camera`. Extra attributes that the field reads must be there.
+    /// Renders `gaussians`, deformed to `time_norm` (0..1), with `camera`. `gaussians` must have the extra attributes that the deformer reads.
     fn render(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<RenderedPlanes>;
 }
 
-/// A deformation field as a function from Gaussians to moved Gaussians.
+/// A deformer as a function from canonical Gaussians to deformed ones.
 pub trait EvaluateDeformer {
-    /// `gaussians` as the field moves them at `time_norm` (0..1); those below the dynamic threshold stay. The order is that of `gaussians`.
+    /// `gaussians` deformed to `time_norm` (0..1), in the same order. Those whose score is not above the dynamic threshold stay unchanged.
     fn deform(&self, gaussians: &HostGaussians, time_norm: f32) -> Result<HostGaussians>;
 }
 
@@ -64,7 +64,7 @@ pub struct RenderedPlanes {
 }
 
 impl RenderedPlanes {
-    /// Red, green and blue as an 8-bit image.
+    /// The RGB planes as an 8-bit image; values are clamped to 0..1.
     pub fn to_image(&self) -> Image8 {
         Image8::from_planes(&self.planes, self.width, self.height)
     }

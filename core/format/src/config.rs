@@ -3,23 +3,29 @@
 use crate::{Error, Result};
 use serde::de::DeserializeOwned;
 
-/// Parses a section into `T`. Unknown keys, wrong types and missing values name the section and the key.
+/// Parses a section into `T`. `object` is the section's name in errors.
+///
+/// # Errors
+/// [`Error::Parameter`] with section and key, for unknown keys, wrong types and missing values.
 pub fn parse_section<T: DeserializeOwned>(object: &str, section: &toml::Table) -> Result<T> {
     T::deserialize(toml::Value::Table(section.clone()))
         .map_err(|e| Error::parameter(object, e.message().trim().to_string(), "`cc4dgs plugins NAME` and the presets show the known keys"))
 }
 
-/// Parses TOML text into a table; `object` names the file.
+/// Parses TOML text into a table; `object` names the file in errors.
+///
+/// # Errors
+/// [`Error::Parameter`] for text that is not TOML.
 pub fn parse_table(object: &str, text: &str) -> Result<toml::Table> {
     text.parse::<toml::Table>().map_err(|e| Error::parameter(object, e.to_string().replace('\n', " ").trim().to_string(), "Correct the TOML"))
 }
 
-/// Lays `over` on `base`, table by table; values of `over` win.
+/// Merges `over` into `base`, table by table; values of `over` take precedence. A section whose `kind` changes drops the settings of the old plug-in.
 pub fn merge(base: &mut toml::Table, over: &toml::Table) {
     for (key, value) in over {
         match (base.get_mut(key), value) {
             (Some(toml::Value::Table(inner)), toml::Value::Table(new)) => {
-                // Another plug-in's settings mean nothing to the new one.
+                // The settings of the old plug-in are not valid for the new one.
                 let changes_kind = new.get("kind").is_some_and(|k| inner.get("kind") != Some(k));
                 if changes_kind {
                     inner.clear();
@@ -33,7 +39,10 @@ pub fn merge(base: &mut toml::Table, over: &toml::Table) {
     }
 }
 
-/// Applies one `--set a.b.c=value`. The value is read as TOML; bare words become strings.
+/// Applies one `--set a.b.c=value`. The value is parsed as TOML; bare words become strings.
+///
+/// # Errors
+/// [`Error::Parameter`] for an assignment without `=` or with an empty part in its key.
 pub fn set(table: &mut toml::Table, assignment: &str) -> Result<()> {
     let object = format!("--set {assignment}");
     let Some((path, text)) = assignment.split_once('=') else {
@@ -54,8 +63,8 @@ pub fn set(table: &mut toml::Table, assignment: &str) -> Result<()> {
     Ok(())
 }
 
-/// Applies several assignments in their order, except that plug-ins are chosen first: `deformer.levels=3` before `deformer.kind=cdf` sets the levels of
-/// `cdf`, where [`set`] alone would drop them with the settings of the plug-in before.
+/// Applies several assignments in order, those of `kind` first. So `deformer.levels=3` before `deformer.kind=cdf` sets the levels of `cdf`; with [`set`]
+/// alone, the change of `kind` would drop them.
 pub fn set_all(table: &mut toml::Table, assignments: &[String]) -> Result<()> {
     let chooses = |assignment: &&String| assignment.split('=').next().is_some_and(|path| path.trim().ends_with(".kind"));
     let (kinds, others): (Vec<&String>, Vec<&String>) = assignments.iter().partition(chooses);
@@ -87,7 +96,7 @@ mod tests {
         set(&mut t, "deformer.kind=none").unwrap();
         assert_eq!(t["train"]["iterations"].as_integer(), Some(20));
         assert_eq!(t["deformer"]["kind"].as_str(), Some("none"));
-        assert!(t["deformer"].get("levels").is_none(), "settings of another plug-in must go");
+        assert!(t["deformer"].get("levels").is_none(), "settings of another plug-in must be dropped");
         assert!(set(&mut t, "nonsense").is_err());
     }
 

@@ -1,19 +1,19 @@
-//! What a deformation field is told of its scene.
+//! What a deformer knows of its scene.
 
 use crate::Seed;
 use serde::{Deserialize, Serialize};
 
-/// What a field must know of its scene before its weights mean anything. Stored in checkpoints and archives.
+/// The properties of a scene that define the meaning of a deformer's weights. Stored in checkpoints and archives.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DeformerContext {
-    /// Lower corner of the box the field covers, world units.
+    /// Lower corner of the deformer's bounding box, world units.
     pub box_min: [f32; 3],
-    /// Upper corner of the box the field covers, world units.
+    /// Upper corner of the deformer's bounding box, world units.
     pub box_max: [f32; 3],
-    /// The number of frames of the sequence (sets temporal bandwidth).
+    /// Number of frames of the sequence; it sets the temporal bandwidth.
     pub frame_count: usize,
-    /// Spherical-harmonics degree of the Gaussians it will move.
+    /// Spherical-harmonics degree of the Gaussians.
     pub sh_degree: usize,
-    /// The field's own node of the seed tree.
+    /// The deformer's node of the seed tree.
     pub seed: Seed,
 }

@@ -1,31 +1,31 @@
-//! Errors, sorted by who is at fault. Every message names the object, the value or limit seen, and the remedy.
+//! Errors, sorted by cause. Every message names the object, the value or limit, and the remedy.
 
 use std::path::{Path, PathBuf};
 
 /// The result of every fallible call of this workspace.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// What went wrong, by fault. Applications map the variants to exit codes (see [`Error::exit_code`]). `Debug` prints the same sentence as `Display`, so that
-/// an error returned from `main` reads well.
+/// An error, by cause. Applications map the variants to exit codes (see [`Error::exit_code`]). `Debug` prints the same text as `Display`, so that
+/// an error returned from `main` is readable.
 #[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The user asked for something impossible: a configuration key, a command-line value, a name.
+    /// A wrong request of the user: a configuration key, a command-line value, a name.
     #[error("{object}: {problem}. {remedy}")]
     Parameter {
         /// What was being configured.
         object: String,
-        /// The value seen and why it is wrong.
+        /// The value and why it is wrong.
         problem: String,
         /// What to do instead.
         remedy: String,
     },
-    /// Bytes from outside are broken: a truncated archive, a lying header, a NaN in a file.
+    /// Invalid input data: a truncated archive, a wrong header, a NaN in a file.
     #[error("{object}: {problem}. {remedy}")]
     Data {
         /// The file, stream or record.
         object: String,
-        /// The value seen and why it is wrong.
+        /// The value and why it is wrong.
         problem: String,
         /// What to do about it.
         remedy: String,
@@ -35,14 +35,14 @@ pub enum Error {
     Limit {
         /// What was too large.
         object: String,
-        /// The size claimed or seen.
+        /// The size.
         value: u64,
-        /// The limit it was held to.
+        /// The limit.
         limit: u64,
         /// How to raise the limit or shrink the input.
         remedy: String,
     },
-    /// The request is sensible, and this build cannot do it.
+    /// A valid request that this build cannot fulfil.
     #[error("{object}: {problem}. {remedy}")]
     Unsupported {
         /// The feature, version or device.
@@ -52,15 +52,15 @@ pub enum Error {
         /// What works instead.
         remedy: String,
     },
-    /// The operating system refused.
+    /// An error of the operating system.
     #[error("{path}: {source}. Check that the path exists and may be read or written")]
     Io {
-        /// The path involved.
+        /// The path.
         path: PathBuf,
-        /// The system's own word.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// A device or numeric back end failed, or a computation lost its meaning (a NaN in training).
+    /// A device or backend failed, or a computation gave invalid values (a NaN in training).
     #[error("{object}: {problem}. {remedy}")]
     Backend {
         /// The device, kernel or quantity.
@@ -70,7 +70,7 @@ pub enum Error {
         /// What to try.
         remedy: String,
     },
-    /// The user interrupted; everything needed to resume was written.
+    /// The user interrupted. A checkpoint was written before.
     #[error("interrupted: {0}")]
     Interrupted(String),
 }
@@ -106,7 +106,7 @@ impl Error {
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Self::Io { path: path.as_ref().to_path_buf(), source }
     }
-    /// The process exit code: 2 user error, 3 data error, 4 out of memory or over a limit, 5 back end, 130 interruption.
+    /// The process exit code: 2 user error, 3 data error, 4 out of memory or over a limit, 5 backend, 130 interruption.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Parameter { .. } | Self::Unsupported { .. } => 2,

@@ -1,33 +1,33 @@
-//! Everything a run says, as typed events. Progress bars, JSON-lines logs, viewers and tests are listeners; library code never prints.
+//! Everything a run reports, as typed events. Progress bars, JSON-lines logs, viewers and tests are listeners. Library code never prints.
 
 use serde::{Deserialize, Serialize};
 
-/// One thing that happened.
+/// An event of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Event {
     /// A run began.
     RunStarted {
-        /// What runs: `train`, `compress`, `eval`.
+        /// The command: `train`, `compress`, `eval`.
         command: String,
         /// Device name.
         device: String,
         /// Root seed.
         seed: u64,
     },
-    /// Something was decided that the user did not ask for by name.
+    /// A decision that the user did not make explicitly.
     Note {
         /// What it is about.
         object: String,
         /// What was decided.
         message: String,
     },
-    /// Something the user should know and nothing has to stop for.
+    /// A problem that does not stop the run.
     Warning {
         /// The object it is about.
         object: String,
-        /// What was seen and what was done about it.
+        /// The problem and what was done about it.
         message: String,
     },
     /// A stage of training began.
@@ -39,7 +39,7 @@ pub enum Event {
         /// Gaussians at its start.
         gaussians: usize,
     },
-    /// A training iteration ended (not every one is told).
+    /// A training iteration ended. Not every iteration is reported.
     Iteration {
         /// The stage.
         stage: String,
@@ -49,14 +49,14 @@ pub enum Event {
         of: usize,
         /// Loss, smoothed.
         loss: f32,
-        /// Training PSNR in dB, smoothed, unrounded images.
+        /// PSNR of training views in dB, smoothed; images are not rounded to 8 bits.
         psnr_db: f32,
-        /// Gaussians.
+        /// Number of Gaussians.
         gaussians: usize,
         /// Milliseconds per iteration since the last such event.
         ms: f32,
     },
-    /// Densification or pruning changed the set.
+    /// Density control changed the Gaussians.
     Densified {
         /// Iteration within the stage.
         iteration: usize,
@@ -64,14 +64,14 @@ pub enum Event {
         cloned: usize,
         /// Gaussians split in two.
         split: usize,
-        /// Gaussians moved to another place.
+        /// Gaussians relocated.
         moved: usize,
         /// Gaussians removed.
         pruned: usize,
-        /// Gaussians now.
+        /// Number of Gaussians after it.
         gaussians: usize,
     },
-    /// Work that was skipped or done, counted.
+    /// Counts of work done and skipped.
     Work {
         /// The stage or command.
         stage: String,
@@ -82,50 +82,50 @@ pub enum Event {
         /// Units skipped.
         skipped: u64,
     },
-    /// Long work advanced.
+    /// Progress of a long task.
     Progress {
         /// The task.
         task: String,
         /// Units done.
         done: u64,
-        /// Units in all.
+        /// Units in total.
         total: u64,
     },
     /// A stage ended.
     StageFinished {
         /// The stage.
         stage: String,
-        /// Wall seconds.
+        /// Wall-clock time in seconds.
         seconds: f64,
         /// Gaussians at its end.
         gaussians: usize,
     },
-    /// A file was completed.
+    /// A file was written.
     Saved {
-        /// Which file.
+        /// Path of the file.
         path: String,
-        /// Its size.
+        /// Its size in bytes.
         bytes: u64,
     },
 }
 
 /// Listens to events.
 pub trait EventSink: Send + Sync {
-    /// Takes one event. Must not block for long.
+    /// Receives one event. Must not block for long.
     fn emit(&self, event: &Event);
 }
 
-/// Ignores everything.
+/// Ignores all events.
 pub struct Silent;
 impl EventSink for Silent {
     fn emit(&self, _: &Event) {}
 }
 
-/// Keeps everything, for tests.
+/// Records all events, for tests.
 #[derive(Default)]
 pub struct Recorder(std::sync::Mutex<Vec<Event>>);
 impl Recorder {
-    /// What was heard so far.
+    /// The events so far.
     pub fn events(&self) -> Vec<Event> {
         self.0.lock().map(|e| e.clone()).unwrap_or_default()
     }

@@ -13,40 +13,40 @@ pub const fn sh_rest_len(degree: usize) -> usize {
 /// Names of the attributes every Gaussian has, in the order of [`HostGaussians::columns`].
 pub const CORE_ATTRIBUTES: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
 
-/// A per-Gaussian attribute a plug-in brings along (an embedding, a second rotation): `width` floats per Gaussian.
+/// A per-Gaussian attribute of a plug-in (an embedding, a second rotation): `width` floats per Gaussian.
 ///
-/// `tolerance` and `needed` tell an encoder what it may lose. They are not stored: decoded attributes have neither.
+/// `tolerance` and `needed` tell an encoder which errors are allowed. They are not stored; decoded attributes have neither.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct ExtraAttribute {
     /// Floats per Gaussian.
     pub width: usize,
     /// Row-major values `[N, width]`.
     pub values: Vec<f32>,
-    /// The largest absolute error that a codec may make in a value; `None` keeps the values bit for bit.
+    /// Largest absolute error of a value after decoding; `None` means bit for bit.
     pub tolerance: Option<f32>,
-    /// The rows that anybody reads; `None`: all of them.
+    /// The rows that must be stored; `None` means all.
     pub needed: Option<NeededRows>,
 }
 
-/// The rows of an attribute that must be stored. A codec may leave the others out; they come back as `start`.
+/// The rows of an attribute that must be stored. A codec may omit the others; their values are then decoded as `start`.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct NeededRows {
     /// Whether each row is needed `[N]`.
     pub rows: Vec<bool>,
-    /// What every value of a row comes back as that was not stored.
+    /// Decoded value of rows that were not stored.
     pub start: f32,
 }
 
 impl ExtraAttribute {
-    /// An attribute of which every row is kept bit for bit.
+    /// An attribute of which every row must be stored bit for bit. `values` are [N,width], row-major.
     pub fn exact(width: usize, values: Vec<f32>) -> Self {
         Self { width, values, tolerance: None, needed: None }
     }
-    /// The same values, of which a codec may change each by at most `tolerance`.
+    /// The same values, with a largest absolute error of `tolerance`.
     pub fn within(self, tolerance: f32) -> Self {
         Self { tolerance: Some(tolerance), ..self }
     }
-    /// The same values, of which only the rows that are true in `rows` `[N]` must be stored; the others may come back as `start`.
+    /// The same values. Only rows whose flag in `rows` `[N]` is set must be stored; others may be decoded as `start`.
     pub fn needed_in(self, rows: Vec<bool>, start: f32) -> Self {
         Self { needed: Some(NeededRows { rows, start }), ..self }
     }
@@ -69,7 +69,7 @@ pub struct HostGaussians {
     pub sh_dc: Vec<f32>,
     /// Colour coefficients of degree 1 and up, coefficient-major `[N, (d+1)^2-1, 3]`.
     pub sh_rest: Vec<f32>,
-    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves iff its score is over the threshold `[N]`.
+    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves if and only if its score is above the threshold `[N]`.
     pub dynamic_scores: Vec<f32>,
     /// Attributes of plug-ins by name.
     pub extra: BTreeMap<String, ExtraAttribute>,
@@ -109,7 +109,10 @@ impl HostGaussians {
             ("dynamic_scores", 1, &mut self.dynamic_scores),
         ]
     }
-    /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite.
+    /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite. `object` names the Gaussians in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`], [`Error::Limit`], and [`Error::Parameter`] for impossible tolerances or flags of extra attributes.
     pub fn validate(&self, object: &str, limits: &Limits) -> Result<()> {
         let n = self.len();
         limits.check_gaussians(object, n as u64)?;
@@ -121,7 +124,7 @@ impl HostGaussians {
             if values.len() != n * width {
                 return Err(Error::data(
                     object,
-                    format!("{name} holds {} values, {} Gaussians need {}", values.len(), n, n * width),
+                    format!("{name} has {} values, {} Gaussians need {}", values.len(), n, n * width),
                     "The file is damaged; fetch it again",
                 ));
             }
@@ -140,7 +143,7 @@ impl HostGaussians {
         }
         Ok(())
     }
-    /// The Gaussians of `keep`, in that order.
+    /// The Gaussians with the indices `keep`, in that order. The indices must be below N.
     pub fn select(&self, keep: &[usize]) -> Self {
         let pick = |width: usize, values: &[f32]| keep.iter().flat_map(|&i| values[i * width..(i + 1) * width].iter().copied()).collect::<Vec<_>>();
         let mut out = Self { sh_degree: self.sh_degree, ..Default::default() };

@@ -16,7 +16,10 @@ pub struct Image8 {
 }
 
 impl Image8 {
-    /// Refuses an image without pixels, with other than 3 or 4 channels, or with another number of bytes than its size wants; `object` names it in the error.
+    /// Refuses an image without pixels, with other than 3 or 4 channels, or with a number of bytes that does not match its size. `object` names it in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`].
     pub fn validate(&self, object: &str) -> Result<()> {
         let bytes = u64::from(self.width).saturating_mul(u64::from(self.height)).saturating_mul(u64::from(self.channels));
         if bytes == 0 || !(3..=4).contains(&self.channels) || self.data.len() as u64 != bytes {

@@ -1,8 +1,8 @@
-//! The stored form of cc4dgs: Gaussians as plain arrays, the `.cc4d` archive, the codec seams, PLY and SPZ.
+//! The stored form of cc4dgs: Gaussians as plain arrays, the `.cc4d` archive, the codec traits, PLY and SPZ.
 //!
-//! This crate knows nothing of burn, and on `wasm32` nothing of C: it is all that a codec or a small player needs. The author of a codec implements
-//! [`AttributeCodec`] (or [`WeightCodec`]) and submits a [`CodecPlugin`] ([`WeightCodecPlugin`]) through `inventory::submit!`; [`storage`] has the parts that
-//! most codecs share, [`conformance`] the suites that every codec passes. inventory, serde and toml are re-exported in the versions that this crate uses.
+//! This crate does not depend on burn, and on `wasm32` not on C libraries. It is all that a codec or a small player needs. To add a codec, implement
+//! [`AttributeCodec`] (or [`WeightCodec`]) and submit a [`CodecPlugin`] ([`WeightCodecPlugin`]) through `inventory::submit!`. [`storage`] has building blocks
+//! that most codecs share, [`conformance`] the suites that every codec must pass. inventory, serde and toml are re-exported in the versions that this crate uses.
 
 pub mod archive;
 mod camera;

@@ -1,19 +1,19 @@
-//! How much a reader may believe of what a file claims.
+//! Limits on the sizes that readers accept from files.
 
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// Caps for everything that reads bytes from outside. A reader checks a claimed size here before it allocates for it.
+/// Upper bounds for readers of untrusted bytes. A reader checks a stated size against them before it allocates memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
-    /// The most bytes one object (a stream, an image, an array) may take once decoded.
+    /// Largest decoded size of one object (a stream, an image, an array), in bytes.
     pub max_bytes: u64,
-    /// The most Gaussians (or points) one model may hold.
+    /// Largest number of Gaussians (or points) of one model.
     pub max_gaussians: u64,
-    /// The most pixels one image may have.
+    /// Largest number of pixels of one image.
     pub max_pixels: u64,
-    /// The most nested levels of a document.
+    /// Largest nesting depth of a document.
     pub max_depth: u32,
 }
 
@@ -24,15 +24,24 @@ impl Default for Limits {
 }
 
 impl Limits {
-    /// Refuses `bytes` claimed by `object` when they are over [`Limits::max_bytes`].
+    /// Refuses an `object` of more than [`Limits::max_bytes`].
+    ///
+    /// # Errors
+    /// [`Error::Limit`].
     pub fn check_bytes(&self, object: &str, bytes: u64) -> Result<()> {
         Self::check(object, bytes, self.max_bytes, "Raise limits.max_bytes if the file is trusted")
     }
-    /// Refuses `count` Gaussians claimed by `object` when they are over [`Limits::max_gaussians`].
+    /// Refuses an `object` of more than [`Limits::max_gaussians`].
+    ///
+    /// # Errors
+    /// [`Error::Limit`].
     pub fn check_gaussians(&self, object: &str, count: u64) -> Result<()> {
         Self::check(object, count, self.max_gaussians, "Raise limits.max_gaussians if the file is trusted")
     }
-    /// Refuses a `width` x `height` image claimed by `object` when it is over [`Limits::max_pixels`].
+    /// Refuses an image `object` of more than [`Limits::max_pixels`].
+    ///
+    /// # Errors
+    /// [`Error::Limit`].
     pub fn check_pixels(&self, object: &str, width: u64, height: u64) -> Result<()> {
         Self::check(object, width.saturating_mul(height), self.max_pixels, "Raise limits.max_pixels if the image is trusted")
     }

@@ -1,4 +1,4 @@
-//! What every plug-in says of itself, and how the linked ones of a kind are found by name.
+//! Facts about plug-ins, and the collection of the linked plug-ins of a kind by name.
 
 use crate::{Error, Result};
 use serde::Serialize;
@@ -7,23 +7,23 @@ use std::collections::BTreeMap;
 /// Facts of one registry entry.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Plugin {
-    /// The name used in configurations; lower-case kebab.
+    /// The name used in configurations, in lower-case kebab case.
     pub name: &'static str,
     /// Version of the plug-in's stored form.
     pub version: &'static str,
-    /// One line for lists.
+    /// A summary of one line.
     pub summary: &'static str,
-    /// Where the method comes from.
+    /// The paper or work that the method comes from.
     pub paper: &'static str,
     /// Settings with defaults, as TOML text with comments.
     pub schema: &'static str,
-    /// What it can do: `differentiable`, `static-only`, `profiles=…`.
+    /// Capabilities, such as `differentiable`, `static-only`, `profiles=…`.
     pub capabilities: &'static [&'static str],
 }
 
 /// A kind of plug-in: what `inventory::submit!` takes.
 pub trait PluginEntry: Sized + Sync + 'static {
-    /// The kind's name: of its section in configurations, its method of the registry, its folder.
+    /// The kind's name: its section in configurations, its method of the registry, its folder.
     const KIND: &'static str;
     /// Facts of this entry.
     fn info(&self) -> &Plugin;
@@ -31,7 +31,7 @@ pub trait PluginEntry: Sized + Sync + 'static {
     fn linked() -> Vec<&'static Self>;
 }
 
-/// Implements [`PluginEntry`] for a plug-in struct with a field `info`, and makes it collectable.
+/// Implements [`PluginEntry`] for a plug-in struct with a field `info`, and registers the type with inventory.
 #[macro_export]
 macro_rules! plugin_kind {
     ($plugin:ty, $kind:literal) => {
@@ -52,7 +52,10 @@ macro_rules! plugin_kind {
 pub struct Entries<P: 'static>(BTreeMap<&'static str, &'static P>);
 
 impl<P: PluginEntry> Entries<P> {
-    /// Collects them. A name taken twice is an error.
+    /// Collects all linked plug-ins of this kind.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] if two plug-ins have the same name.
     pub fn collect() -> Result<Self> {
         let mut map = BTreeMap::new();
         for plugin in P::linked() {
@@ -63,7 +66,10 @@ impl<P: PluginEntry> Entries<P> {
         }
         Ok(Self(map))
     }
-    /// The entry called `name`. An unknown name is an error that lists the nearest known ones.
+    /// The entry called `name`.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for an unknown name; it lists similar names.
     pub fn get(&self, name: &str) -> Result<&'static P> {
         self.0.get(name).copied().ok_or_else(|| unknown_name(P::KIND, name, self.0.keys().copied()))
     }
@@ -77,19 +83,22 @@ impl<P: PluginEntry> Entries<P> {
     }
 }
 
-/// An error about `name` that lists the nearest of `known`.
+/// An error for the unknown `name` of a `kind`; it lists all `known` names and the most similar ones.
 pub fn unknown_name<'a>(kind: &str, name: &str, known: impl Iterator<Item = &'a str>) -> Error {
     let mut known: Vec<&str> = known.collect();
     known.sort_by(|a, b| strsim::jaro_winkler(b, name).total_cmp(&strsim::jaro_winkler(a, name)).then(a.cmp(b)));
-    // Jaro-Winkler misses swapped letters in short names, edit distance misses long names that share only their beginning.
+    // Jaro-Winkler misses swapped letters in short names; edit distance misses long names that share only a prefix.
     let few_edits = |k: &str| strsim::damerau_levenshtein(k, name) <= (name.chars().count() / 3).min(2);
     let near: Vec<&str> = known.iter().copied().filter(|k| strsim::jaro_winkler(k, name) > 0.75 || few_edits(k)).take(3).collect();
     let remedy =
         if near.is_empty() { format!("Known: {}", known.join(", ")) } else { format!("Did you mean {}? Known: {}", near.join(" or "), known.join(", ")) };
-    Error::parameter(format!("{kind} '{name}'"), "no such name", remedy)
+    Error::parameter(format!("{kind} '{name}'"), "unknown name", remedy)
 }
 
-/// Splits a plug-in section into its `kind` and the rest.
+/// Splits a plug-in section into its `kind` and the other settings. `object` is the section's name in errors.
+///
+/// # Errors
+/// [`Error::Parameter`] if `kind` is missing or not a string.
 pub fn split_kind(object: &str, section: &toml::Table) -> Result<(String, toml::Table)> {
     let mut settings = section.clone();
     match settings.remove("kind") {

@@ -1,8 +1,8 @@
-//! PLY in and out: the layout of 3D Gaussian splatting (Inria), binary little-endian float32 per Gaussian.
+//! Reads and writes PLY files in the layout of 3D Gaussian splatting (Inria): binary little-endian float32 properties per Gaussian.
 //!
 //! `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3 [dynamic]`, all before activation; `f_rest` is channel-major (all
 //! coefficients of red, then green, then blue). With degree 3 that is 62 floats, 63 with Swift4D's `dynamic`. Properties are found by
-//! name, so their order does not matter and normals may be missing; the number of `f_rest` gives the degree (0, 9, 24, 45 or 72).
+//! name, so their order does not matter and normals may be missing. The number of `f_rest` (0, 9, 24, 45 or 72) gives the degree.
 
 use crate::archive::write_atomically;
 use crate::gaussians::sh_rest_len;
@@ -10,15 +10,18 @@ use crate::{Error, HostGaussians, Limits, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// The most bytes a header may take; 3DGS headers take about 1.5 kB.
+/// Largest header in bytes; 3DGS headers have about 1.5 kB.
 const HEADER_LIMIT: usize = 64 << 10;
 
-/// Reads the Gaussians of a PLY file. Unknown properties are ignored ([`read_reporting`] tells which).
+/// Reads the Gaussians of a PLY file. Unknown properties are ignored; [`read_reporting`] lists them.
+///
+/// # Errors
+/// [`Error::Io`], [`Error::Data`] for invalid files, [`Error::Unsupported`] for other PLY layouts, [`Error::Limit`].
 pub fn read(path: impl AsRef<Path>, limits: &Limits) -> Result<HostGaussians> {
     Ok(read_reporting(path, limits)?.0)
 }
 
-/// [`read`], and what was found odd: ignored properties, missing dynamic scores.
+/// Like [`read`]; also returns warnings about ignored properties and missing dynamic scores.
 pub fn read_reporting(path: impl AsRef<Path>, limits: &Limits) -> Result<(HostGaussians, Vec<String>)> {
     let path = path.as_ref();
     let object = path.display().to_string();
@@ -28,14 +31,14 @@ pub fn read_reporting(path: impl AsRef<Path>, limits: &Limits) -> Result<(HostGa
     from_bytes(&object, &bytes, limits)
 }
 
-/// [`read_reporting`] of a file in memory; `object` names it in errors.
+/// Like [`read_reporting`], for a file in memory; `object` names it in errors.
 pub fn from_bytes(object: &str, bytes: &[u8], limits: &Limits) -> Result<(HostGaussians, Vec<String>)> {
     let header = Header::parse(object, bytes, limits)?;
     let body = &bytes[header.body..];
     let claimed = header.count as u64 * header.stride as u64;
     if (body.len() as u64) < claimed || (header.last && body.len() as u64 > claimed) {
-        let problem = format!("{} Gaussians of {} bytes need {claimed} bytes, the file holds {}", header.count, header.stride, body.len());
-        return Err(Error::data(object, problem, "The file is truncated or its header lies; fetch it again"));
+        let problem = format!("{} Gaussians of {} bytes need {claimed} bytes, the file has {}", header.count, header.stride, body.len());
+        return Err(Error::data(object, problem, "The file is truncated or its header is wrong; fetch it again"));
     }
     let layout = Layout::find(object, &header)?;
     let gaussians = layout.gather(&body[..claimed as usize], header.stride);
@@ -50,7 +53,10 @@ pub fn from_bytes(object: &str, bytes: &[u8], limits: &Limits) -> Result<(HostGa
     Ok((gaussians, warnings))
 }
 
-/// Writes Gaussians as PLY, all or nothing; `include_dynamic` appends the property `dynamic`. Attributes of plug-ins are not written.
+/// Writes Gaussians as PLY, atomically. `include_dynamic` appends the property `dynamic`. Attributes of plug-ins are not written.
+///
+/// # Errors
+/// [`Error::Io`], and [`Error::Data`] for invalid Gaussians.
 pub fn write(path: impl AsRef<Path>, gaussians: &HostGaussians, include_dynamic: bool) -> Result<()> {
     write_atomically(path, &to_bytes(gaussians, include_dynamic)?)
 }
@@ -89,7 +95,7 @@ pub fn to_bytes(gaussians: &HostGaussians, include_dynamic: bool) -> Result<Vec<
     Ok(out)
 }
 
-/// What the header says of the element `vertex`.
+/// The header's description of the element `vertex`.
 struct Header {
     count: usize,
     /// Bytes per vertex.
@@ -100,7 +106,7 @@ struct Header {
     names: Vec<String>,
     /// Whether no other element follows.
     last: bool,
-    /// Where the values begin.
+    /// Byte offset of the first value.
     body: usize,
 }
 
@@ -120,11 +126,11 @@ impl Header {
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words.as_slice() {
                 ["ply"] if first => {}
-                _ if first => return Err(bad("it does not begin with the line 'ply'".into())),
+                _ if first => return Err(bad("the first line is not 'ply'".into())),
                 ["comment" | "obj_info", ..] => {}
                 ["format", "binary_little_endian", _] => format = true,
                 ["format", other, ..] => {
-                    return Err(Error::unsupported(object, format!("PLY format '{other}' is not read"), "Convert the file to binary_little_endian"));
+                    return Err(Error::unsupported(object, format!("PLY format '{other}' is not supported"), "Convert the file to binary_little_endian"));
                 }
                 ["element", "vertex", count] if vertex.is_none() => {
                     let count: u64 = count.parse().map_err(|_| bad(format!("'{count}' is not a number of vertices")))?;
@@ -146,13 +152,13 @@ impl Header {
                         return Err(bad(format!("property '{name}' has the unknown type '{kind}'")));
                     };
                     if header.properties.insert((*name).to_string(), (header.stride, (*kind).to_string())).is_some() {
-                        return Err(bad(format!("property '{name}' is there twice")));
+                        return Err(bad(format!("property '{name}' appears twice")));
                     }
                     header.names.push((*name).to_string());
                     header.stride += size;
                 }
                 ["end_header"] if format && vertex.is_some() => return Ok(header),
-                ["end_header"] => return Err(bad("the header names no format or no vertices".into())),
+                ["end_header"] => return Err(bad("the header has no format or no element vertex".into())),
                 _ => return Err(bad(format!("the header line '{}' is not understood", line.escape_default().take(80).collect::<String>()))),
             }
         }
@@ -196,7 +202,7 @@ impl Layout {
         };
         let rest = header.names.iter().filter(|n| n.starts_with("f_rest_")).count();
         let Some(sh_degree) = (0..=4).find(|&d| 3 * sh_rest_len(d) == rest) else {
-            return Err(bad(format!("{rest} properties f_rest_* belong to no spherical-harmonics degree (0, 9, 24, 45 and 72 do)")));
+            return Err(bad(format!("{rest} properties f_rest_*, expected 0, 9, 24, 45 or 72 (spherical-harmonics degree 0 to 4)")));
         };
         let k = sh_rest_len(sh_degree);
         let mut layout = Self {
@@ -234,7 +240,7 @@ impl Layout {
 mod tests {
     use super::*;
 
-    /// Two Gaussians whose every number says where it belongs.
+    /// Two Gaussians in which every value is different.
     fn sample(sh_degree: usize) -> HostGaussians {
         let mut out = HostGaussians { sh_degree, opacity_logits: vec![0.0; 2], ..Default::default() };
         for (a, (_, width, values)) in out.columns_mut().into_iter().enumerate() {

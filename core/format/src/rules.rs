@@ -1,4 +1,4 @@
-//! The rules of projection and blending that a model was trained under.
+//! The rules of projection and blending that a model was trained with.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Rules {
-    /// gsplat 1.6: near 0.01, 3.33 sigma per axis, alpha cap 0.99 without gradient beyond the cap.
+    /// gsplat 1.6: near 0.01, 3.33 sigma per axis, alpha cap 0.99 with zero gradient above it.
     #[default]
     Gsplat099,
     /// gsplat up to 1.5.3: as above with the cap at 0.999.
     Gsplat0999,
-    /// Inria: near 0.2, square of 3 sigma of the major axis, alpha cap 0.99 that the gradient ignores.
+    /// Inria: near 0.2, square of 3 sigma of the major axis, alpha cap 0.99 that passes the gradient on.
     Inria,
 }

@@ -1,4 +1,4 @@
-//! Randomness as a tree: a root seed and named children, so that adding a consumer never shifts another's numbers.
+//! Random seeds as a tree: a root seed and named children, so that a new consumer never changes another consumer's random numbers.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -22,7 +22,7 @@ impl Seed {
     pub fn index(self, index: u64) -> Self {
         Self(xxhash_rust::xxh3::xxh3_64_with_seed(&index.to_le_bytes(), self.0))
     }
-    /// The node's own 64 bits.
+    /// The node's 64 bits.
     pub fn value(self) -> u64 {
         self.0
     }

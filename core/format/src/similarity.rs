@@ -29,7 +29,7 @@ impl Similarity {
     /// Refuses numbers that are not finite, scales that are not positive, and scales so far from 1 that float32 positions lose their meaning; `object` names
     /// the file in the error.
     pub fn validate(&self, object: &str) -> Result<()> {
-        let sound = (1e-30..=1e30).contains(&self.scale) && self.translation.iter().all(|v| v.is_finite());
+        let sound = (1e-15..=1e15).contains(&self.scale) && self.translation.iter().all(|v| v.is_finite());
         if sound {
             return Ok(());
         }

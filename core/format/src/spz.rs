@@ -1,7 +1,7 @@
 //! Niantic's SPZ: static Gaussians in some 20 bytes plus harmonics, read by most viewers. The layout is that of the format's published description,
 //! version 3 written, 2 and 3 read: a gzip stream of a header of 16 bytes and the attributes one after the other.
 //!
-//! SPZ's axes are right, up, back; those of cameras and PLY files here are right, down, forward. Both ways turn half around x.
+//! SPZ's axes are right, up, back; those of cameras and PLY files here are right, down, forward. Reading and writing rotate by 180 degrees around x.
 
 use crate::gaussians::sh_rest_len;
 use crate::{Error, HostGaussians, Limits, Result};
@@ -14,18 +14,18 @@ use std::io::{Read, Write};
 /// "NGSP".
 const MAGIC: u32 = 0x5053_474e;
 const HEADER: usize = 16;
-/// Places of fixed-point coordinates after the point, at most.
+/// Largest number of fractional bits of fixed-point coordinates.
 const MOST_FRACTION: u8 = 20;
-/// The largest coordinate that 24 bits hold, with no bit for fractions.
+/// Largest absolute coordinate, world units: 24 bits without fractional bits.
 pub const LARGEST: f32 = 8_388_607.0;
-/// Bytes of vendors' extensions that are passed over.
+/// Largest vendor extension that is skipped, in bytes.
 const MOST_EXTENSION: usize = 1 << 24;
-/// What a unit of the degree-0 coefficient becomes in 0..1.
+/// Scale of the degree-0 coefficient in the stored colour range 0..1.
 const COLOR: f32 = 0.15;
-/// Largest value of a small component of a quaternion in version 3.
+/// Largest code of a quaternion component in version 3.
 const COMPONENT: f32 = 511.0;
 
-/// Whether coefficient `k` of 1.. changes sign when y and z do: odd powers of y and z together.
+/// Whether spherical-harmonics coefficient `k` (from 1) changes sign if y and z do: the powers of y and z add up to an odd number.
 fn is_odd(k: usize) -> bool {
     // By degree, in the order of 3DGS: -y z -x; xy yz zz xz xx-yy; y xyz y z x z x; xy yz xy yz zz xz xx xz xx.
     const ODD: [bool; 24] = [
@@ -37,7 +37,11 @@ fn is_odd(k: usize) -> bool {
     ODD[k - 1]
 }
 
-/// An SPZ file of `gaussians`, which must be sound ([`HostGaussians::validate`]). Dynamic scores and plug-in attributes are left out.
+/// An SPZ file of `gaussians`, which must be valid ([`HostGaussians::validate`]). Dynamic scores and plug-in attributes are not stored. `sh1_bits` and
+/// `sh_rest_bits` (1 to 8) are the bits per coefficient of degree 1 and of higher degrees.
+///
+/// # Errors
+/// [`Error::Parameter`] or [`Error::Limit`] for coordinates or counts that the format cannot store.
 pub fn to_spz(gaussians: &HostGaussians, sh1_bits: u8, sh_rest_bits: u8) -> Result<Vec<u8>> {
     let n = gaussians.len();
     let count = u32::try_from(n).map_err(|_| Error::limit("SPZ file", n as u64, u64::from(u32::MAX), "Prune the model"))?;
@@ -45,7 +49,7 @@ pub fn to_spz(gaussians: &HostGaussians, sh1_bits: u8, sh_rest_bits: u8) -> Resu
     if farthest > LARGEST {
         return Err(Error::data(
             "Gaussians to write as SPZ",
-            format!("a coordinate of {farthest:e} is beyond 24 bits"),
+            format!("a coordinate of {farthest:e} does not fit 24 bits"),
             "Remove far outliers, or use another codec",
         ));
     }
@@ -63,7 +67,7 @@ pub fn to_spz(gaussians: &HostGaussians, sh1_bits: u8, sh_rest_bits: u8) -> Resu
     }
     let byte = |v: f32| v.round().clamp(0.0, 255.0) as u8;
     let unit: Vec<Option<[f32; 4]>> = gaussians.quaternions.as_chunks::<4>().0.iter().map(|q| normalized(*q)).collect();
-    // A quaternion of no direction is not drawn, so neither is what stands for it.
+    // A quaternion of norm zero is not drawn, so its Gaussian is stored with an opacity of zero.
     raw.extend(gaussians.opacity_logits.iter().zip(&unit).map(|(o, q)| if q.is_some() { byte(255.0 / (1.0 + (-o).exp())) } else { 0 }));
     raw.extend(gaussians.sh_dc.iter().map(|c| byte((c * COLOR + 0.5) * 255.0)));
     raw.extend(gaussians.log_scales.iter().map(|s| byte((s + 10.0) * 16.0)));
@@ -83,7 +87,10 @@ pub fn to_spz(gaussians: &HostGaussians, sh1_bits: u8, sh_rest_bits: u8) -> Resu
     encoder.write_all(&raw).and_then(|()| encoder.finish()).map_err(|e| Error::backend("SPZ", e.to_string(), "Report this as a defect"))
 }
 
-/// The Gaussians of an SPZ file; dynamic scores are zero.
+/// The Gaussians of an SPZ file; dynamic scores are zero. `object` names the file in errors.
+///
+/// # Errors
+/// [`Error::Data`] for invalid files, [`Error::Unsupported`] for other versions, [`Error::Limit`].
 pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<HostGaussians> {
     let damaged = |problem: String| Error::data(object, problem, "Fetch the file again");
     let mut decoder = GzDecoder::new(bytes);
@@ -128,7 +135,7 @@ pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<HostGauss
         if is_odd(1 + i / 3 % (rest / 3).max(1)) { -value } else { value }
     };
     let sh_rest = take(rest)?.iter().enumerate().map(level).collect();
-    // What follows are extensions of vendors. Reading to the end checks the sum of the gzip stream.
+    // Vendor extensions follow. Reading to the end verifies the checksum of the gzip stream.
     let mut beyond = vec![0u8; 1 << 16];
     let mut left = MOST_EXTENSION;
     while left > 0 {
@@ -138,14 +145,14 @@ pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<HostGauss
         }
     }
     if left == 0 || !decoder.get_ref().is_empty() {
-        return Err(damaged("something follows the Gaussians that is no extension".into()));
+        return Err(damaged("unknown data follows the Gaussians".into()));
     }
     let found = HostGaussians { sh_degree, means, log_scales, quaternions, opacity_logits, sh_dc, sh_rest, dynamic_scores: vec![0.0; n], ..Default::default() };
     found.validate(object, limits)?;
     Ok(found)
 }
 
-/// Half around x.
+/// Rotation by 180 degrees around x.
 fn turned([x, y, z]: [f32; 3]) -> [f32; 3] {
     [x, -y, -z]
 }
@@ -155,7 +162,7 @@ fn normalized(q: [f32; 4]) -> Option<[f32; 4]> {
     (norm > 1e-15 && norm.is_finite()).then(|| q.map(|v| (f64::from(v) / norm) as f32))
 }
 
-/// (x,y,z,w): the place of the largest in two bits, then sign and nine bits of each other in order.
+/// Packs (x,y,z,w): two bits for the index of the largest component, then sign and nine bits for each of the others in order.
 fn pack_rotation(q: [f32; 4]) -> u32 {
     let largest = (0..4).fold(0, |a, k| if q[k].abs() > q[a].abs() { k } else { a });
     let flip = q[largest] < 0.0;
@@ -175,11 +182,11 @@ fn unpack_rotation(packed: u32) -> [f32; 4] {
     with_largest(small, (packed >> 30) as usize)
 }
 
-/// A unit quaternion from three components and the place of the fourth, which is not negative.
-fn with_largest(small: [f32; 3], place: usize) -> [f32; 4] {
+/// A unit quaternion from three components and the index of the fourth, which is not negative.
+fn with_largest(small: [f32; 3], index: usize) -> [f32; 4] {
     let rest = (1.0 - small.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
     let mut others = small.into_iter();
-    let q = std::array::from_fn(|k| if k == place { rest } else { others.next().unwrap_or(0.0) });
+    let q = std::array::from_fn(|k| if k == index { rest } else { others.next().unwrap_or(0.0) });
     normalized(q).unwrap_or([0.0, 0.0, 0.0, 1.0])
 }
 
@@ -200,7 +207,7 @@ mod tests {
 
     #[test]
     fn signs_are_those_of_the_basis_turned_half_around_x() {
-        // Functions of 3DGS up to degree 3 at a direction, without factors.
+        // The basis functions of 3DGS up to degree 3, without factors.
         let values = |[x, y, z]: [f32; 3]| {
             let (xx, yy, zz) = (x * x, y * y, z * z);
             [

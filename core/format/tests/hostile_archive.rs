@@ -145,7 +145,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
     };
     vec![
         ("empty.cc4d", vec![], "fewer"),
-        ("not_an_archive.cc4d", magic, "does not begin like"),
+        ("not_an_archive.cc4d", magic, "wrong magic bytes"),
         ("version_9.cc4d", version, "version 9"),
         ("truncated.cc4d", sound()[..sound().len() - 1].to_vec(), "claims"),
         ("trailing.cc4d", trailing, "4 bytes follow the last stream"),

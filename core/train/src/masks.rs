@@ -1,4 +1,4 @@
-//! Temporal-deviation masks: which pixels of a fixed camera see something move (Swift4D; baselines §2.2).
+//! Temporal-deviation masks: which pixels of a fixed camera see something move (Swift4D, Wu et al. 2025).
 
 use cc4dgs_core::{Event, EventSink, Result, Scene, Split};
 use rayon::prelude::*;

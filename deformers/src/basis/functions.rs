@@ -1,4 +1,4 @@
-//! The functions of time that all Gaussians share: a constant, t, Fourier bands, cubic B-splines, and a few learned by a small network.
+//! The functions of time that all Gaussians share: a constant, t, Fourier bands, cubic B-splines, and functions learned by a small network.
 
 use crate::parts::time::encode;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -6,17 +6,17 @@ use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::Result;
 use std::sync::Arc;
 
-/// Falloff of the bands that the network sees: what it learns is smooth first, so that it does not learn each training time by itself.
+/// Falloff of the network's input bands. It favours smooth functions, so that the network does not fit each training time separately.
 const NETWORK_FALLOFF: f32 = 1.0;
 
-/// Which functions there are, in this order: the constant, t, a sine and a cosine per band, the splines, what is learned.
+/// The functions, in this order: the constant, t, a sine and a cosine per band, the splines, the learned ones.
 #[derive(Clone, Debug)]
 pub(super) struct TemporalFunctions {
     /// Fourier bands of 1, 2, 4… cycles per sequence.
     pub(super) bands: usize,
-    /// Each band is 2^-falloff as large as the one below.
+    /// The amplitude of each band is 2^-falloff times that of the next lower one.
     pub(super) falloff: f32,
-    /// Cubic B-splines over the sequence; none or at least four.
+    /// Number of cubic B-splines over the sequence: 0 or at least 4.
     pub(super) splines: usize,
     /// The network from time to the learned functions.
     pub(super) network: Option<Arc<ReluShape>>,
@@ -30,16 +30,16 @@ impl TemporalFunctions {
     fn learned(&self) -> usize {
         self.network.as_ref().and_then(|n| n.output_widths().first().copied()).unwrap_or(0)
     }
-    /// How many there are.
+    /// The number of functions.
     pub(super) fn count(&self) -> usize {
         1 + Self::encoding(self.bands) + self.splines + self.learned()
     }
-    /// What a function costs in [`super::sparsity`]: 1, but the l-th band 2^l times its size, as motion through it is fast.
+    /// The penalty of each function in [`super::sparsity`]: 1, but 2^l times its amplitude for the l-th band, because high bands move fast.
     pub(super) fn prices(&self) -> Vec<f32> {
         let fourier = (0..self.bands).flat_map(|band| [(band as f32 * (1.0 - self.falloff)).exp2(); 2]);
         [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(1.0, self.splines + self.learned())).collect()
     }
-    /// All of them at some times: φ(t) [times, functions]. `weights` are those of the network.
+    /// All functions at `times_norm` (0..1): φ(t) [times, functions]. `weights` are those of the network.
     pub(super) fn at(&self, times_norm: &[f32], weights: Option<Tensor<1>>, like: &Device) -> Result<Tensor<2>> {
         let rows = |of: &dyn Fn(f32) -> Vec<f32>| {
             let values: Vec<f32> = times_norm.iter().flat_map(|&t| of(t)).collect();
@@ -53,7 +53,7 @@ impl TemporalFunctions {
         }
         Ok(Tensor::cat(parts, 1))
     }
-    /// t and the bands, each 2^-falloff as large as the one below.
+    /// t and the bands; the amplitude of each band is 2^-falloff times that of the next lower one.
     fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
         let mut encoding = encode(time_norm, self.bands);
         for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
@@ -63,7 +63,7 @@ impl TemporalFunctions {
     }
 }
 
-/// `count` uniform cubic B-splines that cover 0..1; each is not zero over four of the `count` - 3 intervals, and they add up to 1.
+/// `count` uniform cubic B-splines over 0..1. Each is non-zero on at most four of the `count` - 3 intervals; together they sum to 1.
 fn splines_at(time_norm: f32, count: usize) -> Vec<f32> {
     let place = f64::from(time_norm.clamp(0.0, 1.0)) * count.saturating_sub(3) as f64;
     let spline = |i: usize| {

@@ -1,12 +1,13 @@
-//! A field that is linear in its functions of time: offsets = C(f_voxel) φ(t).
+//! A deformer that is linear in its functions of time: offsets = C(f_voxel) φ(t).
 //!
 //! C is a matrix of coefficients per Gaussian, computed from the same hashed voxel features as the CDF's (paper Section IV-B) and cached by playback like
-//! them; φ is one vector per frame, shared by all Gaussians: a constant, t, Fourier bands and a few functions learned by a small network. A frame costs
-//! a dot product per offset in place of a network per Gaussian, and motion over many cycles is in reach, which FiLM in front of a trunk hardly learns.
+//! them; φ is one vector per frame, shared by all Gaussians: a constant, t, Fourier bands, optional splines and functions learned by a small network.
+//! A frame costs a dot product per offset instead of a network per Gaussian. It also represents motion over many cycles, which FiLM in front of a trunk hardly
+//! learns.
 //! Trajectories as combinations of few shared functions are the idea of DynMF (Kratimenos et al. 2024) and Gaussian-Flow (Lin et al. 2024), which store the
 //! coefficients per Gaussian.
 //!
-//! After training, functions that a head hardly uses are left out, and so are heads: see [`simplify`].
+//! After training, functions that a head hardly uses and heads without effect are dropped: see [`simplify`].
 
 mod functions;
 mod simplify;
@@ -30,27 +31,27 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Settings with their defaults, as shown to users.
-const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as of `cdf`
-# levels, resolutions, hidden, features, hashes, modulus, vertex_reuse: as of `cdf`
+const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as for `cdf`
+# levels, resolutions, hidden, features, hashes, modulus, vertex_reuse: as for `cdf`
 # width = 128            # width of the coefficient network (small: 64; mid: 96)
 layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
-falloff = 1.0            # each band is 2^-falloff as large as the one below: fast motion is learned later; 0 treats all alike
-sparsity = 1e-4          # pull of a group lasso on every function of every head (Fourier bands: times their speed); 0 is off
-splines = 0              # cubic B-splines over the sequence beside the bands; none or at least 4
+falloff = 1.0            # amplitude of a band over the next lower one is 2^-falloff: fast motion is learned later; 0 treats all alike
+sparsity = 1e-4          # weight of a group lasso on every function of every head (Fourier bands: times their frequency); 0 is off
+splines = 0              # cubic B-splines over the sequence, in addition to the bands; 0 or at least 4
 learned = 16             # functions of time learned by a small network; 0 is none
 heads = ["means", "log_scales", "quaternions"]
-rotation = "additive"    # quaternions change by sums (the paper) | "exponential": by a rotation vector, which composes however far it turns
-unused = 0.01            # after training, functions whose part in a head's offsets is below this share are left out; 0 keeps all
+rotation = "additive"    # added to quaternions (the paper) | "exponential": a rotation vector, exact for any angle
+unused = 0.01            # after training, functions whose part in a head's offsets is below this share are dropped; 0 keeps all
 lr_start = 1e-3          # Adam, log-linear to lr_end over the main stage
 lr_end = 1e-5
 warmup = 0.025           # linear warm-up, as a share of the stage
 clip_norm = 1.0          # gradient-norm clip per group; 0 is off
-# [deformer.kept]        # functions by head, by number; written by training
+# [deformer.kept]        # function indices per head; written by training
 # means = [0, 1, 2]
 "#;
 
-/// The most bands that are chosen automatically: 32 cycles per sequence.
+/// Largest number of bands chosen automatically: up to 32 cycles per sequence.
 const MOST_BANDS: usize = 6;
 /// Parameter groups by index.
 const GRID: usize = 0;
@@ -66,7 +67,7 @@ enum Rotation {
     Exponential,
 }
 
-/// Settings of what comes after the voxels.
+/// Settings of everything after the voxel features.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 struct BasisSettings {
@@ -102,20 +103,20 @@ impl Default for BasisSettings {
 }
 
 impl BasisSettings {
-    /// Numbers of a head.
+    /// Values per Gaussian of a head.
     fn width_of(&self, head: Head, sh_degree: usize) -> usize {
         if head == Head::Quaternions && self.rotation == Rotation::Exponential { 3 } else { head.width(sh_degree) }
     }
-    /// The functions of every head, all of `count` unless some were left out.
+    /// The function indices of every head: all of `count` unless some were dropped.
     fn functions_of_heads(&self, count: usize) -> Result<Vec<Vec<usize>>> {
         if let Some(name) = self.kept.keys().find(|name| !self.heads.iter().any(|h| h.name() == name.as_str())) {
-            return Err(Error::parameter(format!("deformer.kept.{name}"), "no head is called so", "Name heads of deformer.heads"));
+            return Err(Error::parameter(format!("deformer.kept.{name}"), "no such head", "Name heads of deformer.heads"));
         }
         let of_head = |head: &Head| {
             let Some(own) = self.kept.get(head.name()) else { return Ok((0..count).collect()) };
             if own.is_empty() || own.windows(2).any(|w| w[0] >= w[1]) || own.iter().any(|&f| f >= count) {
-                let problem = format!("{own:?} is no ascending list of functions below {count}");
-                return Err(Error::parameter(format!("deformer.kept.{}", head.name()), problem, "Give each function once, or leave the list out"));
+                let problem = format!("{own:?} is not an ascending list of function indices below {count}");
+                return Err(Error::parameter(format!("deformer.kept.{}", head.name()), problem, "Give each function once, or omit the list"));
             }
             Ok(own.clone())
         };
@@ -123,7 +124,7 @@ impl BasisSettings {
     }
 }
 
-/// The field. Parameters: decoders by level, the functions' network (if any), the coefficients' trunk, one head each.
+/// The deformer. Parameters: decoders by level, the functions' network (if any), the coefficients' trunk, one head each.
 struct CdfBasis {
     section: toml::Table,
     context: DeformerContext,
@@ -131,7 +132,7 @@ struct CdfBasis {
     rates: Rates,
     voxels: Voxels,
     functions: TemporalFunctions,
-    /// Functions by head.
+    /// Function indices by head.
     kept: Vec<Vec<usize>>,
     shape: Arc<BasisShape>,
     coefficients: Arc<ReluShape>,
@@ -152,7 +153,11 @@ impl CdfBasis {
         within("learned", settings.learned, 0, 256)?;
         within("splines", settings.splines, 0, 1024)?;
         if (1..4).contains(&settings.splines) {
-            return Err(Error::parameter("deformer.splines", format!("{} are too few for cubic pieces", settings.splines), "Give 0 (none) or at least 4"));
+            return Err(Error::parameter(
+                "deformer.splines",
+                format!("{} splines are too few; cubic splines need 4", settings.splines),
+                "Give 0 (none) or at least 4",
+            ));
         }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
         if !(0.0..=4.0).contains(&settings.falloff) {
@@ -162,7 +167,7 @@ impl CdfBasis {
             return Err(Error::parameter("deformer.sparsity", format!("{} cannot be used", settings.sparsity), "Give 0 (off) to 1"));
         }
         if !(0.0..1.0).contains(&settings.unused) {
-            return Err(Error::parameter("deformer.unused", format!("{} is no share", settings.unused), "Give a share from 0 to below 1"));
+            return Err(Error::parameter("deformer.unused", format!("{} is not in 0..1", settings.unused), "Give a share from 0 to below 1"));
         }
         let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
         let network = (settings.learned > 0).then(|| Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(bands), width, width, settings.learned])));
@@ -189,26 +194,26 @@ impl CdfBasis {
         let (section, context) = (section.clone(), context.clone());
         Ok(Self { section, context, rates, voxels, functions, kept, shape, coefficients, parameters, settings })
     }
-    /// The weights of the parameter from `place` after the decoders to the end, side by side.
+    /// The weights of all parameters from index `place` after the decoders to the end, concatenated.
     fn weights_after(&self, place: usize) -> Tensor<1> {
         Tensor::cat(self.parameters[self.voxels.levels() + place..].iter().map(|p| p.value.clone()).collect(), 0)
     }
-    /// What one is in a head: half the diagonal of the box for centres, else 1.
+    /// The unit of a head's outputs: half the diagonal of the box (world units) for centres, else 1.
     fn scale_of(&self, head: Head) -> f64 {
         let side = |k: usize| f64::from(self.context.box_max[k]) - f64::from(self.context.box_min[k]);
         if head == Head::Means { 0.5 * (0..3).map(|k| side(k).powi(2)).sum::<f64>().sqrt() } else { 1.0 }
     }
-    /// Every function at every time: φ(t) [times, functions].
+    /// All functions at `times_norm` (0..1): φ(t) [times, functions].
     fn functions_at(&self, times_norm: &[f32], like: &Device) -> Result<Tensor<2>> {
         let weights = self.functions.network.as_ref().map(|_| self.parameters[self.voxels.levels()].value.clone());
         self.functions.at(times_norm, weights, like)
     }
-    /// φ(t) as the heads read it, each its own, one head after the other.
+    /// φ(t) for each head (its own functions only), concatenated head after head.
     fn functions_by_head(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
         let all: Tensor<1> = self.functions_at(&[time_norm], like)?.flatten(0, 1);
-        let places: Vec<i64> = self.kept.iter().flatten().map(|&f| f as i64).collect();
-        let count = places.len();
-        Ok(all.select(0, Tensor::<1, Int>::from_data(TensorData::new(places, [count]), like)))
+        let indices: Vec<i64> = self.kept.iter().flatten().map(|&f| f as i64).collect();
+        let count = indices.len();
+        Ok(all.select(0, Tensor::<1, Int>::from_data(TensorData::new(indices, [count]), like)))
     }
 }
 
@@ -271,7 +276,7 @@ inventory::submit! {
         info: Plugin {
             name: "cdf-basis",
             version: "2",
-            summary: "computational field, linear in shared functions of time: a dot product per frame",
+            summary: "computational deformation field, linear in shared functions of time: a dot product per frame",
             paper: "CC-4DGS, Section IV-B (spatial half); DynMF, Gaussian-Flow (shared temporal functions)",
             schema: SCHEMA,
             capabilities: &["differentiable", "starts-as-identity", "vertex-reuse", "cached-spatial", "simplifies", "rotation=additive,exponential"],

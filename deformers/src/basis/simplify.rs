@@ -1,7 +1,7 @@
-//! Leaving out functions of time that a trained field hardly uses, and whole heads: fewer bytes to store and fewer coefficients to read per frame.
+//! Drops functions of time that a trained deformer hardly uses, and heads without effect: fewer bytes to store and fewer coefficients to read per frame.
 //!
-//! The part of a function in a head's offsets is measured over the scene's own Gaussians and times, not over weights: the root-mean-square of its coefficients
-//! times its own. Functions are left out from the least on, as long as all that is left out stays below a share of the head's offsets.
+//! A function's part in a head's offsets is measured on the scene's own Gaussians and times, not on weights: the root-mean-square of its coefficients times
+//! its own. Functions are dropped from the smallest part on, as long as the sum of what is dropped stays below a share of the head's offsets.
 
 use super::{CdfBasis, NET};
 use crate::parts::heads::Head;
@@ -10,7 +10,7 @@ use burn::tensor::Tensor;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Deformer, Error, Parameter, Part, Result, Simplified};
 
-/// Offsets of a head below this root-mean-square are those of a head that does nothing: shares of the box's half diagonal for centres, else plain numbers.
+/// A head whose offsets have a root-mean-square below this has no effect. The unit is half the diagonal of the box for centres, else 1.
 fn negligible(head: Head) -> f64 {
     match head {
         Head::Means => 1e-6,
@@ -18,10 +18,10 @@ fn negligible(head: Head) -> f64 {
     }
 }
 
-/// What remains of a head.
+/// What is kept of a head.
 struct Plan {
     head: Head,
-    /// Places in the head's list of functions.
+    /// Indices into the head's list of functions.
     kept: Vec<usize>,
 }
 
@@ -44,7 +44,7 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
     let (mut column, mut first) = (0, 0);
     for (&head, &(width, own)) in field.settings.heads.iter().zip(&field.shape.groups) {
         let coefficients = &values[m * column..m * (column + width * own)];
-        // Mean square over Gaussians, outputs and times of c φ, function by function.
+        // Mean square over Gaussians, outputs and times of c φ, per function.
         let strength = mean_squares(coefficients, own);
         let part = |f: usize| strength[f] * of_functions[first + f];
         let parts: Vec<f64> = (0..own).map(part).collect();
@@ -60,7 +60,7 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
         column += width * own;
         first += own;
     }
-    // A field without heads is no field; what moves nothing is the trainer's to notice.
+    // A deformer needs at least one head. The trainer handles deformers that move nothing.
     if lines.is_empty() || plans.iter().all(|p| p.kept.is_empty()) {
         return Ok(None);
     }
@@ -94,7 +94,7 @@ fn combined_square(coefficients: &[f32], (width, own): (usize, usize), functions
     sum / terms.max(1) as f64
 }
 
-/// Places to keep so that the others together stay below `allowed`.
+/// The indices to keep so that the parts of the others sum to less than `allowed`.
 fn keep(parts: &[f64], allowed: f64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..parts.len()).collect();
     order.sort_by(|&a, &b| parts[a].total_cmp(&parts[b]));
@@ -110,7 +110,7 @@ fn keep(parts: &[f64], allowed: f64) -> Vec<usize> {
     kept
 }
 
-/// The field with the planned functions only: the same weights without the columns of the others.
+/// The deformer with the planned functions only: the same weights without the columns of the others.
 fn rebuilt(field: &CdfBasis, plans: &[Plan]) -> Result<CdfBasis> {
     let left: Vec<(&Plan, &Vec<usize>)> = plans.iter().zip(&field.kept).filter(|(p, _)| !p.kept.is_empty()).collect();
     let mut section = field.section.clone();
@@ -139,7 +139,7 @@ fn rebuilt(field: &CdfBasis, plans: &[Plan]) -> Result<CdfBasis> {
     Ok(small)
 }
 
-/// A head's layers without some functions: those of W [in, hidden] and b [hidden] as they are, of the last layer's W [hidden, outputs x functions] and b some
+/// A head's layers without some functions: W [in, hidden] and b [hidden] unchanged, of the last layer's W [hidden, outputs x functions] and b only the kept
 /// columns.
 fn head_weights(values: &[f32], (outputs, own): (usize, usize), width: usize, kept: &[usize]) -> Vec<f32> {
     let first = width * (width + 1);

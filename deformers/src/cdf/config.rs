@@ -30,7 +30,7 @@ warmup = 0.025           # linear warm-up, as a share of the stage
 clip_norm = 1.0          # gradient-norm clip per group; 0 is off
 "#;
 
-/// How time meets space.
+/// How time features and spatial features are combined.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fusion {
@@ -41,7 +41,7 @@ pub enum Fusion {
     Concat,
 }
 
-/// How time enters.
+/// Encoding of time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TimeEncoding {
@@ -59,7 +59,7 @@ pub struct CdfConfig {
     pub voxels: VoxelSettings,
     /// How the weights are optimised.
     pub rates: Rates,
-    /// Everything else.
+    /// All other settings.
     pub network: NetworkSettings,
 }
 
@@ -74,21 +74,21 @@ impl<'de> Deserialize<'de> for CdfConfig {
     }
 }
 
-/// Settings of what comes after the voxels.
+/// Settings of everything after the voxel features.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NetworkSettings {
     /// Width of the deformation network.
     pub width: Option<usize>,
-    /// How time enters.
+    /// Encoding of time.
     pub time_encoding: TimeEncoding,
     /// Frequency bands; 0 chooses by the number of frames.
     pub time_bands: usize,
     /// Hidden layers of the time network.
     pub time_layers: usize,
-    /// How time meets space.
+    /// How time features and spatial features are combined.
     pub fusion: Fusion,
-    /// What the field moves.
+    /// The outputs, in order.
     pub heads: Vec<Head>,
     /// Whether playback keeps spatial features.
     pub cache: bool,
@@ -108,7 +108,7 @@ impl Default for NetworkSettings {
     }
 }
 
-/// The sizes of one field, all settled.
+/// All sizes of one deformer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sizes {
     /// Grid and decoders.
@@ -136,7 +136,10 @@ impl Sizes {
 }
 
 impl CdfConfig {
-    /// Settles all sizes for the scene in `context`, refusing what cannot work.
+    /// Computes all sizes for the scene in `context`.
+    ///
+    /// # Errors
+    /// [`cc4dgs_core::Error::Parameter`] for sizes out of range.
     pub fn sizes(&self, context: &DeformerContext) -> Result<Sizes> {
         let voxels = self.voxels.sizes()?;
         let network = &self.network;

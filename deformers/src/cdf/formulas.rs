@@ -1,5 +1,5 @@
-//! The field by the paper's formulas, in burn's primitives: no fused kernels, nothing folded. Slow and obvious: the tests hold the field to it, and the
-//! benchmarks measure against it.
+//! The computational deformation field by the paper's formulas, in burn's primitives: no fused kernels, nothing folded. Slow and obvious: tests compare the
+//! fused implementation with it, and so do the benchmarks.
 
 use super::Cdf;
 use crate::parts::time;
@@ -8,7 +8,7 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{MishShape, VoxelCorners};
 use cc4dgs_core::{Error, Result};
 
-/// A field to be computed step by step.
+/// A deformer to be evaluated step by step.
 pub struct Formulas<'a>(pub &'a Cdf);
 
 fn matrix(values: Vec<f32>, width: usize, device: &Device) -> Tensor<2> {
@@ -16,7 +16,7 @@ fn matrix(values: Vec<f32>, width: usize, device: &Device) -> Tensor<2> {
     Tensor::from_data(TensorData::new(values, [rows, width]), device)
 }
 
-/// Linear layer of `input` to `output` out of a flat array from `at` on, which moves past it.
+/// Linear layer from `input` to `output` features. Its weights start at `at` in a flat array; `at` is advanced past them.
 fn linear(x: Tensor<2>, weights: &Tensor<1>, at: &mut usize, (input, output): (usize, usize)) -> Tensor<2> {
     let w = weights.clone().narrow(0, *at, input * output).reshape([input, output]);
     let b = weights.clone().narrow(0, *at + input * output, output).reshape([1, output]);
@@ -54,7 +54,7 @@ impl Formulas<'_> {
         let found = self.0.parameters.iter().find(|p| p.name == name).map(|p| p.value.clone());
         found.ok_or_else(|| Error::backend("deformer cdf", format!("it has no weights {name}"), "Report this as a defect"))
     }
-    /// f_voxel [M, width] of `means_world` [M,3] on the device of the weights. Corners are found, and signatures hashed on the host, as the field does it.
+    /// f_voxel [M, width] of `means_world` [M,3] on the device of the weights. Cells and signatures are computed on the host, by the same functions as in [`Cdf`].
     fn voxels(&self, means_world: &Tensor<2>, device: &Device) -> Result<Tensor<2>> {
         let mut levels = Vec::new();
         let m = means_world.dims()[0];

@@ -1,9 +1,9 @@
 //! The computational deformation field (paper Section IV-B): features of grid vertices are computed from hash signatures by small
 //! decoders instead of being stored, interpolated at the Gaussians, modulated by time, and turned into offsets.
 //!
-//! Everything that does not depend on time is in `spatial`: its output is the hidden state W_s f_voxel + b_s, not f_voxel, so that a cache
-//! saves the spatial layer as well. What time does to that state is the same for all Gaussians and affine, so `deform` folds it into the
-//! first trunk layer: h (gamma ⊙ T) + (beta T + b) in place of (gamma ⊙ h + beta) T + b.
+//! Everything that does not depend on time is in `spatial`. Its output is the hidden state W_s f_voxel + b_s, not f_voxel, so that a cache
+//! saves the spatial layer as well. The modulation by time is affine and the same for all Gaussians, so `deform` folds it into the
+//! first trunk layer: h (gamma ⊙ T) + (beta T + b) instead of (gamma ⊙ h + beta) T + b.
 
 mod config;
 mod formulas;
@@ -27,7 +27,7 @@ use std::sync::Arc;
 const GRID: usize = 0;
 const NET: usize = 1;
 
-/// The field: settings, settled sizes, weights.
+/// The deformer: settings, sizes, weights.
 pub struct Cdf {
     config: CdfConfig,
     sizes: Sizes,
@@ -42,7 +42,10 @@ pub struct Cdf {
 }
 
 impl Cdf {
-    /// A fresh field for the scene of `context`, weights on `device`.
+    /// A deformer with initial weights on `device` for the scene of `context`.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for sizes out of range.
     pub fn new(config: CdfConfig, context: &DeformerContext, device: &Device) -> Result<Self> {
         let sizes = config.sizes(context)?;
         let seed = context.seed;
@@ -73,17 +76,17 @@ impl Cdf {
         })
     }
 
-    /// The settled sizes.
+    /// The sizes that follow from the settings and the scene.
     pub fn sizes(&self) -> &Sizes {
         &self.sizes
     }
 
-    /// The weights of the parameter after the decoders, by place.
+    /// The weights of the parameter at index `place` after the decoders.
     fn net(&self, place: usize) -> Tensor<1> {
         self.parameters[self.voxels.levels() + place].value.clone()
     }
 
-    /// The trunk's weights at a time, modulation folded into its first layer.
+    /// The trunk's weights at `time_norm` (0..1), modulation folded into its first layer.
     fn modulated_trunk(&self, time_norm: f32) -> Result<Tensor<1>> {
         let w = self.sizes.width;
         let trunk = self.net(if self.film.is_some() { 3 } else { 2 });
@@ -129,7 +132,7 @@ impl Deformer for Cdf {
         let layer = if self.film.is_some() {
             layer
         } else {
-            // The rows that read the time features belong to `deform`.
+            // `deform` applies the rows that read the time features.
             let end = layer.dims()[0];
             Tensor::cat(vec![layer.clone().narrow(0, 0, rows * w), layer.narrow(0, end - w, w)], 0)
         };

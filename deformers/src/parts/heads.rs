@@ -1,10 +1,10 @@
-//! The outputs of a field: which there are, how wide, and how they become offsets.
+//! The heads of deformers: names, widths, and their conversion to offsets.
 
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Offsets, Result};
 use serde::Deserialize;
 
-/// An output of the field.
+/// An output of a deformer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Head {
@@ -31,7 +31,7 @@ impl Head {
             Self::Sh => "sh",
         }
     }
-    /// Its width for Gaussians of `sh_degree`.
+    /// Values per Gaussian, for spherical harmonics of `sh_degree`.
     pub fn width(self, sh_degree: usize) -> usize {
         match self {
             Self::Means | Self::LogScales => 3,
@@ -42,13 +42,16 @@ impl Head {
     }
 }
 
-/// Refuses a list without heads or with one named twice.
+/// Refuses an empty list and a head named twice.
+///
+/// # Errors
+/// [`Error::Parameter`].
 pub fn check(heads: &[Head]) -> Result<()> {
     if heads.is_empty() {
         return Err(Error::parameter("deformer.heads", "the list is empty", "Name at least one head, or use deformer kind = \"none\""));
     }
     if let Some((i, head)) = heads.iter().enumerate().find(|(i, h)| heads[..*i].contains(h)) {
-        return Err(Error::parameter("deformer.heads", format!("'{}' appears again at place {}", head.name(), i + 1), "Name each head once"));
+        return Err(Error::parameter("deformer.heads", format!("'{}' appears again at index {}", head.name(), i), "Name each head once"));
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! What fields are made of: each part is one idea that several fields share.
+//! Building blocks that several deformers share, one idea each.
 
 pub mod centres;
 pub mod heads;

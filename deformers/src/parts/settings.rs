@@ -1,4 +1,4 @@
-//! Settings that several fields share, taken out of a `[deformer]` section before the field reads the rest of it.
+//! Settings that several deformers share. They are taken out of a `[deformer]` section before the deformer parses the rest.
 
 use cc4dgs_core::{Error, ParameterGroup, Result, config};
 use serde::Deserialize;
@@ -18,7 +18,7 @@ pub enum Capacity {
 }
 
 impl Capacity {
-    /// Width of the networks behind the voxels.
+    /// Width of the networks behind the voxel features.
     pub fn width(self) -> usize {
         match self {
             Self::Small => 64,
@@ -49,9 +49,12 @@ impl Default for Rates {
 }
 
 impl Rates {
-    /// The keys of a section that belong here.
+    /// The keys of these settings in a `[deformer]` section.
     pub const KEYS: [&'static str; 4] = ["lr_start", "lr_end", "warmup", "clip_norm"];
-    /// Refuses rates that are not numbers or below 0.
+    /// Refuses rates that are negative or not finite, and a warm-up outside 0..1.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`].
     pub fn check(&self) -> Result<()> {
         let rates = [self.lr_start, self.lr_end, self.clip_norm];
         if rates.iter().any(|r| !r.is_finite() || *r < 0.0) || !(0.0..=1.0).contains(&self.warmup) {
@@ -77,13 +80,19 @@ impl Rates {
     }
 }
 
-/// Moves `keys` out of `section` and reads them.
+/// Moves `keys` out of `section` and parses them.
+///
+/// # Errors
+/// [`Error::Parameter`] for values of wrong types.
 pub fn take<T: DeserializeOwned>(section: &mut toml::Table, keys: &[&str]) -> Result<T> {
     let own: toml::Table = keys.iter().filter_map(|k| section.remove(*k).map(|v| (k.to_string(), v))).collect();
     config::parse_section("deformer", &own)
 }
 
 /// Refuses a size outside `low..=high`.
+///
+/// # Errors
+/// [`Error::Parameter`] for `deformer.NAME`.
 pub fn within(name: &str, value: usize, low: usize, high: usize) -> Result<()> {
     if (low..=high).contains(&value) {
         return Ok(());

@@ -2,17 +2,17 @@
 
 use std::f64::consts::TAU;
 
-/// Bands for a sequence of `frames`: the highest frequency, 2^(L-1) cycles, stays near half the frame count (8 for 300 frames, 10 for 1200, 6 for 50).
+/// Number of bands L for a sequence of `frames`: the highest frequency, 2^(L-1) cycles, is near half the frame count (8 for 300 frames, 10 for 1200, 6 for 50).
 pub fn bands_for(frames: usize) -> usize {
     (frames.max(1) as f64).log2().round().clamp(1.0, 16.0) as usize
 }
 
-/// [t, sin(2 pi t), cos(2 pi t), sin(4 pi t), …]: 1 + 2 `bands` numbers.
+/// [t, sin(2 pi t), cos(2 pi t), sin(4 pi t), …] for t = `time_norm`: 1 + 2 `bands` values.
 pub fn encode(time_norm: f32, bands: usize) -> Vec<f32> {
     let t = f64::from(time_norm);
     let mut out = vec![time_norm];
     for l in 0..bands {
-        // Whole turns are dropped first, so that high bands keep their precision.
+        // Whole periods are removed before scaling by 2 pi, so that high bands keep their precision.
         let turns = (t * (l as f64).exp2()).fract();
         let (sin, cos) = (TAU * turns).sin_cos();
         out.extend([sin as f32, cos as f32]);

@@ -1,5 +1,5 @@
-//! Features of canonical centres without stored tables: the vertices of a multi-resolution grid get hash signatures, one small decoder per level turns
-//! those into features, and a centre interpolates the features of its eight corners (paper Section IV-B).
+//! Features of canonical centres without stored tables (paper Section IV-B). The vertices of a multi-resolution grid have hash signatures. One small decoder per
+//! level turns signatures into features. A centre interpolates the features of its eight corners.
 
 use super::settings::{Capacity, within};
 use super::weights;
@@ -13,7 +13,7 @@ use std::sync::Arc;
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VoxelSettings {
-    /// The sizes that are not given one by one.
+    /// Defaults of the sizes below.
     pub capacity: Capacity,
     /// Grid levels.
     pub levels: Option<usize>,
@@ -27,7 +27,7 @@ pub struct VoxelSettings {
     pub hashes: usize,
     /// m of the hash functions.
     pub modulus: u32,
-    /// Whether equal vertices are decoded once.
+    /// Whether a vertex that several centres share is decoded once.
     pub vertex_reuse: bool,
 }
 
@@ -37,7 +37,7 @@ impl Default for VoxelSettings {
     }
 }
 
-/// The settled sizes of grid and decoders.
+/// The sizes of grid and decoders.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VoxelSizes {
     /// Cells per axis of each level.
@@ -47,17 +47,20 @@ pub struct VoxelSizes {
 }
 
 impl VoxelSizes {
-    /// The features of all levels side by side.
+    /// Features per centre: those of all levels together.
     pub fn width(&self) -> usize {
         self.resolutions.len() * self.decoder.output
     }
 }
 
 impl VoxelSettings {
-    /// The keys of a section that belong here.
+    /// The keys of these settings in a `[deformer]` section.
     pub const KEYS: [&'static str; 8] = ["capacity", "levels", "resolutions", "hidden", "features", "hashes", "modulus", "vertex_reuse"];
 
-    /// Settles the sizes, refusing what cannot work.
+    /// Computes the sizes.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for sizes out of range.
     pub fn sizes(&self) -> Result<VoxelSizes> {
         let (levels, hidden, features) = match self.capacity {
             Capacity::Small => (4, vec![64, 64], 16),
@@ -85,7 +88,7 @@ impl VoxelSettings {
     }
 }
 
-/// The grid over a scene's box with the hash functions and layer shapes of its decoders. Weights are [`Parameter`]s of the field that owns it.
+/// The grid over a scene's box with the hash functions and layer shapes of its decoders. The weights are [`Parameter`]s of the deformer that owns the grid.
 #[derive(Clone, Debug)]
 pub struct Voxels {
     box_min: [f32; 3],
@@ -97,7 +100,7 @@ pub struct Voxels {
 }
 
 impl Voxels {
-    /// A grid for the scene of `context` and the fresh weights of its decoders, one parameter per level in optimizer group `group`.
+    /// A grid for the scene of `context` and the initial weights of its decoders, one parameter per level in optimizer group `group`.
     pub fn new(settings: &VoxelSettings, context: &DeformerContext, group: usize, device: &Device) -> Result<(Self, Vec<Parameter>)> {
         if context.box_min.iter().chain(&context.box_max).any(|v| !v.is_finite()) {
             return Err(Error::parameter("deformer box", format!("{:?} to {:?}", context.box_min, context.box_max), "Give finite corners"));
@@ -129,13 +132,13 @@ impl Voxels {
     pub fn width(&self) -> usize {
         self.width
     }
-    /// f_voxel [M, width] of `means_world` [M,3] (M > 0) by the decoders of `parameters` (the first [`Voxels::levels`]), and what it cost.
+    /// f_voxel [M, width] of `means_world` [M,3] (M > 0) by the decoders of `parameters` (the first [`Voxels::levels`]), and the work done.
     pub fn features(&self, parameters: &[Parameter], means_world: Tensor<2>) -> Result<(Tensor<2>, DeformerWork)> {
         let [m, _] = means_world.dims();
         let mut work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };
         let mut levels = Vec::with_capacity(self.decoders.len());
         let grids: Vec<GridBox> = self.grids().map(|(grid, _)| grid).collect();
-        // Training does not wait for a number that nothing but a report would need.
+        // Training does not read the vertex count back, because only reports use it.
         let counted = !parameters.iter().any(|p| p.value.is_require_grad());
         let found = VoxelCorners::find(means_world, &grids, self.reuse, counted)?;
         for ((decoder, parameter), corners) in self.decoders.iter().zip(parameters).zip(found) {

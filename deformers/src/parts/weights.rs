@@ -1,6 +1,6 @@
-//! Initial weights. Layers in front of a ReLU keep the size of their signal (He et al. 2015): with PyTorch's default for `nn.Linear` the nine
-//! ReLU layers between time and motion shrink it a hundredfold, the biases take over, and Adam then kills the trunk before anything moves.
-//! Decoders normalise their layers themselves and use that default.
+//! Initial weights. Layers in front of a ReLU preserve the variance of their input (He et al. 2015). With PyTorch's default for `nn.Linear`, the nine
+//! ReLU layers between time and motion shrink the signal a hundredfold, the biases dominate, and Adam then turns off the trunk's ReLUs before anything moves.
+//! Decoders normalise their hidden layers and use that default.
 
 use burn::tensor::Tensor;
 use cc4dgs_backends::ops::field::{MishShape, ReluShape};
@@ -31,7 +31,7 @@ fn rectified(seed: Seed, input: usize, output: usize) -> Vec<f32> {
     preserving(seed, input, output, 2.0)
 }
 
-/// A decoder: LayerNorm starts as the identity.
+/// A decoder; LayerNorm starts with scale 1 and shift 0.
 pub fn decoder(seed: Seed, shape: &MishShape) -> Vec<f32> {
     let mut out = Vec::with_capacity(shape.parameter_count());
     for (i, layer) in shape.layers().iter().enumerate() {
@@ -43,17 +43,17 @@ pub fn decoder(seed: Seed, shape: &MishShape) -> Vec<f32> {
     out
 }
 
-/// The layers of a chain of `widths`, a ReLU after each.
+/// Layers of the given `widths`, each followed by a ReLU.
 pub fn chain(seed: Seed, widths: &[usize]) -> Vec<f32> {
     widths.windows(2).enumerate().flat_map(|(i, pair)| rectified(seed.index(i as u64), pair[0], pair[1])).collect()
 }
 
-/// The widths of a one-headed chain, input first.
+/// The widths of a network with one head, input first.
 pub fn widths(shape: &ReluShape) -> Vec<usize> {
     std::iter::once(shape.input).chain(shape.trunk.iter().copied()).chain(shape.heads.iter().flatten().copied()).collect()
 }
 
-/// FiLM's generator: its last layer has zero weights and bias (1…, 0…), so that modulation starts as the identity.
+/// The FiLM generator: its last layer has zero weights and bias (1…, 0…), so that modulation starts as the identity.
 pub fn film(seed: Seed, shape: &ReluShape, width: usize) -> Vec<f32> {
     let mut out = chain(seed, &widths(shape));
     let at = out.len() - 2 * width;
@@ -62,7 +62,7 @@ pub fn film(seed: Seed, shape: &ReluShape, width: usize) -> Vec<f32> {
     out
 }
 
-/// A head: its last layer is zero, so that nothing moves at first. Signatures are of order 1, so random heads would displace everything.
+/// A head: its last layer is zero, so that nothing moves at first. Features are of order 1, so random heads would displace everything.
 pub fn head(seed: Seed, width: usize, output: usize) -> Vec<f32> {
     let mut out = rectified(seed, width, width);
     out.extend(std::iter::repeat_n(0.0, (width + 1) * output));
@@ -79,19 +79,19 @@ pub fn glorot(seed: Seed, input: usize, output: usize) -> Vec<f32> {
     uniform(seed, input * output, (6.0 / (input + output) as f32).sqrt())
 }
 
-/// `count` numbers in ±`bound`.
+/// `count` values, uniform in ±`bound`.
 pub fn uniform(seed: Seed, count: usize, bound: f32) -> Vec<f32> {
     let mut random = seed.rng();
     (0..count).map(|_| random.random_range(-bound..=bound)).collect()
 }
 
-/// A linear layer with Glorot weights and PyTorch's bias, as 4DGS and E-D3DGS start.
+/// A linear layer with Glorot weights and PyTorch's bias, as in 4DGS and E-D3DGS.
 pub fn glorot_with_bias(seed: Seed, input: usize, output: usize) -> Vec<f32> {
     let bias = uniform(seed.child("bias"), output, 1.0 / (input.max(1) as f32).sqrt());
     glorot(seed.child("matrix"), input, output).into_iter().chain(bias).collect()
 }
 
-/// The flat weights of layers that have no bias, given their matrices one after another: zeros are laid between.
+/// The flat weights of layers without biases: `matrices` one after another, with zero biases inserted.
 pub fn without_biases(matrices: Tensor<1>, layers: &[(usize, usize)]) -> Tensor<1> {
     let mut at = 0;
     let mut parts = Vec::with_capacity(2 * layers.len());

@@ -1,17 +1,17 @@
 //! A 3x3 matrix and an offset per training camera: exposure, white balance and flare.
 //!
-//! Camera c records (I + D_c - mean D) rgb + (b_c - mean b). The mean over the training cameras is the identity by construction, so that the model cannot move colour from the
-//! Gaussians into all cameras at once, and held-out cameras see the mean.
+//! Camera c records (I + D_c - mean D) rgb + (b_c - mean b). The mean over the training cameras is the identity by construction, so that the model cannot move a colour change
+//! common to all cameras out of the Gaussians. Held-out cameras see the rendered image, which is the mean.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::{Appearance, AppearanceContext, AppearancePlugin, Error, Parameter, ParameterGroup, Part, Plugin, Result, config, inventory};
 use serde::Deserialize;
 
 const SCHEMA: &str = "\
-lr = 1e-3                # learning rate of all numbers
+lr = 1e-3                # learning rate of matrices and offsets
 identity = 1e-3          # weight of the squared distance from the identity, mean over cameras (FreeTimeGS++: 1e-3)
 ";
-/// Numbers per camera: nine of the matrix, three of the offset.
+/// Weights per camera: nine of the matrix, three of the offset.
 const NUMBERS: usize = 12;
 
 #[derive(Clone, Debug, Deserialize)]
@@ -30,7 +30,7 @@ impl Default for Settings {
 struct Affine {
     settings: Settings,
     cameras: usize,
-    /// D and b of all cameras [cameras x 12], rows of a matrix before the offset.
+    /// D and b of all cameras [cameras, 12], flat: the rows of the matrix, then the offset.
     parameters: Vec<Parameter>,
 }
 
@@ -93,7 +93,7 @@ inventory::submit! {
             name: "affine",
             version: "1",
             summary: "a colour matrix and offset per training camera, the identity on average",
-            paper: "after FreeTimeGS++ and Dynamic 3D Gaussians (per-camera colour)",
+            paper: "per-camera colour as in FreeTimeGS++ and Dynamic 3D Gaussians",
             schema: SCHEMA,
             capabilities: &["differentiable"],
         },

@@ -1,4 +1,4 @@
-//! What lies between the rendered image and the one a camera recorded.
+//! Appearance models: corrections between the rendered image and the recorded image of a training camera.
 
 mod affine;
 mod none;

@@ -1,4 +1,4 @@
-//! Which Gaussians are added, moved and removed during training.
+//! Density controls: they add, move and remove Gaussians during training.
 
 mod clone_split;
 mod none;

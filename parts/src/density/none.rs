@@ -26,7 +26,7 @@ impl DensityControl for Fixed {
     }
     fn restore(&mut self, state: Vec<(String, Tensor<1>)>, _count: usize) -> Result<()> {
         match state.first() {
-            Some((name, _)) => Err(Error::data(format!("density state '{name}'"), "the control 'none' keeps nothing", "Resume with the run's own config.toml")),
+            Some((name, _)) => Err(Error::data(format!("density state '{name}'"), "the control 'none' has no state", "Resume with the run's own config.toml")),
             None => Ok(()),
         }
     }

@@ -1,4 +1,4 @@
-//! 1 - SSIM of rendered and recorded image: 11x11 Gaussian window of sigma 1.5, zero padding.
+//! Loss term: 1 - SSIM of rendered and recorded image, 11x11 Gaussian window of sigma 1.5, zero padding.
 
 use super::photometric::Photometric;
 use cc4dgs_core::{LossPlugin, LossTerm, Plugin, Result, config, inventory};

@@ -1,4 +1,4 @@
-//! Mean absolute difference of rendered and recorded image.
+//! Loss term: mean absolute difference of rendered and recorded image.
 
 use super::photometric::Photometric;
 use cc4dgs_core::{LossPlugin, LossTerm, Plugin, Result, config, inventory};

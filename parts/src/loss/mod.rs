@@ -1,4 +1,4 @@
-//! Terms of the loss.
+//! Loss terms.
 
 mod dssim;
 mod l1;

@@ -1,4 +1,4 @@
-//! Mean opacity of the Gaussians, as drawn at the time of the view: a pull towards few and small Gaussians (3DGS-MCMC).
+//! Loss term: mean opacity of the Gaussians at the time of the view. It favours few and small Gaussians (3DGS-MCMC).
 
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
@@ -30,7 +30,7 @@ inventory::submit! {
         info: Plugin {
             name: "opacity",
             version: "1",
-            summary: "mean opacity of the Gaussians, as drawn at the time of the view",
+            summary: "mean opacity of the Gaussians at the time of the view",
             paper: "Kheradmand et al. 2024 (3DGS-MCMC)",
             schema: "# no settings\n",
             capabilities: &["differentiable"],

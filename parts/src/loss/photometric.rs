@@ -1,4 +1,4 @@
-//! L1 and 1 - SSIM together, in one pass over the images.
+//! Loss term: L1 and 1 - SSIM in one pass over the images.
 
 use burn::tensor::Tensor;
 use cc4dgs_backends::ops::photometric::photometric_loss;
@@ -33,7 +33,7 @@ impl Default for Settings {
 fn build(section: &toml::Table) -> Result<Box<dyn LossTerm>> {
     let Settings { l1_share } = config::parse_section("loss photometric", section)?;
     if !(0.0..=1.0).contains(&l1_share) {
-        return Err(Error::parameter("loss photometric: l1_share", format!("{l1_share} is not in 0..1"), "It is the weight of L1 against 1 - SSIM"));
+        return Err(Error::parameter("loss photometric: l1_share", format!("{l1_share} is not in 0..1"), "Give the weight of L1; 1 - SSIM gets the rest"));
     }
     Ok(Box::new(Photometric { scale: 1.0, l1_share }))
 }
@@ -52,7 +52,7 @@ inventory::submit! {
         info: Plugin {
             name: "photometric",
             version: "1",
-            summary: "L1 and 1 - SSIM in one pass; stands in for the terms l1 and dssim where both are listed",
+            summary: "L1 and 1 - SSIM in one pass; replaces the terms l1 and dssim if both are listed",
             paper: "Kerbl et al. 2023 (3DGS); CC-4DGS, Section IV-E",
             schema: "l1_share = 0.8           # weight of L1; the rest goes to 1 - SSIM (the paper's lambda_c)\n",
             capabilities: &["differentiable"],

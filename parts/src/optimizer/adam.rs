@@ -1,4 +1,4 @@
-//! Adam (Kingma and Ba 2015) with the fused kernel: moments and step counts by name of the array.
+//! Adam (Kingma and Ba 2015) with the fused kernel. Moments and step counts are stored per array, by its name.
 
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
@@ -24,7 +24,7 @@ impl Default for Settings {
     }
 }
 
-/// State of one array: first and second moment [N,W], and how many steps they have seen.
+/// State of one array: first and second moment [N,W], and the number of steps.
 struct Moments {
     first: Tensor<2>,
     second: Tensor<2>,
@@ -89,12 +89,18 @@ impl Optimizer for Adam {
             let first = state_array(&mut state, &format!("{name}/first_moment"))?;
             let second = state_array(&mut state, &format!("{name}/second_moment"))?;
             if first.dims() != second.dims() {
-                return Err(Error::data(format!("optimizer state of {name}"), "the two moments have other shapes", "The checkpoint is damaged; use another"));
+                return Err(Error::data(
+                    format!("optimizer state of {name}"),
+                    "the shapes of the two moments differ",
+                    "The checkpoint is damaged; use another",
+                ));
             }
             self.moments.insert(name, Moments { first, second, steps });
         }
         match state.arrays.keys().next() {
-            Some(name) => Err(Error::data(format!("optimizer state '{name}'"), "it belongs to no array", "The checkpoint is damaged or of another optimizer")),
+            Some(name) => {
+                Err(Error::data(format!("optimizer state '{name}'"), "it belongs to no known array", "The checkpoint is damaged or of another optimizer"))
+            }
             None => Ok(()),
         }
     }
@@ -114,7 +120,7 @@ inventory::submit! {
         info: Plugin {
             name: "adam",
             version: "1",
-            summary: "Adam; rows that no view shows keep value and state where training asks for it",
+            summary: "Adam; optionally skips rows that no view shows",
             paper: "Kingma and Ba 2015; Mallick et al. 2024 (rows in view only)",
             schema: SCHEMA,
             capabilities: &[],

@@ -1,3 +1,3 @@
-//! From gradients to new values.
+//! Optimizers: from gradients to new values.
 
 mod adam;

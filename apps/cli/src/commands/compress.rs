@@ -54,7 +54,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let mut settings = toml::Table::new();
     config::set_all(&mut settings, &args.sets)?;
-    // A name that nobody knows is told before the scene is read.
+    // An unknown name is refused before the scene is read.
     context.registry.weight_codec(&args.field_weights)?;
     let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?;
     let options = ArchiveOptions {

@@ -54,6 +54,9 @@ fn archive(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     if context.registry.codec(&of.codec.name).is_err() {
         notes.push(not_linked("codec", &of.codec.name, &of.codec.version));
     }
+    if let Some(weights) = of.deformer.as_ref().map(|d| &d.weights).filter(|w| context.registry.weight_codec(&w.name).is_err()) {
+        notes.push(not_linked("weight codec", &weights.name, &weights.version));
+    }
     let field = match &of.deformer {
         None => Some((0, 0)),
         Some(entry) if context.registry.deformer(&entry.name).is_err() => {

@@ -76,11 +76,11 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     })
 }
 
-/// Cameras with their times, and the background of the scene they are from.
+/// Cameras and normalised times, and the background of the scene they are from.
 type Shots = (Vec<(Camera, f32)>, Option<[f32; 3]>);
 
-/// What to render.
-fn shots(context: &Context, args: &Render, model: &cc4dgs_play::Model) -> Result<Shots> {
+/// Chooses what to render.
+fn shots(context: &Context, args: &Render, model: &cc4dgs_play::model::Model) -> Result<Shots> {
     let Some(path) = &args.scene else {
         if !args.sets.is_empty() {
             return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));

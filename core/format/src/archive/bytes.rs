@@ -1,8 +1,8 @@
-//! Reading little-endian values out of bytes that may lie.
+//! Reading of little-endian values from untrusted bytes.
 
 use crate::{Error, Result};
 
-/// A cursor over hostile bytes: running out is an error that names the object and the place.
+/// A cursor over untrusted bytes. Reading past the end is an error that names the object and the byte offset.
 #[derive(Clone, Debug)]
 pub struct ByteReader<'a> {
     object: String,
@@ -61,7 +61,7 @@ impl<'a> ByteReader<'a> {
     /// The next `count` floats, all finite.
     pub fn f32s(&mut self, count: usize) -> Result<Vec<f32>> {
         let Some(bytes) = count.checked_mul(4) else {
-            return Err(self.error(format!("{count} floats are more than memory can hold")));
+            return Err(self.error(format!("{count} floats do not fit into memory")));
         };
         let start = self.at;
         let values: Vec<f32> = self.take(bytes)?.chunks_exact(4).map(|c| f32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect();
@@ -78,11 +78,14 @@ impl<'a> ByteReader<'a> {
             _ => Err(self.error(format!("the name at byte {} is not printable text", self.at - length))),
         }
     }
-    /// All that has not been read.
+    /// All remaining bytes.
     pub fn rest(self) -> &'a [u8] {
         &self.bytes[self.at..]
     }
-    /// Refuses bytes that nobody asked for.
+    /// Refuses remaining bytes.
+    ///
+    /// # Errors
+    /// [`Error::Data`].
     pub fn finish(self) -> Result<()> {
         if self.remaining() == 0 { Ok(()) } else { Err(self.error(format!("{} bytes follow the end", self.remaining()))) }
     }

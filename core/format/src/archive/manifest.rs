@@ -1,4 +1,4 @@
-//! What an archive says of itself.
+//! The manifest of an archive.
 
 use crate::{DeformerContext, Error, Limits, Result, Rules, Similarity};
 use serde::{Deserialize, Serialize};
@@ -6,54 +6,54 @@ use serde::{Deserialize, Serialize};
 /// The archive version this build writes and reads.
 pub const FORMAT_VERSION: u32 = 2;
 
-/// Which codec wrote some of the streams.
+/// The codec of some of the streams.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CodecEntry {
     /// Registry name.
     pub name: String,
-    /// Profile, empty for the codec's default one.
+    /// Profile; empty for the codec's default profile.
     pub profile: String,
     /// Version of the codec's stored form ([`crate::Plugin::version`]).
     pub version: String,
-    /// The settings it was built with.
+    /// The codec's settings.
     pub settings: toml::Table,
 }
 
-/// Which deformation field the field streams belong to.
+/// The deformer of the weight streams.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DeformerEntry {
     /// Registry name.
     pub name: String,
-    /// The field's own version.
+    /// Version of the deformer's stored form.
     pub version: String,
     /// The settings it was built with, without `kind`.
     pub settings: toml::Table,
-    /// What it was told of the scene.
+    /// What the deformer knows of the scene.
     pub context: DeformerContext,
-    /// The weight codec of the field streams. Weight codecs have no profiles.
+    /// The weight codec of the weight streams. Weight codecs have no profiles.
     pub weights: CodecEntry,
 }
 
-/// How the model wants to be drawn.
+/// How the model is rendered.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RasterizerEntry {
     /// Registry name of the rasterizer used in training.
     pub name: String,
-    /// The rules it was trained under.
+    /// The rules it was trained with.
     pub rules: Rules,
     /// Whether the antialiasing compensation was on.
     pub antialiased: bool,
-    /// Smallest camera depth drawn, units of the model, where the rules' own was not used.
+    /// Smallest camera depth drawn, units of the model; absent if the rules' default was used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
     /// Its settings, without `kind`.
     pub settings: toml::Table,
 }
 
-/// Where a model comes from. Nothing that changes between equal runs (no clock, no host name), so that equal runs write equal bytes.
+/// The origin of a model. It has nothing that differs between equal runs (no clock, no host name), so that equal runs write equal bytes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
-    /// Commit of the program, empty if unknown.
+    /// Commit of the program; empty if unknown.
     pub commit: String,
     /// Root seed.
     pub seed: u64,
@@ -63,16 +63,16 @@ pub struct Provenance {
     pub config: toml::Table,
 }
 
-/// The archive's manifest. Keys a reader does not know are ignored; additions of a writer go to `extra`.
+/// The archive's manifest. Readers ignore unknown keys; writers put additions into `extra`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
     /// [`FORMAT_VERSION`] of the writer.
     pub format_version: u32,
     /// The codec of the canonical streams.
     pub codec: CodecEntry,
-    /// The deformation field; none for a static model.
+    /// The deformer; `None` for a static model.
     pub deformer: Option<DeformerEntry>,
-    /// How to draw it.
+    /// How to render it.
     pub rasterizer: RasterizerEntry,
     /// Frames in the sequence, 1 for a static model.
     pub frame_count: usize,
@@ -83,30 +83,36 @@ pub struct Manifest {
     pub normalisation: Similarity,
     /// Lower and upper corner of the model in its own units.
     pub box_world: [[f32; 3]; 2],
-    /// Background colour in 0..1 it was trained on.
+    /// RGB background colour in 0..1 that it was trained with.
     pub background: [f32; 3],
     /// Spherical-harmonics degree of the Gaussians.
     pub sh_degree: usize,
-    /// A Gaussian is dynamic iff its score is above this (zeta of the paper).
+    /// A Gaussian is dynamic if and only if its score is above this (zeta of the paper).
     pub dynamic_threshold: f32,
-    /// Gaussians in the canonical streams.
+    /// Number of Gaussians in the canonical streams.
     pub gaussian_count: u64,
-    /// Where it comes from.
+    /// The origin of the model.
     pub provenance: Provenance,
-    /// Free for others.
+    /// Additional data of writers.
     #[serde(default)]
     pub extra: serde_json::Map<String, serde_json::Value>,
 }
 
 impl Manifest {
-    /// The manifest as JSON. Refuses one that would not read back the same (numbers that are not finite).
+    /// The manifest as JSON. Refuses a manifest that does not survive a round trip (numbers that are not finite).
+    ///
+    /// # Errors
+    /// [`Error::Parameter`].
     pub fn to_json(&self) -> Result<Vec<u8>> {
         let refuse = |problem: String| Error::parameter("archive manifest", problem, "Give finite numbers and plain TOML values");
         let json = serde_json::to_vec(self).map_err(|e| refuse(e.to_string()))?;
-        let back: Self = serde_json::from_slice(&json).map_err(|e| refuse(format!("it would not read back: {e}")))?;
-        if &back == self { Ok(json) } else { Err(refuse("it would not read back unchanged".into())) }
+        let back: Self = serde_json::from_slice(&json).map_err(|e| refuse(format!("its JSON cannot be read back: {e}")))?;
+        if &back == self { Ok(json) } else { Err(refuse("it does not survive a round trip through JSON".into())) }
     }
-    /// Parses and checks JSON from outside; `object` names the file.
+    /// Parses and checks untrusted JSON; `object` names the file in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`] or [`Error::Limit`].
     pub fn from_json(object: &str, json: &[u8], limits: &Limits) -> Result<Self> {
         let object = format!("manifest of {object}");
         check_depth(&object, json, limits.max_depth)?;
@@ -128,7 +134,7 @@ impl Manifest {
         }
         let context = self.deformer.iter().flat_map(|d| d.context.box_min.iter().chain(&d.context.box_max));
         let mut numbers = self.time_range.iter().chain(self.box_world.iter().flatten()).chain(&self.background).chain([&self.dynamic_threshold]).chain(context);
-        // A decimal beyond the range of f32 reads as infinity.
+        // A decimal beyond the range of f32 is parsed as infinity.
         if let Some(v) = numbers.find(|v| !v.is_finite()) {
             return Err(damaged(object, format!("a time, box, colour or threshold is {v}")));
         }
@@ -140,7 +146,7 @@ fn damaged(object: &str, problem: String) -> Error {
     Error::data(object, problem, "The file is damaged; fetch or write it again")
 }
 
-/// Refuses JSON nested deeper than `max_depth` before a recursive parser sees it.
+/// Refuses JSON nested deeper than `max_depth`, before a recursive parser reads it.
 fn check_depth(object: &str, json: &[u8], max_depth: u32) -> Result<()> {
     let (mut depth, mut in_string, mut escaped) = (0u32, false, false);
     for &byte in json {

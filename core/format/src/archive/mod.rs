@@ -29,22 +29,22 @@ pub use packing::estimate_stored_len;
 pub use read::{Archive, StreamInfo};
 pub use write::{ArchiveWriter, write_atomically};
 
-/// First bytes of every archive. The high bit, the line ends and the control character show transfers that mangled the file.
+/// First bytes of every archive. The high bit, the line ends and the control character reveal damage by transfers in text mode.
 pub const MAGIC: [u8; 8] = *b"\x89CC4D\r\n\x1a";
 
 /// Bytes before the header: magic, version, header length, header checksum.
 const PREFIX_BYTES: usize = 24;
 
-/// What a stream is for.
+/// Purpose of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StreamKind {
     /// Canonical Gaussians, written and read by the codec.
     Canonical,
-    /// Weights of the deformation field.
+    /// Weights of the deformer.
     Field,
-    /// Anything else a writer of this version added.
+    /// Any other data of this version.
     Meta,
-    /// A kind of a later writer; readers skip it.
+    /// A kind of a later version; readers skip it.
     Other(u8),
 }
 

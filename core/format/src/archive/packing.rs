@@ -1,14 +1,14 @@
-//! One stream's bytes, smaller: byte planes and Zstandard.
+//! Compression of a stream: byte planes and Zstandard.
 
 use super::zstandard::{compress, decompress};
 use crate::{Error, Limits, Result};
 
-/// The shuffle width is chosen on this many leading bytes of a stream: exact for short streams, cheap for long ones.
+/// The shuffle width is chosen on this many leading bytes of a stream, which bounds the time for long streams.
 const TRIAL_BYTES: usize = 1 << 20;
 /// Element sizes whose byte planes are tried.
 const SHUFFLES: [u8; 3] = [0, 2, 4];
 
-/// How the stored bytes of a stream are to be read.
+/// Encoding of the stored bytes of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Encoding {
     Stored,
@@ -38,7 +38,7 @@ pub(super) struct Packed {
     pub(super) bytes: Vec<u8>,
 }
 
-/// Packs `bytes` in the smallest form known.
+/// Packs `bytes` in the smallest form.
 pub(super) fn pack(bytes: &[u8]) -> Result<Packed> {
     let (shuffle, trial) = best_shuffle(bytes)?;
     let compressed = if bytes.len() <= TRIAL_BYTES { trial } else { compress(&shuffled(bytes, shuffle))? };
@@ -49,14 +49,14 @@ pub(super) fn pack(bytes: &[u8]) -> Result<Packed> {
     }
 }
 
-/// About how many bytes a stream of these bytes takes in an archive (exact up to 1 MiB), for encoders that choose between forms.
+/// Estimated stored size of a stream in an archive, in bytes (exact up to 1 MiB), for encoders that choose between forms.
 pub fn estimate_stored_len(bytes: &[u8]) -> Result<u64> {
     let (_, trial) = best_shuffle(bytes)?;
     let tried = bytes.len().clamp(1, TRIAL_BYTES) as f64;
     Ok((trial.len() as f64 * (bytes.len() as f64 / tried)).min(bytes.len() as f64) as u64)
 }
 
-/// The width whose planes compress the leading bytes best (the plain order on a tie), and those bytes compressed.
+/// The shuffle width that compresses the leading bytes best (no shuffle on a tie), and those bytes compressed.
 fn best_shuffle(bytes: &[u8]) -> Result<(u8, Vec<u8>)> {
     let sample = &bytes[..bytes.len().min(TRIAL_BYTES)];
     let mut best = (0, compress(sample)?);
@@ -69,7 +69,7 @@ fn best_shuffle(bytes: &[u8]) -> Result<(u8, Vec<u8>)> {
     Ok(best)
 }
 
-/// Undoes [`pack`]: at most `decoded_len` bytes, which `limits` must allow; memory grows with the bytes that are really there.
+/// Undoes [`pack`]: at most `decoded_len` bytes, which `limits` must allow. Memory grows with the bytes actually decoded.
 pub(super) fn unpack(object: &str, stored: Vec<u8>, encoding: Encoding, shuffle: u8, decoded_len: u64, limits: &Limits) -> Result<Vec<u8>> {
     limits.check_bytes(object, decoded_len)?;
     let damaged = |problem: String| Error::data(object, problem, "The file is damaged; fetch or write it again");
@@ -84,7 +84,7 @@ pub(super) fn unpack(object: &str, stored: Vec<u8>, encoding: Encoding, shuffle:
     Ok(unshuffled(planes, shuffle))
 }
 
-/// Byte planes of `width`-byte elements: all first bytes, all second bytes, ...; a last partial element follows as it is.
+/// Byte planes of `width`-byte elements: all first bytes, all second bytes, ...; a partial last element follows unchanged.
 fn shuffled(bytes: &[u8], width: u8) -> Vec<u8> {
     let width = usize::from(width);
     if width < 2 {
@@ -130,10 +130,10 @@ mod tests {
         for n in [0usize, 1, 3, 4, 5, 7, 8, 1000, 1001, 1002, 1003] {
             round_trip(&(0..n).map(|i| (i * i % 251) as u8).collect::<Vec<_>>());
         }
-        // Longer than the trial, so that the whole is packed by the choice made on its head.
+        // Longer than TRIAL_BYTES, so that the choice on the leading bytes applies to the whole.
         let floats: Vec<u8> = (0..400_000).flat_map(|i| (1.0f32 + i as f32 * 1e-6).to_le_bytes()).collect();
         let packed = round_trip(&floats);
-        assert_eq!(packed.shuffle, 4, "slowly varying floats belong in byte planes");
+        assert_eq!(packed.shuffle, 4, "slowly varying floats compress better in byte planes");
     }
 
     #[test]
@@ -145,7 +145,7 @@ mod tests {
     #[test]
     fn a_bomb_ends_at_its_declared_length() {
         let bomb = compress(&vec![0u8; 50 << 20]).unwrap();
-        assert!(unpack("test", bomb.clone(), Encoding::Zstd, 0, 1000, &Limits::default()).is_err(), "its window alone is too large");
+        assert!(unpack("test", bomb.clone(), Encoding::Zstd, 0, 1000, &Limits::default()).is_err(), "its window is too large");
         let e = unpack("test", compress(&[0u8; 1500]).unwrap(), Encoding::Zstd, 0, 1400, &Limits::default()).unwrap_err().to_string();
         assert!(e.contains("1400 decoded bytes were declared, more are there"), "{e}");
         let small = Limits { max_bytes: 1 << 20, ..Limits::default() };

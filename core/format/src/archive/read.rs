@@ -1,4 +1,4 @@
-//! Reading an archive: the front once, then any stream alone.
+//! Reading of an archive: manifest and directory once, then any stream separately.
 
 use super::packing::{Encoding, unpack};
 use super::{ByteReader, FORMAT_VERSION, MAGIC, Manifest, PREFIX_BYTES, StreamKind};
@@ -11,16 +11,16 @@ use std::path::Path;
 use std::sync::Mutex;
 use xxhash_rust::xxh3::xxh3_64;
 
-/// One line of the directory.
+/// An entry of the directory.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StreamInfo {
     /// The stream's name, unique in the archive.
     pub name: String,
-    /// What it is for.
+    /// Its purpose.
     pub kind: StreamKind,
-    /// Bytes once decoded, as declared.
+    /// Declared size in bytes after decoding.
     pub decoded_bytes: u64,
-    /// Bytes in the file.
+    /// Size in bytes in the file.
     pub stored_bytes: u64,
 }
 
@@ -65,7 +65,7 @@ impl Source {
 }
 
 fn lock(file: &Mutex<File>) -> Result<std::sync::MutexGuard<'_, File>> {
-    file.lock().map_err(|_| Error::backend("archive", "a reader panicked before", "Open the archive again"))
+    file.lock().map_err(|_| Error::backend("archive", "another thread panicked while reading", "Open the archive again"))
 }
 
 fn damaged(object: &str, problem: String) -> Error {
@@ -82,7 +82,10 @@ pub struct Archive {
 }
 
 impl Archive {
-    /// Opens the archive at `path` and reads its front. Nothing is allocated for what the file merely claims.
+    /// Opens the archive at `path` and reads manifest and directory. Memory is allocated only for bytes that are present.
+    ///
+    /// # Errors
+    /// [`Error::Io`], [`Error::Data`] for invalid files, [`Error::Unsupported`] for other versions, [`Error::Limit`].
     pub fn open(path: impl AsRef<Path>, limits: &Limits) -> Result<Self> {
         let path = path.as_ref();
         let file = File::open(path).map_err(|e| Error::io(path, e))?;
@@ -95,12 +98,12 @@ impl Archive {
     fn from_source(object: String, source: Source, limits: &Limits) -> Result<Self> {
         let total = source.len(&object)?;
         if total < PREFIX_BYTES as u64 {
-            return Err(damaged(&object, format!("{total} bytes are fewer than the {PREFIX_BYTES} an archive begins with")));
+            return Err(damaged(&object, format!("{total} bytes are fewer than the {PREFIX_BYTES} bytes of an archive's prefix")));
         }
         let prefix = source.read(&object, 0, PREFIX_BYTES as u64)?;
         let mut reader = ByteReader::new(object.clone(), &prefix);
         if reader.take(8)? != MAGIC {
-            return Err(Error::data(object, "it does not begin like a .cc4d archive", "Check the path; transfers in text mode also damage archives"));
+            return Err(Error::data(object, "it is not a .cc4d archive (wrong magic bytes)", "Check the path; transfers in text mode also damage archives"));
         }
         let version = reader.u32()?;
         if version != FORMAT_VERSION {
@@ -122,7 +125,7 @@ impl Archive {
         reader.finish()?;
         Ok(Self { object, limits: *limits, manifest, entries, source })
     }
-    /// What the archive says of itself.
+    /// The manifest.
     pub fn manifest(&self) -> &Manifest {
         &self.manifest
     }
@@ -161,7 +164,7 @@ impl Archive {
 /// The directory; stored lengths must fill the file from `start` to `total` exactly.
 fn read_directory(reader: &mut ByteReader, start: u64, total: u64) -> Result<Vec<Entry>> {
     let count = reader.u32()?;
-    // Grown entry by entry: the count is a claim, the bytes behind it are not.
+    // Grown entry by entry, because the stated count is untrusted.
     let mut entries = Vec::new();
     let (mut offset, mut names) = (start, BTreeSet::new());
     for _ in 0..count {

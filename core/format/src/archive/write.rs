@@ -1,4 +1,4 @@
-//! Writing an archive, deterministically and all or nothing.
+//! Writing of an archive, deterministically and atomically.
 
 use super::packing::pack;
 use super::{FORMAT_VERSION, MAGIC, Manifest, StreamKind};
@@ -34,7 +34,7 @@ impl ArchiveWriter {
         let mut names: Vec<&str> = self.streams.iter().map(|(_, s)| s.name.as_str()).collect();
         names.sort_unstable();
         if let Some(pair) = names.windows(2).find(|w| w[0] == w[1]) {
-            return Err(refuse(pair[0], "the name is taken"));
+            return Err(refuse(pair[0], "the name is used twice"));
         }
         if let Some(name) = names.iter().find(|n| n.is_empty() || n.len() > 255 || n.chars().any(char::is_control)) {
             return Err(refuse(name, "the name is empty, over 255 bytes or not printable"));
@@ -65,7 +65,7 @@ impl ArchiveWriter {
         }
         Ok(out)
     }
-    /// Writes the archive to `path` and returns its size in bytes. On any failure `path` is what it was before.
+    /// Writes the archive to `path` and returns its size in bytes. On failure `path` is unchanged.
     pub fn write_to(&self, path: impl AsRef<Path>) -> Result<u64> {
         let bytes = self.to_bytes()?;
         write_atomically(path, &bytes)?;
@@ -73,9 +73,9 @@ impl ArchiveWriter {
     }
 }
 
-/// Writes `bytes` to a temporary name in the folder of `path`, flushes them to the disk and renames. On any failure `path` is what it was before.
+/// Writes `bytes` to a temporary name in the folder of `path`, flushes them to the disk and renames. On failure `path` is unchanged.
 ///
-/// On `wasm32` there is no file system: the call is an error, and [`ArchiveWriter::to_bytes`] and its likes are what to use.
+/// On `wasm32` there is no file system and the call is an error; use [`ArchiveWriter::to_bytes`] and similar functions.
 pub fn write_atomically(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     write_file(path.as_ref(), bytes)
 }
@@ -94,14 +94,14 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
     };
     let mut builder = tempfile::Builder::new();
     builder.prefix(".cc4dgs-").suffix(".part");
-    // Temporary files are private by default; the result should have the permissions any new file gets.
+    // Temporary files are private by default; the result gets the permissions of an ordinary new file.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     let mut file = builder.tempfile_in(folder).map_err(|e| Error::io(folder, e))?;
     file.write_all(bytes).map_err(|e| Error::io(path, e))?;
     file.as_file().sync_all().map_err(|e| Error::io(path, e))?;
     file.persist(path).map_err(|e| Error::io(path, e.error))?;
-    // The rename itself becomes durable with the folder; systems that cannot open a folder do without.
+    // Syncing the folder makes the rename durable; skipped on systems that cannot open a folder.
     if let Ok(folder) = std::fs::File::open(folder) {
         folder.sync_all().ok();
     }

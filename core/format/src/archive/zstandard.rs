@@ -1,4 +1,4 @@
-//! Zstandard: the C library where there is one, a Rust implementation on `wasm32`. Both decoders keep to the same bounds.
+//! Zstandard: the C library, or a Rust implementation on `wasm32`. Both decoders have the same bounds.
 
 use crate::Error;
 use crate::Result;
@@ -6,11 +6,11 @@ use std::io::Read;
 
 /// First bytes of a Zstandard frame.
 const MAGIC: [u8; 4] = 0xfd2f_b528u32.to_le_bytes();
-/// No frame may ask for a larger window. Level 19 asks for 8 MiB.
+/// Largest window that a frame may require, in bytes. Level 19 requires 8 MiB.
 const LARGEST_WINDOW: u64 = 128 << 20;
-/// Every frame may ask for the window of one block, which is what the encoder on `wasm32` always asks for.
+/// Every frame may require the window of one block, as the encoder on `wasm32` always does.
 const SMALLEST_WINDOW: u64 = 128 << 10;
-/// Capacity that a decoder starts with; more is allocated only for bytes that are there.
+/// Initial capacity of a decoder in bytes; more is allocated only for decoded bytes.
 const FIRST_CAPACITY: u64 = 1 << 20;
 
 #[cfg(not(target_arch = "wasm32"))]
@@ -24,23 +24,23 @@ pub(super) fn compress(bytes: &[u8]) -> Result<Vec<u8>> {
 }
 
 /// Decodes `frame`, which must be a single frame that fills the bytes: at most `decoded_len` + 1 bytes, so that the caller sees a frame that is too long.
-/// The error is what is wrong, in words.
+/// The error is the problem as text.
 pub(super) fn decompress(frame: &[u8], decoded_len: u64) -> Result<Vec<u8>, String> {
     let window = check_window(frame, decoded_len)?;
     library::decompress(frame, decoded_len, window)
 }
 
-/// Refuses frames that ask for more window than a stream of `decoded_len` bytes can need, and returns the largest window to allow.
+/// Refuses frames that require a larger window than a stream of `decoded_len` bytes can need. Returns the largest allowed window in bytes.
 fn check_window(frame: &[u8], decoded_len: u64) -> Result<u64, String> {
     let allowed = decoded_len.saturating_mul(2).clamp(SMALLEST_WINDOW, LARGEST_WINDOW).next_power_of_two();
     match frame_window(frame) {
         None => Err("it does not begin with a Zstandard frame".into()),
-        Some(window) if window > allowed => Err(format!("its Zstandard frame asks for a window of {window} bytes, {allowed} are allowed")),
+        Some(window) if window > allowed => Err(format!("its Zstandard frame requires a window of {window} bytes, {allowed} are allowed")),
         Some(_) => Ok(allowed),
     }
 }
 
-/// The window that the header of a frame asks for, in bytes (RFC 8878, section 3.1.1.1); `None` where there is no whole header.
+/// The window that a frame's header requires, in bytes (RFC 8878, section 3.1.1.1); `None` without a complete header.
 fn frame_window(frame: &[u8]) -> Option<u64> {
     let descriptor = *frame.strip_prefix(&MAGIC)?.first()?;
     let single_segment = descriptor & 0x20 != 0;
@@ -49,7 +49,7 @@ fn frame_window(frame: &[u8]) -> Option<u64> {
         let base = 1u64 << (10 + u32::from(window >> 3));
         return Some(base + base / 8 * u64::from(window & 7));
     }
-    // The window is the content, whose size follows the identifier of the dictionary.
+    // A single segment: the window is the content size, which follows the dictionary identifier.
     let size_at = 5 + [0, 1, 2, 4][usize::from(descriptor & 3)];
     let size_len = [1, 2, 4, 8][usize::from(descriptor >> 6)];
     let bytes = frame.get(size_at..size_at + size_len)?;
@@ -72,7 +72,7 @@ mod c_library {
         let mut decoder = zstd::stream::read::Decoder::with_buffer(frame).map_err(|e| e.to_string())?.single_frame();
         decoder.window_log_max(window.ilog2()).map_err(|e| e.to_string())?;
         let mut out = Vec::with_capacity(decoded_len.min(FIRST_CAPACITY) as usize);
-        decoder.by_ref().take(decoded_len.saturating_add(1)).read_to_end(&mut out).map_err(|e| format!("Zstandard says: {e}"))?;
+        decoder.by_ref().take(decoded_len.saturating_add(1)).read_to_end(&mut out).map_err(|e| format!("Zstandard: {e}"))?;
         let rest = decoder.finish();
         if out.len() as u64 == decoded_len && !rest.is_empty() {
             return Err(format!("{} bytes follow the Zstandard frame", rest.len()));
@@ -92,7 +92,7 @@ mod rust_library {
     }
 
     pub(super) fn decompress(frame: &[u8], decoded_len: u64, window: u64) -> Result<Vec<u8>, String> {
-        let said = |e: &dyn std::fmt::Display| format!("Zstandard says: {e}");
+        let said = |e: &dyn std::fmt::Display| format!("Zstandard: {e}");
         let mut decoder = StreamingDecoder::new_with_max_window_size(frame, window).map_err(|e| said(&e))?;
         let mut out = Vec::with_capacity(decoded_len.min(FIRST_CAPACITY) as usize);
         decoder.by_ref().take(decoded_len.saturating_add(1)).read_to_end(&mut out).map_err(|e| said(&e))?;
@@ -101,7 +101,7 @@ mod rust_library {
         }
         let (rest, frame) = decoder.into_parts();
         match (frame.get_checksum_from_data(), frame.get_calculated_checksum()) {
-            (Some(stored), Some(found)) if stored != found => Err("Zstandard says: the checksum of the content does not match".into()),
+            (Some(stored), Some(found)) if stored != found => Err("Zstandard: the checksum of the content does not match".into()),
             _ if !rest.is_empty() => Err(format!("{} bytes follow the Zstandard frame", rest.len())),
             _ => Ok(out),
         }
@@ -151,12 +151,12 @@ mod tests {
         for refused in both(&bomb, 1000) {
             assert!(refused.unwrap_err().contains("window"));
         }
-        // A window that fits and content that does not: decoding stops one byte behind the declared length.
+        // A window that fits and content that does not: decoding stops one byte after the declared length.
         let frame = c_library::compress(&[0u8; 1500]).unwrap();
         for decoded in both(&frame, 1400) {
             assert_eq!(decoded.unwrap().len(), 1401);
         }
-        // No content size, the largest window that a header can name.
+        // No content size, the largest window that a header can state.
         let mut wide = MAGIC.to_vec();
         wide.extend([0x00, 0xff, 0x01, 0x00, 0x00]);
         assert_eq!(frame_window(&wide), Some((1 << 41) + 7 * (1 << 38)));
@@ -178,7 +178,7 @@ mod tests {
         }
         for cut in 0..frame.len() {
             for decoded in both(&frame[..cut], payload.len() as u64) {
-                assert!(decoded.is_err(), "a frame cut at {cut} was taken");
+                assert!(decoded.is_err(), "a frame truncated at {cut} was accepted");
             }
         }
     }
@@ -191,7 +191,7 @@ mod tests {
             for k in 0..300u64 {
                 let mut damaged = frame.clone();
                 let draw = Seed::root(9).index(k).value();
-                // Headers matter most, so every other flip hits the first bytes.
+                // Every second flip is in the first bytes, where the header is.
                 let at = (draw >> 8) as usize % if k % 2 == 0 { 24 } else { frame.len() };
                 damaged[at] ^= 1 << (draw % 8);
                 let length = payload.len() as u64;
@@ -201,6 +201,6 @@ mod tests {
                 }
             }
         }
-        assert!(agreed > 10, "too few damaged frames decode to say anything: {agreed}");
+        assert!(agreed > 10, "too few damaged frames could be decoded: {agreed}");
     }
 }

@@ -1,20 +1,25 @@
-//! What an attribute codec must keep to.
+//! The conformance suite of attribute codecs.
 
 use super::uniform;
 use crate::gaussians::sh_rest_len;
 use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, NeededRows, Result, Seed, Silent, Stream};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// Name of the extra attribute that tells the Gaussians apart after a codec has reordered them.
+/// Name of the extra attribute that identifies the Gaussians after a codec has reordered them.
 const MARK: &str = "conformance-mark";
-/// Damaged versions of each stream that are tried.
+/// Damaged versions tried per stream.
 const DAMAGES: usize = 24;
 
-/// Holds a codec to its promises: unknown settings are refused; what comes back has the same Gaussians (in any order), the same extra attributes (bit for bit,
-/// or as far as [`ExtraAttribute`] allows), and loses of each column at most what is declared; the same input gives the same bytes; no Gaussians and a single one come back; Gaussians that are not
-/// finite are refused; streams that are truncated, damaged or missing give an error or sound Gaussians, never a panic, and never more than the limits allow.
+/// Tests a codec. Each finding is a line; an empty list means that it passed.
 ///
-/// `profile` is what follows the colon of `name:profile`; `settings` can make an expensive codec quick.
+/// - Unknown settings are refused.
+/// - Decoding gives the same Gaussians in any order, with extra attributes bit for bit or as [`ExtraAttribute`] allows.
+/// - The error of each column is at most the declared one.
+/// - Equal inputs give equal bytes.
+/// - Sets of no Gaussians and of one Gaussian can be stored; Gaussians that are not finite are refused.
+/// - Truncated, damaged and missing streams give an error or valid Gaussians within the limits, never a panic.
+///
+/// `profile` is the part after the colon of `name:profile`; `settings` can make an expensive codec fast.
 pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec<String> {
     let name = format!("{}:{profile}", plugin.info.name);
     let codec = match (plugin.build)(profile, settings) {
@@ -33,7 +38,7 @@ pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec
         note(&format!("{count} Gaussians of degree {degree}"), comes_back(codec, &scene(count, degree)));
     }
     note("repeats", repeats(codec));
-    note("numbers that are none", refuses_what_is_not_finite(codec));
+    note("values that are not finite", refuses_what_is_not_finite(codec));
     note("damaged streams", survives_damage(codec));
     findings
 }
@@ -42,7 +47,7 @@ fn context() -> CodecContext<'static> {
     CodecContext::new(Seed::root(7).child("conformance"), Limits::default(), &Silent)
 }
 
-/// Clustered Gaussians with colours that have some structure, marked by an extra attribute.
+/// Clustered Gaussians with correlated colours, numbered by an extra attribute.
 fn scene(count: usize, sh_degree: usize) -> HostGaussians {
     let mut g = HostGaussians { sh_degree, ..Default::default() };
     let rest = 3 * sh_rest_len(sh_degree);
@@ -84,7 +89,7 @@ fn relative_rms(before: &[f32], after: &[f32]) -> f64 {
     let mean = before.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
     let error: f64 = before.iter().zip(after).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
     let variance: f64 = before.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum();
-    // A column of one value has no deviation to measure by; its size has to do.
+    // The standard deviation of a constant column is 0; its magnitude is used instead.
     let scale = if variance > 0.0 { variance } else { before.iter().map(|&v| f64::from(v).powi(2)).sum() };
     if error == 0.0 { 0.0 } else { (error / scale).sqrt() }
 }
@@ -116,18 +121,18 @@ fn comes_back(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Optio
     for ((column, _, before), (_, _, after)) in expected.columns().into_iter().zip(found.columns()) {
         let allowed = losses.iter().find(|l| l.attribute == column).map_or(0.0, |l| l.relative_rms);
         if before.len() != after.len() || !after.iter().all(|v| v.is_finite()) {
-            return Ok(Some(format!("{column} has another length or holds what is no number")));
+            return Ok(Some(format!("{column} has another length or a value that is not finite")));
         }
         let lost = relative_rms(before, after);
         let exact = before.iter().zip(after.iter()).all(|(a, b)| a.to_bits() == b.to_bits());
         if lost > allowed || (allowed == 0.0 && !exact) {
-            return Ok(Some(format!("{column} lost {lost:.2e} of its deviation, {allowed:.2e} is declared")));
+            return Ok(Some(format!("{column} has a relative error of {lost:.2e}, declared is {allowed:.2e}")));
         }
     }
     Ok(None)
 }
 
-/// What is wrong with `after`, given that `before` was to be kept.
+/// How `after` violates what `before` allows; `None` if it does not.
 fn attribute_changed(before: &ExtraAttribute, after: &ExtraAttribute) -> Option<String> {
     if after.width != before.width || after.values.len() != before.values.len() {
         return Some("has another shape".into());
@@ -140,7 +145,7 @@ fn attribute_changed(before: &ExtraAttribute, after: &ExtraAttribute) -> Option<
         };
         if !kept && !before.needed.as_ref().is_some_and(left_out) {
             let allowed = before.tolerance.map_or("bit for bit".into(), |tolerance| format!("within {tolerance}"));
-            return Some(format!("became {b} where it was {a} and was to be kept {allowed}"));
+            return Some(format!("changed from {a} to {b}; it must be kept {allowed}"));
         }
     }
     None
@@ -177,20 +182,20 @@ fn survives_damage(codec: &dyn AttributeCodec) -> Result<Option<String>> {
     let limits = Limits { max_gaussians: 1000, ..Limits::default() };
     let context = CodecContext { limits, ..context() };
     let mut tries: Vec<(String, Vec<Stream>)> = vec![("no streams".into(), Vec::new())];
-    for place in 0..sound.len() {
-        let name = &sound[place].name;
+    for index in 0..sound.len() {
+        let name = &sound[index].name;
         let mut without = sound.clone();
-        without.remove(place);
-        // A stream may be optional, so its absence may be answered either way.
+        without.remove(index);
+        // A stream may be optional, so both an error and a result are allowed without it.
         tries.push((format!("'{name}' is missing"), without));
-        let length = sound[place].bytes.len();
+        let length = sound[index].bytes.len();
         for k in 0..DAMAGES.min(2 * length) {
             let mut damaged = sound.clone();
-            let bytes = &mut damaged[place].bytes;
-            let at = (Seed::root(3).index((place * DAMAGES + k) as u64).value() % length as u64) as usize;
+            let bytes = &mut damaged[index].bytes;
+            let at = (Seed::root(3).index((index * DAMAGES + k) as u64).value() % length as u64) as usize;
             let what = if k % 3 == 0 {
                 bytes.truncate(at);
-                "is cut short"
+                "is truncated"
             } else {
                 bytes[at] ^= 1 << (k % 8);
                 "has a flipped bit"
@@ -198,8 +203,8 @@ fn survives_damage(codec: &dyn AttributeCodec) -> Result<Option<String>> {
             tries.push((format!("'{name}' {what} at {at}"), damaged));
         }
         let mut longer = sound.clone();
-        longer[place].bytes.extend([255; 9]);
-        tries.push((format!("'{name}' goes on"), longer));
+        longer[index].bytes.extend([255; 9]);
+        tries.push((format!("'{name}' has trailing bytes"), longer));
     }
     for (what, streams) in tries {
         match catch_unwind(AssertUnwindSafe(|| codec.decode(&streams, &context))) {
@@ -207,7 +212,7 @@ fn survives_damage(codec: &dyn AttributeCodec) -> Result<Option<String>> {
             Ok(Err(_)) => {}
             Ok(Ok(found)) => {
                 if found.validate("decoded", &limits).is_err() {
-                    return Ok(Some(format!("unsound Gaussians came back where {what}")));
+                    return Ok(Some(format!("invalid Gaussians were returned where {what}")));
                 }
             }
         }

@@ -1,15 +1,19 @@
-//! What a weight codec must keep to.
+//! The conformance suite of weight codecs.
 
 use super::uniform;
 use crate::{CodecContext, Limits, Result, Seed, Silent, Stream, WeightArray, WeightCodec, WeightCodecPlugin};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// Damaged versions of each stream that are tried.
+/// Damaged versions tried per stream.
 const DAMAGES: usize = 48;
 
-/// Holds a weight codec to its promises: unknown settings are refused; names, shapes and order come back, and every value within the declared loss; equal
-/// weights give equal bytes; names that are taken, shapes that do not fit and values that are not finite are refused; damaged streams give an error or sound
-/// weights, never a panic.
+/// Tests a weight codec. Each finding is a line; an empty list means that it passed.
+///
+/// - Unknown settings are refused.
+/// - Names, shapes and their order are kept; the error of every value is at most the declared one.
+/// - Equal weights give equal bytes.
+/// - Duplicate names, shapes that do not match the values and values that are not finite are refused.
+/// - Damaged streams give an error or valid weights, never a panic.
 pub fn weight_codec(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Vec<String> {
     let name = plugin.info.name;
     let codec = match (plugin.build)(settings) {
@@ -27,7 +31,7 @@ pub fn weight_codec(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Vec<S
     note("weights", comes_back(codec, &weights()));
     note("no weights", comes_back(codec, &[]));
     note("repeats", repeats(codec));
-    note("unsound weights", refuses_unsound(codec));
+    note("invalid weights", refuses_unsound(codec));
     note("damaged streams", survives_damage(codec));
     findings
 }
@@ -74,10 +78,10 @@ fn comes_back(codec: &dyn WeightCodec, given: &[WeightArray]) -> Result<Option<S
         let worst = before.values.iter().zip(&after.values).map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).fold(0.0, f64::max);
         let allowed = codec.loss() * largest;
         let exact = before.values.iter().zip(&after.values).all(|(a, b)| a.to_bits() == b.to_bits());
-        // Written so that what is no number fails.
+        // NaN fails this comparison.
         let kept = if allowed == 0.0 && largest > 0.0 { exact } else { worst <= allowed };
         if !kept || after.values.iter().any(|v| !v.is_finite()) {
-            return Ok(Some(format!("'{}' is off by {worst:.2e}, {allowed:.2e} is declared", before.name)));
+            return Ok(Some(format!("'{}' has a relative error of {worst:.2e}, declared is {allowed:.2e}", before.name)));
         }
     }
     Ok(None)
@@ -112,11 +116,11 @@ fn survives_damage(codec: &dyn WeightCodec) -> Result<Option<String>> {
             let mut damaged = sound.clone();
             let bytes = &mut damaged[index].bytes;
             let draw = Seed::root(6).index((index * DAMAGES + k) as u64).value();
-            // Every other damage hits the first bytes, where counts and shapes usually are.
+            // Every second damage is in the first bytes, where counts and shapes usually are.
             let at = (draw >> 8) as usize % if k % 2 == 0 { length } else { length.min(64) };
             let what = if k % 3 == 0 {
                 bytes.truncate(at);
-                "is cut short"
+                "is truncated"
             } else {
                 bytes[at] ^= 1 << (draw % 8);
                 "has a flipped bit"
@@ -125,7 +129,7 @@ fn survives_damage(codec: &dyn WeightCodec) -> Result<Option<String>> {
         }
         let mut longer = sound.clone();
         longer[index].bytes.extend([255; 9]);
-        tries.push((format!("'{name}' goes on"), longer));
+        tries.push((format!("'{name}' has trailing bytes"), longer));
     }
     for (what, streams) in tries {
         match catch_unwind(AssertUnwindSafe(|| codec.decode(&streams, &context()))) {
@@ -134,7 +138,7 @@ fn survives_damage(codec: &dyn WeightCodec) -> Result<Option<String>> {
             Ok(Ok(found)) => {
                 let sound = |a: &WeightArray| a.values.iter().all(|v| v.is_finite()) && a.shape.iter().product::<usize>() == a.values.len();
                 if !found.iter().all(sound) {
-                    return Ok(Some(format!("unsound weights came back where {what}")));
+                    return Ok(Some(format!("invalid weights were returned where {what}")));
                 }
             }
         }

@@ -1,21 +1,21 @@
-//! One column of numbers as few bits: constant, uniform, mu-law or exact.
+//! Storage of a column of numbers in few bits: constant, uniform, mu-law or exact.
 //!
-//! Uniform quantisers span percentiles of the values, a little widened; the few values beyond are kept exactly in a list of escapes, so that
-//! an outlier neither widens the steps of the others nor is clamped itself. An encoder that misses the loss it may cause takes more bits.
+//! Uniform quantisers span percentiles of the values, a little widened; the few values outside are stored exactly in a list of escapes, so that
+//! an outlier neither widens the steps of the others nor is clamped. If the error is over the allowed loss, more bits are used.
 
 use super::mulaw;
 use crate::Result;
 use crate::archive::ByteReader;
 
-/// Share of the values at either end that [`encode_within`] may keep as escapes.
+/// Share of the values at either end that [`encode_within`] may store as escapes.
 const TAIL_WITHIN: f64 = 1e-3;
 
-/// How the codes of a column become numbers.
+/// How the codes of a column are decoded.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Form {
-    /// The same number everywhere; no codes.
+    /// All values are equal; there are no codes.
     Constant(f32),
-    /// `2^bits` even steps from `low` to `high`.
+    /// `2^bits` levels at equal distances from `low` to `high`.
     Uniform {
         /// Value of code 0.
         low: f32,
@@ -41,16 +41,16 @@ pub struct Column {
     pub form: Form,
     /// One or two bytes per value; four for [`Form::Exact`], none for [`Form::Constant`].
     pub codes: Vec<u8>,
-    /// Values that the codes do not reach: (row, value), rows ascending.
+    /// Values outside the range of the codes: (row, value), rows ascending.
     pub escapes: Vec<(u32, f32)>,
 }
 
-/// The form to try first and the loss that is allowed (root-mean-square error over standard deviation).
+/// The form to try first and the largest loss (root-mean-square error over standard deviation).
 #[derive(Clone, Copy, Debug)]
 pub struct Target {
     /// Bits per code, 2 to 16.
     pub bits: u8,
-    /// Companded steps in place of even ones.
+    /// Mu-law instead of uniform levels.
     pub mu_law: bool,
     /// Largest root-mean-square error over the standard deviation.
     pub loss: f64,
@@ -58,7 +58,7 @@ pub struct Target {
     pub tail: f64,
 }
 
-/// Encodes `values` (all finite) in the first form within the allowed loss: the wanted one, 16 uniform bits, exact.
+/// Encodes `values` (all finite) in the first form whose error is within the loss of `target`: the target's form, then 16 uniform bits, then exact.
 pub fn encode(values: &[f32], target: Target) -> Column {
     if let Some(column) = constant(values) {
         return column;
@@ -78,7 +78,7 @@ pub fn encode(values: &[f32], target: Target) -> Column {
     quantise(values, Form::Exact)
 }
 
-/// Encodes `values` (all finite) so that none is off by more than `tolerance`: in the fewest bits whose steps are small enough, else exactly.
+/// Encodes `values` (all finite) with an absolute error of at most `tolerance`: in the fewest bits that suffice, else exactly.
 pub fn encode_within(values: &[f32], tolerance: f32) -> Column {
     if let Some(column) = constant(values) {
         return column;
@@ -86,7 +86,7 @@ pub fn encode_within(values: &[f32], tolerance: f32) -> Column {
     let Form::Uniform { low, high, .. } = uniform(values, 2, TAIL_WITHIN) else { return quantise(values, Form::Exact) };
     let steps = (f64::from(high) - f64::from(low)) / (2.0 * f64::from(tolerance));
     let bits = (2..=16u8).find(|&bits| f64::from((1u32 << bits) - 1) >= steps).unwrap_or(16);
-    // One bit more where rounding to float32 took a step over the tolerance.
+    // Rounding to float32 may exceed the tolerance; then one more bit is used.
     for bits in [bits, (bits + 1).min(16)] {
         let column = quantise(values, Form::Uniform { low, high, bits });
         let decoded = dequantise(&column, values.len());
@@ -112,7 +112,7 @@ fn uniform(values: &[f32], bits: u8, tail: f64) -> Form {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f32::total_cmp);
     let last = sorted.len() - 1;
-    // Even few values may hold an outlier or two.
+    // Of few values, up to two at either end may be outliers.
     let cut = ((tail * sorted.len() as f64) as usize).max(2.min(sorted.len() / 8));
     let (inner_low, inner_high) = (f64::from(sorted[cut]), f64::from(sorted[last - cut]));
     let margin = 0.1 * (inner_high - inner_low);
@@ -151,9 +151,9 @@ fn push_code(codes: &mut Vec<u8>, code: u16, bits: u8) {
     if bits > 8 { codes.extend(code.to_le_bytes()) } else { codes.push(code as u8) }
 }
 
-/// What [`read`] will make of a column.
+/// The `count` values that [`read`] decodes from a column.
 pub fn dequantise(column: &Column, count: usize) -> Vec<f32> {
-    // The codes were written just now, so they cannot be short.
+    // The codes were written by `quantise`, so there are enough of them.
     let mut reader = ByteReader::new("column", &column.codes);
     read(&mut reader, column.form, count, &column.escapes).unwrap_or_default()
 }
@@ -178,7 +178,7 @@ impl Form {
             Self::Exact => out.push(3),
         }
     }
-    /// Reads a form; every number in it is checked.
+    /// Reads a form and checks its numbers.
     pub fn read(reader: &mut ByteReader) -> Result<Self> {
         let kind = reader.u8()?;
         let form = match kind {
@@ -192,7 +192,7 @@ impl Form {
                 Self::MuLaw { peak: reader.f32()?, bits }
             }
             3 => Self::Exact,
-            _ => return Err(reader.error(format!("a column has the unknown form {kind}"))),
+            _ => return Err(reader.error(format!("unknown form {kind} of a column"))),
         };
         match form {
             Self::Uniform { low, high, bits } if !(2..=16).contains(&bits) || low > high => {
@@ -219,7 +219,7 @@ pub fn widths(mut meta: ByteReader, count: usize) -> Result<Vec<usize>> {
     (0..count).map(|_| Ok(Form::read(&mut meta)?.bytes_per_code())).collect()
 }
 
-/// Decodes `count` values of `form` from `reader`. Both sides of the codec call this, so both see the same bits.
+/// Decodes `count` values of `form` from `reader`. Encoder and decoder both call this, so that they get the same bits.
 pub fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &[(u32, f32)]) -> Result<Vec<f32>> {
     if let Form::Exact = form {
         return reader.f32s(count);
@@ -246,7 +246,7 @@ pub fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &[(u32, 
             let value = |c: u16| ((f64::from(peak) * mulaw::decode((i32::from(c) - zero).min(zero), bits)) as f32).clamp(-peak, peak);
             let codes = codes(bits)?;
             if count > 1 << bits {
-                // More values than codes: a table spares most of the exponentials.
+                // More values than codes: a table avoids most of the exponentials.
                 let table: Vec<f32> = (0..=u16::MAX >> (16 - bits)).map(value).collect();
                 codes.into_iter().map(|c| table[usize::from(c)]).collect()
             } else {
@@ -258,7 +258,7 @@ pub fn read(reader: &mut ByteReader, form: Form, count: usize, escapes: &[(u32, 
     for &(row, value) in escapes {
         match values.get_mut(row as usize) {
             Some(v) => *v = value,
-            None => return Err(reader.error(format!("an escape names row {row} of {count}"))),
+            None => return Err(reader.error(format!("an escape refers to row {row} of {count}"))),
         }
     }
     Ok(values)
@@ -279,7 +279,7 @@ pub fn read_escapes(reader: &mut ByteReader) -> Result<Vec<(u32, f32)>> {
     Ok(rows.into_iter().zip(values).collect())
 }
 
-/// Root-mean-square error over the standard deviation of the values; 0 when nothing differs, NaN when something is not finite.
+/// Root-mean-square error over the standard deviation of the values; 0 if they are equal, NaN if a value is not finite.
 pub fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
     let n = values.len().max(1) as f64;
     let error: f64 = values.iter().zip(decoded).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>() / n;
@@ -291,8 +291,8 @@ pub fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
     if values.len() == decoded.len() { (error / variance).sqrt() } else { f64::NAN }
 }
 
-/// [`relative_rms`] of the values between the 5th and the 95th percentile. Far values that make the deviation large must not hide that the
-/// others lost their differences.
+/// [`relative_rms`] of the values between the 5th and the 95th percentile. Outliers enlarge the standard deviation and would hide
+/// the errors of the other values.
 fn central_loss(values: &[f32], decoded: &[f32]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f32::total_cmp);
@@ -332,7 +332,7 @@ mod tests {
 
     #[test]
     fn outliers_too_many_to_escape_do_not_swallow_the_rest() {
-        // Two in a hundred at 10^4: over the whole deviation 8 bits look harmless, yet 0 to 6 would all become 0.
+        // Two of a hundred values are 10^4: relative to the whole standard deviation 8 bits look sufficient, but 0 to 6 would all become 0.
         let values: Vec<f32> = (0..1000).map(|i| if i % 50 == 0 { 1e4 } else { (i % 7) as f32 }).collect();
         let decoded = dequantise(&encode(&values, TARGET), values.len());
         assert!(values.iter().zip(&decoded).all(|(a, b)| (a - b).abs() < 0.2));

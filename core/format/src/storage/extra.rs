@@ -1,4 +1,4 @@
-//! The extra attributes of plug-ins as streams.
+//! Storage of the extra attributes of plug-ins as streams.
 //!
 //! A stream begins with a byte of flags. 1: only some rows are stored; the start value (f32) and a bitmask with a bit per Gaussian, lowest first, follow.
 //! 2: values are quantised; u32 bytes of column forms, u32 bytes of escapes, both, and then the codes follow. Without 2, float32 columns follow.
@@ -15,9 +15,9 @@ const QUANTISED: u8 = 2;
 /// How an encoder stores extra attributes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Attributes {
-    /// Every value bit for bit, whatever is allowed.
+    /// Every value bit for bit.
     Exact,
-    /// As few bytes as [`ExtraAttribute::tolerance`] and [`ExtraAttribute::needed`] allow.
+    /// In as few bytes as [`ExtraAttribute::tolerance`] and [`ExtraAttribute::needed`] allow.
     AsAllowed,
 }
 
@@ -66,7 +66,7 @@ pub(super) fn decode(set: &StreamSet, name: &str, width: usize, count: usize) ->
     let mut reader = set.reader(&stream_name(name))?;
     let flags = reader.u8()?;
     if flags & !(SOME_ROWS | QUANTISED) != 0 {
-        return Err(reader.error(format!("attribute '{name}' is stored in the unknown form {flags}")));
+        return Err(reader.error(format!("unknown storage flags {flags} of attribute '{name}'")));
     }
     let needed = if flags & SOME_ROWS == 0 { None } else { Some((reader.f32()?, read_mask(&mut reader, count)?)) };
     let stored = needed.as_ref().map_or(count, |(_, rows)| rows.iter().filter(|row| **row).count());
@@ -92,7 +92,7 @@ pub(super) fn decode(set: &StreamSet, name: &str, width: usize, count: usize) ->
 fn read_mask(reader: &mut ByteReader, count: usize) -> Result<Vec<bool>> {
     let mask = reader.take(count.div_ceil(8))?;
     if !count.is_multiple_of(8) && mask.last().is_some_and(|last| last >> (count % 8) != 0) {
-        return Err(reader.error(format!("the mask of stored rows goes beyond {count} Gaussians")));
+        return Err(reader.error(format!("the mask of stored rows has bits beyond {count} Gaussians")));
     }
     Ok((0..count).map(|i| mask[i / 8] >> (i % 8) & 1 == 1).collect())
 }
@@ -113,7 +113,7 @@ mod tests {
         ExtraAttribute::exact(width, (0..count * width).map(|i| (i as f32 * 0.37).sin()).collect())
     }
 
-    /// Bytes of the stream, and what comes back.
+    /// Bytes of the stream, and the decoded attribute.
     fn round_trip(attribute: &ExtraAttribute, count: usize, how: Attributes) -> (usize, ExtraAttribute) {
         let gaussians = model(count, attribute.clone());
         let streams: Vec<Stream> = extra_streams(&gaussians, how).collect();
@@ -130,7 +130,7 @@ mod tests {
             assert_eq!(round_trip(&attribute, count, Attributes::AsAllowed).1, attribute);
         }
         let (_, found) = round_trip(&sparse, 101, Attributes::Exact);
-        assert_eq!(found.values, sparse.values, "permissions are not orders");
+        assert_eq!(found.values, sparse.values, "all rows are stored in exact mode");
     }
 
     #[test]

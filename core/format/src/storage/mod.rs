@@ -1,11 +1,11 @@
-//! What most codecs need and nobody should write twice.
+//! Building blocks that most codecs share.
 //!
-//! * [`Shape`], [`StreamSet`], [`open`], [`assemble`], [`close`]: the frame of a codec. A `meta` stream holds a version, the number of Gaussians, the degree
-//!   and the extra attributes; a decoder reads and checks all that before it allocates anything.
+//! * [`Shape`], [`StreamSet`], [`open`], [`assemble`], [`close`]: the common structure of codecs. A `meta` stream holds a version, the number of Gaussians, the
+//!   degree and the extra attributes; a decoder reads and checks them before it allocates memory.
 //! * [`extra_streams`], [`Shape::read_extra`]: the extra attributes of plug-ins, bit for bit or within their tolerance, in the rows that are needed.
-//! * [`mod@column`], [`store`], [`load`], [`split`], [`interleave`]: numbers as columns of codes with few bits, outliers kept exactly beside them.
+//! * [`mod@column`], [`store`], [`load`], [`split`], [`interleave`]: columns of codes with few bits, outliers stored exactly in a separate list.
 //! * [`to_planes`], [`from_planes`]: float32 values, column by column.
-//! * [`write_shapes`], [`read_shapes`]: names and shapes of a field's weights.
+//! * [`write_shapes`], [`read_shapes`]: names and shapes of a deformer's weights.
 //!
 //! The smallest lossless codec:
 //!

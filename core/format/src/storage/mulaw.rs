@@ -1,4 +1,4 @@
-//! Mu-law companding (paper Eq. for the dynamic indicator): fine steps near zero, coarse ones in the tail.
+//! Mu-law companding, as in the paper for dynamic scores: fine steps near zero, coarse steps for large values.
 
 /// The companding constant of the archive's dynamic scores.
 pub const MU: f64 = 255.0;

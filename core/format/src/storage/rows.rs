@@ -13,7 +13,7 @@ pub fn store(columns: &[Column], meta: &mut Vec<u8>, escapes: &mut Vec<u8>) -> V
     columns.iter().flat_map(|c| &c.codes).copied().collect()
 }
 
-/// Undoes [`store`]: `width` columns of `count` values. `codes` must be read to the end by that.
+/// Undoes [`store`]: `width` columns of `count` values. `codes` must end there.
 pub fn load(mut codes: ByteReader, count: usize, width: usize, meta: &mut ByteReader, escapes: &mut ByteReader) -> Result<Vec<Vec<f32>>> {
     let mut columns = Vec::with_capacity(width);
     for _ in 0..width {

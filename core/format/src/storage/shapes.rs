@@ -1,24 +1,27 @@
-//! Names and shapes of a field's weights, checked on both sides.
+//! Names and shapes of a deformer's weights, checked by writers and readers.
 
 use crate::archive::ByteReader;
 use crate::{Error, Result, WeightArray};
 use std::collections::BTreeSet;
 
-/// The most dimensions a weight array may have.
+/// Largest number of dimensions of a weight array.
 const MAX_RANK: usize = 8;
 
-/// Appends u32 count; per array u16 + name, u8 rank, u64 dimensions. Refuses names that are empty or taken, shapes that do not hold the values, and values
+/// Appends u32 count; per array u16 + name, u8 rank, u64 dimensions. Refuses empty and duplicate names, shapes that do not match the values, and values
 /// that are not finite.
+///
+/// # Errors
+/// [`Error::Parameter`], and [`Error::Backend`] for values that are not finite.
 pub fn write_shapes(arrays: &[WeightArray], out: &mut Vec<u8>) -> Result<()> {
     out.extend((arrays.len() as u32).to_le_bytes());
     let mut names = BTreeSet::new();
     for array in arrays {
-        let refuse = |problem: String| Err(Error::parameter(format!("weights '{}'", array.name), problem, "Correct the field's parameters()"));
+        let refuse = |problem: String| Err(Error::parameter(format!("weights '{}'", array.name), problem, "Correct Deformer::parameters()"));
         if array.name.is_empty() || array.name.len() > usize::from(u16::MAX) || array.name.chars().any(char::is_control) || !names.insert(array.name.as_str()) {
-            return refuse("the name is empty, too long, not printable or taken".into());
+            return refuse("the name is empty, too long, not printable or not unique".into());
         }
         if array.shape.len() > MAX_RANK || value_count(&array.shape) != Some(array.values.len()) {
-            return refuse(format!("shape {:?} does not hold {} values", array.shape, array.values.len()));
+            return refuse(format!("shape {:?} does not match {} values", array.shape, array.values.len()));
         }
         if let Some(i) = array.values.iter().position(|v| !v.is_finite()) {
             return Err(Error::backend(
@@ -35,7 +38,7 @@ pub fn write_shapes(arrays: &[WeightArray], out: &mut Vec<u8>) -> Result<()> {
     Ok(())
 }
 
-/// Reads what [`write_shapes`] wrote; `values` are empty. How many values each array has ([`value_count`]) is a claim until bytes account for it.
+/// Reads what [`write_shapes`] wrote; `values` are empty. The number of values ([`value_count`]) is untrusted; compare it with the bytes left before allocating.
 pub fn read_shapes(reader: &mut ByteReader) -> Result<Vec<WeightArray>> {
     let count = reader.u32()?;
     let (mut arrays, mut names) = (Vec::new(), BTreeSet::new());
@@ -44,7 +47,7 @@ pub fn read_shapes(reader: &mut ByteReader) -> Result<Vec<WeightArray>> {
         let name = reader.name(name_len)?;
         let rank = usize::from(reader.u8()?);
         if rank > MAX_RANK {
-            return Err(reader.error(format!("weights '{name}' claim {rank} dimensions, over {MAX_RANK}")));
+            return Err(reader.error(format!("weights '{name}' have {rank} dimensions, over the limit of {MAX_RANK}")));
         }
         let shape = (0..rank).map(|_| reader.u64().map(|d| usize::try_from(d).unwrap_or(usize::MAX))).collect::<Result<Vec<_>>>()?;
         if !names.insert(name.clone()) {
@@ -55,7 +58,7 @@ pub fn read_shapes(reader: &mut ByteReader) -> Result<Vec<WeightArray>> {
     Ok(arrays)
 }
 
-/// The product of `shape`; `None` where it is more than memory can hold.
+/// The product of `shape`; `None` if the values do not fit into memory.
 pub fn value_count(shape: &[usize]) -> Option<usize> {
     shape.iter().try_fold(1usize, |count, &dimension| count.checked_mul(dimension))
 }

@@ -1,28 +1,31 @@
-//! The frame of a codec: which streams there are, and what every decoder reads and checks first.
+//! The common structure of codecs: the set of streams, and the `meta` stream that every decoder reads and checks first.
 
 use super::extra::{self, Attributes, extra_streams};
 use crate::archive::ByteReader;
 use crate::gaussians::sh_rest_len;
 use crate::{Error, HostGaussians, Limits, Result, Stream};
 
-/// The stream that says what the others hold.
+/// The stream that describes the others.
 pub const META: &str = "meta";
 
-/// The stream with the values that lie beyond the steps of a quantiser.
+/// The stream with the values outside the range of their quantiser.
 pub const ESCAPES: &str = "escapes";
 
-/// The streams handed to a decoder, by name.
+/// The streams of a decoder, by name.
 pub struct StreamSet<'a> {
     codec: &'static str,
     streams: &'a [Stream],
 }
 
 impl<'a> StreamSet<'a> {
-    /// The streams handed to the decoder of `codec`, which errors name.
+    /// The streams of a decoder; `codec` is the name in errors.
     pub fn new(codec: &'static str, streams: &'a [Stream]) -> Self {
         Self { codec, streams }
     }
     /// A reader over the stream `name`.
+    ///
+    /// # Errors
+    /// [`Error::Data`] if there is no such stream.
     pub fn reader(&self, name: &str) -> Result<ByteReader<'a>> {
         match self.streams.iter().find(|s| s.name == name) {
             Some(stream) => Ok(ByteReader::new(format!("{} stream '{name}'", self.codec), &stream.bytes)),
@@ -31,7 +34,10 @@ impl<'a> StreamSet<'a> {
     }
 }
 
-/// What every decoder reads first: the streams by name, the meta stream behind its version and the shape, and the shape.
+/// The first step of every decoder: returns the streams by name, the meta stream after version and shape, and the shape.
+///
+/// # Errors
+/// [`Error::Unsupported`] for another version, [`Error::Data`] for invalid streams, [`Error::Limit`].
 pub fn open<'a>(codec: &'static str, streams: &'a [Stream], version: u8, limits: &Limits) -> Result<(StreamSet<'a>, ByteReader<'a>, Shape)> {
     let set = StreamSet::new(codec, streams);
     let mut meta = set.reader(META)?;
@@ -43,7 +49,7 @@ pub fn open<'a>(codec: &'static str, streams: &'a [Stream], version: u8, limits:
     Ok((set, meta, shape))
 }
 
-/// All streams of a lossy encoder: `meta`, the `columns` by name, the extra attributes of `gaussians` as far as they must be kept, and `escapes`.
+/// All streams of a lossy encoder: `meta`, the `columns` by name, the extra attributes of `gaussians` ([`Attributes::AsAllowed`]), and `escapes`.
 pub fn assemble(gaussians: &HostGaussians, meta: Vec<u8>, escapes: Vec<u8>, columns: Vec<Stream>) -> Vec<Stream> {
     let mut streams = vec![Stream { name: META.into(), bytes: meta }];
     streams.extend(columns);
@@ -52,7 +58,7 @@ pub fn assemble(gaussians: &HostGaussians, meta: Vec<u8>, escapes: Vec<u8>, colu
     streams
 }
 
-/// What a decoder of [`assemble`] does last: `read` (meta and escapes) must have been read to the end, the extra attributes are read, and the whole is validated.
+/// The last step of a decoder of [`assemble`]: checks that `read` (meta and escapes) has no bytes left, reads the extra attributes, and validates the result.
 pub fn close(set: &StreamSet, shape: &Shape, read: [ByteReader; 2], mut out: HostGaussians, limits: &Limits) -> Result<HostGaussians> {
     for reader in read {
         reader.finish()?;
@@ -65,11 +71,11 @@ pub fn close(set: &StreamSet, shape: &Shape, read: [ByteReader; 2], mut out: Hos
 /// Number of Gaussians, degree and extra attributes: what every meta stream holds.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Shape {
-    /// Gaussians.
+    /// Number of Gaussians.
     pub count: usize,
     /// Spherical-harmonics degree, 0 to 4.
     pub sh_degree: usize,
-    /// Names of the extra attributes and floats per Gaussian of each.
+    /// Name and floats per Gaussian of each extra attribute.
     pub extra: Vec<(String, usize)>,
 }
 
@@ -84,7 +90,7 @@ impl Shape {
         out.push(self.sh_degree as u8);
         out.extend((self.extra.len() as u16).to_le_bytes());
         for (name, width) in &self.extra {
-            // The archive names a stream after the attribute, in at most 255 bytes.
+            // The stream of an attribute has its name, and stream names have at most 255 bytes.
             if name.is_empty()
                 || name.len() > 240
                 || name.chars().any(char::is_control)
@@ -104,7 +110,7 @@ impl Shape {
         }
         Ok(())
     }
-    /// Reads and checks what the file claims against `limits`, before anything is allocated for it.
+    /// Reads a shape and checks it against `limits`, before memory is allocated for it.
     pub fn read(reader: &mut ByteReader, limits: &Limits) -> Result<Self> {
         let count = reader.u64()?;
         limits.check_gaussians("encoded Gaussians", count)?;
@@ -114,7 +120,7 @@ impl Shape {
         }
         let attributes = usize::from(reader.u16()?);
         if attributes > MAX_EXTRA {
-            return Err(reader.error(format!("{attributes} extra attributes are over {MAX_EXTRA}")));
+            return Err(reader.error(format!("{attributes} extra attributes, over the limit of {MAX_EXTRA}")));
         }
         let mut extra = Vec::new();
         let mut floats = 15 + 3 * sh_rest_len(sh_degree) as u64;
@@ -123,7 +129,7 @@ impl Shape {
             let name = reader.name(name_len)?;
             let width = reader.u32()? as usize;
             if width == 0 || width > MAX_EXTRA_WIDTH || extra.iter().any(|(n, _)| *n == name) {
-                return Err(reader.error(format!("attribute '{name}' of width {width} is impossible or there twice")));
+                return Err(reader.error(format!("attribute '{name}' of width {width}: the width is invalid or the name is not unique")));
             }
             floats += width as u64;
             extra.push((name, width));
@@ -143,7 +149,7 @@ impl Shape {
 const MAX_EXTRA: usize = 256;
 const MAX_EXTRA_WIDTH: usize = 4096;
 
-/// Rows `[N, width]` as float32 columns, one after the other: neighbours in a stream then have alike bytes.
+/// Rows `[N, width]` as float32 columns, one after the other, so that neighbouring values in a stream are similar.
 pub fn to_planes(rows: &[f32], width: usize) -> Vec<u8> {
     (0..width).flat_map(|c| rows.iter().skip(c).step_by(width)).flat_map(|v| v.to_le_bytes()).collect()
 }

@@ -9,6 +9,8 @@ use glam::DVec3;
 
 /// Distance of the median camera from the origin of the normalised frame.
 pub(super) const CAMERA_DISTANCE: f64 = 4.0;
+/// No dataset's origin is farther than this from what its cameras look at, in units of the normalised frame.
+const FARTHEST: f64 = 1e18;
 /// The most cameras and points that are asked how far away the points are.
 const SAMPLE: [usize; 2] = [64, 2000];
 
@@ -27,9 +29,20 @@ pub(super) fn normalisation(raw: &RawScene) -> Similarity {
         .collect();
     let found = focus(&rays, depth_hint(raw, &rays));
     // Where nothing says how long a unit is, it stays as it is.
-    let scale = found.distance.map_or(1.0, |d| CAMERA_DISTANCE / d);
-    let map = Similarity::centred(found.point.to_array(), scale);
+    let scale = found.distance.map_or(1.0, |d| significant(CAMERA_DISTANCE / d, 8));
+    let mut map = Similarity::centred(found.point.to_array(), scale);
+    map.translation = map.translation.map(|t| placed(t).clamp(-FARTHEST, FARTHEST));
     if map.validate("normalisation").is_ok() { map } else { Similarity::IDENTITY }
+}
+
+/// `value` with so many significant decimal digits. JSON readers take decimals of at most 15 digits back to the last bit, which they do not promise of others.
+fn significant(value: f64, digits: usize) -> f64 {
+    format!("{value:.*e}", digits - 1).parse().unwrap_or(value)
+}
+
+/// A coordinate with six decimal places, or 15 digits where that is less.
+fn placed(value: f64) -> f64 {
+    if value.abs() < 1e9 { format!("{value:.6}").parse().unwrap_or(value) } else { significant(value, 15) }
 }
 
 /// How far ahead of the cameras the scene is, from its points or its box: the median over cameras of the median depth, which a few points at the horizon or
@@ -103,6 +116,18 @@ mod tests {
             assert!((found.scale - 0.04).abs() < 1e-6 && found.apply([5.0, 6.0, 107.0]).iter().all(|v| v.abs() < 1e-6), "{found:?}");
         }
         assert_eq!(normalisation(&RawScene::default()).scale, 1.0);
+    }
+
+    #[test]
+    fn json_keeps_every_bit() {
+        for i in 0..2000 {
+            let x = f64::from(i) * 0.618_033_988_749;
+            let (size, far) = (10f64.powf(x.fract() * 16.0 - 8.0), 10f64.powf((1.7 * x).fract() * 20.0 - 8.0));
+            let eyes: Vec<[f64; 3]> = (0..8).map(|k| f64::from(k) * 0.785).map(|a| [far + size * a.cos(), -far + 0.3 * size, size * a.sin()]).collect();
+            let map = normalisation(&rig(&eyes, |_| [far, -far, 0.0]));
+            let back: Similarity = serde_json::from_str(&serde_json::to_string(&map).unwrap()).unwrap();
+            assert_eq!(back, map);
+        }
     }
 
     #[test]

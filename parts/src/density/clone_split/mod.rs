@@ -23,16 +23,16 @@ max_scale_share = 0.0    # larger Gaussians are removed, as a share of the exten
 min_weight = 0.02        # a weight pruning removes Gaussians whose largest blending weight is below this
 weight_every = 3000      # reference iterations between two weight prunings; 0 is off
 reset_every = 3000       # reference iterations between two opacity resets of the coarse stage; 0 is off
-max_gaussians = 400000   # no growth at or over this many
+max_gaussians = 400000   # at this count or more, no Gaussians are added
 ";
 
 /// Opacity that a reset leaves at most.
 const RESET_OPACITY: f32 = 0.01;
-/// Fewest iterations left after an opacity reset; a shorter rest of the stage is not reset.
+/// Least number of iterations left in the stage after an opacity reset; later resets are skipped.
 const MIN_RECOVERY: usize = 500;
-/// Fewest iterations between two weight prunings, so that every view had a chance to show a Gaussian.
+/// Least number of iterations between two weight prunings, so that all views contribute blending weights.
 const MIN_WEIGHT_INTERVAL: usize = 100;
-/// Fewest iterations between two rounds.
+/// Least number of iterations between two rounds.
 const MIN_INTERVAL: usize = 25;
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -77,7 +77,7 @@ impl Settings {
     fn weight_interval(&self, schedule: &Schedule) -> usize {
         schedule.at(self.weight_every).max(MIN_WEIGHT_INTERVAL)
     }
-    /// What is due after this iteration.
+    /// The actions due after this iteration.
     fn due(&self, schedule: &Schedule) -> Due {
         let (iteration, end) = (schedule.iteration, self.end(schedule));
         let reset_interval = schedule.at(self.reset_every).max(1);
@@ -105,7 +105,7 @@ impl DensityControl for CloneSplit {
         if schedule.iteration < end {
             wanted.push(Statistic::ScreenGradient);
         }
-        // Weights are asked for while a weight pruning is still to come.
+        // Blending weights are collected until the last weight pruning.
         let interval = self.settings.weight_interval(schedule);
         if self.settings.weight_every > 0 && schedule.iteration.div_ceil(interval) * interval < end {
             wanted.push(Statistic::MaxWeight);

@@ -7,15 +7,15 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, HostGaussians, Result, Seed};
 use rand::Rng;
 
-/// Two Gaussians of 1/1.6 the size stand for one (3DGS: 0.8 times 2).
+/// The two halves of a split are smaller by this factor (3DGS: 0.8 times 2).
 const SPLIT_SHRINK: f32 = 1.6;
 
-/// What is due after an iteration.
+/// The actions due after an iteration.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Due {
     /// Clone and split.
     pub grow: bool,
-    /// Remove by blending weight, and start that statistic anew.
+    /// Prune by blending weight, and reset that statistic.
     pub prune_weight: bool,
     /// Lower all opacities.
     pub reset: bool,
@@ -24,7 +24,7 @@ pub(super) struct Due {
 /// A Gaussian to add: its parent, and a standard normal sample if it comes from a split.
 type Child = (usize, Option<[f32; 3]>);
 
-/// One round. Statistics start anew; `None` where every Gaussian would have to go, which keeps them all.
+/// One round. Resets the statistics. `None` if every Gaussian would be removed; then all are kept.
 pub(super) fn round(
     settings: &Settings,
     statistics: &mut Statistics,
@@ -88,7 +88,7 @@ pub(super) fn round(
     let count = plan.len();
     *statistics = Statistics::zeros(count, device);
     if !due.prune_weight {
-        // New Gaussians have no history: they cannot fail the next weight pruning.
+        // New Gaussians have no blending weights yet; weight 1 protects them from the next weight pruning.
         let weights: Vec<f32> = plan.parents().iter().enumerate().map(|(row, &parent)| if row < kept { weight[parent].min(1.0) } else { 1.0 }).collect();
         statistics.max_weight = Tensor::from_data(TensorData::new(weights, [count]), device);
     }

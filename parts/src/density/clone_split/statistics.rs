@@ -1,11 +1,11 @@
-//! Running statistics between two rounds, on the device.
+//! Statistics summed over the views between two rounds, on the device.
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{Error, Result, ViewStatistics};
 
 /// Sums over the views since the last round.
 pub(super) struct Statistics {
-    /// Sum of screen-gradient norms in normalised device units [N].
+    /// Sum of the norms of screen gradients, in normalised device coordinates [N].
     pub gradient_sum: Tensor<1>,
     /// Views that saw the Gaussian [N].
     pub seen: Tensor<1>,
@@ -23,7 +23,7 @@ impl Statistics {
     pub fn add(&mut self, view: &ViewStatistics) {
         if let Some(gradient) = &view.screen_gradient {
             let n = gradient.dims()[0];
-            // From pixels of a loss that was divided by the number of views to half images of the view's own loss.
+            // Converts the gradient per pixel of a loss divided by the number of views to the gradient of the view's own loss per unit of normalised device coordinates.
             let scale = view.views as f32 * 0.5;
             let axis = |k: usize, side: u32| gradient.clone().narrow(1, k, 1).reshape([n]).mul_scalar(scale * side as f32);
             let (x, y) = (axis(0, view.size.0), axis(1, view.size.1));
@@ -36,7 +36,7 @@ impl Statistics {
             self.max_weight = self.max_weight.clone().max_pair(weights.clone());
         }
     }
-    /// Forgets gradients, as every round does.
+    /// Resets the gradients, after every round.
     pub fn reset_gradients(&mut self) {
         self.gradient_sum = self.gradient_sum.zeros_like();
         self.seen = self.seen.zeros_like();
