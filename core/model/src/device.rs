@@ -78,7 +78,7 @@ mod adapter {
             // burn may find an adapter that enumeration does not list.
             None if index == 0 => DeviceKind::DefaultDevice,
             None => {
-                let problem = format!("there is no such adapter; this machine has {}", adapters().len());
+                let problem = format!("there is no such adapter; this machine has {} adapters", adapters().len());
                 return Err(Error::unsupported(format!("device wgpu:{index}"), problem, "`cc4dgs doctor` lists them"));
             }
         };
