@@ -12,15 +12,15 @@ const LANES: usize = 16;
 /// The nearest centre of each point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Assignment {
-    /// Index of the nearest centre, the lowest on a tie [N].
+    /// Index of the nearest centre, the lowest on a tie `[N]`.
     pub labels: Vec<u32>,
-    /// Squared distance to it [N].
+    /// Squared distance to it `[N]`.
     pub distances: Vec<f32>,
     /// Sum of the squared distances.
     pub inertia: f64,
 }
 
-/// Centres [K,width] of `points` [N,width] after k-means++ seeding and at most `iterations` Lloyd iterations. K is `k`, or the number of
+/// Centres `[K,width]` of `points` `[N,width]` after k-means++ seeding and at most `iterations` Lloyd iterations. K is `k`, or the number of
 /// distinct points if that is smaller; no points give no centres.
 pub fn cluster(points: &[f32], width: usize, k: usize, iterations: usize, seed: Seed) -> Vec<f32> {
     if points.is_empty() || width == 0 || k == 0 {
@@ -39,7 +39,7 @@ pub fn cluster(points: &[f32], width: usize, k: usize, iterations: usize, seed: 
     centers
 }
 
-/// The nearest of `centers` [K,width], K at least 1, for each of `points` [N,width].
+/// The nearest of `centers` `[K,width]`, K at least 1, for each of `points` `[N,width]`.
 pub fn assign(points: &[f32], width: usize, centers: &[f32]) -> Assignment {
     let k = centers.len() / width;
     // Blocks of LANES centres, one dimension after the other. Padding centres are infinitely far away.

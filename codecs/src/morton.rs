@@ -5,7 +5,7 @@ use rayon::prelude::*;
 /// Bits per axis: 2^BITS cells.
 const BITS: u32 = 21;
 
-/// The indices [N] of the points `means` [N,3] along the Z-curve of their bounding box. Points of the same cell keep their order.
+/// The indices `[N]` of the points `means` `[N,3]` along the Z-curve of their bounding box. Points of the same cell keep their order.
 pub fn order(means: &[f32]) -> Vec<usize> {
     let mut low = [f64::INFINITY; 3];
     let mut high = [f64::NEG_INFINITY; 3];

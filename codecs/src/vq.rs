@@ -49,7 +49,7 @@ impl Default for Settings {
 struct Vq(Settings);
 
 impl Vq {
-    /// A codebook for `rows` [N,width] and the codebook index of each row; `None` if its error is over the limit.
+    /// A codebook for `rows` `[N,width]` and the codebook index of each row; `None` if its error is over the limit.
     fn book(&self, rows: &[f32], width: usize, seed: Seed) -> Option<(Vec<f32>, Vec<u32>)> {
         let n = rows.len().checked_div(width).unwrap_or(0);
         if n == 0 {

@@ -10,8 +10,9 @@
 use cc4dgs::core::burn::tensor::{Tensor, TensorData};
 use cc4dgs::core::gaussians::to_vec;
 use cc4dgs::core::{Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, parse_device};
-use cc4dgs::engine::{eval::evaluate, model::Model};
+use cc4dgs::play::Model;
 use cc4dgs::scenes::open_as_trained;
+use cc4dgs::train::eval::evaluate;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
@@ -84,7 +85,7 @@ fn main() -> Result<()> {
         let bits = Arc::new(Mutex::new(0.0));
         if let Some(own) = model.field.take() {
             let field = Box::new(Rounded { inner: own.field, step, bits: bits.clone() });
-            model.field = Some(cc4dgs::engine::model::ModelDeformer { field, ..own });
+            model.field = Some(cc4dgs::play::model::ModelDeformer { field, ..own });
         }
         let report = score(&model)?;
         let bytes = *bits.lock().unwrap_or_else(std::sync::PoisonError::into_inner) / 8.0;

@@ -12,7 +12,7 @@ fn main() -> Result<()> {
     let folder = PathBuf::from(arguments.next().unwrap_or_else(|| "runs/example".into()));
     let iterations = arguments.next().unwrap_or_else(|| "600".into());
 
-    // Library code never prints; whoever wants to hear of progress listens.
+    // Library code never prints: progress comes as events.
     let session = Session::builder()
         .on_event(|event| {
             if let Event::StageFinished { stage, seconds, gaussians } = event {

@@ -21,25 +21,26 @@
 //! linked. The `cc4dgs` command is built on this crate; a program that wants the whole command line depends on `cc4dgs-cli` instead.
 
 mod model;
-mod orbit;
+
 pub mod plugins;
 pub mod runs;
 pub mod scenes;
 mod session;
 pub mod video;
 
+pub use cc4dgs_play::Orbit;
 pub use model::Model;
-pub use orbit::Orbit;
 pub use session::{Session, SessionBuilder};
 
 pub use cc4dgs_core::{Camera, Error, Event, EventSink, HostGaussians, Image8, Limits, Registry, Result, Scene, SceneOptions, Split};
-pub use cc4dgs_engine::config::RunConfig;
-pub use cc4dgs_engine::images::write_png;
-pub use cc4dgs_engine::play::Player;
+pub use cc4dgs_play::player::Player;
+pub use cc4dgs_train::config::RunConfig;
+pub use cc4dgs_train::images::write_png;
 
 pub use cc4dgs_backends as backends;
 pub use cc4dgs_codecs as codecs;
 pub use cc4dgs_core as core;
 pub use cc4dgs_deformers as deformers;
-pub use cc4dgs_engine as engine;
 pub use cc4dgs_parts as parts;
+pub use cc4dgs_play as play;
+pub use cc4dgs_train as train;

@@ -2,19 +2,22 @@
 
 use crate::Session;
 use cc4dgs_core::{Event, Result};
-use cc4dgs_engine::model::ArchiveOptions;
+use cc4dgs_play::ArchiveOptions;
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
 
-/// A model: its Gaussians, the deformer that moves them, and how they want to be drawn. Everything of [`cc4dgs_engine::model::Model`] is there as well.
+/// The weight codec of [`Model::save`]: exact.
+const FIELD_WEIGHTS: &str = "fp32";
+
+/// A model: its Gaussians, the deformer that moves them, and how they want to be drawn. Everything of [`cc4dgs_play::model::Model`] is there as well.
 pub struct Model {
-    inner: cc4dgs_engine::model::Model,
+    inner: cc4dgs_play::model::Model,
     session: Session,
 }
 
 impl Model {
     /// `inner` as a model of `session`.
-    pub fn new(inner: cc4dgs_engine::model::Model, session: Session) -> Self {
+    pub fn new(inner: cc4dgs_play::model::Model, session: Session) -> Self {
         Self { inner, session }
     }
     /// Writes a `.cc4d` archive with the codec `name` or `name:profile` and returns its size in bytes. The file appears complete or not at all.
@@ -22,9 +25,9 @@ impl Model {
     /// # Errors
     /// [`Error::Parameter`](crate::Error::Parameter) for unknown codecs and profiles, and what codec and disk report.
     pub fn save(&self, path: impl AsRef<Path>, codec: &str) -> Result<u64> {
-        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: "fp32", scene: None })
+        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None })
     }
-    /// As [`Model::save`], with settings of the codec, a codec of the field's weights, and a scene that codecs may use.
+    /// As [`Model::save`], with settings of the codec, a weight codec for the deformer, and the scene for codecs that make use of it.
     ///
     /// # Errors
     /// As [`Model::save`], and for settings the codec does not have.
@@ -37,7 +40,7 @@ impl Model {
 }
 
 impl Deref for Model {
-    type Target = cc4dgs_engine::model::Model;
+    type Target = cc4dgs_play::model::Model;
     fn deref(&self) -> &Self::Target {
         &self.inner
     }

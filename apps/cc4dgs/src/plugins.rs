@@ -1,7 +1,7 @@
 //! Checking the plug-ins of a configuration before anything long begins.
 
 use cc4dgs_core::{AppearanceContext, DeformerContext, Registry, Result, Seed, parse_device, split_kind};
-use cc4dgs_engine::config::RunConfig;
+use cc4dgs_train::config::RunConfig;
 
 /// Builds every plug-in of `config` once and drops it. A mistake in the settings of the deformer should not wait for the main stage, nor leave a
 /// folder behind.

@@ -1,7 +1,8 @@
 //! The folder of a training run.
 
 use cc4dgs_core::{Error, Result};
-use cc4dgs_engine::train::{CHECKPOINT, CONFIG};
+use cc4dgs_play::checkpoint::CHECKPOINT;
+use cc4dgs_train::train::CONFIG;
 use std::path::Path;
 
 /// Name of the log inside a run's folder: one JSON object per event and line.

@@ -1,8 +1,8 @@
 //! Opening a dataset as a model was trained on it.
 
 use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config};
-use cc4dgs_engine::data;
-use cc4dgs_engine::model::Model;
+use cc4dgs_play::model::Model;
+use cc4dgs_train::data;
 use std::path::Path;
 
 /// Keys of `[scene]` that a stored configuration must not choose: programs to run, folders to write, memory to take.
@@ -13,11 +13,11 @@ const OURS_ALONE: [&str; 3] = ["ffmpeg", "video_cache", "cache_mb"];
 /// # Errors
 /// [`Error::Parameter`] for an assignment that is no scene option, and whatever the reader reports.
 pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], registry: &Registry, limits: &Limits) -> Result<Scene> {
-    data::open(path, &options_as_trained(&model.provenance.config, sets)?, registry, limits)
+    data::open_in(path, &options_as_trained(&model.provenance.config, sets)?, &model.normalisation, registry, limits)
 }
 
-/// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. A model may come from anyone: what it says never chooses
-/// programs to run, folders to write or memory to take.
+/// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. Models may come from untrusted sources: their configuration never
+/// chooses programs to run, folders to write or memory to take.
 ///
 /// # Errors
 /// [`Error::Parameter`] for an assignment that is no scene option, and for stored options of another version.

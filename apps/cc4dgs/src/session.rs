@@ -1,16 +1,15 @@
-//! The front door: a session holds what every call needs, so that programs pass it once.
+//! A session holds what most calls need (plug-ins, limits, events, the device), so that a program states it once.
 
 use crate::Model;
 use crate::runs::{Existing, check_folder};
 use crate::{plugins, scenes};
 use burn::tensor::Device;
-use cc4dgs_core::SceneOptions;
-use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, Silent, Split, parse_device};
-use cc4dgs_engine::config::RunConfig;
-use cc4dgs_engine::data;
-use cc4dgs_engine::eval::{EvalReport, evaluate};
-use cc4dgs_engine::play::Player;
-use cc4dgs_engine::train::{CONFIG, TrainJob, train};
+use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device};
+use cc4dgs_play::player::Player;
+use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::data;
+use cc4dgs_train::eval::{EvalReport, evaluate};
+use cc4dgs_train::train::{CONFIG, TrainJob, train};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -43,17 +42,17 @@ impl SessionBuilder {
         self.device = name.into();
         self
     }
-    /// What readers accept of files; the default is generous for trusted files of this field.
+    /// Upper bounds for what readers accept of files.
     pub fn limits(mut self, limits: Limits) -> Self {
         self.limits = limits;
         self
     }
-    /// Who hears what happens; by default nobody.
+    /// Receives all events; by default they are dropped.
     pub fn events(mut self, sink: impl EventSink + 'static) -> Self {
         self.events = Arc::new(sink);
         self
     }
-    /// Calls `listener` for everything that happens, from any thread.
+    /// Calls `listener` with every event, from any thread.
     pub fn on_event(self, listener: impl Fn(&Event) + Send + Sync + 'static) -> Self {
         self.events(Listener(listener))
     }
@@ -93,11 +92,11 @@ impl Session {
     pub fn registry(&self) -> &Registry {
         &self.shared.registry
     }
-    /// What readers accept of files.
+    /// Upper bounds for what readers accept of files.
     pub fn limits(&self) -> &Limits {
         &self.shared.limits
     }
-    /// Who hears what happens.
+    /// Receives all events.
     pub fn events(&self) -> &dyn EventSink {
         self.shared.events.as_ref()
     }
@@ -124,8 +123,8 @@ impl Session {
     pub fn read_scene(&self, path: impl AsRef<Path>, options: &SceneOptions) -> Result<Scene> {
         data::open(path.as_ref(), options, self.registry(), self.limits())
     }
-    /// Opens the dataset at `path` as `model` was trained on it. What a stranger's model says never chooses programs to run, folders to write or memory to
-    /// take.
+    /// Opens the dataset at `path` as `model` was trained on it. The configuration stored in a model never chooses programs to run, folders to write or memory
+    /// to take.
     ///
     /// # Errors
     /// As [`Session::read_scene`].
@@ -167,9 +166,9 @@ impl Session {
     /// Opens a model: the folder of a run, a checkpoint, an archive, a PLY or an SPZ file. The first bytes decide.
     ///
     /// # Errors
-    /// As [`cc4dgs_engine::model::Model::open`].
+    /// As [`cc4dgs_play::model::Model::open`].
     pub fn open(&self, path: impl AsRef<Path>) -> Result<Model> {
-        let inner = cc4dgs_engine::model::Model::open(path.as_ref(), self.registry(), self.device(), self.limits(), self.events())?;
+        let inner = cc4dgs_play::model::Model::open(path.as_ref(), self.registry(), self.device(), self.limits(), self.events())?;
         Ok(Model::new(inner, self.clone()))
     }
     /// Uploads `model` for playback.

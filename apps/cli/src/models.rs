@@ -1,7 +1,7 @@
 //! The model a command works on.
 
 use cc4dgs_core::{EventSink, Limits, Registry, Result, auto_device, parse_device};
-use cc4dgs_engine::model::Model;
+use cc4dgs_play::model::Model;
 use std::path::Path;
 
 /// A model on a device.

@@ -98,7 +98,7 @@ fn mistakes_end_with_their_own_exit_code() {
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--set", unknown, "--out", text(&out)], 2).contains("capasity"));
     fail(&["train", "--scene", text(&folder.path().join("nowhere")), "--out", text(&out)], 2);
     assert!(!out.exists(), "a refused command leaves nothing behind");
-    std::fs::write(&broken, b"\x89CC4D\r\n\x1a\x01\0\0\0\x10\0\0\0 and then nothing that makes sense as a header").unwrap();
+    std::fs::write(&broken, b"\x89CC4D\r\n\x1a\x02\0\0\0\x10\0\0\0 and then nothing that makes sense as a header").unwrap();
     fail(&["info", text(&broken)], 3);
     fail(&["eval", text(&broken), "--scene", "procedural:tiny"], 3);
     fail(&["decompress", text(&folder.path().join("missing.cc4d")), "--out", text(&out)], 3);

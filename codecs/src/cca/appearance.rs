@@ -196,7 +196,8 @@ fn row_weights(gaussians: &HostGaussians) -> Vec<f32> {
     raw.iter().map(|w| (w / mean.max(f64::MIN_POSITIVE)).clamp(ROW_WEIGHTS.0, ROW_WEIGHTS.1) as f32).collect()
 }
 
-/// Coefficients [N,width] from latents `z` [N,latents], the conditions and, if given, the codebook. Encoder and decoder both call this, so that they compute the same bits.
+/// Coefficients `[N,width]` from latents `z` `[N,latents]`, the conditions and, if given, the codebook. Encoder and decoder both call this, so that they
+/// compute the same bits.
 fn reconstruct(
     network: &Decoder,
     statistics: &Statistics,

@@ -13,13 +13,13 @@ pub(super) const SHARD: usize = 256;
 pub(super) struct Data<'a> {
     /// Coefficients per Gaussian.
     pub(super) width: usize,
-    /// Normalised coefficients [N,width].
+    /// Normalised coefficients `[N,width]`.
     pub(super) targets: &'a [f32],
-    /// Conditions [N].
+    /// Conditions `[N]`.
     pub(super) conditions: &'a [[f32; CONDITIONS]],
-    /// Weight of each Gaussian [N].
+    /// Weight of each Gaussian `[N]`.
     pub(super) row_weights: &'a [f32],
-    /// Weight of an error of each normalised coefficient [width].
+    /// Weight of an error of each normalised coefficient `[width]`.
     pub(super) column_weights: &'a [f32],
 }
 

@@ -72,7 +72,7 @@ pub(super) fn train(data: &Data, bits: u8, settings: &Settings, seed: Seed, even
     (parameters, decoder)
 }
 
-/// The latents [N, latents] of all Gaussians.
+/// The latents `[N, latents]` of all Gaussians.
 pub(super) fn encode_all(data: &Data, encoder: &[f32]) -> Vec<f32> {
     let net = Net::new(data.width);
     let mut out = vec![0.0; data.len() * net.latents];

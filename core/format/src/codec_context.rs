@@ -59,7 +59,7 @@ pub struct RenderedPlanes {
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// Planes [5,H,W]: red, green, blue (background included), alpha, depth (sum of weight times z, world units).
+    /// Planes `[5,H,W]`: red, green, blue (background included), alpha, depth (sum of weight times z, world units).
     pub planes: Vec<f32>,
 }
 

@@ -10,6 +10,9 @@ pub const fn sh_rest_len(degree: usize) -> usize {
     (degree + 1) * (degree + 1) - 1
 }
 
+/// Names of the attributes every Gaussian has, in the order of [`HostGaussians::columns`].
+pub const CORE_ATTRIBUTES: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
+
 /// A per-Gaussian attribute of a plug-in (an embedding, a second rotation): `width` floats per Gaussian.
 ///
 /// `tolerance` and `needed` tell an encoder which errors are allowed. They are not stored; decoded attributes have neither.
@@ -17,7 +20,7 @@ pub const fn sh_rest_len(degree: usize) -> usize {
 pub struct ExtraAttribute {
     /// Floats per Gaussian.
     pub width: usize,
-    /// Row-major values [N, width].
+    /// Row-major values `[N, width]`.
     pub values: Vec<f32>,
     /// Largest absolute error of a value after decoding; `None` means bit for bit.
     pub tolerance: Option<f32>,
@@ -28,7 +31,7 @@ pub struct ExtraAttribute {
 /// The rows of an attribute that must be stored. A codec may omit the others; their values are then decoded as `start`.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct NeededRows {
-    /// Whether each row is needed [N].
+    /// Whether each row is needed `[N]`.
     pub rows: Vec<bool>,
     /// Decoded value of rows that were not stored.
     pub start: f32,
@@ -43,7 +46,7 @@ impl ExtraAttribute {
     pub fn within(self, tolerance: f32) -> Self {
         Self { tolerance: Some(tolerance), ..self }
     }
-    /// The same values. Only rows whose flag in `rows` [N] is set must be stored; others may be decoded as `start`.
+    /// The same values. Only rows whose flag in `rows` `[N]` is set must be stored; others may be decoded as `start`.
     pub fn needed_in(self, rows: Vec<bool>, start: f32) -> Self {
         Self { needed: Some(NeededRows { rows, start }), ..self }
     }
@@ -54,19 +57,19 @@ impl ExtraAttribute {
 pub struct HostGaussians {
     /// Spherical-harmonics degree of `sh_rest`, 0 to 4.
     pub sh_degree: usize,
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: Vec<f32>,
-    /// Natural logarithm of the standard deviations [N,3].
+    /// Natural logarithm of the standard deviations `[N,3]`.
     pub log_scales: Vec<f32>,
-    /// Quaternions (w,x,y,z), not normalised [N,4].
+    /// Quaternions (w,x,y,z), not normalised `[N,4]`.
     pub quaternions: Vec<f32>,
-    /// Opacity before the sigmoid [N].
+    /// Opacity before the sigmoid `[N]`.
     pub opacity_logits: Vec<f32>,
-    /// Degree-0 colour coefficients [N,3].
+    /// Degree-0 colour coefficients `[N,3]`.
     pub sh_dc: Vec<f32>,
-    /// Colour coefficients of degree 1 and up, coefficient-major [N, (d+1)^2-1, 3].
+    /// Colour coefficients of degree 1 and up, coefficient-major `[N, (d+1)^2-1, 3]`.
     pub sh_rest: Vec<f32>,
-    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves if and only if its score is above the threshold [N].
+    /// Dynamic scores (Swift4D's d, paper Section IV); a Gaussian moves if and only if its score is above the threshold `[N]`.
     pub dynamic_scores: Vec<f32>,
     /// Attributes of plug-ins by name.
     pub extra: BTreeMap<String, ExtraAttribute>,

@@ -31,7 +31,7 @@ impl Image8 {
         }
         Ok(())
     }
-    /// Linear planes [3,H,W] in 0..1, alpha composited over `background`.
+    /// Linear planes `[3,H,W]` in 0..1, alpha composited over `background`.
     pub fn to_planes(&self, background: [f32; 3]) -> Vec<f32> {
         let pixels = (self.width * self.height) as usize;
         let mut planes = vec![0.0f32; 3 * pixels];
@@ -44,7 +44,7 @@ impl Image8 {
         }
         planes
     }
-    /// The RGB image of planes [3,H,W]: clamped to 0..1, `value * 255 + 0.5` truncated (the protocol of published tables).
+    /// The RGB image of planes `[3,H,W]`: clamped to 0..1, `value * 255 + 0.5` truncated (the protocol of published tables).
     pub fn from_planes(planes: &[f32], width: u32, height: u32) -> Self {
         let pixels = (width * height) as usize;
         let mut data = vec![0u8; 3 * pixels];

@@ -61,7 +61,7 @@ pub fn write(path: impl AsRef<Path>, gaussians: &HostGaussians, include_dynamic:
     write_atomically(path, &to_bytes(gaussians, include_dynamic)?)
 }
 
-/// The bytes that [`write`] writes.
+/// The bytes that [`write()`] writes.
 pub fn to_bytes(gaussians: &HostGaussians, include_dynamic: bool) -> Result<Vec<u8>> {
     gaussians.validate("Gaussians to write", &Limits { max_gaussians: u64::MAX, ..Limits::default() })?;
     let k = sh_rest_len(gaussians.sh_degree);

@@ -228,7 +228,7 @@ pub struct DensityPlugin {
 }
 cc4dgs_format::plugin_kind!(DensityPlugin, "density");
 
-#[cfg(test)]
+#[cfg(all(test, feature = "cpu"))]
 mod tests {
     use super::*;
     use crate::HostGaussians;

@@ -14,8 +14,7 @@ pub const DEVICE_NAMES: [&str; 5] = ["auto", "flex", "ndarray", "wgpu", "cuda"];
 pub fn parse_device(name: &str) -> Result<Device> {
     match name {
         "auto" => parse_device(auto_device().0),
-        "flex" => Ok(Device::flex()),
-        "ndarray" => Ok(Device::ndarray()),
+        "flex" | "ndarray" => processor_device(name),
         "wgpu" => wgpu_device(0),
         "cuda" => cuda_device(),
         other => match other.strip_prefix("wgpu:").map(str::parse) {
@@ -23,6 +22,16 @@ pub fn parse_device(name: &str) -> Result<Device> {
             _ => Err(unknown_name("device", other, DEVICE_NAMES.into_iter())),
         },
     }
+}
+
+#[cfg(feature = "cpu")]
+fn processor_device(name: &str) -> Result<Device> {
+    Ok(if name == "ndarray" { Device::ndarray() } else { Device::flex() })
+}
+
+#[cfg(not(feature = "cpu"))]
+fn processor_device(name: &str) -> Result<Device> {
+    Err(Error::unsupported(format!("device {name}"), "this build has no backend for processors", "Build with the feature `cpu`, or use --device wgpu"))
 }
 
 #[cfg(feature = "cuda")]

@@ -4,11 +4,8 @@
 
 use crate::{Error, Result};
 use burn::tensor::{Device, Tensor, TensorData};
-pub use cc4dgs_format::gaussians::{ExtraAttribute, HostGaussians, sh_rest_len};
+pub use cc4dgs_format::gaussians::{CORE_ATTRIBUTES, ExtraAttribute, HostGaussians, NeededRows, sh_rest_len};
 use std::collections::BTreeMap;
-
-/// Names of the attributes that every Gaussian has, in the order of [`HostGaussians::columns`].
-pub const CORE_ATTRIBUTES: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
 
 /// Gaussians as burn tensors on one device.
 #[derive(Clone, Debug)]

@@ -29,8 +29,8 @@ pub use burn;
 pub use cc4dgs_format as format;
 pub use cc4dgs_format::{
     AttributeCodec, Camera, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Entries, Error, EvaluateDeformer, Event, EventSink, ExtraAttribute,
-    Fanout, HostGaussians, Image8, Limits, NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rules, Seed, Silent, Stream,
-    TrainingViews, WeightArray, WeightCodec, WeightCodecPlugin, archive, config, inventory, plugin_kind, ply, serde, split_kind, spz, storage, toml,
+    Fanout, HostGaussians, Image8, Limits, NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rules, Seed, Silent, Similarity,
+    Stream, TrainingViews, WeightArray, WeightCodec, WeightCodecPlugin, archive, config, inventory, plugin_kind, ply, serde, split_kind, spz, storage, toml,
     unknown_name,
 };
 pub use deformer::{
@@ -45,7 +45,7 @@ pub use offsets::Offsets;
 pub use optimizer::{Optimizer, OptimizerPlugin, OptimizerState, StepSettings, state_array};
 pub use preset::{PresetPlugin, PresetRole};
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, SplatColors, Splats};
-pub use reader::{Background, CameraRef, Distortion, ImageSource, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, SceneOptions};
+pub use reader::{Background, CameraRef, Distortion, ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, SceneOptions};
 pub use registry::Registry;
 pub use scene::{FrameSource, PointCloud, Scene, Split, View};
 pub use schedule::{REFERENCE_ITERATIONS, Schedule, Stage};

@@ -170,7 +170,7 @@ impl ModuleMapper for Assigner<'_> {
     }
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "cpu"))]
 mod tests {
     use super::*;
     use crate::gaussians::to_vec;

@@ -1,6 +1,6 @@
 //! A scene: cameras, times, and 8-bit frames that are decoded on demand.
 
-use crate::{Camera, Error, Image8, Result};
+use crate::{Camera, Error, Image8, Result, Similarity};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -31,13 +31,13 @@ pub struct View {
 /// Initial points with colours, as computed by structure from motion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointCloud {
-    /// Positions in world units.
+    /// Positions in the scene's units.
     pub positions: Vec<[f32; 3]>,
     /// Colours in 0..1.
     pub colors: Vec<[f32; 3]>,
 }
 
-/// Decodes the image of a view. Implementations read files or trace rays; they do not cache.
+/// Loads the image of a view. Implementations read files or trace rays; they do not cache.
 pub trait FrameSource: Send + Sync {
     /// The image of `view`, undistorted and at the size of its camera.
     fn load(&self, view: usize) -> Result<Image8>;
@@ -53,9 +53,11 @@ pub struct Scene {
     pub views: Vec<View>,
     /// Frames in the sequence (1 for a static scene).
     pub frame_count: usize,
+    /// From the dataset's coordinates to those of this scene. Cameras, points, box, and all models trained on it are in the coordinates of the scene.
+    pub normalisation: Similarity,
     /// Initial points, if the dataset has any.
     pub points: Option<PointCloud>,
-    /// Box for random initial points if there are no others: lower and upper corner in world units.
+    /// Box for random initial points if there are no others: lower and upper corner in the scene's units.
     pub init_box: Option<([f32; 3], [f32; 3])>,
     /// Warnings of the reader about data that was ignored.
     pub warnings: Vec<String>,
@@ -88,7 +90,19 @@ impl Scene {
         }
         let frame_count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
         let frames = FrameCache { source, cap: cache_bytes, state: Mutex::default() };
-        Ok(Self { name, cameras, views, frame_count, points: None, init_box: None, warnings: Vec::new(), background: None, foreground_masks: None, frames })
+        Ok(Self {
+            name,
+            cameras,
+            views,
+            frame_count,
+            normalisation: Similarity::IDENTITY,
+            points: None,
+            init_box: None,
+            warnings: Vec::new(),
+            background: None,
+            foreground_masks: None,
+            frames,
+        })
     }
     /// Indices of the views of `split`, in order.
     pub fn split(&self, split: Split) -> Vec<usize> {

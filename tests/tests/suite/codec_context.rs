@@ -8,12 +8,13 @@ use cc4dgs_core::{
     Seed, Silent, Stream, inventory,
 };
 use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
-use cc4dgs_engine::codec_services::{ModelServices, SceneViews};
-use cc4dgs_engine::config::RenderConfig;
-use cc4dgs_engine::data;
-use cc4dgs_engine::model::{ArchiveOptions, Model, ModelDeformer, ModelSize};
-use cc4dgs_engine::play::Player;
-use cc4dgs_engine::train::Moving;
+use cc4dgs_play::Moving;
+use cc4dgs_play::RenderConfig;
+use cc4dgs_play::codec_services::{ModelServices, SceneViews};
+use cc4dgs_play::model::{ModelDeformer, ModelSize};
+use cc4dgs_play::player::Player;
+use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_train::data;
 use std::path::Path;
 
 /// The codec `raw`, which also records the parts of its context.
@@ -75,6 +76,7 @@ fn model(registry: &Registry) -> Model {
         background: Some([0.2, 0.4, 0.6]),
         rasterizer: "kind = \"tile\"".parse().unwrap(),
         frame_count: 10,
+        normalisation: Default::default(),
         provenance: Default::default(),
         size: ModelSize::default(),
     }

@@ -3,12 +3,13 @@
 use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
 use cc4dgs_core::{Error, Event, EventSink, Limits, PresetRole, Recorder, Registry, Scene, Silent, Split};
-use cc4dgs_engine::agreement::agreement;
-use cc4dgs_engine::config::RunConfig;
-use cc4dgs_engine::eval::{EvalReport, evaluate};
-use cc4dgs_engine::model::{ArchiveOptions, Model};
-use cc4dgs_engine::play::Player;
-use cc4dgs_engine::train::{CHECKPOINT, TrainJob, TrainReport, train};
+use cc4dgs_play::checkpoint::CHECKPOINT;
+use cc4dgs_play::player::Player;
+use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_train::agreement::agreement;
+use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::eval::{EvalReport, evaluate};
+use cc4dgs_train::train::{TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock};
@@ -31,7 +32,7 @@ fn options<'a>(codec: &'a str, field_weights: &'a str) -> ArchiveOptions<'a> {
 }
 
 fn open(config: &RunConfig) -> Arc<Scene> {
-    Arc::new(cc4dgs_engine::data::open(Path::new("procedural"), &config.scene, &Registry::collect().unwrap(), &config.limits).unwrap())
+    Arc::new(cc4dgs_train::data::open(Path::new("procedural"), &config.scene, &Registry::collect().unwrap(), &config.limits).unwrap())
 }
 
 fn run(config: &RunConfig, out: &Path, resume: bool, events: &dyn EventSink, stop: &AtomicBool) -> cc4dgs_core::Result<TrainReport> {
@@ -136,7 +137,7 @@ fn cache_and_reuse_change_the_work_and_not_the_image() {
         for (to, from) in rebuilt.parameters_mut().into_iter().zip(field.field.parameters()) {
             to.value = from.value.clone();
         }
-        model.field = Some(cc4dgs_engine::model::ModelDeformer { field: rebuilt, section, context: field.context });
+        model.field = Some(cc4dgs_play::model::ModelDeformer { field: rebuilt, section, context: field.context });
         let mut player = Player::new(&model, &registry, &Device::flex()).unwrap();
         let frames: Vec<Vec<f32>> =
             [0.0, 0.3, 0.9].iter().map(|&t| player.render(camera, t).unwrap().0.planes.into_data().try_to_vec::<f32>().unwrap()).collect();

@@ -5,6 +5,7 @@
 mod baselines;
 mod basis;
 mod cdf;
+mod checkpoints;
 mod codec_context;
 mod codecs;
 mod conformance;

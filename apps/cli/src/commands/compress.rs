@@ -6,8 +6,9 @@ use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
 use cc4dgs_core::{Event, EventSink, Result, config};
-use cc4dgs_engine::eval::SizeMb;
-use cc4dgs_engine::model::{ArchiveOptions, Model, ModelSize};
+use cc4dgs_play::model::ModelSize;
+use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_train::eval::SizeMb;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -53,7 +54,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let mut settings = toml::Table::new();
     config::set_all(&mut settings, &args.sets)?;
-    // A name that nobody knows is told before the scene is read.
+    // An unknown name is refused before the scene is read.
     context.registry.weight_codec(&args.field_weights)?;
     let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?;
     let options = ArchiveOptions {

@@ -5,7 +5,7 @@ use crate::args::Decompress;
 use crate::models::load_model;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Event, EventSink, Result, ply, spz};
-use cc4dgs_engine::play::Player;
+use cc4dgs_play::player::Player;
 use serde_json::json;
 
 pub fn run(context: &Context, args: &Decompress) -> Result<()> {
@@ -14,10 +14,12 @@ pub fn run(context: &Context, args: &Decompress) -> Result<()> {
     }
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    let gaussians = match args.time {
+    let mut gaussians = match args.time {
         None => loaded.model.gaussians.clone(),
         Some(time) => Player::new(&loaded.model, &context.registry, &loaded.device)?.gaussians_at(time)?.to_host()?,
     };
+    // Other programs expect the coordinates of the dataset.
+    loaded.model.to_dataset(&mut gaussians);
     create_parent(&args.out)?;
     let is_spz = args.out.extension().is_some_and(|e| e.eq_ignore_ascii_case("spz"));
     if is_spz {

@@ -10,8 +10,8 @@ use cc4dgs::runs::{EVENTS, Existing};
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Result, Split};
-use cc4dgs_engine::model::ArchiveOptions;
-use cc4dgs_engine::train::TrainReport;
+use cc4dgs_play::ArchiveOptions;
+use cc4dgs_train::train::TrainReport;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -33,8 +33,8 @@ struct DemoReport {
     codec_loss_db: f64,
     archive: PathBuf,
     sheet: Option<PathBuf>,
-    size_mb: cc4dgs_engine::eval::SizeMb,
-    frame_ms: cc4dgs_engine::eval::FrameMs,
+    size_mb: cc4dgs_train::eval::SizeMb,
+    frame_ms: cc4dgs_train::eval::FrameMs,
     train: TrainReport,
     compress: compress::CompressReport,
     eval_checkpoint: FullReport,

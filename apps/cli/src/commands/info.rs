@@ -7,10 +7,10 @@ use crate::args::Info;
 use cc4dgs_core::archive::{Archive, DeformerEntry, StreamKind};
 use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::{Error, HostGaussians, Result, SceneOptions, Silent, Split, parse_device};
-use cc4dgs_engine::data;
-use cc4dgs_engine::eval::SizeMb;
-use cc4dgs_engine::model::{Model, attribute_width};
-use cc4dgs_engine::source::{Source, SourceKind};
+use cc4dgs_play::source::{Source, SourceKind};
+use cc4dgs_play::{Model, attribute_width};
+use cc4dgs_train::data;
+use cc4dgs_train::eval::SizeMb;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -53,6 +53,9 @@ fn archive(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     let mut notes = Vec::new();
     if context.registry.codec(&of.codec.name).is_err() {
         notes.push(not_linked("codec", &of.codec.name, &of.codec.version));
+    }
+    if let Some(weights) = of.deformer.as_ref().map(|d| &d.weights).filter(|w| context.registry.weight_codec(&w.name).is_err()) {
+        notes.push(not_linked("weight codec", &weights.name, &weights.version));
     }
     let field = match &of.deformer {
         None => Some((0, 0)),
@@ -144,6 +147,7 @@ fn scene(context: &Context, path: &Path) -> Result<Value> {
         "test_views": scene.split(Split::Test).len(),
         "image_sizes": sizes,
         "camera_extent": plain(&scene.extent())?,
+        "normalisation": plain(&scene.normalisation)?,
         "initial_points": scene.points.as_ref().map(|p| p.positions.len()),
         "init_box": plain(&scene.init_box)?,
         "background": plain(&scene.background)?,

@@ -8,8 +8,8 @@ use cc4dgs::Orbit;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs::video;
 use cc4dgs_core::{Camera, Error, Event, EventSink, Result};
-use cc4dgs_engine::images::write_png;
-use cc4dgs_engine::play::Player;
+use cc4dgs_play::player::Player;
+use cc4dgs_train::images::write_png;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -55,7 +55,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
         video::encode(&args.out, shots.len(), args.fps, path)?;
     }
     let steady = if times.len() > 1 { &times[1..] } else { &times[..] };
-    let mean = |pick: fn(&cc4dgs_engine::play::FrameTime) -> f64| steady.iter().map(pick).sum::<f64>() / steady.len() as f64;
+    let mean = |pick: fn(&cc4dgs_play::player::FrameTime) -> f64| steady.iter().map(pick).sum::<f64>() / steady.len() as f64;
     let report = RenderReport {
         model: args.model.clone(),
         device: loaded.device_name.clone(),
@@ -76,8 +76,11 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     })
 }
 
-/// Cameras and times to render, and the background of the scene they are from.
-fn shots(context: &Context, args: &Render, model: &cc4dgs_engine::model::Model) -> Result<(Vec<(Camera, f32)>, Option<[f32; 3]>)> {
+/// Cameras and normalised times, and the background of the scene they are from.
+type Shots = (Vec<(Camera, f32)>, Option<[f32; 3]>);
+
+/// Chooses what to render.
+fn shots(context: &Context, args: &Render, model: &cc4dgs_play::model::Model) -> Result<Shots> {
     let Some(path) = &args.scene else {
         if !args.sets.is_empty() {
             return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));

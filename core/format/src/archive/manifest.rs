@@ -1,6 +1,6 @@
 //! The manifest of an archive.
 
-use crate::{DeformerContext, Error, Limits, Result, Rules};
+use crate::{DeformerContext, Error, Limits, Result, Rules, Similarity};
 use serde::{Deserialize, Serialize};
 
 /// The archive version this build writes and reads.
@@ -43,7 +43,7 @@ pub struct RasterizerEntry {
     pub rules: Rules,
     /// Whether the antialiasing compensation was on.
     pub antialiased: bool,
-    /// Smallest camera depth drawn, world units; absent if the rules' default was used.
+    /// Smallest camera depth drawn, units of the model; absent if the rules' default was used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
     /// Its settings, without `kind`.
@@ -78,7 +78,10 @@ pub struct Manifest {
     pub frame_count: usize,
     /// First and last normalised time.
     pub time_range: [f32; 2],
-    /// Lower and upper corner of the model in world units.
+    /// From the coordinates of the dataset to those of the model. Exports undo it.
+    #[serde(default)]
+    pub normalisation: Similarity,
+    /// Lower and upper corner of the model in its own units.
     pub box_world: [[f32; 3]; 2],
     /// RGB background colour in 0..1 that it was trained with.
     pub background: [f32; 3],
@@ -122,6 +125,7 @@ impl Manifest {
             return Err(damaged(object, format!("format version {} differs from the file's version {FORMAT_VERSION}", self.format_version)));
         }
         limits.check_gaussians(object, self.gaussian_count)?;
+        self.normalisation.validate(object)?;
         if self.sh_degree > 4 {
             return Err(damaged(object, format!("spherical-harmonics degree {} is over 4", self.sh_degree)));
         }

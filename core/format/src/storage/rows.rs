@@ -24,12 +24,12 @@ pub fn load(mut codes: ByteReader, count: usize, width: usize, meta: &mut ByteRe
     Ok(columns)
 }
 
-/// The columns of `rows` [N,width].
+/// The columns of `rows` `[N,width]`.
 pub fn split(rows: &[f32], width: usize) -> Vec<Vec<f32>> {
     (0..width).map(|c| rows.iter().skip(c).step_by(width).copied().collect()).collect()
 }
 
-/// Rows [N,columns] of `columns`, each of `count` values.
+/// Rows `[N,columns]` of `columns`, each of `count` values.
 pub fn interleave(columns: &[Vec<f32>], count: usize) -> Vec<f32> {
     let mut rows = Vec::with_capacity(count * columns.len());
     for i in 0..count {

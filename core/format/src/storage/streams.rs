@@ -149,7 +149,7 @@ impl Shape {
 const MAX_EXTRA: usize = 256;
 const MAX_EXTRA_WIDTH: usize = 4096;
 
-/// Rows [N, width] as float32 columns, one after the other, so that neighbouring values in a stream are similar.
+/// Rows `[N, width]` as float32 columns, one after the other, so that neighbouring values in a stream are similar.
 pub fn to_planes(rows: &[f32], width: usize) -> Vec<u8> {
     (0..width).flat_map(|c| rows.iter().skip(c).step_by(width)).flat_map(|v| v.to_le_bytes()).collect()
 }

@@ -1,6 +1,6 @@
 //! The conformance suite of dataset readers.
 
-use crate::reader::{ImageSource, RawCamera, RawScene, RawView, ReaderPlugin, SceneOptions, files};
+use crate::reader::{ImageSource, InitBox, RawCamera, RawScene, RawView, ReaderPlugin, SceneOptions, files};
 use crate::{Error, Image8, Limits, Result, Seed, Split};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -93,10 +93,13 @@ fn soundness(scene: &RawScene) -> Vec<String> {
     if let Some(pair) = timed.windows(2).find(|p| if p[0].frame == p[1].frame { p[0].time != p[1].time } else { p[0].time > p[1].time }) {
         found.push(format!("frame {} is at {:?}, frame {} at {:?}", pair[0].frame, pair[0].time, pair[1].frame, pair[1].time));
     }
-    if let Some([low, high]) = scene.init_box
-        && !(0..3).all(|k| low[k] < high[k])
-    {
-        found.push(format!("its box {low:?} to {high:?} is empty"));
+    let empty = match scene.init_box {
+        Some(InitBox::Corners { low, high }) => !(0..3).all(|k| low[k] < high[k]),
+        Some(InitBox::Cube { half_share }) => !(half_share.is_finite() && half_share > 0.0),
+        None => false,
+    };
+    if empty {
+        found.push(format!("its box {:?} is empty", scene.init_box));
     }
     found
 }

@@ -103,6 +103,23 @@ pub struct RawPoints {
     pub colors: Vec<[f32; 3]>,
 }
 
+/// Where the first Gaussians of a scene without points go.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum InitBox {
+    /// A box in the dataset's units.
+    Corners {
+        /// Lower corner.
+        low: [f64; 3],
+        /// Upper corner.
+        high: [f64; 3],
+    },
+    /// A cube around the point the cameras look at.
+    Cube {
+        /// Half its side, as a share of the median distance of the cameras from that point.
+        half_share: f64,
+    },
+}
+
 /// A parsed dataset.
 #[derive(Clone, Debug, Default)]
 pub struct RawScene {
@@ -114,8 +131,8 @@ pub struct RawScene {
     pub views: Vec<RawView>,
     /// Initial points, if the dataset has any.
     pub points: Option<RawPoints>,
-    /// Lower and upper corner of the scene's bounding box, in the dataset's units, if the dataset states it. Otherwise it is estimated from the cameras.
-    pub init_box: Option<[[f64; 3]; 2]>,
+    /// The location of the scene, if the format states it. Otherwise it is estimated from the cameras.
+    pub init_box: Option<InitBox>,
     /// Background of the dataset's RGBA images, RGB in 0..1.
     pub background: Option<[f32; 3]>,
     /// Whether the reader has already applied `scene.width`, `scene.height` and `scene.downscale`, as readers that compute images can.

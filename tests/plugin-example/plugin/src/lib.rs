@@ -1,5 +1,8 @@
-//! A deformer, a reader and presets that cc4dgs knows nothing of.
+//! Plug-ins that cc4dgs knows nothing of: two deformers, density control, a loss term, a reader and presets.
 
+mod faint;
+mod mcmc;
 mod preset;
 mod rig;
 mod sway;
+mod wobble;

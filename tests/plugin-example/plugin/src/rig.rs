@@ -2,7 +2,8 @@
 
 use cc4dgs_core::reader::files::{file_name, read_text};
 use cc4dgs_core::{
-    Camera, Distortion, Error, FrameSource, Image8, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
+    Camera, Distortion, Error, FrameSource, Image8, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split,
+    inventory,
 };
 use std::path::{Path, PathBuf};
 use std::str::{FromStr, SplitWhitespace};
@@ -16,7 +17,8 @@ struct Ppm {
 
 impl FrameSource for Ppm {
     fn load(&self, index: usize) -> Result<Image8> {
-        let path = self.files.get(index).ok_or_else(|| Error::parameter(format!("image {index}"), format!("{} exist", self.files.len()), "Ask for one of them"))?;
+        let path =
+            self.files.get(index).ok_or_else(|| Error::parameter(format!("image {index}"), format!("{} exist", self.files.len()), "Ask for one of them"))?;
         let object = path.display().to_string();
         let text = read_text(path, &self.limits)?;
         let mut words = Words { object: &object, words: text.split_whitespace() };

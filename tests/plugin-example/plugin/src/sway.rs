@@ -3,8 +3,8 @@
 use cc4dgs_core::burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::serde::{self, Deserialize};
 use cc4dgs_core::{
-    Deformer, Error, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput, config,
-    inventory, toml,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput,
+    config, inventory, toml,
 };
 
 #[derive(Deserialize)]

@@ -1,24 +1,41 @@
 //! The suites that cc4dgs runs on its own plug-ins.
 
+use cc4dgs_core::burn::tensor::Device;
 use cc4dgs_core::{Registry, conformance, parse_device, toml::Table};
 use sway as _;
 
-#[test]
-fn the_deformer_conforms() {
-    let registry = Registry::collect().unwrap();
+/// What `suite` finds wrong on all devices of this machine.
+fn findings(suite: impl Fn(&Device) -> Vec<String>) -> String {
+    let mut all = Vec::new();
     for device in ["flex", "ndarray", "wgpu"] {
-        let device = match parse_device(device) {
-            Ok(device) => device,
+        match parse_device(device) {
+            Ok(device) => all.extend(suite(&device)),
             // A machine without a graphics driver still runs the others; CI says that it has one.
-            Err(e) if std::env::var_os("CC4DGS_REQUIRE_WGPU").is_none() => {
-                eprintln!("{e}: skipped");
-                continue;
-            }
+            Err(e) if std::env::var_os("CC4DGS_REQUIRE_WGPU").is_none() => eprintln!("{e}: skipped"),
             Err(e) => panic!("{e}"),
-        };
-        let findings = conformance::deformer(registry.deformer("sway").unwrap(), &Table::new(), &device);
-        assert!(findings.is_empty(), "{}", findings.join("\n"));
+        }
     }
+    all.join("\n")
+}
+
+#[test]
+fn the_deformers_conform() {
+    let registry = Registry::collect().unwrap();
+    for name in ["sway", "wobble"] {
+        assert_eq!(findings(|device| conformance::deformer(registry.deformer(name).unwrap(), &Table::new(), device)), "");
+    }
+}
+
+#[test]
+fn the_density_control_conforms() {
+    let registry = Registry::collect().unwrap();
+    assert_eq!(findings(|device| conformance::density(registry.density("mcmc").unwrap(), &Table::new(), device)), "");
+}
+
+#[test]
+fn the_loss_conforms() {
+    let registry = Registry::collect().unwrap();
+    assert_eq!(findings(|device| conformance::loss(registry.loss("faint").unwrap(), &Table::new(), &registry, device)), "");
 }
 
 /// A dataset of the reader `rig`: two cameras, one held out, two frames.

@@ -13,7 +13,7 @@ pub fn load(path: &Path) -> Result<Scene, Error> {
 
 /// Opens a dataset with all readers linked into the tests.
 pub fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Scene, Error> {
-    cc4dgs_engine::data::open(path, options, &Registry::collect().unwrap(), limits)
+    cc4dgs_train::data::open(path, options, &Registry::collect().unwrap(), limits)
 }
 
 /// An image whose pixel (x, y) is [x, y, marker] (and alpha).
@@ -59,6 +59,16 @@ pub fn project(camera: &Camera, p: [f64; 3]) -> (f64, f64, f64) {
     let m = &camera.world_to_camera;
     let c: Vec<f64> = (0..3).map(|i| m[i][0] * p[0] + m[i][1] * p[1] + m[i][2] * p[2] + m[i][3]).collect();
     (camera.fx * c[0] / c[2] + camera.cx, camera.fy * c[1] / c[2] + camera.cy, c[2])
+}
+
+/// The camera of a view, in the coordinates of the dataset.
+pub fn dataset_camera(scene: &Scene, view: usize) -> Camera {
+    scene.normalisation.inverse().apply_camera(scene.camera(view))
+}
+
+/// A position of a scene, in the coordinates of the dataset.
+pub fn dataset_point(scene: &Scene, p: [f32; 3]) -> [f64; 3] {
+    scene.normalisation.inverse().apply(p.map(f64::from))
 }
 
 pub fn same_pose(a: &Camera, b: &Camera) {

@@ -14,11 +14,13 @@ fn dnerf() {
     let scene = load(dir.path()).unwrap();
     assert_eq!(train_count(&scene), (5, 2));
     assert_eq!(scene.frame_count, 5, "distinct times");
-    assert_eq!(scene.init_box, Some(([-1.3; 3], [1.3; 3])));
+    // The cube of D-NeRF's scenes, whose cameras are 4.03 away.
+    let (low, high) = scene.init_box.unwrap();
+    assert!((0..3).all(|k| low[k] == -high[k] && (high[k] - 1.29).abs() < 1e-3), "{low:?} {high:?}");
     assert_eq!(scene.background, Some([1.0; 3]));
     for (i, truth) in cameras.iter().enumerate().take(5) {
         let view = scene.views.iter().position(|v| scene.cameras[v.camera].name == format!("train/r_{i:03}")).unwrap();
-        same_pose(scene.camera(view), truth);
+        same_pose(&dataset_camera(&scene, view), truth);
         assert!((scene.camera(view).fx - truth.fx).abs() < 1e-9);
         assert!((f64::from(scene.views[view].time_norm) - i as f64 / 4.0).abs() < 1e-6);
         assert_eq!(scene.frame(view).unwrap().data[..4], [10, 20, 30, 255]);
@@ -34,7 +36,7 @@ fn panoptic() {
     assert_eq!((scene.cameras.len(), scene.frame_count), (5, 3), "a camera that stands is one camera");
     for (view, v) in scene.views.iter().enumerate() {
         let c: usize = scene.camera(view).name.parse().unwrap();
-        same_pose(scene.camera(view), &cameras[c]);
+        same_pose(&dataset_camera(&scene, view), &cameras[c]);
         assert_eq!(scene.frame(view).unwrap().data[2], (10 * c + v.frame) as u8, "each view shows its own image");
         assert!((v.time_norm - v.frame as f32 / 3.0).abs() < 1e-6);
     }
@@ -73,7 +75,7 @@ fn llff_with_frame_folders() {
     assert_eq!(train_count(&scene), (8, 4));
     for (view, v) in scene.views.iter().enumerate() {
         let camera = scene.camera(view);
-        same_pose(camera, &cameras[v.camera]);
+        same_pose(&dataset_camera(&scene, view), &cameras[v.camera]);
         assert_eq!((camera.width, camera.fx, camera.cx), (16, cameras[0].fx / 2.0, 8.0));
         assert_eq!(v.split, if camera.name == "cam00" { Split::Test } else { Split::Train });
         assert_eq!(v.time_norm, v.frame as f32 / 4.0);
@@ -149,7 +151,7 @@ fn technicolor() {
     assert_eq!((scene.frame_count, train_count(&scene)), (3, (33, 3)));
     for (view, v) in scene.views.iter().enumerate() {
         let camera = scene.camera(view);
-        same_pose(camera, &cameras[v.camera]);
+        same_pose(&dataset_camera(&scene, view), &cameras[v.camera]);
         assert_eq!((camera.cx, camera.cy), (8.5, 5.25), "the principal point is honoured");
         assert_eq!(v.split == Split::Test, camera.name == "cam10");
         assert_eq!(scene.frame(view).unwrap().data[2] as usize, v.camera);
@@ -163,11 +165,14 @@ fn colmap_names() -> Vec<String> {
 fn check_colmap(scene: &cc4dgs_core::Scene, cameras: &[cc4dgs_core::Camera]) {
     assert_eq!(train_count(scene), (7, 2), "every eighth is held out");
     for (view, v) in scene.views.iter().enumerate() {
-        same_pose(scene.camera(view), &cameras[v.camera]);
+        same_pose(&dataset_camera(scene, view), &cameras[v.camera]);
         assert_eq!(scene.frame(view).unwrap().data[2] as usize, v.camera);
     }
     let points = scene.points.as_ref().unwrap();
-    assert_eq!(points.positions, vec![[0.0, -1.0, 2.0], [0.5, -1.0, 2.0]]);
+    for (found, truth) in points.positions.iter().zip([[0.0, -1.0, 2.0], [0.5, -1.0, 2.0]]) {
+        let found = dataset_point(scene, *found);
+        assert!((0..3).all(|k| (found[k] - truth[k]).abs() < 1e-5), "{found:?}");
+    }
     assert_eq!(points.colors[0], [1.0, 128.0 / 255.0, 0.0]);
 }
 
@@ -246,7 +251,7 @@ fn nerfstudio_with_shared_and_own_intrinsics_and_gaps() {
     assert_eq!(train_count(&scene), (7, 2));
     assert!(scene.warnings.iter().any(|w| w.contains("1 of 10") && w.contains("images/0004.jpg")), "{:?}", scene.warnings);
     let camera = |name: &str| scene.cameras.iter().find(|c| c.name == name).unwrap();
-    same_pose(camera("images/0005.jpg"), &cameras[5]);
+    same_pose(&scene.normalisation.inverse().apply_camera(camera("images/0005.jpg")), &cameras[5]);
     assert_eq!((camera("images/0005.jpg").fx, camera("images/0006.jpg").fx, camera("images/0006.jpg").fy), (55.0, 50.0, 51.0));
 }
 

@@ -2,7 +2,7 @@
 
 use super::common::*;
 use cc4dgs_core::{Limits, Result, Scene};
-use cc4dgs_engine::data::npy::read_npy;
+use cc4dgs_train::data::npy::read_npy;
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
 

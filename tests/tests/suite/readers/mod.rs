@@ -5,6 +5,7 @@ mod conformance;
 mod formats;
 mod golden;
 mod hostile;
+mod invariance;
 mod procedural;
 mod real;
 mod selection;

@@ -2,9 +2,9 @@
 
 use super::common::*;
 use cc4dgs_core::{Limits, Scene, SceneOptions, Seed, Split};
-use cc4dgs_engine::data::assemble;
-use cc4dgs_engine::data::init::photo_points;
-use cc4dgs_engine::data::procedural::{NAMES, ProceduralScene};
+use cc4dgs_train::data::assemble;
+use cc4dgs_train::data::init::photo_points;
+use cc4dgs_train::data::procedural::{NAMES, ProceduralScene};
 use glam::DVec3;
 use rand::Rng;
 use std::path::Path;
@@ -55,7 +55,7 @@ fn the_points_are_near_the_surface_and_have_its_colour() {
     let scene = builtin("default", &options());
     let points = scene.points.as_ref().unwrap();
     assert_eq!((points.positions.len(), points.colors.len()), (truth.points, truth.points));
-    let mean = points.positions.iter().map(|p| distance(&truth, DVec3::from(p.map(f64::from)))).sum::<f64>() / points.positions.len() as f64;
+    let mean = points.positions.iter().map(|p| distance(&truth, DVec3::from(dataset_point(&scene, *p)))).sum::<f64>() / points.positions.len() as f64;
     assert!(mean < truth.point_noise * 1.5, "mean distance to the surface {mean}");
 }
 
@@ -89,7 +89,7 @@ fn frames_can_be_finer_and_subsets_agree() {
 
 /// Distance of a point to the surface of one object at a time, by the shape's own formula.
 fn object_distance(truth: &ProceduralScene, object: usize, p: DVec3, time: f64) -> f64 {
-    use cc4dgs_engine::data::procedural::Shape;
+    use cc4dgs_train::data::procedural::Shape;
     let o = &truth.objects[object];
     let local = o.motion.pose(time).inverse_apply(p);
     match o.shape {
@@ -109,13 +109,13 @@ fn distance(truth: &ProceduralScene, p: DVec3) -> f64 {
 fn points_from_images_lie_on_the_truth() {
     // Distances between cameras as in a capture, and images large enough for matching.
     let truth = ProceduralScene { width: 240, height: 200, train_cameras: 20, frames: 1, ..ProceduralScene::named("default").unwrap() };
-    let scene = assemble(truth.clone().into_raw("truth".into()), &options(), &Limits::default()).unwrap();
+    let scene = assemble(truth.clone().into_raw("truth".into()), &options(), None, &Limits::default()).unwrap();
     let start = std::time::Instant::now();
     let cloud = photo_points(&scene, 5000, Seed::root(3)).unwrap();
     eprintln!("{} points in {:.2} s", cloud.positions.len(), start.elapsed().as_secs_f64());
     assert!(cloud.positions.len() > 3000, "{}", cloud.positions.len());
     let sorted = |points: Vec<[f32; 3]>| {
-        let mut errors: Vec<f64> = points.iter().map(|p| distance(&truth, DVec3::from(p.map(f64::from)))).collect();
+        let mut errors: Vec<f64> = points.iter().map(|p| distance(&truth, DVec3::from(dataset_point(&scene, *p)))).collect();
         errors.sort_by(f64::total_cmp);
         errors
     };

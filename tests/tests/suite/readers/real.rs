@@ -2,15 +2,16 @@
 
 use super::common::*;
 use cc4dgs_core::{Limits, SceneOptions, Seed, Split};
-use cc4dgs_engine::data::init::photo_points;
+use cc4dgs_train::data::init::photo_points;
 
 #[test]
 fn dnerf_mutant() {
     let Some(path) = real("dnerf_mutant") else { return };
     let scene = open(&path, &SceneOptions { width: 400, ..Default::default() }, &Limits::default()).unwrap();
     assert_eq!((scene.split(Split::Train).len(), scene.split(Split::Test).len(), scene.frame_count), (150, 20, 150));
-    for camera in &scene.cameras {
-        let (u, v, z) = project(camera, [0.0; 3]);
+    assert!((scene.normalisation.scale - 1.0).abs() < 0.02, "{:?}", scene.normalisation);
+    for camera in scene.cameras.iter().map(|c| scene.normalisation.inverse().apply_camera(c)) {
+        let (u, v, z) = project(&camera, [0.0; 3]);
         assert!((u - 200.0).abs() < 1.0 && (v - 200.0).abs() < 1.0 && (z - 4.031).abs() < 0.01, "{}: origin at ({u}, {v}, {z})", camera.name);
     }
     let image = scene.frame(0).unwrap();

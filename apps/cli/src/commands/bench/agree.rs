@@ -5,7 +5,7 @@ use crate::commands::{Context, evenly};
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::{Error, Result};
-use cc4dgs_engine::agreement::{Agreement, agreement};
+use cc4dgs_train::agreement::{Agreement, agreement};
 use serde::Serialize;
 
 #[derive(Serialize)]

@@ -9,11 +9,12 @@ use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::bench::{RoomCase, growth, room, shrunk};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformerContext, Event, EventSink, Result, Seed, SpatialInput, config, parse_device};
-use cc4dgs_engine::config::{RenderConfig, RunConfig};
-use cc4dgs_engine::model::{Model, ModelDeformer, ModelSize};
-use cc4dgs_engine::play::Player;
-use cc4dgs_engine::train::Moving;
+use cc4dgs_core::{DeformerContext, Event, EventSink, Result, Seed, Similarity, SpatialInput, config, parse_device};
+use cc4dgs_play::Moving;
+use cc4dgs_play::RenderConfig;
+use cc4dgs_play::model::{Model, ModelDeformer, ModelSize};
+use cc4dgs_play::player::Player;
+use cc4dgs_train::config::RunConfig;
 use serde::Serialize;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
@@ -104,6 +105,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         background: Some([0.0; 3]),
         rasterizer: config.rasterizer.clone(),
         frame_count: SEQUENCE,
+        normalisation: Similarity::IDENTITY,
         provenance: Provenance::default(),
         size: ModelSize::default(),
     };

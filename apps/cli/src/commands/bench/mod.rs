@@ -18,7 +18,7 @@ pub use step::step;
 
 use cc4dgs_backends::bench::{ROOM_CASES, RoomCase, shrunk};
 use cc4dgs_core::{Camera, RenderWork, Result, unknown_name};
-use cc4dgs_engine::play::{PlayWork, Player};
+use cc4dgs_play::player::{PlayWork, Player};
 use std::time::Instant;
 
 /// Runs that are not counted: caches fill and kernels compile.

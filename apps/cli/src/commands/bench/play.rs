@@ -6,7 +6,7 @@ use crate::commands::Context;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::{Camera, Error, Result};
-use cc4dgs_engine::play::Player;
+use cc4dgs_play::player::Player;
 use serde::Serialize;
 
 #[derive(Serialize)]

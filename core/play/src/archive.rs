@@ -1,0 +1,279 @@
+//! A model as a `.cc4d` archive.
+
+use crate::codec_services::{ModelServices, SceneViews};
+use crate::model::{Model, ModelDeformer, ModelSize};
+use crate::{Moving, RenderConfig};
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, RasterizerEntry, StreamKind};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{
+    CodecContext, DeclaredLoss, Deformer, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
+    WeightArray, split_kind,
+};
+use serde::Serialize;
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Key of the manifest's `extra` under which [`Moving`] is stored.
+const MOVING: &str = "moving";
+/// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
+const ATTRIBUTES: &str = "attributes";
+
+/// How [`Model::save_archive`] stores a model.
+pub struct ArchiveOptions<'a> {
+    /// Codec of the Gaussians: `name` or `name:profile`.
+    pub codec: &'a str,
+    /// Settings of that codec.
+    pub settings: &'a toml::Table,
+    /// Name of the weight codec of the field.
+    pub field_weights: &'a str,
+    /// The scene that the model was trained on and the device that its field is on, for codecs that make use of the training views, of renders and of the
+    /// field. Every codec works without.
+    pub scene: Option<(&'a Scene, &'a Device)>,
+}
+
+/// Weights of a field are stored in streams of these names, before the names that the weight codec gave them.
+const FIELD_STREAMS: &str = "field.";
+
+impl Model {
+    /// Reads the archive at `path`.
+    pub(crate) fn from_archive(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
+        let archive = Archive::open(path, limits)?;
+        let object = path.display().to_string();
+        let manifest = archive.manifest().clone();
+        let spec = format!("{}:{}", manifest.codec.name, manifest.codec.profile);
+        let codec = linked(&object, "codec", &manifest.codec.name, &manifest.codec.version, registry)?;
+        check_version(&object, "codec", &manifest.codec.name, &manifest.codec.version, codec)?;
+        let codec = registry.build_codec(&spec, &manifest.codec.settings)?;
+        let context = CodecContext::new(codec_seed(manifest.provenance.seed), *limits, events);
+        let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
+        gaussians.validate(&object, limits)?;
+        if gaussians.len() as u64 != manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
+            let problem = format!(
+                "the manifest says {} Gaussians of degree {}, the streams hold {} of degree {}",
+                manifest.gaussian_count,
+                manifest.sh_degree,
+                gaussians.len(),
+                gaussians.sh_degree
+            );
+            return Err(Error::data(object, problem, "The archive is damaged; fetch it again"));
+        }
+        let field = match &manifest.deformer {
+            None => None,
+            Some(entry) => {
+                let known = linked(&object, "deformer", &entry.name, &entry.version, registry)?;
+                check_version(&object, "deformer", &entry.name, &entry.version, known)?;
+                let mut section = entry.settings.clone();
+                section.insert("kind".into(), entry.name.clone().into());
+                let mut field = registry.build_deformer(&section, &entry.context, device)?;
+                let weights = read_weights(&archive, &object, &entry.weights, registry, limits, events)?;
+                load_weights(&object, field.as_mut(), weights, device)?;
+                Some(ModelDeformer { field, section, context: entry.context.clone() })
+            }
+        };
+        let moving = match manifest.extra.get(MOVING) {
+            Some(value) => {
+                serde_json::from_value(value.clone()).map_err(|e| Error::data(&object, format!("moving: {e}"), "The archive is damaged; fetch it again"))?
+            }
+            None => Moving::Scored { zeta: manifest.dynamic_threshold },
+        };
+        let mut rasterizer = manifest.rasterizer.settings.clone();
+        rasterizer.insert("kind".into(), manifest.rasterizer.name.clone().into());
+        let of_kind = |kind| archive.stream_sizes().iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();
+        let (deform_grid, deform_net) = field.as_ref().map_or((0, 0), |f| f.field.size_bytes());
+        let size = ModelSize {
+            deform_grid,
+            deform_net,
+            deform: of_kind(StreamKind::Field),
+            point_cloud: of_kind(StreamKind::Canonical),
+            total: archive.total_bytes()?,
+        };
+        Ok(Self {
+            gaussians,
+            field,
+            moving,
+            background: Some(manifest.background),
+            render: RenderConfig {
+                rules: manifest.rasterizer.rules,
+                antialiased: manifest.rasterizer.antialiased,
+                near: manifest.rasterizer.near,
+                background: Some(manifest.background),
+            },
+            rasterizer,
+            frame_count: manifest.frame_count,
+            normalisation: manifest.normalisation,
+            provenance: manifest.provenance.clone(),
+            size,
+        })
+    }
+    /// Writes a `.cc4d` archive and returns its size in bytes.
+    pub fn save_archive(&self, path: &Path, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
+        let ArchiveOptions { codec: spec, settings, field_weights, scene } = *options;
+        let codec = registry.build_codec(spec, settings)?;
+        let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
+        let views = scene.map(|(scene, _)| SceneViews::new(scene));
+        let services = scene.map(|(_, device)| ModelServices::new(self, registry, device)).transpose()?;
+        let context = |seed: Seed| CodecContext {
+            views: views.as_ref().map(|v| v as &dyn TrainingViews),
+            renderer: services.as_ref().map(|s| s as &dyn cc4dgs_core::RenderModel),
+            deformer: services.as_ref().filter(|_| self.field.is_some()).map(|s| s as &dyn cc4dgs_core::EvaluateDeformer),
+            ..CodecContext::new(seed, *limits, events)
+        };
+        let streams = codec.encode(&self.for_codec(&codec.losses()), &context(codec_seed(self.provenance.seed)))?;
+        // A field that moves nothing is not stored.
+        let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
+        let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
+        let deformer = match field {
+            None => None,
+            Some(f) => {
+                let (name, settings) = split_kind("deformer", &f.section)?;
+                let version = registry.deformer(&name)?.info.version.to_string();
+                let weight_version = registry.weight_codec(field_weights)?.info.version.to_string();
+                let weights = CodecEntry { name: field_weights.into(), version: weight_version, ..Default::default() };
+                Some(DeformerEntry { name, version, settings, context: f.context.clone(), weights })
+            }
+        };
+        let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
+        let moving = if movable { self.moving } else { Moving::Nothing };
+        let mut extra = serde_json::Map::from_iter([(MOVING.to_string(), json(&moving)?)]);
+        if !self.gaussians.extra.is_empty() {
+            let widths: BTreeMap<&str, usize> = self.gaussians.extra.iter().map(|(name, a)| (name.as_str(), a.width)).collect();
+            extra.insert(ATTRIBUTES.into(), json(&widths)?);
+        }
+        let (lower, upper) = self.bounds();
+        let manifest = Manifest {
+            codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
+            deformer,
+            rasterizer: RasterizerEntry {
+                name: rasterizer,
+                rules: self.render.rules,
+                antialiased: self.render.antialiased,
+                near: self.render.near,
+                settings: rasterizer_settings,
+            },
+            frame_count: self.frame_count,
+            normalisation: self.normalisation,
+            time_range: [0.0, 1.0],
+            box_world: [lower, upper],
+            background: self.background_on(None),
+            sh_degree: self.gaussians.sh_degree,
+            dynamic_threshold: if let Moving::Scored { zeta } = moving { zeta } else { 0.0 },
+            gaussian_count: self.gaussians.len() as u64,
+            provenance: self.provenance.clone(),
+            extra,
+            ..Default::default()
+        };
+        let mut writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams);
+        if let Some(f) = field {
+            let codec = registry.build_weight_codec(field_weights, &toml::Table::new())?;
+            let streams = codec.encode(&weights_of(f.field.as_ref())?, &context(weight_seed(self.provenance.seed)))?;
+            writer = writer.add_all(StreamKind::Field, streams.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s }));
+        }
+        writer.write_to(path)
+    }
+    /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move. `losses` are the codec's.
+    fn for_codec(&self, losses: &[DeclaredLoss]) -> HostGaussians {
+        let mut out = self.gaussians.clone();
+        let Some(field) = &self.field else { return out };
+        // A score just under the threshold may come back over it.
+        let slack = losses.iter().find(|l| l.attribute == "dynamic_scores").map_or(0.0, |l| SCORE_SLACK * l.relative_rms * deviation(&out.dynamic_scores));
+        let moving = match self.moving {
+            Moving::Scored { zeta } => Moving::Scored { zeta: zeta - slack as f32 },
+            other => other,
+        };
+        let needed = moving.rows(&out.dynamic_scores).map(|rows| {
+            let mut needed = vec![false; out.len()];
+            rows.into_iter().for_each(|row| needed[row] = true);
+            needed
+        });
+        for spec in field.field.attributes() {
+            if let Some(attribute) = out.extra.get_mut(&spec.name) {
+                attribute.tolerance = spec.tolerance;
+                attribute.needed = needed.clone().map(|rows| NeededRows { rows, start: spec.start });
+            }
+        }
+        out
+    }
+}
+
+/// Attributes are kept of Gaussians whose score is under the threshold by at most so many root-mean-square errors of the codec.
+const SCORE_SLACK: f64 = 6.0;
+
+fn deviation(values: &[f32]) -> f64 {
+    let n = values.len().max(1) as f64;
+    let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
+    (values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n).sqrt()
+}
+
+fn weight_seed(root: u64) -> Seed {
+    Seed::root(root).child("weight-codec")
+}
+
+/// The field's weights, decoded by the codec that the manifest names.
+fn read_weights(archive: &Archive, object: &str, entry: &CodecEntry, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
+    check_version(object, "weight codec", &entry.name, &entry.version, linked(object, "weight-codec", &entry.name, &entry.version, registry)?)?;
+    let codec = registry.build_weight_codec(&entry.name, &entry.settings)?;
+    let streams = archive.read_kind(StreamKind::Field)?;
+    let streams: Vec<Stream> =
+        streams.into_iter().filter_map(|s| Some(Stream { name: s.name.strip_prefix(FIELD_STREAMS)?.to_string(), bytes: s.bytes })).collect();
+    codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events))
+}
+
+/// Floats per Gaussian of all plug-in attributes that the archive of `manifest` holds.
+pub fn attribute_width(manifest: &Manifest) -> u64 {
+    let widths = manifest.extra.get(ATTRIBUTES).and_then(Value::as_object);
+    widths.map_or(0, |all| all.values().filter_map(Value::as_u64).fold(0, u64::saturating_add))
+}
+
+fn json(value: &impl Serialize) -> Result<Value> {
+    serde_json::to_value(value).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))
+}
+
+/// The version of the linked plug-in that `object` names, or an error that says what to link.
+fn linked(object: &str, kind: &str, name: &str, version: &str, registry: &Registry) -> Result<&'static str> {
+    let plugins = registry.plugins();
+    let known: Vec<_> = plugins.into_iter().filter(|(k, _)| *k == kind).map(|(_, p)| p).collect();
+    known.iter().find(|p| p.name == name).map(|p| p.version).ok_or_else(|| {
+        let names: Vec<&str> = known.iter().map(|p| p.name).collect();
+        let remedy = format!("Use a program that links the crate of this {kind}; this one links {}", names.join(", "));
+        Error::unsupported(object, format!("it needs the {kind} '{name}' (version {version}), which is not linked into this program"), remedy)
+    })
+}
+
+fn codec_seed(root: u64) -> Seed {
+    Seed::root(root).child("codec")
+}
+
+fn check_version(object: &str, kind: &str, name: &str, stored: &str, known: &str) -> Result<()> {
+    if stored == known {
+        return Ok(());
+    }
+    Err(Error::unsupported(format!("{object}: {kind} {name}"), format!("version {stored} of its stored form"), format!("This program reads version {known}")))
+}
+
+fn weights_of(field: &dyn Deformer) -> Result<Vec<WeightArray>> {
+    field
+        .parameters()
+        .into_iter()
+        .map(|p| Ok(WeightArray { name: p.name.clone(), shape: p.shape.clone(), values: to_vec(p.value.clone(), &p.name)? }))
+        .collect()
+}
+
+fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
+    let wanted: Vec<(String, Vec<usize>)> = field.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect();
+    let found: Vec<(String, Vec<usize>)> = weights.iter().map(|w| (w.name.clone(), w.shape.clone())).collect();
+    if wanted != found {
+        let odd = wanted
+            .iter()
+            .zip(&found)
+            .find(|(a, b)| a != b)
+            .map_or_else(|| format!("{} arrays, {} expected", found.len(), wanted.len()), |(a, b)| format!("found {b:?}, expected {a:?}"));
+        return Err(Error::data(object, format!("field weights do not fit the field: {odd}"), "The archive is damaged or of another version of the deformer"));
+    }
+    for (parameter, array) in field.parameters_mut().into_iter().zip(weights) {
+        let len = array.values.len();
+        parameter.value = Tensor::from_data(TensorData::new(array.values, [len]), device);
+    }
+    Ok(())
+}

@@ -1,0 +1,22 @@
+//! Models and their playback: what a program needs that shows a model and does not train one.
+//!
+//! A [`Model`] comes from the folder of a run, a checkpoint, a `.cc4d` archive, a PLY or an SPZ file; a [`Player`] draws it, through the cameras of an
+//! [`Orbit`] or any others. The trainer depends on this crate, never
+//! the other way.
+
+mod archive;
+pub mod checkpoint;
+pub mod codec_services;
+pub mod model;
+mod moving;
+mod orbit;
+pub mod player;
+mod render;
+pub mod source;
+
+pub use archive::{ArchiveOptions, attribute_width};
+pub use model::Model;
+pub use moving::{Moving, MovingRows};
+pub use orbit::Orbit;
+pub use player::Player;
+pub use render::{RenderConfig, default_rasterizer};

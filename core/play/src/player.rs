@@ -1,0 +1,204 @@
+//! Playback: spatial features once, then deform and draw per frame.
+
+use crate::model::Model;
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use cc4dgs_core::{Camera, DeformerWork, Gaussians, Image8, Rasterizer, Registry, RenderOutput, RenderSettings, Result, SpatialInput, Splats};
+use serde::Serialize;
+use std::time::Instant;
+
+/// Frames between two read-backs of the number of pairs, in playback without waiting.
+const LOOK_EVERY: u64 = 16;
+/// Capacity for pairs over the most seen, so that a few more do not overflow it.
+const SPARE: f64 = 1.25;
+
+/// Capacity for (Gaussian, tile) pairs, learned from past frames.
+#[derive(Default)]
+struct PairCapacity {
+    capacity: Option<usize>,
+    /// The most pairs of any frame since the last read-back, on the device.
+    most: Option<Tensor<1, Int>>,
+    frames: u64,
+}
+
+impl PairCapacity {
+    fn note(&mut self, count: Tensor<1, Int>) {
+        self.frames += 1;
+        self.most = Some(match self.most.take() {
+            Some(most) => most.max_pair(count),
+            None => count,
+        });
+        if self.capacity.is_none() || self.frames.is_multiple_of(LOOK_EVERY) {
+            let most = self.most.take().map_or(0, |most| most.into_scalar::<i64>().max(0)) as f64;
+            let wanted = (most * SPARE) as usize + 1024;
+            // The capacity shrinks too, once it is twice what is needed: sorting takes time for all of it.
+            if self.capacity.is_none_or(|capacity| most as usize > capacity || wanted * 2 < capacity || most * 1.1 > capacity as f64) {
+                self.capacity = Some(wanted);
+            }
+        }
+    }
+}
+
+/// Plays one model on one device.
+pub struct Player<'a> {
+    model: &'a Model,
+    device: Device,
+    rasterizer: Box<dyn Rasterizer>,
+    /// All Gaussians, moving ones first. The moving rows hold the last frame's values.
+    frame: Gaussians,
+    /// The moving Gaussians without offsets.
+    moving_gaussians: Gaussians,
+    /// What the deformer is asked about.
+    spatial_input: SpatialInput,
+    moving: usize,
+    cache: Option<Tensor<2>>,
+    settings: RenderSettings,
+    pair_capacity: PairCapacity,
+    /// Work of the field since the start.
+    pub work: PlayWork,
+}
+
+/// Counts of work done and skipped over all frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct PlayWork {
+    /// Frames drawn.
+    pub frames: u64,
+    /// Gaussians deformed.
+    pub deformed: u64,
+    /// Static Gaussians the field was spared.
+    pub static_skipped: u64,
+    /// Spatial passes of the field.
+    pub spatial: DeformerWork,
+    /// Frames whose spatial pass came from the cache.
+    pub spatial_cached: u64,
+}
+
+/// Milliseconds of one frame.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct FrameTime {
+    /// The field and the application of its offsets.
+    pub field_ms: f64,
+    /// Projection, sorting and blending, to pixels in host-readable memory.
+    pub raster_ms: f64,
+}
+
+fn colour(rgb: [f32; 3], device: &Device) -> Tensor<1> {
+    Tensor::from_data(TensorData::new(rgb.to_vec(), [3]), device)
+}
+
+impl<'a> Player<'a> {
+    /// Uploads the model. Where it has no background of its own, it is drawn on black; see [`Player::on`].
+    ///
+    /// # Errors
+    /// What the rasterizer says of the model's `[rasterizer]` section.
+    pub fn new(model: &'a Model, registry: &Registry, device: &Device) -> Result<Self> {
+        let n = model.gaussians.len();
+        let moves = model.field.as_ref().is_some_and(|f| !f.field.is_static());
+        let rows = if moves { model.moving.rows(&model.gaussians.dynamic_scores) } else { Some(Vec::new()) };
+        let moving = rows.as_ref().map_or(n, Vec::len);
+        // Moving rows come first, so that a frame adds to one block of rows instead of gathering and scattering them.
+        let sorted = rows.filter(|_| (1..n).contains(&moving)).map(|rows| {
+            let mut still = vec![true; n];
+            rows.iter().for_each(|&row| still[row] = false);
+            let order: Vec<usize> = rows.into_iter().chain((0..n).filter(|&i| still[i])).collect();
+            model.gaussians.select(&order)
+        });
+        let host = sorted.as_ref().unwrap_or(&model.gaussians);
+        let frame = Gaussians::from_host(host, device);
+        let moving_gaussians =
+            if (1..n).contains(&moving) { Gaussians::from_host(&host.select(&(0..moving).collect::<Vec<_>>()), device) } else { frame.clone() };
+        let wanted = model.field.iter().filter(|_| moving > 0).flat_map(|f| f.field.attributes());
+        let moving_attributes = wanted
+            .filter_map(|spec| host.extra.get(&spec.name))
+            .map(|a| Tensor::<2>::from_data(TensorData::new(a.values[..moving * a.width].to_vec(), [moving, a.width]), device))
+            .collect();
+        Ok(Self {
+            device: device.clone(),
+            rasterizer: registry.build_rasterizer(&model.rasterizer)?,
+            frame,
+            spatial_input: SpatialInput { means_world: moving_gaussians.means.clone(), attributes: moving_attributes },
+            moving_gaussians,
+            moving,
+            cache: None,
+            settings: model.render.settings(Some(colour(model.background_on(None), device))),
+            pair_capacity: PairCapacity::default(),
+            work: PlayWork::default(),
+            model,
+        })
+    }
+    /// The same player for comparison with images of a scene, whose background counts where the model has none.
+    pub fn on(mut self, scene: Option<[f32; 3]>) -> Self {
+        self.settings = self.model.render.settings(Some(colour(self.model.background_on(scene), &self.device)));
+        self
+    }
+    /// Gaussians the field moves.
+    pub fn moving(&self) -> usize {
+        self.moving
+    }
+    /// The Gaussians at `time_norm`, moving ones first.
+    pub fn gaussians_at(&mut self, time_norm: f32) -> Result<Gaussians> {
+        self.work.frames += 1;
+        self.work.deformed += self.moving as u64;
+        self.work.static_skipped += (self.frame.len() - self.moving) as u64;
+        let Some(field) = self.model.field.as_ref().filter(|_| self.moving > 0) else { return Ok(self.frame.clone()) };
+        let features = match &self.cache {
+            Some(features) => {
+                self.work.spatial_cached += 1;
+                features.clone()
+            }
+            None => {
+                let spatial = field.field.spatial(&self.spatial_input)?;
+                self.work.spatial.gaussians += spatial.work.gaussians;
+                self.work.spatial.vertices_queried += spatial.work.vertices_queried;
+                self.work.spatial.vertices_decoded += spatial.work.vertices_decoded;
+                let features = field.field.packed(spatial.values);
+                if field.field.caches_spatial() {
+                    self.cache = Some(features.clone());
+                }
+                features
+            }
+        };
+        let offsets = field.field.deform(features, time_norm)?;
+        // The frame is written in place. A caller who kept the last one keeps a copy of its own.
+        let nothing = self.moving_gaussians.clone();
+        let frame = std::mem::replace(&mut self.frame, nothing);
+        self.frame = offsets.apply_over(field.name(), &self.moving_gaussians, frame)?;
+        Ok(self.frame.clone())
+    }
+    /// The 8-bit RGB image that `camera` sees at `time_norm` (0 to 1).
+    pub fn frame(&mut self, camera: &Camera, time_norm: f32) -> Result<Image8> {
+        let planes = self.render(camera, time_norm)?.0.planes;
+        self.download(planes)
+    }
+    /// Draws one frame and waits for it.
+    pub fn render(&mut self, camera: &Camera, time_norm: f32) -> Result<(RenderOutput, FrameTime)> {
+        let began = Instant::now();
+        let gaussians = self.gaussians_at(time_norm)?;
+        self.sync()?;
+        let field_ms = began.elapsed().as_secs_f64() * 1000.0;
+        let began = Instant::now();
+        let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
+        let output = self.rasterizer.render(&splats, camera, &self.settings)?;
+        self.sync()?;
+        Ok((output, FrameTime { field_ms, raster_ms: began.elapsed().as_secs_f64() * 1000.0 }))
+    }
+    /// Draws one frame without waiting for the device. Only the number of (Gaussian, tile) pairs is read back, every 16 frames, to set the capacity for
+    /// them. If a frame suddenly has a quarter more than the most seen, its farthest Gaussians are left out until the next read-back.
+    pub fn play(&mut self, camera: &Camera, time_norm: f32) -> Result<RenderOutput> {
+        let gaussians = self.gaussians_at(time_norm)?;
+        let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
+        let settings = RenderSettings { pair_capacity: self.pair_capacity.capacity, ..self.settings.clone() };
+        let output = self.rasterizer.render(&splats, camera, &settings)?;
+        if let Some(count) = &output.stats.pair_count {
+            self.pair_capacity.note(count.clone());
+        }
+        Ok(output)
+    }
+    /// The 8-bit image of rendered planes `[5,H,W]`, read back from the device.
+    pub fn download(&self, planes: Tensor<3>) -> Result<Image8> {
+        self.rasterizer.download(planes)
+    }
+    /// Waits until the device has finished.
+    pub fn sync(&self) -> Result<()> {
+        self.device.sync().map_err(|e| cc4dgs_core::Error::backend("device", format!("{e:?}"), "Try another device (--device flex)"))
+    }
+}

@@ -1,0 +1,39 @@
+//! How images are drawn, in training and afterwards.
+
+use burn::tensor::Tensor;
+use cc4dgs_core::{RenderSettings, Rules};
+use serde::{Deserialize, Serialize};
+
+/// The `[rasterizer]` section of a model whose file names none.
+pub fn default_rasterizer() -> toml::Table {
+    toml::Table::from_iter([("kind".into(), "tile".into())])
+}
+
+/// How images are drawn, in training and afterwards.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RenderConfig {
+    /// Corner-case rules of projection and blending.
+    pub rules: Rules,
+    /// Mip-Splatting's 2D filter.
+    pub antialiased: bool,
+    /// Smallest camera depth drawn, units of the normalised frame; absent, the rules' own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub near: Option<f32>,
+    /// Colour behind everything, RGB in 0..1; absent, the dataset's own, else white (Swift4D's choice).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub background: Option<[f32; 3]>,
+}
+
+impl Default for RenderConfig {
+    fn default() -> Self {
+        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None }
+    }
+}
+
+impl RenderConfig {
+    /// What a rasterizer is told; the colour behind everything comes as a tensor, `None` is black.
+    pub fn settings(&self, background: Option<Tensor<1>>) -> RenderSettings {
+        RenderSettings { rules: self.rules, antialiased: self.antialiased, near: self.near, background, ..RenderSettings::default() }
+    }
+}

@@ -1,0 +1,202 @@
+//! Checkpoints of a training: the model ([`cc4dgs_play::checkpoint`]) and everything needed to resume to the same bytes.
+
+use crate::config::RunConfig;
+use crate::gaussian_set::GaussianSet;
+use crate::train::{Parts, TrainState};
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::archive::Provenance;
+use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
+use cc4dgs_play::Model;
+use cc4dgs_play::checkpoint::{CheckpointArrays, CheckpointFile, DeformerHeader, FORMAT, ModelHeader};
+use cc4dgs_play::model::ModelSize;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Everything about a checkpoint that is not an array.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Header {
+    format: u32,
+    model: ModelHeader,
+    training: TrainingHeader,
+}
+
+/// What training needs to go on.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct TrainingHeader {
+    stage: Stage,
+    iteration: usize,
+    smooth: bool,
+    /// Weights of the appearance model with their lengths.
+    appearance: Vec<(String, usize)>,
+    /// Arrays of the density control with their lengths.
+    density: Vec<(String, usize)>,
+    /// Arrays of the optimizer with their shapes.
+    optimizer: Vec<(String, [usize; 2])>,
+    /// Step counts of the optimizer.
+    optimizer_steps: BTreeMap<String, u64>,
+}
+
+/// Arrays of training by part.
+#[derive(Default)]
+struct TrainingArrays {
+    appearance: Vec<Vec<f32>>,
+    density: Vec<Vec<f32>>,
+    optimizer: Vec<Vec<f32>>,
+}
+
+/// A checkpoint read back.
+pub struct Checkpoint {
+    model: Model,
+    training: TrainingHeader,
+    arrays: TrainingArrays,
+    device: Device,
+}
+
+impl Checkpoint {
+    /// From the coordinates of the dataset to those of the Gaussians.
+    pub fn normalisation(&self) -> Similarity {
+        self.model.normalisation
+    }
+    /// The state to go on from, with freshly built `parts`. Refuses a configuration other than the one the run was started with.
+    pub fn into_state(self, run: &RunConfig, mut parts: Parts) -> Result<TrainState> {
+        let stored: RunConfig = config::parse_section("configuration of the checkpoint", &self.model.provenance.config)?;
+        let (mut now, mut then) = (run.clone(), stored);
+        // How often to say something does not change a result.
+        (now.train.log_every, now.train.checkpoint_every) = (0, 0);
+        (then.train.log_every, then.train.checkpoint_every) = (0, 0);
+        if now.to_toml()? != then.to_toml()? {
+            return Err(Error::parameter(
+                "--resume",
+                "the configuration differs from the checkpoint's",
+                "Resume with the run's own config.toml, or start in another folder",
+            ));
+        }
+        let (model, training) = (self.model, self.training);
+        let one = |values: &[f32]| Tensor::<1>::from_data(TensorData::new(values.to_vec(), [values.len()]), &self.device);
+        let damaged = |problem: String| Error::data("checkpoint", problem, "Use another checkpoint of the run");
+        let mut weights = parts.appearance.parameters_mut();
+        let found: Vec<(String, usize)> = weights.iter().map(|p| (p.name.clone(), p.value.dims()[0])).collect();
+        if found != training.appearance {
+            return Err(damaged(format!("the appearance model has the weights {found:?}, the checkpoint {:?}", training.appearance)));
+        }
+        weights.iter_mut().zip(&self.arrays.appearance).for_each(|(parameter, values)| parameter.value = one(values));
+        let density = training.density.iter().zip(&self.arrays.density).map(|((name, _), values)| (name.clone(), one(values))).collect();
+        parts.density.restore(density, model.gaussians.len())?;
+        let two = |((name, shape), values): (&(String, [usize; 2]), &Vec<f32>)| {
+            (name.clone(), Tensor::<2>::from_data(TensorData::new(values.clone(), *shape), &self.device))
+        };
+        let arrays = training.optimizer.iter().zip(&self.arrays.optimizer).map(two).collect();
+        parts.optimizer.restore(OptimizerState { arrays, steps: training.optimizer_steps })?;
+        let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, parts);
+        (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, model.field);
+        Ok(state)
+    }
+}
+
+/// Writes `state` to `path` and returns its size in bytes.
+pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> {
+    let mut arrays = CheckpointArrays::default();
+    let mut attributes = Vec::new();
+    for (name, values) in state.set.iter() {
+        arrays.add(format!("gaussians/{name}"), values)?;
+        attributes.push((name.to_string(), values.dims()[1]));
+    }
+    if let Some(deformer) = &state.deformer {
+        for parameter in deformer.field.parameters() {
+            arrays.add(format!("deformer/{}", parameter.name), &parameter.value)?;
+        }
+    }
+    let mut appearance = Vec::new();
+    for parameter in state.appearance.parameters() {
+        arrays.add(format!("appearance/{}", parameter.name), &parameter.value)?;
+        appearance.push((parameter.name.clone(), parameter.value.dims()[0]));
+    }
+    let mut density = Vec::new();
+    for (name, values) in state.density.state() {
+        arrays.add(format!("density/{name}"), &values)?;
+        density.push((name, values.dims()[0]));
+    }
+    let optimizer_state = state.optimizer.state();
+    let mut optimizer = Vec::new();
+    for (name, values) in &optimizer_state.arrays {
+        arrays.add(format!("optimizer/{name}"), values)?;
+        optimizer.push((name.clone(), values.dims()));
+    }
+    let header = Header {
+        format: FORMAT,
+        model: ModelHeader {
+            gaussians: state.set.len(),
+            sh_degree: state.set.sh_degree,
+            attributes,
+            moving: state.moving,
+            frame_count: frame_count(state),
+            normalisation: state.normalisation,
+            background: config.background()?,
+            render: config.render.clone(),
+            rasterizer: config.rasterizer.clone(),
+            deformer: state.deformer.as_ref().map(|d| DeformerHeader { section: d.section.clone(), context: d.context.clone() }),
+            provenance: provenance(config)?,
+        },
+        training: TrainingHeader {
+            stage: state.stage,
+            iteration: state.iteration,
+            smooth: state.smooth,
+            appearance,
+            density,
+            optimizer,
+            optimizer_steps: optimizer_state.steps,
+        },
+    };
+    arrays.write(path, &header)
+}
+
+/// Reads a checkpoint. Every claim of the file is checked against its bytes and `limits`.
+pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) -> Result<Checkpoint> {
+    let file = CheckpointFile::read(path, limits)?;
+    let Header { model, training, .. } = file.header()?;
+    let model = model.read(&file, registry, device, limits)?;
+    let list =
+        |part: &str, names: &[(String, usize)]| names.iter().map(|(name, len)| file.array(&format!("{part}/{name}"), Some(*len))).collect::<Result<Vec<_>>>();
+    let optimizer = training.optimizer.iter().map(|(name, [rows, width])| file.array(&format!("optimizer/{name}"), rows.checked_mul(*width)));
+    let arrays = TrainingArrays {
+        appearance: list("appearance", &training.appearance)?,
+        density: list("density", &training.density)?,
+        optimizer: optimizer.collect::<Result<_>>()?,
+    };
+    Ok(Checkpoint { model, training, arrays, device: device.clone() })
+}
+
+/// The model that a run ends with.
+pub fn trained_model(state: TrainState, config: &RunConfig) -> Result<Model> {
+    let (gaussians, frame_count) = (state.set.host_gaussians()?, frame_count(&state));
+    Ok(Model {
+        size: ModelSize::float32(&gaussians, state.deformer.as_ref()),
+        gaussians,
+        field: state.deformer,
+        moving: state.moving,
+        background: Some(config.background()?),
+        render: config.render.clone(),
+        rasterizer: config.rasterizer.clone(),
+        frame_count,
+        normalisation: state.normalisation,
+        provenance: provenance(config)?,
+    })
+}
+
+/// Frames in the sequence the deformer was built for; 1 before the main stage.
+fn frame_count(state: &TrainState) -> usize {
+    state.deformer.as_ref().map_or(1, |d| d.context.frame_count)
+}
+
+fn provenance(config: &RunConfig) -> Result<Provenance> {
+    let table = config.to_toml()?.parse().unwrap_or_default();
+    Ok(Provenance { commit: env!("CC4DGS_COMMIT").into(), seed: config.seed, device: config.device.clone(), config: table })
+}
+
+/// Reads only the configuration of a run's folder.
+pub fn read_config(folder: &Path) -> Result<RunConfig> {
+    let path = folder.join(crate::train::CONFIG);
+    let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
+    config::parse_section("configuration", &config::parse_table(&path.display().to_string(), &text)?)
+}

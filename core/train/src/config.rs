@@ -1,0 +1,405 @@
+//! The configuration of a run: presets, files and overrides, read strictly.
+
+use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
+use cc4dgs_play::{RenderConfig, default_rasterizer};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Everything that decides a run. Written beside every result as `config.toml`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// Name of the preset it started from, for the record.
+    #[serde(default)]
+    pub preset: String,
+    /// Root of the seed tree.
+    #[serde(default)]
+    pub seed: u64,
+    /// Device name; see [`cc4dgs_core::parse_device`].
+    #[serde(default = "flex")]
+    pub device: String,
+    /// What readers may believe.
+    #[serde(default)]
+    pub limits: Limits,
+    /// How the scene is read.
+    #[serde(default)]
+    pub scene: SceneOptions,
+    /// How pictures are drawn.
+    #[serde(default)]
+    pub render: RenderConfig,
+    /// The rasterizer plug-in: `kind` and its settings.
+    #[serde(default = "default_rasterizer")]
+    pub rasterizer: toml::Table,
+    /// The deformation field plug-in: `kind` and its settings.
+    #[serde(default = "cdf")]
+    pub deformer: toml::Table,
+    /// The density control plug-in: `kind` and its settings.
+    #[serde(default = "clone_split")]
+    pub density: toml::Table,
+    /// The loss terms: `kind`, `weight` (1 if absent) and their settings.
+    #[serde(default = "l1_and_dssim")]
+    pub loss: Vec<toml::Table>,
+    /// The loss term of the score stage: `kind` and its settings. Its target is the mask of what moves, [1,H,W].
+    #[serde(default = "mask_bce")]
+    pub score_loss: toml::Table,
+    /// The appearance plug-in: `kind` and its settings.
+    #[serde(default = "no_appearance")]
+    pub appearance: toml::Table,
+    /// The optimizer plug-in: `kind` and its settings.
+    #[serde(default = "adam")]
+    pub optimizer: toml::Table,
+    /// Where the first Gaussians come from.
+    #[serde(default)]
+    pub init: InitConfig,
+    /// The trainer.
+    #[serde(default)]
+    pub train: TrainConfig,
+}
+
+/// A plug-in section with nothing but its `kind`.
+fn kind(name: &str) -> toml::Table {
+    toml::Table::from_iter([("kind".into(), name.into())])
+}
+fn clone_split() -> toml::Table {
+    kind("clone-split")
+}
+/// The paper's loss with lambda_c = 0.8.
+fn l1_and_dssim() -> Vec<toml::Table> {
+    [("l1", 0.8), ("dssim", 0.2)]
+        .into_iter()
+        .map(|(name, weight)| toml::Table::from_iter([("kind".into(), name.into()), ("weight".into(), weight.into())]))
+        .collect()
+}
+fn mask_bce() -> toml::Table {
+    kind("mask-bce")
+}
+fn no_appearance() -> toml::Table {
+    kind("none")
+}
+fn adam() -> toml::Table {
+    kind("adam")
+}
+
+fn flex() -> String {
+    "flex".into()
+}
+fn cdf() -> toml::Table {
+    kind("cdf")
+}
+
+/// Where the points of the first Gaussians come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum InitSource {
+    /// The dataset's points, else photo-consistent ones if several cameras share a time, else random.
+    #[default]
+    Auto,
+    /// The dataset's points.
+    Points,
+    /// Photo-consistent points of cameras that share a time.
+    Photo,
+    /// Random points in the scene's box.
+    Random,
+}
+
+/// The frames that the coarse stage sees.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CoarseFrames {
+    /// The first one (all where no time has several cameras).
+    First,
+    /// All of them.
+    All,
+}
+
+/// Which Gaussians may move.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Dynamic {
+    /// By dynamic score where a camera has several frames, else all.
+    Auto,
+    /// By dynamic score.
+    Score,
+    /// All of them.
+    All,
+    /// None of them.
+    None,
+}
+
+/// Where the first Gaussians come from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct InitConfig {
+    /// Where points come from.
+    pub source: InitSource,
+    /// The most Gaussians to start with.
+    pub count: usize,
+    /// Opacity of a new Gaussian, 0..1.
+    pub opacity: f32,
+}
+
+impl Default for InitConfig {
+    fn default() -> Self {
+        Self { source: InitSource::Auto, count: 40_000, opacity: 0.1 }
+    }
+}
+
+/// The three-stage trainer (paper Section V; Swift4D's rules). Counts marked "reference" are iterations of the 28,000-iteration
+/// schedule and scale with [`TrainConfig::iterations`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// Iterations of all stages together: the one knob that scales every schedule.
+    pub iterations: usize,
+    /// Shares of coarse, score and main stage.
+    pub shares: [f64; 3],
+    /// Views per iteration.
+    pub batch: usize,
+    /// Frames the coarse stage sees.
+    pub coarse_frames: CoarseFrames,
+    /// Share of the main stage over which frames come in one after another, where the coarse stage saw the first frame only; 0 is all at once.
+    pub time_ramp: f64,
+    /// Standard deviation, in frames, of noise on the times the field is asked about; it falls to zero by half of the main stage (Deformable 3DGS: 0.1).
+    pub time_noise: f64,
+    /// Highest spherical-harmonics degree.
+    pub sh_degree: usize,
+    /// Reference iterations between two degrees.
+    pub sh_interval: usize,
+    /// Smoothness weight at the end of its ramp (the paper's lambda_r); 0 is off.
+    pub lambda_r: f32,
+    /// Switch smoothness on only when flicker is measured.
+    pub smooth_auto: bool,
+    /// Flicker above which `smooth_auto` acts: rms second difference of the motion per frame over its rms amplitude.
+    pub flicker_threshold: f32,
+    /// Half-width of the smoothness perturbation, normalised units (the paper's delta).
+    pub smooth_delta: f32,
+    /// Dynamic-score threshold (the paper's zeta).
+    pub zeta: f32,
+    /// Temporal standard deviation over which a pixel counts as dynamic.
+    pub mask_threshold: f32,
+    /// Which Gaussians may move.
+    pub dynamic: Dynamic,
+    /// Step only the Gaussians that a view of the iteration shows.
+    pub sparse_adam: bool,
+    /// Learning rates of the Gaussians.
+    pub lr: GaussianRates,
+    /// Iterations between two log events.
+    pub log_every: usize,
+    /// Iterations between two checkpoints; 0 writes only the last one.
+    pub checkpoint_every: usize,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            iterations: 28_000,
+            shares: [5.0, 3.0, 20.0],
+            batch: 2,
+            coarse_frames: CoarseFrames::First,
+            time_ramp: 0.0,
+            time_noise: 0.0,
+            sh_degree: 3,
+            sh_interval: 1000,
+            lambda_r: 0.05,
+            smooth_auto: true,
+            flicker_threshold: 0.5,
+            smooth_delta: 0.005,
+            zeta: 7.0,
+            mask_threshold: 0.02,
+            dynamic: Dynamic::Auto,
+            sparse_adam: true,
+            lr: GaussianRates::default(),
+            log_every: 10,
+            checkpoint_every: 5000,
+        }
+    }
+}
+
+/// Adam's learning rates per attribute (Inria's, as Swift4D uses them).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GaussianRates {
+    /// Positions at the first iteration of a stage, times the camera extent.
+    pub means: f64,
+    /// Positions at the last iteration of a stage, times the camera extent.
+    pub means_end: f64,
+    /// Log-scales.
+    pub log_scales: f64,
+    /// Quaternions.
+    pub quaternions: f64,
+    /// Opacity logits.
+    pub opacity: f64,
+    /// Degree-0 colour.
+    pub sh_dc: f64,
+    /// Higher colour coefficients.
+    pub sh_rest: f64,
+    /// Dynamic scores at the first iteration of their stage.
+    pub score: f64,
+    /// Attributes that plug-ins bring along.
+    pub extra: f64,
+}
+
+impl Default for GaussianRates {
+    fn default() -> Self {
+        Self {
+            means: 1.6e-4,
+            means_end: 1.6e-6,
+            log_scales: 5e-3,
+            quaternions: 1e-3,
+            opacity: 0.05,
+            sh_dc: 2.5e-3,
+            sh_rest: 1.25e-4,
+            score: 0.05,
+            extra: 2.5e-3,
+        }
+    }
+}
+
+impl RunConfig {
+    /// Layers a preset, a TOML file and `key=value` overrides, in that order, and reads the result strictly.
+    pub fn resolve(preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
+        let mut table = toml::Table::new();
+        let from_file = match file {
+            Some(path) => {
+                let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+                config::parse_table(&path.display().to_string(), &text)?
+            }
+            None => toml::Table::new(),
+        };
+        let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
+        if let Some(name) = preset.map(str::to_string).or(named) {
+            table = Registry::collect()?.preset(&name)?;
+        }
+        config::merge(&mut table, &from_file);
+        config::set_all(&mut table, sets)?;
+        refuse_renamed(&table)?;
+        let resolved: Self = config::parse_section("configuration", &table)?;
+        resolved.validate()?;
+        Ok(resolved)
+    }
+    /// This configuration with every setting of its plug-ins, defaults included.
+    pub fn completed(&self, registry: &Registry) -> Result<Self> {
+        let mut full = self.clone();
+        let kind = |section: &toml::Table, object: &str| split_kind(object, section).map(|(kind, _)| kind);
+        full.deformer = filled(registry.deformer(&kind(&self.deformer, "deformer")?)?.info.schema, &self.deformer)?;
+        full.rasterizer = filled(registry.rasterizer(&kind(&self.rasterizer, "rasterizer")?)?.info.schema, &self.rasterizer)?;
+        full.density = filled(registry.density(&kind(&self.density, "density")?)?.info.schema, &self.density)?;
+        full.appearance = filled(registry.appearance(&kind(&self.appearance, "appearance")?)?.info.schema, &self.appearance)?;
+        full.optimizer = filled(registry.optimizer(&kind(&self.optimizer, "optimizer")?)?.info.schema, &self.optimizer)?;
+        for section in full.loss.iter_mut().chain([&mut full.score_loss]) {
+            *section = filled(registry.loss(&kind(section, "loss")?)?.info.schema, section)?;
+        }
+        Ok(full)
+    }
+    /// The configuration as TOML text; reading it back gives the same run.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string_pretty(self).map_err(|e| Error::parameter("configuration", e.to_string(), "Report this: every configuration should be printable"))
+    }
+    /// The colour behind everything: `scene.background`, else `render.background`, else white.
+    pub fn background(&self) -> Result<[f32; 3]> {
+        self.scene.background.as_ref().map_or(Ok(self.render.background.unwrap_or([1.0; 3])), |b| b.rgb())
+    }
+    /// This configuration with its background settled for `scene`, whose own counts when nothing else was asked for.
+    pub fn settled_for(&self, scene: &Scene) -> Result<Self> {
+        let mut settled = self.clone();
+        let wanted = self.scene.background.as_ref().map(|b| b.rgb()).transpose()?.or(self.render.background).or(scene.background);
+        settled.render.background = Some(wanted.unwrap_or([1.0; 3]));
+        Ok(settled)
+    }
+    fn validate(&self) -> Result<()> {
+        self.scene.validate()?;
+        let t = &self.train;
+        let bad = |key: &str, problem: String, remedy: &str| Err(Error::parameter(format!("train.{key}"), problem, remedy));
+        if t.iterations == 0 || t.iterations > 10_000_000 {
+            return bad("iterations", format!("{} is not in 1..10,000,000", t.iterations), "Choose the number of training iterations");
+        }
+        if t.batch == 0 || t.batch > 64 {
+            return bad("batch", format!("{} is not in 1..64", t.batch), "Choose the number of views per iteration");
+        }
+        if t.sh_degree > 4 {
+            return bad("sh_degree", format!("{} is over 4", t.sh_degree), "Choose a degree of 0 to 4");
+        }
+        if t.shares.iter().any(|s| !s.is_finite() || *s < 0.0) || t.shares.iter().sum::<f64>() <= 0.0 {
+            return bad("shares", format!("{:?} are not shares", t.shares), "Give three numbers of which one is positive");
+        }
+        if !(0.0..=1.0).contains(&t.time_ramp) {
+            return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");
+        }
+        if !(0.0..=10.0).contains(&t.time_noise) {
+            return bad("time_noise", format!("{} frames", t.time_noise), "Give 0 to 10 frames");
+        }
+        if let Some(near) = self.render.near.filter(|near| !near.is_finite() || *near < 0.0) {
+            return Err(Error::parameter(
+                "render.near",
+                format!("{near} is not a depth"),
+                "Give a finite depth of 0 or more, in units of the normalised frame (cameras are about 4 from what they see)",
+            ));
+        }
+        if let Some(background) = self.render.background.filter(|b| b.iter().any(|c| !(0.0..=1.0).contains(c))) {
+            return Err(Error::parameter("render.background", format!("{background:?} is not RGB in 0..1"), "Give three numbers in 0..1"));
+        }
+        if !(self.init.opacity > 0.0 && self.init.opacity < 1.0) || self.init.count == 0 {
+            return Err(Error::parameter(
+                "init",
+                format!("opacity {} count {}", self.init.opacity, self.init.count),
+                "Opacity lies between 0 and 1, the count is positive",
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// Keys of earlier versions and what replaces them.
+const RENAMED: [(&str, &str); 2] =
+    [("train.densify", "[density], such as density.max_gaussians"), ("train.lambda_c", "the weights of [[loss]] kind = \"l1\" and kind = \"dssim\"")];
+
+/// Refuses keys of earlier versions; the error names the new ones.
+fn refuse_renamed(table: &toml::Table) -> Result<()> {
+    for (old, new) in RENAMED {
+        let (section, key) = old.split_once('.').unwrap_or((old, ""));
+        if table.get(section).and_then(|s| s.as_table()).is_some_and(|s| s.contains_key(key)) {
+            return Err(Error::parameter(old, "this key was replaced", format!("Use {new}")));
+        }
+    }
+    Ok(())
+}
+
+/// `section` with the settings that its plug-in's `schema` states where it has none of its own.
+fn filled(schema: &str, section: &toml::Table) -> Result<toml::Table> {
+    let mut full = config::parse_table("plug-in schema", schema)?;
+    if let Some(kind) = section.get("kind") {
+        full.insert("kind".into(), kind.clone());
+    }
+    config::merge(&mut full, section);
+    Ok(full)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::PresetRole;
+
+    #[test]
+    fn every_preset_parses_and_round_trips() {
+        for plugin in Registry::collect().unwrap().presets().filter(|p| p.role != PresetRole::Method) {
+            let name = plugin.info.name;
+            let config = RunConfig::resolve(Some(name), None, &["train.iterations=7".into()]).unwrap();
+            assert_eq!(config.train.iterations, 7);
+            let text = config.to_toml().unwrap();
+            let again: RunConfig = config::parse_section("again", &text.parse().unwrap()).unwrap();
+            assert_eq!(again.to_toml().unwrap(), text);
+        }
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let e = RunConfig::resolve(Some("dnerf_cpu"), None, &[]).unwrap_err().to_string();
+        assert!(e.contains("dnerf-cpu"), "{e}");
+        let e = RunConfig::resolve(Some("demo"), None, &["train.densify.every=3".into()]).unwrap_err().to_string();
+        assert!(e.contains("[density]"), "{e}");
+        let e = RunConfig::resolve(Some("demo"), None, &["init.source=pionts".into()]).unwrap_err().to_string();
+        assert!(e.contains("pionts") && e.contains("points"), "{e}");
+        let e = RunConfig::resolve(Some("demo"), None, &["train.iteratons=3".into()]).unwrap_err().to_string();
+        assert!(e.contains("iteratons"), "{e}");
+    }
+}

@@ -1,0 +1,139 @@
+//! From what a reader hands over to a [`Scene`]: the steps all scenes share.
+
+use super::camera_box::camera_box;
+use super::frames::{Job, Plan, SceneFrames};
+use super::normalise::{CAMERA_DISTANCE, normalisation};
+use super::select::select;
+use super::undistort::Undistort;
+use super::video::VideoFrames;
+use cc4dgs_core::reader::files::image_size;
+use cc4dgs_core::{
+    Camera, Error, FrameSource, ImageSource, InitBox, Limits, PointCloud, RawCamera, RawPoints, RawScene, Result, Scene, SceneOptions, Similarity, Split,
+};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Positions over this many units of the normalised frame are useless.
+const FARTHEST: f64 = 1e9;
+
+/// The scene a reader parsed, with frames and cameras chosen, lenses undone and images brought to the size the options ask for.
+///
+/// The scene is in the normalised frame of its cameras, or in the one that is given.
+///
+/// Errors: [`Error::Parameter`] for options that choose nothing, [`Error::Data`] for a scene that is not sound, [`Error::Limit`] for images over `limits`.
+pub fn assemble(mut raw: RawScene, options: &SceneOptions, frame: Option<Similarity>, limits: &Limits) -> Result<Scene> {
+    if let Some(v) = raw.views.iter().find(|v| v.camera >= raw.cameras.len()) {
+        return Err(Error::data(raw.name, format!("an image names camera {} of {}", v.camera, raw.cameras.len()), "Check the dataset's index files"));
+    }
+    // Before views are chosen: the frame must not depend on the options.
+    let frame = frame.unwrap_or_else(|| normalisation(&raw));
+    let views = select(&mut raw, options)?;
+    if !views.iter().any(|v| v.split == Split::Train) {
+        let hint = raw.warnings.last().cloned().unwrap_or_default();
+        return Err(Error::data(raw.name, format!("there is no training image. {hint}"), "Check the path, scene.frames and scene.test_cameras"));
+    }
+    raw.validate()?;
+    let mut plans = Vec::with_capacity(raw.cameras.len());
+    let mut cameras = Vec::with_capacity(raw.cameras.len());
+    for (index, camera) in raw.cameras.iter_mut().enumerate() {
+        let native = match raw.views.iter().find(|v| v.camera == index).map(|v| &v.image) {
+            Some(ImageSource::File { path, .. }) => fit_to_image(camera, image_size(path, limits)?, &mut raw.warnings)?,
+            _ => camera.size,
+        };
+        let (plan, pinhole) = plan_camera(camera, native, (!raw.resized).then_some(options), limits)?;
+        plans.push(plan);
+        cameras.push(frame.apply_camera(&pinhole));
+    }
+    let videos = VideoFrames::new(&raw.views, &plans, options)?;
+    let jobs = raw.views.iter().map(|v| Job { image: Some(v.image.clone()), plan: v.camera }).collect();
+    let mask = |image: &ImageSource| match image {
+        ImageSource::File { mask: Some(path), .. } if path.is_file() => Some(ImageSource::File { path: path.clone(), mask: None }),
+        _ => None,
+    };
+    let masks: Vec<Job> = raw.views.iter().map(|v| Job { image: mask(&v.image), plan: v.camera }).collect();
+    let has_masks = masks.iter().any(|j| j.image.is_some());
+    let source = SceneFrames { jobs, plans: plans.clone(), videos, limits: *limits };
+    let mut scene = Scene::new(raw.name, cameras, views, Arc::new(source), options.cache_mb.saturating_mul(1_000_000))?;
+    if has_masks {
+        let source: Arc<dyn FrameSource> = Arc::new(SceneFrames { jobs: masks, plans, videos: VideoFrames::default(), limits: *limits });
+        scene.foreground_masks = Some(source);
+    }
+    let single = |p: [f64; 3]| p.map(|v| v as f32);
+    scene.normalisation = frame;
+    scene.points = raw.points.map(|p| normalised_points(&p, &frame, &mut raw.warnings)).filter(|p| !p.positions.is_empty());
+    let init_box = raw.init_box.map(|found| match found {
+        InitBox::Corners { low, high } => (single(frame.apply(low)), single(frame.apply(high))),
+        InitBox::Cube { half_share } => (single([-half_share * CAMERA_DISTANCE; 3]), single([half_share * CAMERA_DISTANCE; 3])),
+    });
+    let usable = |b: &([f32; 3], [f32; 3])| (0..3).all(|k| b.0[k] < b.1[k] && b.0[k].is_finite() && b.1[k].is_finite());
+    scene.init_box = init_box.filter(usable).or_else(|| scene.points.is_none().then(|| camera_box(&scene)));
+    scene.background = options.background.as_ref().map(|b| b.rgb()).transpose()?.or(raw.background);
+    scene.warnings = dedupe(raw.warnings);
+    Ok(scene)
+}
+
+/// The points in the normalised frame. Points so far away that squares of their distances leave float32 are left out.
+fn normalised_points(points: &RawPoints, frame: &Similarity, warnings: &mut Vec<String>) -> PointCloud {
+    let mut cloud = PointCloud::default();
+    for (position, color) in points.positions.iter().zip(&points.colors) {
+        let position = frame.apply(*position);
+        if position.iter().all(|v| v.abs() < FARTHEST) {
+            cloud.positions.push(position.map(|v| v as f32));
+            cloud.colors.push(*color);
+        }
+    }
+    let left_out = points.positions.len() - cloud.positions.len();
+    if left_out > 0 {
+        warnings.push(format!("{left_out} points are over {FARTHEST:e} units of the normalised frame away and were left out"));
+    }
+    cloud
+}
+
+/// Brings the calibration to the size the images really have, if only the scale differs.
+fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: &mut Vec<String>) -> Result<[u32; 2]> {
+    let [w, h] = camera.size.map(f64::from);
+    let (sx, sy) = (f64::from(found.0) / w, f64::from(found.1) / h);
+    if camera.size == [found.0, found.1] {
+        return Ok(camera.size);
+    }
+    if !sx.is_finite() || !sy.is_finite() || (sx / sy - 1.0).abs() > 0.01 {
+        return Err(Error::data(
+            format!("camera {}", camera.name),
+            format!("calibrated for {w}x{h} pixels, its image has {}x{}", found.0, found.1),
+            "Use the images the calibration was made for",
+        ));
+    }
+    warnings.push(format!("the images are {}x{}, the calibration is for {w}x{h}; it was scaled", found.0, found.1));
+    camera.focal = [camera.focal[0] * sx, camera.focal[1] * sy];
+    camera.principal = [camera.principal[0] * sx, camera.principal[1] * sy];
+    camera.size = [found.0, found.1];
+    Ok(camera.size)
+}
+
+/// What happens to the images of a camera, and the pinhole camera they have then. Without options the images keep their size.
+fn plan_camera(camera: &RawCamera, native: [u32; 2], options: Option<&SceneOptions>, limits: &Limits) -> Result<(Plan, Camera)> {
+    let object = format!("camera {}", camera.name);
+    let mut pinhole = Camera { width: native[0], height: native[1], ..camera.pinhole() };
+    pinhole.validate()?;
+    let undistort = if camera.distortion.is_identity() {
+        None
+    } else {
+        let plan = Undistort::plan(&object, &camera.distortion, native, camera.focal, camera.principal)?;
+        [pinhole.width, pinhole.height] = plan.size;
+        [pinhole.cx, pinhole.cy] = plan.principal_point();
+        Some(plan)
+    };
+    let size = (pinhole.width, pinhole.height);
+    let output = options.map_or(size, |o| o.target_size(size));
+    limits.check_pixels(&object, u64::from(output.0), u64::from(output.1))?;
+    Ok((Plan { native, undistort, output }, pinhole.resized(output.0, output.1)))
+}
+
+/// Each distinct warning once, with how often it came.
+fn dedupe(warnings: Vec<String>) -> Vec<String> {
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+    for w in warnings {
+        *counts.entry(w).or_default() += 1;
+    }
+    counts.into_iter().map(|(w, n)| if n > 1 { format!("{w} ({n} times)") } else { w }).collect()
+}

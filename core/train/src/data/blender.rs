@@ -1,0 +1,96 @@
+//! D-NeRF and Blender scenes: `transforms_train.json` and friends, RGBA images, times in 0..1.
+
+use super::nerfstudio::image_path;
+use cc4dgs_core::reader::files::{file_name, image_size, read_json};
+use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
+use cc4dgs_core::{
+    Distortion, Error, ImageSource, InitBox, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
+};
+use serde::Deserialize;
+use std::path::Path;
+
+#[derive(Deserialize)]
+struct Transforms {
+    camera_angle_x: f64,
+    frames: Vec<Frame>,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    file_path: String,
+    time: Option<f64>,
+    transform_matrix: Vec<Vec<f64>>,
+}
+
+/// Half the side of the cube D-NeRF scenes are initialised in (Deformable 3D Gaussians, 4DGS: 1.3 units) over the distance of their cameras.
+const INIT_HALF_SHARE: f64 = 1.3 / 4.0311;
+
+inventory::submit! {
+    ReaderPlugin {
+        info: Plugin {
+            name: "blender",
+            version: "1",
+            summary: "D-NeRF and NeRF synthetic scenes",
+            paper: "D-NeRF: Neural Radiance Fields for Dynamic Scenes (Pumarola et al. 2021)",
+            schema: "",
+            capabilities: &[],
+        },
+        looks_for: "transforms_train.json (D-NeRF, NeRF synthetic)",
+        order: 400,
+        probe,
+        open,
+    }
+}
+
+fn probe(path: &Path) -> bool {
+    path.join("transforms_train.json").is_file()
+}
+
+fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+    let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    let mut times: Vec<Option<f64>> = Vec::new();
+    read_split(path, "train", Split::Train, limits, &mut scene, &mut times)?;
+    let test = format!("transforms_{}.json", options.test_split);
+    if path.join(&test).is_file() {
+        read_split(path, &options.test_split, Split::Test, limits, &mut scene, &mut times)?;
+    } else {
+        scene.warnings.push(format!("there is no {test}; nothing is held out"));
+    }
+    scene.rank_times(&times, &path.display().to_string())?;
+    scene.init_box = Some(InitBox::Cube { half_share: INIT_HALF_SHARE });
+    // The published tables composite over white (4DGS, Swift4D); images without alpha stay as they are.
+    scene.background = Some([1.0; 3]);
+    Ok(scene)
+}
+
+fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &mut RawScene, times: &mut Vec<Option<f64>>) -> Result<()> {
+    let file = folder.join(format!("transforms_{name}.json"));
+    let object = file.display().to_string();
+    let transforms: Transforms = read_json(&file, limits)?;
+    let angle = transforms.camera_angle_x;
+    if !(angle > 0.0 && angle < std::f64::consts::PI) {
+        return Err(Error::data(object, format!("camera_angle_x is {angle}, not an angle below pi"), "Write the horizontal field of view in radians"));
+    }
+    let paths: Vec<_> = transforms.frames.iter().map(|f| image_path(folder, &f.file_path)).collect();
+    let Some(present) = paths.iter().find(|p| p.is_file()) else {
+        let first = paths.first().map(|p| p.display().to_string()).unwrap_or_else(|| "any".into());
+        return Err(Error::data(object, format!("none of its {} images exist ({first})", paths.len()), "Check that the images lie beside the JSON"));
+    };
+    let (w, h) = image_size(present, limits)?;
+    let focal = 0.5 * f64::from(w) / (0.5 * angle).tan();
+    for (frame, path) in transforms.frames.iter().zip(paths) {
+        let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
+        let world_to_camera = matrix4(&frame.transform_matrix).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
+        scene.cameras.push(RawCamera {
+            name: frame.file_path.trim_start_matches("./").to_string(),
+            size: [w, h],
+            focal: [focal; 2],
+            principal: [0.5 * f64::from(w), 0.5 * f64::from(h)],
+            distortion: Distortion::None,
+            world_to_camera,
+        });
+        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, image: ImageSource::File { path, mask: None } });
+        times.push(frame.time);
+    }
+    Ok(())
+}

@@ -1,0 +1,71 @@
+//! Datasets: a path in, a [`Scene`] out.
+//!
+//! [`open`] asks each registered reader whether a path is its kind. Readers only parse; what all scenes share (choosing frames and cameras, resizing,
+//! undoing distortion, missing images, the cache) happens once, in [`assemble`].
+
+mod assemble;
+mod blender;
+mod camera_box;
+mod colmap;
+mod colmap_binary;
+mod colmap_text;
+mod focus;
+mod frames;
+pub mod init;
+mod llff;
+mod nerfstudio;
+mod normalise;
+pub mod npy;
+mod panoptic;
+pub mod procedural;
+mod resample;
+mod select;
+mod technicolor;
+mod undistort;
+mod video;
+
+pub use assemble::assemble;
+pub use camera_box::camera_box;
+pub use resample::resize;
+pub use undistort::Undistort;
+
+use cc4dgs_core::{Error, Limits, RawScene, ReaderPlugin, Registry, Result, Scene, SceneOptions, Similarity};
+use std::path::Path;
+
+/// Opens the scene at `path` with the registered reader that recognises it, or the one `options` name. Frames are decoded later, on demand.
+///
+/// Errors: [`Error::Parameter`] for options and paths no reader understands, [`Error::Data`] for broken files, [`Error::Limit`] for claims over `limits`.
+pub fn open(path: &Path, options: &SceneOptions, registry: &Registry, limits: &Limits) -> Result<Scene> {
+    assemble(read(path, options, registry, limits)?, options, None, limits)
+}
+
+/// Opens the scene at `path` in the frame of a model that was trained on it: other frames or cameras of a dataset would be given another frame of their own.
+pub fn open_in(path: &Path, options: &SceneOptions, normalisation: &Similarity, registry: &Registry, limits: &Limits) -> Result<Scene> {
+    assemble(read(path, options, registry, limits)?, options, Some(*normalisation), limits)
+}
+
+fn read(path: &Path, options: &SceneOptions, registry: &Registry, limits: &Limits) -> Result<RawScene> {
+    options.validate()?;
+    (choose(path, options, registry)?.open)(path, options, limits)
+}
+
+fn choose(path: &Path, options: &SceneOptions, registry: &Registry) -> Result<&'static ReaderPlugin> {
+    let readers = registry.readers();
+    let named = if options.reader == "auto" { None } else { Some(registry.reader(&options.reader)?) };
+    let found = named.or_else(|| readers.iter().copied().find(|r| (r.probe)(path)));
+    // A reader may compute its scene from a path that is only a name.
+    match found {
+        Some(reader) if path.exists() || (reader.probe)(path) => Ok(reader),
+        _ if !path.exists() => {
+            Err(Error::parameter(format!("scene {}", path.display()), "no such file or folder", "Check the path, or use `procedural` for the built-in scene"))
+        }
+        _ => {
+            let list: Vec<String> = readers.iter().map(|r| format!("{} looks for {}", r.info.name, r.looks_for)).collect();
+            Err(Error::parameter(
+                format!("scene {}", path.display()),
+                "no reader recognises it",
+                format!("Known formats: {}. Name one with scene.reader", list.join("; ")),
+            ))
+        }
+    }
+}

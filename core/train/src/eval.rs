@@ -1,0 +1,231 @@
+//! Evaluation by the protocol of published tables: 8-bit images, metrics per image, then their means.
+
+use crate::config::TrainConfig;
+use crate::masks::dynamic_masks;
+use burn::tensor::Device;
+use cc4dgs_core::metrics::{FrameSet, Metric, Rounding, SsimConvention};
+use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
+use cc4dgs_play::model::ModelSize;
+use cc4dgs_play::player::{FrameTime, PlayWork};
+use cc4dgs_play::{Model, Player};
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// Sizes in MB = 10^6 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct SizeMb {
+    /// Everything.
+    pub total: f64,
+    /// The field.
+    pub deform: f64,
+    /// The Gaussians.
+    pub point_cloud: f64,
+    /// Float32 size of the field's spatial encoding.
+    pub deform_grid_f32: f64,
+    /// Float32 size of the rest of the field.
+    pub deform_net_f32: f64,
+}
+
+impl From<ModelSize> for SizeMb {
+    fn from(s: ModelSize) -> Self {
+        let mb = |bytes: u64| bytes as f64 / 1e6;
+        Self { total: mb(s.total), deform: mb(s.deform), point_cloud: mb(s.point_cloud), deform_grid_f32: mb(s.deform_grid), deform_net_f32: mb(s.deform_net) }
+    }
+}
+
+/// Milliseconds per frame: the first frame (t = 0, spatial features computed) apart from the others.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct FrameMs {
+    /// Mean of a whole frame at t > 0.
+    pub mean: f64,
+    /// The field in the first frame.
+    pub field_first: f64,
+    /// The rasterizer in the first frame.
+    pub raster_first: f64,
+    /// The field, median of the other frames.
+    pub field: f64,
+    /// The rasterizer, median of the other frames.
+    pub raster: f64,
+}
+
+/// One image's numbers.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ImageScore {
+    /// Index of the view in the scene.
+    pub view: usize,
+    /// The camera's name.
+    pub camera: String,
+    /// Frame index.
+    pub frame: usize,
+    /// Peak signal-to-noise ratio, 8-bit images, all pixels and channels.
+    pub psnr_db: f64,
+    /// The same over the pixels that see something move; absent where the camera has no such pixel, or one frame only.
+    pub psnr_dynamic_db: Option<f64>,
+    /// Structural similarity, Inria's convention.
+    pub ssim: f64,
+    /// The same over windows centred on pixels that see something move.
+    pub ssim_dynamic: Option<f64>,
+    /// Milliseconds.
+    pub field_ms: f64,
+    /// Milliseconds.
+    pub raster_ms: f64,
+}
+
+/// The whole evaluation.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct EvalReport {
+    /// Scene name.
+    pub scene: String,
+    /// Which views.
+    pub split: Split,
+    /// Mean over images.
+    pub psnr_db: f64,
+    /// Mean over the images that have it, of the pixels that see something move: temporal deviation over the training threshold (Swift4D's masks).
+    pub psnr_dynamic_db: Option<f64>,
+    /// Mean over images, Inria's convention.
+    pub ssim: f64,
+    /// Mean over the images that have it, of the windows centred on pixels that see something move.
+    pub ssim_dynamic: Option<f64>,
+    /// Mean over images, skimage's Gaussian convention.
+    pub ssim_skimage: f64,
+    /// Mean over images; absent where an image is too small for five scales.
+    pub ms_ssim: Option<f64>,
+    /// Sizes.
+    pub size_mb: SizeMb,
+    /// Times.
+    pub frame_ms: FrameMs,
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Of which the field moves.
+    pub dynamic_gaussians: usize,
+    /// Work counted over all frames.
+    pub work: PlayWork,
+    /// What the numbers mean.
+    pub protocol: &'static str,
+    /// The protocol of each mean by its key.
+    pub metrics: BTreeMap<&'static str, Metric>,
+    /// Per image.
+    pub images: Vec<ImageScore>,
+}
+
+/// What [`evaluate`] hands to `on_image`: the view, the truth, the render, and their score.
+pub type OnImage<'a> = dyn FnMut(usize, &Image8, &Image8, &ImageScore) -> Result<()> + 'a;
+
+/// Renders every view of `split` (at most `max_views`, evenly spread; 0 is all) and scores it. A model without a background of its own is drawn on the
+/// scene's.
+///
+/// # Errors
+/// [`cc4dgs_core::Error::Parameter`] for a split without views, and what scene, field, rasterizer and `on_image` report.
+pub fn evaluate(
+    model: &Model,
+    scene: &Scene,
+    split: Split,
+    max_views: usize,
+    registry: &Registry,
+    device: &Device,
+    events: &dyn EventSink,
+    on_image: &mut OnImage,
+) -> Result<EvalReport> {
+    let mut views = scene.split(split);
+    let in_split = views.len();
+    if max_views > 0 && views.len() > max_views {
+        views = (0..max_views).map(|i| views[i * views.len() / max_views]).collect();
+    }
+    if views.is_empty() {
+        return Err(cc4dgs_core::Error::parameter("--split", format!("{} has no view of split {split:?}", scene.name), "Evaluate the other split"));
+    }
+    let background = model.background_on(scene.background);
+    let mut player = Player::new(model, registry, device)?.on(scene.background);
+    let mut images = Vec::with_capacity(views.len());
+    let mut times: Vec<FrameTime> = Vec::with_capacity(views.len());
+    let (mut skimage, mut ms_ssim) = (0.0, Some(0.0));
+    let frames = FrameSet { split, count: views.len(), of: in_split };
+    let metric = |m: Metric| m.over(frames.clone());
+    let psnr_metric = metric(Metric::psnr(Rounding::EightBit));
+    let dynamic_metric = metric(Metric::psnr(Rounding::EightBit).masked());
+    let masks: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, background, events)?
+        .into_iter()
+        .filter(|m| m.mask.contains(&1.0))
+        .map(|m| (scene.views[m.view].camera, m.mask.iter().map(|v| *v > 0.0).collect()))
+        .collect();
+    let ssim_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit));
+    let ssim_dynamic_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit).masked());
+    let skimage_metric = metric(Metric::ssim(SsimConvention::Skimage, Rounding::EightBit));
+    let ms_ssim_metric = metric(Metric::ms_ssim(Rounding::EightBit));
+    for (done, &view) in views.iter().enumerate() {
+        let camera = scene.camera(view);
+        let (output, time) = player.render(camera, scene.views[view].time_norm)?;
+        let render = player.download(output.planes)?;
+        let frame = scene.frame(view)?;
+        // Both images are rounded to 8 bits before they are compared.
+        let truth = Image8::from_planes(&frame.to_planes(background), camera.width, camera.height);
+        skimage += skimage_metric.score_images(&truth, &render)?;
+        let multi_scale = ms_ssim_metric.score_images(&truth, &render).ok();
+        ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);
+        let mask = masks.get(&scene.views[view].camera);
+        let shape = [3, camera.height as usize, camera.width as usize];
+        let planes = mask.map(|mask| ([&truth, &render].map(|image| image.to_planes(background)), mask));
+        let masked = |metric: &Metric| planes.as_ref().map(|([a, b], mask)| metric.score(a, b, shape, Some(mask))).transpose();
+        let (psnr_dynamic_db, ssim_dynamic) = (masked(&dynamic_metric)?, masked(&ssim_dynamic_metric)?);
+        let score = ImageScore {
+            view,
+            camera: camera.name.clone(),
+            frame: scene.views[view].frame,
+            psnr_db: psnr_metric.score_images(&truth, &render)?,
+            psnr_dynamic_db,
+            ssim: ssim_metric.score_images(&truth, &render)?,
+            ssim_dynamic,
+            field_ms: time.field_ms,
+            raster_ms: time.raster_ms,
+        };
+        on_image(view, &truth, &render, &score)?;
+        images.push(score);
+        times.push(time);
+        events.emit(&Event::Progress { task: "evaluate".into(), done: done as u64 + 1, total: views.len() as u64 });
+    }
+    let n = images.len() as f64;
+    let steady = if times.len() > 1 { &times[1..] } else { &times[..] };
+    let frame_ms = FrameMs {
+        mean: steady.iter().map(|t| t.field_ms + t.raster_ms).sum::<f64>() / steady.len() as f64,
+        field_first: times[0].field_ms,
+        raster_first: times[0].raster_ms,
+        field: median(steady.iter().map(|t| t.field_ms)),
+        raster: median(steady.iter().map(|t| t.raster_ms)),
+    };
+    Ok(EvalReport {
+        scene: scene.name.clone(),
+        split,
+        psnr_db: images.iter().map(|i| i.psnr_db).sum::<f64>() / n,
+        psnr_dynamic_db: mean(images.iter().filter_map(|i| i.psnr_dynamic_db)),
+        ssim: images.iter().map(|i| i.ssim).sum::<f64>() / n,
+        ssim_dynamic: mean(images.iter().filter_map(|i| i.ssim_dynamic)),
+        ssim_skimage: skimage / n,
+        ms_ssim: ms_ssim.map(|s| s / n),
+        size_mb: model.size.into(),
+        frame_ms,
+        gaussians: model.gaussians.len(),
+        dynamic_gaussians: player.moving(),
+        work: player.work,
+        protocol: "8-bit RGB images, range 255; PSNR over all pixels and channels; SSIM 11x11 Gaussian sigma 1.5, zero padding (Inria); means over images; times on the stated device, synchronised, first frame apart",
+        metrics: BTreeMap::from([
+            ("psnr_db", psnr_metric),
+            ("psnr_dynamic_db", dynamic_metric),
+            ("ssim", ssim_metric),
+            ("ssim_dynamic", ssim_dynamic_metric),
+            ("ssim_skimage", skimage_metric),
+            ("ms_ssim", ms_ssim_metric),
+        ]),
+        images,
+    })
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (sum, count) = values.fold((0.0, 0u64), |(sum, count), v| (sum + v, count + 1));
+    (count > 0).then(|| sum / count as f64)
+}
+
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_unstable_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}

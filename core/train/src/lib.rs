@@ -1,0 +1,16 @@
+//! Training and evaluation: readers, initialisation, the three-stage trainer, its checkpoints, scores of whole scenes. Plug-ins are named only in defaults.
+
+pub mod agreement;
+pub mod checkpoint;
+pub mod config;
+pub mod data;
+pub mod eval;
+pub mod gaussian_set;
+pub mod images;
+pub mod init;
+pub mod knn;
+pub mod masks;
+pub mod presets;
+pub mod schedule;
+pub mod train;
+pub mod trajectory;

@@ -1,0 +1,98 @@
+//! Temporal-deviation masks: which pixels of a fixed camera see something move (Swift4D, Wu et al. 2025).
+
+use cc4dgs_core::{Event, EventSink, Result, Scene, Split};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+
+/// The mask of one fixed camera over the whole sequence.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DynamicMask {
+    /// The view (the camera's first frame) it is rendered from.
+    pub view: usize,
+    /// 1 where the pixel is dynamic, else 0, row-major [H,W].
+    pub mask: Vec<f32>,
+}
+
+/// Masks of every camera of `split` that has at least two frames there: the population standard deviation over time, averaged over the channels,
+/// blurred by a 31x31 Gaussian of sigma 5, over `threshold`.
+pub fn dynamic_masks(scene: &Scene, split: Split, threshold: f32, background: [f32; 3], events: &dyn EventSink) -> Result<Vec<DynamicMask>> {
+    let mut views_of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for view in scene.split(split) {
+        views_of_camera.entry(scene.views[view].camera).or_default().push(view);
+    }
+    views_of_camera.retain(|_, views| views.len() >= 2);
+    let total = views_of_camera.len() as u64;
+    let mut masks = Vec::new();
+    for views in views_of_camera.into_values() {
+        let camera = scene.camera(views[0]);
+        let (w, h) = (camera.width as usize, camera.height as usize);
+        let (mut sum, mut squares) = (vec![0.0f64; 3 * w * h], vec![0.0f64; 3 * w * h]);
+        for &view in &views {
+            let planes = scene.frame(view)?.to_planes(background);
+            sum.par_iter_mut().zip(squares.par_iter_mut()).zip(planes.par_iter()).for_each(|((s, q), &v)| {
+                *s += f64::from(v);
+                *q += f64::from(v) * f64::from(v);
+            });
+        }
+        let n = views.len() as f64;
+        let deviation: Vec<f32> = (0..w * h)
+            .into_par_iter()
+            .map(|i| {
+                let per_channel = (0..3).map(|c| {
+                    let mean = sum[c * w * h + i] / n;
+                    (squares[c * w * h + i] / n - mean * mean).max(0.0).sqrt()
+                });
+                (per_channel.sum::<f64>() / 3.0) as f32
+            })
+            .collect();
+        let mask = blur(&deviation, w, h).into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
+        masks.push(DynamicMask { view: views[0], mask });
+        events.emit(&Event::Progress { task: "dynamic masks".into(), done: masks.len() as u64, total });
+    }
+    Ok(masks)
+}
+
+/// 31x31 Gaussian of sigma 5 (OpenCV's automatic sigma), edges mirrored without repeating the border pixel.
+fn blur(image: &[f32], w: usize, h: usize) -> Vec<f32> {
+    const RADIUS: isize = 15;
+    let mut kernel: Vec<f32> = (-RADIUS..=RADIUS).map(|d| (-(d * d) as f32 / 50.0).exp()).collect();
+    let norm: f32 = kernel.iter().sum();
+    kernel.iter_mut().for_each(|k| *k /= norm);
+    let mirror = |i: isize, n: usize| -> usize {
+        let period = 2 * (n as isize - 1).max(1);
+        let i = i.rem_euclid(period);
+        (if i >= n as isize { period - i } else { i }).clamp(0, n as isize - 1) as usize
+    };
+    let pass = |source: &[f32], along: usize, across: usize, stride: usize, step: usize| -> Vec<f32> {
+        // Returns [across, along] row-major lines.
+        (0..across)
+            .into_par_iter()
+            .flat_map_iter(|line| {
+                let kernel = &kernel;
+                (0..along).map(move |i| {
+                    (0..kernel.len()).map(|k| kernel[k] * source[line * stride + mirror(i as isize + k as isize - RADIUS, along) * step]).sum::<f32>()
+                })
+            })
+            .collect()
+    };
+    let rows = pass(image, w, h, w, 1);
+    let columns = pass(&rows, h, w, 1, w);
+    (0..w * h).map(|i| columns[(i % w) * h + i / w]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blur_keeps_constants_and_mass() {
+        let flat = blur(&vec![0.5; 40 * 20], 40, 20);
+        assert!(flat.iter().all(|v| (v - 0.5).abs() < 1e-5));
+        let mut point = vec![0.0; 101 * 101];
+        point[50 * 101 + 50] = 1.0;
+        let blurred = blur(&point, 101, 101);
+        assert!((blurred.iter().sum::<f32>() - 1.0).abs() < 1e-4);
+        assert_eq!(blurred[50 * 101 + 47], blurred[47 * 101 + 50]);
+        assert_eq!(blur(&[0.3], 1, 1).len(), 1);
+    }
+}

@@ -1,0 +1,326 @@
+//! The three-stage trainer (paper Section V): coarse, dynamic score, main. It is composed of parts that are found by name: deformer, rasterizer, density control, loss terms,
+//! appearance model and optimizer.
+
+mod density;
+mod log;
+mod losses;
+mod parameters;
+mod sampler;
+mod score;
+mod smoothness;
+mod state;
+mod step;
+
+pub use state::{Parts, TrainState};
+
+use crate::checkpoint;
+use crate::config::{CoarseFrames, Dynamic, RunConfig};
+use crate::gaussian_set::GaussianSet;
+use crate::init::initialise;
+use crate::masks::{DynamicMask, dynamic_masks};
+use crate::schedule::StageLengths;
+use burn::tensor::Device;
+use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::{AppearanceContext, Error, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, check_attributes, parse_device};
+use cc4dgs_play::checkpoint::CHECKPOINT;
+use cc4dgs_play::model::ModelDeformer;
+use cc4dgs_play::{Model, Moving};
+use losses::LossTerms;
+use sampler::{Prefetcher, Sampler};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// Name of the configuration inside a run's folder.
+pub const CONFIG: &str = "config.toml";
+
+/// What to train, where to, and who listens.
+pub struct TrainJob<'a> {
+    /// The configuration.
+    pub config: &'a RunConfig,
+    /// The scene, already opened.
+    pub scene: Arc<Scene>,
+    /// The run's folder, created if missing; `None` writes nothing.
+    pub out: Option<PathBuf>,
+    /// Continue from the folder's checkpoint.
+    pub resume: bool,
+    /// Where plug-ins are found.
+    pub registry: &'a Registry,
+    /// Where events go.
+    pub events: &'a dyn EventSink,
+    /// Set to stop after the current iteration, with a checkpoint.
+    pub stop: &'a AtomicBool,
+}
+
+/// What came of it.
+#[derive(Clone, Debug, Serialize)]
+pub struct TrainReport {
+    /// Wall seconds of this call, all stages.
+    pub seconds: f64,
+    /// Wall seconds per stage of this call.
+    pub stage_seconds: BTreeMap<String, f64>,
+    /// Gaussians at the end.
+    pub gaussians: usize,
+    /// Of which the deformer moves.
+    pub dynamic_gaussians: usize,
+    /// The checkpoint, where a folder was given.
+    pub checkpoint: Option<PathBuf>,
+}
+
+/// What stays fixed during a run.
+pub(crate) struct Context<'a> {
+    pub job: &'a TrainJob<'a>,
+    pub lengths: StageLengths,
+    pub device: Device,
+    pub rasterizer: Box<dyn Rasterizer>,
+    pub losses: LossTerms,
+    pub score_loss: LossTerms,
+    pub seed: Seed,
+    pub masks: Vec<DynamicMask>,
+    /// Index among the training cameras, by index in the scene.
+    pub training_camera: BTreeMap<usize, usize>,
+    pub checkpoint: Option<PathBuf>,
+}
+
+/// Trains. With a folder, `config.toml` and `checkpoint` are written into it.
+///
+/// # Errors
+/// [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when the loss or the offsets are no longer numbers,
+/// and whatever the scene, the plug-ins or the disk report.
+pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
+    let began = Instant::now();
+    let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
+    let job = &TrainJob { config, scene: job.scene.clone(), out: job.out.clone(), ..*job };
+    if let Some(out) = &job.out {
+        std::fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
+        write_atomically(out.join(CONFIG), config.to_toml()?.as_bytes())?;
+    }
+    let device = parse_device(&config.device)?;
+    let seed = Seed::root(config.seed);
+    job.events.emit(&Event::RunStarted { command: "train".into(), device: config.device.clone(), seed: config.seed });
+    for message in &job.scene.warnings {
+        job.events.emit(&Event::Warning { object: job.scene.name.clone(), message: message.clone() });
+    }
+
+    let moving = decide_moving(job);
+    let training_camera = training_cameras(&job.scene);
+    let parts = Parts {
+        appearance: job.registry.build_appearance(
+            &config.appearance,
+            &AppearanceContext { cameras: training_camera.len(), seed: seed.child("appearance") },
+            &device,
+        )?,
+        density: job.registry.build_density(&config.density)?,
+        optimizer: job.registry.build_optimizer(&config.optimizer)?,
+    };
+    let masks = match moving {
+        Moving::Scored { .. } => dynamic_masks(&job.scene, Split::Train, config.train.mask_threshold, config.background()?, job.events)?,
+        _ => Vec::new(),
+    };
+    let checkpoint = job.out.as_ref().map(|out| out.join(CHECKPOINT));
+    let mut state = match &checkpoint {
+        Some(path) if job.resume => {
+            let stored = checkpoint::load(path, job.registry, &device, &config.limits)?;
+            if stored.normalisation() != job.scene.normalisation {
+                return Err(Error::parameter(
+                    "--resume",
+                    format!("the scene's normalisation is {:?}, the checkpoint's {:?}", job.scene.normalisation, stored.normalisation()),
+                    "Resume on the dataset the run was started on, or start in another folder",
+                ));
+            }
+            stored.into_state(config, parts)?
+        }
+        _ => {
+            let host = initialise(&job.scene, config, seed.child("init"), job.events)?;
+            TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, parts)
+        }
+    };
+    let context = Context {
+        job,
+        lengths: StageLengths::new(&config.train, matches!(moving, Moving::Scored { .. }), job.scene.extent()),
+        rasterizer: job.registry.build_rasterizer(&config.rasterizer)?,
+        losses: LossTerms::build(job.registry, &config.loss)?,
+        score_loss: LossTerms::build(job.registry, std::slice::from_ref(&config.score_loss))?,
+        device,
+        seed,
+        masks,
+        training_camera,
+        checkpoint,
+    };
+
+    let mut stage_seconds = BTreeMap::new();
+    for stage in Stage::ALL {
+        if stage < state.stage {
+            continue;
+        }
+        let stage_began = Instant::now();
+        context.run_stage(stage, &mut state)?;
+        stage_seconds.insert(stage.name().to_string(), stage_began.elapsed().as_secs_f64());
+        if stage != Stage::Main {
+            state.stage = Stage::ALL[stage as usize + 1];
+            state.iteration = 0;
+        }
+    }
+    context.save(&state)?;
+    let dynamic_gaussians = state.moving_rows(&context.device)?.count();
+    let report = TrainReport {
+        seconds: began.elapsed().as_secs_f64(),
+        stage_seconds,
+        gaussians: state.set.len(),
+        dynamic_gaussians,
+        checkpoint: context.checkpoint.clone(),
+    };
+    Ok((checkpoint::trained_model(state, config)?, report))
+}
+
+/// Index among the training cameras, by index in the scene.
+fn training_cameras(scene: &Scene) -> BTreeMap<usize, usize> {
+    let used: std::collections::BTreeSet<usize> = scene.split(Split::Train).into_iter().map(|view| scene.views[view].camera).collect();
+    used.into_iter().enumerate().map(|(index, camera)| (camera, index)).collect()
+}
+
+/// Whether everything, nothing, or what the dynamic scores say may move.
+fn decide_moving(job: &TrainJob) -> Moving {
+    let train = &job.config.train;
+    let mut frames_of_camera: BTreeMap<usize, usize> = BTreeMap::new();
+    for view in job.scene.split(Split::Train) {
+        *frames_of_camera.entry(job.scene.views[view].camera).or_default() += 1;
+    }
+    let can_score = frames_of_camera.values().any(|&frames| frames >= 2);
+    let static_scene = job.scene.frame_count <= 1;
+    match train.dynamic {
+        _ if static_scene => Moving::Nothing,
+        Dynamic::None => Moving::Nothing,
+        Dynamic::All => Moving::Everything,
+        _ if can_score => Moving::Scored { zeta: train.zeta },
+        wanted => {
+            if wanted == Dynamic::Score {
+                let message = "no training camera has two frames, so dynamic scores cannot be fitted: every Gaussian may move".to_string();
+                job.events.emit(&Event::Warning { object: "train.dynamic".into(), message });
+            }
+            Moving::Everything
+        }
+    }
+}
+
+impl Context<'_> {
+    fn run_stage(&self, stage: Stage, state: &mut TrainState) -> Result<()> {
+        let length = self.lengths.length(stage);
+        let events = self.job.events;
+        if length == 0 || (stage == Stage::Score && self.masks.is_empty()) {
+            if stage == Stage::Main {
+                self.begin_main(state)?;
+            }
+            return Ok(());
+        }
+        if state.iteration == 0 {
+            state.begin_stage(&self.device);
+            if stage == Stage::Main {
+                self.begin_main(state)?;
+            }
+        }
+        events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
+        let began = Instant::now();
+        let mut sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), self.job.config.train.batch);
+        // Only a canonical space that is the first frame can be left frame by frame.
+        if stage == Stage::Main && self.stage_views(Stage::Coarse).len() < self.stage_views(Stage::Main).len() {
+            let ramp = (self.job.config.train.time_ramp * length as f64).round() as usize;
+            sampler = sampler.with_ramp(ramp, |view| self.job.scene.views[view].time_norm);
+        }
+        let prefetcher = Prefetcher::new(self.job.scene.clone());
+        let mut log = log::Log::new(stage, length, self.job.config.train.log_every);
+        let resumed_at = state.iteration;
+        while state.iteration < length {
+            if self.job.stop.load(Ordering::Relaxed) {
+                self.save(state)?;
+                let at = format!("at iteration {} of stage {}", state.iteration, stage.name());
+                return Err(Error::Interrupted(match &self.checkpoint {
+                    Some(path) => format!("{at}; everything is in {}, --resume continues", path.display()),
+                    None => at,
+                }));
+            }
+            let batch = sampler.batch(state.iteration);
+            prefetcher.want(sampler.batch(state.iteration + 1));
+            let schedule = self.lengths.schedule(stage, state.iteration + 1);
+            match stage {
+                Stage::Score => self.score_step(state, &schedule, &mut log)?,
+                _ => {
+                    self.photometric_step(&schedule, state, &batch, &mut log)?;
+                    self.control_density(&schedule, state)?;
+                }
+            }
+            state.iteration = schedule.iteration;
+            let every = self.job.config.train.checkpoint_every;
+            if every > 0 && state.iteration.is_multiple_of(every) && state.iteration < length {
+                self.save(state)?;
+            }
+        }
+        log.finish(events);
+        if stage == Stage::Main && state.iteration > resumed_at {
+            self.simplify(state)?;
+        }
+        events.emit(&Event::StageFinished { stage: stage.name().into(), seconds: began.elapsed().as_secs_f64(), gaussians: state.set.len() });
+        if stage == Stage::Score {
+            let moving = state.moving_rows(&self.device)?.count() as u64;
+            let all = state.set.len() as u64;
+            events.emit(&Event::Work { stage: "score".into(), counter: "gaussians that move".into(), done: moving, skipped: all - moving });
+        }
+        Ok(())
+    }
+
+    /// The training views a stage draws from.
+    fn stage_views(&self, stage: Stage) -> Vec<usize> {
+        let scene = &self.job.scene;
+        let all = scene.split(Split::Train);
+        if stage != Stage::Coarse || self.job.config.train.coarse_frames == CoarseFrames::All {
+            return all;
+        }
+        let first = all.iter().map(|&v| scene.views[v].frame).min().unwrap_or(0);
+        let of_first: Vec<usize> = all.iter().copied().filter(|&v| scene.views[v].frame == first).collect();
+        // A single image says nothing of depth: one moving camera needs all of them.
+        if of_first.len() >= 2 { of_first } else { all }
+    }
+
+    /// Builds the deformer over the box of what moves, once the scores are known.
+    fn begin_main(&self, state: &mut TrainState) -> Result<()> {
+        let section = &self.job.config.deformer;
+        let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
+        let field = self.job.registry.build_deformer(section, &context, &self.device)?;
+        let deformer = ModelDeformer { field, section: section.clone(), context };
+        check_attributes(deformer.name(), &deformer.field.attributes())?;
+        state.set.add_attributes(&deformer.field.attributes(), self.seed.child("attributes"))?;
+        let moves = !deformer.field.is_static() && state.moving_rows(&self.device)?.count() > 0;
+        if !moves && !deformer.field.is_static() && state.moving != Moving::Nothing {
+            let message = "no dynamic score is over train.zeta: the deformer is skipped".to_string();
+            self.job.events.emit(&Event::Warning { object: "deformer".into(), message });
+        }
+        state.deformer = Some(deformer);
+        Ok(())
+    }
+
+    /// Leaves out what the trained deformer does not use. Not called again when a finished run is resumed.
+    fn simplify(&self, state: &mut TrainState) -> Result<()> {
+        let rows = state.moving_rows(&self.device)?;
+        let Some(deformer) = state.deformer.as_ref().filter(|_| rows.count() > 0) else { return Ok(()) };
+        let spatial = deformer.field.spatial(&state.spatial_input(deformer, &rows)?)?;
+        let frames = self.job.scene.frame_count.max(2);
+        let times: Vec<f32> = (0..frames).map(|f| f as f32 / (frames - 1) as f32).collect();
+        let Some(simple) = deformer.field.simplified(spatial.values, &times)? else { return Ok(()) };
+        let mut section = simple.settings;
+        section.insert("kind".into(), deformer.name().into());
+        self.job.events.emit(&Event::Note { object: "deformer".into(), message: simple.message });
+        state.deformer = Some(ModelDeformer { field: simple.field, section, context: deformer.context.clone() });
+        state.optimizer.restart("deformer/");
+        Ok(())
+    }
+
+    fn save(&self, state: &TrainState) -> Result<()> {
+        let Some(path) = &self.checkpoint else { return Ok(()) };
+        let bytes = checkpoint::save(path, state, self.job.config)?;
+        self.job.events.emit(&Event::Saved { path: path.display().to_string(), bytes });
+        Ok(())
+    }
+}

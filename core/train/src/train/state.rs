@@ -1,0 +1,97 @@
+//! Everything a run needs to continue to the same bytes.
+
+use crate::gaussian_set::GaussianSet;
+use burn::tensor::Device;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Appearance, DeformerContext, DensityControl, Optimizer, Result, Seed, Similarity, SpatialInput, Stage};
+use cc4dgs_play::model::ModelDeformer;
+use cc4dgs_play::{Moving, MovingRows};
+
+/// The state between two iterations.
+pub struct TrainState {
+    /// Stage under way.
+    pub stage: Stage,
+    /// Iterations of the stage that are done.
+    pub iteration: usize,
+    /// The Gaussians.
+    pub set: GaussianSet,
+    /// What may move.
+    pub moving: Moving,
+    /// From the coordinates of the dataset to those of the Gaussians.
+    pub normalisation: Similarity,
+    /// The deformer, from the main stage on.
+    pub deformer: Option<ModelDeformer>,
+    /// Between rendered and recorded images.
+    pub appearance: Box<dyn Appearance>,
+    /// Adds, moves and removes Gaussians.
+    pub density: Box<dyn DensityControl>,
+    /// Steps everything that learns.
+    pub optimizer: Box<dyn Optimizer>,
+    /// Whether smoothness was switched on.
+    pub smooth: bool,
+    rows: Option<MovingRows>,
+}
+
+/// The parts of the trainer that have state.
+pub struct Parts {
+    /// Between rendered and recorded images.
+    pub appearance: Box<dyn Appearance>,
+    /// Adds, moves and removes Gaussians.
+    pub density: Box<dyn DensityControl>,
+    /// Steps everything that learns.
+    pub optimizer: Box<dyn Optimizer>,
+}
+
+impl TrainState {
+    /// A fresh run.
+    pub fn new(set: GaussianSet, moving: Moving, normalisation: Similarity, parts: Parts) -> Self {
+        let Parts { appearance, density, optimizer } = parts;
+        Self { stage: Stage::Coarse, iteration: 0, set, moving, normalisation, deformer: None, appearance, density, optimizer, smooth: false, rows: None }
+    }
+    /// New optimizer state and statistics, as every stage starts with (Swift4D).
+    pub fn begin_stage(&mut self, device: &Device) {
+        self.optimizer.restart("");
+        self.density.begin_stage(self.set.len(), device);
+    }
+    /// The rows the deformer moves; kept until the set changes.
+    pub fn moving_rows(&mut self, device: &Device) -> Result<MovingRows> {
+        if let Some(rows) = &self.rows {
+            return Ok(rows.clone());
+        }
+        let rows = match self.moving {
+            Moving::Scored { .. } => self.moving.rows(&to_vec(self.set.get("dynamic_scores")?.clone(), "dynamic_scores")?),
+            other => other.rows(&[]),
+        };
+        let rows = MovingRows::new(rows, self.set.len(), device);
+        self.rows = Some(rows.clone());
+        Ok(rows)
+    }
+    /// What the deformer is asked about, without gradient.
+    pub fn spatial_input(&self, deformer: &ModelDeformer, rows: &MovingRows) -> Result<SpatialInput> {
+        let attributes = deformer.field.attributes().iter().map(|a| Ok(rows.select(self.set.get(&a.name)?.clone()))).collect::<Result<_>>()?;
+        Ok(SpatialInput { means_world: rows.select(self.set.get("means")?.clone()), attributes })
+    }
+    /// To be called whenever Gaussians or scores changed.
+    pub fn invalidate_rows(&mut self) {
+        self.rows = None;
+    }
+    /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres, padded by 5 %.
+    pub fn field_context(&mut self, frame_count: usize, seed: Seed) -> Result<DeformerContext> {
+        let host = self.set.host_gaussians()?;
+        let mut rows = self.moving.rows(&host.dynamic_scores).unwrap_or_default();
+        if rows.is_empty() {
+            rows = (0..host.len()).collect();
+        }
+        let (mut box_min, mut box_max) = ([0.0f32; 3], [0.0f32; 3]);
+        for k in 0..3 {
+            let mut values: Vec<f32> = rows.iter().map(|&i| host.means[3 * i + k]).collect();
+            values.sort_unstable_by(f32::total_cmp);
+            let pick = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
+            let (low, high) = (pick(0.001), pick(0.999));
+            // A flat axis still needs a width to be normalised by.
+            let pad = (0.05 * (high - low)).max(1e-4 * (1.0 + low.abs().max(high.abs())));
+            (box_min[k], box_max[k]) = (low - pad, high + pad);
+        }
+        Ok(DeformerContext { box_min, box_max, frame_count, sh_degree: self.set.sh_degree, seed })
+    }
+}

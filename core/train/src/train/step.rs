@@ -1,0 +1,224 @@
+//! One photometric step: deform, render, loss, backward, optimizer. Shared by the coarse and the main stage.
+
+use super::log::Log;
+use super::smoothness::{flicker, smoothness};
+use super::{Context, TrainState, parameters};
+use crate::gaussian_set::{Leaves, gaussian_rate};
+use burn::tensor::{Int, Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Camera, Event, LossInput, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics};
+use cc4dgs_play::MovingRows;
+use cc4dgs_play::model::ModelDeformer;
+use std::collections::BTreeMap;
+
+/// What the deformer has to say about this iteration's Gaussians before a time is known.
+struct Spatial {
+    input: SpatialInput,
+    features: Tensor<2>,
+}
+
+/// A rendered view whose statistics wait for the backward pass.
+struct Rendered<'a> {
+    screen_probe: Option<Tensor<2>>,
+    absolute_screen_probe: Option<Tensor<2>>,
+    radii: Tensor<1, Int>,
+    max_weights: Option<Tensor<1>>,
+    camera: &'a Camera,
+}
+
+impl Context<'_> {
+    /// One iteration on the views of `batch`.
+    pub(crate) fn photometric_step(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], log: &mut Log) -> Result<()> {
+        let train = &self.job.config.train;
+        let scene = &self.job.scene;
+        let (n, progress) = (state.set.len(), schedule.progress());
+        let rows = state.moving_rows(&self.device)?;
+        let moves = state.deformer.as_ref().is_some_and(|d| !d.field.is_static()) && rows.count() > 0;
+        self.decide_smoothness(state, schedule, moves)?;
+
+        let leaves = state.set.leaves(|name| name != "dynamic_scores");
+        let gaussians = leaves.gaussians()?;
+        let autodiff = gaussians.means.device();
+        let spatial = match &mut state.deformer {
+            Some(deformer) if moves => {
+                parameters::track(deformer.field.parameters_mut());
+                deformer.field.set_progress(progress as f32);
+                Some(spatial_pass(deformer, &leaves, &rows, log, n)?)
+            }
+            _ => None,
+        };
+        parameters::track(state.appearance.parameters_mut());
+
+        let statistics = state.density.statistics(schedule);
+        let background_rgb = self.job.config.background()?;
+        let background = Tensor::<1>::from_data(TensorData::new(background_rgb.to_vec(), [3]), &self.device);
+        let max_weights = statistics.contains(&Statistic::MaxWeight);
+        let settings = RenderSettings { max_weights, ..self.job.config.render.settings(Some(Tensor::from_inner(background))) };
+        let mut total: Option<Tensor<1>> = None;
+        let mut rendered = Vec::with_capacity(batch.len());
+        let mut seen: Option<Tensor<1, Int>> = None;
+        let read = log.due(schedule.iteration);
+        for &view in batch {
+            let (camera, time_norm) = (scene.camera(view), scene.views[view].time_norm);
+            let drawn = match (&spatial, &state.deformer) {
+                (Some(spatial), Some(deformer)) => {
+                    let offsets = deformer.field.deform(spatial.features.clone(), self.noisy_time(time_norm, schedule, view))?;
+                    offsets.check(deformer.name(), rows.count())?;
+                    if read {
+                        offsets.check_finite(deformer.name())?;
+                    }
+                    offsets.apply(deformer.name(), &gaussians, rows.indices())?
+                }
+                _ => gaussians.clone(),
+            };
+            let mut splats = Splats::from_gaussians(&drawn, schedule.sh_degree);
+            let probe = |wanted| statistics.contains(&wanted).then(|| Tensor::<2>::zeros([n, 2], &autodiff).require_grad());
+            let (screen_probe, absolute_screen_probe) = (probe(Statistic::ScreenGradient), probe(Statistic::AbsoluteScreenGradient));
+            splats.screen_probe = screen_probe.clone();
+            splats.absolute_screen_probe = absolute_screen_probe.clone();
+            let output = self.rasterizer.render(&splats, camera, &settings)?;
+            let planes = state.appearance.apply(output.planes, self.training_camera.get(&scene.views[view].camera).copied())?;
+            let target = Tensor::<3>::from_inner(self.rasterizer.upload(&scene.frame(view)?, background_rgb, &self.device));
+            let radii = output.stats.radii;
+            let loss = self.losses.value(&LossInput { planes: &planes, target: &target, gaussians: &drawn, radii: &radii, time_norm, schedule })?;
+            if read {
+                log.psnr(psnr_db(planes, target)?);
+            }
+            let loss = loss.div_scalar(batch.len() as f32);
+            total = Some(match total {
+                Some(sum) => sum + loss,
+                None => loss,
+            });
+            seen = Some(match seen {
+                Some(other) => other.max_pair(radii.clone()),
+                None => radii.clone(),
+            });
+            rendered.push(Rendered { screen_probe, absolute_screen_probe, radii, max_weights: output.stats.max_weights, camera });
+        }
+        let Some(mut loss) = total else { return Ok(()) };
+        if let (Some(deformer), Some(&view), Some(spatial)) = (&state.deformer, batch.first(), &spatial) {
+            let time_norm = scene.views[view].time_norm;
+            if state.smooth {
+                let seed = self.seed.child("smoothness").index(schedule.iteration as u64);
+                if let Some(term) = smoothness(deformer.field.as_ref(), &deformer.context, &spatial.input, time_norm, train, progress, seed)? {
+                    loss = loss + term;
+                }
+            }
+            if let Some(term) = deformer.field.regularizer(&spatial.input, time_norm, progress as f32)? {
+                loss = loss + term;
+            }
+        }
+        if let Some(term) = state.appearance.regularizer()? {
+            loss = loss + term;
+        }
+        if read {
+            log.loss(to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN), schedule)?;
+        }
+
+        let gradients = loss.backward();
+        for Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera } in rendered {
+            let gradient_of = |probe: Option<Tensor<2>>| probe.and_then(|probe| probe.grad(&gradients));
+            let (screen_gradient, absolute_screen_gradient) = (gradient_of(screen_probe), gradient_of(absolute_screen_probe));
+            let size = (camera.width, camera.height);
+            state.density.observe(&ViewStatistics { radii, screen_gradient, absolute_screen_gradient, max_weights, size, views: batch.len() })?;
+        }
+        let of_gaussians = leaves.gradients(&gradients);
+        let deformed = spatial.is_some();
+        // Whoever else holds the values would keep the optimizer from working in place.
+        drop((leaves, gaussians, loss, spatial));
+        let visible = if train.sparse_adam { seen } else { None };
+        if let Some(visible) = &visible
+            && read
+        {
+            let shown = visible.clone().greater_elem(0).int().sum().into_scalar::<i64>().max(0) as u64;
+            log.count_optimizer(shown, n as u64 - shown.min(n as u64));
+        }
+        let extent = f64::from(schedule.extent);
+        let of_plugin: BTreeMap<String, f64> =
+            state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
+        let rate = |name: &str| of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
+        self.step_gaussians(state, of_gaussians, |name| StepSettings { visible: visible.as_ref(), ..StepSettings::new(rate(name)) })?;
+        let TrainState { deformer, appearance, optimizer, .. } = state;
+        if let Some(deformer) = deformer.as_mut().filter(|_| deformed) {
+            let groups = deformer.field.groups();
+            parameters::update("deformer/", deformer.field.parameters_mut(), &groups, &gradients, optimizer.as_mut(), progress, extent)?;
+        }
+        let groups = appearance.groups();
+        parameters::update("appearance/", appearance.parameters_mut(), &groups, &gradients, optimizer.as_mut(), progress, extent)?;
+        log.step(self.job.events, schedule.iteration, state.set.len());
+        Ok(())
+    }
+
+    /// One optimizer step of the Gaussians' attributes that have a gradient.
+    pub(crate) fn step_gaussians<'a>(
+        &self,
+        state: &mut TrainState,
+        gradients: Vec<(String, Tensor<2>)>,
+        settings: impl Fn(&str) -> StepSettings<'a>,
+    ) -> Result<()> {
+        let mut gradients: BTreeMap<String, Tensor<2>> = gradients.into_iter().collect();
+        for (name, slot) in state.set.slots() {
+            let Some(gradient) = gradients.remove(name) else { continue };
+            let device = slot.device();
+            // Moved out, so that the optimizer holds the only reference and works in place.
+            let value = std::mem::replace(slot, Tensor::empty([0, 0], &device));
+            *slot = state.optimizer.step(&format!("gaussians/{name}"), value, gradient, &settings(name))?;
+        }
+        Ok(())
+    }
+
+    /// `time_norm` with the noise of `train.time_noise`.
+    fn noisy_time(&self, time_norm: f32, schedule: &Schedule, view: usize) -> f32 {
+        let frames = self.job.config.train.time_noise * (1.0 - 2.0 * schedule.progress());
+        let intervals = self.job.scene.frame_count.saturating_sub(1);
+        if frames <= 0.0 || intervals == 0 {
+            return time_norm;
+        }
+        let seed = self.seed.child("time noise").index(schedule.iteration as u64).index(view as u64);
+        // The sum of twelve uniform numbers, minus six, is nearly standard normal.
+        let normal = (0..12u64).map(|k| (seed.index(k).value() >> 11) as f64 / (1u64 << 53) as f64).sum::<f64>() - 6.0;
+        (f64::from(time_norm) + normal * frames / intervals as f64).clamp(0.0, 1.0) as f32
+    }
+
+    /// At a quarter and at half of the main stage, when motion has taken shape: measure flicker, and switch smoothness on if the scene needs it.
+    fn decide_smoothness(&self, state: &mut TrainState, schedule: &Schedule, moves: bool) -> Result<()> {
+        let train = &self.job.config.train;
+        if train.lambda_r <= 0.0 || state.smooth || schedule.stage != Stage::Main || !moves {
+            return Ok(());
+        }
+        if !train.smooth_auto {
+            state.smooth = true;
+            return Ok(());
+        }
+        if ![4, 2].iter().any(|&share| schedule.length >= share && schedule.iteration == schedule.length / share) {
+            return Ok(());
+        }
+        let rows = state.moving_rows(&self.device)?;
+        let Some(deformer) = &state.deformer else { return Ok(()) };
+        let measured = flicker(deformer.field.as_ref(), &state.spatial_input(deformer, &rows)?, self.job.scene.frame_count)?;
+        state.smooth = measured > train.flicker_threshold;
+        if state.smooth {
+            let message = format!("flicker {measured:.3} is over train.flicker_threshold {}: smoothness switched on", train.flicker_threshold);
+            self.job.events.emit(&Event::Warning { object: "smoothness".into(), message });
+        }
+        Ok(())
+    }
+}
+
+/// Features of the moving Gaussians. Their centres are constants, which makes caching in playback exact; attributes of the deformer are tracked.
+fn spatial_pass(deformer: &ModelDeformer, leaves: &Leaves, rows: &MovingRows, log: &mut Log, total: usize) -> Result<Spatial> {
+    let means_world = Tensor::<2>::from_inner(rows.select(leaves.get("means")?.clone().inner()));
+    let attributes = deformer.field.attributes().iter().map(|a| Ok(rows.select(leaves.get(&a.name)?.clone()))).collect::<Result<_>>()?;
+    let input = SpatialInput { means_world, attributes };
+    let spatial = deformer.field.spatial(&input)?;
+    let (work, moving) = (spatial.work, rows.count() as u64);
+    log.count_deformer(work.vertices_decoded, work.vertices_queried - work.vertices_decoded, moving, total as u64 - moving);
+    Ok(Spatial { input, features: spatial.values })
+}
+
+/// PSNR in dB of the first three of `planes` against `target`, unrounded, data range 1; at most 100 dB, where float32 images stop differing.
+fn psnr_db(planes: Tensor<3>, target: Tensor<3>) -> Result<f32> {
+    let difference = planes.inner().narrow(0, 0, 3) - target.inner();
+    let mse = to_vec((difference.clone() * difference).mean(), "mean squared error")?;
+    Ok(-10.0 * mse.first().copied().unwrap_or(f32::NAN).max(1e-10).log10())
+}
