@@ -103,7 +103,7 @@ pub struct RawPoints {
     pub colors: Vec<[f32; 3]>,
 }
 
-/// Where the first Gaussians of a scene without points go.
+/// The region of random initial Gaussians, for scenes without points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum InitBox {
     /// A box in the dataset's units.
@@ -113,9 +113,9 @@ pub enum InitBox {
         /// Upper corner.
         high: [f64; 3],
     },
-    /// A cube around the point the cameras look at.
+    /// A cube around the point that the cameras look at.
     Cube {
-        /// Half its side, as a share of the median distance of the cameras from that point.
+        /// Half the side over the median distance of the cameras from that point.
         half_share: f64,
     },
 }
