@@ -179,7 +179,7 @@ fn the_normalised_scene_does_not_depend_on_unit_origin_and_direction() {
     }
 }
 
-/// The held-out PSNR in dB of a short training.
+/// A short training: the model and its held-out PSNR in dB.
 fn trained(scene: Scene, seed: u64) -> (Model, f64) {
     let registry = Registry::collect().unwrap();
     let sets = ["init.source=random", "init.count=400", "train.iterations=120", "train.log_every=1000", &format!("seed={seed}")];
