@@ -1,4 +1,4 @@
-//! What the suites share.
+//! Helpers that the test suites share.
 #![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
 use burn::tensor::{Device, Tensor};
@@ -10,13 +10,13 @@ pub fn devices() -> Vec<(&'static str, Device)> {
     match parse_device("wgpu") {
         Ok(device) => devices.push(("wgpu", device)),
         Err(e) if std::env::var_os("CC4DGS_REQUIRE_WGPU").is_some() => panic!("{e}"),
-        // A machine without Vulkan may still run everything else; CI installs lavapipe and sets the variable.
+        // A machine without Vulkan can still run all other tests; CI installs lavapipe and sets the variable.
         Err(e) => eprintln!("{e}: its part of the suite is skipped"),
     }
     devices
 }
 
-/// Leaves the device's free memory full of NaNs, so that a kernel that reads what nobody wrote is found out.
+/// Fills the device's free memory with NaNs, so that tests detect kernels that read uninitialised memory.
 pub fn poison(device: &Device) {
     let mut held = Vec::new();
     for bits in 6..22 {
@@ -25,12 +25,12 @@ pub fn poison(device: &Device) {
     device.sync().expect("the device answers");
 }
 
-/// The snippets of CONTRIBUTING.md, which are compiled with the documentation tests.
+/// The snippets of CONTRIBUTING.md, compiled by the documentation tests.
 #[cfg(doctest)]
 #[doc = include_str!("../../CONTRIBUTING.md")]
 pub struct Contributing;
 
-/// The program in README.md, likewise.
+/// The program of README.md, compiled by the documentation tests.
 #[cfg(doctest)]
 #[doc = include_str!("../../README.md")]
 pub struct Readme;

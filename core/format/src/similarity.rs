@@ -1,9 +1,9 @@
-//! Changes of unit and origin between a dataset and the normalised frame it is trained in.
+//! Similarities (scale and translation) between a dataset and the normalised frame in which it is trained.
 
 use crate::{Camera, Error, HostGaussians, Result};
 use serde::{Deserialize, Serialize};
 
-/// The map x -> scale * x + translation. Axes keep their directions, so that quaternions, viewing directions and spherical harmonics stay as they are.
+/// The map x -> scale * x + translation. The directions of axes do not change, so quaternions, viewing directions and spherical harmonics do not either.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Similarity {
     /// Units of the target per unit of the source, positive.
@@ -19,14 +19,14 @@ impl Default for Similarity {
 }
 
 impl Similarity {
-    /// Changes nothing.
+    /// The identity.
     pub const IDENTITY: Self = Self { scale: 1.0, translation: [0.0; 3] };
 
-    /// The map that takes `center` to the origin and multiplies lengths by `scale`.
+    /// The map of `center` to the origin that multiplies lengths by `scale`.
     pub fn centred(center: [f64; 3], scale: f64) -> Self {
         Self { scale, translation: center.map(|c| -scale * c) }
     }
-    /// Refuses numbers that are not finite, scales that are not positive, and scales so far from 1 that float32 positions lose their meaning; `object` names
+    /// Refuses numbers that are not finite, scales that are not positive, and scales too far from 1 for float32 positions; `object` names
     /// the file in the error.
     pub fn validate(&self, object: &str) -> Result<()> {
         let sound = (1e-15..=1e15).contains(&self.scale) && self.translation.iter().all(|v| v.is_finite());
@@ -43,15 +43,15 @@ impl Similarity {
     pub fn apply(&self, point: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|k| self.scale * point[k] + self.translation[k])
     }
-    /// The way back.
+    /// The inverse map.
     pub fn inverse(&self) -> Self {
         Self { scale: 1.0 / self.scale, translation: self.translation.map(|t| -t / self.scale) }
     }
-    /// First `first`, then this.
+    /// The composition: `first`, then this map.
     pub fn compose(&self, first: &Self) -> Self {
         Self { scale: self.scale * first.scale, translation: self.apply(first.translation) }
     }
-    /// The camera that sees the moved scene as `camera` sees the original; depths are multiplied by the scale.
+    /// The camera whose image of the mapped scene equals `camera`'s image of the original; depths are multiplied by the scale.
     pub fn apply_camera(&self, camera: &Camera) -> Camera {
         let mut out = camera.clone();
         let center = self.apply(camera.center_world());
@@ -60,7 +60,7 @@ impl Similarity {
         }
         out
     }
-    /// Moves Gaussians: centres, and log-scales by the logarithm of the scale. Attributes of plug-ins stay as they are.
+    /// Maps Gaussians: centres are mapped, the logarithm of the scale is added to log-scales. Attributes of plug-ins are unchanged.
     pub fn apply_gaussians(&self, gaussians: &mut HostGaussians) {
         if *self == Self::IDENTITY {
             return;

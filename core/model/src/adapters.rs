@@ -1,4 +1,4 @@
-//! The graphics adapters of this machine, and which of them `auto` takes.
+//! The graphics adapters of this machine, and the choice of `auto` among them.
 
 use serde::Serialize;
 
@@ -10,11 +10,11 @@ pub enum AdapterKind {
     Discrete,
     /// A GPU on the processor's chip.
     Integrated,
-    /// A share of a graphics card, assigned by a hypervisor.
+    /// A virtual GPU, assigned by a hypervisor.
     Virtual,
     /// Software that runs on the processor, such as Mesa's lavapipe.
     Software,
-    /// The driver does not say.
+    /// Not stated by the driver.
     Other,
 }
 
@@ -25,11 +25,11 @@ pub struct Adapter {
     pub name: String,
     /// Kind of hardware.
     pub kind: AdapterKind,
-    /// Vulkan, Metal or Dx12; Gl where nothing answers through these.
+    /// Vulkan, Metal or Dx12; Gl if no adapter answers through these.
     pub api: String,
     /// Driver and its version.
     pub driver: String,
-    /// Largest buffer a kernel may read, in bytes.
+    /// Largest buffer binding of a kernel, in bytes.
     pub max_binding_bytes: u64,
     /// Largest buffer, in bytes.
     pub max_buffer_bytes: u64,
@@ -76,7 +76,7 @@ mod enumeration {
     use wgpu::{Backends, DeviceType, Instance, InstanceDescriptor};
 
     impl Adapter {
-        /// What burn calls it.
+        /// burn's name for it.
         pub(crate) fn device_kind(&self) -> DeviceKind {
             match self.kind {
                 _ if self.is_opengl() => DeviceKind::DefaultDevice,
@@ -92,9 +92,9 @@ mod enumeration {
     /// All adapters, the most capable kind first; enumerated once. None in a build without the feature `wgpu`.
     pub fn adapters() -> &'static [Adapter] {
         static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
-        // A driver that panics when it is asked counts as absent.
+        // A driver that panics during enumeration counts as absent.
         let enumerate = |backends| std::panic::catch_unwind(|| enumerate(backends)).unwrap_or_default();
-        // burn takes OpenGL where there is nothing better. Beside Vulkan it would list the same cards again.
+        // burn uses OpenGL only if no other API has an adapter. Listing it beside Vulkan would list the same cards twice.
         ADAPTERS.get_or_init(|| Some(enumerate(Backends::PRIMARY)).filter(|all| !all.is_empty()).unwrap_or_else(|| enumerate(Backends::GL)))
     }
 
@@ -130,7 +130,7 @@ mod enumeration {
         all
     }
 
-    /// The value of a future that is ready when first polled, as wgpu's are outside browsers.
+    /// The value of a future that is ready at the first poll, as wgpu's futures are outside browsers.
     fn wait<T>(future: impl Future<Output = T>) -> T {
         let mut future = std::pin::pin!(future);
         let mut context = std::task::Context::from_waker(std::task::Waker::noop());
@@ -143,7 +143,7 @@ mod enumeration {
     }
 }
 
-/// The device that `auto` stands for, and why.
+/// The device name that `auto` resolves to, and the reason.
 pub fn auto_device() -> (&'static str, String) {
     if !cfg!(feature = "wgpu") {
         return ("flex", "this build has no wgpu backend, and flex is the CPU device burn recommends".into());

@@ -1,22 +1,22 @@
-//! Appearance: what lies between the rendered image and the one a camera recorded.
+//! Appearance models: corrections between the rendered image and the recorded image of a training camera.
 
 use crate::Plugin;
 use crate::{Parameter, ParameterGroup, Result, Seed};
 use burn::tensor::{Device, Tensor};
 
-/// What an appearance model must know before its weights mean anything.
+/// The properties of a scene that an appearance model is built for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AppearanceContext {
-    /// Cameras that training sees.
+    /// Number of training cameras.
     pub cameras: usize,
-    /// The model's own node of the seed tree.
+    /// The model's node of the seed tree.
     pub seed: Seed,
 }
 
-/// Turns rendered planes into those a camera records. Used in training only: held-out cameras and playback see the rendered image.
+/// Maps rendered planes to the planes that a camera records. Used in training only; held-out cameras and playback use the rendered image.
 pub trait Appearance: Send {
-    /// The planes `[5,H,W]` as training camera `camera` (0-based) records them; `None` is a camera that was not trained on, for which it must be the identity.
-    /// Alpha and depth stay.
+    /// The planes `[5,H,W]` as training camera `camera` (0-based) records them; `None` is a camera that was not trained on, for which the model must be the identity.
+    /// Alpha and depth are unchanged.
     fn apply(&self, planes: Tensor<3>, camera: Option<usize>) -> Result<Tensor<3>>;
     /// The weights, in a fixed order.
     fn parameters(&self) -> Vec<&Parameter> {
@@ -30,7 +30,7 @@ pub trait Appearance: Send {
     fn groups(&self) -> Vec<ParameterGroup> {
         Vec::new()
     }
-    /// A loss term `[1]` of its own.
+    /// An additional loss term `[1]`.
     fn regularizer(&self) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
@@ -38,7 +38,7 @@ pub trait Appearance: Send {
 
 /// An appearance model in the registry.
 pub struct AppearancePlugin {
-    /// Facts for people, tables and checks.
+    /// Name, version and other facts.
     pub info: Plugin,
     /// Builds the model from the `[appearance]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table, &AppearanceContext, &Device) -> Result<Box<dyn Appearance>>,

@@ -1,11 +1,11 @@
-//! The first seam: deformation fields.
+//! The deformer trait (deformation fields), its inputs and parameters.
 
 use crate::gaussians::CORE_ATTRIBUTES;
 use crate::{DeformerContext, Error, Offsets, Plugin, Result};
 use burn::tensor::{Device, Int, Tensor};
 use serde::{Deserialize, Serialize};
 
-/// Which share of the stored bytes a parameter counts towards (the paper's Deform-Grid and Deform-Net).
+/// The part of a model's size that a parameter is counted in (the paper's Deform-Grid and Deform-Net).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Part {
@@ -15,12 +15,12 @@ pub enum Part {
     Net,
 }
 
-/// One named weight array of a field. The optimizer replaces `value`; the field reads it at every call.
+/// A named weight array of a deformer. The optimizer replaces `value`; the deformer reads it at every call.
 #[derive(Clone, Debug)]
 pub struct Parameter {
-    /// Unique within the field.
+    /// Unique within the deformer.
     pub name: String,
-    /// Which share of the bytes it counts towards.
+    /// The part of the size that it is counted in.
     pub part: Part,
     /// The logical shape; `value` is flat.
     pub shape: Vec<usize>,
@@ -33,7 +33,7 @@ pub struct Parameter {
 /// How a set of parameters is optimised (Adam).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ParameterGroup {
-    /// For people and logs.
+    /// Display name.
     pub name: String,
     /// Learning rate at the first step.
     pub lr_start: f64,
@@ -56,27 +56,27 @@ impl ParameterGroup {
     }
 }
 
-/// What a call cost, counted rather than timed.
+/// Counts of the work of a call.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DeformerWork {
-    /// Gaussians asked about.
+    /// Number of Gaussians.
     pub gaussians: u64,
-    /// Corner queries before reuse.
+    /// Vertices needed before reuse: eight per Gaussian and level.
     pub vertices_queried: u64,
-    /// Vertices actually decoded; in training on a GPU, where nobody waits for their number, the most there can have been.
+    /// Vertices decoded. In training on a GPU the upper bound, because the exact number is not read back.
     pub vertices_decoded: u64,
 }
 
-/// Time-invariant features of M Gaussians and what they cost.
+/// Time-invariant features of M Gaussians and the work done for them.
 #[derive(Clone, Debug)]
 pub struct SpatialFeatures {
-    /// Features `[M, F]`. Only the field itself reads them; what lies where is its own affair.
+    /// Features `[M, F]`. Only the deformer itself reads them; their layout is its own.
     pub values: Tensor<2>,
     /// The work done for them.
     pub work: DeformerWork,
 }
 
-/// What the time-invariant half of a deformer is computed from: M Gaussians.
+/// Input of the time-invariant half of a deformer: M Gaussians.
 #[derive(Clone, Debug)]
 pub struct SpatialInput {
     /// Canonical centres in world units `[M,3]`. They are constants: no gradient flows to them.
@@ -86,11 +86,11 @@ pub struct SpatialInput {
 }
 
 impl SpatialInput {
-    /// Centres of a deformer without attributes.
+    /// Input for a deformer without attributes: centres [M,3] in world units.
     pub fn new(means_world: Tensor<2>) -> Self {
         Self { means_world, attributes: Vec::new() }
     }
-    /// Centres with the start value of each attribute of `deformer`.
+    /// Centres [M,3] in world units, with the start value of each attribute of `deformer`.
     pub fn at_start(means_world: Tensor<2>, deformer: &dyn Deformer) -> Self {
         let (m, device) = (means_world.dims()[0], means_world.device());
         let attributes = deformer.attributes().iter().map(|a| Tensor::full([m, a.width], a.start, &device)).collect();
@@ -104,18 +104,21 @@ impl SpatialInput {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// The Gaussians `rows` `[K]` of these.
+    /// The Gaussians with the indices `rows` `[K]`.
     pub fn select(&self, rows: &Tensor<1, Int>) -> Self {
         self.map(|values| values.clone().select(0, rows.clone()))
     }
-    /// The first `count` of these.
+    /// The first `count` Gaussians.
     pub fn first(&self, count: usize) -> Self {
         self.map(|values| values.clone().narrow(0, 0, count.min(self.len())))
     }
     fn map(&self, change: impl Fn(&Tensor<2>) -> Tensor<2>) -> Self {
         Self { means_world: change(&self.means_world), attributes: self.attributes.iter().map(&change).collect() }
     }
-    /// Refuses attributes other than those `wanted`, with their widths. `deformer` is the name in the error.
+    /// Refuses attributes whose number or shapes differ from `wanted`. `deformer` is the name in the error.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`].
     pub fn check(&self, deformer: &str, wanted: &[AttributeSpec]) -> Result<()> {
         let m = self.len();
         if self.attributes.len() == wanted.len() && self.attributes.iter().zip(wanted).all(|(a, spec)| a.dims() == [m, spec.width]) {
@@ -128,34 +131,38 @@ impl SpatialInput {
     }
 }
 
-/// A number or vector that a deformer keeps per Gaussian, learned beside its weights. It is one of the Gaussians' extra attributes: density control copies and
+/// A number or vector per Gaussian that a deformer learns in addition to its weights. It is one of the Gaussians' extra attributes: density control copies and
 /// removes it with its Gaussian, and checkpoints and archives store it by name.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AttributeSpec {
-    /// Name of the extra attribute: letters, digits, `_`, `-` and `.`; unique, and none of the names every Gaussian has.
+    /// Name of the extra attribute: letters, digits, `_`, `-` and `.`; unique, and not one of the attributes that every Gaussian has.
     pub name: String,
     /// Floats per Gaussian, at least 1.
     pub width: usize,
     /// Start value of every float.
     pub start: f32,
-    /// Start values are drawn uniformly from `start - spread` to `start + spread`, by the run's seed.
+    /// Start values are uniform random numbers from `start - spread` to `start + spread`, from the run's seed.
     pub spread: f32,
     /// Learning rate of the optimizer.
     pub lr: f64,
     /// Whether the rate is multiplied by the extent of the cameras (as that of the positions is).
     pub times_extent: bool,
-    /// The largest absolute error of a float that a lossy codec may make; `None` asks for the exact bits.
+    /// Largest absolute error of a float after lossy compression; `None` means bit-exact.
     pub tolerance: Option<f32>,
 }
 
 impl AttributeSpec {
-    /// An attribute that starts at `start`, learns at the rate `lr`, and is stored exactly.
+    /// An attribute of `width` floats with start value `start` and learning rate `lr`, stored exactly.
     pub fn new(name: &str, width: usize, start: f32, lr: f64) -> Self {
         Self { name: name.into(), width, start, spread: 0.0, lr, times_extent: false, tolerance: None }
     }
 }
 
-/// Refuses attribute lists that could not be stored: names that are empty, taken or not printable, and widths of 0.
+/// Refuses attributes that cannot be stored: names that are empty, duplicate, reserved or have other characters, widths outside 1..4096, and numbers that are
+/// not finite.
+///
+/// # Errors
+/// [`Error::Parameter`] that names the deformer and the attribute.
 pub fn check_attributes(deformer: &str, attributes: &[AttributeSpec]) -> Result<()> {
     let bad = |name: &str, problem: &str| {
         Err(Error::parameter(format!("deformer {deformer}: attribute '{name}'"), problem, "Give each attribute its own name and at least one float"))
@@ -181,19 +188,19 @@ pub fn check_attributes(deformer: &str, attributes: &[AttributeSpec]) -> Result<
     Ok(())
 }
 
-/// A deformation field: canonical Gaussians in, offsets at a time out (paper Section IV-B).
+/// A deformer (deformation field): from canonical Gaussians to offsets at a time (paper Section IV-B).
 ///
-/// The time-invariant half is a call of its own so that playback can cache it; training recomputes it every step.
+/// The time-invariant half is a separate call, so that playback can cache it. Training recomputes it every step.
 pub trait Deformer: Send {
-    /// Features of M Gaussians, from their centres and the attributes that the deformer keeps per Gaussian.
+    /// Features of M Gaussians, from their centres and the attributes of [`Deformer::attributes`].
     fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures>;
-    /// What the deformer keeps per Gaussian; [`Deformer::spatial`] receives the values.
+    /// The deformer's attributes per Gaussian; [`Deformer::spatial`] receives their values.
     fn attributes(&self) -> Vec<AttributeSpec> {
         Vec::new()
     }
     /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` `[M,F]`; the same heads at every time.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
-    /// The same features as [`Deformer::deform`] reads them fastest. Playback asks for this once per spatial pass.
+    /// The same features in the layout that [`Deformer::deform`] reads fastest. Playback calls this once per spatial pass.
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
         features
     }
@@ -203,22 +210,22 @@ pub trait Deformer: Send {
     fn parameters_mut(&mut self) -> Vec<&mut Parameter>;
     /// The optimizer groups that [`Parameter::group`] points into.
     fn groups(&self) -> Vec<ParameterGroup>;
-    /// Whether playback may keep spatial features between frames.
+    /// Whether playback may cache spatial features between frames.
     fn caches_spatial(&self) -> bool {
         true
     }
-    /// Whether the field never moves anything, so that every stage may skip it.
+    /// Whether the deformer never moves anything, so that every stage may skip it.
     fn is_static(&self) -> bool {
         false
     }
-    /// A loss term `[1]` of the deformer's own, for the moving Gaussians at a time, at `progress` in 0..1 of the main stage.
+    /// An additional loss term `[1]` for the moving Gaussians at `time_norm` (0..1); `progress` (0..1) is that of the main stage.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
-    /// How far the main stage of training is, 0 to 1; called before every step. Default: progress 1, as after training.
+    /// Sets the progress of the main stage of training, 0..1; called before every step. A deformer without such a call has progress 1, as after training.
     fn set_progress(&mut self, _progress: f32) {}
-    /// After training, a smaller field that does nearly the same: without what this scene does not use. `features` `[M,F]` are those of all Gaussians that move,
-    /// `times` the normalised times of the frames.
+    /// After training, a smaller deformer with nearly the same offsets, without parts that this scene does not use; `None` if there is none. `features` `[M,F]` are
+    /// those of all moving Gaussians, `times` the normalised times of the frames.
     fn simplified(&self, _features: Tensor<2>, _times: &[f32]) -> Result<Option<Simplified>> {
         Ok(None)
     }
@@ -229,21 +236,21 @@ pub trait Deformer: Send {
     }
 }
 
-/// What [`Deformer::simplified`] returns.
+/// The result of [`Deformer::simplified`].
 pub struct Simplified {
-    /// The smaller field.
+    /// The smaller deformer.
     pub field: Box<dyn Deformer>,
-    /// The settings that build it, without `kind`.
+    /// The `[deformer]` settings that build it, without `kind`.
     pub settings: toml::Table,
-    /// What was left out, for people.
+    /// A message that says what was dropped.
     pub message: String,
 }
 
-/// A deformation field in the registry.
+/// A deformer in the registry.
 pub struct DeformerPlugin {
-    /// Facts for people, tables and checks.
+    /// Name, version and other facts.
     pub info: Plugin,
-    /// Builds a fresh field. The table is the `[deformer]` section without `kind`; unknown keys are errors.
+    /// Builds a deformer with initial weights. The table is the `[deformer]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>,
 }
 cc4dgs_format::plugin_kind!(DeformerPlugin, "deformer");

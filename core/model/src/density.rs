@@ -1,17 +1,17 @@
 //! Density control: which Gaussians are added, moved and removed during training.
 //!
-//! A control sees statistics of the rendered views and answers with a [`DensityPlan`]. The trainer carries the plan out, so that attributes of plug-ins, optimizer state and
-//! checkpoints are handled in one place.
+//! A control observes statistics of rendered views and returns a [`DensityPlan`]. The trainer executes the plan, so that the trainer alone handles attributes of
+//! plug-ins, optimizer state and checkpoints.
 
 use crate::Plugin;
 use crate::gaussians::to_vec;
 use crate::{Error, Gaussians, Result, Schedule, Seed};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-/// A statistic that the rasterizer collects only when asked.
+/// A statistic that the rasterizer collects only on request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Statistic {
-    /// Gradient of the loss by the projected centres.
+    /// Gradient of the loss with respect to the projected centres.
     ScreenGradient,
     /// Sum over pixels of the absolute values of that gradient (AbsGS).
     AbsoluteScreenGradient,
@@ -19,7 +19,7 @@ pub enum Statistic {
     MaxWeight,
 }
 
-/// What one rendered view says of N Gaussians. Fields that were not asked for are `None`.
+/// Statistics of N Gaussians in one rendered view. Fields that were not requested are `None`.
 #[derive(Clone, Debug)]
 pub struct ViewStatistics {
     /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
@@ -32,18 +32,18 @@ pub struct ViewStatistics {
     pub max_weights: Option<Tensor<1>>,
     /// Image size in pixels.
     pub size: (u32, u32),
-    /// Views of this iteration; the loss behind the gradients was divided by it.
+    /// Number of views of this iteration. The loss of the gradients was divided by it.
     pub views: usize,
 }
 
-/// Numbers of what a plan does, for events.
+/// Counts of a plan's actions, for events.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DensityReport {
     /// Copies added.
     pub cloned: usize,
     /// Gaussians replaced by two smaller ones.
     pub split: usize,
-    /// Gaussians moved to another place.
+    /// Gaussians relocated.
     pub moved: usize,
     /// Gaussians removed.
     pub removed: usize,
@@ -54,20 +54,20 @@ pub struct DensityReport {
 pub struct RowValues {
     /// Name of the attribute, as in [`Gaussians::attribute`].
     pub attribute: String,
-    /// Rows of the new set, each at most once.
+    /// Rows of the new Gaussians, each at most once.
     pub rows: Vec<usize>,
     /// Floats of each row, row-major.
     pub values: Vec<f32>,
 }
 
-/// What becomes of the Gaussians: every row of the new set has a parent among the old rows, whose attributes it inherits. Rows that no new row names are removed.
+/// The next set of Gaussians: every new row has a parent among the old rows, whose attributes it inherits. Old rows without a new row are removed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct DensityPlan {
     parents: Vec<usize>,
     fresh: Vec<bool>,
     values: Vec<RowValues>,
     restarted: Vec<String>,
-    /// What is told of it.
+    /// Counts for events.
     pub report: DensityReport,
 }
 
@@ -84,8 +84,8 @@ impl DensityPlan {
     pub fn keep(&mut self, row: usize) -> usize {
         self.add(row, false)
     }
-    /// Adds a Gaussian with the attributes of the old row `parent`, whose optimizer state starts from zero; returns its new row. A split is two copies with new values and no
-    /// [`DensityPlan::keep`] of the parent; a relocation is a copy in place of a row that is not kept.
+    /// Adds a Gaussian with the attributes of the old row `parent` and zero optimizer state; returns its new row. A split is two copies with new values, without
+    /// [`DensityPlan::keep`] of the parent. A relocation is a copy instead of keeping a dead row.
     pub fn copy(&mut self, parent: usize) -> usize {
         self.add(parent, true)
     }
@@ -94,7 +94,7 @@ impl DensityPlan {
         self.fresh.push(fresh);
         self.parents.len() - 1
     }
-    /// Gives the new row `row` other values of `attribute`.
+    /// Sets `attribute` of the new row `row` to `values` [width].
     pub fn set(&mut self, row: usize, attribute: &str, values: &[f32]) {
         match self.values.iter_mut().find(|v| v.attribute == attribute) {
             Some(found) => {
@@ -104,19 +104,19 @@ impl DensityPlan {
             None => self.values.push(RowValues { attribute: attribute.into(), rows: vec![row], values: values.to_vec() }),
         }
     }
-    /// Lets the optimizer state of `attribute` start from zero in all rows (opacity resets).
+    /// Resets the optimizer state of `attribute` to zero in all rows (opacity resets).
     pub fn restart(&mut self, attribute: &str) {
         self.restarted.push(attribute.into());
     }
-    /// Gaussians of the new set.
+    /// Number of new rows.
     pub fn len(&self) -> usize {
         self.parents.len()
     }
-    /// Whether the new set has none.
+    /// Whether there are no new rows.
     pub fn is_empty(&self) -> bool {
         self.parents.is_empty()
     }
-    /// The old row behind every new one.
+    /// The parent (old row) of every new row.
     pub fn parents(&self) -> &[usize] {
         &self.parents
     }
@@ -124,7 +124,7 @@ impl DensityPlan {
     pub fn fresh(&self) -> &[bool] {
         &self.fresh
     }
-    /// Values that are set after the rows are in place.
+    /// Values that are set after the rows are copied.
     pub fn values(&self) -> &[RowValues] {
         &self.values
     }
@@ -132,11 +132,11 @@ impl DensityPlan {
     pub fn restarted(&self) -> &[String] {
         &self.restarted
     }
-    /// Whether rows stay as and where they are.
+    /// Whether all `count` rows are kept in their order.
     pub fn keeps_all(&self, count: usize) -> bool {
         self.parents.len() == count && self.parents.iter().enumerate().all(|(i, &p)| i == p) && !self.fresh.contains(&true)
     }
-    /// The Gaussians after the plan, on the same device. Check it first.
+    /// The Gaussians after the plan, on the same device. Call [`DensityPlan::check`] first.
     pub fn apply(&self, gaussians: &Gaussians) -> Result<Gaussians> {
         let device = gaussians.means.device();
         let rows = (!self.keeps_all(gaussians.len())).then(|| index_tensor(&self.parents, &device));
@@ -158,7 +158,11 @@ impl DensityPlan {
         let attributes = changed.collect::<Result<Vec<_>>>()?;
         Gaussians::from_attributes(gaussians.sh_degree, attributes)
     }
-    /// Refuses plans that name rows or attributes `gaussians` do not have, remove everything, or set values that are not finite.
+    /// Refuses plans that refer to rows or attributes that `gaussians` do not have, remove all Gaussians, or set values that are not finite. `control` is the name in
+    /// errors.
+    ///
+    /// # Errors
+    /// [`Error::Backend`].
     pub fn check(&self, control: &str, gaussians: &Gaussians) -> Result<()> {
         let bad =
             |problem: String| Err(Error::backend(format!("density control {control}"), problem, "Correct the plan it returns, or choose another control"));
@@ -167,17 +171,17 @@ impl DensityPlan {
             return bad(format!("its plan removes all {count} Gaussians"));
         }
         if let Some(row) = self.parents.iter().find(|&&row| row >= count) {
-            return bad(format!("its plan names row {row} of {count}"));
+            return bad(format!("its plan refers to row {row} of {count}"));
         }
         for set in &self.values {
             let Some(width) = gaussians.attribute(&set.attribute).map(|a| a.dims()[1]) else {
                 return bad(format!("its plan sets the attribute '{}', which the Gaussians do not have", set.attribute));
             };
             if set.values.len() != width * set.rows.len() {
-                return bad(format!("its plan sets {} values of '{}' in {} rows of width {width}", set.values.len(), set.attribute, set.rows.len()));
+                return bad(format!("its plan sets {} values of '{}' for {} rows of width {width}", set.values.len(), set.attribute, set.rows.len()));
             }
             if let Some(row) = set.rows.iter().find(|&&row| row >= self.len()) {
-                return bad(format!("its plan sets '{}' of row {row}; the new set has {}", set.attribute, self.len()));
+                return bad(format!("its plan sets '{}' of row {row} of {}", set.attribute, self.len()));
             }
             if let Some(value) = set.values.iter().find(|v| !v.is_finite()) {
                 return bad(format!("its plan sets '{}' to {value}", set.attribute));
@@ -194,30 +198,30 @@ fn index_tensor(rows: &[usize], device: &Device) -> Tensor<1, Int> {
     Tensor::from_data(TensorData::new(rows, [count]), device)
 }
 
-/// Adds, moves and removes Gaussians during the coarse and the main stage. It owns its settings, its statistics, and what it writes to checkpoints.
+/// Adds, moves and removes Gaussians during the coarse and the main stage. It owns its settings, its statistics, and its state in checkpoints.
 pub trait DensityControl: Send {
     /// A stage begins with `count` Gaussians: statistics start from zero.
     fn begin_stage(&mut self, count: usize, device: &Device);
-    /// Which statistics it wants of the views of this iteration.
+    /// The optional statistics that it needs from the views of this iteration.
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic>;
-    /// Takes the statistics of one view, after the backward pass.
+    /// Receives the statistics of one view, after the backward pass.
     fn observe(&mut self, view: &ViewStatistics) -> Result<()>;
-    /// After the optimizer step of an iteration: what is due now, `None` for nothing. The trainer carries the plan out before the next iteration; the control's own statistics must
-    /// fit the new set when this returns. Everything random comes from `seed`, which is another one in every iteration.
+    /// The plan after the optimizer step of an iteration; `None` for no change. The trainer executes it before the next iteration. When this returns, the control's own
+    /// statistics must already match the new Gaussians. All randomness comes from `seed`, which differs in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
-    /// After every optimizer step: attributes with new values of all rows `[N,width]`, which keep their optimizer state (the noise of 3DGS-MCMC).
+    /// Called after every optimizer step. Returns attributes with new values for all rows `[N,width]`; their optimizer state is kept (for the noise of 3DGS-MCMC).
     fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         Ok(Vec::new())
     }
-    /// What checkpoints must keep, by name.
+    /// State for checkpoints, by name.
     fn state(&self) -> Vec<(String, Tensor<1>)>;
-    /// Takes back what [`DensityControl::state`] returned, for `count` Gaussians. Arrays come from a file: an error, never a panic.
+    /// Restores what [`DensityControl::state`] returned, for `count` Gaussians. Arrays are untrusted: an error, never a panic.
     fn restore(&mut self, state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()>;
 }
 
 /// A density control in the registry.
 pub struct DensityPlugin {
-    /// Facts for people, tables and checks.
+    /// Name, version and other facts.
     pub info: Plugin,
     /// Builds the control from the `[density]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table) -> Result<Box<dyn DensityControl>>,
@@ -260,7 +264,7 @@ mod tests {
     fn plans_are_checked() {
         let g = three();
         assert!(DensityPlan::unchanged(3).check("t", &g).is_ok() && DensityPlan::unchanged(3).keeps_all(3));
-        assert!(DensityPlan::new().check("t", &g).is_err(), "nothing is left");
+        assert!(DensityPlan::new().check("t", &g).is_err(), "no Gaussian is left");
         assert!(DensityPlan::unchanged(4).check("t", &g).is_err(), "there is no fourth row");
         let with = |attribute: &str, values: &[f32]| {
             let mut plan = DensityPlan::new();

@@ -10,7 +10,7 @@ pub const DEVICE_NAMES: [&str; 5] = ["auto", "flex", "ndarray", "wgpu", "cuda"];
 /// Turns a device name into a burn device. `auto` is wgpu on a graphics card and flex without one; see [`auto_device`].
 ///
 /// # Errors
-/// [`Error::Parameter`] for an unknown name, [`Error::Unsupported`] where the device does not answer.
+/// [`Error::Parameter`] for an unknown name, [`Error::Unsupported`] if the device is missing or not in this build.
 pub fn parse_device(name: &str) -> Result<Device> {
     match name {
         "auto" => parse_device(auto_device().0),
@@ -37,7 +37,7 @@ fn processor_device(name: &str) -> Result<Device> {
 #[cfg(feature = "cuda")]
 fn cuda_device() -> Result<Device> {
     let device = || Device::cuda(0);
-    // A missing driver is reported by panicking.
+    // burn reports a missing driver by panicking.
     match std::panic::catch_unwind(|| burn::tensor::Tensor::<1>::from_floats([1.0, 2.0], &device()).sum().into_scalar::<f32>()) {
         Ok(sum) if sum == 3.0 => Ok(device()),
         _ => Err(Error::unsupported("device cuda", "no CUDA driver answers", "Use --device wgpu or flex")),
@@ -84,10 +84,10 @@ mod adapter {
         static ANSWERS: Mutex<BTreeMap<usize, bool>> = Mutex::new(BTreeMap::new());
         let kind = match adapters().get(index) {
             Some(adapter) => adapter.device_kind(),
-            // burn may reach an adapter that enumeration does not list.
+            // burn may find an adapter that enumeration does not list.
             None if index == 0 => DeviceKind::DefaultDevice,
             None => {
-                let problem = format!("this machine has {} adapters", adapters().len());
+                let problem = format!("there is no such adapter; this machine has {} adapters", adapters().len());
                 return Err(Error::unsupported(format!("device wgpu:{index}"), problem, "`cc4dgs doctor` lists them"));
             }
         };
@@ -105,13 +105,13 @@ mod adapter {
         }
         Err(Error::unsupported(
             "device wgpu",
-            "no graphics adapter answers",
+            "no graphics adapter was found (Vulkan, Metal, Dx12 or OpenGL)",
             "Install a Vulkan driver (mesa-vulkan-drivers for a software one), or use --device flex",
         ))
     }
 
-    /// Lets the process end without the static destructors of graphics drivers: Mesa's software one destroys its compiler while a thread may still be compiling
-    /// the last kernels with it, which killed about one process in four after its work was done.
+    /// Ends the process without the static destructors of graphics drivers. Mesa's software driver destroys its compiler while a thread may still be compiling kernels
+    /// with it; about one process in four crashed at exit.
     fn end_without_destructors() {
         #[cfg(all(target_os = "linux", target_env = "gnu"))]
         {
@@ -121,12 +121,12 @@ mod adapter {
             }
             extern "C" fn leave(status: i32, _: *mut std::ffi::c_void) {
                 use std::io::Write;
-                // Nothing can be done about an error here.
+                // An error cannot be handled here.
                 let _ = std::io::stdout().flush();
-                // SAFETY: ends the process; takes no memory.
+                // SAFETY: ends the process without touching memory.
                 unsafe { _exit(status) }
             }
-            // SAFETY: the handler is a function of this program and keeps no context.
+            // SAFETY: the handler is a function of this program and has no context.
             unsafe { on_exit(leave, std::ptr::null_mut()) };
         }
     }

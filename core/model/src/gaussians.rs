@@ -49,6 +49,9 @@ impl Gaussians {
         }
     }
     /// Reads the tensors back into plain arrays.
+    ///
+    /// # Errors
+    /// [`Error::Backend`] if a tensor cannot be read.
     pub fn to_host(&self) -> Result<HostGaussians> {
         Ok(HostGaussians {
             sh_degree: self.sh_degree,
@@ -70,7 +73,7 @@ impl Gaussians {
     pub fn attribute_names(&self) -> Vec<String> {
         CORE_ATTRIBUTES.iter().map(ToString::to_string).chain(self.extra.keys().cloned()).collect()
     }
-    /// An attribute by name, as rows `[N,width]`; `None` if there is none of this name.
+    /// An attribute by name, as rows `[N,width]`; `None` for an unknown name.
     pub fn attribute(&self, name: &str) -> Option<Tensor<2>> {
         let n = self.len();
         Some(match name {
@@ -84,7 +87,10 @@ impl Gaussians {
             other => self.extra.get(other)?.clone(),
         })
     }
-    /// Gaussians of named attributes `[N,width]`. A core attribute that is missing is an error; every other name is an attribute of a plug-in.
+    /// Gaussians from named attributes `[N,width]`. Names that are not core attributes are attributes of plug-ins.
+    ///
+    /// # Errors
+    /// [`Error::Data`] if a core attribute is missing or has another width.
     pub fn from_attributes(sh_degree: usize, attributes: impl IntoIterator<Item = (String, Tensor<2>)>) -> Result<Self> {
         let mut by_name: BTreeMap<String, Tensor<2>> = attributes.into_iter().collect();
         let mut take = |name: &str, width: usize| match by_name.remove(name) {
@@ -122,6 +128,9 @@ impl Gaussians {
 }
 
 /// Reads a float tensor back, row-major; `object` names it in errors.
+///
+/// # Errors
+/// [`Error::Backend`] if the device fails.
 pub fn to_vec<const D: usize>(tensor: Tensor<D>, object: &str) -> Result<Vec<f32>> {
     tensor
         .into_data()

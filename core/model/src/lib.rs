@@ -1,7 +1,8 @@
-//! The tensor nouns, the seams of training and playback, and the registry of cc4dgs.
+//! Gaussians, cameras and scenes as tensors, the traits of plug-ins for training and playback, and the registry of cc4dgs.
 //!
-//! A plug-in crate depends on this crate alone (burn, inventory, serde and toml are re-exported in the versions that it uses): implement [`Deformer`] or
-//! [`Rasterizer`] and `inventory::submit!` a [`DeformerPlugin`] or [`RasterizerPlugin`]. Codecs need only `cc4dgs-format`, of which everything is re-exported here.
+//! A plug-in crate depends on this crate alone (burn, inventory, serde and toml are re-exported in the versions that it uses): implement a trait such as
+//! [`Deformer`] or [`Rasterizer`] and submit a [`DeformerPlugin`] or [`RasterizerPlugin`] through `inventory::submit!`. Codecs need only `cc4dgs-format`, whose
+//! items are re-exported here.
 
 mod adapters;
 mod appearance;

@@ -1,7 +1,8 @@
-//! From a burn module and two functions to a deformation field.
+//! A deformer made of a burn module and two functions.
 //!
-//! burn's `Module` is not object safe and owns its weights; a field is a trait object whose weights the optimizer replaces. This adapter keeps the weights
-//! flat and hands a module made of the current ones to the author's functions, so that a new field is its layers, its two functions and a registration.
+//! burn's `Module` is not object safe and owns its weights; a deformer is a trait object whose weights the optimizer replaces. This adapter stores the weights
+//! as flat arrays and calls the author's functions with a module that has the current weights. So a new deformer consists of its layers, two functions and a
+//! registration.
 
 use crate::{AttributeSpec, Deformer, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Result, SpatialFeatures, SpatialInput};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
@@ -9,12 +10,12 @@ use burn::tensor::Tensor;
 
 /// A loss term of a module: module, input, normalised time, progress.
 type Regularizer<M> = Box<dyn Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send>;
-/// Changes a module, weights excepted, as training advances.
+/// Changes a module, except for its weights, as training advances.
 type Progress<M> = Box<dyn Fn(&mut M, f32) + Send>;
 
 /// A [`Deformer`] made of a module `M`: `spatial(module, input)` gives features `[M,F]`, `deform(module, features, time_norm)` offsets.
 ///
-/// Both functions see the weights of the current step; gradients flow through them. Register it like any deformer: `build` returns it in a box.
+/// Both functions receive the weights of the current step; gradients flow through them. Register it like any deformer: `build` returns it in a box.
 pub struct ModuleDeformer<M, S, D> {
     module: M,
     spatial: S,
@@ -33,7 +34,8 @@ where
     S: Fn(&M, &SpatialInput) -> Result<Tensor<2>> + Send,
     D: Fn(&M, Tensor<2>, f32) -> Result<Offsets> + Send,
 {
-    /// All float weights of `module` in one optimizer group, counted as network bytes. Names are the paths of the module tree (`trunk.0.weight`).
+    /// A deformer whose weights are all float weights of `module`, in one optimizer group and counted as network. Names are paths of the module tree
+    /// (`trunk.0.weight`).
     pub fn new(module: M, group: ParameterGroup, spatial: S, deform: D) -> Self {
         let mut list = Collector { path: Vec::new(), parameters: Vec::new() };
         module.visit(&mut list);
@@ -49,22 +51,22 @@ where
             cached: true,
         }
     }
-    /// What it keeps per Gaussian; `spatial` receives the values in [`SpatialInput::attributes`], in this order.
+    /// Adds attributes per Gaussian; `spatial` receives their values in [`SpatialInput::attributes`], in this order.
     pub fn with_attributes(mut self, attributes: Vec<AttributeSpec>) -> Self {
         self.attributes = attributes;
         self
     }
-    /// A loss term `[1]` of its own: `term(module, input, time_norm, progress)`.
+    /// Adds a loss term `[1]`: `term(module, input, time_norm, progress)`.
     pub fn with_regularizer(mut self, term: impl Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send + 'static) -> Self {
         self.regularizer = Some(Box::new(term));
         self
     }
-    /// `change(module, progress)` is called before every training step, progress from 0 to 1. It may change anything but weights.
+    /// Calls `change(module, progress)` before every training step, with progress in 0..1. It may change anything except weights.
     pub fn with_progress(mut self, change: impl Fn(&mut M, f32) + Send + 'static) -> Self {
         self.progress = Some(Box::new(change));
         self
     }
-    /// Counts weights whose path starts with `prefix` as grid bytes, and gives them an optimizer group of their own if one is named.
+    /// Counts weights whose path starts with `prefix` as grid, and puts them into their own optimizer group if `group` is given.
     pub fn with_grid(mut self, prefix: &str, group: Option<ParameterGroup>) -> Self {
         let index = match group {
             Some(group) => {
@@ -79,7 +81,7 @@ where
         }
         self
     }
-    /// Whether playback may keep spatial features between frames (it may, unless told otherwise).
+    /// Sets whether playback may cache spatial features between frames; default: true.
     pub fn with_cache(mut self, cached: bool) -> Self {
         self.cached = cached;
         self
@@ -148,7 +150,7 @@ impl ModuleVisitor for Collector {
         let count: usize = shape.iter().product();
         let mut name = self.path.join(".");
         if name.is_empty() || self.parameters.iter().any(|p| p.name == name) {
-            // A path that does not tell weights apart still needs unique names in files.
+            // Paths may be equal, but names in files must be unique.
             name = format!("{name}#{}", self.parameters.len());
         }
         self.parameters.push(Parameter { name, part: Part::Net, shape, value: value.reshape([count]), group: 0 });

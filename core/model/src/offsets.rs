@@ -1,21 +1,21 @@
-//! What a deformation field returns, and the one function that applies it.
+//! Offsets, the output of a deformer, and their application to Gaussians.
 
 use crate::{Error, Gaussians, Result};
 use burn::tensor::activation::{log_sigmoid, sigmoid};
 use burn::tensor::{Int, Tensor};
 
-/// Scales that changes would take below this stay there, world units.
+/// Lower bound on scales after a change, world units.
 const LEAST_SCALE: f32 = 1e-7;
-/// What is left of 1 beside an opacity is not taken for less than this.
+/// Lower bound on 1 - opacity.
 const LEAST_REST: f32 = 1e-30;
-/// Added to squared angles, so that no rotation at all has a derivative.
+/// Added to squared angles, so that the derivative at angle zero is finite.
 const LEAST_SQUARED_ANGLE: f32 = 1e-14;
-/// Norms of quaternions are not taken for smaller than this.
+/// Lower bound on the norm of quaternions.
 const LEAST_NORM: f32 = 1e-12;
 
-/// Time-dependent changes of M Gaussians (a row per Gaussian the field was asked about). Every head is optional.
+/// Time-dependent changes of M Gaussians, a row per moving Gaussian. Every head is optional.
 ///
-/// Offsets are added to the raw parameters, before activation (paper Section IV-B; Swift4D, 4DGS, E-D3DGS), except where a field says otherwise.
+/// Offsets are added to the raw parameters, before activation (paper Section IV-B; Swift4D, 4DGS, E-D3DGS), except for the heads documented otherwise.
 #[derive(Clone, Debug, Default)]
 pub struct Offsets {
     /// Change of the centres in world units `[M,3]`.
@@ -26,20 +26,23 @@ pub struct Offsets {
     pub scales: Option<Tensor<2>>,
     /// Change of the raw quaternions `[M,4]`.
     pub quaternions: Option<Tensor<2>>,
-    /// Rotations in front of the canonical ones, axis times angle in radians, world axes `[M,3]`. Unlike sums of quaternions they compose, however far they turn.
+    /// Rotations in front of the canonical ones, axis times angle in radians, world axes `[M,3]`. Unlike sums of quaternions they are exact for any angle.
     pub rotation_vectors: Option<Tensor<2>>,
     /// Whether quaternions are normalised before they are changed (Deformable 3DGS, Grid4D).
     pub unit_quaternions: bool,
     /// Change of the opacity logits `[M]`.
     pub opacity_logits: Option<Tensor<1>>,
-    /// Logarithm of a factor of the opacity after its activation, at most 0 `[M]` (Gaussians that come and go).
+    /// Logarithm of a factor of the opacity after its activation, at most 0 `[M]` (Gaussians that appear and vanish).
     pub opacity_log_factor: Option<Tensor<1>>,
     /// Change of all spherical-harmonics coefficients, degree 0 first `[M, (d+1)^2, 3]`.
     pub sh: Option<Tensor<3>>,
 }
 
 impl Offsets {
-    /// Refuses heads whose shape is not the one documented here for `count` Gaussians; the error names `deformer` and the head.
+    /// Refuses heads whose shape for `count` Gaussians is not the documented one.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] that names `deformer` and the head.
     pub fn check(&self, deformer: &str, count: usize) -> Result<()> {
         fn dims<const D: usize>(tensor: &Option<Tensor<D>>) -> Option<Vec<usize>> {
             tensor.as_ref().map(|t| t.dims().to_vec())
@@ -69,7 +72,10 @@ impl Offsets {
             _ => Ok(()),
         }
     }
-    /// Refuses offsets that are not finite; the error names `deformer` and the head. Reads one number per head back.
+    /// Refuses offsets that are not finite. Reads one number per head back from the device.
+    ///
+    /// # Errors
+    /// [`Error::Backend`] that names `deformer` and the head.
     pub fn check_finite(&self, deformer: &str) -> Result<()> {
         fn sum<const D: usize>(tensor: &Option<Tensor<D>>) -> Option<Tensor<1>> {
             tensor.as_ref().map(|t| t.clone().sum())
@@ -85,7 +91,7 @@ impl Offsets {
             ("sh", sum(&self.sh)),
         ];
         for (head, sum) in heads {
-            // A sum is finite only if every summand is, and shader compilers do not simplify it.
+            // A sum is finite only if every summand is; shader compilers do not optimise it away.
             if let Some(total) = sum.map(|t| t.into_scalar::<f32>()).filter(|total| !total.is_finite()) {
                 return Err(Error::backend(
                     format!("deformer {deformer}, head {head}"),
@@ -96,8 +102,7 @@ impl Offsets {
         }
         Ok(())
     }
-    /// Applies the offsets to the Gaussians `rows` `[M]`; `None` means that row i of the offsets belongs to Gaussian i, for the first M.
-    /// Everything else is returned as it came.
+    /// Applies the offsets to the Gaussians with the indices `rows` `[M]`; `None` means the first M. All other Gaussians are returned unchanged.
     ///
     /// # Errors
     /// [`Error::Parameter`] with the name of `deformer` and of the head, for a head of another shape.
@@ -106,7 +111,7 @@ impl Offsets {
         self.check(deformer, count)?;
         Ok(self.applied(canonical, rows))
     }
-    /// Rows of the first head there is.
+    /// Number of rows of the first head that is present.
     fn rows(&self) -> Option<usize> {
         let two = [&self.means, &self.log_scales, &self.scales, &self.quaternions, &self.rotation_vectors];
         let one = [&self.opacity_logits, &self.opacity_log_factor];
@@ -146,7 +151,7 @@ impl Offsets {
             moved.sh_dc = add(moved.sh_dc, Some(dc), rows);
             if k > 1 {
                 let rest = sh.slice([0..m, 1..k, 0..3]);
-                // A field may drive fewer degrees than the Gaussians store.
+                // A deformer may change fewer degrees than the Gaussians have.
                 let stored = moved.sh_rest.dims()[1];
                 let rest = if stored > k - 1 {
                     let padding = Tensor::zeros([m, stored - (k - 1), 3], &rest.device());
@@ -159,8 +164,8 @@ impl Offsets {
         }
         moved
     }
-    /// Applies the offsets to `moving` `[M]` and writes the results over the first M Gaussians of `frame` [N >= M]: in place where nobody else holds them, and
-    /// without touching what no head changes or the Gaussians behind.
+    /// Applies the offsets to `moving` `[M]` and writes the results to the first M Gaussians of `frame` [N >= M]. The update is in place if `frame` holds the only
+    /// reference. Attributes that no head changes and all other Gaussians stay unchanged.
     ///
     /// # Errors
     /// As [`Offsets::apply`].
@@ -190,7 +195,7 @@ impl Offsets {
         }
         Ok(frame)
     }
-    /// All heads side by side as one matrix `[M, total width]`, for regularisers; `None` when every head is off.
+    /// All heads concatenated as one matrix `[M, total width]`, for regularisers; `None` without heads.
     pub fn concatenated(&self) -> Option<Tensor<2>> {
         let mut parts: Vec<Tensor<2>> = Vec::new();
         parts.extend(self.means.clone());
@@ -205,7 +210,7 @@ impl Offsets {
     }
 }
 
-/// Quaternions `[M,4]` with the rotations `vectors` `[M,3]` in front of them; their lengths stay.
+/// Quaternions `[M,4]` multiplied from the left by the rotations `vectors` `[M,3]` (axis times angle in radians); norms are unchanged.
 fn turned(quaternions: Tensor<2>, vectors: Tensor<2>) -> Tensor<2> {
     let angle = (vectors.clone() * vectors.clone()).sum_dim(1).add_scalar(LEAST_SQUARED_ANGLE).sqrt();
     let half = angle.clone().mul_scalar(0.5);
@@ -246,7 +251,7 @@ fn over<const D: usize>(base: Tensor<D>, first: Tensor<D>) -> Tensor<D> {
     if len == 0 || first.dims() == dims {
         return if len == 0 { base } else { first };
     }
-    // One stretch of memory, whatever the shape.
+    // As one contiguous array, for any shape.
     let flat = base.reshape([dims.iter().product::<usize>()]);
     flat.slice_assign(burn::tensor::s![0..len], first.reshape([len])).reshape(dims)
 }

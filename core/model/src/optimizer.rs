@@ -1,18 +1,18 @@
-//! Optimizers: from gradients to new values. The state (moments, step counts) belongs to the optimizer and is found by the name of the array.
+//! Optimizers: from gradients to new values. The optimizer owns its state (moments, step counts), which is stored by the name of the array.
 
 use crate::Plugin;
 use crate::{Error, Result};
 use burn::tensor::{Int, Tensor};
 use std::collections::BTreeMap;
 
-/// One step of one array.
+/// Settings of one step of one array.
 #[derive(Clone, Debug)]
 pub struct StepSettings<'a> {
     /// Learning rate.
     pub lr: f64,
-    /// Added to the denominator, where the optimizer has one.
+    /// Added to the denominator, if the optimizer has one.
     pub epsilon: f64,
-    /// Rows `[N]` that are 0 keep values and state; `None` steps all rows.
+    /// Rows `[N]` that are 0 keep values and state; `None` updates all rows.
     pub visible: Option<&'a Tensor<1, Int>>,
 }
 
@@ -23,39 +23,45 @@ impl StepSettings<'_> {
     }
 }
 
-/// What an optimizer keeps between steps, for checkpoints.
+/// The state of an optimizer between steps, for checkpoints.
 #[derive(Clone, Debug, Default)]
 pub struct OptimizerState {
-    /// Arrays `[N,W]` by name; the name begins with that of the array they belong to and a slash.
+    /// Arrays `[N,W]` by name; the name is that of the optimised array, a slash, and a suffix.
     pub arrays: BTreeMap<String, Tensor<2>>,
-    /// Step counts by name of the array they belong to.
+    /// Step counts by name of the optimised array.
     pub steps: BTreeMap<String, u64>,
 }
 
-/// Steps named arrays along their gradients.
+/// Updates named arrays by their gradients.
 pub trait Optimizer: Send {
-    /// The values after one step. `value` and `gradient` are `[N,W]`, plain tensors; an array that was not seen before starts with empty state.
+    /// The values after one step. `value` and `gradient` are `[N,W]`, plain tensors; a new array starts with zero state.
     fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>>;
-    /// Forgets the state of all arrays whose names begin with `prefix`.
+    /// Removes the state of all arrays whose names begin with `prefix`.
     fn restart(&mut self, prefix: &str);
-    /// Rows of the arrays whose names begin with `prefix` changed: row i now stands for the old row `parents[i]`, and where `fresh[i]` is true its state starts from zero.
+    /// Reorders the state of the arrays whose names begin with `prefix`: row i is a copy of the old row `parents[i]`, or zero if `fresh[i]` is set.
+    ///
+    /// # Errors
+    /// [`Error::Backend`] for rows that do not exist.
     fn select_rows(&mut self, prefix: &str, parents: &[usize], fresh: &[bool]) -> Result<()>;
-    /// What checkpoints must keep.
+    /// The state for checkpoints.
     fn state(&self) -> OptimizerState;
-    /// Takes back what [`Optimizer::state`] returned. It comes from a file: an error, never a panic.
+    /// Restores what [`Optimizer::state`] returned. It is untrusted: an error, never a panic.
     fn restore(&mut self, state: OptimizerState) -> Result<()>;
 }
 
 /// An optimizer in the registry.
 pub struct OptimizerPlugin {
-    /// Facts for people, tables and checks.
+    /// Name, version and other facts.
     pub info: Plugin,
     /// Builds the optimizer from the `[optimizer]` section without `kind`; unknown keys are errors.
     pub build: fn(&toml::Table) -> Result<Box<dyn Optimizer>>,
 }
 cc4dgs_format::plugin_kind!(OptimizerPlugin, "optimizer");
 
-/// The state array `name`, or an error that names it.
+/// Removes and returns the state array `name`.
+///
+/// # Errors
+/// [`Error::Data`] if it is missing.
 pub fn state_array(state: &mut OptimizerState, name: &str) -> Result<Tensor<2>> {
     state
         .arrays

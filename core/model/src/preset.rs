@@ -2,17 +2,17 @@
 
 use crate::{Error, Plugin, Registry, Result, config, plugin_kind, unknown_name};
 
-/// What a preset's layer is for.
+/// The role of a preset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PresetRole {
     /// Settings for a family of datasets: a whole configuration.
     Family {
-        /// Table of a method's layer that is for this family (`dnerf` for `dnerf` and `dnerf-cpu`).
+        /// The table of a method's layer that applies to this family (`dnerf` for `dnerf` and `dnerf-cpu`).
         dataset: &'static str,
-        /// Whether its sizes are for two cores, so that a method's `cpu` table is for it too.
+        /// Whether its sizes are for two cores, so that a method's `cpu` table applies too.
         small: bool,
     },
-    /// What a method changes in a family. The layer has one table for `all` families, one per dataset that differs, and one for `cpu` sizes.
+    /// Changes to a family by a method. The layer has a table `all` for all families, one per dataset that differs, and one for `cpu` sizes.
     Method,
 }
 
@@ -20,7 +20,7 @@ pub enum PresetRole {
 pub struct PresetPlugin {
     /// Facts for lists; `info.schema` is the layer itself, as TOML text with comments.
     pub info: Plugin,
-    /// What the layer is for.
+    /// Its role.
     pub role: PresetRole,
 }
 
@@ -36,7 +36,8 @@ impl PresetPlugin {
 impl Registry {
     /// The settings called `name`: a family, or a family and a method joined by `+`.
     ///
-    /// Errors: [`Error::Parameter`] for an unknown family or method and for a method in a family's place, [`Error::Parameter`] for a layer that is no TOML.
+    /// # Errors
+    /// [`Error::Parameter`] for an unknown family or method, for a method instead of a family, and for a layer that is not TOML.
     pub fn preset(&self, name: &str) -> Result<toml::Table> {
         let (family, method) = name.split_once('+').map_or((name, None), |(family, method)| (family, Some(method)));
         let plugin = self.presets().find(|p| p.info.name == family && p.role != PresetRole::Method);

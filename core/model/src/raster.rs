@@ -27,10 +27,10 @@ pub enum SplatColors {
         dc: Tensor<2>,
         /// Degree 1 and up `[N,K,3]`; K may exceed what `degree` uses.
         rest: Tensor<3>,
-        /// The degree evaluated now.
+        /// The degree to evaluate.
         degree: usize,
     },
-    /// Three numbers blended as they are `[N,3]` (dynamic scores, labels).
+    /// Three values per Gaussian, blended directly `[N,3]` (dynamic scores, labels).
     Direct(Tensor<2>),
 }
 
@@ -51,8 +51,8 @@ pub struct Splats {
     pub space: ParameterSpace,
     /// A tensor of zeros `[N,2]` whose gradient becomes d loss / d projected centre in pixels (densification reads it).
     pub screen_probe: Option<Tensor<2>>,
-    /// A tensor of zeros `[N,2]` whose gradient becomes, per axis, the sum over pixels of the absolute value of each pixel's share in the gradient of
-    /// `screen_probe` (AbsGS, Ye et al. 2024). Computed only where it is given.
+    /// A tensor of zeros `[N,2]` whose gradient becomes, per axis, the sum over pixels of the absolute value of each pixel's contribution to the gradient of
+    /// `screen_probe` (AbsGS, Ye et al. 2024). Computed only if it is given.
     pub absolute_screen_probe: Option<Tensor<2>>,
     /// A tensor of zeros `[4,4]` whose gradient becomes d loss / d world_to_camera.
     pub camera_probe: Option<Tensor<2>>,
@@ -88,8 +88,8 @@ pub struct RenderSettings {
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
-    /// Capacity in (Gaussian, tile) pairs, for playback on devices that would otherwise wait for the count of every frame. Pairs beyond it are not drawn,
-    /// farthest Gaussians first; [`RenderStats::pair_count`] tells afterwards. Not for gradients. `None` allocates for all.
+    /// Capacity in (Gaussian, tile) pairs, for playback on devices that would otherwise read the count of every frame back. Pairs beyond it are not drawn,
+    /// those of the farthest Gaussians first; [`RenderStats::pair_count`] has the true count. Not for gradients. `None` allocates memory for all pairs.
     pub pair_capacity: Option<usize>,
 }
 
@@ -148,10 +148,10 @@ pub struct RenderWork {
     pub pixel_pairs: u64,
 }
 
-/// Draws Gaussians, differentiably.
+/// Renders Gaussians, differentiably.
 pub trait Rasterizer: Send + Sync {
-    /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn. Every tensor of `splats` that tracks gradients receives one in the
-    /// backward pass, the probes included; no probe may change the planes or another gradient.
+    /// Renders `splats` through `camera`. Non-finite Gaussians are culled, never drawn. Every tensor of `splats` that tracks gradients, the probes included,
+    /// receives one in the backward pass. A probe must not change the planes or other gradients.
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput>;
     /// Planes `[3,H,W]` in 0..1 of an 8-bit image on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
     fn upload(&self, image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
@@ -174,7 +174,7 @@ pub trait Rasterizer: Send + Sync {
 
 /// A rasterizer in the registry.
 pub struct RasterizerPlugin {
-    /// Facts for people, tables and checks.
+    /// Name, version and other facts.
     pub info: Plugin,
     /// Builds the rasterizer from the `[rasterizer]` section without `kind`.
     pub build: fn(&toml::Table) -> Result<Box<dyn Rasterizer>>,

@@ -1,4 +1,4 @@
-//! All plug-ins that are linked in, collected once into a value. A name taken twice and a name unknown are errors.
+//! The registry: all linked plug-ins, collected into a value. Duplicate and unknown names are errors.
 
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, DensityControl, DensityPlugin,
@@ -22,7 +22,10 @@ pub struct Registry {
 }
 
 impl Registry {
-    /// Collects everything linked into this program.
+    /// Collects all plug-ins that are linked into this program.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`](crate::Error::Parameter) if two plug-ins of a kind have the same name.
     pub fn collect() -> Result<Self> {
         Ok(Self {
             deformers: Entries::collect()?,
@@ -98,10 +101,10 @@ impl Registry {
     pub fn reader(&self, name: &str) -> Result<&'static ReaderPlugin> {
         self.readers.get(name)
     }
-    /// All readers in the order in which they are asked whether a path is theirs.
+    /// All readers in the order in which they are probed.
     pub fn readers(&self) -> Vec<&'static ReaderPlugin> {
         let mut readers: Vec<_> = self.readers.iter().collect();
-        // Entries come sorted by name, and the sort is stable: equal orders are asked by name.
+        // Entries are sorted by name and the sort is stable, so readers of equal order are probed by name.
         readers.sort_by_key(|r| r.order);
         readers
     }

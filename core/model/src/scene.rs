@@ -1,15 +1,15 @@
-//! A scene: cameras, times, and lazily decoded 8-bit frames.
+//! A scene: cameras, times, and 8-bit frames that are decoded on demand.
 
 use crate::{Camera, Error, Image8, Result, Similarity};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
-/// Which side of the split a view is on.
+/// The part of the split that a view belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
-    /// Seen in training.
+    /// Used in training.
     Train,
     /// Held out.
     Test,
@@ -28,7 +28,7 @@ pub struct View {
     pub split: Split,
 }
 
-/// Initial points with colours, as structure from motion leaves them.
+/// Initial points with colours, as computed by structure from motion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointCloud {
     /// Positions in the scene's units.
@@ -37,31 +37,31 @@ pub struct PointCloud {
     pub colors: Vec<[f32; 3]>,
 }
 
-/// Loads the image of a view. Implementations read files or trace rays; they keep no cache of their own.
+/// Loads the image of a view. Implementations read files or trace rays; they do not cache.
 pub trait FrameSource: Send + Sync {
-    /// The image of `view`, already undistorted and at the size of its camera.
+    /// The image of `view`, undistorted and at the size of its camera.
     fn load(&self, view: usize) -> Result<Image8>;
 }
 
-/// A dynamic scene. Frames are decoded on demand and kept up to a byte cap.
+/// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes.
 pub struct Scene {
-    /// A name for people.
+    /// Display name.
     pub name: String,
     /// All cameras; a moving camera is one entry per pose.
     pub cameras: Vec<Camera>,
-    /// All images, train and test.
+    /// All views, train and test.
     pub views: Vec<View>,
     /// Frames in the sequence (1 for a static scene).
     pub frame_count: usize,
     /// From the dataset's coordinates to those of this scene. Cameras, points, box, and all models trained on it are in the coordinates of the scene.
     pub normalisation: Similarity,
-    /// Points to start from, if the dataset has any.
+    /// Initial points, if the dataset has any.
     pub points: Option<PointCloud>,
-    /// Where random points go when there are none: box corners in the scene's units.
+    /// Box for random initial points if there are no others: lower and upper corner in the scene's units.
     pub init_box: Option<([f32; 3], [f32; 3])>,
-    /// What the reader found odd and left out.
+    /// Warnings of the reader about data that was ignored.
     pub warnings: Vec<String>,
-    /// The background the dataset's images want (RGBA scenes), if it says.
+    /// Background of the dataset's images (RGBA scenes), RGB in 0..1, if stated.
     pub background: Option<[f32; 3]>,
     /// Foreground masks by view, where the dataset has them: white (first channel over 127) is foreground. Not cached.
     pub foreground_masks: Option<Arc<dyn FrameSource>>,
@@ -69,7 +69,10 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// A scene over `source`; frames are cached up to `cache_bytes`. Refuses a scene without training views, views that point nowhere, and bad cameras.
+    /// A scene over `source`; frames are cached up to `cache_bytes`.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for a scene without training views, views of cameras that do not exist or with times outside 0..1, and invalid cameras.
     pub fn new(name: impl Into<String>, cameras: Vec<Camera>, views: Vec<View>, source: Arc<dyn FrameSource>, cache_bytes: u64) -> Result<Self> {
         let name = name.into();
         for camera in &cameras {
@@ -78,12 +81,12 @@ impl Scene {
         if let Some(v) = views.iter().find(|v| v.camera >= cameras.len() || !v.time_norm.is_finite()) {
             return Err(Error::data(
                 name,
-                format!("a view names camera {} of {} at time {}", v.camera, cameras.len(), v.time_norm),
+                format!("a view refers to camera {} of {} at time {}", v.camera, cameras.len(), v.time_norm),
                 "Check the dataset's index files",
             ));
         }
         if !views.iter().any(|v| v.split == Split::Train) {
-            return Err(Error::data(name, "there is no training view", "Check the path and that its images exist"));
+            return Err(Error::data(name, "there is no training view", "Check the path, and that the images exist"));
         }
         let frame_count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
         let frames = FrameCache { source, cap: cache_bytes, state: Mutex::default() };
@@ -119,7 +122,7 @@ impl Scene {
         let n = centers.len().max(1) as f64;
         let mean: [f64; 3] = std::array::from_fn(|k| centers.iter().map(|c| c[k]).sum::<f64>() / n);
         let far = centers.iter().map(|c| (0..3).map(|k| (c[k] - mean[k]).powi(2)).sum::<f64>().sqrt()).fold(0.0, f64::max);
-        // A single camera has no spread; 1 keeps the learning rates meaningful.
+        // The distance of a single camera from the mean is 0; 1 avoids learning rates of 0.
         if far > 1e-6 { (1.1 * far) as f32 } else { 1.0 }
     }
 }
@@ -147,7 +150,7 @@ impl FrameCache {
                 return Ok(image.clone());
             }
         }
-        // Decoded outside the lock, so that prefetching threads work side by side.
+        // Decoded outside the lock, so that prefetching threads work in parallel.
         let image = Arc::new(self.source.load(view)?);
         if let Ok(mut state) = self.state.lock() {
             let size = image.data.len() as u64;

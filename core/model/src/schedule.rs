@@ -1,8 +1,8 @@
-//! Where a training run stands: a value that is computed once per iteration and handed to every part of the trainer.
+//! The schedule of a training run: a value that is computed once per iteration and passed to every part of the trainer.
 
 use serde::{Deserialize, Serialize};
 
-/// Iterations of the protocol in which windows and intervals are stated (paper Section V: 5,000 + 3,000 + 20,000).
+/// Iterations of the reference protocol, the unit of windows and intervals (paper Section V: 5,000 + 3,000 + 20,000).
 pub const REFERENCE_ITERATIONS: usize = 28_000;
 
 /// The three stages of training (paper Section V).
@@ -41,7 +41,7 @@ impl Stage {
 /// One iteration of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Schedule {
-    /// The stage under way.
+    /// The current stage.
     pub stage: Stage,
     /// Iteration within the stage, from 1.
     pub iteration: usize,
@@ -49,9 +49,9 @@ pub struct Schedule {
     pub length: usize,
     /// Iterations of all stages together.
     pub total: usize,
-    /// Spherical-harmonics degree that is drawn now.
+    /// Spherical-harmonics degree that is rendered now.
     pub sh_degree: usize,
-    /// Side of the images over that of the recorded ones, 0..1.
+    /// Image size over the recorded size, per axis, 0..1.
     pub image_scale: f32,
     /// 1.1 times the largest distance of a training camera from their mean, world units.
     pub extent: f32,
@@ -62,19 +62,19 @@ impl Schedule {
     pub fn main(length: usize) -> Self {
         Self { stage: Stage::Main, iteration: 1, length, total: length, sh_degree: 3, image_scale: 1.0, extent: 1.0 }
     }
-    /// Share of the stage that is done with this iteration, above 0 to 1.
+    /// Share of the stage done after this iteration, above 0 and at most 1.
     pub fn progress(&self) -> f64 {
         self.iteration as f64 / self.length as f64
     }
-    /// Iterations of the stage after this one.
+    /// Iterations left in the stage after this one.
     pub fn left(&self) -> usize {
         self.length.saturating_sub(self.iteration)
     }
-    /// `reference` iterations of the stage's protocol as iterations of this run.
+    /// Converts `reference` iterations of the stage to iterations of this run.
     pub fn at(&self, reference: usize) -> usize {
         (reference as f64 / self.stage.reference_length() as f64 * self.length as f64).round() as usize
     }
-    /// An interval of `reference` iterations: it shrinks with short runs, but not below `least`, and does not grow with long ones.
+    /// An interval of `reference` iterations. It shrinks in short runs, but not below `least`, and does not grow in long ones.
     pub fn interval(&self, reference: usize, least: usize) -> usize {
         let scale = self.total as f64 / REFERENCE_ITERATIONS as f64;
         ((reference as f64 * scale.min(1.0)).round() as usize).max(least.min(reference)).max(1)

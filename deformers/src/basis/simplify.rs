@@ -52,7 +52,7 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
         let scale = field.scale_of(head);
         let kept = if whole.sqrt() < negligible(head) * scale { Vec::new() } else { keep(&parts, whole * field.settings.unused.powi(2)) };
         if kept.is_empty() {
-            lines.push(format!("{} does nothing and is left out", head.name()));
+            lines.push(format!("{} has no effect and is dropped", head.name()));
         } else if kept.len() < own {
             lines.push(format!("{} keeps {} of {own} functions", head.name(), kept.len()));
         }

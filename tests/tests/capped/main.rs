@@ -1,4 +1,4 @@
-//! Suites that lower the limits of the device for the whole process: apart from the others, which run beside each other.
+//! Suites that lower device limits for the whole process. They are a separate program, because the other suites run in parallel.
 #![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 #![allow(clippy::unwrap_used, reason = "tests: a failed helper is a failed test")]
 

@@ -1,5 +1,5 @@
-//! Networks of every shape against layers written in burn's primitives, forwards and backwards, on every device: trunks, heads, outputs wider than a tile,
-//! layers too wide for one, and rows that are worked on in parts.
+//! Networks of every shape compared with layers in burn's primitives, forward and backward, on every device: trunks, heads, outputs wider than a tile,
+//! layers too wide for a tile, and rows that are processed in parts.
 
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -79,13 +79,13 @@ fn networks_of_every_shape_are_those_of_their_layers() {
         // Outputs wider than the shared memory, behind a hidden layer and directly behind the trunk.
         shape(12, &[16], &[&[16, 150], &[90]]),
         shape(130, &[130], &[&[130, 4]]),
-        // Too wide for shared memory anywhere.
+        // Too wide for the shared memory of any device.
         shape(3, &[1100], &[&[2]]),
     ];
     for (name, device) in devices() {
         for shape in &shapes {
             for rows in [1, 70, 1100] {
-                // Wide layers are checked on few rows.
+                // Wide layers are tested with few rows.
                 if rows > 70 && shape.parameter_count() > 20_000 {
                     continue;
                 }
@@ -101,10 +101,10 @@ fn networks_of_every_shape_are_those_of_their_layers() {
             }
         }
     }
-    // With less to bind at once, rows go in parts.
+    // With smaller bindings, rows are processed in parts.
     let shape = &shapes[4];
     let whole: Vec<_> = devices().into_iter().map(|(name, device)| (name, run(1100, shape, true, &device, true), device)).collect();
-    // With less shared memory, tiles are smaller, or there are none.
+    // With less shared memory, tiles are smaller or not used.
     type Cap = (&'static str, fn(u64), u64);
     let _held = crate::LIMITS.lock().unwrap();
     let caps: [Cap; 3] = [("bindings", cap_bindings, 1 << 16), ("shared memory", cap_shared_memory, 16 << 10), ("shared memory", cap_shared_memory, 2 << 10)];

@@ -1,4 +1,4 @@
-//! Scenes at the edges of what a rasterizer meets, on every device and in poisoned memory, against the float64 reference.
+//! Extreme scenes on every device, with poisoned memory, compared with the float64 reference rasterizer.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::random_gaussians;
@@ -14,7 +14,7 @@ struct Case {
     gaussians: HostGaussians,
     size: (u32, u32),
     rules: Rules,
-    /// Of the relative error of a gradient.
+    /// Tolerance of the relative error of a gradient.
     tolerance: f64,
 }
 
@@ -108,7 +108,7 @@ fn every_device_draws_the_edges_like_the_reference() {
         for (name, device) in &devices {
             poison(device);
             let (planes, _) = draw(&TileRasterizer, case, device, &upstream);
-            // A float32 decision may fall the other way at a few pixels; those get no upstream gradient.
+            // A float32 threshold may be decided differently at a few pixels; those get no upstream gradient.
             let mut masked = upstream.clone();
             let mut flipped = 0;
             for i in 0..pixels {
@@ -133,7 +133,7 @@ fn every_device_draws_the_edges_like_the_reference() {
     }
 }
 
-/// Gaussians in a plane that faces the camera, but for a few millionths: rounded on the way, their depths come in another order on every device.
+/// Gaussians in a plane parallel to the image, up to a few millionths: rounding makes their depth order differ between devices.
 #[test]
 fn near_ties_of_depth_are_drawn_in_one_order() {
     let (width, height) = (48u32, 32u32);
@@ -161,8 +161,8 @@ fn near_ties_of_depth_are_drawn_in_one_order() {
     }
 }
 
-/// Adapters may let a kernel read as little as 128 MiB of a buffer (here it is 1 MiB, so that 10,000 Gaussians do what a million would), and share as little as
-/// 16 KiB of shared memory.
+/// Adapters may limit a buffer binding to 128 MiB and shared memory to 16 KiB. Here the binding is limited to 1 MiB, so that 10,000 Gaussians exceed it as a
+/// million would.
 #[test]
 fn small_adapters_change_nothing_or_are_an_error() {
     let case = |count| Case {
@@ -189,9 +189,9 @@ fn small_adapters_change_nothing_or_are_an_error() {
         assert!(whole.0 == image, "{name}: images differ with less shared memory");
         for (k, (whole, small)) in whole.1.iter().zip(&gradients).enumerate() {
             let scale = whole.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-            // Sums over the pixels of a tile are split differently.
+            // The sums over the pixels of a tile have another order.
             let worst = whole.iter().zip(small).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            // Round Gaussians have no gradient of rotation but rounding.
+            // The rotation gradient of round Gaussians is zero up to rounding.
             assert!(worst < 1e-5 * scale + 1e-7, "{name}: gradient {k} differs by {worst:e} of {scale:e} with less shared memory");
         }
         let message = refused.map(|_| ()).expect_err("20,000 Gaussians need more").to_string();

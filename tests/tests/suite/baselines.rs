@@ -1,4 +1,4 @@
-//! The baselines are as large as their papers say.
+//! The baselines have the sizes stated in their papers.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
@@ -6,7 +6,7 @@ use cc4dgs_core::{DeformerContext, Registry, Seed, SpatialInput, config};
 use cc4dgs_deformers as _;
 use glam::{DMat3, DMat4, DVec3, DVec4};
 
-/// Bytes (grid, net) as float32 of a field built for 300 frames of Gaussians of degree 3.
+/// Bytes (grid, net) as float32 of a deformer for 300 frames and Gaussians of degree 3.
 fn size(kind: &str, settings: &str) -> (u64, u64) {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(1) };
     let section = config::parse_table("test", settings).unwrap();
@@ -44,12 +44,12 @@ fn deform_mlp_takes_2_megabytes() {
 #[test]
 fn embedding_takes_1_17_megabytes() {
     let (grid, net) = size("embedding", "");
-    // The published 292,756 floats hold 30 time offsets of cameras besides.
+    // The published 292,756 floats include 30 time offsets of cameras.
     assert_eq!((grid, net), (4 * 150 * 256, 4 * (292_756 - 30 - 150 * 256)));
 }
 
-/// The floats that native-4d adds to a Gaussian's 59: a time, a duration, a velocity and two more cosines of 48. Published are 161 in all, with two quaternions
-/// for a rotation in four dimensions: seven numbers with two norms among them, where a quaternion and a velocity say the same in seven.
+/// The floats that native-4d adds to a Gaussian's 59: a time, a duration, a velocity and two more cosines of 48. The published code has 161 in total, because it
+/// stores a rotation in four dimensions as two quaternions: eight floats, two of them norms. A quaternion and a velocity represent the same with seven.
 #[test]
 fn native_4d_takes_160_floats_per_gaussian() {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 3, seed: Seed::root(1) };
@@ -59,7 +59,7 @@ fn native_4d_takes_160_floats_per_gaussian() {
     assert_eq!(field.size_bytes(), (0, 0));
 }
 
-/// A Gaussian over space and time is the product of what native-4d makes of it at a moment: a weight and a Gaussian over space.
+/// A Gaussian over space and time, at a time, equals native-4d's weight times its Gaussian over space.
 #[test]
 fn native_4d_conditions_gaussians_of_four_dimensions() {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 300, sh_degree: 0, seed: Seed::root(1) };

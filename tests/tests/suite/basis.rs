@@ -1,4 +1,4 @@
-//! Combinations of shared functions: against sums in float64, forwards and backwards, on every device.
+//! Basis combinations compared with sums in float64, forward and backward, on every device.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
@@ -23,17 +23,17 @@ fn values_and_gradients_are_those_of_the_sums() {
             let mut values = vec![0.0f64; rows * width];
             let mut of_coefficients = vec![0.0f64; rows * columns];
             let mut of_functions = vec![0.0f64; count];
-            // Head after head: outputs [rows, outputs] and coefficients [rows, outputs, functions] in the order of memory.
-            let (mut output, mut place, mut function) = (0, 0, 0);
+            // Head after head: outputs [rows, outputs] and coefficients [rows, outputs, functions] in memory order.
+            let (mut output, mut index, mut function) = (0, 0, 0);
             for &(outputs, functions_of_head) in &shape.groups {
                 for _ in 0..rows * outputs {
                     let d = f64::from(upstream[output]);
                     for f in function..function + functions_of_head {
-                        let (c, phi) = (f64::from(coefficients[place]), f64::from(functions[f]));
+                        let (c, phi) = (f64::from(coefficients[index]), f64::from(functions[f]));
                         values[output] += c * phi;
-                        of_coefficients[place] = d * phi;
+                        of_coefficients[index] = d * phi;
                         of_functions[f] += d * c;
-                        place += 1;
+                        index += 1;
                     }
                     output += 1;
                 }
@@ -75,7 +75,7 @@ fn what_does_not_fit_is_an_error() {
     }
 }
 
-/// A field some of whose functions do next to nothing in one head, and nothing at all in another.
+/// A deformer with functions that have almost no effect in one head and none in another.
 #[test]
 fn what_a_scene_does_not_use_is_left_out() {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
@@ -108,11 +108,11 @@ fn what_a_scene_does_not_use_is_left_out() {
     let times = [0.0, 0.2, 0.45, 0.7, 1.0];
     let features = field.spatial(&SpatialInput::new(points.clone())).unwrap().values;
     let simple = field.simplified(features, &times).unwrap().expect("something is unused");
-    assert!(simple.message.contains("means keeps 4 of 9") && simple.message.contains("log_scales does nothing"), "{}", simple.message);
+    assert!(simple.message.contains("means keeps 4 of 9") && simple.message.contains("log_scales has no effect"), "{}", simple.message);
     let bytes = |f: &dyn Deformer| f.size_bytes().0 + f.size_bytes().1;
     assert!(bytes(simple.field.as_ref()) < bytes(field.as_ref()));
 
-    // What the settings build takes the weights, and does the same.
+    // The deformer built from the settings accepts the weights and gives the same offsets.
     let mut again = (plugin.build)(&simple.settings, &context, &Device::flex()).unwrap();
     for (to, from) in again.parameters_mut().into_iter().zip(simple.field.parameters()) {
         assert_eq!((&to.name, &to.shape), (&from.name, &from.shape));
@@ -139,7 +139,7 @@ fn what_a_scene_does_not_use_is_left_out() {
     }
 }
 
-/// The pull on functions against its definition: prices times norms, and its slope, on every device.
+/// The group lasso compared with its definition (penalties times norms) and its gradient with finite differences, on every device.
 #[test]
 fn the_lasso_pulls_every_function_by_its_price() {
     let context = DeformerContext { box_min: [-1.0, -2.0, 0.0], box_max: [1.0, 2.0, 4.0], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
@@ -184,7 +184,7 @@ fn rotation_vectors_turn_what_is_there() {
     for (name, device) in devices() {
         let mut host = HostGaussians { means: vec![0.0; 6], log_scales: vec![0.0; 6], sh_dc: vec![0.0; 6], ..Default::default() };
         (host.opacity_logits, host.dynamic_scores) = (vec![0.0; 2], vec![0.0; 2]);
-        // A quarter turn around x, twice as long as a unit quaternion; and one that stays.
+        // A quarter turn around x with norm 2, and one without rotation.
         let half = std::f32::consts::FRAC_1_SQRT_2;
         host.quaternions = vec![2.0 * half, 2.0 * half, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5];
         let vectors = vec![0.0, 0.0, std::f32::consts::FRAC_PI_2, 0.0, 0.0, 0.0];

@@ -1,5 +1,5 @@
-//! The computational deformation field: sizes, start, switches, and its outputs and gradients against the paper's formulas written in
-//! burn primitives.
+//! The computational deformation field: sizes, initial state, options, and outputs and gradients compared with the paper's formulas in
+//! burn's primitives.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::{Deformer, DeformerContext, Offsets, Registry, Seed, SpatialInput};
@@ -15,7 +15,7 @@ fn config(text: &str) -> CdfConfig {
     cc4dgs_core::config::parse_section("deformer cdf", &cc4dgs_core::config::parse_table("test", text).expect("TOML")).expect("settings")
 }
 
-/// Small enough for exact comparison, every part present.
+/// Small sizes for exact comparison, with every part present.
 const TINY: &str = "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = [20, 12]\nfeatures = 6\nwidth = 16\n";
 
 fn field(text: &str, device: &Device) -> Cdf {
@@ -37,7 +37,7 @@ fn centres(n: usize) -> Vec<f32> {
     (0..3 * n).map(|i| if i % 3 == 2 { random.random_range(-0.1..2.1) } else { random.random_range(-1.1f32..1.1) }).collect()
 }
 
-/// Replaces every weight by a random one of the same order, so that no head is zero.
+/// Replaces every weight by a random one of the same order of magnitude, so that no head is zero.
 fn shake(field: &mut dyn Deformer, device: &Device) {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(9);
     for p in field.parameters_mut() {
@@ -72,7 +72,7 @@ fn sizes_are_those_of_the_paper() {
     assert_eq!(count("capacity = \"mid\""), (125_920, 162_587));
     assert_eq!(count("capacity = \"small\""), (54_848, 71_547));
     assert_eq!(count("levels = 4").0, 4 * 37_664);
-    // One switch, one share: each head is a layer of its own width and its output layer.
+    // Every head adds a hidden layer of its own and an output layer.
     assert_eq!(count("heads = [\"means\"]").1, 278_203 - 4 * 16_512 - (3 + 4 + 1 + 48) * 129);
     // Raw time drops 16 inputs of the time network.
     assert_eq!(count("time_encoding = \"raw\"").1, 278_203 - 16 * 128);
@@ -156,10 +156,10 @@ fn gradients_match_finite_differences() {
         };
         let out = evaluate(&field, &points, 0.43, &device).1.concatenated().expect("heads");
         let grads = (out * matrix(wave.clone(), 59, &device)).sum().backward();
-        // Along its own gradient the loss changes most, which drowns rounding; the short step crosses few kinks of ReLU.
-        for place in 0..field.parameters().len() {
+        // Along its gradient the loss changes most, so the change is above the rounding error; the short step crosses few ReLU kinks.
+        for index in 0..field.parameters().len() {
             let (gradient, start) = {
-                let p = field.parameters()[place];
+                let p = field.parameters()[index];
                 (values(p.value.grad(&grads).expect("a gradient")), values(p.value.clone()))
             };
             let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
@@ -167,13 +167,13 @@ fn gradients_match_finite_differences() {
             for (end, step) in ends.iter_mut().zip([5e-4, -5e-4]) {
                 let moved: Vec<f32> = start.iter().zip(&gradient).map(|(s, g)| s + (step * f64::from(*g) / norm) as f32).collect();
                 let n = moved.len();
-                field.parameters_mut()[place].value = Tensor::<1>::from_data(TensorData::new(moved, [n]), &device);
+                field.parameters_mut()[index].value = Tensor::<1>::from_data(TensorData::new(moved, [n]), &device);
                 *end = loss(&field);
             }
             let n = start.len();
-            field.parameters_mut()[place].value = Tensor::<1>::from_data(TensorData::new(start, [n]), &device);
+            field.parameters_mut()[index].value = Tensor::<1>::from_data(TensorData::new(start, [n]), &device);
             let slope = (ends[0] - ends[1]) / 1e-3;
-            assert!((slope / norm - 1.0).abs() < 0.03, "{name} {}: slope {slope} where the gradient says {norm}", field.parameters()[place].name);
+            assert!((slope / norm - 1.0).abs() < 0.03, "{name} {}: slope {slope}, gradient norm {norm}", field.parameters()[index].name);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What a codec is handed when a model is stored with its scene, and what it may lose of a field's attributes.
+//! The context of a codec when a model is stored together with its scene, and the loss of a deformer's attributes.
 
 use burn::tensor::Device;
 use cc4dgs_core::SceneOptions;
@@ -17,7 +17,7 @@ use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::data;
 use std::path::Path;
 
-/// `raw`, and a note of what the context held.
+/// The codec `raw`, which also records the parts of its context.
 struct Witness(Box<dyn AttributeCodec>);
 
 impl AttributeCodec for Witness {
@@ -135,7 +135,7 @@ fn attributes_of_gaussians_that_stand_still_are_not_stored_by_lossy_codecs() {
         let stored: u64 = Archive::open(&path, &limits).unwrap().stream_sizes().iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
         sizes.push(stored);
         let back = Model::open(&path, &registry, &Device::flex(), &limits, &Silent).unwrap();
-        // Codecs reorder; where a Gaussian moves tells it from one that does not, and its attributes must be among those that went in.
+        // Codecs reorder Gaussians. The score tells moving ones from static ones, and their attributes must be among the encoded ones.
         for spec in model.field.as_ref().unwrap().field.attributes() {
             let given = &model.gaussians.extra[&spec.name].values;
             for (row, score) in back.gaussians.extra[&spec.name].values.chunks_exact(spec.width).zip(&back.gaussians.dynamic_scores) {

@@ -1,5 +1,5 @@
-//! Conformance of every registered codec: what comes back is what its declared losses allow, the bytes are the same every time, hostile
-//! streams end in errors.
+//! Every registered codec: decoded values are within the declared losses, bytes are reproducible, untrusted
+//! streams give errors.
 
 use cc4dgs_codecs::morton;
 use cc4dgs_core::gaussians::sh_rest_len;
@@ -11,7 +11,7 @@ fn context() -> CodecContext<'static> {
     CodecContext::new(Seed::root(11), Limits::default(), &Silent)
 }
 
-/// Every codec with every profile it says it has.
+/// Every codec with every profile of its capabilities.
 fn codecs() -> Vec<(String, Box<dyn AttributeCodec>)> {
     let registry = Registry::collect().unwrap();
     let mut out = Vec::new();
@@ -19,7 +19,7 @@ fn codecs() -> Vec<(String, Box<dyn AttributeCodec>)> {
         let profiles = plugin.capabilities.iter().find_map(|c| c.strip_prefix("profiles=")).unwrap_or("");
         for profile in profiles.split(',') {
             let spec = format!("{}:{profile}", plugin.name);
-            // A codec that trains is told to be quick about it.
+            // Fewer training steps for codecs that train.
             let quick = if plugin.schema.contains("sample_budget") { "sample_budget = 20000".parse().unwrap() } else { toml::Table::new() };
             out.push((spec.clone(), registry.build_codec(&spec, &quick).unwrap()));
         }
@@ -32,7 +32,7 @@ fn codec(spec: &str) -> Box<dyn AttributeCodec> {
     codecs().into_iter().find(|(name, _)| name == spec).unwrap().1
 }
 
-/// Gaussians shaped like a trained model's: clustered, long-tailed scales, colours correlated over coefficients and with the geometry.
+/// Gaussians with the statistics of a trained model: clustered, long-tailed scales, colours correlated between coefficients and with the geometry.
 fn scene(n: usize, sh_degree: usize, seed: u64) -> HostGaussians {
     let mut rng = Seed::root(seed).rng();
     let mut normal = move || -> f32 { (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0 };
@@ -56,10 +56,10 @@ fn scene(n: usize, sh_degree: usize, seed: u64) -> HostGaussians {
     g
 }
 
-/// Name of the attribute by which the order that a codec chose is known.
+/// Name of the attribute that records the order of a codec.
 const MARK: &str = "mark";
 
-/// Decodes, and puts the original into the order the codec chose, if it reorders.
+/// Decodes, and puts the original Gaussians into the codec's order.
 fn round_trip(name: &str, codec: &dyn AttributeCodec, g: &HostGaussians) -> (HostGaussians, HostGaussians, Vec<Stream>) {
     let mut g = g.clone();
     g.extra.insert(MARK.into(), ExtraAttribute::exact(1, (0..g.len()).map(|i| i as f32).collect()));
@@ -114,7 +114,7 @@ fn degenerate_models_come_back() {
         let one = scene(1, 3, 3);
         let same = one.select(&[0; 900]);
         let found = hold_to_losses(&name, codec.as_ref(), &same).sh_rest;
-        // The steps of a foreign format are where they are.
+        // SPZ has fixed quantisation levels.
         assert!(found == same.sh_rest || name.starts_with("spz"), "{name}: 900 equal Gaussians are exact");
         let mut dark = scene(2000, 3, 4);
         dark.sh_rest.fill(0.0);
@@ -179,7 +179,7 @@ fn lower_profiles_take_fewer_bytes() {
 
 #[test]
 fn colours_without_structure_are_not_thrown_away() {
-    // White noise in twice as many dimensions as there are latents: whatever form is chosen, the declared loss holds.
+    // White noise in twice as many dimensions as there are latents: the loss is within the declared one for every form.
     let mut g = scene(3000, 4, 9);
     let mut rng = Seed::root(10).rng();
     g.sh_rest.iter_mut().for_each(|v| *v = rng.random_range(-1.0..1.0));
@@ -222,7 +222,7 @@ fn models_that_are_not_sound_are_refused() {
     }
 }
 
-/// Sound streams of a small model, with the autoencoder where the codec has one.
+/// Valid streams of a small model, with the autoencoder if the codec has one.
 fn sound_streams(codec: &dyn AttributeCodec, n: usize) -> Vec<Stream> {
     codec.encode(&scene(n, 3, 12), &context()).unwrap()
 }
@@ -235,8 +235,8 @@ fn truncated_and_flipped_streams_never_panic() {
             for cut in 0..streams[s].bytes.len() {
                 let mut bad = streams.clone();
                 bad[s].bytes.truncate(cut);
-                assert!(codec.decode(&bad, &context()).is_err(), "{name}: {} cut at {cut} was taken", streams[s].name);
-                // A flip may give another sound model, never a panic and never a number that is not finite.
+                assert!(codec.decode(&bad, &context()).is_err(), "{name}: {} truncated at {cut} was accepted", streams[s].name);
+                // A flipped bit may give another valid model, but never a panic or a value that is not finite.
                 let mut bad = streams.clone();
                 for bit in 0..8 {
                     bad[s].bytes[cut] ^= 1 << bit;
@@ -321,7 +321,7 @@ proptest! {
         degree in 0usize..=4,
         bits in proptest::collection::vec(any::<u32>(), 1..200),
     ) {
-        // Any finite bit patterns at all: denormals, extremes, both zeros.
+        // All kinds of finite bit patterns: denormals, extremes, both zeros.
         let mut at = 0usize;
         let mut next = || { at += 1; let v = f32::from_bits(bits[at % bits.len()].wrapping_mul(at as u32 | 1)); if v.is_finite() { v } else { 0.25 } };
         let mut g = HostGaussians { sh_degree: degree, opacity_logits: vec![0.0; n], ..Default::default() };

@@ -1,4 +1,4 @@
-//! Every registered plug-in against the suites that `cc4dgs-core` exports.
+//! Every registered plug-in with the conformance suites that `cc4dgs-core` exports.
 
 use cc4dgs_backends as _;
 use cc4dgs_codecs as _;
@@ -7,7 +7,7 @@ use cc4dgs_deformers as _;
 use cc4dgs_parts as _;
 use cc4dgs_tests::devices;
 
-/// Sizes that keep the suite quick, for the fields that have sizes.
+/// Small sizes that make the suite fast, for deformers that have sizes.
 fn small(name: &str) -> toml::Table {
     let text = match name {
         "cdf" => "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = [20, 12]\nfeatures = 6\nwidth = 16",
@@ -17,7 +17,7 @@ fn small(name: &str) -> toml::Table {
         "hexplane" => "resolution = 6\ntime_resolution = 8\nfeatures = 4\nwidth = 16",
         "deform-mlp" => "width = 24\nlayers = 4\nskip = 2\nposition_bands = 3\ntime_bands = 3\ntime_network = true",
         "embedding" => "gaussian_features = 6\ntime_features = 10\ntime_rows = 9\ncoarse_rows = 4\nwidth = 16",
-        // The field is a field over all times: at the start its Gaussians must not be hidden.
+        // The suite evaluates all times, so Gaussians must not be hidden initially.
         "native-4d" => "duration = 0.5\nharmonics = 1",
         _ => "",
     };
@@ -46,7 +46,7 @@ fn every_codec_conforms() {
     for (_, plugin) in registry.plugins().into_iter().filter(|(kind, _)| *kind == "codec") {
         let profiles = plugin.capabilities.iter().find_map(|c| c.strip_prefix("profiles=")).unwrap_or("");
         for profile in profiles.split(',') {
-            // A codec that trains is told to be quick about it.
+            // Fewer training steps for codecs that train.
             let quick = if plugin.schema.contains("sample_budget") { "sample_budget = 5000" } else { "" };
             findings.extend(conformance::codec(registry.codec(plugin.name).unwrap(), profile, &config::parse_table("test", quick).unwrap()));
             seen += 1;

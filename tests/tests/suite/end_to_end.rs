@@ -1,4 +1,4 @@
-//! Whole runs on the built-in scene, small enough for a test: reproducibility, resuming, archives, switches.
+//! Complete runs on the built-in scene at small size: reproducibility, resuming, archives, options.
 
 use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
@@ -14,7 +14,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock};
 
-/// The demo, shrunk: every stage runs, every mechanism fires at least once.
+/// The demo at small size: every stage runs, and every kind of density control happens at least once.
 fn tiny(extra: &[&str]) -> RunConfig {
     let mut sets: Vec<String> =
         ["scene.width=48", "scene.height=48", "train.iterations=160", "train.batch=2", "init.count=400", "train.log_every=5", "train.lambda_r=0.01"]
@@ -25,7 +25,7 @@ fn tiny(extra: &[&str]) -> RunConfig {
     RunConfig::resolve(Some("demo"), None, &sets).unwrap()
 }
 
-/// Storage by `codec` and the weight codec `field_weights`, without a scene.
+/// Storage with `codec` and the weight codec `field_weights`, without a scene.
 fn options<'a>(codec: &'a str, field_weights: &'a str) -> ArchiveOptions<'a> {
     static NO_SETTINGS: LazyLock<toml::Table> = LazyLock::new(toml::Table::new);
     ArchiveOptions { codec, settings: &NO_SETTINGS, field_weights, scene: None }
@@ -93,7 +93,7 @@ fn same_seed_gives_the_same_bytes_and_resuming_does_too() {
     assert_eq!(stages, ["coarse", "score", "main"]);
     assert!(recorder.events().iter().any(|e| matches!(e, Event::Densified { .. })), "nothing was densified");
 
-    // The archive of equal checkpoints is equal too, and plays back what the checkpoint shows.
+    // Equal checkpoints give equal archives, and an archive renders the same images as its checkpoint.
     let registry = Registry::collect().unwrap();
     let archives = [(&a, "a.cc4d"), (&b, "b.cc4d")].map(|(run, name)| {
         let path = folder.path().join(name);
@@ -118,7 +118,7 @@ fn resuming_with_another_configuration_is_refused() {
 }
 
 #[test]
-fn cache_and_reuse_change_the_work_and_not_the_picture() {
+fn cache_and_reuse_change_the_work_and_not_the_image() {
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
     let base = tiny(&["train.dynamic=all", "train.iterations=60"]);
@@ -126,7 +126,7 @@ fn cache_and_reuse_change_the_work_and_not_the_picture() {
     let registry = Registry::collect().unwrap();
     let scene = open(&base);
     let camera = scene.camera(0);
-    let mut pictures = Vec::new();
+    let mut images = Vec::new();
     for (cache, reuse) in [(true, true), (false, false)] {
         let mut model = load(folder.path());
         let field = model.field.take().unwrap();
@@ -148,9 +148,9 @@ fn cache_and_reuse_change_the_work_and_not_the_picture() {
         } else {
             assert_eq!(work.spatial.vertices_decoded, work.spatial.vertices_queried);
         }
-        pictures.push(frames);
+        images.push(frames);
     }
-    assert!(pictures[0] == pictures[1], "caching or reuse changed the picture");
+    assert!(images[0] == images[1], "caching or reuse changed the image");
 }
 
 #[test]
@@ -166,7 +166,7 @@ fn static_gaussians_cost_no_field_time() {
     assert!(still > 0 && report.dynamic_gaussians > 0, "{report:?}");
     assert_eq!((player.work.deformed, player.work.static_skipped), (report.dynamic_gaussians as u64, still));
     assert_eq!(player.work.spatial.gaussians, report.dynamic_gaussians as u64);
-    // A frame is written over the one before it, unless somebody kept that; either way it is what it would have been as the first.
+    // Frames are updated in place unless the last one is still referenced; the result is the same in both cases.
     let registry = Registry::collect().unwrap();
     for (name, device) in cc4dgs_tests::devices() {
         let model = Model::open(folder.path(), &registry, &device, &Limits::default(), &Silent).unwrap();
@@ -203,7 +203,7 @@ fn runs_on_wgpu_are_reproducible_and_every_device_draws_the_same() {
     }
 }
 
-/// Every field, with whatever it keeps per Gaussian: learns, resumes to the same bytes, plays, and survives an archive.
+/// Every deformer, with its attributes per Gaussian, can be trained, resumed to the same bytes, played back, and stored in an archive.
 #[test]
 fn every_field_trains_resumes_plays_and_is_archived() {
     let registry = Registry::collect().unwrap();

@@ -1,4 +1,4 @@
-//! K-means and mu-law against scikit-learn and torchaudio.
+//! K-means and mu-law compared with scikit-learn and torchaudio.
 
 use cc4dgs_codecs::kmeans;
 use cc4dgs_core::Seed;
@@ -52,7 +52,7 @@ fn golden_kmeans_reaches_the_quality_bar() {
     let bar = 1.02 * facts["quality_bar"]["mean"].as_f64().unwrap();
     let x = f32s(&file, "in.x");
     for seed in 0..3 {
-        // The codec's own 25 iterations, a quarter of what the bar allows.
+        // The codec's 25 iterations, a quarter of those of the reference.
         let centers = kmeans::cluster(&x, 15, 256, 25, Seed::root(seed));
         let inertia = kmeans::assign(&x, 15, &centers).inertia;
         assert!(inertia <= bar, "seed {seed}: inertia {inertia:.1} is over {bar:.1}");
@@ -80,7 +80,7 @@ fn golden_mulaw_codes_and_values() {
             assert!((value - decoded[i]).abs() < 1e-6, "{name} code {}: {value} against {}", codes[i], decoded[i]);
         }
     }
-    // The codec's own: mu = 255, signed 16-bit codes, halves away from zero.
+    // As in the codec: mu = 255, signed 16-bit codes, halves rounded away from zero.
     let codes = i32s(&file, "mu255_i16.code");
     let decoded = f64s(&file, "mu255_i16.decoded");
     let before = f64s(&file, "mu255_i16.precode");

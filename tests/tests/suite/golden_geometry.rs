@@ -1,4 +1,4 @@
-//! Spherical harmonics, rotations, covariances and projection against the golden numbers: the vector kernels in float32, the reference in float64.
+//! Spherical harmonics, rotations, covariances and projection compared with golden values: the SIMD kernels in float32, the reference in float64.
 
 use crate::raster_fixtures::{Fixture, largest_difference, narrow, relative_l2, settings, widen};
 use cc4dgs_backends::cpu::raster::check::{ProjectionUpstream, harmonics, projection, rotations};
@@ -20,7 +20,7 @@ fn golden_sh_kernel() {
         assert_close(&key("basis"), relative_l2(&widen(&out.basis), &fixture.get(&key("out.basis"))), 1e-6);
         assert_close(&key("value"), relative_l2(&widen(&out.value), &fixture.get(&key("out.value"))), 2e-6);
         assert_close(&key("directions"), relative_l2(&widen(&out.directions), &fixture.get(&key("grad.dirs"))), 2e-6);
-        // The value is linear in the coefficients: their gradient is the basis times the weights.
+        // The value is linear in the coefficients, so their gradient is the basis times the weights.
         let count = (degree + 1) * (degree + 1);
         let product: Vec<f64> = (0..weights.len() * count)
             .map(|k| {
@@ -125,7 +125,7 @@ fn golden_quat_scale_cov_reference() {
     }
 }
 
-/// What a loss of the projection fixture weighs.
+/// The weights of the projection fixture's loss.
 #[derive(Clone, Copy, PartialEq)]
 enum Loss {
     Centers,
@@ -177,10 +177,10 @@ impl Projection {
     }
 }
 
-/// Largest relative L2 error that the reference's own float32 run shows for gradients of a category (projection.json), times ten, at least 1e-5.
+/// Ten times the largest relative L2 error of gradients of a category in the reference's float32 run (projection.json), at least 1e-5.
 fn tolerance(noise: &serde_json::Value, loss: &str, array: &str, category: &str) -> Option<f64> {
     let rel = noise[format!("grad.{loss}.{array}[{category}]")]["rel_l2"].as_f64()?;
-    // Beyond a percent, float32 says nothing.
+    // At a relative error above one percent, a float32 comparison is not meaningful.
     (rel < 1e-2).then_some((10.0 * rel).max(1e-5))
 }
 
@@ -211,7 +211,7 @@ fn golden_projection_kernel() {
             };
             assert_close("centres", relative_l2(&of(&out.centers, 2), &p.part("out.means2d", camera, 2)), 1e-6);
             assert_close("depths", relative_l2(&of(&out.depths, 1), &p.part("out.depths", camera, 1)), 1e-6);
-            // The determinant is formed without cancellation here, so conics and compensations are better than the reference's float32.
+            // The determinant is computed without cancellation here, so conics and compensations are more accurate than the reference's float32.
             assert_close("conics", relative_l2(&of(&out.conics, 3), &p.part("out.conics", camera, 3)), 1e-4);
             assert_close("compensations", relative_l2(&of(&out.compensations, 1), &p.part("out.compensations", camera, 1)), 1e-3);
             // 3.33 sigma per axis before rounding up.
@@ -274,7 +274,7 @@ fn golden_projection_reference() {
                 (0..16).for_each(|k| sums[3][16 * camera + k] += d[10 + k]);
             }
         }
-        // The compensation of needles loses half of float64's digits to cancellation, in the fixture as here.
+        // The compensation of very thin Gaussians loses half of float64's digits to cancellation, in the fixture and here.
         let limit = if loss.weighs(Loss::Compensations) { 1e-6 } else { 1e-8 };
         for (array, sum) in ["means", "quats", "scales", "viewmats"].into_iter().zip(&sums) {
             assert_close(&format!("{loss_name}: {array}"), relative_l2(sum, &p.fixture.get(&format!("grad.{loss_name}.{array}"))), limit);

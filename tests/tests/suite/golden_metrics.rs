@@ -1,4 +1,4 @@
-//! Metrics against the numbers of scikit-image, pytorch-msssim and Inria's code (`golden/metrics.json`), and against their own definitions.
+//! Metrics compared with the values of scikit-image, pytorch-msssim and Inria's code (`golden/metrics.json`), and with their definitions.
 
 use cc4dgs_core::metrics::{Metric, PSNR_CEILING_DB, Planes, Protocol, Rounding, SsimConvention, mean_absolute_error, mean_squared_error, ms_ssim, psnr, ssim};
 use serde_json::Value;
@@ -87,7 +87,7 @@ fn masks_choose_the_pixels() {
     let (width, height) = (48, 40);
     let a = texture(width, height, 0.0);
     let mut b = a.clone();
-    // Damage the left third of every plane; a mask of the right half must not see it.
+    // Damage the left third of every plane; a mask of the right half must exclude it.
     for (i, v) in b.iter_mut().enumerate() {
         if i % width < width / 3 {
             *v = 1.0 - *v;

@@ -1,4 +1,4 @@
-//! The rasterizers against the golden renders: images, and gradients of every input, for both rule sets and both CPU devices.
+//! The rasterizers compared with golden renders: images and gradients of every input, for both rule sets and both CPU devices.
 
 use crate::raster_fixtures::{Scene, narrow, relative_l2, scenes, widen};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -7,13 +7,13 @@ use cc4dgs_backends::rasterizers::reference::{self, ReferenceInput};
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::{Camera, ParameterSpace, Rasterizer, RenderSettings, SplatColors, Splats};
 
-/// Collects what is out of tolerance, so that one run shows everything.
+/// Collects values out of tolerance, so that one run reports all of them.
 #[derive(Default)]
 struct Findings(Vec<String>);
 
 impl Findings {
     fn check(&mut self, what: String, error: f64, tolerance: f64) {
-        // A NaN is over every tolerance.
+        // NaN is out of every tolerance.
         if error.is_nan() || error > tolerance {
             self.0.push(format!("{what}: error {error:.3e} over {tolerance:.0e}"));
         }
@@ -37,7 +37,7 @@ fn reference_input(scene: &Scene) -> ReferenceInput {
     }
 }
 
-/// Gradients of the coefficients side by side, as the fixtures have them.
+/// Gradients of the coefficients concatenated, as in the fixtures.
 fn join_coefficients(dc: &[f64], rest: &[f64], n: usize) -> Vec<f64> {
     let width = rest.len() / n;
     (0..n).flat_map(|i| dc[3 * i..3 * i + 3].iter().chain(&rest[i * width..(i + 1) * width]).copied().collect::<Vec<_>>()).collect()
@@ -197,7 +197,7 @@ fn check_operation(scene: &Scene, device: &Device, findings: &mut Findings) {
     ] {
         findings.check(format!("{} grad {key}", scene.name), relative_l2(&values, &scene.results.get(&format!("grad.{key}"))), tolerance);
     }
-    // Radii may differ by the rounding up of a number that is nearly whole, and where nothing of the Gaussian reaches 1/255.
+    // Radii may differ if the value before rounding up is close to an integer, and if the Gaussian's alpha stays below 1/255.
     let golden = scene.results.get("out.radii");
     let radii = out.stats.radii.into_data().convert::<i64>().try_to_vec::<i64>().unwrap();
     let drawn = out.stats.max_weights.unwrap().into_data().try_to_vec::<f32>().unwrap();

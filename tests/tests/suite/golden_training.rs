@@ -1,4 +1,4 @@
-//! Loss, optimizer and network kernels against the reference numbers of `golden/` on every device.
+//! Loss, optimizer and network kernels compared with the reference values of `golden/` on every device.
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::cpu::mlp::{activation, mish};
@@ -59,7 +59,7 @@ fn golden_ssim_loss() {
     let (_, target) = planes(&fixture, "in.target");
     for (name, device) in devices() {
         for (lambda_c, loss_key, grad_key) in [(0.8, "out.loss", "grad.loss.render"), (0.0, "out.ssim", "grad.ssim.render")] {
-            // Two more planes, as a rasterizer's output has them.
+            // Two more planes, as in a rasterizer's output.
             let mut five = to_f32(&render);
             five.resize(5 * shape[1] * shape[2], 0.25);
             let planes5 = Tensor::<3>::from_data(TensorData::new(five, [5, shape[1], shape[2]]), &device.clone().autodiff()).require_grad();
@@ -69,7 +69,7 @@ fn golden_ssim_loss() {
             let grads = out.loss.clone().backward();
             let grad = values(planes5.grad(&grads).expect("a gradient"));
             let loss = f64::from(values(out.loss)[0]);
-            // With lambda_c = 0 the loss is 1 - SSIM, and its gradient the negative one.
+            // With lambda_c = 0 the loss is 1 - SSIM, and its gradient is minus that of SSIM.
             let (want, sign) = if lambda_c == 0.0 { (1.0 - fixture[loss_key].1[0], -1.0) } else { (fixture[loss_key].1[0], 1.0) };
             assert!((loss - want).abs() < 1e-5, "{name}: loss {loss} instead of {want}");
             assert!((f64::from(numbers.l1) - fixture["out.l1"].1[0]).abs() < 1e-6);
@@ -132,7 +132,7 @@ fn adam_leaves_invisible_and_broken_rows_alone() {
         let mut settings = AdamSettings::new(0.01, 3);
         settings.visible = Some(Tensor::<1, Int>::from_data(TensorData::new(visible.clone(), [rows]), &device));
         let out = adam_step(matrix(p0.clone()), matrix(m0.clone()), matrix(v0.clone()), matrix(g.clone()), &settings).expect("a step");
-        // Row 9000 is a multiple of 3, so it was not selected and does not count.
+        // 9000 is a multiple of 3, so this row was not selected and is not compared.
         assert_eq!(out.skipped_rows.into_data().iter::<i64>().collect::<Vec<_>>(), [2], "{name}");
         let (p, m, v) = (values(out.param), values(out.m), values(out.v));
         for (row, &shown) in visible.iter().enumerate() {
@@ -206,7 +206,7 @@ fn golden_nn_mlp() {
     check("whole", &grad, &flat("mlp.grad"), 3e-6);
 }
 
-/// The loss by its definition in float64, each window summed in two dimensions.
+/// The loss by its definition in float64, with two-dimensional windows.
 fn plain_loss(x: &[f64], y: &[f64], (c, h, w): (usize, usize, usize), lambda_c: f64) -> f64 {
     let weight = |d: isize| (-(d * d) as f64 / 4.5).exp();
     let norm: f64 = (-5..=5).map(weight).sum();
@@ -250,7 +250,7 @@ fn photometric_loss_matches_its_definition_at_awkward_sizes() {
             let target = Tensor::<3>::from_data(TensorData::new(to_f32(&y), [3, h, w]), &device);
             let out = photometric_loss(planes.clone(), target.clone(), 0.6).expect("a loss");
             let untracked = photometric_loss(planes.clone().inner(), target, 0.6).expect("a loss");
-            // A factor on the way back must arrive at the pixels.
+            // A factor of the upstream gradient must reach the pixels.
             let grads = (out.loss.clone() * 3.0).backward();
             let grad = values(planes.grad(&grads).expect("a gradient"));
             let loss = values(out.loss)[0];

@@ -1,4 +1,4 @@
-//! 8-bit images become the same numbers on every device.
+//! 8-bit images are converted to the same values on every device.
 
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::ops::image::{image_planes, read_image};

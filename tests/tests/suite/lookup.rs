@@ -1,4 +1,4 @@
-//! Lookups in stored grids: against the formulas of their papers, forwards and backwards, on every device.
+//! Lookups in stored grids compared with the formulas of their papers, forward and backward, on every device.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, PRIMES, lookup};
@@ -7,7 +7,7 @@ use cc4dgs_tests::{devices, poison};
 use rand::{Rng, SeedableRng};
 use std::sync::Arc;
 
-/// A joint hash grid as tiny-cuda-nn builds it: half a cell of stagger, dense where the table suffices.
+/// A joint hash grid as in tiny-cuda-nn: positions offset by half a cell, dense levels if the table is large enough.
 fn hash_grid(dims: usize, levels: u32, rows: usize) -> GridShape {
     let mut shape = GridShape { dims, features: 3, levels: Vec::new(), stagger: 0.5, smooth: false, clamps: false, outside: Outside::Zero };
     for l in 0..levels {
@@ -17,7 +17,7 @@ fn hash_grid(dims: usize, levels: u32, rows: usize) -> GridShape {
     shape
 }
 
-/// Planes as 4DGS samples them: dense, corners aligned, the border repeated.
+/// Planes as sampled by 4DGS: dense, corners aligned, border values repeated.
 fn planes() -> GridShape {
     let mut shape = GridShape { dims: 2, features: 11, levels: Vec::new(), stagger: 0.0, smooth: false, clamps: true, outside: Outside::Clamp };
     for (w, h) in [(5, 7), (9, 7)] {
@@ -26,7 +26,7 @@ fn planes() -> GridShape {
     shape
 }
 
-/// The same in float64, one point, one level at a time.
+/// The same lookup in float64, for one point and one level at a time.
 fn oracle(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f64> {
     let mut out = Vec::new();
     for x in points.chunks(shape.dims) {
@@ -86,7 +86,7 @@ fn features_and_gradients_are_those_of_the_formulas() {
             let (found, gradient) = run(&device.clone().autodiff());
             let worst = found.iter().zip(&truth).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max);
             assert!(worst < 1e-4, "{name}, {} axes: features differ by {worst:.2e}", shape.dims);
-            // The lookup is linear in its table, so <gradient, table> = <upstream, features> and the gradient is the matrix's transpose.
+            // The lookup is linear in its table, so <gradient, table> = <upstream, features>.
             let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
             assert!((dot(&gradient, &table) - dot(&upstream, &found)).abs() < 1e-3 * dot(&upstream, &upstream).sqrt(), "{name}");
             match &of_first {
@@ -99,7 +99,7 @@ fn features_and_gradients_are_those_of_the_formulas() {
             let again = run(&device.clone().autodiff());
             assert!(again.0 == found, "{name}: two runs differ");
         }
-        // Along any direction of the table, the loss of the oracle rises by what the gradient says.
+        // In any direction of the table, the slope of the oracle's loss agrees with the gradient.
         let direction: Vec<f32> = (0..table.len()).map(|_| random.random_range(-1.0..1.0)).collect();
         let loss: f64 = oracle(&shape, &direction, &points).iter().zip(&upstream).map(|(a, b)| a * f64::from(*b)).sum();
         let slope: f64 = of_first.unwrap().iter().zip(&direction).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum();

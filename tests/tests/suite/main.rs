@@ -1,4 +1,4 @@
-//! All suites of the workspace in one program, so that burn is linked once. `cargo test --release --workspace --test suite NAME` runs a part.
+//! All suites of the workspace in one program, so that burn is linked only once. `cargo test --release --workspace --test suite NAME` runs a part.
 #![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests: a failed helper is a failed test, and skipped ones say so")]
 

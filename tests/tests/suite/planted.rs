@@ -1,4 +1,4 @@
-//! Mistakes that a conformance suite must find: a deformer that keeps all it learns per Gaussian, right once and wrong in many ways.
+//! Errors that a conformance suite must find: a deformer whose weights are all per-Gaussian attributes, in one correct and several wrong versions.
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
@@ -6,7 +6,7 @@ use cc4dgs_core::{
     SpatialInput, conformance,
 };
 
-/// What is wrong with [`Velocities`].
+/// The error in [`Velocities`].
 #[derive(Clone, Copy, PartialEq)]
 enum Mistake {
     None,
@@ -75,7 +75,7 @@ fn findings(build: Build, schema: &'static str) -> String {
     conformance::deformer(&DeformerPlugin { info, build }, &toml::Table::new(), &Device::flex()).join("\n")
 }
 
-/// A build function per mistake, which function pointers cannot carry.
+/// A build function per error, because function pointers cannot capture it.
 macro_rules! with {
     ($mistake:ident) => {
         |settings, _, _| {

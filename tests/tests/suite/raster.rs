@@ -1,4 +1,4 @@
-//! The rasterizers against each other, against finite differences, and at the edges.
+//! The rasterizers compared with each other and with finite differences, and edge cases.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::{STANDARD_CASES, StepCase, random_gaussians, step_camera};
@@ -53,12 +53,12 @@ fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> 
     }
 }
 
-/// Numbers in -1..1 that follow from `seed`.
+/// Random numbers in -1..1 from `seed`.
 pub fn noise(seed: Seed, len: usize) -> Vec<f32> {
     (0..len as u64).map(|k| (seed.index(k).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0).collect()
 }
 
-/// A random scene with some opaque Gaussians, so that pixels stop early.
+/// A random scene with some opaque Gaussians, so that blending of pixels ends early.
 pub fn scene(count: usize, seed: Seed) -> HostGaussians {
     let mut g = random_gaussians(count, seed);
     let strength = noise(seed.child("opacity"), count);
@@ -88,7 +88,7 @@ fn tile_agrees_with_the_reference() {
     for (k, (rules, antialiased, degree)) in
         [(Rules::Gsplat099, false, 3), (Rules::Gsplat0999, true, 2), (Rules::Inria, false, 1), (Rules::Inria, true, 0)].into_iter().enumerate()
     {
-        // Sizes that leave partial tiles on both sides.
+        // Sizes with partial tiles on both axes.
         let camera = step_camera(&StepCase { width: 53, height: 37, gaussians: 400 });
         let g = scene(400, seed.index(k as u64));
         let settings = settings(&camera, rules, antialiased, degree);
@@ -98,7 +98,7 @@ fn tile_agrees_with_the_reference() {
         let wide = ReferenceInput::widen(&splats);
         let exact = reference::forward(&wide, &settings);
         let pixels = settings.width * settings.height;
-        // A float32 decision may fall the other way at a few pixels; those get no upstream gradient.
+        // A float32 threshold may be decided differently at a few pixels; those get no upstream gradient.
         let mut upstream = noise(seed.child("upstream"), 5 * pixels);
         let mut flipped = 0;
         for i in 0..pixels {
@@ -145,7 +145,7 @@ fn reference_gradients_match_finite_differences() {
     let loss = |input: &ReferenceInput, s: &RasterSettings| -> f64 { reference::forward(input, s).planes.iter().zip(&upstream).map(|(a, b)| a * b).sum() };
     let out = reference::forward(&base, &s);
     let g = reference::backward(&base, &s, &out.items, &upstream);
-    // Thresholds make the loss jump where a pixel's decision flips, so single entries may be off; the median must not be.
+    // The loss jumps where a pixel crosses a threshold, so single entries may be wrong, but not the median.
     let median = |mut errors: Vec<f64>| {
         errors.sort_by(f64::total_cmp);
         errors[errors.len() / 2]
@@ -296,7 +296,7 @@ fn empty_splats(device: &Device) -> Splats {
 fn no_gaussians_show_the_background() {
     let camera = step_camera(&StepCase { width: 5, height: 3, gaussians: 0 });
     for (name, device) in cc4dgs_tests::devices() {
-        // The reference computes in float64 on the host and says so elsewhere.
+        // The reference computes in float64 on the host and refuses other devices.
         let on_host = name != "wgpu";
         for rasterizer in [&TileRasterizer as &dyn Rasterizer, &ReferenceRasterizer].into_iter().take(if on_host { 2 } else { 1 }) {
             let background = Tensor::<1>::from_floats([0.25, 0.5, 1.0], &device);
@@ -331,7 +331,7 @@ fn direct_colours_are_blended_as_they_are() {
     let host = scene(50, Seed::root(41));
     let device = Device::flex().autodiff();
     let g = Gaussians::from_host(&host, &device);
-    // Negative values would be clamped if they were harmonics.
+    // Negative spherical-harmonics colours would be clamped; direct colours are not.
     let colors = Tensor::<2>::from_data(TensorData::new(noise(Seed::root(42), 150), [50, 3]), &device).require_grad();
     let mut splats = Splats::from_gaussians(&g, 3);
     splats.colors = SplatColors::Direct(colors.clone());
@@ -375,7 +375,7 @@ fn mistakes_are_named() {
 
 #[test]
 fn too_many_pairs_are_an_error() {
-    // Every Gaussian covers the whole of a large image.
+    // Every Gaussian covers the whole large image.
     let camera = step_camera(&StepCase { width: 8192, height: 8192, gaussians: 600 });
     let mut g = random_gaussians(600, Seed::root(61));
     g.log_scales.iter_mut().for_each(|s| *s = 4.0);

@@ -40,7 +40,7 @@ fn absolute_screen_gradients_agree_with_the_reference() {
         for (s, a) in signed.iter().zip(&absolute) {
             assert!(s.abs() <= a * (1.0 + 1e-4) + 1e-6, "{name}: absolute gradient {a} below the signed {s}");
         }
-        // Asking changes nothing else.
+        // A probe does not change other gradients.
         let [same_signed, none, same_means] = screen_gradients(&TileRasterizer, &device, &host, &camera, false);
         assert!(same_signed == signed && same_means == means && none.is_empty(), "{name}: asking for absolute gradients changes others");
     }

@@ -1,4 +1,4 @@
-//! The library as a program uses it.
+//! The library as used by a program.
 
 use cc4dgs::{Error, Event, Orbit, Session, Split};
 use std::sync::Arc;
@@ -19,7 +19,7 @@ fn a_session_trains_saves_opens_and_plays() {
     assert_eq!(config.device, "flex");
     let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
 
-    // With and without a folder: the same bytes.
+    // With and without a run folder the bytes are equal.
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path().join("run");
     let model = session.train(&config, scene.clone(), Some(&run)).unwrap();
@@ -47,7 +47,7 @@ fn a_session_trains_saves_opens_and_plays() {
         assert!(image == second.frame(camera, orbit.time(index)).unwrap(), "a lossless archive draws the same image");
     }
 
-    // The scene as the model was trained on it: a black background, not the scene's own.
+    // The scene with the background that the model was trained with: black instead of the scene's own.
     let again = session.open_scene("procedural:tiny", &opened).unwrap();
     assert_eq!(again.background, Some([0.0; 3]));
     let report = session.evaluate(&opened, &again, Split::Test).unwrap();
@@ -59,7 +59,7 @@ fn a_stopped_training_leaves_a_checkpoint_and_resumes() {
     let session = flex();
     let stopper = session.clone();
     let stopping = Session::builder().device("flex").on_event(move |_| stopper.stop()).build().unwrap();
-    // A session stops its own trainings alone.
+    // A session stops only its own trainings.
     let config = stopping.config("demo", &["train.iterations=30"]).unwrap();
     let scene = Arc::new(stopping.read_scene("procedural:tiny", &config.scene).unwrap());
     let whole = stopping.train(&config, scene.clone(), None).unwrap();

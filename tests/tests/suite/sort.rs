@@ -1,4 +1,4 @@
-//! The sort behind tile lists and shared vertices, on every device.
+//! The sort of tile lists and shared vertices, on every device.
 
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::ops::sort::sort_order;
@@ -9,7 +9,7 @@ use rand::{Rng, SeedableRng};
 fn orders_are_ascending_and_stable() {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(4);
     for (name, device) in devices() {
-        // Around the sizes where one workgroup, one block or one pass is just enough.
+        // Sizes around the capacity of one workgroup, one block and one pass.
         for count in [1, 2, 255, 256, 257, 1023, 1024, 1025, 70_000] {
             for bits in [1, 8, 9, 17, 32] {
                 let keys: Vec<u32> = (0..count).map(|i| if i % 3 == 0 { random.random_range(0..7) } else { random.random() }).collect();

@@ -1,4 +1,4 @@
-//! What an appearance model must keep to.
+//! The conformance suite of appearance models.
 
 use super::{guarded, schema_is_the_default, uniform};
 use crate::gaussians::to_vec;
@@ -9,14 +9,19 @@ use burn::tensor::{Device, Tensor, TensorData};
 const SHAPE: [usize; 3] = [5, 7, 9];
 /// Training cameras.
 const CAMERAS: usize = 4;
-/// Largest relative difference between a slope by finite differences and the gradient along itself.
+/// Largest relative difference between a finite difference along the gradient and the gradient's norm.
 const SLOPE_TOLERANCE: f64 = 0.02;
 /// Size of the random changes of the weights.
 const SHAKE: f32 = 0.1;
 
-/// Holds an appearance model to its promises on `device`: its schema is TOML and states the defaults; unknown settings are refused; a fresh model changes
-/// nothing; a camera that was not trained on sees the rendered planes bit for bit, whatever the weights; alpha and depth stay; planes keep their shape and
-/// are finite; gradients by weights and planes agree with finite differences; parameters have sound names, shapes and groups; nothing panics.
+/// Tests an appearance model on `device`. Each finding is a line; an empty list means that it passed.
+///
+/// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
+/// - A new model is the identity.
+/// - For a camera that was not trained on, the planes are unchanged bit for bit, with any weights.
+/// - Alpha and depth are unchanged; planes keep their shape and are finite.
+/// - Gradients of weights and planes agree with finite differences.
+/// - Parameters have unique names, matching shapes and existing groups.
 pub fn appearance(plugin: &AppearancePlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
     guarded(
@@ -90,18 +95,18 @@ impl Suite<'_> {
         let fresh = self.fresh(self.device)?;
         for camera in 0..CAMERAS {
             if apply(fresh.as_ref(), Some(camera))?.iter().zip(&rendered).any(|(a, b)| (a - b).abs() > 1e-6) {
-                return Ok(Some(format!("a fresh model changes the image of camera {camera}")));
+                return Ok(Some(format!("a new model changes the image of camera {camera}")));
             }
         }
         let shaken = self.shaken(self.device)?;
         if apply(shaken.as_ref(), None)? != rendered {
-            return Ok(Some("a camera that was not trained on does not see the rendered planes".into()));
+            return Ok(Some("the planes of a camera that was not trained on are changed".into()));
         }
         for camera in 0..CAMERAS {
             let recorded = apply(shaken.as_ref(), Some(camera))?;
             let colour = 3 * SHAPE[1] * SHAPE[2];
             if recorded.len() != rendered.len() || recorded[colour..] != rendered[colour..] || !recorded.iter().all(|v| v.is_finite()) {
-                return Ok(Some(format!("camera {camera}: alpha or depth changed, or planes of another shape or not finite")));
+                return Ok(Some(format!("camera {camera}: alpha or depth changed, or planes have another shape or are not finite")));
             }
         }
         Ok(None)

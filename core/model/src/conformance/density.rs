@@ -1,4 +1,4 @@
-//! What a density control must keep to.
+//! The conformance suite of density controls.
 
 use super::{guarded, schema_is_the_default, uniform};
 use crate::{
@@ -8,17 +8,20 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 
 /// Gaussians at the start.
 const COUNT: usize = 40;
-/// More Gaussians than this, from [`COUNT`], are no answer to anything.
+/// Largest number of Gaussians that a control may grow [`COUNT`] to.
 const MOST: usize = 20 * COUNT;
 /// Iterations of the suite's stages.
 const ITERATIONS: usize = 320;
-/// Name of the extra attribute that tells the Gaussians apart.
+/// Name of the extra attribute that identifies the Gaussians.
 const LABEL: &str = "conformance-label";
 
-/// Holds a density control to its promises on `device`, over a coarse and a main stage of random statistics: its schema is TOML and states the defaults;
-/// unknown settings are refused; plans name rows and attributes that there are, set finite values, and never remove everything; equal seeds give equal
-/// plans; what is stored after any iteration continues to the same plans; stored state of another size is an error; Gaussians without any statistics, one
-/// Gaussian, and values that are not finite are answered; nothing panics.
+/// Tests a density control on `device`, with a coarse and a main stage of random statistics. Each finding is a line; an empty list means that it passed.
+///
+/// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
+/// - Plans refer to existing rows and attributes, set finite values, and never remove all Gaussians.
+/// - Equal seeds give equal plans. State stored after any iteration continues with the same plans.
+/// - Stored state of another size is an error.
+/// - Gaussians without statistics, a single Gaussian, and statistics that are not finite give plans or errors.
 pub fn density(plugin: &DensityPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
     guarded(
@@ -38,7 +41,7 @@ struct Suite<'a> {
     device: &'a Device,
 }
 
-/// What a run saw: the plan of every iteration, and the Gaussians at its end.
+/// The record of a run: the plan of every iteration, and the Gaussians at the end.
 struct Run {
     plans: Vec<Option<DensityPlan>>,
     end: Gaussians,
@@ -77,7 +80,7 @@ impl Suite<'_> {
     fn schedule(stage: Stage, iteration: usize) -> Schedule {
         Schedule { stage, iteration, total: 2 * ITERATIONS, ..Schedule::main(ITERATIONS) }
     }
-    /// Statistics of a view of `count` Gaussians, with what was asked for.
+    /// Random statistics of a view of `count` Gaussians; `wanted` lists the optional ones.
     fn view(&self, count: usize, wanted: &[Statistic], seed: Seed) -> ViewStatistics {
         let draw = |k: usize| uniform(seed, k);
         let radii: Vec<i64> = (0..count).map(|i| if draw(i) > -0.6 { 1 + (4.0 * (draw(i) + 1.0)) as i64 } else { 0 }).collect();
@@ -136,7 +139,7 @@ impl Suite<'_> {
     fn plans_are_sound(&self) -> Result<Option<String>> {
         let (first, second) = (self.run(None)?, self.run(None)?);
         if first.plans != second.plans {
-            return Ok(Some("two runs with equal seeds give other plans".into()));
+            return Ok(Some("two runs with equal seeds give different plans".into()));
         }
         if first.end.len() > MOST {
             return Ok(Some(format!("{COUNT} Gaussians became {} in {} iterations", first.end.len(), 2 * ITERATIONS)));
@@ -153,7 +156,7 @@ impl Suite<'_> {
         let whole = self.run(None)?;
         for at in [1, ITERATIONS / 3, ITERATIONS - 1] {
             if self.run(Some(at))?.plans != whole.plans {
-                return Ok(Some(format!("stored after iteration {at} of the main stage, it goes on with other plans")));
+                return Ok(Some(format!("after storing at iteration {at} of the main stage, it continues with other plans")));
             }
         }
         let mut control = self.build()?;
@@ -168,7 +171,7 @@ impl Suite<'_> {
         }
         let mut renamed = state;
         renamed.push(("conformance-no-such-array".into(), Tensor::zeros([COUNT], self.device)));
-        Ok(self.build()?.restore(renamed, COUNT).is_ok().then(|| "stored state with an array it does not know was accepted".into()))
+        Ok(self.build()?.restore(renamed, COUNT).is_ok().then(|| "stored state with an unknown array was accepted".into()))
     }
     fn odd_inputs_are_answered(&self) -> Result<Option<String>> {
         let mut odd = self.gaussians(3);
@@ -179,7 +182,7 @@ impl Suite<'_> {
             control.begin_stage(gaussians.len(), self.device);
             for iteration in 1..=ITERATIONS {
                 let schedule = Self::schedule(Stage::Main, iteration);
-                // No view saw anything.
+                // No Gaussian was visible in any view.
                 let Some(plan) = control.plan(&gaussians, &schedule, Seed::root(47).index(iteration as u64))? else { continue };
                 plan.check(self.plugin.info.name, &gaussians)?;
                 gaussians = plan.apply(&gaussians)?;
@@ -189,11 +192,11 @@ impl Suite<'_> {
     }
 }
 
-/// `gaussians` with other values of one attribute.
+/// `gaussians` with `values` [N,width] of the attribute `name`.
 fn replaced(gaussians: &Gaussians, name: &str, values: Tensor<2>) -> Result<Gaussians> {
     let Some(old) = gaussians.attribute(name).filter(|old| old.dims() == values.dims()) else {
-        let problem = format!("after_step returns '{name}' {:?}, which is no attribute of this shape", values.dims());
-        return Err(Error::backend("conformance", problem, "Return attributes that there are, for all rows"));
+        let problem = format!("after_step returns '{name}' {:?}, but there is no attribute of this name and shape", values.dims());
+        return Err(Error::backend("conformance", problem, "Return existing attributes, for all rows"));
     };
     drop(old);
     let all = gaussians.attribute_names().into_iter().filter_map(|n| Some((gaussians.attribute(&n)?, n)));

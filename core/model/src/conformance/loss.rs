@@ -1,4 +1,4 @@
-//! What a loss term must keep to.
+//! The conformance suite of loss terms.
 
 use super::{guarded, schema_is_the_default, uniform};
 use crate::gaussians::to_vec;
@@ -9,14 +9,18 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 const SIZE: [usize; 2] = [17, 23];
 /// Gaussians of the suite.
 const COUNT: usize = 6;
-/// Largest relative difference between a slope by finite differences and the gradient along itself.
+/// Largest relative difference between a finite difference along the gradient and the gradient's norm.
 const SLOPE_TOLERANCE: f64 = 0.05;
 /// Largest relative difference between a fused term and the sum of its parts.
 const FUSED_TOLERANCE: f64 = 1e-4;
 
-/// Holds a loss term to its promises on `device`: its schema is TOML and states the defaults; unknown settings are refused; the value is one finite number and
-/// repeats bit for bit; gradients by the planes and by the Gaussians agree with finite differences; images of one pixel and sets without Gaussians are
-/// answered; a term that stands in for others (looked up in `registry`) is their weighted sum; nothing panics.
+/// Tests a loss term on `device`. Each finding is a line; an empty list means that it passed.
+///
+/// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
+/// - The value is one finite number and repeats bit for bit.
+/// - Gradients of the planes and of the Gaussians agree with finite differences.
+/// - Images of one pixel and sets without Gaussians give a value or an error.
+/// - A fused term is the weighted sum of the terms it replaces, which are looked up in `registry`.
 pub fn loss(plugin: &LossPlugin, settings: &toml::Table, registry: &Registry, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, registry, device };
     guarded(
@@ -85,7 +89,7 @@ impl Suite<'_> {
     fn term(&self) -> Result<Box<dyn LossTerm>> {
         (self.plugin.build)(self.settings)
     }
-    /// The value, and the tracked inputs if `track`: planes and Gaussians.
+    /// The value and its inputs, planes and Gaussians; they track gradients if `track` is set.
     fn value(&self, term: &dyn LossTerm, inputs: &Inputs, track: bool) -> Result<(Option<Tensor<1>>, Tensor<3>, Gaussians)> {
         let device = self.device.clone().autodiff();
         let [h, w] = inputs.size;
@@ -111,9 +115,9 @@ impl Suite<'_> {
     }
     fn value_is_a_number(&self) -> Result<Option<String>> {
         let (term, inputs) = (self.term()?, inputs(SIZE, COUNT));
-        let Some(value) = self.value(term.as_ref(), &inputs, true)?.0 else { return Ok(Some("it has no value for an ordinary view".into())) };
+        let Some(value) = self.value(term.as_ref(), &inputs, true)?.0 else { return Ok(Some("it returns no value for an ordinary view".into())) };
         if value.dims() != [1] {
-            return Ok(Some(format!("its value has shape {:?} in place of [1]", value.dims())));
+            return Ok(Some(format!("its value has shape {:?}, expected [1]", value.dims())));
         }
         let (first, second) = (self.number(term.as_ref(), &inputs)?, self.number(term.as_ref(), &inputs)?);
         Ok((!first.is_finite() || first != second).then(|| format!("two values of one input are {first} and {second}")))
@@ -144,7 +148,7 @@ impl Suite<'_> {
                 continue;
             }
             reached += 1;
-            // The first steps may drown in rounding where the last cross kinks.
+            // The first steps may be below the rounding error, the last may cross kinks.
             let mut slopes = Vec::new();
             for step in [3e-3, 1e-2, 3e-2] {
                 let mut ends = [0.0; 2];
@@ -180,6 +184,6 @@ impl Suite<'_> {
         for (kind, weight) in fusion.kinds.iter().zip(&weights) {
             sum += weight * self.number((self.registry.loss(kind)?.build)(&toml::Table::new())?.as_ref(), &inputs)?;
         }
-        Ok(((fused - sum).abs() > FUSED_TOLERANCE * sum.abs()).then(|| format!("with weights {weights:?} it is {fused}, its parts sum to {sum}")))
+        Ok(((fused - sum).abs() > FUSED_TOLERANCE * sum.abs()).then(|| format!("with weights {weights:?} it is {fused}, the sum of its terms is {sum}")))
     }
 }

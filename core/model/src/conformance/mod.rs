@@ -1,6 +1,7 @@
-//! Suites that every plug-in passes, ours and anyone's: call them from a test of your own crate.
+//! Conformance suites for plug-ins. Call them from a test of the plug-in's own crate.
 //!
-//! Each returns what it found wrong, one line per finding; an empty list is a pass. They draw their own inputs and need no data, but for readers, which need a tiny dataset.
+//! Each returns a list of findings, one line each; an empty list means that the plug-in passed. They generate their own inputs and need no data, except for readers,
+//! which need a tiny dataset.
 
 mod appearance;
 mod deformer;
@@ -26,7 +27,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_format::conformance::uniform;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// One check by name: what it found, if anything.
+/// A check with its name; it returns a finding, if any.
 type Check<'a> = (&'static str, Box<dyn Fn() -> Result<Option<String>> + 'a>);
 
 /// Runs all checks of `subject`; errors and panics are findings too.
@@ -48,10 +49,10 @@ fn guarded(subject: &str, checks: Vec<Check>) -> Vec<String> {
 fn schema_is_the_default(kind: &str, info: &Plugin, build: impl Fn(&toml::Table) -> Result<()>) -> Result<Option<String>> {
     let stated = config::parse_table(&format!("schema of {kind} {}", info.name), info.schema)?;
     build(&toml::Table::new())?;
-    Ok(build(&stated).err().map(|e| format!("it refuses the settings that its schema states: {e}")))
+    Ok(build(&stated).err().map(|e| format!("it refuses the settings of its own schema: {e}")))
 }
 
-/// `[rows, width]` uniform in -1..1.
+/// A tensor `[rows, width]` of uniform random numbers in -1..1.
 fn matrix(seed: Seed, rows: usize, width: usize, device: &Device) -> Tensor<2> {
     let values: Vec<f32> = (0..rows * width).map(|k| uniform(seed, k)).collect();
     Tensor::from_data(TensorData::new(values, [rows, width]), device)

@@ -1,4 +1,4 @@
-//! What an optimizer must keep to.
+//! The conformance suite of optimizers.
 
 use super::{guarded, matrix, schema_is_the_default};
 use crate::gaussians::to_vec;
@@ -7,12 +7,17 @@ use burn::tensor::{Device, Int, Tensor};
 
 /// Rows and width of the suite's array.
 const SHAPE: [usize; 2] = [12, 3];
-/// Steps within which a quadratic must be at most a tenth of what it was.
+/// Number of steps in which a quadratic function must fall to a tenth or less.
 const STEPS: usize = 400;
 
-/// Holds an optimizer to its promises on `device`: its schema is TOML and states the defaults; unknown settings are refused; it lowers a quadratic; rows that
-/// are not visible keep their values and their state; rows follow their parents, and fresh ones start from nothing; forgetting state, and storing and
-/// restoring it, lead to the same bytes as never having had it and as never having stored it; broken state is an error; nothing panics.
+/// Tests an optimizer on `device`. Each finding is a line; an empty list means that it passed.
+///
+/// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
+/// - It minimises a quadratic function.
+/// - Rows that are not visible keep values and state.
+/// - Selected rows take over the state of their parents; fresh rows start with zero state.
+/// - After a restart it takes the same steps as a new optimizer; after storing and restoring state, the same steps as without.
+/// - Invalid state is an error.
 pub fn optimizer(plugin: &OptimizerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
     guarded(
@@ -50,7 +55,7 @@ impl Suite<'_> {
     fn start(&self) -> Tensor<2> {
         matrix(Seed::root(71), SHAPE[0], SHAPE[1], self.device)
     }
-    /// `steps` steps down a quadratic whose minimum is at zero.
+    /// `steps` steps on a quadratic function with its minimum at zero.
     fn descend(&self, optimizer: &mut dyn Optimizer, mut value: Tensor<2>, steps: usize) -> Result<Tensor<2>> {
         for _ in 0..steps {
             let gradient = value.clone().mul_scalar(2.0);
@@ -99,11 +104,11 @@ impl Suite<'_> {
         let after = to_vec(reordered.step(NAME, moved, moved_gradient, &StepSettings::new(0.02))?, "values")?;
         for (row, &parent) in parents.iter().enumerate().take(SHAPE[0]) {
             if after[row * SHAPE[1]..(row + 1) * SHAPE[1]] != plain[parent * SHAPE[1]..(parent + 1) * SHAPE[1]] {
-                return Ok(Some(format!("row {row}, which was row {parent}, takes another step")));
+                return Ok(Some(format!("row {row}, a copy of row {parent}, takes another step")));
             }
         }
         if reordered.select_rows("gaussians/", &[SHAPE[0] + 5], &[false]).is_ok() {
-            return Ok(Some("a row that there is not was selected".into()));
+            return Ok(Some("a row that does not exist was selected".into()));
         }
         Ok(None)
     }
@@ -116,10 +121,10 @@ impl Suite<'_> {
         forgetful.restart("gaussians/");
         let step = |o: &mut dyn Optimizer| to_vec(self.descend(o, middle.clone(), 3)?, "values");
         if step(whole.as_mut())? != step(copy.as_mut())? {
-            return Ok(Some("after its state is restored it takes other steps".into()));
+            return Ok(Some("after restoring its state it takes other steps".into()));
         }
         if step(forgetful.as_mut())? != step(self.build()?.as_mut())? {
-            return Ok(Some("after its state is forgotten it takes other steps than a new one".into()));
+            return Ok(Some("after a restart it takes other steps than a new optimizer".into()));
         }
         let mut state = whole.state();
         let Some(name) = state.arrays.keys().next().cloned() else { return Ok(None) };

@@ -1,9 +1,12 @@
-//! What a preset must keep to.
+//! The conformance suite of presets.
 
 use crate::{PresetPlugin, PresetRole, Registry};
 
-/// Holds a preset to its promises: its name can be written in `FAMILY+METHOD`; its layer is TOML; a method's layer holds tables for families and changes
-/// something; with every family or method it makes settings whose field is registered.
+/// Tests a preset. Each finding is a line; an empty list means that it passed.
+///
+/// - Its name can be used in `FAMILY+METHOD`.
+/// - Its layer is TOML; a method's layer has tables for families and changes a setting.
+/// - Combined with every family or method, it gives settings with a registered deformer.
 pub fn preset(plugin: &PresetPlugin, registry: &Registry) -> Vec<String> {
     let name = plugin.info.name;
     let mut findings = Vec::new();

@@ -1,4 +1,4 @@
-//! What a rasterizer must keep to.
+//! The conformance suite of rasterizers.
 
 mod probes;
 
@@ -11,16 +11,16 @@ use burn::tensor::{Device, Tensor, TensorData};
 const SIZE: (u32, u32) = (37, 25);
 /// Gaussians of the suite.
 const COUNT: usize = 30;
-/// Largest relative difference between a slope by finite differences and the gradient along itself.
+/// Largest relative difference between a finite difference along the gradient and the gradient's norm.
 const SLOPE_TOLERANCE: f64 = 0.05;
 
-/// Holds a rasterizer to its promises on `device`:
+/// Tests a rasterizer on `device`. Each finding is a line; an empty list means that it passed.
 ///
 /// - Unknown settings are refused.
 /// - Without Gaussians, the image is the background.
-/// - A Gaussian in the middle of the image has its own colour and opacity there.
+/// - At the centre of a Gaussian in the middle of the image, the image has its colour and opacity.
 /// - Gaussians behind the camera, and those that are not finite, are not drawn; their radius is 0.
-/// - Planes have their shapes, alpha lies in 0..1, and two renders are the same bit for bit. Largest weights lie in 0..1 where they are asked for.
+/// - Planes have their shapes, alpha lies in 0..1, and two renders are equal bit for bit. Largest weights, if requested, lie in 0..1.
 /// - Gradients agree with finite differences: of every attribute, of projected centres (signed, and absolute per pixel), and of the camera's pose.
 pub fn rasterizer(plugin: &RasterizerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let name = plugin.info.name;
@@ -54,7 +54,7 @@ struct Suite<'a> {
     device: &'a Device,
 }
 
-/// Whether a slope by finite differences along a gradient is that gradient's norm.
+/// Whether one of the finite differences along a gradient agrees with the gradient's norm.
 fn agrees(slopes: &[f64], norm: f64) -> bool {
     slopes.iter().any(|slope| (slope / norm - 1.0).abs() <= SLOPE_TOLERANCE)
 }
@@ -69,7 +69,7 @@ fn camera() -> Camera {
     Camera::look_at("conformance", SIZE, 0.9, [0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0])
 }
 
-/// Soft, round Gaussians in sight, so that nothing is at a threshold.
+/// Faint, round Gaussians in view, so that no value is at a threshold.
 fn cloud(count: usize) -> HostGaussians {
     let seed = Seed::root(31);
     let mut g = HostGaussians { sh_degree: 1, ..Default::default() };
@@ -109,7 +109,7 @@ impl Suite<'_> {
         g.opacity_logits = vec![0.4];
         g.sh_rest.fill(0.0);
         let planes = self.planes(&g)?;
-        // Rows and columns are odd in number, so that the principal point is the centre of a pixel.
+        // The numbers of rows and columns are odd, so the principal point is the centre of a pixel.
         let (width, height) = (SIZE.0 as usize, SIZE.1 as usize);
         let (middle, pixels) = (height / 2 * width + width / 2, width * height);
         let opacity = 1.0 / (1.0 + (-0.4f32).exp());
@@ -117,12 +117,12 @@ impl Suite<'_> {
             let wanted = opacity * (0.282_094_79 * dc + 0.5).max(0.0);
             let found = planes[k * pixels + middle];
             if (wanted - found).abs() > 2e-3 || !found.is_finite() {
-                return Ok(Some(format!("channel {k} in the middle is {found} where {wanted} is expected")));
+                return Ok(Some(format!("channel {k} in the middle is {found}, expected {wanted}")));
             }
         }
         let (alpha, depth) = (planes[3 * pixels + middle], planes[4 * pixels + middle]);
         let right = (alpha - opacity).abs() < 2e-3 && (depth - 4.0 * opacity).abs() < 1e-2;
-        Ok((!right).then(|| format!("alpha {alpha} and depth {depth} in the middle where {opacity} and {} are expected", 4.0 * opacity)))
+        Ok((!right).then(|| format!("alpha {alpha} and depth {depth} in the middle, expected {opacity} and {}", 4.0 * opacity)))
     }
     fn odd_gaussians_are_left_out(&self) -> Result<Option<String>> {
         let clean = cloud(4);
@@ -194,7 +194,7 @@ impl Suite<'_> {
                 return Ok(Some(format!("the gradient of {name} has norm {norm}")));
             }
             let mut slopes = Vec::new();
-            // Short steps drown in rounding where long ones cross a threshold, and the other way round.
+            // Short steps may be below the rounding error, long ones may cross a threshold.
             for step in [3e-4, 1e-3, 3e-3] {
                 let mut ends = [0.0; 2];
                 for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {

@@ -1,25 +1,29 @@
-//! What a dataset reader must keep to.
+//! The conformance suite of dataset readers.
 
 use crate::reader::{ImageSource, InitBox, RawCamera, RawScene, RawView, ReaderPlugin, SceneOptions, files};
 use crate::{Error, Image8, Limits, Result, Seed, Split};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
-/// Damaged versions of each file that are tried, per way of damaging.
+/// Damaged versions tried per file and kind of damage.
 const DAMAGES: usize = 16;
-/// The most files of a dataset that are damaged; images count twice, because many look alike.
+/// Largest number of files that are damaged; images count twice, because many are similar.
 const FILES: usize = 24;
-/// Images of the dataset that are decoded.
+/// Largest number of images that are decoded.
 const IMAGES: usize = 12;
-/// What a reader may believe of a tiny dataset.
+/// Limits for a tiny dataset.
 const LIMITS: Limits = Limits { max_bytes: 1 << 24, max_gaussians: 100_000, max_pixels: 1 << 22, max_depth: 64 };
-/// What stands in for a number of a text file.
+/// Replacements for numbers in text files.
 const ABSURD: [&str; 6] = ["1e308", "-1", "99999999999999999999", "0", "nan", ""];
 
-/// Holds a reader to its promises on the tiny dataset at `folder`, which it must be able to open: it recognises the folder and neither an empty nor a missing
-/// one; it reads the same twice; its poses are rigid, its times lie in 0..1 and grow with the frames; there is a training view; images and masks have the size of
-/// their cameras, or that size scaled; a scene it calls resized follows `scene.width`; and damaged copies of its files (truncated, with flipped bits, with absurd
-/// numbers) give errors or sound scenes, never a panic.
+/// Tests a reader on the tiny dataset at `folder`, which it must be able to open. Each finding is a line; an empty list means that it passed.
+///
+/// - It recognises the folder, and neither an empty nor a missing one.
+/// - Opening twice gives equal scenes.
+/// - Poses are rigid; times lie in 0..1 and increase with frames; there is a training view.
+/// - Images and masks have the size of their cameras, or a scaled size of the same aspect.
+/// - A scene marked as resized has the size of `scene.width`.
+/// - Damaged copies of its files (truncated, flipped bits, absurd numbers) give errors or valid scenes, never a panic.
 ///
 /// The dataset is copied, not changed. A `folder` that does not exist is allowed for readers that compute their scenes.
 pub fn reader(plugin: &ReaderPlugin, folder: &Path) -> Vec<String> {
@@ -118,7 +122,7 @@ fn images(scene: &RawScene) -> Vec<String> {
     found
 }
 
-/// Whether there is an image, which then must fit the camera. Videos need a program and are passed over.
+/// Whether there is an image; its size must match the camera. Videos are skipped, because they need an external program.
 fn image(camera: &RawCamera, source: &ImageSource) -> Result<bool> {
     match source {
         ImageSource::Video { .. } => Ok(false),
@@ -130,7 +134,11 @@ fn image(camera: &RawCamera, source: &ImageSource) -> Result<bool> {
             if let Some(mask) = mask.as_ref().filter(|m| m.is_file()) {
                 let size = files::image_size(mask, &LIMITS)?;
                 if size != (found.width, found.height) {
-                    return Err(Error::data(mask.display().to_string(), format!("a mask of {size:?} pixels for {object}"), "A mask has the size of its image"));
+                    return Err(Error::data(
+                        mask.display().to_string(),
+                        format!("a mask of {size:?} pixels for {object}"),
+                        "Give the mask the size of its image",
+                    ));
                 }
             }
             Ok(true)
@@ -139,7 +147,7 @@ fn image(camera: &RawCamera, source: &ImageSource) -> Result<bool> {
     }
 }
 
-/// Files may have another size than the calibration, if the aspect is the same; frames a reader brings have the camera's.
+/// Files may have another size than the calibration if the aspect is the same; frames that a reader computes have the camera's size.
 fn fits(object: &str, camera: &RawCamera, image: &Image8, scaled: bool) -> Result<()> {
     image.validate(object)?;
     let scale = [0, 1].map(|k| f64::from([image.width, image.height][k]) / f64::from(camera.size[k]));
@@ -163,7 +171,7 @@ fn follows_the_size(plugin: &ReaderPlugin, folder: &Path, scene: &RawScene) -> R
     }
     let small = attempt(plugin, folder, &SceneOptions { width: 8, ..SceneOptions::default() })?;
     let wrong = small.cameras.iter().find(|c| c.size[0] != 8);
-    Ok(wrong.map(|c| format!("camera {} has {:?} pixels where scene.width is 8", c.name, c.size)).into_iter().collect())
+    Ok(wrong.map(|c| format!("camera {} has {:?} pixels, but scene.width is 8", c.name, c.size)).into_iter().collect())
 }
 
 fn survives_damage(plugin: &ReaderPlugin, folder: &Path) -> Result<Vec<String>> {
@@ -175,7 +183,7 @@ fn survives_damage(plugin: &ReaderPlugin, folder: &Path) -> Result<Vec<String>> 
     let target = copy.path().join("dataset");
     let mut copied = Vec::new();
     copy_tree(folder, &target, &mut copied)?;
-    // Index files first: few datasets have many.
+    // Index files first; most datasets have few.
     copied.sort_by_key(|p| (files::is_image(p), p.clone()));
     let images = copied.iter().filter(|p| files::is_image(p)).count();
     copied.truncate((copied.len() - images + FILES / 12).min(FILES));
@@ -185,7 +193,7 @@ fn survives_damage(plugin: &ReaderPlugin, folder: &Path) -> Result<Vec<String>> 
             std::fs::write(file, bytes).map_err(|e| Error::io(file, e))?;
             match attempt(plugin, &target, &SceneOptions::default()) {
                 Err(e) if is_panic(&e) => found.push(format!("it panics where {} {what}", files::file_name(file))),
-                Err(e) if e.to_string().len() < 12 => found.push(format!("{} {what}: the error {e:?} says too little", files::file_name(file))),
+                Err(e) if e.to_string().len() < 12 => found.push(format!("{} {what}: the error {e:?} is too short to be useful", files::file_name(file))),
                 _ => {}
             }
         }
@@ -210,7 +218,7 @@ fn copy_tree(from: &Path, to: &Path, copied: &mut Vec<PathBuf>) -> Result<()> {
     Ok(())
 }
 
-/// Damaged versions of a file, with what was done to each.
+/// Damaged versions of a file, each with a description of the damage.
 fn damages(sound: &[u8], seed: Seed) -> Vec<(String, Vec<u8>)> {
     let mut out = vec![("is empty".to_string(), Vec::new())];
     if sound.is_empty() {
@@ -219,12 +227,12 @@ fn damages(sound: &[u8], seed: Seed) -> Vec<(String, Vec<u8>)> {
     let draw = |name: &str, k: usize, below: usize| (seed.child(name).index(k as u64).value() % below.max(1) as u64) as usize;
     for k in 0..DAMAGES {
         let at = draw("cut", k, sound.len());
-        out.push((format!("is cut at byte {at}"), sound[..at].to_vec()));
+        out.push((format!("is truncated at byte {at}"), sound[..at].to_vec()));
         let at = draw("flip", k, sound.len());
         let mut bytes = sound.to_vec();
         bytes[at] ^= 1 << (k % 8);
         out.push((format!("has a flipped bit at byte {at}"), bytes));
-        // A size or count: the beginning first, where headers are.
+        // A wrong size or count; offsets near the beginning first, where headers are.
         let at = if k < 4 { 8 * k } else { draw("word", k, sound.len()) };
         let mut bytes = sound.to_vec();
         let value: u8 = if k % 2 == 0 { 0xff } else { 0x7f };
@@ -236,13 +244,16 @@ fn damages(sound: &[u8], seed: Seed) -> Vec<(String, Vec<u8>)> {
         for k in 0..(2 * DAMAGES).min(ABSURD.len() * numbers.len()) {
             let (start, end) = numbers[draw("number", k, numbers.len())];
             let absurd = ABSURD[k % ABSURD.len()];
-            out.push((format!("says '{absurd}' for '{}' at byte {start}", &text[start..end]), [&text[..start], absurd, &text[end..]].concat().into_bytes()));
+            out.push((
+                format!("has '{absurd}' instead of '{}' at byte {start}", &text[start..end]),
+                [&text[..start], absurd, &text[end..]].concat().into_bytes(),
+            ));
         }
     }
     out
 }
 
-/// Where numbers stand in a text, as byte ranges.
+/// The byte ranges of numbers in a text.
 fn numbers(text: &str) -> Vec<(usize, usize)> {
     let (mut found, mut start) = (Vec::new(), None);
     for (i, b) in text.bytes().chain([b' ']).enumerate() {

@@ -10,13 +10,16 @@ pub const MS_SSIM_WEIGHTS: [f64; 5] = [0.0448, 0.2856, 0.3001, 0.2363, 0.1333];
 /// The smallest side that still holds an 11-tap window after four halvings.
 const SMALLEST_SIDE: usize = 161;
 
-/// MS-SSIM of two pictures of data range 1: windows inside the picture only, 2x2 mean pooling between scales, contrast terms of the first four
+/// MS-SSIM of two images of data range 1: windows inside the image only, 2x2 mean pooling between scales, contrast terms of the first four
 /// scales and SSIM of the last, negative terms set to 0, product per channel, mean over channels. Refuses sides below 161 pixels.
+///
+/// # Errors
+/// [`Error::Parameter`] for small images or different shapes.
 pub fn ms_ssim(a: &Planes, b: &Planes) -> Result<f64> {
     a.check_pair(b, None)?;
     if a.width().min(a.height()) < SMALLEST_SIDE {
-        let problem = format!("a {}x{} picture has a side below {SMALLEST_SIDE} pixels", a.width(), a.height());
-        return Err(Error::parameter("MS-SSIM", problem, "Five scales need larger pictures; use SSIM"));
+        let problem = format!("the image is {}x{}; each side needs at least {SMALLEST_SIDE} pixels", a.width(), a.height());
+        return Err(Error::parameter("MS-SSIM", problem, "Use SSIM, or larger images"));
     }
     let mut products = vec![1.0; a.channels()];
     let mut scale = (a.clone(), b.clone());

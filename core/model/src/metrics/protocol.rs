@@ -1,4 +1,4 @@
-//! A metric and everything its number depends on.
+//! A metric and everything that its score depends on.
 
 use super::{Planes, SsimConvention, ms_ssim, psnr, ssim};
 use crate::{Error, Image8, Result, Split};
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MetricKind {
-    /// Peak signal-to-noise ratio in dB, MSE over all channels and pixels of a picture, mean over pictures.
+    /// Peak signal-to-noise ratio in dB, MSE over all channels and pixels of an image, mean over images.
     Psnr,
     /// Structural similarity.
     Ssim,
@@ -16,11 +16,11 @@ pub enum MetricKind {
     MsSsim,
 }
 
-/// What is done to pixel values before they are compared.
+/// Rounding of pixel values before they are compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Rounding {
-    /// Both pictures are compared as they are.
+    /// Both images are compared without rounding.
     Float,
     /// Both are clamped to 0..1 and rounded to 256 levels, as if saved as PNG (the protocol of published tables).
     EightBit,
@@ -35,11 +35,11 @@ pub struct Window {
     pub sigma: f64,
 }
 
-/// What a window sees beyond the border.
+/// Values of a window beyond the border.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Padding {
-    /// Nothing: only windows inside the picture count.
+    /// None: only windows inside the image count.
     Valid,
     /// Zeros: every pixel is the centre of a window.
     Zero,
@@ -49,29 +49,29 @@ pub enum Padding {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MaskRule {
-    /// All.
+    /// All pixels.
     Whole,
-    /// Those set in a mask (for SSIM: windows centred on them).
+    /// Pixels set in a mask (for SSIM: windows centred on them).
     Masked,
 }
 
-/// Which pictures of a scene were measured.
+/// The images of a scene that a mean is over.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FrameSet {
     /// The side of the split.
     pub split: Split,
-    /// How many pictures the mean is over, evenly spread.
+    /// Number of images that the mean is over, evenly spread.
     pub count: usize,
-    /// How many the split has.
+    /// Number of images of the split.
     pub of: usize,
 }
 
-/// Everything a score depends on besides the pictures.
+/// Everything that a score depends on besides the images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Protocol {
     /// The formula.
     pub metric: MetricKind,
-    /// The convention, where several are in use.
+    /// The convention, if several are in use.
     pub convention: Option<SsimConvention>,
     /// The span from black to white.
     pub data_range: f64,
@@ -83,11 +83,11 @@ pub struct Protocol {
     pub padding: Option<Padding>,
     /// Which pixels count.
     pub mask: MaskRule,
-    /// Which pictures the mean is over, once known.
+    /// The images that the mean is over, once known.
     pub frames: Option<FrameSet>,
 }
 
-/// A metric whose number can be trusted because it carries its [`Protocol`]. Only its constructors make one, so the protocol is what is computed.
+/// A metric with its [`Protocol`]. Only the constructors below create one, so the protocol always states what is computed.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(transparent)]
 pub struct Metric {
@@ -112,7 +112,7 @@ impl Metric {
         self.protocol.mask = MaskRule::Masked;
         self
     }
-    /// The same metric, recording which pictures its mean is over.
+    /// The same metric, recording the images that its mean is over.
     pub fn over(mut self, frames: FrameSet) -> Self {
         self.protocol.frames = Some(frames);
         self
@@ -121,7 +121,10 @@ impl Metric {
     pub fn protocol(&self) -> &Protocol {
         &self.protocol
     }
-    /// The score of `render` against `reference`, both planes `[channels, height, width]` in 0..1. A masked metric needs a mask `[H,W]`, a whole one takes none.
+    /// The score of `render` against `reference`, both planes `[channels, height, width]` in 0..1. A masked metric needs a mask `[H,W]`, others must not get one.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for shapes and masks that do not match, [`Error::Data`] for values that are not finite, [`Error::Unsupported`] for MS-SSIM with a mask.
     pub fn score(&self, reference: &[f32], render: &[f32], shape: [usize; 3], mask: Option<&[bool]>) -> Result<f64> {
         let [channels, height, width] = shape;
         let planes = |values: &[f32]| match self.protocol.rounding {
@@ -129,11 +132,18 @@ impl Metric {
             Rounding::EightBit => Planes::from_f32_rounded(values, channels, height, width),
         };
         if mask.is_some() != (self.protocol.mask == MaskRule::Masked) {
-            return Err(Error::parameter("metric mask", "the mask given and the protocol disagree", "Use Metric::masked() exactly when passing a mask"));
+            return Err(Error::parameter(
+                "metric mask",
+                "a mask was given for an unmasked metric, or is missing for a masked one",
+                "Use Metric::masked() if and only if a mask is passed",
+            ));
         }
         self.compute(&planes(reference)?, &planes(render)?, mask)
     }
-    /// The score of two 8-bit pictures, which are rounded already; alpha channels are left out. Refuses masked metrics.
+    /// The score of two 8-bit images, which are rounded already; alpha channels are ignored. Refuses masked metrics.
+    ///
+    /// # Errors
+    /// As [`Metric::score`].
     pub fn score_images(&self, reference: &Image8, render: &Image8) -> Result<f64> {
         if self.protocol.mask == MaskRule::Masked {
             return Err(Error::parameter("metric mask", "a masked metric needs a mask", "Use Metric::score"));
@@ -145,7 +155,7 @@ impl Metric {
             (MetricKind::Psnr, _) => psnr(reference, render, mask),
             (MetricKind::Ssim, convention) => ssim(reference, render, convention.unwrap_or(SsimConvention::Skimage), mask),
             (MetricKind::MsSsim, _) if mask.is_some() => {
-                Err(Error::unsupported("MS-SSIM with a mask", "pooled scales have no agreed mask", "Use SSIM for masked pixels"))
+                Err(Error::unsupported("MS-SSIM with a mask", "there is no established definition of masks at pooled scales", "Use SSIM for masked pixels"))
             }
             (MetricKind::MsSsim, _) => ms_ssim(reference, render),
         }

@@ -1,11 +1,11 @@
-//! Peak signal-to-noise ratio and the plain errors under it.
+//! Peak signal-to-noise ratio, mean squared and mean absolute error.
 
 use super::Planes;
 use crate::Result;
 use rayon::prelude::*;
 
-/// What identical pictures score, in dB. A number rather than infinity, so that means and JSON stay defined; no pair of 8-bit
-/// pictures with fewer than 380 million values comes this close without being equal.
+/// The PSNR of identical images in dB. Finite, so that means and JSON stay defined. Two different 8-bit images with fewer than 380 million
+/// values always score less.
 pub const PSNR_CEILING_DB: f64 = 134.0;
 
 /// The mean over all channels and (masked) pixels of `term(a, b)`, summed row by row in a fixed order.

@@ -5,23 +5,23 @@ use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Which of the conventions in use computes SSIM. All share the 11-tap Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2 for data range 1,
+/// A convention of SSIM. All share the 11-tap Gaussian window of sigma 1.5, C1 = 0.01^2, C2 = 0.03^2 for data range 1,
 /// population covariances, and average over channels; they differ at the border and therefore in the second decimal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SsimConvention {
-    /// scikit-image with `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`: only windows that lie inside the picture.
+    /// scikit-image with `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`: only windows that lie inside the image.
     Skimage,
-    /// Inria's 3DGS code and its descendants: the picture is padded with 5 zeros, every pixel counts.
+    /// Inria's 3DGS code and its descendants: the image is padded with 5 zeros per side, every pixel counts.
     Inria,
 }
 
 impl SsimConvention {
-    /// The window both conventions share.
+    /// The window, which both conventions share.
     pub fn window(self) -> Window {
         Window { taps: 11, sigma: 1.5 }
     }
-    /// What happens at the border.
+    /// The rule at the border.
     pub fn padding(self) -> Padding {
         match self {
             Self::Skimage => Padding::Valid,
@@ -30,7 +30,10 @@ impl SsimConvention {
     }
 }
 
-/// SSIM of two pictures of data range 1, mean over windows and channels. With a mask `[H,W]`, only windows centred on set pixels count.
+/// SSIM of two images of data range 1, mean over windows and channels. With a mask `[H,W]`, only windows centred on set pixels count.
+///
+/// # Errors
+/// [`Error::Parameter`] for different shapes, an image smaller than the window, or a mask without pixels.
 pub fn ssim(a: &Planes, b: &Planes, convention: SsimConvention, mask: Option<&[bool]>) -> Result<f64> {
     a.check_pair(b, mask)?;
     let means = channel_means(a, b, convention.padding(), mask)?;
@@ -42,7 +45,7 @@ const RADIUS: usize = TAPS / 2;
 const SIGMA: f64 = 1.5;
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
-/// Output rows per task: enough to make the ten rows of overlap cheap, few enough to feed all threads.
+/// Output rows per task: enough to amortise the ten rows of overlap, few enough to give every thread work.
 const BAND: usize = 48;
 
 fn gaussian_window() -> [f64; TAPS] {
@@ -71,8 +74,8 @@ pub(super) fn channel_means(a: &Planes, b: &Planes, padding: Padding, mask: Opti
     };
     let (out_width, out_height) = ((a.width() + 2 * pad).saturating_sub(TAPS - 1), (a.height() + 2 * pad).saturating_sub(TAPS - 1));
     if out_width == 0 || out_height == 0 {
-        let problem = format!("a {}x{} picture is smaller than the {TAPS}x{TAPS} window", a.width(), a.height());
-        return Err(Error::parameter("SSIM without padding", problem, "Compare larger pictures or use the inria convention"));
+        let problem = format!("the image is {}x{}, smaller than the {TAPS}x{TAPS} window", a.width(), a.height());
+        return Err(Error::parameter("SSIM without padding", problem, "Compare larger images or use the inria convention"));
     }
     let bands = out_height.div_ceil(BAND);
     let sums: Vec<Sums> = (0..a.channels() * bands)
@@ -87,7 +90,7 @@ pub(super) fn channel_means(a: &Planes, b: &Planes, padding: Padding, mask: Opti
         .map(|chunk| {
             let total = chunk.iter().fold(Sums::default(), |t, s| Sums { ssim: t.ssim + s.ssim, contrast: t.contrast + s.contrast, count: t.count + s.count });
             if total.count == 0 {
-                return Err(Error::parameter("metric mask", "no whole window is centred on a set pixel", "Leave such frames out of the frame set"));
+                return Err(Error::parameter("metric mask", "no whole window is centred on a set pixel", "Exclude such frames from the frame set"));
             }
             Ok(ChannelMeans { ssim: total.ssim / total.count as f64, contrast: total.contrast / total.count as f64 })
         })

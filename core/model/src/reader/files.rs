@@ -1,4 +1,4 @@
-//! Reading files that may be hostile: sizes are checked before anything is allocated for them.
+//! Reading of untrusted files: sizes are checked before memory is allocated.
 
 use crate::{Error, Image8, Limits, Result};
 use image::{DynamicImage, ImageReader};
@@ -7,12 +7,15 @@ use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
-/// The whole of a regular file, refused over `limits.max_bytes`.
+/// The bytes of a regular file of at most `limits.max_bytes`.
+///
+/// # Errors
+/// [`Error::Io`], [`Error::Data`] for other than regular files, [`Error::Limit`].
 pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
     let object = path.display().to_string();
     let meta = std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
     if !meta.is_file() {
-        // A pipe would make the reader wait for ever.
+        // Reading a pipe could block for ever.
         return Err(Error::data(object, "is not a regular file", "Point to a file"));
     }
     limits.check_bytes(&object, meta.len())?;
@@ -23,12 +26,18 @@ pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
 }
 
 /// The file as UTF-8 text.
+///
+/// # Errors
+/// As [`read_bytes`], and [`Error::Data`] for other text.
 pub fn read_text(path: &Path, limits: &Limits) -> Result<String> {
     String::from_utf8(read_bytes(path, limits)?)
         .map_err(|e| Error::data(path.display().to_string(), format!("byte {} is not UTF-8 text", e.utf8_error().valid_up_to()), "Fetch the file again"))
 }
 
-/// The JSON document of a file.
+/// The JSON document of a file, nested at most `limits.max_depth` deep.
+///
+/// # Errors
+/// As [`read_text`], and [`Error::Data`] for invalid JSON.
 pub fn read_json<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T> {
     let text = read_text(path, limits)?;
     let object = path.display().to_string();
@@ -59,7 +68,10 @@ fn limits_depth(text: &str, object: &str, limits: &Limits) -> Result<()> {
     Ok(())
 }
 
-/// Sorted entries of a folder that satisfy `keep`.
+/// Sorted entries of a folder for which `keep` is true.
+///
+/// # Errors
+/// [`Error::Io`].
 pub fn list(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
@@ -82,7 +94,7 @@ pub fn has_extension(path: &Path, known: &[&str]) -> bool {
     path.extension().and_then(|e| e.to_str()).is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()))
 }
 
-/// The last part of a path as text.
+/// The last component of a path as text.
 pub fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_else(|| path.display().to_string())
 }
@@ -91,7 +103,10 @@ fn image_error(path: &Path, e: impl std::fmt::Display) -> Error {
     Error::data(path.display().to_string(), format!("not a readable image: {e}"), "Fetch the file again, or remove it from the dataset")
 }
 
-/// Width and height from an image's header.
+/// Width and height in pixels from an image's header.
+///
+/// # Errors
+/// [`Error::Data`] for unreadable images, [`Error::Limit`] for large ones.
 pub fn image_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
     let reader = ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(|e| Error::io(path, e))?;
@@ -101,6 +116,9 @@ pub fn image_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
 }
 
 /// Decodes a PNG or JPEG of at most `limits.max_pixels` into 8-bit RGB or RGBA.
+///
+/// # Errors
+/// [`Error::Data`] for unreadable or truncated images, [`Error::Limit`].
 pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
     let bytes = read_bytes(path, limits)?;
     if bytes.starts_with(&[0xff, 0xd8]) && jpeg_is_cut(&bytes) {
@@ -127,7 +145,7 @@ pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
     Ok(Image8 { width, height, channels, data })
 }
 
-/// A JPEG that lost its tail still decodes, with grey where data is missing; within entropy-coded data the end marker cannot occur by chance.
+/// Whether the end marker of a JPEG is missing. A truncated JPEG still decodes, with grey for missing data. Entropy-coded data cannot contain the end marker.
 fn jpeg_is_cut(bytes: &[u8]) -> bool {
     let last = |marker: u8| bytes.windows(2).rposition(|w| w == [0xff, marker]);
     match (last(0xda), last(0xd9)) {

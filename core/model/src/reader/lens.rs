@@ -1,9 +1,9 @@
 //! Lens distortion. Scenes hold pinhole cameras only; images of distorted cameras are resampled when they are loaded.
 
-/// How a lens bends normalised image coordinates (x/z, y/z).
+/// A model of lens distortion of normalised image coordinates (x/z, y/z).
 #[derive(Clone, Debug, PartialEq)]
 pub enum Distortion {
-    /// A pinhole.
+    /// No distortion (pinhole).
     None,
     /// Brown-Conrady as in OpenCV: radial polynomial in r^2 .. r^8 and tangential terms.
     Brown {
@@ -20,7 +20,7 @@ pub enum Distortion {
 }
 
 impl Distortion {
-    /// Whether nothing is bent.
+    /// Whether there is no distortion.
     pub fn is_identity(&self) -> bool {
         match self {
             Self::None => true,
@@ -28,7 +28,7 @@ impl Distortion {
             Self::Fisheye { .. } => false,
         }
     }
-    /// Where the lens puts the ideal point (x, y).
+    /// The distorted point of the undistorted point (x, y).
     pub fn distort(&self, x: f64, y: f64) -> (f64, f64) {
         match self {
             Self::None => (x, y),
@@ -49,10 +49,10 @@ impl Distortion {
             }
         }
     }
-    /// The ideal point the lens puts at (x, y), by Newton's method; `None` where there is none.
+    /// The undistorted point of the distorted point (x, y), by Newton's method; `None` if there is none.
     pub fn undistort(&self, x: f64, y: f64) -> Option<(f64, f64)> {
         if let Self::Fisheye { .. } = self {
-            // A pinhole image cannot show an angle of 90 degrees or more.
+            // A pinhole image cannot contain angles of 90 degrees or more.
             if x.hypot(y) >= 0.5 * std::f64::consts::PI * 1.5 {
                 return None;
             }
@@ -78,7 +78,7 @@ impl Distortion {
         let (fx, fy) = self.distort(u, v);
         ((fx - x).abs().max((fy - y).abs()) < 1e-6).then_some((u, v))
     }
-    /// The ideal radius, at most `largest`, up to which the radial mapping grows. Beyond it the polynomial folds back and means nothing.
+    /// The undistorted radius, at most `largest`, up to which the radial mapping increases. Beyond it the polynomial folds back and is not valid.
     pub fn fold_radius(&self, largest: f64) -> f64 {
         const STEPS: usize = 512;
         let mut before = 0.0;

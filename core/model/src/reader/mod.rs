@@ -1,7 +1,7 @@
-//! The reader seam: a dataset format as a plug-in.
+//! Readers: dataset formats as plug-ins.
 //!
-//! A reader parses the index files of a dataset into a [`RawScene`]: calibrated cameras, views, and where the image of each view comes from. What all scenes
-//! share (choosing frames and cameras, resizing, undoing lens distortion, the frame cache) happens afterwards, once, for every reader.
+//! A reader parses the index files of a dataset into a [`RawScene`]: calibrated cameras, views, and where the image of each view comes from. Everything
+//! common to all scenes (choosing frames and cameras, resizing, undoing lens distortion, the frame cache) happens afterwards, in the same code for every reader.
 //!
 //! ```
 //! use cc4dgs_core::reader::{RawScene, ReaderPlugin, SceneOptions, files};
@@ -26,7 +26,7 @@
 //! }
 //! ```
 //!
-//! [`files`] reads files that may be hostile, [`pose`] converts the usual conventions of camera poses. `conformance::reader` is the suite a reader passes.
+//! [`files`] reads untrusted files, [`pose`] converts common conventions of camera poses. `conformance::reader` is the conformance suite of readers.
 
 pub mod files;
 mod lens;
@@ -43,17 +43,18 @@ use std::path::Path;
 
 /// A registered dataset format.
 pub struct ReaderPlugin {
-    /// Facts for lists; `info.name` is the value of `scene.reader`.
+    /// Name, version and other facts; `info.name` is the value of `scene.reader`.
     pub info: Plugin,
-    /// What [`ReaderPlugin::probe`] looks for, for people: `transforms.json (nerfstudio)`.
+    /// Description of what [`ReaderPlugin::probe`] looks for: `transforms.json (nerfstudio)`.
     pub looks_for: &'static str,
-    /// Readers are asked in ascending order, equal ones by name. The more specific a format's mark, the lower; built-in readers use multiples of 100 up to 700.
+    /// Readers are probed in ascending order, equal ones by name. More specific formats get lower numbers; built-in readers use multiples of 100 up to 700.
     pub order: u32,
     /// Whether a path looks like this format. It reads directory entries and at most the beginning of a file, and never fails.
     pub probe: fn(&Path) -> bool,
     /// Parses the index files at a path. No image is decoded. The path need not exist for a reader that computes its scenes.
     ///
-    /// Errors: [`crate::Error::Data`] for broken files, [`crate::Error::Limit`] for claims over the limits, [`crate::Error::Parameter`] for options it cannot follow.
+    /// # Errors
+    /// [`crate::Error::Data`] for invalid files, [`crate::Error::Limit`] for sizes over the limits, [`crate::Error::Parameter`] for options that it does not support.
     pub open: fn(&Path, &SceneOptions, &Limits) -> Result<RawScene>,
 }
 

@@ -16,6 +16,9 @@ pub enum Background {
 
 impl Background {
     /// The colour as RGB in 0..1.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for an unknown name or values outside 0..1.
     pub fn rgb(&self) -> Result<[f32; 3]> {
         match self {
             Self::Name(name) => match name.as_str() {
@@ -50,7 +53,7 @@ pub struct SceneOptions {
     pub width: u32,
     /// Target height in pixels; 0 keeps the native one, or the aspect if only the width is given.
     pub height: u32,
-    /// Divides the native size; excludes `width` and `height`.
+    /// Divides the native size; not together with `width` and `height`.
     pub downscale: f64,
     /// First frame, number of frames (0: all that follow) and stride, by frame index of the dataset.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -67,9 +70,9 @@ pub struct SceneOptions {
     pub max_views: usize,
     /// Which `transforms_*.json` is the held-out one of Blender-style scenes (`val` is the usual choice for D-NeRF lego).
     pub test_split: String,
-    /// The `ffmpeg` command used for video input; `ffprobe` is looked for beside it.
+    /// The `ffmpeg` command for video input; `ffprobe` is expected in the same folder.
     pub ffmpeg: String,
-    /// Where frames extracted from videos are kept; the system's temporary folder if absent.
+    /// Folder for frames extracted from videos; the system's temporary folder if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub video_cache: Option<PathBuf>,
 }
@@ -94,7 +97,10 @@ impl Default for SceneOptions {
 }
 
 impl SceneOptions {
-    /// Refuses contradictions and values without meaning.
+    /// Refuses contradictory options and values out of range.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] that names the option.
     pub fn validate(&self) -> Result<()> {
         if !(self.downscale.is_finite() && self.downscale > 0.0) {
             return Err(Error::parameter("scene.downscale", format!("{} is not a positive number", self.downscale), "Write 2 to halve the images"));
@@ -110,7 +116,7 @@ impl SceneOptions {
         }
         Ok(())
     }
-    /// The size images of `native` pixels are brought to.
+    /// The size, width and height in pixels, to which images of the size `native` are scaled.
     pub fn target_size(&self, native: (u32, u32)) -> (u32, u32) {
         let (w, h) = (f64::from(native.0), f64::from(native.1));
         let pixels = |v: f64| v.round().clamp(1.0, f64::from(u32::MAX)) as u32;

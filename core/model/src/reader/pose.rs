@@ -1,4 +1,4 @@
-//! Conventions of camera poses, all brought to rigid OpenCV world-to-camera transforms. Errors are sentences; the reader adds file and frame.
+//! Conversion of camera poses to rigid OpenCV world-to-camera transforms. Errors are texts; the reader adds file and frame.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -34,14 +34,14 @@ pub fn from_opengl_camera_to_world(m: &Matrix4) -> Result<Matrix4, String> {
 pub fn from_quaternion(wxyz: [f64; 4], t: [f64; 3]) -> Result<Matrix4, String> {
     let q = DQuat::from_xyzw(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
     if !(q.length().is_finite() && q.length() > 1e-8) {
-        return Err(format!("quaternion {wxyz:?} has no direction"));
+        return Err(format!("quaternion {wxyz:?} has norm zero or is not finite"));
     }
     let r = DMat3::from_quat(q.normalize());
     let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], t[i]];
     Ok([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])
 }
 
-/// The nearest-by-Gram-Schmidt rotation; a uniform scale is taken out, shear and mirroring are refused.
+/// The rotation of `m` by Gram-Schmidt. A uniform scale is removed; shear and mirroring are refused.
 fn orthonormal(m: DMat3) -> Result<DMat3, String> {
     let lengths = [m.x_axis.length(), m.y_axis.length(), m.z_axis.length()];
     let mean = lengths.iter().sum::<f64>() / 3.0;

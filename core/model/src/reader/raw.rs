@@ -1,4 +1,4 @@
-//! What a reader hands over.
+//! The output of a reader.
 
 use super::lens::Distortion;
 use super::pose::Matrix4;
@@ -7,28 +7,28 @@ use std::fmt;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// How far from the origin a camera may be, in the dataset's units: squares of distances must stay within f32.
+/// Largest distance of a camera from the origin, in the dataset's units: squares of distances must fit f32.
 const FARTHEST: f64 = 1e12;
 
-/// A calibrated camera with its lens, at the image size its calibration is for.
+/// A calibrated camera with lens distortion, at the image size of its calibration.
 #[derive(Clone, Debug)]
 pub struct RawCamera {
     /// Name as the dataset has it.
     pub name: String,
-    /// Width and height in pixels the calibration is for.
+    /// Image size of the calibration: width and height in pixels.
     pub size: [u32; 2],
     /// Focal lengths in pixels.
     pub focal: [f64; 2],
     /// Principal point in pixels; the centre of the first pixel is at 0.5.
     pub principal: [f64; 2],
-    /// The lens.
+    /// Lens distortion.
     pub distortion: Distortion,
     /// Rigid transform of world points to camera points, OpenCV axes (x right, y down, z forward), row-major.
     pub world_to_camera: Matrix4,
 }
 
 impl RawCamera {
-    /// The same camera without its lens.
+    /// The same camera without lens distortion.
     pub fn pinhole(&self) -> Camera {
         Camera {
             name: self.name.clone(),
@@ -43,14 +43,14 @@ impl RawCamera {
     }
 }
 
-/// Where the image of a view comes from.
+/// The source of a view's image.
 #[derive(Clone)]
 pub enum ImageSource {
     /// A PNG or JPEG file, and a foreground mask of the same size if there is one.
     File {
         /// The image.
         path: PathBuf,
-        /// White where the foreground is. The file may be missing.
+        /// White is foreground. The file may be missing.
         mask: Option<PathBuf>,
     },
     /// A frame of a video, decoded by `ffmpeg`.
@@ -60,11 +60,11 @@ pub enum ImageSource {
         /// Frame of the video, 0-based.
         frame: usize,
     },
-    /// Whatever the reader brings: computed images, another container, a network.
+    /// Any other source: computed images, another container, a network.
     Frames {
-        /// Loads images of the size of their [`RawCamera`], with its lens still in them.
+        /// Loads images of the size of their [`RawCamera`], not undistorted.
         source: Arc<dyn FrameSource>,
-        /// What `source` is asked for.
+        /// Index of the image in `source`.
         index: usize,
     },
 }
@@ -94,7 +94,7 @@ pub struct RawView {
     pub image: ImageSource,
 }
 
-/// Points of a dataset, as structure from motion leaves them.
+/// Points of a dataset, as computed by structure from motion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RawPoints {
     /// Positions in the dataset's units.
@@ -103,7 +103,7 @@ pub struct RawPoints {
     pub colors: Vec<[f32; 3]>,
 }
 
-/// Where the first Gaussians of a scene without points go.
+/// The region of random initial Gaussians, for scenes without points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum InitBox {
     /// A box in the dataset's units.
@@ -113,9 +113,9 @@ pub enum InitBox {
         /// Upper corner.
         high: [f64; 3],
     },
-    /// A cube around the point the cameras look at.
+    /// A cube around the point that the cameras look at.
     Cube {
-        /// Half its side, as a share of the median distance of the cameras from that point.
+        /// Half the side over the median distance of the cameras from that point.
         half_share: f64,
     },
 }
@@ -123,30 +123,33 @@ pub enum InitBox {
 /// A parsed dataset.
 #[derive(Clone, Debug, Default)]
 pub struct RawScene {
-    /// A name for people.
+    /// Display name.
     pub name: String,
     /// All cameras; a moving camera is one entry per pose.
     pub cameras: Vec<RawCamera>,
     /// All views, in any order.
     pub views: Vec<RawView>,
-    /// Points to start from, if the dataset has any.
+    /// Initial points, if the dataset has any.
     pub points: Option<RawPoints>,
-    /// Where the scene is, if the format says. Else it is judged from the cameras.
+    /// The location of the scene, if the format states it. Otherwise it is estimated from the cameras.
     pub init_box: Option<InitBox>,
-    /// The background the dataset's RGBA images want, RGB in 0..1.
+    /// Background of the dataset's RGBA images, RGB in 0..1.
     pub background: Option<[f32; 3]>,
-    /// Whether the reader has already followed `scene.width`, `scene.height` and `scene.downscale`, as one that computes its images can.
+    /// Whether the reader has already applied `scene.width`, `scene.height` and `scene.downscale`, as readers that compute images can.
     pub resized: bool,
-    /// What was odd and left out.
+    /// Warnings about data that was ignored.
     pub warnings: Vec<String>,
 }
 
 impl RawScene {
-    /// Sets frame and time of each view from the dataset's times, one per view: the frame is the rank among the distinct times; times over 1 are
-    /// divided by the largest. `object` names the file in errors, which are about times that are negative or not finite.
+    /// Sets frame and time of each view from the dataset's times, one per view: the frame is the rank among the distinct times; if times exceed 1,
+    /// all are divided by the largest. `object` names the file in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for times that are negative or not finite.
     pub fn rank_times(&mut self, times: &[Option<f64>], object: &str) -> Result<()> {
         if let Some(t) = times.iter().flatten().find(|t| !t.is_finite() || **t < 0.0) {
-            return Err(Error::data(object, format!("time {t} is not a number from 0 up"), "Correct the times in the file"));
+            return Err(Error::data(object, format!("time {t} is negative or not finite"), "Correct the times in the file"));
         }
         let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
         let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
@@ -160,15 +163,18 @@ impl RawScene {
         Ok(())
     }
 
-    /// Refuses views of cameras that do not exist, times outside 0..1, cameras with shown views that are not rigid or not finite or absurdly far away, and
-    /// points or a background that are not sound.
+    /// Refuses views of cameras that do not exist, times outside 0..1, cameras with views that are not rigid, not finite or too far away, and
+    /// invalid points or backgrounds.
+    ///
+    /// # Errors
+    /// [`Error::Data`].
     pub fn validate(&self) -> Result<()> {
         let bad = |problem: String| Err(Error::data(&self.name, problem, "Check the dataset's index files"));
         let mut used = vec![false; self.cameras.len()];
         for view in &self.views {
             match used.get_mut(view.camera) {
                 Some(slot) => *slot = true,
-                None => return bad(format!("a view names camera {} of {}", view.camera, self.cameras.len())),
+                None => return bad(format!("a view refers to camera {} of {}", view.camera, self.cameras.len())),
             }
             if let Some(t) = view.time.filter(|t| !(0.0..=1.0).contains(t)) {
                 return bad(format!("a view of frame {} is at time {t}, outside 0..1", view.frame));

@@ -5,7 +5,7 @@ use cc4dgs_core::{ParameterSpace, Rules};
 use safetensors::{Dtype, SafeTensors};
 use std::path::{Path, PathBuf};
 
-/// The folder of fixtures: `CC4DGS_GOLDEN`, or the committed ones.
+/// The folder of fixtures: `CC4DGS_GOLDEN`, or the committed folder.
 pub fn folder() -> PathBuf {
     let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden");
     std::env::var_os("CC4DGS_GOLDEN").map_or(committed, PathBuf::from)
@@ -28,7 +28,7 @@ impl Fixture {
     pub fn shape(&self, key: &str) -> Vec<usize> {
         self.tensors().tensor(key).unwrap_or_else(|e| panic!("{} {key}: {e}", self.name)).shape().to_vec()
     }
-    /// Values of an array, whatever its type.
+    /// Values of an array of any type, as float64.
     pub fn get(&self, key: &str) -> Vec<f64> {
         let file = self.tensors();
         let view = file.tensor(key).unwrap_or_else(|e| panic!("{} {key}: {e}", self.name));
@@ -109,7 +109,7 @@ pub struct Scene {
     pub results: Fixture,
     /// Sizes, camera, rules.
     pub settings: RasterSettings,
-    /// Whether float32 loses digits here (needles).
+    /// Whether float32 is inaccurate here (very thin Gaussians).
     pub ill_conditioned: bool,
 }
 
@@ -161,7 +161,7 @@ impl Scene {
         planes.extend(self.results.get("out.depth_acc"));
         planes
     }
-    /// Largest difference over robust pixels: of the colour and alpha planes, of depth over its largest value, and over all pixels.
+    /// Largest difference at robust pixels: of the colour and alpha planes, and of depth over its largest value; then at all pixels.
     pub fn image_errors(&self, planes: &[f64]) -> (f64, f64, f64) {
         let golden = self.planes();
         let robust = self.inputs.get("robust_pixel");

@@ -1,4 +1,4 @@
-//! Writing tiny datasets.
+//! Writers of tiny datasets.
 
 use cc4dgs_core::{Camera, Error, Limits, Registry, Scene, SceneOptions};
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ pub fn load(path: &Path) -> Result<Scene, Error> {
     open(path, &options(), &Limits::default())
 }
 
-/// Opens with everything that is linked into the tests.
+/// Opens a dataset with all readers linked into the tests.
 pub fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Scene, Error> {
     cc4dgs_train::data::open(path, options, &Registry::collect().unwrap(), limits)
 }
@@ -95,10 +95,10 @@ pub fn write_dnerf(root: &Path, train: usize, test: usize, size: u32) -> Vec<Cam
         let frames: Vec<_> = range
             .clone()
             .map(|i| {
-                let place = i - range.start;
-                write_rgba_image(&root.join(name).join(format!("r_{place:03}.png")), size, size, [10, 20, 30, 255]);
-                let time = place as f64 / (range.len().max(2) - 1) as f64;
-                serde_json::json!({"file_path": format!("./{name}/r_{place:03}"), "time": time, "transform_matrix": opengl_camera_to_world(&cameras[i])})
+                let index = i - range.start;
+                write_rgba_image(&root.join(name).join(format!("r_{index:03}.png")), size, size, [10, 20, 30, 255]);
+                let time = index as f64 / (range.len().max(2) - 1) as f64;
+                serde_json::json!({"file_path": format!("./{name}/r_{index:03}"), "time": time, "transform_matrix": opengl_camera_to_world(&cameras[i])})
             })
             .collect();
         let document = serde_json::json!({"camera_angle_x": 0.8, "frames": frames});
@@ -107,7 +107,7 @@ pub fn write_dnerf(root: &Path, train: usize, test: usize, size: u32) -> Vec<Cam
     cameras
 }
 
-/// A PanopticSports scene: `train` + 1 cameras, `frames` times; returns the training cameras.
+/// A PanopticSports scene with `train` + 1 cameras and `frames` times; returns the training cameras.
 pub fn write_panoptic(root: &Path, train: usize, frames: usize) -> Vec<Camera> {
     let cameras = ring(train + 1, 16, 12);
     for (name, range) in [("train", 0..train), ("test", train..train + 1)] {
@@ -221,7 +221,7 @@ pub fn write_technicolor(root: &Path, count: u8, frames: &[u32]) -> Vec<Camera> 
     cameras
 }
 
-/// A folder of real data, from `CC4DGS_DATA` or beside the repository; `None` with a note if absent.
+/// A folder of real data, in `CC4DGS_DATA` or beside the repository; prints a note and returns `None` if absent.
 pub fn real(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("CC4DGS_DATA").map(PathBuf::from).unwrap_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")));
     let path = root.join(name);

@@ -1,4 +1,4 @@
-//! Every registered reader on a tiny dataset, every preset with every other: the suites that `cc4dgs-core` exports.
+//! Conformance suites of `cc4dgs-core`: every registered reader on a tiny dataset, and every preset combined with every other.
 
 use super::common::*;
 use cc4dgs_core::{Registry, conformance};
@@ -39,7 +39,7 @@ fn every_reader_conforms() {
         let root = tempfile::tempdir().unwrap();
         let path = tiny(reader.info.name, root.path());
         findings.extend(conformance::reader(reader, &path));
-        // Every other reader that claims the folder too comes later.
+        // Other readers that also recognise the folder have a higher order.
         let first = readers.iter().find(|r| (r.probe)(&path)).unwrap();
         assert_eq!(first.info.name, reader.info.name, "{}", path.display());
     }
@@ -53,7 +53,7 @@ fn every_preset_conforms() {
     assert!(findings.is_empty() && registry.presets().count() >= 15, "{}", findings.join("\n"));
 }
 
-/// A suite that finds nothing wrong with anything would be of no use.
+/// The suite finds the errors of a faulty reader.
 #[test]
 fn a_careless_reader_is_caught() {
     use cc4dgs_core::reader::{RawScene, ReaderPlugin, SceneOptions};

@@ -1,4 +1,4 @@
-//! Every format on a tiny scene: poses come back, splits and times follow the convention of the dataset.
+//! Every format on a tiny scene: poses are reproduced, splits and times follow the convention of the dataset.
 
 use super::common::*;
 use cc4dgs_core::{Limits, Registry, SceneOptions, Split};
@@ -92,7 +92,7 @@ fn llff_refuses_a_camera_too_many() {
     assert!(message.contains("2 rows") && message.contains("3 cameras"), "{message}");
 }
 
-/// A stand-in for ffmpeg that answers the two calls the reader makes, by copying frames prepared by the test.
+/// A fake ffmpeg for the two calls of the reader; it copies frames prepared by the test.
 #[cfg(unix)]
 #[test]
 fn llff_with_videos() {
@@ -126,7 +126,7 @@ fn llff_with_videos() {
     let calls = std::fs::read_to_string(&log).unwrap();
     assert_eq!(calls.lines().count(), 2, "each video is decoded once: {calls}");
     assert!(calls.contains("between(n,1,5)*not(mod(n-1,2))") && calls.contains("scale=16:12"), "{calls}");
-    // A second scene finds the frames in the cache.
+    // A second scene reads the frames from the cache.
     let again = open(dir.path(), &options, &Limits::default()).unwrap();
     again.frame(0).unwrap();
     assert_eq!(std::fs::read_to_string(&log).unwrap().lines().count(), 2);
@@ -264,7 +264,7 @@ fn the_right_reader_answers_or_all_are_named() {
     }
     let missing = load(&dir.path().join("nothing")).err().unwrap();
     assert_eq!(missing.exit_code(), 2, "{missing}");
-    // A folder with the marks of two formats goes to the more particular one, and scene.reader decides otherwise.
+    // A folder that two readers recognise is opened by the more specific one, unless scene.reader names the other.
     write_dnerf(dir.path(), 3, 1, 8);
     std::fs::write(dir.path().join("transforms.json"), "{}").unwrap();
     assert!(load(dir.path()).is_ok());

@@ -1,4 +1,4 @@
-//! The instant-ngp fox scene: its lens, its size and its gaps, as `golden/fox.json` states them, on images of a fortieth of the size.
+//! The instant-ngp fox scene: lens, size and missing images as in `golden/fox.json`, with images of a fortieth of the size.
 
 use super::common::*;
 use cc4dgs_core::{Distortion, Split};
@@ -16,7 +16,7 @@ fn golden_fox() {
     let number = |key: &str| fox["intrinsics"][key].as_f64().unwrap();
     let (w, h) = ((number("w") / 40.0) as u32, (number("h") / 40.0) as u32);
     let mut document = fox["intrinsics"].clone();
-    // The names that are missing, and as many others as there are images.
+    // The missing names, and as many other names as there are images.
     let mut names: Vec<String> = missing.iter().map(|n| n.to_string()).collect();
     let others = (1..).map(|i| format!("images/{i:04}.jpg")).filter(|n| !missing.contains(&n.as_str()));
     names.extend(others.take(present));
@@ -33,7 +33,7 @@ fn golden_fox() {
     assert!(scene.warnings.iter().any(|w| w.contains(&format!("{} of {frames}", missing.len())) && w.contains(missing[0])), "{:?}", scene.warnings);
     let camera = scene.camera(0);
     assert!((camera.fx - number("fl_x") / 40.0).abs() < 1e-9 && (camera.fy - number("fl_y") / 40.0).abs() < 1e-9);
-    // The lens is undone in the image: red is the column a pixel came from.
+    // The image is undistorted: red is the column that a pixel came from.
     let lens = Distortion::Brown { radial: [number("k1"), number("k2"), 0.0, 0.0], tangential: [number("p1"), number("p2")] };
     let image = scene.frame(0).unwrap();
     assert_eq!((image.width, image.height), (camera.width, camera.height));
@@ -41,7 +41,7 @@ fn golden_fox() {
     for (row, column) in [(4u32, 4u32), (24, 13), (40, 20), (10, 22), (44, 3)] {
         let (x, y) = ((f64::from(column) + 0.5 - camera.cx) / camera.fx, (f64::from(row) + 0.5 - camera.cy) / camera.fy);
         let source = lens.distort(x, y).0 * camera.fx + number("cx") / 40.0 - 0.5;
-        // JPEG images: a few grey levels are its own.
+        // JPEG compression changes values by a few grey levels.
         worst = worst.max((f64::from(image.data[((row * image.width + column) * 3) as usize]) - source).abs());
     }
     assert!(worst < 4.0, "columns off by {worst}");

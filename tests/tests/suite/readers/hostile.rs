@@ -1,4 +1,4 @@
-//! Bytes that lie: an error or a sound result, never a panic and never memory for a claim.
+//! Untrusted bytes: an error or a valid result, never a panic, and no memory allocated for a stated size alone.
 
 use super::common::*;
 use cc4dgs_core::{Limits, Result, Scene};
@@ -6,7 +6,7 @@ use cc4dgs_train::data::npy::read_npy;
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
 
-/// Small limits, so that a reader that believes a claim fails the test instead of the machine.
+/// Small limits, so that a reader that trusts a stated size fails the test and does not exhaust memory.
 fn limits() -> Limits {
     Limits { max_bytes: 1 << 22, max_gaussians: 10_000, max_pixels: 1 << 20, max_depth: 64 }
 }
@@ -15,7 +15,7 @@ fn open(path: &Path) -> Result<Scene> {
     super::common::open(path, &options(), &limits())
 }
 
-/// Whatever opens must also be sound.
+/// A scene that opens must also be valid.
 fn check(result: Result<Scene>) {
     match result {
         Ok(scene) => {
@@ -36,15 +36,15 @@ fn check(result: Result<Scene>) {
     }
 }
 
-/// Changes of a file: (place, new byte) and a cut.
+/// Changes of a file: (offset, new byte) pairs and a truncation.
 fn damage() -> impl Strategy<Value = (Vec<(prop::sample::Index, u8)>, Option<prop::sample::Index>)> {
     (prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..6), prop::option::weighted(0.3, any::<prop::sample::Index>()))
 }
 
 fn apply(bytes: &[u8], (changes, cut): &(Vec<(prop::sample::Index, u8)>, Option<prop::sample::Index>)) -> Vec<u8> {
     let mut out = bytes.to_vec();
-    for (place, value) in changes {
-        let i = place.index(out.len());
+    for (offset, value) in changes {
+        let i = offset.index(out.len());
         out[i] = *value;
     }
     if let Some(cut) = cut {
@@ -53,7 +53,7 @@ fn apply(bytes: &[u8], (changes, cut): &(Vec<(prop::sample::Index, u8)>, Option<
     out
 }
 
-/// A dataset written once; each case damages one of its files and puts it back.
+/// A dataset that is written once; each case damages one of its files and restores it.
 struct Victim {
     root: tempfile::TempDir,
     file: PathBuf,
@@ -96,7 +96,7 @@ fn every_cut_of_every_index_file_is_survived() {
         let step = (victim.bytes.len() / 150).max(1);
         for keep in (0..victim.bytes.len()).step_by(step) {
             std::fs::write(&victim.file, &victim.bytes[..keep]).unwrap();
-            assert!(open(victim.root.path()).is_err(), "{} cut to {keep} of {}", victim.file.display(), victim.bytes.len());
+            assert!(open(victim.root.path()).is_err(), "{} truncated to {keep} of {}", victim.file.display(), victim.bytes.len());
         }
     }
 }
@@ -112,9 +112,9 @@ fn counts_and_sizes_that_lie_are_refused() {
         assert!(message.contains("points3D.bin"), "{message}");
     }
     let victim = Victim::new(write_colmap, "sparse/0/cameras.bin");
-    for (place, value) in [(16, u64::MAX), (24, 1 << 40), (16, 0)] {
+    for (offset, value) in [(16, u64::MAX), (24, 1 << 40), (16, 0)] {
         let mut bytes = victim.bytes.clone();
-        bytes[place..place + 8].copy_from_slice(&value.to_le_bytes());
+        bytes[offset..offset + 8].copy_from_slice(&value.to_le_bytes());
         std::fs::write(&victim.file, bytes).unwrap();
         assert!(open(victim.root.path()).is_err(), "camera size {value}");
     }
@@ -137,7 +137,7 @@ fn hostile_documents_are_refused() {
     }
 }
 
-/// Files others sent in: each must be refused by the reader its folder is for.
+/// Contributed files: each must be refused by the reader of its folder.
 #[test]
 fn the_corpus_is_refused() {
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("bad/scenes");

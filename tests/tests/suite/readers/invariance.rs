@@ -1,4 +1,4 @@
-//! The same scene in other units, at another place, and turned: what is trained must not depend on it.
+//! The same scene in other units, translated and rotated: training must not depend on it.
 
 use super::common::*;
 use cc4dgs_core::{Camera, HostGaussians, Limits, Registry, Scene, Seed, Silent, Split, parse_device};
@@ -95,7 +95,7 @@ impl Truth {
             std::fs::write(root.join(format!("transforms_{name}.json")), serde_json::json!({"camera_angle_x": 0.85, "frames": frames}).to_string()).unwrap();
         }
     }
-    /// The first instant, with points.
+    /// The first time, with points.
     fn colmap(&self, root: &Path, change: &Change) {
         let model = root.join("sparse/0");
         std::fs::create_dir_all(&model).unwrap();
@@ -135,7 +135,7 @@ fn start(scene: &Scene) -> HostGaussians {
     initialise(scene, &config(&[source, "init.count=300"]), Seed::root(1), &Silent).unwrap()
 }
 
-/// The largest distance of corresponding points, `a` turned by `rotation`.
+/// The largest distance of corresponding points, `a` rotated by `rotation`.
 fn apart(a: &[f32], b: &[f32], rotation: DMat3) -> f64 {
     assert_eq!(a.len(), b.len());
     let point = |p: &[f32]| DVec3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]));
@@ -164,12 +164,12 @@ fn the_normalised_scene_does_not_depend_on_unit_origin_and_direction() {
             let put = change.point(DVec3::from(base.normalisation.inverse().apply_camera(&base.cameras[0]).center_world()));
             assert!((DVec3::from(own.center_world()) - put).length() < 1e-4 * change.scale, "{name} {what}");
             if let (Some(a), Some(b)) = (base.init_box, found.init_box) {
-                // Boxes keep to the axes: their middles and sides agree, their corners need not.
+                // Boxes are axis-aligned: their centres and sides must agree, their corners need not.
                 let middle = |(low, high): ([f32; 3], [f32; 3])| std::array::from_fn::<f32, 3, _>(|k| 0.5 * (low[k] + high[k]));
                 assert!(apart(&middle(a), &middle(b), r) < 4e-4 && ((a.1[0] - a.0[0]) / (b.1[0] - b.0[0]) - 1.0).abs() < 1e-4, "{name} {what}: {a:?} {b:?}");
             }
             let after = start(&found);
-            // Random points fill a box along the axes, which is another box where the scene is turned.
+            // Random points fill an axis-aligned box, which is another box in a rotated scene.
             if what != "turned" || base.points.is_some() {
                 let distance = apart(&before.means, &after.means, r);
                 let widest = before.log_scales.iter().zip(&after.log_scales).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
@@ -179,7 +179,7 @@ fn the_normalised_scene_does_not_depend_on_unit_origin_and_direction() {
     }
 }
 
-/// A short training, and its held-out PSNR.
+/// A short training: the model and its held-out PSNR in dB.
 fn trained(scene: Scene, seed: u64) -> (Model, f64) {
     let registry = Registry::collect().unwrap();
     let sets = ["init.source=random", "init.count=400", "train.iterations=120", "train.log_every=1000", &format!("seed={seed}")];
@@ -192,7 +192,7 @@ fn trained(scene: Scene, seed: u64) -> (Model, f64) {
     (model, psnr)
 }
 
-/// Middle and mean log-scale of a model's Gaussians in the coordinates of its dataset, read back from an archive.
+/// Mean centre and mean log-scale of a model's Gaussians in the coordinates of its dataset, read back from an archive.
 fn exported(model: &Model) -> (DVec3, f64) {
     let (registry, limits, folder) = (Registry::collect().unwrap(), Limits::default(), tempfile::tempdir().unwrap());
     let path = folder.path().join("model.cc4d");
@@ -222,7 +222,7 @@ fn training_does_not_depend_on_unit_origin_and_direction() {
         let (model, psnr) = run(&change, 0);
         eprintln!("{what}: {psnr:.2} dB, {base:?} unchanged");
         assert!((psnr - base[0]).abs() < 0.3, "{what}: {psnr} dB, {} dB unchanged", base[0]);
-        // What other programs get is where the dataset is, as large as the dataset.
+        // Exports are in the coordinates of the dataset.
         let (found, found_scale) = exported(&model);
         let distance = (found - change.point(middle)).length() / change.scale;
         assert!(distance < 0.1 && (found_scale - change.scale.ln() - log_scale).abs() < 0.1, "{what}: {distance} from {found}, log-scale {found_scale}");

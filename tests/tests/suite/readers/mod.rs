@@ -1,4 +1,4 @@
-//! Dataset readers: each on a tiny scene written by the test, on hostile bytes, and on the real scenes where they are present.
+//! Dataset readers: each on a tiny scene written by the test, on untrusted bytes, and on real scenes if they are present.
 
 mod common;
 mod conformance;

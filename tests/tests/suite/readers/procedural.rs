@@ -1,4 +1,4 @@
-//! The built-in scene and the points made from images, against the known truth.
+//! The built-in scene, and points computed from images, compared with the known geometry.
 
 use super::common::*;
 use cc4dgs_core::{Limits, Scene, SceneOptions, Seed, Split};
@@ -107,7 +107,7 @@ fn distance(truth: &ProceduralScene, p: DVec3) -> f64 {
 
 #[test]
 fn points_from_images_lie_on_the_truth() {
-    // Cameras as near to each other as in a capture, and images large enough to match.
+    // Distances between cameras as in a capture, and images large enough for matching.
     let truth = ProceduralScene { width: 240, height: 200, train_cameras: 20, frames: 1, ..ProceduralScene::named("default").unwrap() };
     let scene = assemble(truth.clone().into_raw("truth".into()), &options(), None, &Limits::default()).unwrap();
     let start = std::time::Instant::now();

@@ -1,4 +1,4 @@
-//! The real scenes, where they are present.
+//! The real scenes, if they are present.
 
 use super::common::*;
 use cc4dgs_core::{Limits, SceneOptions, Seed, Split};
@@ -50,7 +50,7 @@ fn panoptic_points_agree_with_a_held_out_camera() {
     let cloud = photo_points(&scene, 40_000, Seed::root(0)).unwrap();
     eprintln!("{} points in {:.2} s", cloud.positions.len(), start.elapsed().as_secs_f64());
     assert!(cloud.positions.len() > 20_000);
-    // Nearest point per block of pixels, drawn into a camera that was not used, must look like its image more than a shuffled one does.
+    // The nearest point per block of pixels, projected into a held-out camera, must be closer to its image than shuffled points are.
     let mut errors = [0.0, 0.0];
     for &view in &scene.split(Split::Test) {
         let (camera, image) = (scene.camera(view), scene.frame(view).unwrap());
@@ -93,7 +93,7 @@ fn n3dv_sample() {
     assert_eq!((camera.width, camera.height, camera.cx), (676, 507, 338.0));
     assert!((camera.fx - 1462.067 / 4.0).abs() < 0.01);
     assert_eq!(scene.frame(0).unwrap().data.len(), 676 * 507 * 3);
-    // The COLMAP model in the folder is of another world, with other images, and must not be taken.
+    // The COLMAP model in the folder belongs to another coordinate system and other images, and must not be used.
     assert!(scene.points.is_none());
     let (low, high) = scene.init_box.unwrap();
     assert!((0..3).all(|k| low[k] < high[k]), "{low:?} {high:?}");

@@ -1,4 +1,4 @@
-//! The options all readers share: frames, held-out cameras, sizes, missing and misfit images.
+//! The options that all readers share: frames, held-out cameras, sizes, images that are missing or have a wrong size.
 
 use super::common::*;
 use cc4dgs_core::reader::files::read_png_or_jpeg;
@@ -84,9 +84,9 @@ fn misfit_and_broken_images_are_errors_that_name_them() {
     };
     assert!(read(&bytes).is_ok());
     for keep in [0, 1, 3, bytes.len() / 2, bytes.len() - 3] {
-        assert!(read(&bytes[..keep]).is_err(), "a JPEG cut to {keep} of {} bytes", bytes.len());
+        assert!(read(&bytes[..keep]).is_err(), "a JPEG truncated to {keep} of {} bytes", bytes.len());
     }
-    // A PNG header that claims a gigantic image.
+    // A PNG header that states a gigantic image.
     let png = dir.path().join("ims/0/000000.png");
     let mut bytes = std::fs::read(&png).unwrap();
     bytes[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff]);

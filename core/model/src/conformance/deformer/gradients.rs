@@ -6,9 +6,9 @@ use crate::gaussians::to_vec;
 use crate::{Deformer, Result, Seed, SpatialInput};
 use burn::tensor::{Device, Tensor, TensorData};
 
-/// Largest relative difference between a slope by finite differences and the gradient along itself.
+/// Largest relative difference between a finite difference along the gradient and the gradient's norm.
 const SLOPE_TOLERANCE: f64 = 0.05;
-/// Step along the gradient's direction: short enough to cross few kinks of ReLU, long enough to stand out from rounding.
+/// Step along the gradient's direction: short enough to cross few ReLU kinks, long enough to be above the rounding error.
 const STEP: f64 = 5e-4;
 /// Time at which gradients are taken.
 const TIME: f32 = 0.43;
@@ -48,7 +48,7 @@ impl Suite<'_> {
         let tracked = SpatialInput { means_world: plain.means_world.clone(), attributes: plain.attributes.iter().map(track).collect() };
         let Some(value) = scalar(built.as_ref(), &tracked)? else { return Ok(None) };
         if value.dims() != [1] {
-            return Ok(Some(format!("the value has shape {:?} in place of [1]", value.dims())));
+            return Ok(Some(format!("the value has shape {:?}, expected [1]", value.dims())));
         }
         let size = f64::from(to_vec(value.clone(), "value")?[0]);
         if !size.is_finite() {
@@ -105,7 +105,7 @@ fn upload1(values: Vec<f32>, device: &Device) -> Tensor<1> {
     Tensor::from_data(TensorData::new(values, [n]), device)
 }
 
-/// The slope of `measure` along `gradient` from `start` against the gradient's norm. With `needed`, a gradient of zero is a finding.
+/// Compares the slope of `measure` along `gradient` at `start` with the gradient's norm. With `needed`, a gradient of zero is a finding.
 fn compare(name: &str, start: &[f32], gradient: &[f32], size: f64, needed: bool, mut measure: impl FnMut(Vec<f32>) -> Result<f64>) -> Result<Option<String>> {
     let norm = gradient.iter().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt();
     if !norm.is_finite() || (norm == 0.0 && needed) {
@@ -114,9 +114,9 @@ fn compare(name: &str, start: &[f32], gradient: &[f32], size: f64, needed: bool,
     if norm == 0.0 {
         return Ok(None);
     }
-    // The change must stand out from the rounding of the value itself.
+    // The change must be above the rounding error of the value itself.
     let step = (1e-3 * size.abs() / norm).clamp(STEP, 20.0 * STEP);
-    // A short and a long step: the first may drown in rounding where the second crosses kinks.
+    // A short and a long step: the short one may be below the rounding error, the long one may cross kinks.
     let mut slopes = Vec::new();
     for step in [STEP, step] {
         let mut ends = [0.0; 2];

@@ -1,4 +1,4 @@
-//! What a deformer must keep to.
+//! The conformance suite of deformers.
 
 mod gradients;
 
@@ -9,24 +9,24 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 /// Largest difference of offsets from packed features, as a share of the largest offset: sums may run in another order.
 const PACKED_TOLERANCE: f32 = 1e-5;
-/// Largest difference of a simplified deformer's offsets, root-mean-square over that of the offsets.
+/// Largest root-mean-square difference of a simplified deformer's offsets, over the root-mean-square of the offsets.
 const SIMPLIFIED_TOLERANCE: f64 = 0.5;
-/// Size of the random changes that wake heads which start at zero.
+/// Size of the random changes of weights, so that no head is zero.
 const SHAKE: f32 = 0.1;
 /// Centres of the suite.
 const CENTRES: usize = 48;
 
-/// Holds a deformer to its promises on `device`:
+/// Tests a deformer on `device`:
 /// - its schema is TOML and states the defaults; unknown settings are refused; nothing panics;
-/// - equal seeds give equal weights; weights, parameters and attributes have sound names, shapes and groups;
+/// - equal seeds give equal weights; weights, parameters and attributes have unique names, matching shapes and existing groups;
 /// - every head has its shape; offsets have the same heads at every time and at every progress of training, are finite, and repeat bit for bit;
-/// - a deformer that declares `starts-as-identity` moves nothing at first, a static one never does;
+/// - a deformer that declares `starts-as-identity` moves nothing initially, a static one never does;
 /// - gradients of all weights and of all attributes agree with finite differences, through the offsets and through the regularizer;
-/// - packed features give the same offsets; weights survive being copied to a fresh deformer, bit for bit;
+/// - packed features give the same offsets; weights can be copied to a new deformer, bit for bit;
 /// - what `simplified` returns can be built again from its settings, and moves Gaussians in nearly the same way;
-/// - centres that are none, one or not finite are answered, and missing attributes and times that are not numbers are refused.
+/// - no centres, one centre and centres that are not finite give offsets or errors; missing attributes and times that are not numbers are refused.
 ///
-/// `settings` is the `[deformer]` section without `kind`; small sizes make the suite quick. Each finding is a line; an empty list is a pass.
+/// `settings` is the `[deformer]` section without `kind`; small sizes make the suite fast. Each finding is a line; an empty list means that it passed.
 pub fn deformer(plugin: &DeformerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
     let suite = Suite { plugin, settings, device };
     guarded(
@@ -64,7 +64,7 @@ impl Suite<'_> {
     fn fresh(&self, device: &Device) -> Result<Built> {
         (self.plugin.build)(self.settings, &self.context(), device)
     }
-    /// A deformer none of whose weights is special.
+    /// A deformer with random changes of all weights.
     fn shaken(&self, device: &Device) -> Result<Built> {
         let mut built = self.fresh(device)?;
         for (index, parameter) in built.parameters_mut().into_iter().enumerate() {
@@ -82,12 +82,12 @@ impl Suite<'_> {
         let shift = Tensor::<2>::from_data(TensorData::new(vec![0.0f32, 0.0, 1.0], [1, 3]), device);
         matrix(Seed::root(3), n, 3, device) * scale + shift
     }
-    /// Values of the attributes of `n` Gaussians, each another, row-major.
+    /// Random values of the attributes of `n` Gaussians, row-major.
     fn attribute_values(&self, built: &dyn Deformer, n: usize) -> Vec<Vec<f32>> {
         let specs = built.attributes().into_iter().enumerate();
         specs.map(|(a, spec)| (0..n * spec.width).map(|k| spec.start + (spec.spread + SHAKE) * uniform(Seed::root(9).index(a as u64), k)).collect()).collect()
     }
-    /// `n` Gaussians with attributes none of which is special.
+    /// `n` Gaussians with random attributes.
     fn input(&self, built: &dyn Deformer, n: usize, device: &Device) -> SpatialInput {
         let upload = |values: Vec<f32>, width: usize| Tensor::<2>::from_data(TensorData::new(values, [n, width]), device);
         let attributes = self.attribute_values(built, n).into_iter().zip(built.attributes()).map(|(values, spec)| upload(values, spec.width)).collect();
@@ -111,18 +111,18 @@ impl Suite<'_> {
             Err(_) => None,
         })
     }
-    /// `config.toml` is written in full from the schema, so that it must build what no settings build.
+    /// `config.toml` is written in full from the schema, so the schema's settings must build the same deformer as no settings.
     fn schema_states_the_defaults(&self) -> Result<Option<String>> {
         let stated = config::parse_table(&format!("schema of deformer {}", self.plugin.info.name), self.plugin.info.schema)?;
         let build = |settings: &toml::Table| (self.plugin.build)(settings, &self.context(), self.device);
         let (a, b) = (build(&toml::Table::new())?, build(&stated)?);
         let shapes = |d: &dyn Deformer| d.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect::<Vec<_>>();
         if shapes(a.as_ref()) != shapes(b.as_ref()) || a.attributes() != b.attributes() || a.groups() != b.groups() {
-            return Ok(Some("the settings it states build another deformer than no settings".into()));
+            return Ok(Some("its settings build another deformer than no settings".into()));
         }
         for (p, q) in a.parameters().into_iter().zip(b.parameters()) {
             if to_vec(p.value.clone(), &p.name)? != to_vec(q.value.clone(), &q.name)? {
-                return Ok(Some(format!("the settings it states give other start values of {} than no settings", p.name)));
+                return Ok(Some(format!("its settings give other initial values of {} than no settings", p.name)));
             }
         }
         Ok(None)
@@ -137,7 +137,7 @@ impl Suite<'_> {
         if specs.is_empty() {
             return Ok(None);
         }
-        // Gaussians without the attributes are of another model: features made up for them would hide that.
+        // Gaussians without the attributes belong to another model, which must be an error.
         let missing = SpatialInput::new(self.centres(CENTRES, self.device));
         Ok(built.spatial(&missing).is_ok().then(|| "Gaussians without its attributes were accepted".into()))
     }
@@ -148,7 +148,7 @@ impl Suite<'_> {
                 return Ok(Some(format!("{}: {} weights for shape {:?}, group {} of {}", p.name, p.value.dims()[0], p.shape, p.group, a.groups().len())));
             }
             if to_vec(p.value.clone(), &p.name)? != to_vec(q.value.clone(), &q.name)? {
-                return Ok(Some(format!("{}: two deformers of one seed differ", p.name)));
+                return Ok(Some(format!("{}: two deformers with one seed differ", p.name)));
             }
         }
         let mut names: Vec<&str> = a.parameters().into_iter().map(|p| p.name.as_str()).collect();
@@ -160,7 +160,7 @@ impl Suite<'_> {
         let declared = self.plugin.info.capabilities.contains(&"starts-as-identity") || built.is_static();
         let input = SpatialInput::at_start(self.centres(CENTRES, self.device), built.as_ref());
         let moved = flat(self.offsets(built.as_ref(), &input, 0.37)?)?.into_iter().any(|v| v != 0.0);
-        Ok((declared && moved).then(|| "a fresh deformer moves Gaussians".into()))
+        Ok((declared && moved).then(|| "a new deformer moves Gaussians".into()))
     }
     fn offsets_are_sound(&self) -> Result<Option<String>> {
         let built = self.shaken(self.device)?;
@@ -173,7 +173,7 @@ impl Suite<'_> {
         }
         let later = self.values(built.as_ref(), CENTRES, 0.81, self.device)?;
         if later.len() != first.len() {
-            return Ok(Some("heads come and go with time".into()));
+            return Ok(Some("the heads differ between times".into()));
         }
         Ok(match (first.iter().chain(&later).all(|v| v.is_finite()), first == later) {
             (false, _) => Some("offsets are not finite".into()),
@@ -200,7 +200,7 @@ impl Suite<'_> {
         let features = built.spatial(&self.input(built.as_ref(), CENTRES, self.device))?.values;
         let packed = built.packed(features.clone());
         if packed.dims() != features.dims() {
-            return Ok(Some(format!("packed features have shape {:?} in place of {:?}", packed.dims(), features.dims())));
+            return Ok(Some(format!("packed features have shape {:?}, expected {:?}", packed.dims(), features.dims())));
         }
         let (plain, packed) = (flat(built.deform(features, 0.37)?)?, flat(built.deform(packed, 0.37)?)?);
         let size = plain.iter().fold(0.0f32, |most, v| most.max(v.abs()));
@@ -237,7 +237,7 @@ impl Suite<'_> {
         let (built, mut copy) = (self.shaken(self.device)?, self.fresh(self.device)?);
         for (to, from) in copy.parameters_mut().into_iter().zip(built.parameters()) {
             if to.name != from.name || to.shape != from.shape {
-                return Ok(Some(format!("a fresh deformer has {} {:?} where this one has {} {:?}", to.name, to.shape, from.name, from.shape)));
+                return Ok(Some(format!("a new deformer has {} {:?}, this one has {} {:?}", to.name, to.shape, from.name, from.shape)));
             }
             let values = to_vec(from.value.clone(), &from.name)?;
             let n = values.len();
@@ -257,7 +257,7 @@ impl Suite<'_> {
         let odd = Tensor::<2>::from_data(TensorData::new(vec![f32::NAN, f32::INFINITY, 0.0, 1e30, -1e30, 0.5], [2, 3]), self.device);
         let input = SpatialInput { means_world: odd, ..self.input(built.as_ref(), 2, self.device) };
         let answered = match self.offsets(built.as_ref(), &input, 0.5) {
-            // An error is a defined answer too.
+            // An error is allowed too.
             Err(_) => true,
             Ok(offsets) => flat(offsets)?.iter().all(|v| v.is_finite()),
         };

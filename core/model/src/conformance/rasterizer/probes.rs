@@ -1,4 +1,4 @@
-//! Gradients that no input carries: those of projected centres and of the camera's pose.
+//! Gradients of probes: of projected centres and of the camera pose.
 
 use super::{COUNT, SIZE, Suite, agrees, camera, cloud};
 use crate::conformance::uniform;
@@ -7,11 +7,11 @@ use crate::{Camera, Gaussians, HostGaussians, RenderSettings, Result, Seed, Spla
 use burn::tensor::{Tensor, TensorData};
 use glam::{DMat4, DQuat, DVec3};
 
-/// Steps of finite differences in pixels. Short ones drown in rounding where long ones cross a threshold, and the other way round.
+/// Steps of finite differences in pixels. Short ones may be below the rounding error, long ones may cross a threshold.
 const PIXEL_STEPS: [f64; 3] = [1e-3, 3e-3, 1e-2];
 /// The same for a pose: world units and radians. A pose moves all Gaussians at once, so thresholds are near and steps are short.
 const POSE_STEPS: [f64; 3] = [2e-5, 5e-5, 1.5e-4];
-/// Gaussians that the camera of a moving pose sees.
+/// Gaussians in the test of the camera pose.
 const POSE_COUNT: usize = 4;
 /// Largest difference between a gradient and a finite difference, as a share of the absolute gradient.
 const TOLERANCE: f64 = 0.05;
@@ -35,7 +35,7 @@ fn one_of(host: &HostGaussians, index: usize) -> HostGaussians {
     one
 }
 
-/// `camera` after a further rotation (axis times angle in radians) and translation of camera space: `pose` holds both.
+/// `camera` after `step` times a rotation and translation of camera space: `pose` is axis times angle in radians, then world units.
 fn moved(camera: &Camera, pose: [f64; 6], step: f64) -> Camera {
     let [rotation, translation] = [0, 3].map(|k| DVec3::new(pose[k], pose[k + 1], pose[k + 2]) * step);
     let matrix = DMat4::from_cols_array_2d(&camera.world_to_camera).transpose();
@@ -43,7 +43,7 @@ fn moved(camera: &Camera, pose: [f64; 6], step: f64) -> Camera {
     Camera { world_to_camera: matrix.transpose().to_cols_array_2d(), ..camera.clone() }
 }
 
-/// From the gradient of the 16 entries of world_to_camera to that of rotation and translation of camera space.
+/// Converts the gradient of the 16 entries of world_to_camera to that of a rotation and translation of camera space.
 fn pose_gradient(camera: &Camera, entries: &[f32]) -> [f64; 6] {
     std::array::from_fn(|k| {
         let axis = [DVec3::X, DVec3::Y, DVec3::Z][k % 3];
@@ -67,7 +67,7 @@ impl Suite<'_> {
         let pixels = weighted.len() / 5;
         Ok((0..pixels).map(|pixel| weighted.iter().skip(pixel).step_by(pixels).sum()).collect())
     }
-    /// `Err` of the inner result names the probe that received nothing, or something of another shape.
+    /// The inner `Err` names a probe that received no gradient, or one of another shape.
     fn probed(&self, host: &HostGaussians, camera: &Camera) -> Result<std::result::Result<Probed, String>> {
         let tracked = self.device.clone().autodiff();
         let g = Gaussians::from_host(host, &tracked);
@@ -95,7 +95,7 @@ impl Suite<'_> {
         let [screen, absolute, camera] = [0, 1, 2].map(|k: usize| std::mem::take(&mut values[k]));
         Ok(Ok(Probed { screen, absolute, camera }))
     }
-    /// A step of the principal point moves every projected centre and nothing else; for one Gaussian, its gradient is that of its centre.
+    /// Moving the principal point moves only the projected centres. So for one Gaussian, the finite difference by the principal point is the gradient of the centre.
     pub(super) fn screen_probes_are_slopes(&self) -> Result<Option<String>> {
         let (host, camera) = (cloud(COUNT), camera());
         for index in 0..4 {
@@ -137,7 +137,7 @@ impl Suite<'_> {
                 .map(|k| format!("Gaussian {} has an absolute gradient of {} on the screen, below its signed one of {}", k / 2, absolute[k], screen[k])),
         })
     }
-    /// Moving the camera along the gradient of its pose changes the loss by as much as its norm says.
+    /// The slope of the loss along the gradient of the camera pose equals the gradient's norm.
     pub(super) fn camera_probe_is_a_slope(&self) -> Result<Option<String>> {
         let (host, camera) = (cloud(POSE_COUNT), camera());
         let probed = match self.probed(&host, &camera)? {
