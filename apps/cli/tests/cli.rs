@@ -127,7 +127,7 @@ fn a_scene_goes_through_the_whole_chain() {
     succeed(&["eval", text(&archive), "--scene", "procedural:tiny", "--split", "test", "-q", "--json", text(&json)]);
     let report = read_json(&json);
     let number = |pointer: &str| report.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("{pointer} in {report}"));
-    assert!(number("/psnr_db") > 12.0 && number("/ssim") > 0.2 && number("/ssim") <= 1.0, "{report}");
+    assert!(number("/psnr_db") > 18.0 && number("/ssim") > 0.6 && number("/ssim") <= 1.0, "{report}");
     let on_disk = std::fs::metadata(&archive).unwrap().len() as f64;
     assert!((number("/size_mb/total") * 1e6 - on_disk).abs() < 0.5, "MB are 10^6 bytes on disk");
     assert!(number("/size_mb/point_cloud") > 0.0 && number("/size_mb/deform") > 0.0);

@@ -203,6 +203,18 @@ fn runs_on_wgpu_are_reproducible_and_every_device_draws_the_same() {
     }
 }
 
+/// PSNR in dB that 40 iterations at 32x32 reach at least, by method: about 0.7 dB below what one seed gave on flex.
+const FLOORS_DB: [(&str, f64); 8] = [
+    ("swift4d", 17.2),
+    ("grid4d", 16.6),
+    ("hexplane", 17.5),
+    ("embedding", 17.5),
+    ("deform-mlp", 16.9),
+    ("native-4d", 16.0),
+    ("cdf-basis", 17.2),
+    ("none", 17.1),
+];
+
 /// Every deformer, with its attributes per Gaussian, can be trained, resumed to the same bytes, played back, and stored in an archive.
 #[test]
 fn every_field_trains_resumes_plays_and_is_archived() {
@@ -236,13 +248,16 @@ fn every_field_trains_resumes_plays_and_is_archived() {
             }
         }
         let before = score(&model, &config).psnr_db;
+        // A method of another crate has no floor here.
+        let floor = FLOORS_DB.iter().find(|(name, _)| *name == method).map_or(15.0, |(_, floor)| *floor);
+        assert!(before >= floor, "{method}: {before} dB, at least {floor} are expected");
         let mut deform = Vec::new();
         for (precision, allowed) in [("fp32", 1e-3), ("fp16", 0.05), ("int8", 0.5)] {
             let archive = folder.path().join(format!("{method}-{precision}.cc4d"));
             model.save_archive(&archive, &options("raw", precision), &registry, &Limits::default(), &Silent).unwrap();
             let stored = load(&archive);
             let after = score(&stored, &config).psnr_db;
-            assert!(before.is_finite() && (before - after).abs() < allowed, "{method}: {before} dB, {after} from the archive with {precision} weights");
+            assert!((before - after).abs() < allowed, "{method}: {before} dB, {after} from the archive with {precision} weights");
             deform.push(stored.size.deform);
         }
         let weightless = model.field.as_ref().is_none_or(|f| f.field.parameters().is_empty());
