@@ -61,7 +61,7 @@ fn main() -> Result<()> {
     let iterations = std::env::args().nth(1).unwrap_or_else(|| "600".into());
     let session = Session::new()?;
     let usual = "{kind = 'l1', weight = 0.8}, {kind = 'dssim', weight = 0.2}";
-    for terms in [usual.to_string(), format!("{usual}, {{kind = 'needles', weight = 0.05}}")] {
+    for terms in [usual.to_string(), format!("{usual}, {{kind = 'needles', weight = 0.1, ratio = 1.1}}")] {
         let config = session.config("demo", &[&format!("train.iterations={iterations}"), &format!("loss=[{terms}]")])?;
         let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene)?);
         let model = session.train(&config, scene.clone(), None)?;
