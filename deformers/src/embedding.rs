@@ -108,7 +108,7 @@ impl Embedding {
         }
         Ok(Self { sh_degree: context.sh_degree, network: Arc::new(network), parameters, settings, progress: 1.0 })
     }
-    /// The row [1, F] at `time_norm` of the table resized to `rows` rows, corners aligned.
+    /// The row `[1, F]` at `time_norm` of the table resized to `rows` rows, corners aligned.
     fn time_row(&self, time_norm: f32, rows: usize) -> Tensor<2> {
         let s = &self.settings;
         let table = self.parameters[0].value.clone().reshape([s.time_rows, s.time_features]);

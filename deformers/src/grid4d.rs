@@ -156,7 +156,7 @@ impl Grid4d {
     fn weight(&self, place: usize) -> Tensor<1> {
         self.parameters[place].value.clone()
     }
-    /// Features of the three grids with time at positions [M,3] in 0..1 of the box, concatenated.
+    /// Features of the three grids with time at positions `[M,3]` in 0..1 of the box, concatenated.
     fn with_time(&self, position: &Tensor<2>, time_norm: f32) -> Result<Tensor<2>> {
         let time = column(position, 0.5 + TIME_SHARE * (time_norm - 0.5));
         let points = Tensor::cat(vec![position.clone(), time], 1);
@@ -172,7 +172,7 @@ fn only(outputs: Vec<Tensor<2>>) -> Result<Tensor<2>> {
     outputs.into_iter().next().ok_or_else(|| Error::backend("deformer grid4d", "a network returned no output", "Report this as a defect"))
 }
 
-/// R(q) x for quaternions [M,4] (w,x,y,z), divided by their squared norm, and points [M,3].
+/// R(q) x for quaternions `[M,4]` (w,x,y,z), divided by their squared norm, and points `[M,3]`.
 fn rotate(q: Tensor<2>, x: Tensor<2>) -> Tensor<2> {
     let part = |t: &Tensor<2>, k: usize| t.clone().narrow(1, k, 1);
     let [w, a, b, c] = std::array::from_fn(|k| part(&q, k));

@@ -124,7 +124,7 @@ impl HexPlane {
     fn net(&self) -> Tensor<1> {
         self.parameters[PLANES.len()].value.clone()
     }
-    /// The product over the planes of `wanted` at points [M,4].
+    /// The product over the planes of `wanted` at points `[M,4]`.
     fn product(&self, points: &Tensor<2>, wanted: impl Fn(&[usize; 2]) -> bool) -> Result<Option<Tensor<2>>> {
         let mut product: Option<Tensor<2>> = None;
         for ((axes, shape), parameter) in PLANES.iter().zip(&self.planes).zip(&self.parameters) {

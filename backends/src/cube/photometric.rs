@@ -30,7 +30,7 @@ fn window() -> [f32; TAPS as usize] {
     std::array::from_fn(|i| (weight(i) / sum) as f32)
 }
 
-/// moments [3,5,H,W]: x, y, x^2, y^2, xy blurred along rows; zero padding.
+/// moments `[3,5,H,W]`: x, y, x^2, y^2, xy blurred along rows; zero padding.
 #[cube(launch)]
 fn blur_moments_in_rows(x: &[f32], y: &[f32], taps: &[f32], moments: &mut [f32], width: u32, pixels: u32) {
     let at = ABSOLUTE_POS as u32;

@@ -18,7 +18,7 @@ const LANES: usize = 16;
 pub(super) struct Layer {
     pub(super) inputs: usize,
     pub(super) outputs: usize,
-    /// Index of the first weight [inputs, outputs]; the biases [outputs] follow.
+    /// Index of the first weight `[inputs, outputs]`; the biases `[outputs]` follow.
     pub(super) at: usize,
 }
 
@@ -100,7 +100,7 @@ pub(super) struct Decoder {
 }
 
 struct Packed {
-    /// Blocks of LANES outputs: [block][input][lane].
+    /// Blocks of LANES outputs: [block][input]`[lane]`.
     weights: Vec<[f32; LANES]>,
     bias: Vec<[f32; LANES]>,
     inputs: usize,

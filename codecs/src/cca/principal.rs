@@ -7,7 +7,7 @@ use super::network::{HALF, Layer};
 use cc4dgs_format::Seed;
 use rand::Rng;
 
-/// Eigenvalues, largest first, and eigenvectors (one per row) of the symmetric matrix `a` [n,n], by cyclic Jacobi rotations.
+/// Eigenvalues, largest first, and eigenvectors (one per row) of the symmetric matrix `a` `[n,n]`, by cyclic Jacobi rotations.
 pub(super) fn eigen(mut a: Vec<f64>, n: usize) -> (Vec<f64>, Vec<f64>) {
     let mut v = vec![0.0; n * n];
     (0..n).for_each(|i| v[i * n + i] = 1.0);

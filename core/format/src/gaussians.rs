@@ -38,7 +38,7 @@ pub struct NeededRows {
 }
 
 impl ExtraAttribute {
-    /// An attribute of which every row must be stored bit for bit. `values` are [N,width], row-major.
+    /// An attribute of which every row must be stored bit for bit. `values` are `[N,width]`, row-major.
     pub fn exact(width: usize, values: Vec<f32>) -> Self {
         Self { width, values, tolerance: None, needed: None }
     }

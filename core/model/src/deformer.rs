@@ -24,7 +24,7 @@ pub struct Parameter {
     pub part: Part,
     /// The logical shape; `value` is flat.
     pub shape: Vec<usize>,
-    /// The weights, flat [product of shape].
+    /// The weights, flat `[product of shape]`.
     pub value: Tensor<1>,
     /// Index into [`Deformer::groups`].
     pub group: usize,
@@ -70,7 +70,7 @@ pub struct DeformerWork {
 /// Time-invariant features of M Gaussians and the work done for them.
 #[derive(Clone, Debug)]
 pub struct SpatialFeatures {
-    /// Features [M, F]. Only the deformer itself reads them; their layout is its own.
+    /// Features `[M, F]`. Only the deformer itself reads them; their layout is its own.
     pub values: Tensor<2>,
     /// The work done for them.
     pub work: DeformerWork,
@@ -79,18 +79,18 @@ pub struct SpatialFeatures {
 /// Input of the time-invariant half of a deformer: M Gaussians.
 #[derive(Clone, Debug)]
 pub struct SpatialInput {
-    /// Canonical centres in world units [M,3]. They are constants: no gradient flows to them.
+    /// Canonical centres in world units `[M,3]`. They are constants: no gradient flows to them.
     pub means_world: Tensor<2>,
-    /// Values [M,width] of [`Deformer::attributes`], in that order. Gradients flow through them.
+    /// Values `[M,width]` of [`Deformer::attributes`], in that order. Gradients flow through them.
     pub attributes: Vec<Tensor<2>>,
 }
 
 impl SpatialInput {
-    /// Input for a deformer without attributes: centres [M,3] in world units.
+    /// Input for a deformer without attributes: centres `[M,3]` in world units.
     pub fn new(means_world: Tensor<2>) -> Self {
         Self { means_world, attributes: Vec::new() }
     }
-    /// Centres [M,3] in world units, with the start value of each attribute of `deformer`.
+    /// Centres `[M,3]` in world units, with the start value of each attribute of `deformer`.
     pub fn at_start(means_world: Tensor<2>, deformer: &dyn Deformer) -> Self {
         let (m, device) = (means_world.dims()[0], means_world.device());
         let attributes = deformer.attributes().iter().map(|a| Tensor::full([m, a.width], a.start, &device)).collect();
@@ -104,7 +104,7 @@ impl SpatialInput {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// The Gaussians with the indices `rows` [K].
+    /// The Gaussians with the indices `rows` `[K]`.
     pub fn select(&self, rows: &Tensor<1, Int>) -> Self {
         self.map(|values| values.clone().select(0, rows.clone()))
     }
@@ -198,7 +198,7 @@ pub trait Deformer: Send {
     fn attributes(&self) -> Vec<AttributeSpec> {
         Vec::new()
     }
-    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` [M,F]; the same heads at every time.
+    /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` `[M,F]`; the same heads at every time.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
     /// The same features in the layout that [`Deformer::deform`] reads fastest. Playback calls this once per spatial pass.
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
@@ -218,13 +218,13 @@ pub trait Deformer: Send {
     fn is_static(&self) -> bool {
         false
     }
-    /// An additional loss term [1] for the moving Gaussians at `time_norm` (0..1); `progress` (0..1) is that of the main stage.
+    /// An additional loss term `[1]` for the moving Gaussians at `time_norm` (0..1); `progress` (0..1) is that of the main stage.
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(None)
     }
     /// Sets the progress of the main stage of training, 0..1; called before every step. A deformer without such a call has progress 1, as after training.
     fn set_progress(&mut self, _progress: f32) {}
-    /// After training, a smaller deformer with nearly the same offsets, without parts that this scene does not use; `None` if there is none. `features` [M,F] are
+    /// After training, a smaller deformer with nearly the same offsets, without parts that this scene does not use; `None` if there is none. `features` `[M,F]` are
     /// those of all moving Gaussians, `times` the normalised times of the frames.
     fn simplified(&self, _features: Tensor<2>, _times: &[f32]) -> Result<Option<Simplified>> {
         Ok(None)

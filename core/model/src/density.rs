@@ -22,13 +22,13 @@ pub enum Statistic {
 /// Statistics of N Gaussians in one rendered view. Fields that were not requested are `None`.
 #[derive(Clone, Debug)]
 pub struct ViewStatistics {
-    /// Screen radius in pixels [N]; 0 where the Gaussian was culled.
+    /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
     pub radii: Tensor<1, Int>,
-    /// [`Statistic::ScreenGradient`] per pixel of x and y [N,2].
+    /// [`Statistic::ScreenGradient`] per pixel of x and y `[N,2]`.
     pub screen_gradient: Option<Tensor<2>>,
-    /// [`Statistic::AbsoluteScreenGradient`] per pixel of x and y [N,2].
+    /// [`Statistic::AbsoluteScreenGradient`] per pixel of x and y `[N,2]`.
     pub absolute_screen_gradient: Option<Tensor<2>>,
-    /// [`Statistic::MaxWeight`] in 0..1 [N].
+    /// [`Statistic::MaxWeight`] in 0..1 `[N]`.
     pub max_weights: Option<Tensor<1>>,
     /// Image size in pixels.
     pub size: (u32, u32),
@@ -94,7 +94,7 @@ impl DensityPlan {
         self.fresh.push(fresh);
         self.parents.len() - 1
     }
-    /// Sets `attribute` of the new row `row` to `values` [width].
+    /// Sets `attribute` of the new row `row` to `values` `[width]`.
     pub fn set(&mut self, row: usize, attribute: &str, values: &[f32]) {
         match self.values.iter_mut().find(|v| v.attribute == attribute) {
             Some(found) => {
@@ -209,7 +209,7 @@ pub trait DensityControl: Send {
     /// The plan after the optimizer step of an iteration; `None` for no change. The trainer executes it before the next iteration. When this returns, the control's own
     /// statistics must already match the new Gaussians. All randomness comes from `seed`, which differs in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
-    /// Called after every optimizer step. Returns attributes with new values for all rows [N,width]; their optimizer state is kept (for the noise of 3DGS-MCMC).
+    /// Called after every optimizer step. Returns attributes with new values for all rows `[N,width]`; their optimizer state is kept (for the noise of 3DGS-MCMC).
     fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         Ok(Vec::new())
     }

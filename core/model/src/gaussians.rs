@@ -12,21 +12,21 @@ use std::collections::BTreeMap;
 pub struct Gaussians {
     /// Spherical-harmonics degree stored in `sh_rest`, 0 to 4.
     pub sh_degree: usize,
-    /// Centres in world units [N,3].
+    /// Centres in world units `[N,3]`.
     pub means: Tensor<2>,
-    /// Natural logarithm of the standard deviations [N,3].
+    /// Natural logarithm of the standard deviations `[N,3]`.
     pub log_scales: Tensor<2>,
-    /// Quaternions (w,x,y,z), not normalised [N,4].
+    /// Quaternions (w,x,y,z), not normalised `[N,4]`.
     pub quaternions: Tensor<2>,
-    /// Opacity before the sigmoid [N].
+    /// Opacity before the sigmoid `[N]`.
     pub opacity_logits: Tensor<1>,
-    /// Degree-0 colour coefficients [N,3].
+    /// Degree-0 colour coefficients `[N,3]`.
     pub sh_dc: Tensor<2>,
-    /// Higher colour coefficients [N, (d+1)^2-1, 3].
+    /// Higher colour coefficients `[N, (d+1)^2-1, 3]`.
     pub sh_rest: Tensor<3>,
-    /// Dynamic scores [N].
+    /// Dynamic scores `[N]`.
     pub dynamic_scores: Tensor<1>,
-    /// Attributes of plug-ins by name [N, width].
+    /// Attributes of plug-ins by name `[N, width]`.
     pub extra: BTreeMap<String, Tensor<2>>,
 }
 
@@ -73,7 +73,7 @@ impl Gaussians {
     pub fn attribute_names(&self) -> Vec<String> {
         CORE_ATTRIBUTES.iter().map(ToString::to_string).chain(self.extra.keys().cloned()).collect()
     }
-    /// An attribute by name, as rows [N,width]; `None` for an unknown name.
+    /// An attribute by name, as rows `[N,width]`; `None` for an unknown name.
     pub fn attribute(&self, name: &str) -> Option<Tensor<2>> {
         let n = self.len();
         Some(match name {
@@ -87,7 +87,7 @@ impl Gaussians {
             other => self.extra.get(other)?.clone(),
         })
     }
-    /// Gaussians from named attributes [N,width]. Names that are not core attributes are attributes of plug-ins.
+    /// Gaussians from named attributes `[N,width]`. Names that are not core attributes are attributes of plug-ins.
     ///
     /// # Errors
     /// [`Error::Data`] if a core attribute is missing or has another width.

@@ -6,13 +6,13 @@ use burn::tensor::Tensor;
 
 /// Input of a loss term: one view at one time.
 pub struct LossInput<'a> {
-    /// Rendered planes [5,H,W]: red, green, blue as the camera records them (after the appearance model), alpha, depth. Gradients flow through them.
+    /// Rendered planes `[5,H,W]`: red, green, blue as the camera records them (after the appearance model), alpha, depth. Gradients flow through them.
     pub planes: &'a Tensor<3>,
-    /// Recorded planes [3,H,W] in 0..1, or the mask [1,H,W] of the score stage.
+    /// Recorded planes `[3,H,W]` in 0..1, or the mask `[1,H,W]` of the score stage.
     pub target: &'a Tensor<3>,
     /// The Gaussians as rendered at this time, with their attributes (opacities and scales before activation). Gradients flow through them.
     pub gaussians: &'a Gaussians,
-    /// Screen radius in pixels [N]; 0 where the Gaussian was culled.
+    /// Screen radius in pixels `[N]`; 0 where the Gaussian was culled.
     pub radii: &'a Tensor<1, burn::tensor::Int>,
     /// Normalised time of the view.
     pub time_norm: f32,
@@ -22,7 +22,7 @@ pub struct LossInput<'a> {
 
 /// One term of the loss.
 pub trait LossTerm: Send {
-    /// The value [1] for one view, without its weight; `None` if the term does not apply.
+    /// The value `[1]` for one view, without its weight; `None` if the term does not apply.
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>>;
 }
 

@@ -13,7 +13,7 @@ type Regularizer<M> = Box<dyn Fn(&M, &SpatialInput, f32, f32) -> Result<Option<T
 /// Changes a module, except for its weights, as training advances.
 type Progress<M> = Box<dyn Fn(&mut M, f32) + Send>;
 
-/// A [`Deformer`] made of a module `M`: `spatial(module, input)` gives features [M,F], `deform(module, features, time_norm)` offsets.
+/// A [`Deformer`] made of a module `M`: `spatial(module, input)` gives features `[M,F]`, `deform(module, features, time_norm)` offsets.
 ///
 /// Both functions receive the weights of the current step; gradients flow through them. Register it like any deformer: `build` returns it in a box.
 pub struct ModuleDeformer<M, S, D> {

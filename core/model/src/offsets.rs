@@ -18,23 +18,23 @@ const LEAST_NORM: f32 = 1e-12;
 /// Offsets are added to the raw parameters, before activation (paper Section IV-B; Swift4D, 4DGS, E-D3DGS), except for the heads documented otherwise.
 #[derive(Clone, Debug, Default)]
 pub struct Offsets {
-    /// Change of the centres in world units [M,3].
+    /// Change of the centres in world units `[M,3]`.
     pub means: Option<Tensor<2>>,
-    /// Change of the log-scales [M,3].
+    /// Change of the log-scales `[M,3]`.
     pub log_scales: Option<Tensor<2>>,
-    /// Change of the scales after activation, world units [M,3] (Deformable 3DGS, Grid4D). Results stay positive.
+    /// Change of the scales after activation, world units `[M,3]` (Deformable 3DGS, Grid4D). Results stay positive.
     pub scales: Option<Tensor<2>>,
-    /// Change of the raw quaternions [M,4].
+    /// Change of the raw quaternions `[M,4]`.
     pub quaternions: Option<Tensor<2>>,
-    /// Rotations in front of the canonical ones, axis times angle in radians, world axes [M,3]. Unlike sums of quaternions they are exact for any angle.
+    /// Rotations in front of the canonical ones, axis times angle in radians, world axes `[M,3]`. Unlike sums of quaternions they are exact for any angle.
     pub rotation_vectors: Option<Tensor<2>>,
     /// Whether quaternions are normalised before they are changed (Deformable 3DGS, Grid4D).
     pub unit_quaternions: bool,
-    /// Change of the opacity logits [M].
+    /// Change of the opacity logits `[M]`.
     pub opacity_logits: Option<Tensor<1>>,
-    /// Logarithm of a factor of the opacity after its activation, at most 0 [M] (Gaussians that appear and vanish).
+    /// Logarithm of a factor of the opacity after its activation, at most 0 `[M]` (Gaussians that appear and vanish).
     pub opacity_log_factor: Option<Tensor<1>>,
-    /// Change of all spherical-harmonics coefficients, degree 0 first [M, (d+1)^2, 3].
+    /// Change of all spherical-harmonics coefficients, degree 0 first `[M, (d+1)^2, 3]`.
     pub sh: Option<Tensor<3>>,
 }
 
@@ -102,7 +102,7 @@ impl Offsets {
         }
         Ok(())
     }
-    /// Applies the offsets to the Gaussians with the indices `rows` [M]; `None` means the first M. All other Gaussians are returned unchanged.
+    /// Applies the offsets to the Gaussians with the indices `rows` `[M]`; `None` means the first M. All other Gaussians are returned unchanged.
     ///
     /// # Errors
     /// [`Error::Parameter`] with the name of `deformer` and of the head, for a head of another shape.
@@ -164,7 +164,7 @@ impl Offsets {
         }
         moved
     }
-    /// Applies the offsets to `moving` [M] and writes the results to the first M Gaussians of `frame` [N >= M]. The update is in place if `frame` holds the only
+    /// Applies the offsets to `moving` `[M]` and writes the results to the first M Gaussians of `frame` `[N >= M]`. The update is in place if `frame` holds the only
     /// reference. Attributes that no head changes and all other Gaussians stay unchanged.
     ///
     /// # Errors
@@ -195,7 +195,7 @@ impl Offsets {
         }
         Ok(frame)
     }
-    /// All heads concatenated as one matrix [M, total width], for regularisers; `None` without heads.
+    /// All heads concatenated as one matrix `[M, total width]`, for regularisers; `None` without heads.
     pub fn concatenated(&self) -> Option<Tensor<2>> {
         let mut parts: Vec<Tensor<2>> = Vec::new();
         parts.extend(self.means.clone());
@@ -210,7 +210,7 @@ impl Offsets {
     }
 }
 
-/// Quaternions [M,4] multiplied from the left by the rotations `vectors` [M,3] (axis times angle in radians); norms are unchanged.
+/// Quaternions `[M,4]` multiplied from the left by the rotations `vectors` `[M,3]` (axis times angle in radians); norms are unchanged.
 fn turned(quaternions: Tensor<2>, vectors: Tensor<2>) -> Tensor<2> {
     let angle = (vectors.clone() * vectors.clone()).sum_dim(1).add_scalar(LEAST_SQUARED_ANGLE).sqrt();
     let half = angle.clone().mul_scalar(0.5);
@@ -245,7 +245,7 @@ fn select<const D: usize>(values: &Tensor<D>, rows: Option<&Tensor<1, Int>>, cou
     }
 }
 
-/// `base` [N,…] with its first rows replaced by `first` [M,…].
+/// `base` `[N,…]` with its first rows replaced by `first` `[M,…]`.
 fn over<const D: usize>(base: Tensor<D>, first: Tensor<D>) -> Tensor<D> {
     let (dims, len) = (base.dims(), first.dims().iter().product::<usize>());
     if len == 0 || first.dims() == dims {

@@ -12,7 +12,7 @@ pub struct StepSettings<'a> {
     pub lr: f64,
     /// Added to the denominator, if the optimizer has one.
     pub epsilon: f64,
-    /// Rows [N] that are 0 keep values and state; `None` updates all rows.
+    /// Rows `[N]` that are 0 keep values and state; `None` updates all rows.
     pub visible: Option<&'a Tensor<1, Int>>,
 }
 
@@ -26,7 +26,7 @@ impl StepSettings<'_> {
 /// The state of an optimizer between steps, for checkpoints.
 #[derive(Clone, Debug, Default)]
 pub struct OptimizerState {
-    /// Arrays [N,W] by name; the name is that of the optimised array, a slash, and a suffix.
+    /// Arrays `[N,W]` by name; the name is that of the optimised array, a slash, and a suffix.
     pub arrays: BTreeMap<String, Tensor<2>>,
     /// Step counts by name of the optimised array.
     pub steps: BTreeMap<String, u64>,
@@ -34,7 +34,7 @@ pub struct OptimizerState {
 
 /// Updates named arrays by their gradients.
 pub trait Optimizer: Send {
-    /// The values after one step. `value` and `gradient` are [N,W], plain tensors; a new array starts with zero state.
+    /// The values after one step. `value` and `gradient` are `[N,W]`, plain tensors; a new array starts with zero state.
     fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>>;
     /// Removes the state of all arrays whose names begin with `prefix`.
     fn restart(&mut self, prefix: &str);

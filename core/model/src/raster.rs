@@ -102,7 +102,7 @@ impl Default for RenderSettings {
 /// One rendered view.
 #[derive(Clone, Debug)]
 pub struct RenderOutput {
-    /// Planes [5, H, W]: red, green, blue (background included), alpha, depth (sum of weight times z, not normalised).
+    /// Planes `[5, H, W]`: red, green, blue (background included), alpha, depth (sum of weight times z, not normalised).
     /// Kept in one tensor so that a loss can read its planes without a copy.
     pub planes: Tensor<3>,
     /// Statistics without gradient.

@@ -39,7 +39,7 @@ pub struct RunConfig {
     /// The loss terms: `kind`, `weight` (1 if absent) and their settings.
     #[serde(default = "l1_and_dssim")]
     pub loss: Vec<toml::Table>,
-    /// The loss term of the score stage: `kind` and its settings. Its target is the mask of what moves, [1,H,W].
+    /// The loss term of the score stage: `kind` and its settings. Its target is the mask of what moves, `[1,H,W]`.
     #[serde(default = "mask_bce")]
     pub score_loss: toml::Table,
     /// The appearance plug-in: `kind` and its settings.

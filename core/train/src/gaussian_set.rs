@@ -1,4 +1,4 @@
-//! The Gaussians under optimisation: every attribute is an array [N, width] by name, so that growing, pruning, checkpoints and attributes of plug-ins need no list of names.
+//! The Gaussians under optimisation: every attribute is an array `[N, width]` by name, so that growing, pruning, checkpoints and attributes of plug-ins need no list of names.
 
 use crate::config::GaussianRates;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -10,7 +10,7 @@ use cc4dgs_core::{AttributeSpec, Error, Gaussians, HostGaussians, Result, Seed};
 pub struct GaussianSet {
     /// Spherical-harmonics degree stored.
     pub sh_degree: usize,
-    /// Attributes by name [N, width], the core ones first.
+    /// Attributes by name `[N, width]`, the core ones first.
     attributes: Vec<(String, Tensor<2>)>,
 }
 
@@ -32,7 +32,7 @@ impl GaussianSet {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// The attribute called `name` [N, width].
+    /// The attribute called `name` `[N, width]`.
     pub fn get(&self, name: &str) -> Result<&Tensor<2>> {
         let found = self.attributes.iter().find(|(known, _)| known == name);
         found.map(|(_, values)| values).ok_or_else(|| Error::backend(format!("attribute {name}"), "the Gaussians do not have it", "Report this as a defect"))
@@ -104,7 +104,7 @@ pub struct Leaves {
 }
 
 impl Leaves {
-    /// The leaf called `name` [N, width].
+    /// The leaf called `name` `[N, width]`.
     pub fn get(&self, name: &str) -> Result<&Tensor<2>> {
         let found = self.tensors.iter().find(|(known, _)| known == name).map(|(_, leaf)| leaf);
         found.ok_or_else(|| Error::backend(format!("attribute {name}"), "the Gaussians do not have it", "Report this as a defect"))

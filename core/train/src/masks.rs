@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 pub struct DynamicMask {
     /// The view (the camera's first frame) it is rendered from.
     pub view: usize,
-    /// 1 where the pixel is dynamic, else 0, row-major [H,W].
+    /// 1 where the pixel is dynamic, else 0, row-major `[H,W]`.
     pub mask: Vec<f32>,
 }
 

@@ -39,7 +39,7 @@ impl TemporalFunctions {
         let fourier = (0..self.bands).flat_map(|band| [(band as f32 * (1.0 - self.falloff)).exp2(); 2]);
         [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(1.0, self.splines + self.learned())).collect()
     }
-    /// All functions at `times_norm` (0..1): φ(t) [times, functions]. `weights` are those of the network.
+    /// All functions at `times_norm` (0..1): φ(t) `[times, functions]`. `weights` are those of the network.
     pub(super) fn at(&self, times_norm: &[f32], weights: Option<Tensor<1>>, like: &Device) -> Result<Tensor<2>> {
         let rows = |of: &dyn Fn(f32) -> Vec<f32>| {
             let values: Vec<f32> = times_norm.iter().flat_map(|&t| of(t)).collect();

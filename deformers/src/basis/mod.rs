@@ -7,7 +7,7 @@
 //! Trajectories as combinations of few shared functions are the idea of DynMF (Kratimenos et al. 2024) and Gaussian-Flow (Lin et al. 2024), which store the
 //! coefficients per Gaussian.
 //!
-//! After training, functions that a head hardly uses and heads without effect are dropped: see [`simplify`].
+//! After training, functions that a head hardly uses and heads without effect are dropped: see `simplify`.
 
 mod functions;
 mod simplify;
@@ -203,7 +203,7 @@ impl CdfBasis {
         let side = |k: usize| f64::from(self.context.box_max[k]) - f64::from(self.context.box_min[k]);
         if head == Head::Means { 0.5 * (0..3).map(|k| side(k).powi(2)).sum::<f64>().sqrt() } else { 1.0 }
     }
-    /// All functions at `times_norm` (0..1): φ(t) [times, functions].
+    /// All functions at `times_norm` (0..1): φ(t) `[times, functions]`.
     fn functions_at(&self, times_norm: &[f32], like: &Device) -> Result<Tensor<2>> {
         let weights = self.functions.network.as_ref().map(|_| self.parameters[self.voxels.levels()].value.clone());
         self.functions.at(times_norm, weights, like)

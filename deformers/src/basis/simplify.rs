@@ -70,7 +70,7 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
     Ok(Some(Simplified { settings: small.section.clone(), field: Box::new(small), message }))
 }
 
-/// The mean square of every column of rows [_, columns].
+/// The mean square of every column of rows `[_, columns]`.
 fn mean_squares(values: &[f32], columns: usize) -> Vec<f64> {
     let mut sums = vec![0.0f64; columns];
     for row in values.chunks_exact(columns) {
@@ -139,7 +139,7 @@ fn rebuilt(field: &CdfBasis, plans: &[Plan]) -> Result<CdfBasis> {
     Ok(small)
 }
 
-/// A head's layers without some functions: W [in, hidden] and b [hidden] unchanged, of the last layer's W [hidden, outputs x functions] and b only the kept
+/// A head's layers without some functions: W `[in, hidden]` and b `[hidden]` unchanged, of the last layer's W `[hidden, outputs x functions]` and b only the kept
 /// columns.
 fn head_weights(values: &[f32], (outputs, own): (usize, usize), width: usize, kept: &[usize]) -> Vec<f32> {
     let first = width * (width + 1);

@@ -6,13 +6,13 @@ use cc4dgs_core::{DeformerContext, Error, Result};
 /// Largest absolute coordinate of a centre, world units; larger ones are clamped, NaN becomes 0.
 const FAR: f32 = 1e6;
 
-/// `means_world` [M,3] with every number finite.
+/// `means_world` `[M,3]` with every number finite.
 pub fn finite(means_world: Tensor<2>) -> Tensor<2> {
     let odd = means_world.clone().is_nan();
     means_world.mask_fill(odd, 0.0).clamp(-FAR, FAR)
 }
 
-/// `means_world` [M,3] mapped to 0..1 inside the deformer's box. NaN stays NaN: lookups handle it.
+/// `means_world` `[M,3]` mapped to 0..1 inside the deformer's box. NaN stays NaN: lookups handle it.
 pub fn in_box(means_world: Tensor<2>, context: &DeformerContext) -> Tensor<2> {
     let device = means_world.device();
     let row = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, [1, 3]), &device);
@@ -20,7 +20,7 @@ pub fn in_box(means_world: Tensor<2>, context: &DeformerContext) -> Tensor<2> {
     (means_world - row(context.box_min.to_vec())) * row(inverse)
 }
 
-/// A column [M,1] of `value`, on the device and with the rows of `like` [M,…].
+/// A column `[M,1]` of `value`, on the device and with the rows of `like` `[M,…]`.
 pub fn column(like: &Tensor<2>, value: f32) -> Tensor<2> {
     Tensor::full([like.dims()[0], 1], value, &like.device())
 }

@@ -56,7 +56,7 @@ pub fn check(heads: &[Head]) -> Result<()> {
     Ok(())
 }
 
-/// Offsets from one output [M, width] per head.
+/// Offsets from one output `[M, width]` per head.
 pub fn offsets(heads: &[Head], outputs: Vec<Tensor<2>>, sh_degree: usize) -> Offsets {
     let mut offsets = Offsets::default();
     for (head, out) in heads.iter().zip(outputs) {

@@ -7,7 +7,7 @@ pub fn bands_for(frames: usize) -> usize {
     (frames.max(1) as f64).log2().round().clamp(1.0, 16.0) as usize
 }
 
-/// [t, sin(2 pi t), cos(2 pi t), sin(4 pi t), …] for t = `time_norm`: 1 + 2 `bands` values.
+/// `[t, sin(2 pi t), cos(2 pi t), sin(4 pi t), …]` for t = `time_norm`: 1 + 2 `bands` values.
 pub fn encode(time_norm: f32, bands: usize) -> Vec<f32> {
     let t = f64::from(time_norm);
     let mut out = vec![time_norm];

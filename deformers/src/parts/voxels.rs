@@ -132,7 +132,7 @@ impl Voxels {
     pub fn width(&self) -> usize {
         self.width
     }
-    /// f_voxel [M, width] of `means_world` [M,3] (M > 0) by the decoders of `parameters` (the first [`Voxels::levels`]), and the work done.
+    /// f_voxel `[M, width]` of `means_world` `[M,3]` (M > 0) by the decoders of `parameters` (the first [`Voxels::levels`]), and the work done.
     pub fn features(&self, parameters: &[Parameter], means_world: Tensor<2>) -> Result<(Tensor<2>, DeformerWork)> {
         let [m, _] = means_world.dims();
         let mut work = DeformerWork { gaussians: m as u64, ..DeformerWork::default() };

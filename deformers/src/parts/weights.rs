@@ -7,14 +7,14 @@ use cc4dgs_backends::ops::field::{MishShape, ReluShape};
 use cc4dgs_core::Seed;
 use rand::Rng;
 
-/// W [input, output], then b [output], uniform in ±1/sqrt(inputs).
+/// W `[input, output]`, then b `[output]`, uniform in ±1/sqrt(inputs).
 fn decoder_layer(seed: Seed, input: usize, output: usize) -> Vec<f32> {
     let bound = 1.0 / (input.max(1) as f32).sqrt();
     let mut random = seed.rng();
     (0..(input + 1) * output).map(|_| random.random_range(-bound..=bound)).collect()
 }
 
-/// A layer whose output has the mean square of its input times `gain`: W [input, output] uniform, b = 0 [output].
+/// A layer whose output has the mean square of its input times `gain`: W `[input, output]` uniform, b = 0 `[output]`.
 fn preserving(seed: Seed, input: usize, output: usize, gain: f32) -> Vec<f32> {
     let bound = (3.0 * gain / input.max(1) as f32).sqrt();
     let mut random = seed.rng();
@@ -69,12 +69,12 @@ pub fn head(seed: Seed, width: usize, output: usize) -> Vec<f32> {
     out
 }
 
-/// A linear layer as PyTorch's `nn.Linear` starts: W [input, output] and b [output] uniform in ±1/sqrt(inputs).
+/// A linear layer as PyTorch's `nn.Linear` starts: W `[input, output]` and b `[output]` uniform in ±1/sqrt(inputs).
 pub fn torch(seed: Seed, input: usize, output: usize) -> Vec<f32> {
     decoder_layer(seed, input, output)
 }
 
-/// W [input, output] uniform in ±sqrt(6 / (input + output)) (Glorot), without a bias.
+/// W `[input, output]` uniform in ±sqrt(6 / (input + output)) (Glorot), without a bias.
 pub fn glorot(seed: Seed, input: usize, output: usize) -> Vec<f32> {
     uniform(seed, input * output, (6.0 / (input + output) as f32).sqrt())
 }

@@ -30,12 +30,12 @@ impl Default for Settings {
 struct Affine {
     settings: Settings,
     cameras: usize,
-    /// D and b of all cameras [cameras, 12], flat: the rows of the matrix, then the offset.
+    /// D and b of all cameras `[cameras, 12]`, flat: the rows of the matrix, then the offset.
     parameters: Vec<Parameter>,
 }
 
 impl Affine {
-    /// Differences from the mean [cameras, 12].
+    /// Differences from the mean `[cameras, 12]`.
     fn differences(&self) -> Tensor<2> {
         let all = self.parameters[0].value.clone().reshape([self.cameras, NUMBERS]);
         all.clone() - all.mean_dim(0)

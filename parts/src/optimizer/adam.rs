@@ -24,7 +24,7 @@ impl Default for Settings {
     }
 }
 
-/// State of one array: first and second moment [N,W], and the number of steps.
+/// State of one array: first and second moment `[N,W]`, and the number of steps.
 struct Moments {
     first: Tensor<2>,
     second: Tensor<2>,

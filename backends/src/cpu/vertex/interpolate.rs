@@ -6,7 +6,7 @@ use rayon::prelude::*;
 /// Points or vertices per task.
 const ROWS: usize = 256;
 
-/// `out` [M, f]: each point's weighted sum over the features `[U, f]` of its eight corners.
+/// `out` `[M, f]`: each point's weighted sum over the features `[U, f]` of its eight corners.
 pub fn forward(features: &[f32], f: usize, corners: &[u32], weights: &[f32]) -> Vec<f32> {
     let mut out = vec![0.0f32; corners.len() / 8 * f];
     if out.is_empty() {
@@ -28,7 +28,7 @@ pub fn forward(features: &[f32], f: usize, corners: &[u32], weights: &[f32]) -> 
     out
 }
 
-/// The gradient `[U, f]` of the features, given that of the output [M, f]: every vertex gathers from its own slots.
+/// The gradient `[U, f]` of the features, given that of the output `[M, f]`: every vertex gathers from its own slots.
 pub fn backward(grad: &[f32], f: usize, weights: &[f32], slots: &[u32], starts: &[u32]) -> Vec<f32> {
     let mut out = vec![0.0f32; starts.len().saturating_sub(1) * f];
     if out.is_empty() {

@@ -90,7 +90,7 @@ fn list_vertices(sorted: &[u32], slots: &[u32], before: &[u32], vertices: &mut [
     }
 }
 
-/// out [M,F]: the features of the eight corners, weighted.
+/// out `[M,F]`: the features of the eight corners, weighted.
 #[cube(launch)]
 fn interpolate_corners(features: &[f32], corners: &[i32], weights: &[f32], out: &mut [f32], width: u32) {
     if ABSOLUTE_POS < out.len() {

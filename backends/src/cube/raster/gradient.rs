@@ -244,7 +244,7 @@ pub fn sum_rows(from: &[f32], to: &mut [f32], rows: u32, stride: u32, first: u32
     }
 }
 
-/// Gradient of the background [3]: transmittance left times upstream colour, summed over pixels.
+/// Gradient of the background `[3]`: transmittance left times upstream colour, summed over pixels.
 #[cube(launch)]
 pub fn background_backward(state: &[f32], upstream: &[f32], to: &mut [f32], pixels: u32) {
     if ABSOLUTE_POS < 3usize {

@@ -5,7 +5,7 @@ use crate::gaussians::to_vec;
 use crate::{Appearance, AppearanceContext, AppearancePlugin, Result, Seed};
 use burn::tensor::{Device, Tensor, TensorData};
 
-/// Planes of the suite [5,H,W].
+/// Planes of the suite `[5,H,W]`.
 const SHAPE: [usize; 3] = [5, 7, 9];
 /// Training cameras.
 const CAMERAS: usize = 4;

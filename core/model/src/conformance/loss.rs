@@ -45,9 +45,9 @@ struct Suite<'a> {
 /// Values of one input, row-major.
 #[derive(Clone)]
 struct Inputs {
-    /// [5,H,W].
+    /// `[5,H,W]`.
     planes: Vec<f32>,
-    /// [3,H,W].
+    /// `[3,H,W]`.
     target: Vec<f32>,
     gaussians: HostGaussians,
     size: [usize; 2],

@@ -52,7 +52,7 @@ fn schema_is_the_default(kind: &str, info: &Plugin, build: impl Fn(&toml::Table)
     Ok(build(&stated).err().map(|e| format!("it refuses the settings of its own schema: {e}")))
 }
 
-/// A tensor [rows, width] of uniform random numbers in -1..1.
+/// A tensor `[rows, width]` of uniform random numbers in -1..1.
 fn matrix(seed: Seed, rows: usize, width: usize, device: &Device) -> Tensor<2> {
     let values: Vec<f32> = (0..rows * width).map(|k| uniform(seed, k)).collect();
     Tensor::from_data(TensorData::new(values, [rows, width]), device)

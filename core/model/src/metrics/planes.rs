@@ -2,7 +2,7 @@
 
 use crate::{Error, Image8, Result};
 
-/// An image as planes [C,H,W] of finite float64 values; 0 is black, 1 is white.
+/// An image as planes `[C,H,W]` of finite float64 values; 0 is black, 1 is white.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Planes {
     width: usize,
@@ -12,7 +12,7 @@ pub struct Planes {
 }
 
 impl Planes {
-    /// Planes [channels, height, width]. Refuses empty images, a length that does not match, and values that are not finite.
+    /// Planes `[channels, height, width]`. Refuses empty images, a length that does not match, and values that are not finite.
     ///
     /// # Errors
     /// [`Error::Parameter`] for shapes, [`Error::Data`] for values.
@@ -27,7 +27,7 @@ impl Planes {
         }
         Ok(Self { width, height, channels, values })
     }
-    /// Float32 planes [channels, height, width], not rounded.
+    /// Float32 planes `[channels, height, width]`, not rounded.
     ///
     /// # Errors
     /// As [`Planes::new`].
@@ -77,7 +77,7 @@ impl Planes {
         let pixels = self.width * self.height;
         &self.values[channel * pixels..(channel + 1) * pixels]
     }
-    /// Refuses a pair of different shapes, and a mask that is not [H,W] or has no pixel set.
+    /// Refuses a pair of different shapes, and a mask that is not `[H,W]` or has no pixel set.
     pub(super) fn check_pair(&self, other: &Self, mask: Option<&[bool]>) -> Result<()> {
         let shape = |p: &Self| (p.channels, p.height, p.width);
         if shape(self) != shape(other) {

@@ -121,7 +121,7 @@ impl Metric {
     pub fn protocol(&self) -> &Protocol {
         &self.protocol
     }
-    /// The score of `render` against `reference`, both planes [channels, height, width] in 0..1. A masked metric needs a mask [H,W], others must not get one.
+    /// The score of `render` against `reference`, both planes `[channels, height, width]` in 0..1. A masked metric needs a mask `[H,W]`, others must not get one.
     ///
     /// # Errors
     /// [`Error::Parameter`] for shapes and masks that do not match, [`Error::Data`] for values that are not finite, [`Error::Unsupported`] for MS-SSIM with a mask.

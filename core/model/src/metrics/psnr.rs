@@ -30,12 +30,12 @@ fn mean(a: &Planes, b: &Planes, mask: Option<&[bool]>, term: fn(f64, f64) -> f64
     Ok(sum / count as f64)
 }
 
-/// Mean squared error over all channels and pixels (those set in `mask` [H,W], if given).
+/// Mean squared error over all channels and pixels (those set in `mask` `[H,W]`, if given).
 pub fn mean_squared_error(a: &Planes, b: &Planes, mask: Option<&[bool]>) -> Result<f64> {
     mean(a, b, mask, |x, y| (x - y) * (x - y))
 }
 
-/// Mean absolute error over all channels and pixels (those set in `mask` [H,W], if given).
+/// Mean absolute error over all channels and pixels (those set in `mask` `[H,W]`, if given).
 pub fn mean_absolute_error(a: &Planes, b: &Planes, mask: Option<&[bool]>) -> Result<f64> {
     mean(a, b, mask, |x, y| (x - y).abs())
 }

@@ -30,7 +30,7 @@ impl SsimConvention {
     }
 }
 
-/// SSIM of two images of data range 1, mean over windows and channels. With a mask [H,W], only windows centred on set pixels count.
+/// SSIM of two images of data range 1, mean over windows and channels. With a mask `[H,W]`, only windows centred on set pixels count.
 ///
 /// # Errors
 /// [`Error::Parameter`] for different shapes, an image smaller than the window, or a mask without pixels.

@@ -35,7 +35,7 @@ impl LossTerms {
         }
         Ok(Self(terms))
     }
-    /// The weighted sum [1] for one view.
+    /// The weighted sum `[1]` for one view.
     pub fn value(&self, input: &LossInput) -> Result<Tensor<1>> {
         let mut total: Option<Tensor<1>> = None;
         for (weight, term) in &self.0 {

@@ -5,11 +5,11 @@ use cc4dgs_core::{Error, Result, ViewStatistics};
 
 /// Sums over the views since the last round.
 pub(super) struct Statistics {
-    /// Sum of the norms of screen gradients, in normalised device coordinates [N].
+    /// Sum of the norms of screen gradients, in normalised device coordinates `[N]`.
     pub gradient_sum: Tensor<1>,
-    /// Views that saw the Gaussian [N].
+    /// Views that saw the Gaussian `[N]`.
     pub seen: Tensor<1>,
-    /// Largest blending weight since the last weight pruning [N].
+    /// Largest blending weight since the last weight pruning `[N]`.
     pub max_weight: Tensor<1>,
 }
 
