@@ -56,7 +56,7 @@ where
         self.attributes = attributes;
         self
     }
-    /// Adds a loss term [1]: `term(module, input, time_norm, progress)`.
+    /// Adds a loss term `[1]`: `term(module, input, time_norm, progress)`.
     pub fn with_regularizer(mut self, term: impl Fn(&M, &SpatialInput, f32, f32) -> Result<Option<Tensor<1>>> + Send + 'static) -> Self {
         self.regularizer = Some(Box::new(term));
         self
