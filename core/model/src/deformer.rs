@@ -86,11 +86,11 @@ pub struct SpatialInput {
 }
 
 impl SpatialInput {
-    /// Input for a deformer without attributes: centres [M,3] in world units.
+    /// Input for a deformer without attributes: centres `[M,3]` in world units.
     pub fn new(means_world: Tensor<2>) -> Self {
         Self { means_world, attributes: Vec::new() }
     }
-    /// Centres [M,3] in world units, with the start value of each attribute of `deformer`.
+    /// Centres `[M,3]` in world units, with the start value of each attribute of `deformer`.
     pub fn at_start(means_world: Tensor<2>, deformer: &dyn Deformer) -> Self {
         let (m, device) = (means_world.dims()[0], means_world.device());
         let attributes = deformer.attributes().iter().map(|a| Tensor::full([m, a.width], a.start, &device)).collect();

@@ -94,7 +94,7 @@ impl DensityPlan {
         self.fresh.push(fresh);
         self.parents.len() - 1
     }
-    /// Sets `attribute` of the new row `row` to `values` [width].
+    /// Sets `attribute` of the new row `row` to `values` `[width]`.
     pub fn set(&mut self, row: usize, attribute: &str, values: &[f32]) {
         match self.values.iter_mut().find(|v| v.attribute == attribute) {
             Some(found) => {

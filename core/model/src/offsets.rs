@@ -164,7 +164,7 @@ impl Offsets {
         }
         moved
     }
-    /// Applies the offsets to `moving` `[M]` and writes the results to the first M Gaussians of `frame` [N >= M]. The update is in place if `frame` holds the only
+    /// Applies the offsets to `moving` `[M]` and writes the results to the first M Gaussians of `frame` `[N >= M]`. The update is in place if `frame` holds the only
     /// reference. Attributes that no head changes and all other Gaussians stay unchanged.
     ///
     /// # Errors

@@ -192,7 +192,7 @@ impl Suite<'_> {
     }
 }
 
-/// `gaussians` with `values` [N,width] of the attribute `name`.
+/// `gaussians` with `values` `[N,width]` of the attribute `name`.
 fn replaced(gaussians: &Gaussians, name: &str, values: Tensor<2>) -> Result<Gaussians> {
     let Some(old) = gaussians.attribute(name).filter(|old| old.dims() == values.dims()) else {
         let problem = format!("after_step returns '{name}' {:?}, but there is no attribute of this name and shape", values.dims());
