@@ -3,7 +3,7 @@
 //! `cargo run --release --example density -- [ITERATIONS]`.
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
-use cc4dgs::core::burn::tensor::{Device, Tensor};
+use cc4dgs::core::burn::tensor::Device;
 use cc4dgs::core::gaussians::to_vec;
 use cc4dgs::core::{DensityControl, DensityPlan, DensityPlugin, Gaussians, Plugin, Schedule, Seed, Statistic, ViewStatistics, config, inventory, serde};
 use cc4dgs::{Result, Session, Split};
@@ -49,12 +49,6 @@ impl DensityControl for Budget {
         }
         plan.report.moved = dead.len();
         Ok(Some(plan))
-    }
-    fn state(&self) -> Vec<(String, Tensor<1>)> {
-        Vec::new()
-    }
-    fn restore(&mut self, _: Vec<(String, Tensor<1>)>, _: usize) -> Result<()> {
-        Ok(())
     }
 }
 

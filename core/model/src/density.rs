@@ -213,10 +213,18 @@ pub trait DensityControl: Send {
     fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         Ok(Vec::new())
     }
-    /// State for checkpoints, by name.
-    fn state(&self) -> Vec<(String, Tensor<1>)>;
-    /// Restores what [`DensityControl::state`] returned, for `count` Gaussians. Arrays are untrusted: an error, never a panic.
-    fn restore(&mut self, state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()>;
+    /// State for checkpoints, by name. Default: none.
+    fn state(&self) -> Vec<(String, Tensor<1>)> {
+        Vec::new()
+    }
+    /// Restores what [`DensityControl::state`] returned, for `count` Gaussians. Arrays are untrusted: an error, never a panic. Default:
+    /// every array is refused.
+    fn restore(&mut self, state: Vec<(String, Tensor<1>)>, _count: usize) -> Result<()> {
+        match state.first() {
+            None => Ok(()),
+            Some((name, _)) => Err(Error::data(format!("density state '{name}'"), "this control has no state", "Resume with the run's own config.toml")),
+        }
+    }
 }
 
 /// A density control in the registry.

@@ -1,7 +1,7 @@
 //! No density control: the Gaussians of the initialisation stay.
 
-use burn::tensor::{Device, Tensor};
-use cc4dgs_core::{DensityControl, DensityPlan, DensityPlugin, Error, Gaussians, Plugin, Result, Schedule, Seed, Statistic, ViewStatistics, config, inventory};
+use burn::tensor::Device;
+use cc4dgs_core::{DensityControl, DensityPlan, DensityPlugin, Gaussians, Plugin, Result, Schedule, Seed, Statistic, ViewStatistics, config, inventory};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -20,15 +20,6 @@ impl DensityControl for Fixed {
     }
     fn plan(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Option<DensityPlan>> {
         Ok(None)
-    }
-    fn state(&self) -> Vec<(String, Tensor<1>)> {
-        Vec::new()
-    }
-    fn restore(&mut self, state: Vec<(String, Tensor<1>)>, _count: usize) -> Result<()> {
-        match state.first() {
-            Some((name, _)) => Err(Error::data(format!("density state '{name}'"), "the control 'none' has no state", "Resume with the run's own config.toml")),
-            None => Ok(()),
-        }
     }
 }
 

@@ -78,12 +78,6 @@ impl DensityControl for Mcmc {
         let step = normal * faint * size * (self.noise * (1.0 - schedule.progress() as f32));
         Ok(vec![("means".into(), gaussians.means.clone() + step)])
     }
-    fn state(&self) -> Vec<(String, Tensor<1>)> {
-        Vec::new()
-    }
-    fn restore(&mut self, _: Vec<(String, Tensor<1>)>, _: usize) -> Result<()> {
-        Ok(())
-    }
 }
 
 /// The logit of each of `copies` Gaussians that together are as opaque as one of `opacity`, and what is added to their log-scales (equation 9).
