@@ -43,7 +43,7 @@ impl Model {
         let object = path.display().to_string();
         let manifest = archive.manifest().clone();
         let spec = format!("{}:{}", manifest.codec.name, manifest.codec.profile);
-        let codec = linked(&object, "codec", &manifest.codec.name, &manifest.codec.version, registry)?;
+        let codec = linked(&object, "codec", &manifest.codec.name, Some(&manifest.codec.version), registry)?;
         check_version(&object, "codec", &manifest.codec.name, &manifest.codec.version, codec)?;
         let codec = registry.build_codec(&spec, &manifest.codec.settings)?;
         let context = CodecContext::new(codec_seed(manifest.provenance.seed), *limits, events);
@@ -62,7 +62,7 @@ impl Model {
         let field = match &manifest.deformer {
             None => None,
             Some(entry) => {
-                let known = linked(&object, "deformer", &entry.name, &entry.version, registry)?;
+                let known = linked(&object, "deformer", &entry.name, Some(&entry.version), registry)?;
                 check_version(&object, "deformer", &entry.name, &entry.version, known)?;
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
@@ -230,14 +230,15 @@ fn json(value: &impl Serialize) -> Result<Value> {
     serde_json::to_value(value).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))
 }
 
-/// The version of the linked plug-in that `object` names, or an error that says what to link.
-fn linked(object: &str, kind: &str, name: &str, version: &str, registry: &Registry) -> Result<&'static str> {
+/// The version of the linked plug-in that the file `object` names, or an error that says what to link. `version` is the stored one, where the file has it.
+pub(crate) fn linked(object: &str, kind: &str, name: &str, version: Option<&str>, registry: &Registry) -> Result<&'static str> {
     let plugins = registry.plugins();
     let known: Vec<_> = plugins.into_iter().filter(|(k, _)| *k == kind).map(|(_, p)| p).collect();
     known.iter().find(|p| p.name == name).map(|p| p.version).ok_or_else(|| {
         let names: Vec<&str> = known.iter().map(|p| p.name).collect();
         let remedy = format!("Use a program that links the crate of this {kind}; this one links {}", names.join(", "));
-        Error::unsupported(object, format!("it needs the {kind} '{name}' (version {version}), which is not linked into this program"), remedy)
+        let version = version.map_or_else(String::new, |version| format!(" (version {version})"));
+        Error::unsupported(object, format!("it needs the {kind} '{name}'{version}, which is not linked into this program"), remedy)
     })
 }
 

@@ -4,12 +4,13 @@
 //! The metadata of the file has one entry, `cc4dgs`: sixteen hexadecimal digits, a space, and the header as JSON. The digits are the XXH3-64 of the header and,
 //! in the order of their names, of every array's name, type, shape and bytes.
 
+use crate::archive::linked;
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Provenance, write_atomically};
 use cc4dgs_core::gaussians::{CORE_ATTRIBUTES, to_vec};
-use cc4dgs_core::{DeformerContext, Error, ExtraAttribute, HostGaussians, Limits, Registry, Result, Similarity};
+use cc4dgs_core::{DeformerContext, Error, ExtraAttribute, HostGaussians, Limits, Registry, Result, Similarity, split_kind};
 use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo, TensorView};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -216,6 +217,8 @@ impl ModelHeader {
         let field = match self.deformer {
             None => None,
             Some(DeformerHeader { section, context }) => {
+                let (kind, _) = split_kind("deformer", &section)?;
+                linked(&file.object, "deformer", &kind, None, registry)?;
                 let mut field = registry.build_deformer(&section, &context, device)?;
                 for parameter in field.parameters_mut() {
                     let len: usize = parameter.shape.iter().product();

@@ -17,7 +17,7 @@ inventory::submit! {
 }
 
 /// A family brings a whole configuration; methods (`tiny+swaying`) are laid over it.
-const TINY: &str = "[deformer]\nkind = \"none\"\n[init]\ncount = 200\n[train]\niterations = 40\nbatch = 1\nsh_degree = 0\n";
+const TINY: &str = "[deformer]\nkind = \"sway\"\n[init]\ncount = 200\n[train]\niterations = 40\nbatch = 1\nsh_degree = 0\n";
 
 inventory::submit! {
     PresetPlugin {
