@@ -212,7 +212,7 @@ fn weight_seed(root: u64) -> Seed {
 
 /// The field's weights, decoded by the codec that the manifest names.
 fn read_weights(archive: &Archive, object: &str, entry: &CodecEntry, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
-    check_version(object, "weight codec", &entry.name, &entry.version, linked(object, "weight-codec", &entry.name, &entry.version, registry)?)?;
+    check_version(object, "weight codec", &entry.name, &entry.version, linked(object, "weight-codec", &entry.name, Some(&entry.version), registry)?)?;
     let codec = registry.build_weight_codec(&entry.name, &entry.settings)?;
     let streams = archive.read_kind(StreamKind::Field)?;
     let streams: Vec<Stream> =
