@@ -45,11 +45,18 @@ fn guarded(subject: &str, checks: Vec<Check>) -> Vec<String> {
     findings
 }
 
-/// `config.toml` is written in full from a plug-in's schema: it must be TOML that the plug-in accepts.
-fn schema_is_the_default(kind: &str, info: &Plugin, build: impl Fn(&toml::Table) -> Result<()>) -> Result<Option<String>> {
+/// Settings are read strictly: an unknown key is refused by name, and the schema, from which `config.toml` is written in full, is TOML that the plug-in accepts.
+fn settings_are_read(kind: &str, info: &Plugin, settings: &toml::Table, build: impl Fn(&toml::Table) -> Result<()>) -> Result<Option<String>> {
+    let mut odd = settings.clone();
+    odd.insert("no_such_setting".into(), 1.into());
+    match build(&odd) {
+        Ok(()) => return Ok(Some("an unknown setting was accepted".into())),
+        Err(e) if !e.to_string().contains("no_such_setting") => return Ok(Some(format!("the error does not name the unknown setting: {e}"))),
+        Err(_) => {}
+    }
     let stated = config::parse_table(&format!("schema of {kind} {}", info.name), info.schema)?;
     build(&toml::Table::new())?;
-    Ok(build(&stated).err().map(|e| format!("it refuses the settings of its own schema: {e}")))
+    Ok(build(&stated).err().map(|e| format!("it refuses the settings that its schema states: {e}")))
 }
 
 /// A tensor `[rows, width]` of uniform random numbers in -1..1.
