@@ -1,6 +1,7 @@
 //! Training and evaluation: readers, initialisation, the three-stage trainer, its checkpoints, scores of whole scenes. Plug-ins are named only in defaults.
 
 pub mod agreement;
+pub mod auto;
 pub mod checkpoint;
 pub mod config;
 pub mod data;
@@ -9,6 +10,7 @@ pub mod gaussian_set;
 pub mod images;
 pub mod init;
 pub mod knn;
+pub mod layers;
 pub mod masks;
 pub mod presets;
 pub mod schedule;
