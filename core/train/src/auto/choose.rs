@@ -149,7 +149,7 @@ fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
     let most = wanted.min(affordable).max(LEAST_GAUSSIANS);
     let most = (most / 500.0).ceil() * 500.0;
     let reason = format!("{:.0} % of the pixels show detail", 100.0 * facts.detail);
-    choice([("density.max_gaussians", integer(most)), ("init.count", integer(0.6 * most))], reason)
+    choice([("density.kind", "clone-split".into()), ("density.max_gaussians", integer(most)), ("init.count", integer(0.6 * most))], reason)
 }
 
 fn background(facts: &Facts) -> Option<Choice> {
