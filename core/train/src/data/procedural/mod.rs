@@ -171,7 +171,7 @@ impl ProceduralScene {
             }
             let camera = &cameras[rng.random_range(0..cameras.len())];
             let (u, v) = (rng.random::<f64>() * f64::from(camera.width), rng.random::<f64>() * f64::from(camera.height));
-            let (origin, direction) = trace::pixel_ray(camera, u, v);
+            let (origin, direction) = trace::PixelRays::new(camera).through(u, v);
             if let Some(hit) = tracer.hit(origin, direction) {
                 // A sum of uniforms is close enough to a normal distribution for noise.
                 let mut normal = || (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0;
@@ -186,7 +186,10 @@ impl ProceduralScene {
     /// All positions of cameras, and what is taken there. World axes: z up, the floor at 0.
     pub fn viewpoints(&self) -> Vec<Viewpoint> {
         let mut viewpoints = self.rig.viewpoints((self.width, self.height), self.frames, self.seed.child("rig"));
-        viewpoints.iter_mut().for_each(|v| v.camera = self.unit.apply_camera(&v.camera));
+        // The identity would still round.
+        if self.unit != Similarity::IDENTITY {
+            viewpoints.iter_mut().for_each(|v| v.camera = self.unit.apply_camera(&v.camera));
+        }
         viewpoints
     }
     /// The lens and sensor of each viewpoint.

@@ -133,7 +133,7 @@ fn dome(train: usize, test: usize, turns: f64, seed: Seed) -> Vec<Stand> {
 }
 
 fn grid(columns: usize, rows: usize, spacing: f64) -> Vec<Stand> {
-    let middle = DVec3::new(0.0, -1.9, 1.45);
+    let middle = DVec3::new(0.0, -1.6, 1.4);
     let stand = |name: String, column: f64, row: f64, split: Split| {
         let offset = spacing * DVec3::new(column - 0.5 * (columns.max(1) - 1) as f64, 0.0, 0.5 * (rows.max(1) - 1) as f64 - row);
         // The outer ones look a third of their offset inwards, and all a little down.
@@ -195,5 +195,5 @@ fn hemisphere(frame: usize, seed: Seed) -> Stand {
     let target = DVec3::Z * 0.85;
     let eye = target + 4.0 * polar(turns, (1.0 - up * up).sqrt(), up);
     let split = if is_held_out(frame) { Split::Test } else { Split::Train };
-    Stand { name: format!("r_{frame:03}"), eye, target, fov_x_rad: 0.62, split, frame: Some(frame) }
+    Stand { name: format!("r_{frame:03}"), eye, target, fov_x_rad: 0.58, split, frame: Some(frame) }
 }

@@ -1,6 +1,6 @@
 //! What a camera makes of the light: lens, exposure, white balance and noise.
 
-use super::trace::{Tracer, pixel_ray, quantised};
+use super::trace::{PixelRays, Tracer, quantised};
 use cc4dgs_core::{Camera, Distortion, Image8, Seed, Split};
 use glam::DVec3;
 use rand::Rng;
@@ -40,7 +40,8 @@ impl Sensor {
 
     /// The image of `camera` with this lens and sensor. `seed` is for the noise of this image.
     pub fn image(&self, tracer: &Tracer, camera: &Camera, supersampling: u32, seed: Seed) -> Image8 {
-        let ideal = |u: f64, v: f64| pixel_ray(camera, u, v);
+        let rays = PixelRays::new(camera);
+        let ideal = |u: f64, v: f64| rays.through(u, v);
         let bent = |u: f64, v: f64| {
             let (x, y) = ((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy);
             let (x, y) = self.distortion.undistort(x, y).unwrap_or((x, y));

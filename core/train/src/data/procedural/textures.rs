@@ -153,14 +153,13 @@ fn contrast(v: f64) -> f64 {
     ((v - 0.5) * 2.2 + 0.5).clamp(0.0, 1.0)
 }
 
-/// 0..1 for a lattice point, by the finaliser of SplitMix64.
+/// 0..1 for a lattice point: SplitMix64's finaliser of a sum that differs for all points nearby.
 fn random(x: f64, y: f64, z: f64, seed: u32) -> f64 {
-    let mut h = u64::from(seed).wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    for c in [x, y, z] {
-        h = (h ^ (c as i64 as u64)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        h ^= h >> 27;
-    }
-    h = h.wrapping_mul(0x94D0_49BB_1331_11EB);
+    let [x, y, z] = [x, y, z].map(|c| c as i64 as u64);
+    let sum = x.wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(y.wrapping_mul(0xC2B2_AE3D_27D4_EB4F)).wrapping_add(z.wrapping_mul(0x1656_67B1_9E37_79F9));
+    let mut h = sum.wrapping_add(u64::from(seed).wrapping_mul(0xD6E8_FEB8_6659_FD93));
+    h = (h ^ (h >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    h = (h ^ (h >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
     ((h ^ (h >> 31)) >> 11) as f64 / (1u64 << 53) as f64
 }
 

@@ -1,14 +1,19 @@
 //! Rays against the objects at one instant, and images made of them.
 
 use super::objects::{Object, Pose};
+use super::shapes::Shape;
 use cc4dgs_core::{Camera, Image8, Similarity};
-use glam::DVec3;
+use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
+use std::f64::consts::PI;
 
 /// Edge of the squares of pixels that share a list of the objects they can see.
-const TILE: u32 = 16;
+const TILE: u32 = 8;
 /// Slack of the cone around a tile's rays: lenses bend the lines between the rays that it is computed from.
 const CONE_SLACK: f64 = 1.1;
+
+/// Slack of bounding balls, for rounding.
+const BALL_SLACK: f64 = 1.0 + 1e-6;
 
 /// Where a ray meets the scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,6 +37,13 @@ struct Placed {
     outer_radius: f64,
 }
 
+impl Placed {
+    /// No point of it is nearer to `eye`, except for rounding.
+    fn least_distance(&self, eye: DVec3) -> f64 {
+        (self.pose.translation - eye).length() - self.outer_radius * BALL_SLACK
+    }
+}
+
 /// The objects frozen at one time.
 pub struct Tracer {
     /// Those that are there.
@@ -43,11 +55,22 @@ pub struct Tracer {
     unit: Similarity,
 }
 
-/// World origin and unit direction of the ray through pixel coordinates (u, v); pixel centres lie at +0.5.
-pub(super) fn pixel_ray(camera: &Camera, u: f64, v: f64) -> (DVec3, DVec3) {
-    let (r, _) = camera.rotation_translation();
-    let local = DVec3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
-    (DVec3::from(camera.center_world()), (r.transpose() * local).normalize())
+/// The rays of a pinhole camera.
+pub(super) struct PixelRays<'a> {
+    camera: &'a Camera,
+    origin: DVec3,
+    to_world: DMat3,
+}
+
+impl<'a> PixelRays<'a> {
+    pub fn new(camera: &'a Camera) -> Self {
+        Self { camera, origin: DVec3::from(camera.center_world()), to_world: camera.rotation_translation().0.transpose() }
+    }
+    /// World origin and unit direction of the ray through pixel coordinates (u, v); pixel centres lie at +0.5.
+    pub fn through(&self, u: f64, v: f64) -> (DVec3, DVec3) {
+        let local = DVec3::new((u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy, 1.0);
+        (self.origin, (self.to_world * local).normalize())
+    }
 }
 
 impl Tracer {
@@ -64,10 +87,11 @@ impl Tracer {
     }
     /// The object at the centre of every pixel, row by row.
     pub fn objects_seen(&self, camera: &Camera) -> Vec<Option<usize>> {
+        let rays = PixelRays::new(camera);
         (0..camera.height * camera.width)
             .into_par_iter()
             .map(|i| {
-                let (origin, direction) = pixel_ray(camera, f64::from(i % camera.width) + 0.5, f64::from(i / camera.width) + 0.5);
+                let (origin, direction) = rays.through(f64::from(i % camera.width) + 0.5, f64::from(i / camera.width) + 0.5);
                 self.hit(origin, direction).map(|hit| hit.object)
             })
             .collect()
@@ -111,11 +135,6 @@ impl Tracer {
         });
         colors
     }
-    /// An image with `supersampling` x `supersampling` rays per pixel on a regular grid.
-    pub fn render(&self, camera: &Camera, supersampling: u32) -> Image8 {
-        let colors = self.trace([camera.width, camera.height], supersampling, &|u, v| pixel_ray(camera, u, v));
-        quantised(camera.width, camera.height, &colors)
-    }
     fn metres(&self, p: DVec3) -> DVec3 {
         DVec3::from(self.to_metres.apply(p.to_array()))
     }
@@ -123,9 +142,19 @@ impl Tracer {
     fn nearest<'a>(&self, candidates: impl Iterator<Item = &'a Placed>, origin: DVec3, direction: DVec3) -> Option<(&'a Placed, Hit)> {
         let mut nearest: Option<(&Placed, f64, DVec3)> = None;
         for place in candidates {
-            let (o, d) = (place.pose.inverse_apply(origin), place.pose.rotation.conjugate() * direction);
+            // Most objects are missed, and their bounding balls too, which is cheaper to find out.
+            let to = place.pose.translation - origin;
+            let (along, reach) = (to.dot(direction), place.outer_radius * BALL_SLACK);
+            if to.length_squared() - along * along > reach * reach || nearest.is_some_and(|n| along - reach > n.1) {
+                continue;
+            }
+            let (o, d) = if place.pose.rotation == DQuat::IDENTITY {
+                (origin - place.pose.translation, direction)
+            } else {
+                (place.pose.inverse_apply(origin), place.pose.rotation.conjugate() * direction)
+            };
             if let Some((distance, normal)) = place.object.shape.intersect(o, d)
-                && nearest.is_none_or(|n| distance < n.1)
+                && nearest.is_none_or(|n| distance < n.1 || (distance == n.1 && place.index < n.0.index))
             {
                 nearest = Some((place, distance, normal));
             }
@@ -143,10 +172,23 @@ impl Tracer {
         let meets = |place: &&Placed| {
             let to = place.pose.translation - eye;
             let distance = to.length();
-            distance <= place.outer_radius || to.angle_between(axis) <= cone + (place.outer_radius / distance).asin()
+            let in_cone = distance <= place.outer_radius || to.angle_between(axis) <= cone + (place.outer_radius / distance).asin();
+            in_cone && !leads_away(place, eye, axis, cone)
         };
-        self.placed.iter().filter(meets).collect()
+        let mut seen: Vec<&Placed> = self.placed.iter().filter(meets).collect();
+        // The nearest first, so that few are asked once something is hit.
+        seen.sort_by(|a, b| a.least_distance(eye).total_cmp(&b.least_distance(eye)));
+        seen
     }
+}
+
+/// Whether all rays of a cone lead away from a box: from beyond one of its faces, further off.
+fn leads_away(place: &Placed, eye: DVec3, axis: DVec3, cone: f64) -> bool {
+    let Shape::Cuboid { half } = place.object.shape else { return false };
+    let (o, d) = (place.pose.inverse_apply(eye), place.pose.rotation.conjugate() * axis);
+    // The angle to the face's normal stays under a quarter turn.
+    let least = (0.5 * PI - cone).max(0.0).cos();
+    (0..3).any(|k| o[k].abs() > half[k] && d[k] * o[k].signum() > least && cone < 0.5 * PI)
 }
 
 fn shade(place: &Placed, hit: &Hit, direction: DVec3) -> [f64; 3] {

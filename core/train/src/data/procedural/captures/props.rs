@@ -75,11 +75,11 @@ impl Props {
     }
     /// The pattern of one wall: paper, bricks or plaster.
     pub fn wall(&mut self, kind: usize) -> Texture {
-        let color = self.color(&[[0.76, 0.70, 0.58], [0.58, 0.68, 0.70], [0.72, 0.60, 0.54], [0.62, 0.68, 0.54]]);
+        let color = self.color(&[[0.84, 0.78, 0.66], [0.68, 0.78, 0.80], [0.82, 0.70, 0.62], [0.74, 0.80, 0.64]]);
         let seed = self.texture_seed();
         match kind % 3 {
             0 => Texture::Stripes { colors: [shaded(color, 0.80), shaded(color, 1.12)], width: 0.28, seed },
-            1 => Texture::Bricks { colors: [[0.42, 0.22, 0.16], [0.68, 0.40, 0.29], [0.74, 0.70, 0.64]], brick: [0.46, 0.20], seed },
+            1 => Texture::Bricks { colors: [[0.48, 0.27, 0.20], [0.76, 0.48, 0.36], [0.80, 0.76, 0.70]], brick: [0.46, 0.20], seed },
             _ => self.rough(color, 0.5),
         }
     }
@@ -203,7 +203,9 @@ impl Props {
         }
     }
     pub fn rug(&mut self, base: &Pose, half: [f64; 2]) {
-        let weave = self.patches(DVec3::splat(0.24));
+        let warm = self.color(&[[0.58, 0.22, 0.18], [0.28, 0.36, 0.50], [0.36, 0.46, 0.34]]);
+        let colors = [warm, [0.80, 0.74, 0.62], shaded(warm, 0.6)];
+        let weave = Texture::Patches { colors, cell: DVec3::splat(0.19), seed: self.texture_seed() };
         let border = self.color(&[[0.46, 0.14, 0.14], [0.16, 0.22, 0.38]]);
         let border = self.rough(border, 0.2);
         self.cuboid(base, v(half[0], half[1], 0.008), v(0.0, 0.0, 0.008), weave);

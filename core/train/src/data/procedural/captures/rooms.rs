@@ -127,11 +127,11 @@ fn open(props: &mut Props) {
     props.rug(&place(0.0, 0.0, turn), [1.0, 0.8]);
     let (a, b) = (props.range(-0.2, 0.2), props.range(-0.3, 0.3));
     props.chair(&place(1.45, -1.25 + a, -2.2 + b));
-    let side = place(-1.35, 1.35 + a, 0.5 + b);
+    let side = place(-1.5, 1.05 + a, 0.5 + b);
     props.table(&side, [0.32, 0.28], 0.55);
     props.vase(&side.then(Pose::at(DVec3::new(0.08, 0.05, 0.55))));
-    props.lamp(&place(-1.75 + a, 0.85, 0.0));
-    props.rope(DVec3::new(-2.6, 1.8, HEIGHT), DVec3::new(1.9, 2.2, HEIGHT), 0.7);
+    props.lamp(&place(-1.0, 1.5 + a, 0.0));
+    props.rope(DVec3::new(-HALF, 1.6, 2.6), DVec3::new(1.6, HALF, 2.6), 0.5);
 }
 
 fn table(props: &mut Props) {
@@ -154,5 +154,5 @@ fn still_life(props: &mut Props) {
     props.chair(&base.then(place(0.1, 0.75, 0.2)));
     props.chair(&base.then(place(-1.1, -0.2, 1.8)));
     props.lamp(&base.then(place(1.15, 0.5, 0.0)));
-    props.crates(&base.then(place(0.95, -0.95, 0.7)));
+    props.plant(&base.then(place(1.0, -0.95, 0.7)));
 }
