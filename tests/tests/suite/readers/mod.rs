@@ -2,6 +2,7 @@
 
 mod common;
 mod conformance;
+mod first_points;
 mod formats;
 mod golden;
 mod hostile;
