@@ -3,17 +3,20 @@
 //! Masks of different times disagree where things move. The share of masks that may leave a point out grows until there is a hull.
 
 use super::Candidate;
-use super::choose::Arrangement;
+use super::choose::{Arrangement, spread};
 use super::views::{Foreground, WorkSet, WorkView};
 use cc4dgs_core::Seed;
-use glam::Vec3;
+use glam::{Mat3, Vec3};
 use rand::Rng;
 use rayon::prelude::*;
 
 /// Cells per axis of the first look.
 const GRID: usize = 64;
-/// Random points per cell that may hold surface.
+/// The most random points per cell that may hold surface, and in all such cells.
 const PER_CELL: usize = 48;
+const IN_ALL: usize = 400_000;
+/// The most masks that are asked.
+const MAX_MASKS: usize = 60;
 /// The fewest cameras that must see a point before their masks decide.
 const MIN_SEEING: usize = 3;
 /// Shares of the seeing cameras whose mask may leave a point out, at one time.
@@ -29,17 +32,43 @@ const INSIDE: usize = 24;
 
 /// Where the foreground can be: a box, in which the hull is sought.
 pub(super) struct Hull<'a> {
-    masked: Vec<&'a WorkView>,
+    masked: Vec<Masked<'a>>,
     low: Vec3,
     high: Vec3,
     misses: &'static [f32],
     whole: bool,
 }
 
+/// A view with a mask, and its projection in single precision.
+struct Masked<'a> {
+    view: &'a WorkView,
+    mask: &'a [bool],
+    projection: Mat3,
+    offset: Vec3,
+    size: [f32; 2],
+}
+
+impl<'a> Masked<'a> {
+    fn new(view: &'a WorkView) -> Option<Self> {
+        let level = view.fine();
+        let projection = (level.k * view.rotation).as_mat3();
+        let offset = (level.k * view.translation).as_vec3();
+        Some(Self { view, mask: view.mask.as_deref()?, projection, offset, size: [level.width as f32, level.height as f32] })
+    }
+    /// Index of the pixel that shows a world point.
+    fn pixel(&self, p: Vec3) -> Option<usize> {
+        let q = self.projection * p + self.offset;
+        let (u, v) = (q.x / q.z, q.y / q.z);
+        let inside = q.z > 1e-6 && u >= 0.0 && v >= 0.0 && u < self.size[0] && v < self.size[1];
+        inside.then(|| v as usize * self.size[0] as usize + u as usize)
+    }
+}
+
 impl<'a> Hull<'a> {
     /// `None` if fewer than three views have masks or the masks have nothing in common.
     pub fn find(set: &'a WorkSet) -> Option<Self> {
         let masked: Vec<&WorkView> = set.views.iter().filter(|v| v.mask.is_some()).collect();
+        let masked: Vec<Masked> = spread(&masked, MAX_MASKS).into_iter().filter_map(Masked::new).collect();
         if masked.len() < MIN_SEEING {
             return None;
         }
@@ -100,6 +129,7 @@ impl<'a> Hull<'a> {
             *near = around(k).any(|c| around(j).any(|b| around(i).any(|a| full[(c * GRID + b) * GRID + a])));
         }
         let cells: Vec<usize> = (0..near.len()).filter(|&c| near[c]).collect();
+        let per_cell = PER_CELL.min(IN_ALL / cells.len().max(1)).max(4);
         let shell = 0.5 * grid.size.max_element();
         let found: Vec<Vec<Candidate>> = cells
             .par_iter()
@@ -107,7 +137,7 @@ impl<'a> Hull<'a> {
                 // One generator per cell: the result does not depend on which thread takes it.
                 let mut rng = seed.index(cell as u64).rng();
                 let mut points = Vec::new();
-                for i in 0..PER_CELL {
+                for i in 0..per_cell {
                     let jitter = Vec3::new(rng.random::<f32>() - 0.5, rng.random::<f32>() - 0.5, rng.random::<f32>() - 0.5);
                     let position = grid.center(cell) + jitter * grid.size;
                     if !self.inside(position, misses) {
@@ -126,10 +156,14 @@ impl<'a> Hull<'a> {
 
     fn inside(&self, p: Vec3, misses: f32) -> bool {
         let (mut seeing, mut missing) = (0usize, 0usize);
+        let most = misses * self.masked.len() as f32;
         for view in &self.masked {
-            let Some(pixel) = view.pixel_of(p) else { continue };
+            let Some(pixel) = view.pixel(p) else { continue };
             seeing += 1;
-            missing += usize::from(!view.mask.as_ref().is_some_and(|m| m[pixel]));
+            missing += usize::from(!view.mask[pixel]);
+            if missing as f32 > most {
+                return false;
+            }
         }
         // What only a corner of the rig sees is not carved, and so not known to be full.
         seeing >= MIN_SEEING.max(self.masked.len() / 3) && missing as f32 <= misses * seeing as f32
@@ -142,10 +176,10 @@ impl<'a> Hull<'a> {
     }
     /// Mean colour of the three cameras that look at the surface most squarely; of all, inside. Only foreground counts.
     fn color(&self, p: Vec3, normal: Option<Vec3>) -> [f32; 3] {
-        let seen = self.masked.iter().filter_map(|view| {
-            let pixel = view.pixel_of(p)?;
-            let facing = normal.map_or(0.0, |n| (view.center.as_vec3() - p).normalize_or_zero().dot(n));
-            view.mask.as_ref().is_some_and(|m| m[pixel]).then(|| (facing, view.fine().rgb[pixel]))
+        let seen = self.masked.iter().filter_map(|m| {
+            let pixel = m.pixel(p).filter(|&pixel| m.mask[pixel])?;
+            let facing = normal.map_or(0.0, |n| (m.view.center.as_vec3() - p).normalize_or_zero().dot(n));
+            Some((facing, m.view.fine().rgb[pixel]))
         });
         let mut seen: Vec<(f32, [f32; 3])> = seen.collect();
         seen.sort_by(|a, b| b.0.total_cmp(&a.0));
