@@ -3,6 +3,7 @@
 mod captures;
 mod common;
 mod conformance;
+mod first_points;
 mod formats;
 mod golden;
 mod hostile;

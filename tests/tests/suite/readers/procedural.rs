@@ -142,11 +142,3 @@ fn points_from_images_do_not_depend_on_threads() {
     assert_eq!(a, b);
     assert!(a.positions.len() > 100);
 }
-
-#[test]
-fn one_moving_camera_is_refused() {
-    let dir = tempfile::tempdir().unwrap();
-    write_dnerf(dir.path(), 5, 1, 8);
-    let error = photo_points(&load(dir.path()).unwrap(), 100, Seed::root(0)).err().unwrap();
-    assert!(error.to_string().contains("4 training cameras"), "{error}");
-}
