@@ -2,6 +2,7 @@
 
 pub mod agreement;
 pub mod checkpoint;
+pub mod checks;
 pub mod config;
 pub mod data;
 pub mod eval;
