@@ -74,9 +74,12 @@ pub struct Train {
     /// A dataset, or `procedural` for the built-in scene. The format is recognised.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// Settings to start from; see `cc4dgs plugins`.
+    /// Settings to start from; see `cc4dgs plugins`. Without one and without --config, `auto` chooses them by looking at the scene.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
+    /// Wall time that the preset `auto` plans for; ten on processors, five on a graphics card by default.
+    #[arg(long, value_name = "M")]
+    pub minutes: Option<f64>,
     /// A TOML file laid over the preset.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,

@@ -1,5 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
+use crate::auto::AutoConfig;
+use crate::layers::Layers;
 use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
 use cc4dgs_play::{RenderConfig, default_rasterizer};
 use serde::{Deserialize, Serialize};
@@ -12,6 +14,9 @@ pub struct RunConfig {
     /// Name of the preset it started from, for the record.
     #[serde(default)]
     pub preset: String,
+    /// What the preset `auto` was asked for and what it chose.
+    #[serde(default)]
+    pub auto: AutoConfig,
     /// Root of the seed tree.
     #[serde(default)]
     pub seed: u64,
@@ -264,25 +269,11 @@ impl Default for GaussianRates {
 
 impl RunConfig {
     /// Layers a preset, a TOML file and `key=value` overrides, in that order, and reads the result strictly.
+    ///
+    /// # Errors
+    /// As [`Layers::collect`] and [`Layers::config`].
     pub fn resolve(preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
-        let mut table = toml::Table::new();
-        let from_file = match file {
-            Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
-                config::parse_table(&path.display().to_string(), &text)?
-            }
-            None => toml::Table::new(),
-        };
-        let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
-        if let Some(name) = preset.map(str::to_string).or(named) {
-            table = Registry::collect()?.preset(&name)?;
-        }
-        config::merge(&mut table, &from_file);
-        config::set_all(&mut table, sets)?;
-        refuse_renamed(&table)?;
-        let resolved: Self = config::parse_section("configuration", &table)?;
-        resolved.validate()?;
-        Ok(resolved)
+        Layers::collect(&Registry::collect()?, preset, file, sets)?.config()
     }
     /// This configuration with every setting of its plug-ins, defaults included.
     pub fn completed(&self, registry: &Registry) -> Result<Self> {
@@ -313,8 +304,9 @@ impl RunConfig {
         settled.render.background = Some(wanted.unwrap_or([1.0; 3]));
         Ok(settled)
     }
-    fn validate(&self) -> Result<()> {
+    pub(crate) fn validate(&self) -> Result<()> {
         self.scene.validate()?;
+        self.auto.validate()?;
         let t = &self.train;
         let bad = |key: &str, problem: String, remedy: &str| Err(Error::parameter(format!("train.{key}"), problem, remedy));
         if t.iterations == 0 || t.iterations > 10_000_000 {
@@ -354,21 +346,6 @@ impl RunConfig {
         }
         Ok(())
     }
-}
-
-/// Keys of earlier versions and what replaces them.
-const RENAMED: [(&str, &str); 2] =
-    [("train.densify", "[density], such as density.max_gaussians"), ("train.lambda_c", "the weights of [[loss]] kind = \"l1\" and kind = \"dssim\"")];
-
-/// Refuses keys of earlier versions; the error names the new ones.
-fn refuse_renamed(table: &toml::Table) -> Result<()> {
-    for (old, new) in RENAMED {
-        let (section, key) = old.split_once('.').unwrap_or((old, ""));
-        if table.get(section).and_then(|s| s.as_table()).is_some_and(|s| s.contains_key(key)) {
-            return Err(Error::parameter(old, "this key was replaced", format!("Use {new}")));
-        }
-    }
-    Ok(())
 }
 
 /// `section` with the settings that its plug-in's `schema` states where it has none of its own.

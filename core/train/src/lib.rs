@@ -1,6 +1,7 @@
 //! Training and evaluation: readers, initialisation, the three-stage trainer, its checkpoints, scores of whole scenes. Plug-ins are named only in defaults.
 
 pub mod agreement;
+pub mod auto;
 pub mod checkpoint;
 pub mod checks;
 pub mod config;
@@ -10,6 +11,7 @@ pub mod gaussian_set;
 pub mod images;
 pub mod init;
 pub mod knn;
+pub mod layers;
 pub mod masks;
 pub mod presets;
 pub mod schedule;

@@ -8,7 +8,6 @@ mod baselines;
 mod cameras;
 mod images;
 mod poses;
-mod probe;
 mod times;
 mod verdict;
 mod watch;

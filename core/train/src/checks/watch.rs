@@ -4,6 +4,7 @@ use super::baselines::{Yardstick, psnr_db};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::train::{Context, TrainState};
+use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, Schedule, Stage};
 use cc4dgs_play::Moving;
 
@@ -72,7 +73,7 @@ impl Watch {
         let (Some(yardstick), Some(end)) = (&self.yardstick, self.scores.last()) else { return Ok(None) };
         self.refuse_failure(context, state, yardstick)?;
         let cap = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).and_then(|cap| usize::try_from(cap).ok());
-        let validation = if self.validation.is_empty() { None } else { Some(mean_psnr(context, state, &self.validation, &mut 0.0)?) };
+        let validation = if self.validation.is_empty() { None } else { Some(scored(context, state, &self.validation, &mut 0.0)?) };
         let verdict = Evidence {
             train_psnr_db: end.psnr_db,
             late_psnr_db: self.scores.iter().find(|s| s.percent == LATE).map(|s| s.psnr_db),
@@ -96,13 +97,15 @@ impl Watch {
         }
         let Some(yardstick) = &self.yardstick else { return Ok(()) };
         let mut detail = 0.0;
-        let psnr = mean_psnr(context, state, &yardstick.views, &mut detail)?;
+        let psnr = scored(context, state, &yardstick.views, &mut detail)?;
         // Each moving view at its own time and, for comparison, a third and two thirds of the sequence later.
         let mut sums = [0.0; 3];
         for (shift, sum) in [0.0, 1.0 / 3.0, 2.0 / 3.0].into_iter().zip(&mut sums) {
             let time = |view: usize| if shift == 0.0 { scene.views[view].time_norm } else { (scene.views[view].time_norm + shift).fract() };
             let requests: Vec<(usize, f32)> = yardstick.moving.iter().map(|m| (m.view, time(m.view))).collect();
-            context.draw(state, &requests, |index, image| {
+            let gaussians = state.set.gaussians()?;
+            context.draw(state, &gaussians, &requests, gaussians.sh_degree, |index, image| {
+                let image = to_vec(image, "drawn view")?;
                 let moving = &yardstick.moving[index];
                 let camera = scene.camera(moving.view);
                 let truth = scene.frame(moving.view)?.to_planes(background);
@@ -168,13 +171,15 @@ impl Watch {
     }
 }
 
-/// Mean PSNR of the model on `views`; `detail` becomes the mean slope of its images over that of the true ones.
-fn mean_psnr(context: &Context, state: &mut TrainState, views: &[usize], detail: &mut f64) -> Result<f64> {
+/// Mean PSNR in dB of the model on `views`; `detail` becomes the mean slope of its images over that of the true ones.
+fn scored(context: &Context, state: &mut TrainState, views: &[usize], detail: &mut f64) -> Result<f64> {
     let scene = &context.job.scene;
     let background = context.job.config.background()?;
     let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
     let (mut sum, mut drawn_slope, mut true_slope) = (0.0, 0.0, 0.0);
-    context.draw(state, &requests, |index, image| {
+    let gaussians = state.set.gaussians()?;
+    context.draw(state, &gaussians, &requests, gaussians.sh_degree, |index, image| {
+        let image = to_vec(image, "drawn view")?;
         let camera = scene.camera(views[index]);
         let truth = scene.frame(views[index])?.to_planes(background);
         sum += psnr_db(&truth, &image, [camera.width, camera.height], None)?;

@@ -2,15 +2,18 @@
 //! appearance model and optimizer.
 
 mod density;
+mod guard;
 mod log;
 mod losses;
 mod parameters;
+mod probe;
 mod sampler;
 mod score;
 mod smoothness;
 mod state;
 mod step;
 
+pub use guard::Guard;
 pub use state::{Parts, TrainState};
 
 use crate::checkpoint;
@@ -106,6 +109,9 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let device = parse_device(&config.device)?;
     let seed = Seed::root(config.seed);
     job.events.emit(&Event::RunStarted { command: "train".into(), device: config.device.clone(), seed: config.seed });
+    for line in config.auto.plan.iter().filter(|_| !job.resume) {
+        job.events.emit(&Event::Note { object: "plan".into(), message: line.clone() });
+    }
     for message in &job.scene.warnings {
         job.events.emit(&Event::Warning { object: job.scene.name.clone(), message: message.clone() });
     }
@@ -144,7 +150,7 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
             TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, parts)
         }
     };
-    let context = Context {
+    let mut context = Context {
         job,
         lengths: StageLengths::new(&config.train, matches!(moving, Moving::Scored { .. }), job.scene.extent()),
         rasterizer: job.registry.build_rasterizer(&config.rasterizer)?,
@@ -157,6 +163,11 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
         checkpoint,
     };
 
+    for stage in Stage::ALL {
+        let views = context.stage_views(stage);
+        let cameras: std::collections::BTreeSet<usize> = views.iter().map(|&view| job.scene.views[view].camera).collect();
+        context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.batch));
+    }
     let mut watch = Watch::new(&context, doubts, validation);
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
