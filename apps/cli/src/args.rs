@@ -7,8 +7,7 @@ pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLos
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
-const EXIT_CODES: &str =
-    "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 back end, 130 interrupted. Sizes are in MB = 10^6 bytes.";
+const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 back end, 6 a training that failed, 130 interrupted. Sizes are in MB = 10^6 bytes.";
 
 /// Dynamic Gaussian splatting: train, compress, play back.
 #[derive(Debug, Parser)]

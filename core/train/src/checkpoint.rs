@@ -65,9 +65,10 @@ impl Checkpoint {
     pub fn into_state(self, run: &RunConfig, mut parts: Parts) -> Result<TrainState> {
         let stored: RunConfig = config::parse_section("configuration of the checkpoint", &self.model.provenance.config)?;
         let (mut now, mut then) = (run.clone(), stored);
-        // How often to say something does not change a result.
+        // What a run says about itself does not change its result.
         (now.train.log_every, now.train.checkpoint_every) = (0, 0);
         (then.train.log_every, then.train.checkpoint_every) = (0, 0);
+        (now.train.checks, then.train.checks) = (true, true);
         if now.to_toml()? != then.to_toml()? {
             return Err(Error::parameter(
                 "--resume",

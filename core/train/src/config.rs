@@ -190,6 +190,11 @@ pub struct TrainConfig {
     pub sparse_adam: bool,
     /// Learning rates of the Gaussians.
     pub lr: GaussianRates,
+    /// Check the scene before training and the result afterwards. A scene that cannot be reconstructed is refused, and a run that stays below simple baselines
+    /// fails; without checks both go on. Changes nothing else.
+    pub checks: bool,
+    /// Training views, evenly spread, that are kept out of training and scored at its end. Test views are never looked at.
+    pub validation: usize,
     /// Iterations between two log events.
     pub log_every: usize,
     /// Iterations between two checkpoints; 0 writes only the last one.
@@ -216,6 +221,8 @@ impl Default for TrainConfig {
             dynamic: Dynamic::Auto,
             sparse_adam: true,
             lr: GaussianRates::default(),
+            checks: true,
+            validation: 0,
             log_every: 10,
             checkpoint_every: 5000,
         }

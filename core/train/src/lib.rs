@@ -3,6 +3,7 @@
 pub mod agreement;
 pub mod auto;
 pub mod checkpoint;
+pub mod checks;
 pub mod config;
 pub mod data;
 pub mod eval;

@@ -34,6 +34,7 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     trial.train.lambda_r = 0.0;
     trial.train.log_every = PER_MEASUREMENT;
     trial.train.checkpoint_every = 0;
+    (trial.train.checks, trial.train.validation) = (false, 0);
     trial.auto = Default::default();
     let recorder = Recorder::default();
     let stop = AtomicBool::new(false);

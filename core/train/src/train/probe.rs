@@ -1,4 +1,4 @@
-//! Training views rendered without a gradient, to judge what was done to the Gaussians.
+//! Views rendered without a gradient, to judge a model that is still in training.
 
 use super::{Context, TrainState};
 use burn::tensor::{Tensor, TensorData};
@@ -11,8 +11,16 @@ impl Context<'_> {
         let count = count.min(views.len());
         (0..count).map(|i| views[(2 * i + 1) * views.len() / (2 * count)]).collect()
     }
-    /// PSNR in dB of each of `views`, images not rounded. `gaussians` have the rows of `state`.
-    pub(crate) fn psnr_of_views(&self, state: &mut TrainState, gaussians: &Gaussians, views: &[usize], sh_degree: usize) -> Result<Vec<f32>> {
+    /// Renders what the cameras of views record at given times (0..1). `gaussians` have the rows of `state`. Hands the index of each request and planes
+    /// `[3,H,W]` to `each`.
+    pub(crate) fn draw(
+        &self,
+        state: &mut TrainState,
+        gaussians: &Gaussians,
+        requests: &[(usize, f32)],
+        sh_degree: usize,
+        mut each: impl FnMut(usize, Tensor<3>) -> Result<()>,
+    ) -> Result<()> {
         let rows = state.moving_rows(&self.device)?;
         let deformer = state.deformer.as_ref().filter(|d| !d.field.is_static() && rows.count() > 0);
         let features = match deformer {
@@ -25,22 +33,29 @@ impl Context<'_> {
         };
         let rgb = self.job.config.background()?;
         let settings = self.job.config.render.settings(Some(Tensor::from_data(TensorData::new(rgb.to_vec(), [3]), &self.device)));
-        let mut scores = Vec::with_capacity(views.len());
-        for &view in views {
-            let own = &self.job.scene.views[view];
+        for (index, &(view, time_norm)) in requests.iter().enumerate() {
             let drawn = match (&features, deformer) {
-                (Some(features), Some(deformer)) => {
-                    deformer.field.deform(features.clone(), own.time_norm)?.apply(deformer.name(), gaussians, rows.indices())?
-                }
+                (Some(features), Some(deformer)) => deformer.field.deform(features.clone(), time_norm)?.apply(deformer.name(), gaussians, rows.indices())?,
                 _ => gaussians.clone(),
             };
             let output = self.rasterizer.render(&Splats::from_gaussians(&drawn, sh_degree), self.job.scene.camera(view), &settings)?;
-            let planes = state.appearance.apply(output.planes, self.training_camera.get(&own.camera).copied())?;
-            let target = self.rasterizer.upload(&self.job.scene.frame(view)?, rgb, &self.device);
-            let difference = planes.narrow(0, 0, 3) - target;
+            let camera = self.training_camera.get(&self.job.scene.views[view].camera).copied();
+            each(index, state.appearance.apply(output.planes, camera)?.narrow(0, 0, 3))?;
+        }
+        Ok(())
+    }
+    /// PSNR in dB of each of `views`, images not rounded. `gaussians` have the rows of `state`.
+    pub(crate) fn psnr_of_views(&self, state: &mut TrainState, gaussians: &Gaussians, views: &[usize], sh_degree: usize) -> Result<Vec<f32>> {
+        let rgb = self.job.config.background()?;
+        let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, self.job.scene.views[view].time_norm)).collect();
+        let mut scores = Vec::with_capacity(views.len());
+        self.draw(state, gaussians, &requests, sh_degree, |index, image| {
+            let target = self.rasterizer.upload(&self.job.scene.frame(views[index])?, rgb, &self.device);
+            let difference = image - target;
             let mse = to_vec((difference.clone() * difference).mean(), "mean squared error")?;
             scores.push(-10.0 * mse.first().copied().unwrap_or(f32::NAN).max(1e-10).log10());
-        }
+            Ok(())
+        })?;
         Ok(scores)
     }
     /// Mean PSNR in dB of `gaussians` on `views`.
