@@ -3,6 +3,9 @@
 use glam::DVec3;
 use std::f64::consts::TAU;
 
+/// Cells begin this share of a cell off the origin.
+const OFF_FACES: f64 = 0.0137;
+
 /// A colour, RGB in 0..1.
 pub type Rgb = [f64; 3];
 
@@ -107,10 +110,12 @@ impl Texture {
                 mottled(color, p, seed)
             }
             Self::Print { colors, line, seed } => {
-                let (row, up) = cell_of(p.z / line);
+                // Off the faces of boxes whose sizes are multiples of a line, where rounding would choose the cell.
+                let (x, z) = (p.x / (0.8 * line) + OFF_FACES, p.z / line + OFF_FACES);
+                let (row, up) = cell_of(z);
                 // A block of a few lines is a heading, a picture or text.
                 let kind = random((row / 3.0).floor(), 0.0, 3.0, seed);
-                let (column, _) = cell_of(p.x / (0.8 * line));
+                let (column, _) = cell_of(x);
                 let ink = (0.2..0.8).contains(&up) && random(column, row, 1.0, seed) > 0.35;
                 let color = match kind {
                     k if k < 0.3 => mix(colors[2], colors[0], contrast(fractal(DVec3::new(p.x / 0.2, 0.0, p.z / 0.2), seed))),
@@ -120,7 +125,7 @@ impl Texture {
                 mottled(color, p, seed)
             }
             Self::Patches { colors, cell, seed } => {
-                let q = (p / cell + DVec3::splat(0.01)).floor();
+                let q = (p / cell + DVec3::splat(OFF_FACES)).floor();
                 let pick = random(q.x, q.y, q.z, seed);
                 let shade = 0.55 + 0.6 * random(q.z, q.x, q.y, seed ^ 1);
                 mottled(scale(colors[((pick * 3.0) as usize).min(2)], shade), p, seed)

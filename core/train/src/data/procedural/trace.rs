@@ -205,3 +205,36 @@ pub(super) fn quantised(width: u32, height: u32, colors: &[[f64; 3]]) -> Image8 
     let data = colors.iter().flatten().map(|c| (c * 255.0 + 0.5).clamp(0.0, 255.0) as u8).collect();
     Image8 { width, height, channels: 3, data }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::procedural::ProceduralScene;
+    use cc4dgs_core::Distortion;
+
+    /// Rays that ask only the objects of their tile see what rays that ask all objects see, also through a lens.
+    #[test]
+    fn tiles_leave_out_nothing_that_is_seen() {
+        let lens = Distortion::Brown { radial: [-0.22, 0.05, 0.0, 0.0], tangential: [0.0; 2] };
+        for name in ["captures/dome", "captures/appear", "captures/units", "frequencies"] {
+            let scene = ProceduralScene { width: 72, height: 52, ..ProceduralScene::named(name).unwrap() };
+            let tracer = scene.tracer(0.4);
+            for (camera, _) in scene.cameras().iter().step_by(3) {
+                let rays = PixelRays::new(camera);
+                let bent = |u: f64, v: f64| {
+                    let (x, y) = lens.undistort((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy).unwrap();
+                    rays.through(x * camera.fx + camera.cx, y * camera.fy + camera.cy)
+                };
+                let straight = |u: f64, v: f64| rays.through(u, v);
+                let both: [&(dyn Fn(f64, f64) -> (DVec3, DVec3) + Sync); 2] = [&straight, &bent];
+                for ray in both {
+                    for (i, found) in tracer.trace([72, 52], 1, ray).iter().enumerate() {
+                        let (origin, direction) = ray((i % 72) as f64 + 0.5, (i / 72) as f64 + 0.5);
+                        let expected = tracer.hit(origin, direction).map_or(scene.background.map(f64::from), |hit| tracer.shade(&hit, direction));
+                        assert!((0..3).all(|k| (found[k] - expected[k]).abs() < 1e-6), "{name}, {}, pixel {i}: {found:?}, {expected:?}", camera.name);
+                    }
+                }
+            }
+        }
+    }
+}

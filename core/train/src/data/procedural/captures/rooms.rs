@@ -154,5 +154,5 @@ fn still_life(props: &mut Props) {
     props.chair(&base.then(place(0.1, 0.75, 0.2)));
     props.chair(&base.then(place(-1.1, -0.2, 1.8)));
     props.lamp(&base.then(place(1.15, 0.5, 0.0)));
-    props.plant(&base.then(place(1.0, -0.95, 0.7)));
+    props.plant(&base.then(place(0.85, -0.7, 0.7)));
 }
