@@ -125,7 +125,7 @@ pub enum CoarseFrames {
 pub enum Dynamic {
     /// By dynamic score where a camera has several frames, else all.
     Auto,
-    /// By dynamic score.
+    /// By dynamic score, fitted to what changes in the images of fixed cameras, or to what a static reconstruction does not explain where none is fixed.
     Score,
     /// All of them.
     All,
