@@ -30,7 +30,7 @@ use views::{Foreground, WorkSet};
 /// Shares of the wanted points for hull, points between matches, and guesses. What one kind lacks goes to the others.
 const SHARE_HULL: f64 = 0.25;
 const SHARE_BETWEEN: f64 = 0.25;
-const SHARE_GUESSED: f64 = 0.1;
+const SHARE_GUESSED: f64 = 0.05;
 /// Share of the wanted points that there are at least; random ones make up for the rest.
 const SHARE_AT_LEAST: f64 = 0.25;
 /// The fewest points that make a reconstruction.
