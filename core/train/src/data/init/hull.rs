@@ -80,7 +80,7 @@ impl<'a> Hull<'a> {
         let mut hull = Self { masked, low: set.box_low, high: set.box_high, misses, misses_of_box, whole: set.foreground == Foreground::Whole };
         // The box may be many times larger than what is in it.
         for _ in 0..3 {
-            let (low, high) = hull.extent()?;
+            let (low, high) = hull.extent(hull.misses_of_box)?;
             let shrunk = (high - low) / (hull.high - hull.low);
             (hull.low, hull.high) = (low, high);
             if shrunk.min_element() > 0.7 {
@@ -97,10 +97,10 @@ impl<'a> Hull<'a> {
     pub fn may_hold(&self, p: Vec3) -> bool {
         self.inside(p, self.misses_of_box)
     }
-    /// The box around the cells that may be full, with a cell to spare.
-    fn extent(&self) -> Option<(Vec3, Vec3)> {
+    /// The box around the cells that at most the share `misses` of the masks leave out, with a cell to spare.
+    fn extent(&self, misses: f32) -> Option<(Vec3, Vec3)> {
         let grid = Grid { low: self.low, size: (self.high - self.low) / GRID as f32 };
-        let full = self.full(&grid, self.misses_of_box);
+        let full = self.full(&grid, misses);
         let centers = || (0..full.len()).filter(|&c| full[c]).map(|c| grid.center(c));
         let low = centers().reduce(Vec3::min)? - 1.5 * grid.size;
         let high = centers().reduce(Vec3::max)? + 1.5 * grid.size;
@@ -123,9 +123,11 @@ impl<'a> Hull<'a> {
         found
     }
     fn points_of(&self, seed: Seed, misses: f32) -> Vec<Candidate> {
-        let grid = Grid { low: self.low, size: (self.high - self.low) / GRID as f32 };
         // A cell's centre may miss a limb that crosses the cell; being nearly inside is enough for the first look.
-        let full = self.full(&grid, (misses + 0.2).max(0.3));
+        let nearly = (misses + 0.2).max(0.3);
+        let Some((low, high)) = self.extent(nearly) else { return Vec::new() };
+        let grid = Grid { low, size: (high - low) / GRID as f32 };
+        let full = self.full(&grid, nearly);
         let mut near = vec![false; full.len()];
         for (c, near) in near.iter_mut().enumerate() {
             let around = |v: usize| v.saturating_sub(1)..(v + 2).min(GRID);
