@@ -12,9 +12,7 @@ const PARTNERS: usize = 4;
 /// Depth maps a depth is compared with, where those are not the partners'.
 const WITNESSES: usize = 6;
 /// The angle between viewing rays that matches best: wide enough for depth, narrow enough to look alike.
-const BEST_ANGLE_RAD: f64 = 0.2;
-/// The same where the scene may move between the images: they are compared with more of the background, and seen less squarely.
-const BEST_ANGLE_ACROSS_RAD: f64 = 0.15;
+const BEST_ANGLE_RAD: f64 = 0.25;
 /// Difference in time, as a share of the sequence, that weighs as much as no angle at all.
 const TIME_SHARE: f64 = 0.15;
 /// Training cameras at one time that need no other times.
@@ -76,14 +74,13 @@ impl Choice {
     fn matched(scene: &Scene, arrangement: Arrangement, pool: &[usize], rig: Focus) -> Self {
         let keys = spread(pool, MAX_KEYS);
         let across = arrangement == Arrangement::AcrossTimes;
-        let best = if across { BEST_ANGLE_ACROSS_RAD } else { BEST_ANGLE_RAD };
         let pose = |&v: &usize| Pose::new(scene.camera(v), f64::from(scene.views[v].time_norm), &rig);
         let own: Vec<Pose> = keys.iter().map(pose).collect();
         let poses: Vec<Pose> = pool.iter().map(pose).collect();
         let (mut views, count) = (keys.clone(), keys.len());
         let (mut partners, mut witnesses) = (Vec::with_capacity(count), Vec::with_capacity(count));
         for (&key, pose) in keys.iter().zip(&own) {
-            let near = nearest(pose, &poses, best, PARTNERS, |j| pool[j] == key);
+            let near = nearest(pose, &poses, PARTNERS, |j| pool[j] == key);
             let near = near.into_iter().map(|j| {
                 views.iter().position(|&v| v == pool[j]).unwrap_or_else(|| {
                     views.push(pool[j]);
@@ -92,7 +89,7 @@ impl Choice {
             });
             partners.push(near.collect::<Vec<_>>());
             let asked = if across { WITNESSES } else { PARTNERS };
-            witnesses.push(nearest(pose, &own, best, asked, |j| keys[j] == key));
+            witnesses.push(nearest(pose, &own, asked, |j| keys[j] == key));
         }
         Self { arrangement, views, keys: count, partners, witnesses, rig }
     }
@@ -155,14 +152,14 @@ impl<'a> Pose<'a> {
         c.z > 0.0 && u >= 0.0 && v >= 0.0 && u <= f64::from(self.camera.width) && v <= f64::from(self.camera.height)
     }
     /// How unsuitable `other` is for matching: by the angle between the rays to the samples, by what it misses of them, and by the time between.
-    fn cost(&self, other: &Self, best: f64) -> f64 {
+    fn cost(&self, other: &Self) -> f64 {
         let (mut angle, mut missed) = (0.0, 0.0);
         for p in &self.samples {
             let (a, b) = ((self.center - *p).normalize_or_zero(), (other.center - *p).normalize_or_zero());
             angle += a.dot(b).clamp(-1.0, 1.0).acos() / 9.0;
             missed += if other.sees(*p) { 0.0 } else { 1.0 / 9.0 };
         }
-        (angle - best).abs() / best + 2.0 * missed + (self.time - other.time).abs() / TIME_SHARE
+        (angle - BEST_ANGLE_RAD).abs() / BEST_ANGLE_RAD + 2.0 * missed + (self.time - other.time).abs() / TIME_SHARE
     }
 }
 
@@ -174,10 +171,10 @@ pub(super) fn focus_depth(center: DVec3, forward: DVec3, rig: &Focus) -> f64 {
 }
 
 /// The `most` poses of the least cost, the best first. A pose at the same position says nothing of depth.
-fn nearest(own: &Pose, poses: &[Pose], best: f64, most: usize, skip: impl Fn(usize) -> bool) -> Vec<usize> {
+fn nearest(own: &Pose, poses: &[Pose], most: usize, skip: impl Fn(usize) -> bool) -> Vec<usize> {
     let mut found: Vec<(f64, usize)> = (0..poses.len())
         .filter(|&j| !skip(j) && poses[j].center.distance(own.center) > 1e-9)
-        .map(|j| (own.cost(&poses[j], best), j))
+        .map(|j| (own.cost(&poses[j]), j))
         .filter(|(cost, _)| cost.is_finite())
         .collect();
     found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));

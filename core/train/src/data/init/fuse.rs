@@ -39,6 +39,15 @@ pub(super) struct Fused {
 struct Verdict {
     agree: u32,
     through: u32,
+    /// Sum over those that agree of the inverse depth they see, over that of the point.
+    ratios: f32,
+}
+
+impl Verdict {
+    /// The inverse depth that the view and those that agree with it mean together.
+    fn mean(&self, own: f32) -> f32 {
+        own * (1.0 + self.ratios) / (1.0 + self.agree as f32)
+    }
 }
 
 /// Asks all depth maps.
@@ -74,10 +83,10 @@ fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fus
         if map.score[p] < MIN_SCORE || inverse >= nearest || !solid(p) {
             continue;
         }
-        let (position, depth) = place(p, inverse);
-        let verdict = ask(set, maps, view, position);
+        let verdict = ask(set, maps, view, place(p, inverse).0);
         if verdict.agree >= needed && verdict.agree > verdict.through {
-            known[p] = inverse;
+            known[p] = verdict.mean(inverse);
+            let (position, depth) = place(p, known[p]);
             found.matched.push(Candidate { position, color: level.rgb[p], confidence: map.score[p] + 0.1 * verdict.agree as f32, depth });
         }
     }
@@ -124,9 +133,12 @@ fn ask(set: &WorkSet, maps: &[DepthMap], view: &WorkView, position: Vec3) -> Ver
         let Some((u, v, z)) = theirs.project(theirs.fine(), position) else { continue };
         let Some(p) = theirs.fine().pixel(u, v) else { continue };
         let (own, seen) = (1.0 / z, map.inverse[p]);
-        let tolerance = 2.0 * map.step + 0.01 * own;
+        let tolerance = map.step + 0.01 * own;
         if (own - seen).abs() < tolerance {
-            verdict.agree += u32::from(map.score[p] > 0.5 * MIN_SCORE);
+            if map.score[p] > 0.5 * MIN_SCORE {
+                verdict.agree += 1;
+                verdict.ratios += seen / own;
+            }
         } else if seen < own - 2.0 * tolerance && map.score[p] > PROOF_SCORE {
             verdict.through += 1;
         }

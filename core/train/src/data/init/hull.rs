@@ -23,8 +23,8 @@ const MIN_SEEING: usize = 3;
 const MISSES_AT_ONE_TIME: [f32; 2] = [0.08, 0.2];
 /// The same across times.
 const MISSES_ACROSS_TIMES: [f32; 3] = [0.1, 0.25, 0.4];
-/// The share for the box around everything that is foreground at some time.
-const MISSES_OF_BOX: f32 = 0.5;
+/// The shares for the box around everything that is foreground at some time, at one time and across times: what moves is often somewhere else.
+const MISSES_OF_BOX: [f32; 2] = [0.5, 0.8];
 /// Points that make a hull.
 const ENOUGH: usize = 500;
 /// One in so many points inside the surface is kept.
@@ -36,6 +36,7 @@ pub(super) struct Hull<'a> {
     low: Vec3,
     high: Vec3,
     misses: &'static [f32],
+    misses_of_box: f32,
     whole: bool,
 }
 
@@ -72,11 +73,14 @@ impl<'a> Hull<'a> {
         if masked.len() < MIN_SEEING {
             return None;
         }
-        let misses: &[f32] = if set.arrangement == Arrangement::OneTime { &MISSES_AT_ONE_TIME } else { &MISSES_ACROSS_TIMES };
-        let mut hull = Self { masked, low: set.box_low, high: set.box_high, misses, whole: set.foreground == Foreground::Whole };
+        let (misses, misses_of_box): (&[f32], f32) = match set.arrangement {
+            Arrangement::OneTime => (&MISSES_AT_ONE_TIME, MISSES_OF_BOX[0]),
+            _ => (&MISSES_ACROSS_TIMES, MISSES_OF_BOX[1]),
+        };
+        let mut hull = Self { masked, low: set.box_low, high: set.box_high, misses, misses_of_box, whole: set.foreground == Foreground::Whole };
         // The box may be many times larger than what is in it.
         for _ in 0..3 {
-            let (low, high) = hull.extent()?;
+            let (low, high) = hull.extent(hull.misses_of_box)?;
             let shrunk = (high - low) / (hull.high - hull.low);
             (hull.low, hull.high) = (low, high);
             if shrunk.min_element() > 0.7 {
@@ -89,14 +93,14 @@ impl<'a> Hull<'a> {
     pub fn bounds(&self) -> (Vec3, Vec3) {
         (self.low, self.high)
     }
-    /// Whether at least half of the masks contain `p`.
+    /// Whether `p` can be foreground at some time.
     pub fn may_hold(&self, p: Vec3) -> bool {
-        self.inside(p, MISSES_OF_BOX)
+        self.inside(p, self.misses_of_box)
     }
-    /// The box around the cells that may be full, with a cell to spare.
-    fn extent(&self) -> Option<(Vec3, Vec3)> {
+    /// The box around the cells that at most the share `misses` of the masks leave out, with a cell to spare.
+    fn extent(&self, misses: f32) -> Option<(Vec3, Vec3)> {
         let grid = Grid { low: self.low, size: (self.high - self.low) / GRID as f32 };
-        let full = self.full(&grid, MISSES_OF_BOX);
+        let full = self.full(&grid, misses);
         let centers = || (0..full.len()).filter(|&c| full[c]).map(|c| grid.center(c));
         let low = centers().reduce(Vec3::min)? - 1.5 * grid.size;
         let high = centers().reduce(Vec3::max)? + 1.5 * grid.size;
@@ -119,9 +123,11 @@ impl<'a> Hull<'a> {
         found
     }
     fn points_of(&self, seed: Seed, misses: f32) -> Vec<Candidate> {
-        let grid = Grid { low: self.low, size: (self.high - self.low) / GRID as f32 };
         // A cell's centre may miss a limb that crosses the cell; being nearly inside is enough for the first look.
-        let full = self.full(&grid, (misses + 0.2).max(0.3));
+        let nearly = (misses + 0.2).max(0.3);
+        let Some((low, high)) = self.extent(nearly) else { return Vec::new() };
+        let grid = Grid { low, size: (high - low) / GRID as f32 };
+        let full = self.full(&grid, nearly);
         let mut near = vec![false; full.len()];
         for (c, near) in near.iter_mut().enumerate() {
             let around = |v: usize| v.saturating_sub(1)..(v + 2).min(GRID);

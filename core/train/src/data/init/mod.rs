@@ -30,7 +30,7 @@ use views::{Foreground, WorkSet};
 /// Shares of the wanted points for hull, points between matches, and guesses. What one kind lacks goes to the others.
 const SHARE_HULL: f64 = 0.25;
 const SHARE_BETWEEN: f64 = 0.25;
-const SHARE_GUESSED: f64 = 0.2;
+const SHARE_GUESSED: f64 = 0.05;
 /// Share of the wanted points that there are at least; random ones make up for the rest.
 const SHARE_AT_LEAST: f64 = 0.25;
 /// The fewest points that make a reconstruction.
@@ -110,7 +110,8 @@ pub fn find_points(scene: &Scene, source: InitSource, count: usize, seed: Seed) 
     let mut set = WorkSet::load(scene, choice)?;
     let mut hull_points = Vec::new();
     if source != InitSource::Random || set.foreground == Foreground::Whole {
-        let found = Hull::find(&set).map(|hull| (hull.points(seed.child("hull")), hull.bounds()));
+        let points = |hull: &Hull| if source == InitSource::Random { Vec::new() } else { hull.points(seed.child("hull")) };
+        let found = Hull::find(&set).map(|hull| (points(&hull), hull.bounds()));
         if let Some((points, (low, high))) = found {
             hull_points = points;
             if set.foreground == Foreground::Whole {
@@ -134,7 +135,7 @@ pub fn find_points(scene: &Scene, source: InitSource, count: usize, seed: Seed) 
     let groups = [
         thin(fused.matched, cell, far, seed.child("matched")),
         thin(fused.between, 2.0 * cell, far, seed.child("fill")),
-        if source == InitSource::Random { Vec::new() } else { thin(hull_points, cell, far, seed.child("thin-hull")) },
+        thin(hull_points, cell, far, seed.child("thin-hull")),
         thin(fused.guessed, 2.0 * cell, far, seed.child("guessed")),
     ];
     if source == InitSource::Photo && groups[0].len() + groups[2].len() < FEWEST.min(count) {
