@@ -1,6 +1,6 @@
 //! Whether the times of the images can be right: one image per camera and time, frames in order.
 
-use super::{Finding, Subject, small_gray, spread};
+use super::{Finding, Severity, Subject, small_gray, spread};
 use cc4dgs_core::{Result, Scene, Split};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -53,8 +53,8 @@ fn same_time(scene: &Scene, background: [f32; 3]) -> Result<Option<Finding>> {
     );
     let remedy = "Give each image of a camera a time of its own (the time key of transforms.json, one folder or index per instant)";
     let of_groups: usize = groups.iter().map(Vec::len).sum();
-    let finding = if 2 * of_groups > train.len() { Finding::refuse } else { Finding::doubt };
-    Ok(Some(finding(Subject::Times, problem, remedy.to_string())))
+    let severity = if 2 * of_groups > train.len() { Severity::Refuse } else { Severity::Doubt };
+    Ok(Some(Finding::new(severity, Subject::Times, problem, remedy)))
 }
 
 /// Whether two images of one size differ by more than brightness, contrast and noise.

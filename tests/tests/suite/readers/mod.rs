@@ -1,6 +1,6 @@
 //! Dataset readers: each on a tiny scene written by the test, on untrusted bytes, and on real scenes if they are present.
 
-mod common;
+pub mod common;
 mod conformance;
 mod formats;
 mod golden;
