@@ -16,9 +16,9 @@ const DIFFERENT: f32 = 0.05;
 /// Fixed cameras whose frames are compared.
 const CAMERAS: usize = 2;
 /// Consecutive frames of a camera that are compared, at least and at most.
-const FRAMES: (usize, usize) = (8, 24);
+const FRAMES: (usize, usize) = (12, 24);
 /// Frames are in order if images at some constant distance in time differ by less than this share of the usual difference ...
-const IN_ORDER: f64 = 0.8;
+const IN_ORDER: f64 = 0.7;
 /// ... and could be in order if each image has another that differs by less than this share.
 const ORDERABLE: f64 = 0.55;
 
@@ -107,7 +107,7 @@ fn shuffled(images: &[Vec<f32>]) -> bool {
     }
     let mean = |values: Vec<f64>| values.iter().sum::<f64>() / values.len().max(1) as f64 / usual;
     // Motion that repeats is in order too.
-    let in_order = (1..=n / 2).map(|lag| mean((lag..n).map(|i| table[i][i - lag]).collect())).fold(f64::INFINITY, f64::min);
+    let in_order = (1..=n / 3).map(|lag| mean((lag..n).map(|i| table[i][i - lag]).collect())).fold(f64::INFINITY, f64::min);
     let nearest = mean((0..n).map(|i| (0..n).filter(|&j| j != i).map(|j| table[i][j]).fold(f64::INFINITY, f64::min)).collect());
     in_order > IN_ORDER && nearest < ORDERABLE
 }
