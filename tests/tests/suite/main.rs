@@ -7,6 +7,7 @@ mod baselines;
 mod basis;
 mod cdf;
 mod checkpoints;
+mod checks;
 mod codec_context;
 mod codecs;
 mod conformance;

@@ -141,6 +141,9 @@ pub struct RawScene {
     pub warnings: Vec<String>,
 }
 
+/// How the warning of [`RawScene::rank_times`] about times that are all equal begins.
+pub const SAME_TIME: &str = "all images state the same time";
+
 impl RawScene {
     /// Sets frame and time of each view from the dataset's times, one per view: the frame is the rank among the distinct times; if times exceed 1,
     /// all are divided by the largest. `object` names the file in errors.
@@ -155,7 +158,7 @@ impl RawScene {
             && !rest.is_empty()
             && rest.iter().all(|t| t.is_some_and(|t| t == *first))
         {
-            self.warnings.push(format!("all {} images state the same time, {first}: the scene is taken for a static one", times.len()));
+            self.warnings.push(format!("{SAME_TIME}, {first}: the scene is taken for a static one"));
         }
         let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
         let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();

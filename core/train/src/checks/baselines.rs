@@ -19,7 +19,7 @@ const MOVING_FRAMES: usize = 16;
 /// Fewer frames say nothing of motion.
 const FEWEST_FRAMES: usize = 4;
 /// Views per fixed camera whose moving pixels are scored.
-const MOVING_VIEWS: usize = 3;
+const MOVING_VIEWS: usize = 2;
 /// Share of the pixels that must move.
 const MOVING_SHARE: f64 = 0.003;
 

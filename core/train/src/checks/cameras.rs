@@ -1,6 +1,6 @@
 //! Whether the cameras can see depth at all.
 
-use super::{Finding, Subject};
+use super::{Finding, Severity, Subject};
 use cc4dgs_core::{Scene, Split};
 use glam::DVec3;
 
@@ -22,6 +22,6 @@ pub(super) fn check(scene: &Scene) -> Vec<Finding> {
         n => format!("all {n} training images were taken from one point, and without parallax depth cannot be known"),
     };
     let remedy = "Add images from other places, check that the poses are the right ones, and look for warnings about images that were skipped";
-    let finding = if scene.points.is_some() { Finding::doubt } else { Finding::refuse };
-    vec![finding(Subject::Cameras, problem, remedy.to_string())]
+    let severity = if scene.points.is_some() { Severity::Doubt } else { Severity::Refuse };
+    vec![Finding::new(severity, Subject::Cameras, problem, remedy)]
 }

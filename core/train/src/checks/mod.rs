@@ -56,11 +56,14 @@ pub struct Finding {
 }
 
 impl Finding {
+    fn new(severity: Severity, subject: Subject, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { severity, subject, problem: problem.into(), remedy: remedy.into() }
+    }
     fn doubt(subject: Subject, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
-        Self { severity: Severity::Doubt, subject, problem: problem.into(), remedy: remedy.into() }
+        Self::new(Severity::Doubt, subject, problem, remedy)
     }
     fn refuse(subject: Subject, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
-        Self { severity: Severity::Refuse, ..Self::doubt(subject, problem, remedy) }
+        Self::new(Severity::Refuse, subject, problem, remedy)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Whether the times of the images can be right: one image per camera and time, frames in order.
 
-use super::{Finding, Subject, small_gray, spread};
+use super::{Finding, Severity, Subject, small_gray, spread};
 use cc4dgs_core::{Result, Scene, Split};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -16,9 +16,9 @@ const DIFFERENT: f32 = 0.05;
 /// Fixed cameras whose frames are compared.
 const CAMERAS: usize = 2;
 /// Consecutive frames of a camera that are compared, at least and at most.
-const FRAMES: (usize, usize) = (8, 24);
+const FRAMES: (usize, usize) = (12, 24);
 /// Frames are in order if images at some constant distance in time differ by less than this share of the usual difference ...
-const IN_ORDER: f64 = 0.8;
+const IN_ORDER: f64 = 0.7;
 /// ... and could be in order if each image has another that differs by less than this share.
 const ORDERABLE: f64 = 0.55;
 
@@ -53,8 +53,8 @@ fn same_time(scene: &Scene, background: [f32; 3]) -> Result<Option<Finding>> {
     );
     let remedy = "Give each image of a camera a time of its own (the time key of transforms.json, one folder or index per instant)";
     let of_groups: usize = groups.iter().map(Vec::len).sum();
-    let finding = if 2 * of_groups > train.len() { Finding::refuse } else { Finding::doubt };
-    Ok(Some(finding(Subject::Times, problem, remedy.to_string())))
+    let severity = if 2 * of_groups > train.len() { Severity::Refuse } else { Severity::Doubt };
+    Ok(Some(Finding::new(severity, Subject::Times, problem, remedy)))
 }
 
 /// Whether two images of one size differ by more than brightness, contrast and noise.
@@ -107,7 +107,7 @@ fn shuffled(images: &[Vec<f32>]) -> bool {
     }
     let mean = |values: Vec<f64>| values.iter().sum::<f64>() / values.len().max(1) as f64 / usual;
     // Motion that repeats is in order too.
-    let in_order = (1..=n / 2).map(|lag| mean((lag..n).map(|i| table[i][i - lag]).collect())).fold(f64::INFINITY, f64::min);
+    let in_order = (1..=n / 3).map(|lag| mean((lag..n).map(|i| table[i][i - lag]).collect())).fold(f64::INFINITY, f64::min);
     let nearest = mean((0..n).map(|i| (0..n).filter(|&j| j != i).map(|j| table[i][j]).fold(f64::INFINITY, f64::min)).collect());
     in_order > IN_ORDER && nearest < ORDERABLE
 }

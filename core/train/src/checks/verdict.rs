@@ -59,6 +59,8 @@ pub(super) struct Evidence<'a> {
     pub cap: Option<usize>,
     pub baselines: Baselines,
     pub doubts: &'a [Finding],
+    /// What the reader said of data that was ignored.
+    pub warnings: &'a [String],
 }
 
 impl Evidence<'_> {
@@ -69,6 +71,10 @@ impl Evidence<'_> {
         if let Some(validation) = self.validation_psnr_db {
             numbers += &format!(", validation views {validation:.1} dB");
         }
+        let reader = match self.warnings.first() {
+            Some(warning) if judgement != Judgement::Good => format!(". The reader warned: {warning}"),
+            _ => String::new(),
+        };
         let b = &self.baselines;
         numbers += &format!(" (the mean colour of each image: {:.1} dB, images blurred 16 times: {:.1} dB", b.mean_colour_db, b.blur_db);
         if let (Some(moving), Some(mean_image)) = (self.moving_psnr_db, b.mean_image_db) {
@@ -76,7 +82,7 @@ impl Evidence<'_> {
         }
         Verdict {
             judgement,
-            sentence: format!("{words}: {numbers})"),
+            sentence: format!("{words}: {numbers}){reader}"),
             train_psnr_db: self.train_psnr_db,
             validation_psnr_db: self.validation_psnr_db,
             moving_psnr_db: self.moving_psnr_db,
@@ -122,6 +128,7 @@ mod tests {
             cap: Some(1000),
             baselines,
             doubts: &[],
+            warnings: &[],
         };
         let doubts = [Finding::doubt(Subject::Poses, "the poses of a, b do not fit", "x")];
         let cases = [

@@ -1,11 +1,11 @@
 //! Scores a model on its way and at its end, and decides whether the run has failed.
 
-use super::baselines::{Yardstick, psnr_db};
+use super::baselines::{MovingPixels, Yardstick, psnr_db};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::train::{Context, TrainState};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Error, Event, Result, Schedule, Stage};
+use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Stage};
 use cc4dgs_play::Moving;
 
 /// Shorter runs are not judged.
@@ -84,6 +84,7 @@ impl Watch {
             cap,
             baselines: yardstick.baselines,
             doubts: &self.doubts,
+            warnings: &context.job.scene.warnings,
         }
         .verdict();
         context.job.events.emit(&Event::Note { object: "verdict".into(), message: verdict.sentence.clone() });
@@ -100,20 +101,21 @@ impl Watch {
         let psnr = scored(context, state, &yardstick.views, &mut detail)?;
         // Each moving view at its own time and, for comparison, a third and two thirds of the sequence later.
         let mut sums = [0.0; 3];
+        let moving: &[MovingPixels] = if percent == LATE { &[] } else { &yardstick.moving };
         for (shift, sum) in [0.0, 1.0 / 3.0, 2.0 / 3.0].into_iter().zip(&mut sums) {
             let time = |view: usize| if shift == 0.0 { scene.views[view].time_norm } else { (scene.views[view].time_norm + shift).fract() };
-            let requests: Vec<(usize, f32)> = yardstick.moving.iter().map(|m| (m.view, time(m.view))).collect();
+            let requests: Vec<(usize, f32)> = moving.iter().map(|m| (m.view, time(m.view))).collect();
             let gaussians = state.set.gaussians()?;
             context.draw(state, &gaussians, &requests, gaussians.sh_degree, |index, image| {
                 let image = to_vec(image, "drawn view")?;
-                let moving = &yardstick.moving[index];
-                let camera = scene.camera(moving.view);
-                let truth = scene.frame(moving.view)?.to_planes(background);
-                *sum += psnr_db(&truth, &image, [camera.width, camera.height], Some(&moving.mask))?;
+                let MovingPixels { view, mask } = &moving[index];
+                let camera = scene.camera(*view);
+                let truth = scene.frame(*view)?.to_planes(background);
+                *sum += psnr_db(&truth, &image, [camera.width, camera.height], Some(mask))?;
                 Ok(())
             })?;
         }
-        let mean = |sum: f64| (!yardstick.moving.is_empty()).then(|| sum / yardstick.moving.len() as f64);
+        let mean = |sum: f64| (!moving.is_empty()).then(|| sum / moving.len() as f64);
         self.scores.push(Score { percent, psnr_db: psnr, moving_db: mean(sums[0]), frozen_db: mean(0.5 * (sums[1] + sums[2])), detail });
         Ok(())
     }
@@ -132,7 +134,8 @@ impl Watch {
         if weak && self.always(|s| s.psnr_db < baselines.blur_db) {
             return Err(self.failure(context, format!("{reached}, less than the images blurred 16 times ({:.1} dB)", baselines.blur_db)));
         }
-        let doubted = self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times));
+        let same_time = context.job.scene.warnings.iter().any(|warning| warning.starts_with(SAME_TIME));
+        let doubted = same_time || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times));
         if weak && doubted && end.psnr_db < baselines.blur_db + DOUBT_MARGIN_DB {
             let problem = format!("{reached}, hardly more than the images blurred 16 times ({:.1} dB)", baselines.blur_db);
             return Err(self.failure(context, problem));
@@ -157,9 +160,14 @@ impl Watch {
     /// The error of a run that is below a baseline, with the likely cause.
     fn failure(&self, context: &Context, problem: String) -> Error {
         let iterations = context.job.config.train.iterations;
-        match self.doubts.first() {
-            Some(doubt) => Error::failed("training", format!("{problem}. The likely cause: {}", doubt.problem), doubt.remedy.clone()),
-            None => {
+        let scene = &context.job.scene;
+        match (self.doubts.first(), scene.warnings.first()) {
+            (Some(doubt), _) => Error::failed("training", format!("{problem}. The likely cause: {}", doubt.problem), doubt.remedy.clone()),
+            (None, Some(warning)) => {
+                let remedy = "Correct the dataset, or train longer (train.iterations). The checkpoint is kept, and train.checks = false accepts such models";
+                Error::failed("training", format!("{problem}. The likely cause: {warning}"), remedy)
+            }
+            (None, None) => {
                 let remedy = format!(
                     "Likely causes are wrong poses or axes, wrong times, another background than that of the images (render.background), or too few iterations: \
                      check the first three, then try train.iterations = {}. The checkpoint is kept, and train.checks = false accepts such models",

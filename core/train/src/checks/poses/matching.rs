@@ -10,8 +10,9 @@ use glam::{DMat3, DVec2, DVec3};
 /// Pixels of the small images that are compared.
 const PIXELS: f64 = 5_000.0;
 /// Half-width of the comparison window, pixels.
-const RADIUS: isize = 3;
-const WINDOW: usize = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as usize;
+const RADIUS: usize = 3;
+const SIDE: usize = 2 * RADIUS + 1;
+const WINDOW: usize = SIDE * SIDE;
 /// Offsets of the compared lines from the true one, as shares of the square root of the number of pixels.
 const OFFSETS: [f64; LINES] = [0.0, 0.07, -0.07, 0.14, -0.14];
 /// Number of compared lines, the true one first.
@@ -92,12 +93,8 @@ impl Look {
         look.corners = look.find_corners();
         look
     }
-    /// Corners with enough texture to be found again.
-    pub fn corners(&self) -> usize {
-        self.corners.len()
-    }
     fn find_corners(&self) -> Vec<(usize, usize)> {
-        let margin = RADIUS as usize + 1;
+        let margin = RADIUS + 1;
         if self.width <= 2 * margin || self.height <= 2 * margin {
             return Vec::new();
         }
@@ -117,8 +114,8 @@ impl Look {
     /// Smaller eigenvalue of the mean structure tensor of the window around (x, y).
     fn corner_strength(&self, x: usize, y: usize) -> f32 {
         let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-        for j in y - RADIUS as usize..=y + RADIUS as usize {
-            for i in x - RADIUS as usize..=x + RADIUS as usize {
+        for j in y - RADIUS..=y + RADIUS {
+            for i in x - RADIUS..=x + RADIUS {
                 let p = j * self.width + i;
                 let (dx, dy) = (0.5 * (self.gray[p + 1] - self.gray[p - 1]), 0.5 * (self.gray[p + self.width] - self.gray[p - self.width]));
                 (xx, xy, yy) = (xx + dx * dx, xy + dx * dy, yy + dy * dy);
@@ -201,9 +198,9 @@ impl Search<'_> {
     /// The window around a corner, zero mean and unit length.
     fn window(&self, x: usize, y: usize) -> [f32; WINDOW] {
         let mut values = [0.0; WINDOW];
-        for (k, value) in values.iter_mut().enumerate() {
-            let side = 2 * RADIUS as usize + 1;
-            *value = self.from.gray[(y + k / side - RADIUS as usize) * self.from.width + x + k % side - RADIUS as usize];
+        for (row, line) in values.chunks_exact_mut(SIDE).enumerate() {
+            let start = (y + row - RADIUS) * self.from.width + x - RADIUS;
+            line.copy_from_slice(&self.from.gray[start..start + SIDE]);
         }
         normalise(&mut values);
         values
@@ -222,13 +219,16 @@ impl Search<'_> {
         if !OFFSETS.iter().all(|offset| inside(p + normal * *offset)) {
             return;
         }
+        let [across, down] = warp.map(|step| step.as_vec2());
         for (score, offset) in scores.iter_mut().zip(OFFSETS) {
-            let middle = p + normal * offset;
+            let middle = (p + normal * offset).as_vec2();
             let mut values = [0.0; WINDOW];
-            for (k, value) in values.iter_mut().enumerate() {
-                let (i, j) = ((k as isize % (2 * RADIUS + 1) - RADIUS) as f64, (k as isize / (2 * RADIUS + 1) - RADIUS) as f64);
-                let q = middle + warp[0] * i + warp[1] * j;
-                *value = self.to.sample(q.x as f32, q.y as f32);
+            for (row, line) in values.chunks_exact_mut(SIDE).enumerate() {
+                let mut q = (middle - across * RADIUS as f32) + down * (row as f32 - RADIUS as f32);
+                for value in line {
+                    *value = self.to.sample(q.x, q.y);
+                    q += across;
+                }
             }
             normalise(&mut values);
             *score = score.max(window.iter().zip(&values).map(|(a, b)| a * b).sum());

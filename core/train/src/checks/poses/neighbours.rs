@@ -28,15 +28,21 @@ impl Stand {
         let ahead = -forward.dot(center);
         Self { center, forward, time, depth: if ahead > 0.25 * distance { ahead } else { distance } }
     }
+    /// The angle, in radians, under which both cameras are seen from what this one looks at.
+    pub fn parallax(&self, other: &Stand) -> f64 {
+        let seen = self.center + self.forward * self.depth;
+        angle(seen - self.center, seen - other.center)
+    }
     /// How badly this image and `other` suit for a comparison; `None` if they cannot be compared.
     fn cost(&self, other: &Stand) -> Option<f64> {
-        let seen = self.center + self.forward * self.depth;
-        let angle = |a: DVec3, b: DVec3| a.normalize_or_zero().dot(b.normalize_or_zero()).clamp(-1.0, 1.0).acos();
-        let parallax = angle(seen - self.center, seen - other.center);
-        let axes = angle(self.forward, other.forward);
+        let (parallax, axes) = (self.parallax(other), angle(self.forward, other.forward));
         let cost = (parallax - BEST_ANGLE_RAD).abs() + 0.5 * axes + TIME_COST_RAD * (self.time - other.time).abs();
         (parallax < WIDEST_RAD && axes < WIDEST_AXES_RAD).then_some(cost)
     }
+}
+
+fn angle(a: DVec3, b: DVec3) -> f64 {
+    a.normalize_or_zero().dot(b.normalize_or_zero()).clamp(-1.0, 1.0).acos()
 }
 
 /// The `count` images that suit image `index` best, best first; fewer where there are not as many.
