@@ -9,3 +9,4 @@ mod invariance;
 mod procedural;
 mod real;
 mod selection;
+mod videos;
