@@ -90,7 +90,7 @@ fn normalised_points(points: &RawPoints, frame: &Similarity, warnings: &mut Vec<
 }
 
 /// Brings the calibration to the size the images really have, if only the scale differs.
-fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: &mut Vec<String>) -> Result<[u32; 2]> {
+pub(super) fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: &mut Vec<String>) -> Result<[u32; 2]> {
     let [w, h] = camera.size.map(f64::from);
     let (sx, sy) = (f64::from(found.0) / w, f64::from(found.1) / h);
     if camera.size == [found.0, found.1] {

@@ -222,6 +222,51 @@ fn start_times_count() {
 }
 
 #[test]
+fn transforms_and_colmap_may_name_videos() {
+    if !ffmpeg() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = ring(3, SIZE.0, SIZE.1);
+    for c in 0..3 {
+        std::fs::create_dir_all(dir.path().join("videos")).unwrap();
+        record(&dir.path().join(format!("videos/c{c}.mp4")), c, &(0..12).collect::<Vec<_>>(), "30", &[]);
+    }
+    let options = SceneOptions { video_cache: Some(dir.path().join("cache")), ..Default::default() };
+    let check = |scene: &Scene| {
+        assert_eq!((scene.cameras.len(), scene.frame_count), (3, 12));
+        assert_eq!(instants(scene), (0..12).map(|k| (k, vec![Some(k); 3])).collect());
+        (0..36).for_each(|view| same_pose(&dataset_camera(scene, view), &cameras[scene.views[view].camera]));
+    };
+    let frame = |(c, camera): (usize, &cc4dgs_core::Camera)| serde_json::json!({"file_path": format!("videos/c{c}.mp4"), "transform_matrix": opengl_camera_to_world(camera)});
+    let frames: Vec<_> = cameras.iter().enumerate().map(frame).collect();
+    let write = |frames: &[serde_json::Value]| {
+        // Calibrated at twice the size of the videos.
+        let document = serde_json::json!({"fl_x": 2.0 * cameras[0].fx, "cx": 64.0, "cy": 48.0, "w": 128, "h": 96, "frames": frames});
+        std::fs::write(dir.path().join("transforms.json"), document.to_string()).unwrap();
+    };
+    write(&frames);
+    let scene = opened(&dir, &options);
+    check(&scene);
+    assert_eq!((scene.camera(0).width, scene.camera(0).cx, scene.cameras[0].name.as_str()), (64, 32.0, "videos/c0.mp4"));
+    let refused = |extra: serde_json::Value| {
+        write(&[&frames[..], &[extra]].concat());
+        open(dir.path(), &options, &Limits::default()).err().unwrap().to_string()
+    };
+    assert!(refused(frames[1].clone()).contains("named by two entries"));
+    write_image(&dir.path().join("a.png"), 64, 48, 0);
+    assert!(refused(serde_json::json!({"file_path": "a.png", "transform_matrix": opengl_camera_to_world(&cameras[0])})).contains("images and videos"));
+
+    std::fs::remove_file(dir.path().join("transforms.json")).unwrap();
+    std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+    let names: Vec<String> = (0..3).map(|c| format!("c{c}.png")).collect();
+    for (file, bytes) in ["cameras", "images", "points3D"].iter().zip(colmap_binary(&cameras, &names)) {
+        std::fs::write(dir.path().join(format!("sparse/0/{file}.bin")), bytes).unwrap();
+    }
+    check(&opened(&dir, &options));
+}
+
+#[test]
 fn broken_videos_are_errors() {
     if !ffmpeg() {
         return;
