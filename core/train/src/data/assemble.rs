@@ -1,5 +1,6 @@
 //! From what a reader hands over to a [`Scene`]: the steps all scenes share.
 
+use super::align::align;
 use super::camera_box::camera_box;
 use super::frames::{Job, Plan, SceneFrames};
 use super::normalise::{CAMERA_DISTANCE, normalisation};
@@ -27,6 +28,7 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, frame: Option<Similar
     }
     // Before views are chosen: the frame must not depend on the options.
     let frame = frame.unwrap_or_else(|| normalisation(&raw));
+    align(&mut raw, options, limits)?;
     let views = select(&mut raw, options)?;
     if !views.iter().any(|v| v.split == Split::Train) {
         let hint = raw.warnings.last().cloned().unwrap_or_default();

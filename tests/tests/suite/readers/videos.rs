@@ -2,7 +2,7 @@
 //! which it was recorded, so that a test can tell what it sees. Skipped with a note where the ffmpeg command is missing.
 
 use super::common::*;
-use cc4dgs_core::{Image8, Limits, Scene, SceneOptions, Seed};
+use cc4dgs_core::{Image8, Limits, Scene, SceneOptions, Seed, SyncMode};
 use rand::Rng;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -219,6 +219,29 @@ fn start_times_count() {
     let scene = opened(&dir, &options);
     assert_eq!(instants(&scene), (0..25).map(|k| (k, vec![Some(5 + k); 2])).collect());
     assert!(scene.warnings.iter().any(|w| w.contains("matched by time")), "{:?}", scene.warnings);
+}
+
+#[test]
+fn offsets_between_cameras_are_undone() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(4, SIZE);
+    let starts = [30, 30, 22, 41];
+    starts.iter().enumerate().for_each(|(c, start)| record(&video(&dir, c), c, &(*start..start + 260).collect::<Vec<_>>(), "30", &[]));
+    let scene = opened(&dir, &options);
+    for (camera, offset) in [("cam02", "k+8"), ("cam03", "k-11")] {
+        assert!(scene.warnings.iter().any(|w| w.contains(camera) && w.contains(offset)), "{camera}: {:?}", scene.warnings);
+    }
+    // All cameras recorded from 41 to 281.
+    assert_eq!(instants(&scene), (0..241).map(|k| (k, vec![Some(41 + k); 4])).collect());
+    // The offsets do not depend on the frames that are chosen, and the second opening reads the cache.
+    let few = opened(&dir, &SceneOptions { frames: Some([7, 2, 5]), ..options.clone() });
+    assert_eq!(instants(&few), [(0, vec![Some(48); 4]), (1, vec![Some(53); 4])].into());
+    let off = opened(&dir, &SceneOptions { sync: SyncMode::Off, frames: Some([0, 2, 1]), ..options.clone() });
+    assert_eq!(instants(&off), (0..2).map(|k| (k, starts.iter().map(|s| Some(s + k)).collect())).collect());
+    let stated = SceneOptions { offsets: [("cam02".to_string(), 8)].into(), frames: Some([0, 2, 1]), ..options };
+    assert_eq!(instants(&opened(&dir, &stated)), (0..2).map(|k| (k, [30, 30, 30, 41].iter().map(|s| Some(s + k)).collect())).collect());
 }
 
 #[test]

@@ -1,11 +1,13 @@
-//! Videos through the `ffmpeg` and `ffprobe` commands: what they contain ([`probe`]), their frames on a common clock ([`footage`]), and extraction
-//! of single frames ([`VideoFrames`]).
+//! Videos through the `ffmpeg` and `ffprobe` commands: what they contain ([`probe`]), their frames on a common clock ([`footage`]), extraction of
+//! single frames ([`VideoFrames`]), and the motion in them over time ([`motion`]).
 
 mod extract;
+mod motion;
 mod probe;
 mod timeline;
 
 pub(super) use extract::VideoFrames;
+pub(super) use motion::motion;
 pub(super) use probe::{VideoFacts, probe};
 use timeline::timeline;
 
