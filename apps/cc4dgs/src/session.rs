@@ -6,9 +6,11 @@ use crate::{plugins, scenes};
 use burn::tensor::Device;
 use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device};
 use cc4dgs_play::player::Player;
+use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::data;
 use cc4dgs_train::eval::{EvalReport, evaluate};
+use cc4dgs_train::layers::Layers;
 use cc4dgs_train::train::{CONFIG, TrainJob, train};
 use std::path::Path;
 use std::sync::Arc;
@@ -115,6 +117,18 @@ impl Session {
     pub fn config(&self, preset: &str, overrides: &[&str]) -> Result<RunConfig> {
         let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
         Ok(self.adopted(RunConfig::resolve(Some(preset), None, &overrides)?))
+    }
+    /// Opens the dataset at `path` and chooses the settings of a training by looking at it (the preset `auto`), with `key=value` overrides, on this session's device
+    /// and limits. `auto.minutes=5` states the time there is.
+    ///
+    /// # Errors
+    /// As [`Session::config`] and [`Session::read_scene`].
+    pub fn plan(&self, path: impl AsRef<Path>, overrides: &[&str]) -> Result<(RunConfig, Arc<Scene>)> {
+        let device = format!("device={}", self.shared.device_name);
+        let overrides: Vec<String> = overrides.iter().map(ToString::to_string).chain([device]).collect();
+        let layers = Layers::collect(self.registry(), Some(auto::PRESET), None, &overrides)?;
+        let (config, scene) = auto::open(path.as_ref(), &layers, self.registry(), self.events())?;
+        Ok((self.adopted(config), scene))
     }
     /// Opens the dataset at `path`; `procedural` and `procedural:NAME` are built in. Images are decoded later, on demand.
     ///

@@ -7,8 +7,7 @@ pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLos
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
-const EXIT_CODES: &str =
-    "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 back end, 130 interrupted. Sizes are in MB = 10^6 bytes.";
+const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 back end, 6 a training that failed, 130 interrupted. Sizes are in MB = 10^6 bytes.";
 
 /// Dynamic Gaussian splatting: train, compress, play back.
 #[derive(Debug, Parser)]
@@ -75,9 +74,12 @@ pub struct Train {
     /// A dataset, or `procedural` for the built-in scene. The format is recognised.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// Settings to start from; see `cc4dgs plugins`.
+    /// Settings to start from; see `cc4dgs plugins`. Without one and without --config, `auto` chooses them by looking at the scene.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
+    /// Wall time that the preset `auto` plans for; ten on processors, five on a graphics card by default.
+    #[arg(long, value_name = "M")]
+    pub minutes: Option<f64>,
     /// A TOML file laid over the preset.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,

@@ -19,7 +19,7 @@ use std::ffi::OsString;
 use std::process::ExitCode;
 
 /// Runs the `cc4dgs` command on `args` (the program's name first) and returns its exit code: 0 done, 2 user error, 3 data error, 4 out of memory or
-/// over a limit, 5 back end, 130 interruption. Every plug-in linked into the program takes part.
+/// over a limit, 5 back end, 6 a training that failed, 130 interruption. Every plug-in linked into the program takes part.
 pub fn run<I, T>(args: I) -> ExitCode
 where
     I: IntoIterator<Item = T>,

@@ -1,9 +1,12 @@
 //! The CPU backends' tensors as plain slices, so that one kernel serves Flex and NdArray alike.
 
+#[cfg(feature = "ndarray")]
+use burn::backend::NdArray;
 use burn::backend::flex::FlexTensor;
+#[cfg(feature = "ndarray")]
 use burn::backend::ndarray::NdArrayTensor;
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Backend, Flex, NdArray};
+use burn::backend::{Backend, Flex};
 use burn::tensor::{DType, Shape, TensorData};
 use std::borrow::Cow;
 
@@ -60,6 +63,7 @@ impl CpuBackend for Flex {
     }
 }
 
+#[cfg(feature = "ndarray")]
 impl CpuBackend for NdArray {
     fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]> {
         let NdArrayTensor::F32(storage) = tensor else { panic!("ndarray: expected float32, got {:?}", burn::backend::TensorMetadata::dtype(tensor)) };

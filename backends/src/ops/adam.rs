@@ -66,7 +66,7 @@ pub struct AdamStep<const D: usize> {
 type Moved<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>, IntTensor<B>);
 
 /// The operations per device: `(param, m, v, skipped rows [1])`.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"))]
 pub trait AdamOps: Backend {
     /// Moves `param` by one step; all four float tensors have one shape.
     fn adam(

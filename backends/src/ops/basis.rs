@@ -53,7 +53,7 @@ pub trait BasisBackward: Backend {
 }
 
 /// The operation per device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"), Autodiff)]
 pub trait BasisOps: Backend {
     /// Flat outputs, head after head, each `[M, outputs]`, of coefficients `[M, C]` and functions `[F]`; differentiable in both.
     fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self>;

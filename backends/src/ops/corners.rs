@@ -39,7 +39,7 @@ pub struct CornersBegun<B: Backend> {
 }
 
 /// Finding corners has no gradient: the field of CC-4DGS is not differentiated with respect to the canonical centres.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"))]
 pub trait CornerOps: Backend {
     /// Finds and groups the corners of points `[M,3]`.
     fn begin_corners(points: FloatTensor<Self>, grid: GridBox, reuse: bool) -> CornersBegun<Self>;

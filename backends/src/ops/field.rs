@@ -44,7 +44,7 @@ pub trait FieldKernels: Backend {
 }
 
 /// The differentiable operations of this module per device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"), Autodiff)]
 pub trait FieldOps: Backend {
     /// Features `[U, F]` of vertices `[U, 3]`; differentiable in the weights.
     fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self>;

@@ -8,7 +8,7 @@ use cc4dgs_core::{Error, Image8, Result};
 use std::sync::Arc;
 
 /// The operation per device; `like` only says which.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"))]
 pub trait ImageOps: Backend {
     /// Planes `[3,H,W]` of an image, alpha composited over a background.
     fn planes(like: FloatTensor<Self>, image: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self>;

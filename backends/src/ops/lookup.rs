@@ -98,7 +98,7 @@ pub trait LookupBackward: Backend {
 }
 
 /// The operation per device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"), Autodiff)]
 pub trait LookupOps: Backend {
     /// Features `[M, width]` of points `[M, dims]`; differentiable in the flat table.
     fn lookup(table: FloatTensor<Self>, points: FloatTensor<Self>, shape: Arc<GridShape>) -> FloatTensor<Self>;

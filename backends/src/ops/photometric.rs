@@ -27,7 +27,7 @@ pub trait PhotometricKernels: Backend {
 }
 
 /// The operations of this module per device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"), Autodiff)]
 pub trait PhotometricOps: Backend {
     /// Loss `[1]` and terms `[3]` (l1, ssim, mse; without gradient) of the first three of `planes` `[C,H,W]` against `target` `[3,H,W]`.
     fn photometric(planes: FloatTensor<Self>, target: FloatTensor<Self>, lambda_c: f32) -> (FloatTensor<Self>, FloatTensor<Self>);

@@ -8,7 +8,7 @@ use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, Result};
 
 /// The operation per device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"))]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"))]
 pub trait SortOps: Backend {
     /// Indices of `keys` `[N]` in ascending order of their lowest `bits` bits.
     fn order(keys: IntTensor<Self>, bits: u32) -> IntTensor<Self>;

@@ -70,6 +70,16 @@ pub enum Error {
         /// What to try.
         remedy: String,
     },
+    /// A training ended with a model that is not worth having. A checkpoint was written before.
+    #[error("{object}: {problem}. {remedy}")]
+    Failed {
+        /// What failed.
+        object: String,
+        /// What was measured, and what is likely wrong.
+        problem: String,
+        /// What to try.
+        remedy: String,
+    },
     /// The user interrupted. A checkpoint was written before.
     #[error("interrupted: {0}")]
     Interrupted(String),
@@ -102,11 +112,16 @@ impl Error {
     pub fn backend(object: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self::Backend { object: object.into(), problem: problem.into(), remedy: remedy.into() }
     }
+    /// A [`Error::Failed`].
+    pub fn failed(object: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self::Failed { object: object.into(), problem: problem.into(), remedy: remedy.into() }
+    }
     /// A [`Error::Io`] about `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Self::Io { path: path.as_ref().to_path_buf(), source }
     }
-    /// The process exit code: 2 user error, 3 data error, 4 out of memory or over a limit, 5 backend, 130 interruption.
+    /// The process exit code: 2 user error, 3 data error, 4 out of memory or over a limit, 5 backend, 6 a training that failed, 130
+    /// interruption.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Parameter { .. } | Self::Unsupported { .. } => 2,
@@ -115,6 +130,7 @@ impl Error {
             Self::Io { .. } => 3,
             Self::Limit { .. } => 4,
             Self::Backend { .. } => 5,
+            Self::Failed { .. } => 6,
             Self::Interrupted(_) => 130,
         }
     }

@@ -104,6 +104,19 @@ impl DensityPlan {
             None => self.values.push(RowValues { attribute: attribute.into(), rows: vec![row], values: values.to_vec() }),
         }
     }
+    /// The old rows of `count` that have no new row, ascending.
+    pub fn removed(&self, count: usize) -> Vec<usize> {
+        let mut kept = vec![false; count];
+        self.parents.iter().filter(|&&row| row < count).for_each(|&row| kept[row] = true);
+        (0..count).filter(|&row| !kept[row]).collect()
+    }
+    /// Keeps `rows` that the plan removes; they become its last rows.
+    pub fn restore(&mut self, rows: &[usize]) {
+        rows.iter().for_each(|&row| {
+            self.keep(row);
+        });
+        self.report.removed = self.report.removed.saturating_sub(rows.len());
+    }
     /// Resets the optimizer state of `attribute` to zero in all rows (opacity resets).
     pub fn restart(&mut self, attribute: &str) {
         self.restarted.push(attribute.into());
@@ -206,9 +219,13 @@ pub trait DensityControl: Send {
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic>;
     /// Receives the statistics of one view, after the backward pass.
     fn observe(&mut self, view: &ViewStatistics) -> Result<()>;
-    /// The plan after the optimizer step of an iteration; `None` for no change. The trainer executes it before the next iteration. When this returns, the control's own
-    /// statistics must already match the new Gaussians. All randomness comes from `seed`, which differs in every iteration.
+    /// The plan after the optimizer step of an iteration; `None` for no change. The trainer may keep rows that the plan removes (see [`DensityPlan::restore`]), executes
+    /// it, and calls [`DensityControl::executed`]. All randomness comes from `seed`, which differs in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;
+    /// The Gaussians are now those of `plan`: statistics per Gaussian must follow its rows. Default: nothing, for controls that keep none.
+    fn executed(&mut self, _plan: &DensityPlan, _device: &Device) -> Result<()> {
+        Ok(())
+    }
     /// Called after every optimizer step. Returns attributes with new values for all rows `[N,width]`; their optimizer state is kept (for the noise of 3DGS-MCMC).
     fn after_step(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         Ok(Vec::new())
@@ -266,6 +283,9 @@ mod tests {
         let after = plan.apply(&g).unwrap().to_host().unwrap();
         assert_eq!((after.opacity_logits, after.extra["label"].values.clone()), (vec![2.0, 7.0], vec![12.0, 11.0]));
         assert_eq!((plan.fresh(), plan.keeps_all(3)), (&[false, true][..], false));
+        assert_eq!(plan.removed(3), [0]);
+        plan.restore(&[0]);
+        assert!(plan.removed(3).is_empty() && plan.parents() == [2, 1, 0]);
     }
 
     #[test]

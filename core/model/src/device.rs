@@ -26,7 +26,17 @@ pub fn parse_device(name: &str) -> Result<Device> {
 
 #[cfg(feature = "cpu")]
 fn processor_device(name: &str) -> Result<Device> {
-    Ok(if name == "ndarray" { Device::ndarray() } else { Device::flex() })
+    if name == "ndarray" { ndarray_device() } else { Ok(Device::flex()) }
+}
+
+#[cfg(feature = "ndarray")]
+fn ndarray_device() -> Result<Device> {
+    Ok(Device::ndarray())
+}
+
+#[cfg(all(feature = "cpu", not(feature = "ndarray")))]
+fn ndarray_device() -> Result<Device> {
+    Err(Error::unsupported("device ndarray", "this build has no ndarray backend", "Build with the feature `ndarray`, or use --device flex"))
 }
 
 #[cfg(not(feature = "cpu"))]

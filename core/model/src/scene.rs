@@ -43,7 +43,8 @@ pub trait FrameSource: Send + Sync {
     fn load(&self, view: usize) -> Result<Image8>;
 }
 
-/// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes.
+/// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes; clones share the cache.
+#[derive(Clone)]
 pub struct Scene {
     /// Display name.
     pub name: String,
@@ -65,7 +66,7 @@ pub struct Scene {
     pub background: Option<[f32; 3]>,
     /// Foreground masks by view, where the dataset has them: white (first channel over 127) is foreground. Not cached.
     pub foreground_masks: Option<Arc<dyn FrameSource>>,
-    frames: FrameCache,
+    frames: Arc<FrameCache>,
 }
 
 impl Scene {
@@ -89,7 +90,7 @@ impl Scene {
             return Err(Error::data(name, "there is no training view", "Check the path, and that the images exist"));
         }
         let frame_count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
-        let frames = FrameCache { source, cap: cache_bytes, state: Mutex::default() };
+        let frames = Arc::new(FrameCache { source, cap: cache_bytes, state: Mutex::default() });
         Ok(Self {
             name,
             cameras,

@@ -49,6 +49,8 @@ pub struct Schedule {
     pub length: usize,
     /// Iterations of all stages together.
     pub total: usize,
+    /// Iterations in which every training camera (pose) of the stage is drawn once. At least 1.
+    pub pass: usize,
     /// Spherical-harmonics degree that is rendered now.
     pub sh_degree: usize,
     /// Image size over the recorded size, per axis, 0..1.
@@ -60,7 +62,7 @@ pub struct Schedule {
 impl Schedule {
     /// The first iteration of a main stage of `length` iterations, for tests and tools.
     pub fn main(length: usize) -> Self {
-        Self { stage: Stage::Main, iteration: 1, length, total: length, sh_degree: 3, image_scale: 1.0, extent: 1.0 }
+        Self { stage: Stage::Main, iteration: 1, length, total: length, pass: 1, sh_degree: 3, image_scale: 1.0, extent: 1.0 }
     }
     /// Share of the stage done after this iteration, above 0 and at most 1.
     pub fn progress(&self) -> f64 {

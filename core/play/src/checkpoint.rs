@@ -35,6 +35,10 @@ impl CheckpointArrays {
     /// Adds the values of `tensor`. Refuses values that are not finite: a checkpoint is there to go on from.
     pub fn add<const D: usize>(&mut self, name: String, tensor: &Tensor<D>) -> Result<()> {
         let values = to_vec(tensor.clone(), &name)?;
+        self.add_values(name, tensor.dims().to_vec(), values)
+    }
+    /// Adds `values` of `shape`, as [`CheckpointArrays::add`].
+    pub fn add_values(&mut self, name: String, shape: Vec<usize>, values: Vec<f32>) -> Result<()> {
         if values.iter().any(|v| !v.is_finite()) {
             return Err(Error::backend(
                 format!("checkpoint array {name}"),
@@ -42,7 +46,7 @@ impl CheckpointArrays {
                 "Resume from the checkpoint on disk with lower learning rates",
             ));
         }
-        self.0.push((name, tensor.dims().to_vec(), values));
+        self.0.push((name, shape, values));
         Ok(())
     }
     /// Writes a checkpoint of these arrays and `header`, all or nothing, and returns its size in bytes. `header` should hold `format: FORMAT`.

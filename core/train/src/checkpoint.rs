@@ -2,7 +2,7 @@
 
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
-use crate::train::{Parts, TrainState};
+use crate::train::{Guard, Parts, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
@@ -31,6 +31,8 @@ struct TrainingHeader {
     appearance: Vec<(String, usize)>,
     /// Arrays of the density control with their lengths.
     density: Vec<(String, usize)>,
+    /// Arrays of the guard of density control with their lengths.
+    guard: Vec<(String, usize)>,
     /// Arrays of the optimizer with their shapes.
     optimizer: Vec<(String, [usize; 2])>,
     /// Step counts of the optimizer.
@@ -42,6 +44,7 @@ struct TrainingHeader {
 struct TrainingArrays {
     appearance: Vec<Vec<f32>>,
     density: Vec<Vec<f32>>,
+    guard: Vec<Vec<f32>>,
     optimizer: Vec<Vec<f32>>,
 }
 
@@ -62,9 +65,10 @@ impl Checkpoint {
     pub fn into_state(self, run: &RunConfig, mut parts: Parts) -> Result<TrainState> {
         let stored: RunConfig = config::parse_section("configuration of the checkpoint", &self.model.provenance.config)?;
         let (mut now, mut then) = (run.clone(), stored);
-        // How often to say something does not change a result.
+        // What a run says about itself does not change its result.
         (now.train.log_every, now.train.checkpoint_every) = (0, 0);
         (then.train.log_every, then.train.checkpoint_every) = (0, 0);
+        (now.train.checks, then.train.checks) = (true, true);
         if now.to_toml()? != then.to_toml()? {
             return Err(Error::parameter(
                 "--resume",
@@ -83,6 +87,8 @@ impl Checkpoint {
         weights.iter_mut().zip(&self.arrays.appearance).for_each(|(parameter, values)| parameter.value = one(values));
         let density = training.density.iter().zip(&self.arrays.density).map(|((name, _), values)| (name.clone(), one(values))).collect();
         parts.density.restore(density, model.gaussians.len())?;
+        let guard = training.guard.iter().zip(self.arrays.guard).map(|((name, _), values)| (name.clone(), values)).collect();
+        let guard = Guard::restore(guard, model.gaussians.len())?;
         let two = |((name, shape), values): (&(String, [usize; 2]), &Vec<f32>)| {
             (name.clone(), Tensor::<2>::from_data(TensorData::new(values.clone(), *shape), &self.device))
         };
@@ -90,6 +96,7 @@ impl Checkpoint {
         parts.optimizer.restore(OptimizerState { arrays, steps: training.optimizer_steps })?;
         let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, parts);
         (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, model.field);
+        state.guard = guard;
         Ok(state)
     }
 }
@@ -116,6 +123,12 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
     for (name, values) in state.density.state() {
         arrays.add(format!("density/{name}"), &values)?;
         density.push((name, values.dims()[0]));
+    }
+    let mut guard = Vec::new();
+    for (name, values) in state.guard.state() {
+        let count = values.len();
+        arrays.add_values(format!("guard/{name}"), vec![count], values)?;
+        guard.push((name, count));
     }
     let optimizer_state = state.optimizer.state();
     let mut optimizer = Vec::new();
@@ -144,6 +157,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             smooth: state.smooth,
             appearance,
             density,
+            guard,
             optimizer,
             optimizer_steps: optimizer_state.steps,
         },
@@ -162,6 +176,7 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
     let arrays = TrainingArrays {
         appearance: list("appearance", &training.appearance)?,
         density: list("density", &training.density)?,
+        guard: list("guard", &training.guard)?,
         optimizer: optimizer.collect::<Result<_>>()?,
     };
     Ok(Checkpoint { model, training, arrays, device: device.clone() })

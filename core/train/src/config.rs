@@ -1,5 +1,7 @@
 //! The configuration of a run: presets, files and overrides, read strictly.
 
+use crate::auto::AutoConfig;
+use crate::layers::Layers;
 use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
 use cc4dgs_play::{RenderConfig, default_rasterizer};
 use serde::{Deserialize, Serialize};
@@ -12,6 +14,9 @@ pub struct RunConfig {
     /// Name of the preset it started from, for the record.
     #[serde(default)]
     pub preset: String,
+    /// What the preset `auto` was asked for and what it chose.
+    #[serde(default)]
+    pub auto: AutoConfig,
     /// Root of the seed tree.
     #[serde(default)]
     pub seed: u64,
@@ -91,14 +96,16 @@ fn cdf() -> toml::Table {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum InitSource {
-    /// The dataset's points, else photo-consistent ones if several cameras share a time, else random.
+    /// The dataset's points, else whatever the scene allows of the others, together.
     #[default]
     Auto,
     /// The dataset's points.
     Points,
-    /// Photo-consistent points of cameras that share a time.
+    /// Photo-consistent points of cameras that share a time, or of a moving camera at neighbouring times.
     Photo,
-    /// Random points in the scene's box.
+    /// The visual hull of the foreground: by masks, transparency or a plain background.
+    Hull,
+    /// Random points in the volume that the cameras see.
     Random,
 }
 
@@ -183,6 +190,11 @@ pub struct TrainConfig {
     pub sparse_adam: bool,
     /// Learning rates of the Gaussians.
     pub lr: GaussianRates,
+    /// Check the scene before training and the result afterwards. A scene that cannot be reconstructed is refused, and a run that stays below simple baselines
+    /// fails; without checks both go on. Changes nothing else.
+    pub checks: bool,
+    /// Training views, evenly spread, that are kept out of training and scored at its end. Test views are never looked at.
+    pub validation: usize,
     /// Iterations between two log events.
     pub log_every: usize,
     /// Iterations between two checkpoints; 0 writes only the last one.
@@ -209,6 +221,8 @@ impl Default for TrainConfig {
             dynamic: Dynamic::Auto,
             sparse_adam: true,
             lr: GaussianRates::default(),
+            checks: true,
+            validation: 0,
             log_every: 10,
             checkpoint_every: 5000,
         }
@@ -257,25 +271,11 @@ impl Default for GaussianRates {
 
 impl RunConfig {
     /// Layers a preset, a TOML file and `key=value` overrides, in that order, and reads the result strictly.
+    ///
+    /// # Errors
+    /// As [`Layers::collect`] and [`Layers::config`].
     pub fn resolve(preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
-        let mut table = toml::Table::new();
-        let from_file = match file {
-            Some(path) => {
-                let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
-                config::parse_table(&path.display().to_string(), &text)?
-            }
-            None => toml::Table::new(),
-        };
-        let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
-        if let Some(name) = preset.map(str::to_string).or(named) {
-            table = Registry::collect()?.preset(&name)?;
-        }
-        config::merge(&mut table, &from_file);
-        config::set_all(&mut table, sets)?;
-        refuse_renamed(&table)?;
-        let resolved: Self = config::parse_section("configuration", &table)?;
-        resolved.validate()?;
-        Ok(resolved)
+        Layers::collect(&Registry::collect()?, preset, file, sets)?.config()
     }
     /// This configuration with every setting of its plug-ins, defaults included.
     pub fn completed(&self, registry: &Registry) -> Result<Self> {
@@ -306,8 +306,9 @@ impl RunConfig {
         settled.render.background = Some(wanted.unwrap_or([1.0; 3]));
         Ok(settled)
     }
-    fn validate(&self) -> Result<()> {
+    pub(crate) fn validate(&self) -> Result<()> {
         self.scene.validate()?;
+        self.auto.validate()?;
         let t = &self.train;
         let bad = |key: &str, problem: String, remedy: &str| Err(Error::parameter(format!("train.{key}"), problem, remedy));
         if t.iterations == 0 || t.iterations > 10_000_000 {
@@ -347,21 +348,6 @@ impl RunConfig {
         }
         Ok(())
     }
-}
-
-/// Keys of earlier versions and what replaces them.
-const RENAMED: [(&str, &str); 2] =
-    [("train.densify", "[density], such as density.max_gaussians"), ("train.lambda_c", "the weights of [[loss]] kind = \"l1\" and kind = \"dssim\"")];
-
-/// Refuses keys of earlier versions; the error names the new ones.
-fn refuse_renamed(table: &toml::Table) -> Result<()> {
-    for (old, new) in RENAMED {
-        let (section, key) = old.split_once('.').unwrap_or((old, ""));
-        if table.get(section).and_then(|s| s.as_table()).is_some_and(|s| s.contains_key(key)) {
-            return Err(Error::parameter(old, "this key was replaced", format!("Use {new}")));
-        }
-    }
-    Ok(())
 }
 
 /// `section` with the settings that its plug-in's `schema` states where it has none of its own.

@@ -1,7 +1,9 @@
 //! Training and evaluation: readers, initialisation, the three-stage trainer, its checkpoints, scores of whole scenes. Plug-ins are named only in defaults.
 
 pub mod agreement;
+pub mod auto;
 pub mod checkpoint;
+pub mod checks;
 pub mod config;
 pub mod data;
 pub mod eval;
@@ -9,6 +11,7 @@ pub mod gaussian_set;
 pub mod images;
 pub mod init;
 pub mod knn;
+pub mod layers;
 pub mod masks;
 pub mod presets;
 pub mod schedule;

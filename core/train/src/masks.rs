@@ -24,32 +24,46 @@ pub fn dynamic_masks(scene: &Scene, split: Split, threshold: f32, background: [f
     let total = views_of_camera.len() as u64;
     let mut masks = Vec::new();
     for views in views_of_camera.into_values() {
-        let camera = scene.camera(views[0]);
-        let (w, h) = (camera.width as usize, camera.height as usize);
-        let (mut sum, mut squares) = (vec![0.0f64; 3 * w * h], vec![0.0f64; 3 * w * h]);
-        for &view in &views {
-            let planes = scene.frame(view)?.to_planes(background);
-            sum.par_iter_mut().zip(squares.par_iter_mut()).zip(planes.par_iter()).for_each(|((s, q), &v)| {
-                *s += f64::from(v);
-                *q += f64::from(v) * f64::from(v);
-            });
-        }
-        let n = views.len() as f64;
-        let deviation: Vec<f32> = (0..w * h)
-            .into_par_iter()
-            .map(|i| {
-                let per_channel = (0..3).map(|c| {
-                    let mean = sum[c * w * h + i] / n;
-                    (squares[c * w * h + i] / n - mean * mean).max(0.0).sqrt()
-                });
-                (per_channel.sum::<f64>() / 3.0) as f32
-            })
-            .collect();
-        let mask = blur(&deviation, w, h).into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
+        let mask = over_time(scene, &views, threshold, background)?.mask;
         masks.push(DynamicMask { view: views[0], mask });
         events.emit(&Event::Progress { task: "dynamic masks".into(), done: masks.len() as u64, total });
     }
     Ok(masks)
+}
+
+/// The images of one fixed camera over time.
+pub(crate) struct OverTime {
+    /// Sum of the images, planes `[3,H,W]`; over the number of images it is their mean.
+    pub sum: Vec<f64>,
+    /// 1 where the pixel is dynamic, else 0, row-major `[H,W]`.
+    pub mask: Vec<f32>,
+}
+
+/// Mean and mask of `views`, which are of one camera.
+pub(crate) fn over_time(scene: &Scene, views: &[usize], threshold: f32, background: [f32; 3]) -> Result<OverTime> {
+    let camera = scene.camera(views[0]);
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let (mut sum, mut squares) = (vec![0.0f64; 3 * w * h], vec![0.0f64; 3 * w * h]);
+    for &view in views {
+        let planes = scene.frame(view)?.to_planes(background);
+        sum.par_iter_mut().zip(squares.par_iter_mut()).zip(planes.par_iter()).for_each(|((s, q), &v)| {
+            *s += f64::from(v);
+            *q += f64::from(v) * f64::from(v);
+        });
+    }
+    let n = views.len() as f64;
+    let deviation: Vec<f32> = (0..w * h)
+        .into_par_iter()
+        .map(|i| {
+            let per_channel = (0..3).map(|c| {
+                let mean = sum[c * w * h + i] / n;
+                (squares[c * w * h + i] / n - mean * mean).max(0.0).sqrt()
+            });
+            (per_channel.sum::<f64>() / 3.0) as f32
+        })
+        .collect();
+    let mask = blur(&deviation, w, h).into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
+    Ok(OverTime { sum, mask })
 }
 
 /// 31x31 Gaussian of sigma 5 (OpenCV's automatic sigma), edges mirrored without repeating the border pixel.

@@ -45,6 +45,7 @@ macro_rules! methods {
 }
 
 families! {
+    "auto", "auto", true, "chooses every setting by looking at the scene, the machine and the time there is";
     "demo", "demo", true, "the built-in ray-traced scene, minutes on two cores";
     "n3dv", "n3dv", false, "Neural 3D Video, the paper's protocol";
     "technicolor", "technicolor", false, "Technicolor light field, the paper's protocol";
@@ -74,7 +75,7 @@ mod tests {
     fn every_family_and_method_resolves() {
         let registry = Registry::collect().unwrap();
         let names = |method: bool| registry.presets().filter(move |p| (p.role == PresetRole::Method) == method).map(|p| p.info.name).collect::<Vec<_>>();
-        assert_eq!((names(false).len(), names(true).len()), (7, 8));
+        assert_eq!((names(false).len(), names(true).len()), (8, 8));
         for family in names(false) {
             for method in names(true).into_iter().map(|name| format!("+{name}")).chain([String::new()]) {
                 let name = format!("{family}{method}");

@@ -8,6 +8,7 @@ use cc4dgs_core::{Schedule, Stage};
 pub struct StageLengths {
     lengths: [usize; 3],
     total: usize,
+    passes: [usize; 3],
     sh_degree: usize,
     sh_interval: usize,
     extent: f32,
@@ -24,16 +25,29 @@ impl StageLengths {
         let mut lengths = shares.map(|s| (config.iterations as f64 * s / sum).round() as usize);
         // Rounding goes to the longest stage, so that the stages add up to the number asked for.
         lengths[2] = config.iterations.saturating_sub(lengths[0] + lengths[1]);
-        Self { lengths, total: config.iterations, sh_degree: config.sh_degree, sh_interval: config.sh_interval, extent }
+        Self { lengths, total: config.iterations, passes: [1; 3], sh_degree: config.sh_degree, sh_interval: config.sh_interval, extent }
     }
     /// Iterations of `stage`.
     pub fn length(&self, stage: Stage) -> usize {
         self.lengths[stage as usize]
     }
+    /// States in how many iterations every camera of `stage` is drawn once.
+    pub fn set_pass(&mut self, stage: Stage, iterations: usize) {
+        self.passes[stage as usize] = iterations.max(1);
+    }
     /// Where iteration `iteration` (from 1) of `stage` stands.
     pub fn schedule(&self, stage: Stage, iteration: usize) -> Schedule {
         let length = self.length(stage);
-        let mut schedule = Schedule { stage, iteration, length, total: self.total, sh_degree: self.sh_degree, image_scale: 1.0, extent: self.extent };
+        let mut schedule = Schedule {
+            stage,
+            iteration,
+            length,
+            total: self.total,
+            pass: self.passes[stage as usize],
+            sh_degree: self.sh_degree,
+            image_scale: 1.0,
+            extent: self.extent,
+        };
         if stage == Stage::Coarse {
             schedule.sh_degree = (iteration.saturating_sub(1) / schedule.interval(self.sh_interval, 100)).min(self.sh_degree);
         }

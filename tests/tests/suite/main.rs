@@ -2,6 +2,7 @@
 #![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "tests: a failed helper is a failed test, and skipped ones say so")]
 
+mod auto;
 mod baselines;
 mod basis;
 mod cdf;

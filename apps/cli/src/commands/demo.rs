@@ -1,7 +1,7 @@
 //! `cc4dgs demo`: the whole chain on the built-in scene.
 
 use super::eval::{FullReport, Images, measure};
-use super::train::{resolve, train_into};
+use super::train::{Trained, layers, train_into};
 use super::{Context, compress, create_parent, eval, train};
 use crate::args::Demo;
 use crate::models::load_model;
@@ -43,9 +43,10 @@ struct DemoReport {
 
 pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let began = Instant::now();
-    let config = resolve(context, Some("demo"), None, &args.sets, args.device.as_deref())?;
+    let layers = layers(context, Some("demo"), None, &args.sets, args.device.as_deref())?;
     let scene_path = Path::new("procedural");
-    let (scene_name, trained) = train_into(context, &config, scene_path, &args.out, if args.overwrite { Existing::Overwrite } else { Existing::Refuse })?;
+    let existing = if args.overwrite { Existing::Overwrite } else { Existing::Refuse };
+    let Trained { scene: scene_name, config, report: trained } = train_into(context, &layers, scene_path, &args.out, existing)?;
 
     let events = context.listeners(Some((&args.out.join(EVENTS), true)))?;
     let archive = args.out.join("model.cc4d");

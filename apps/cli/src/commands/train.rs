@@ -5,13 +5,13 @@ use crate::args::Train;
 use crate::interrupt;
 use cc4dgs::plugins;
 use cc4dgs::runs::{EVENTS, Existing, check_folder};
-use cc4dgs_core::{Result, Scene};
+use cc4dgs_core::Result;
+use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
-use cc4dgs_train::data;
+use cc4dgs_train::layers::Layers;
 use cc4dgs_train::train::{CONFIG, TrainJob, TrainReport, train};
 use serde::Serialize;
 use std::path::Path;
-use std::sync::Arc;
 
 #[derive(Serialize)]
 struct Report<'a> {
@@ -20,6 +20,8 @@ struct Report<'a> {
     device: String,
     seed: u64,
     iterations: usize,
+    /// What the preset `auto` chose, and why.
+    plan: &'a [String],
     #[serde(flatten)]
     train: &'a TrainReport,
 }
@@ -31,37 +33,54 @@ pub fn run(context: &Context, args: &Train) -> Result<()> {
         None if args.resume && args.preset.is_none() && own.exists() => Some(own.as_path()),
         given => given.as_deref(),
     };
-    let config = resolve(context, args.preset.as_deref(), file, &args.sets, args.device.as_deref())?;
+    // Without a word on settings, the scene is looked at.
+    let preset = args.preset.as_deref().or((file.is_none()).then_some(auto::PRESET));
+    let minutes = args.minutes.map(|minutes| format!("auto.minutes={minutes}"));
+    let sets: Vec<String> = args.sets.iter().cloned().chain(minutes).collect();
+    let layers = layers(context, preset, file, &sets, args.device.as_deref())?;
     let existing = match (args.resume, args.overwrite) {
         (true, _) => Existing::Resume,
         (false, true) => Existing::Overwrite,
         (false, false) => Existing::Refuse,
     };
-    let (scene, report) = train_into(context, &config, &args.scene, &args.out, existing)?;
-    let shown =
-        Report { scene, preset: config.preset.clone(), device: config.device.clone(), seed: config.seed, iterations: config.train.iterations, train: &report };
-    context.output.result(&shown, || text(&report))
+    let trained = train_into(context, &layers, &args.scene, &args.out, existing)?;
+    let Trained { scene, config, report } = &trained;
+    let (preset, device) = (config.preset.clone(), config.device.clone());
+    let shown = Report { scene: scene.clone(), preset, device, seed: config.seed, iterations: config.train.iterations, plan: &config.auto.plan, train: report };
+    context.output.result(&shown, || text(report))
 }
 
-/// The configuration of preset, file and overrides, with the device and the limits of the command line on top.
-pub fn resolve(context: &Context, preset: Option<&str>, file: Option<&Path>, sets: &[String], device: Option<&str>) -> Result<RunConfig> {
+/// Preset, file and overrides, with the device and the limits of the command line on top.
+pub fn layers(context: &Context, preset: Option<&str>, file: Option<&Path>, sets: &[String], device: Option<&str>) -> Result<Layers> {
     let limits = context.limit_options.iter().map(|option| format!("limits.{option}"));
     let device = device.map(|name| format!("device={name}"));
     let sets: Vec<String> = sets.iter().cloned().chain(limits).chain(device).collect();
-    RunConfig::resolve(preset, file, &sets)
+    Layers::collect(&context.registry, preset, file, &sets)
 }
 
-/// Trains the scene at `scene_path` into the folder `out`; returns the scene's name and the report.
-pub fn train_into(context: &Context, config: &RunConfig, scene_path: &Path, out: &Path, existing: Existing) -> Result<(String, TrainReport)> {
+/// A training that ended.
+pub struct Trained {
+    /// Name of the scene.
+    pub scene: String,
+    /// The settings, with what the preset `auto` chose.
+    pub config: RunConfig,
+    /// What came of it.
+    pub report: TrainReport,
+}
+
+/// Trains the scene at `scene_path` into the folder `out`.
+pub fn train_into(context: &Context, layers: &Layers, scene_path: &Path, out: &Path, existing: Existing) -> Result<Trained> {
     let stop = interrupt::stop_flag()?;
     check_folder(out, existing, "Go on with it (train --resume), start anew in its place (--overwrite), or choose another folder")?;
-    plugins::check(config, &context.registry)?;
-    let scene: Arc<Scene> = Arc::new(data::open(scene_path, &config.scene, &context.registry, &config.limits)?);
+    plugins::check(&layers.config()?, &context.registry)?;
+    let (config, scene) = auto::open(scene_path, layers, &context.registry, &context.listeners(None)?)?;
+    plugins::check(&config, &context.registry)?;
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let resume = existing == Existing::Resume;
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;
-    let job = TrainJob { config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop };
-    Ok((scene.name.clone(), train(&job)?.1))
+    let job = TrainJob { config: &config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop };
+    let report = train(&job)?.1;
+    Ok(Trained { scene: scene.name.clone(), config, report })
 }
 
 /// The report for people.

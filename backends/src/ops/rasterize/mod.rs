@@ -156,7 +156,7 @@ pub struct RasterGradients<B: Backend> {
 }
 
 /// Rasterization per device.
-#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
+#[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"), Autodiff)]
 pub trait RasterOps: Backend {
     /// Renders Gaussians.
     fn rasterize(
@@ -206,7 +206,9 @@ pub struct RasterInputs {
 /// An error for a device without the operation.
 fn check_device(device: &Device, method: Method) -> Result<()> {
     match (device.clone().without_autodiff().as_dispatch(), method) {
-        (DispatchDevice::Flex(_) | DispatchDevice::NdArray(_), _) => Ok(()),
+        (DispatchDevice::Flex(_), _) => Ok(()),
+        #[cfg(feature = "ndarray")]
+        (DispatchDevice::NdArray(_), _) => Ok(()),
         #[cfg(feature = "cube")]
         (DispatchDevice::Cube(_), Method::Tiles) => Ok(()),
         #[cfg(feature = "cube")]

@@ -18,7 +18,7 @@ const LABEL: &str = "conformance-label";
 /// Tests a density control on `device`, with a coarse and a main stage of random statistics. Each finding is a line; an empty list means that it passed.
 ///
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
-/// - Plans refer to existing rows and attributes, set finite values, and never remove all Gaussians.
+/// - Plans refer to existing rows and attributes, set finite values, and never remove all Gaussians; half of what they remove is kept, as the trainer may.
 /// - Equal seeds give equal plans. State stored after any iteration continues with the same plans.
 /// - Stored state of another size is an error.
 /// - Gaussians without statistics, a single Gaussian, and centres that are not finite give plans or errors.
@@ -104,12 +104,19 @@ impl Suite<'_> {
         for (name, values) in control.after_step(&gaussians, schedule, seed.child("noise"))? {
             gaussians = replaced(&gaussians, &name, values)?;
         }
-        let plan = control.plan(&gaussians, schedule, seed.child("plan"))?;
-        if let Some(plan) = &plan {
-            plan.check(self.plugin.info.name, &gaussians)?;
-            gaussians = plan.apply(&gaussians)?;
+        let mut plan = control.plan(&gaussians, schedule, seed.child("plan"))?;
+        if let Some(plan) = &mut plan {
+            // The trainer may keep rows that a plan removes.
+            let removed = plan.removed(gaussians.len());
+            plan.restore(&removed[..removed.len() / 2]);
+            gaussians = self.execute(control, plan, &gaussians)?;
         }
         Ok((plan, gaussians))
+    }
+    fn execute(&self, control: &mut dyn DensityControl, plan: &DensityPlan, gaussians: &Gaussians) -> Result<Gaussians> {
+        plan.check(self.plugin.info.name, gaussians)?;
+        control.executed(plan, self.device)?;
+        plan.apply(gaussians)
     }
     /// Both stages. With `stored_at`, state and control are stored and rebuilt after that iteration of the main stage.
     fn run(&self, stored_at: Option<usize>) -> Result<Run> {
@@ -177,8 +184,7 @@ impl Suite<'_> {
                 let schedule = Self::schedule(Stage::Main, iteration);
                 // No Gaussian was visible in any view.
                 let Some(plan) = control.plan(&gaussians, &schedule, Seed::root(47).index(iteration as u64))? else { continue };
-                plan.check(self.plugin.info.name, &gaussians)?;
-                gaussians = plan.apply(&gaussians)?;
+                gaussians = self.execute(control.as_mut(), &plan, &gaussians)?;
             }
         }
         Ok(None)

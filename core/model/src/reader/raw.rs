@@ -151,6 +151,12 @@ impl RawScene {
         if let Some(t) = times.iter().flatten().find(|t| !t.is_finite() || **t < 0.0) {
             return Err(Error::data(object, format!("time {t} is negative or not finite"), "Correct the times in the file"));
         }
+        if let [Some(first), rest @ ..] = times
+            && !rest.is_empty()
+            && rest.iter().all(|t| t.is_some_and(|t| t == *first))
+        {
+            self.warnings.push(format!("all {} images state the same time, {first}: the scene is taken for a static one", times.len()));
+        }
         let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
         let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
         distinct.sort_by(f64::total_cmp);

@@ -19,7 +19,7 @@ mod normalise;
 pub mod npy;
 mod panoptic;
 pub mod procedural;
-mod resample;
+pub(crate) mod resample;
 mod select;
 mod sync;
 mod technicolor;

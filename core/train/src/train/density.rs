@@ -20,9 +20,14 @@ impl Context<'_> {
         }
         // The values may have changed.
         let gaussians = state.set.gaussians()?;
-        let Some(plan) = state.density.plan(&gaussians, schedule, seed.child("densify").index(index))? else { return Ok(()) };
-        plan.check(kind, &gaussians)?;
-        self.carry_out(&plan, state, schedule)
+        if let Some(mut plan) = state.density.plan(&gaussians, schedule, seed.child("densify").index(index))? {
+            plan.check(kind, &gaussians)?;
+            drop(gaussians);
+            self.guard_plan(&mut plan, state, schedule)?;
+            self.carry_out(&plan, state, schedule)?;
+            state.density.executed(&plan, &self.device)?;
+        }
+        self.guard_reset(state, schedule)
     }
 
     fn carry_out(&self, plan: &DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {

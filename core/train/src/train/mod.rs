@@ -2,18 +2,22 @@
 //! appearance model and optimizer.
 
 mod density;
+mod guard;
 mod log;
 mod losses;
 mod parameters;
+mod probe;
 mod sampler;
 mod score;
 mod smoothness;
 mod state;
 mod step;
 
+pub use guard::Guard;
 pub use state::{Parts, TrainState};
 
 use crate::checkpoint;
+use crate::checks::{Verdict, Watch, examine, hold_out};
 use crate::config::{CoarseFrames, Dynamic, RunConfig};
 use crate::gaussian_set::GaussianSet;
 use crate::init::initialise;
@@ -68,6 +72,8 @@ pub struct TrainReport {
     pub dynamic_gaussians: usize,
     /// The checkpoint, where a folder was given.
     pub checkpoint: Option<PathBuf>,
+    /// How it went; absent for runs that are too short to be judged, and without `train.checks`.
+    pub verdict: Option<Verdict>,
 }
 
 /// What stays fixed during a run.
@@ -89,11 +95,13 @@ pub(crate) struct Context<'a> {
 ///
 /// # Errors
 /// [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when the loss or the offsets are no longer numbers,
+/// [`Error::Data`] for a scene that cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines (the checkpoint is kept),
 /// and whatever the scene, the plug-ins or the disk report.
 pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let began = Instant::now();
     let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
-    let job = &TrainJob { config, scene: job.scene.clone(), out: job.out.clone(), ..*job };
+    let (scene, validation) = hold_out(&job.scene, config.train.validation)?;
+    let job = &TrainJob { config, scene, out: job.out.clone(), ..*job };
     if let Some(out) = &job.out {
         std::fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
         write_atomically(out.join(CONFIG), config.to_toml()?.as_bytes())?;
@@ -101,9 +109,13 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let device = parse_device(&config.device)?;
     let seed = Seed::root(config.seed);
     job.events.emit(&Event::RunStarted { command: "train".into(), device: config.device.clone(), seed: config.seed });
+    for line in config.auto.plan.iter().filter(|_| !job.resume) {
+        job.events.emit(&Event::Note { object: "plan".into(), message: line.clone() });
+    }
     for message in &job.scene.warnings {
         job.events.emit(&Event::Warning { object: job.scene.name.clone(), message: message.clone() });
     }
+    let doubts = if config.train.checks { examine(&job.scene, config.background()?, job.events)? } else { Vec::new() };
 
     let moving = decide_moving(job);
     let training_camera = training_cameras(&job.scene);
@@ -138,7 +150,7 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
             TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, parts)
         }
     };
-    let context = Context {
+    let mut context = Context {
         job,
         lengths: StageLengths::new(&config.train, matches!(moving, Moving::Scored { .. }), job.scene.extent()),
         rasterizer: job.registry.build_rasterizer(&config.rasterizer)?,
@@ -151,13 +163,19 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
         checkpoint,
     };
 
+    for stage in Stage::ALL {
+        let views = context.stage_views(stage);
+        let cameras: std::collections::BTreeSet<usize> = views.iter().map(|&view| job.scene.views[view].camera).collect();
+        context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.batch));
+    }
+    let mut watch = Watch::new(&context, doubts, validation);
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
         if stage < state.stage {
             continue;
         }
         let stage_began = Instant::now();
-        context.run_stage(stage, &mut state)?;
+        context.run_stage(stage, &mut state, &mut watch)?;
         stage_seconds.insert(stage.name().to_string(), stage_began.elapsed().as_secs_f64());
         if stage != Stage::Main {
             state.stage = Stage::ALL[stage as usize + 1];
@@ -165,6 +183,7 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
         }
     }
     context.save(&state)?;
+    let verdict = watch.conclude(&context, &mut state)?;
     let dynamic_gaussians = state.moving_rows(&context.device)?.count();
     let report = TrainReport {
         seconds: began.elapsed().as_secs_f64(),
@@ -172,6 +191,7 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
         gaussians: state.set.len(),
         dynamic_gaussians,
         checkpoint: context.checkpoint.clone(),
+        verdict,
     };
     Ok((checkpoint::trained_model(state, config)?, report))
 }
@@ -207,7 +227,7 @@ fn decide_moving(job: &TrainJob) -> Moving {
 }
 
 impl Context<'_> {
-    fn run_stage(&self, stage: Stage, state: &mut TrainState) -> Result<()> {
+    fn run_stage(&self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
         let length = self.lengths.length(stage);
         let events = self.job.events;
         if length == 0 || (stage == Stage::Score && self.masks.is_empty()) {
@@ -253,6 +273,7 @@ impl Context<'_> {
                 }
             }
             state.iteration = schedule.iteration;
+            watch.after_iteration(self, state, &schedule)?;
             let every = self.job.config.train.checkpoint_every;
             if every > 0 && state.iteration.is_multiple_of(every) && state.iteration < length {
                 self.save(state)?;

@@ -1,5 +1,6 @@
 //! Everything a run needs to continue to the same bytes.
 
+use super::guard::Guard;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
@@ -25,6 +26,8 @@ pub struct TrainState {
     pub appearance: Box<dyn Appearance>,
     /// Adds, moves and removes Gaussians.
     pub density: Box<dyn DensityControl>,
+    /// Keeps density control from doing harm.
+    pub guard: Guard,
     /// Steps everything that learns.
     pub optimizer: Box<dyn Optimizer>,
     /// Whether smoothness was switched on.
@@ -46,12 +49,27 @@ impl TrainState {
     /// A fresh run.
     pub fn new(set: GaussianSet, moving: Moving, normalisation: Similarity, parts: Parts) -> Self {
         let Parts { appearance, density, optimizer } = parts;
-        Self { stage: Stage::Coarse, iteration: 0, set, moving, normalisation, deformer: None, appearance, density, optimizer, smooth: false, rows: None }
+        let guard = Guard::default();
+        Self {
+            stage: Stage::Coarse,
+            iteration: 0,
+            set,
+            moving,
+            normalisation,
+            deformer: None,
+            appearance,
+            density,
+            guard,
+            optimizer,
+            smooth: false,
+            rows: None,
+        }
     }
     /// New optimizer state and statistics, as every stage starts with (Swift4D).
     pub fn begin_stage(&mut self, device: &Device) {
         self.optimizer.restart("");
         self.density.begin_stage(self.set.len(), device);
+        self.guard.begin_stage(self.set.len());
     }
     /// The rows the deformer moves; kept until the set changes.
     pub fn moving_rows(&mut self, device: &Device) -> Result<MovingRows> {

@@ -32,6 +32,8 @@ const RESET_OPACITY: f32 = 0.01;
 const MIN_RECOVERY: usize = 500;
 /// Least number of iterations between two weight prunings, so that all views contribute blending weights.
 const MIN_WEIGHT_INTERVAL: usize = 100;
+/// Passes over the cameras between two weight prunings: every camera has seen the Gaussians, and the Gaussians have been fitted to every camera.
+const WEIGHT_PASSES: usize = 2;
 /// Least number of iterations between two rounds.
 const MIN_INTERVAL: usize = 25;
 
@@ -75,7 +77,7 @@ impl Settings {
         schedule.at(if schedule.stage == Stage::Coarse { self.until.min(Stage::Coarse.reference_length()) } else { self.until })
     }
     fn weight_interval(&self, schedule: &Schedule) -> usize {
-        schedule.at(self.weight_every).max(MIN_WEIGHT_INTERVAL)
+        schedule.at(self.weight_every).max(MIN_WEIGHT_INTERVAL).max(WEIGHT_PASSES * schedule.pass)
     }
     /// The actions due after this iteration.
     fn due(&self, schedule: &Schedule) -> Due {
@@ -93,6 +95,8 @@ impl Settings {
 struct CloneSplit {
     settings: Settings,
     statistics: Statistics,
+    /// The actions of the last plan.
+    due: Due,
 }
 
 impl DensityControl for CloneSplit {
@@ -118,7 +122,7 @@ impl DensityControl for CloneSplit {
     }
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
         let due = self.settings.due(schedule);
-        let device = gaussians.means.device();
+        self.due = due;
         let mut plan = None;
         let mut logits = None;
         if due.grow || due.prune_weight {
@@ -126,7 +130,7 @@ impl DensityControl for CloneSplit {
             if due.reset {
                 host.opacity_logits.iter_mut().for_each(|v| *v = v.min(reset_logit()));
             }
-            plan = round(&self.settings, &mut self.statistics, &host, due, schedule.extent, seed, &device)?;
+            plan = round(&self.settings, &self.statistics, &host, due, schedule.extent, seed)?;
             logits = Some(host.opacity_logits);
         }
         if due.reset {
@@ -142,6 +146,12 @@ impl DensityControl for CloneSplit {
             plan.restart("opacity_logits");
         }
         Ok(plan)
+    }
+    fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
+        if self.due.grow || self.due.prune_weight {
+            self.statistics = self.statistics.after(plan, self.due.prune_weight, device)?;
+        }
+        Ok(())
     }
     fn state(&self) -> Vec<(String, Tensor<1>)> {
         self.statistics.arrays()
@@ -165,7 +175,7 @@ fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
     if settings.every == 0 {
         return Err(Error::parameter("density clone-split: every", "0 iterations", "Give at least 1, or use density.kind = \"none\""));
     }
-    Ok(Box::new(CloneSplit { settings, statistics: Statistics::zeros(0, &Device::flex()) }))
+    Ok(Box::new(CloneSplit { settings, statistics: Statistics::zeros(0, &Device::flex()), due: Due::default() }))
 }
 
 inventory::submit! {

@@ -2,7 +2,6 @@
 
 use super::Settings;
 use super::statistics::Statistics;
-use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, HostGaussians, Result, Seed};
 use rand::Rng;
@@ -24,16 +23,8 @@ pub(super) struct Due {
 /// A Gaussian to add: its parent, and a standard normal sample if it comes from a split.
 type Child = (usize, Option<[f32; 3]>);
 
-/// One round. Resets the statistics. `None` if every Gaussian would be removed; then all are kept.
-pub(super) fn round(
-    settings: &Settings,
-    statistics: &mut Statistics,
-    host: &HostGaussians,
-    due: Due,
-    extent: f32,
-    seed: Seed,
-    device: &Device,
-) -> Result<Option<DensityPlan>> {
+/// The plan of one round. `None` if every Gaussian would be removed; then all are kept.
+pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGaussians, due: Due, extent: f32, seed: Seed) -> Result<Option<DensityPlan>> {
     let n = host.len();
     let gradient = to_vec(statistics.gradient_sum.clone(), "screen gradients")?;
     let seen = to_vec(statistics.seen.clone(), "screen counts")?;
@@ -72,10 +63,8 @@ pub(super) fn round(
         }
     }
     if plan.is_empty() && children.is_empty() {
-        statistics.reset_gradients();
         return Ok(None);
     }
-    let kept = plan.len();
     for &(parent, normal) in &children {
         let row = plan.copy(parent);
         let Some(normal) = normal else { continue };
@@ -84,13 +73,6 @@ pub(super) fn round(
         plan.set(row, "means", &[means[0] + sample[0], means[1] + sample[1], means[2] + sample[2]]);
         let shrink = SPLIT_SHRINK.ln();
         plan.set(row, "log_scales", &[log_scales[0] - shrink, log_scales[1] - shrink, log_scales[2] - shrink]);
-    }
-    let count = plan.len();
-    *statistics = Statistics::zeros(count, device);
-    if !due.prune_weight {
-        // New Gaussians have no blending weights yet; weight 1 protects them from the next weight pruning.
-        let weights: Vec<f32> = plan.parents().iter().enumerate().map(|(row, &parent)| if row < kept { weight[parent].min(1.0) } else { 1.0 }).collect();
-        statistics.max_weight = Tensor::from_data(TensorData::new(weights, [count]), device);
     }
     Ok(Some(plan))
 }
@@ -110,6 +92,7 @@ fn standard_normal(rng: &mut impl Rng) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use burn::tensor::{Device, Tensor};
     use cc4dgs_core::ExtraAttribute;
 
     fn host_of(n: usize) -> HostGaussians {
@@ -136,9 +119,9 @@ mod tests {
         statistics.gradient_sum = Tensor::from_floats([1.0, 1.0, 1.0, 0.0], &device);
         statistics.seen = Tensor::ones([4], &device);
         let due = Due { grow: true, ..Default::default() };
-        let plan = round(&Settings::default(), &mut statistics, &host, due, 1.0, Seed::root(1), &device).unwrap().unwrap();
+        let plan = round(&Settings::default(), &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
         assert_eq!((plan.report.cloned, plan.report.split, plan.report.removed), (1, 1, 1));
-        assert_eq!(statistics.max_weight.dims(), [5]);
+        assert_eq!(to_vec(statistics.after(&plan, false, &device).unwrap().max_weight, "weights").unwrap(), [0.0, 0.0, 1.0, 1.0, 1.0]);
         let gaussians = cc4dgs_core::Gaussians::from_host(&host, &device);
         plan.check("clone-split", &gaussians).unwrap();
         let after = plan.apply(&gaussians).unwrap().to_host().unwrap();
@@ -153,7 +136,7 @@ mod tests {
         let mut statistics = Statistics::zeros(3, &device);
         statistics.max_weight = Tensor::from_floats([0.5, 0.0, 0.019], &device);
         let due = Due { prune_weight: true, ..Default::default() };
-        let plan = round(&Settings::default(), &mut statistics, &host_of(3), due, 1.0, Seed::root(1), &device).unwrap().unwrap();
+        let plan = round(&Settings::default(), &statistics, &host_of(3), due, 1.0, Seed::root(1)).unwrap().unwrap();
         assert_eq!((plan.report.removed, plan.parents()), (2, &[0][..]));
     }
 }

@@ -1,7 +1,8 @@
 //! Statistics summed over the views between two rounds, on the device.
 
-use burn::tensor::{Device, Tensor};
-use cc4dgs_core::{Error, Result, ViewStatistics};
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{DensityPlan, Error, Result, ViewStatistics};
 
 /// Sums over the views since the last round.
 pub(super) struct Statistics {
@@ -36,10 +37,18 @@ impl Statistics {
             self.max_weight = self.max_weight.clone().max_pair(weights.clone());
         }
     }
-    /// Resets the gradients, after every round.
-    pub fn reset_gradients(&mut self) {
-        self.gradient_sum = self.gradient_sum.zeros_like();
-        self.seen = self.seen.zeros_like();
+    /// The statistics with which the Gaussians of `plan` start. Gradients start from zero after every round, weights after a weight pruning. New Gaussians have no
+    /// weights yet; weight 1 protects them from the next weight pruning.
+    pub fn after(&self, plan: &DensityPlan, weights_restart: bool, device: &Device) -> Result<Self> {
+        let count = plan.len();
+        let mut next = Self::zeros(count, device);
+        if !weights_restart {
+            let weights = to_vec(self.max_weight.clone(), "blending weights")?;
+            let rows = plan.parents().iter().zip(plan.fresh());
+            let inherited: Vec<f32> = rows.map(|(&parent, &fresh)| if fresh { 1.0 } else { weights[parent].min(1.0) }).collect();
+            next.max_weight = Tensor::from_data(TensorData::new(inherited, [count]), device);
+        }
+        Ok(next)
     }
     /// The arrays by name.
     pub fn arrays(&self) -> Vec<(String, Tensor<1>)> {

@@ -1,0 +1,250 @@
+//! From what is known of a scene and a machine to settings, each with its reason.
+
+use super::facts::{Arrangement, Facts};
+use cc4dgs_core::SceneOptions;
+use toml::Value;
+
+/// Pixels per image that a thread can train on in a minute and still see every part of the scene a few hundred times.
+const PIXELS_PER_THREAD_MINUTE: f64 = 1.0e4;
+/// How many threads a graphics card stands for.
+const GRAPHICS_THREADS: f64 = 100.0;
+/// Images up to this much larger than that are left as they are.
+const SPARE: f64 = 1.4;
+/// Fewest pixels that images are reduced to.
+const LEAST_PIXELS: f64 = 2.0e4;
+/// Gaussians per pixel with detail.
+const PER_DETAIL: f64 = 0.8;
+/// Fewest Gaussians at most.
+const LEAST_GAUSSIANS: f64 = 4000.0;
+/// Gaussians that a thread can train in a minute.
+const PER_THREAD_MINUTE: f64 = 4000.0;
+/// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
+const EXPOSURE: f32 = 0.09;
+/// Share of moving pixels below which a scene is static.
+const STATIC: f32 = 2e-4;
+/// Share of transparent pixels from which a scene is an object without surroundings.
+const OBJECT: f32 = 0.05;
+
+/// The computer.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Machine {
+    /// Threads of the processor that are used.
+    pub threads: usize,
+    /// Whether a graphics card computes.
+    pub graphics: bool,
+    /// Memory in bytes, if the system says.
+    pub memory: Option<u64>,
+}
+
+impl Machine {
+    /// How many processor threads it stands for.
+    fn speed(self) -> f64 {
+        if self.graphics { GRAPHICS_THREADS } else { self.threads.max(1) as f64 }
+    }
+}
+
+/// Settings that have one reason.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Choice {
+    /// Keys such as `train.batch`, with their values.
+    pub settings: Vec<(&'static str, Value)>,
+    /// Why, in words.
+    pub reason: String,
+}
+
+fn choice(settings: impl IntoIterator<Item = (&'static str, Value)>, reason: impl Into<String>) -> Choice {
+    Choice { settings: settings.into_iter().collect(), reason: reason.into() }
+}
+
+fn float(value: f64) -> Value {
+    // Six digits: what is written to config.toml is read back to the same number.
+    Value::Float(format!("{value:.6}").parse().unwrap_or(value))
+}
+
+fn integer(value: f64) -> Value {
+    Value::Integer(value.round() as i64)
+}
+
+/// The width images are trained at, where their `native` size is too much for the time. Sizes that the user stated count instead.
+pub(super) fn image_size(native: [u32; 2], options: &SceneOptions, machine: Machine, minutes: f64) -> Option<Choice> {
+    if options.width > 0 || options.height > 0 || options.downscale != 1.0 {
+        return None;
+    }
+    let pixels = f64::from(native[0]) * f64::from(native[1]);
+    let affordable = (PIXELS_PER_THREAD_MINUTE * machine.speed() * minutes).max(LEAST_PIXELS);
+    if pixels <= SPARE * affordable {
+        return None;
+    }
+    let width = (f64::from(native[0]) * (affordable / pixels).sqrt()).round().max(1.0);
+    let reason = format!("images of {}x{} pixels are too many for {minutes:.0} minutes on this machine", native[0], native[1]);
+    Some(choice([("scene.width", integer(width))], reason))
+}
+
+/// Memory for decoded images: all of them, as long as a third of the machine's memory holds them.
+pub(super) fn cache(facts: &Facts, all_views: usize, options: &SceneOptions, machine: Machine) -> Option<Choice> {
+    let needed = all_views as f64 * facts.pixels() * 4.0 / 1e6;
+    let most = machine.memory.map_or(options.cache_mb as f64, |bytes| bytes as f64 / 3e6);
+    let wanted = needed.min(most).ceil();
+    (wanted > options.cache_mb as f64).then(|| choice([("scene.cache_mb", integer(wanted))], format!("{all_views} images are kept decoded")))
+}
+
+/// Every other setting but the number of iterations.
+pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64) -> Vec<Choice> {
+    let mut choices = vec![field(facts, machine), stages(facts), counts(facts, machine, minutes)];
+    choices.extend(background(facts));
+    choices.extend(near(facts));
+    choices.extend(noise(facts));
+    choices.extend(exposure(facts));
+    choices.extend(colour(facts));
+    choices
+}
+
+fn stands_still(facts: &Facts) -> bool {
+    facts.frames <= 1 || facts.moving.is_some_and(|share| share < STATIC)
+}
+
+fn field(facts: &Facts, machine: Machine) -> Choice {
+    if stands_still(facts) {
+        return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
+    }
+    let bands = if facts.arrangement.has_several_cameras() && facts.frames > 100 { 6 } else { 4 };
+    let mut settings = vec![("deformer.kind", "cdf-basis".into()), ("deformer.time_bands", Value::Integer(bands))];
+    if !machine.graphics {
+        settings.push(("deformer.capacity", "small".into()));
+        settings.push(("deformer.resolutions", Value::Array([8, 16, 32, 64].map(Value::Integer).to_vec())));
+        settings.push(("deformer.hashes", Value::Integer(64)));
+    }
+    choice(settings, format!("{} frames; the most accurate field for its time", facts.frames))
+}
+
+fn stages(facts: &Facts) -> Choice {
+    let shares = |shares: [f64; 3]| Value::Array(shares.map(Value::Float).to_vec());
+    let base = [("train.batch", Value::Integer(1))];
+    let (settings, reason) = match facts.arrangement {
+        _ if stands_still(facts) => (vec![("train.shares", shares([1.0, 0.0, 4.0])), ("train.coarse_frames", "all".into())], "a static scene".to_string()),
+        Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere => (
+            vec![("train.shares", shares([2.0, 0.0, 18.0])), ("train.coarse_frames", "all".into()), ("train.dynamic", "all".into())],
+            format!("{}: a single image says nothing of depth, so all frames come at once and everything may move", facts.arrangement.describe()),
+        ),
+        Arrangement::Photos | Arrangement::Dome | Arrangement::Rig => {
+            let smooth = if facts.frames < 12 { 0.0 } else { 0.05 };
+            (
+                vec![
+                    ("train.shares", shares([5.0, 3.0, 20.0])),
+                    ("train.coarse_frames", "first".into()),
+                    ("train.dynamic", "auto".into()),
+                    ("train.time_ramp", Value::Float(0.4)),
+                    ("train.lambda_r", Value::Float(smooth)),
+                ],
+                format!("{} training cameras, {}: the first frame, then what moves", facts.cameras, facts.arrangement.describe()),
+            )
+        }
+    };
+    choice(base.into_iter().chain(settings), reason)
+}
+
+fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
+    let wanted = PER_DETAIL * facts.pixels() * f64::from(facts.detail);
+    let affordable = PER_THREAD_MINUTE * machine.speed() * minutes;
+    let most = wanted.min(affordable).max(LEAST_GAUSSIANS);
+    let most = (most / 500.0).ceil() * 500.0;
+    let reason = format!("{:.0} % of the pixels show detail", 100.0 * facts.detail);
+    choice([("density.kind", "clone-split".into()), ("density.max_gaussians", integer(most)), ("init.count", integer(0.6 * most))], reason)
+}
+
+fn background(facts: &Facts) -> Option<Choice> {
+    let (colour, reason) = match facts.plain {
+        Some(colour) => (colour, "the images have a plain background of this colour"),
+        None if facts.transparent > OBJECT => ([1.0; 3], "the images are transparent"),
+        None => return None,
+    };
+    Some(choice([("render.background", Value::Array(colour.map(|c| float(f64::from(c))).to_vec()))], reason))
+}
+
+fn near(facts: &Facts) -> Option<Choice> {
+    match facts.arrangement {
+        Arrangement::Dome => Some(choice(
+            [("render.rules", "inria".into()), ("render.near", Value::Float(1.0))],
+            "other cameras of the dome may stand among its Gaussians: nothing nearer than a quarter of the way is drawn",
+        )),
+        Arrangement::OneMovingCamera | Arrangement::Rig | Arrangement::Photos => {
+            Some(choice([("render.rules", "inria".into()), ("render.near", Value::Float(0.2))], "nothing nearer than a twentieth of the way is drawn"))
+        }
+        Arrangement::OneCameraAnywhere => None,
+    }
+}
+
+fn noise(facts: &Facts) -> Option<Choice> {
+    let noise = f64::from(facts.noise?);
+    let threshold = 4.0 * noise;
+    let reason = format!("the images have noise of {:.1} levels", 255.0 * noise);
+    (threshold > 0.02 && !stands_still(facts)).then(|| choice([("train.mask_threshold", float(threshold.min(0.2)))], reason))
+}
+
+fn exposure(facts: &Facts) -> Option<Choice> {
+    let ratio = facts.exposure.filter(|ratio| *ratio > EXPOSURE)?;
+    let reason = format!("neighbouring cameras differ in brightness by {:.0} %", 100.0 * (ratio.exp() - 1.0));
+    Some(choice([("appearance.kind", "affine".into())], reason))
+}
+
+/// Few cameras cannot tell how colours change with the direction.
+fn colour(facts: &Facts) -> Option<Choice> {
+    let degree = match facts.cameras {
+        0..=4 => 0,
+        5..=8 => 1,
+        9..=24 => 2,
+        _ => return None,
+    };
+    Some(choice([("train.sh_degree", Value::Integer(degree))], format!("{} cameras say little of how colours change with the direction", facts.cameras)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MACHINE: Machine = Machine { threads: 2, graphics: false, memory: Some(24_000_000_000) };
+
+    fn facts(arrangement: Arrangement) -> Facts {
+        Facts {
+            arrangement,
+            views: 480,
+            cameras: 16,
+            frames: 30,
+            size: [320, 180],
+            points: 0,
+            transparent: 0.0,
+            plain: None,
+            detail: 0.4,
+            moving: Some(0.1),
+            noise: Some(0.001),
+            exposure: Some(0.02),
+        }
+    }
+
+    fn value(choices: &[Choice], key: &str) -> Option<Value> {
+        choices.iter().flat_map(|c| &c.settings).find(|(k, _)| *k == key).map(|(_, v)| v.clone())
+    }
+
+    #[test]
+    fn scenes_get_what_they_need_and_no_more() {
+        let dome = choose(&facts(Arrangement::Dome), MACHINE, 5.0);
+        assert_eq!(value(&dome, "deformer.kind"), Some("cdf-basis".into()));
+        assert_eq!(value(&dome, "train.coarse_frames"), Some("first".into()));
+        assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none() && value(&dome, "render.background").is_none());
+        let photos = choose(&Facts { frames: 1, moving: None, noise: None, ..facts(Arrangement::Photos) }, MACHINE, 5.0);
+        assert_eq!(value(&photos, "deformer.kind"), Some("none".into()));
+        let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
+        let odd = choose(&odd, MACHINE, 5.0);
+        assert_eq!(value(&odd, "train.dynamic"), Some("all".into()));
+        assert!(value(&odd, "appearance.kind").is_some() && value(&odd, "train.mask_threshold").is_some() && value(&odd, "render.background").is_some());
+    }
+
+    #[test]
+    fn images_shrink_to_the_time() {
+        let options = SceneOptions::default();
+        assert!(image_size([320, 180], &options, MACHINE, 10.0).is_none());
+        let width = image_size([1920, 1080], &options, MACHINE, 10.0).and_then(|c| c.settings[0].1.as_integer()).unwrap();
+        assert!((500..700).contains(&width), "{width}");
+        assert!(image_size([1920, 1080], &SceneOptions { width: 700, ..options }, MACHINE, 10.0).is_none());
+    }
+}

@@ -1,0 +1,187 @@
+//! The preset `auto`: a plan made by looking at the scene, the machine and the time there is. Every choice is stated with its reason, written into `config.toml`, and
+//! can be overridden.
+
+mod calibrate;
+mod choose;
+mod facts;
+
+pub use choose::{Choice, Machine};
+pub use facts::{Arrangement, Facts};
+
+use crate::config::RunConfig;
+use crate::data;
+use crate::layers::Layers;
+use calibrate::{Timing, calibrate};
+use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, auto_device, config};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Name of the preset.
+pub const PRESET: &str = "auto";
+/// Minutes on processors and on a graphics card, where none are asked for.
+const MINUTES: [f64; 2] = [10.0, 5.0];
+/// Share of the time that training itself gets; reading, initial points and checkpoints take the rest.
+const TRAINING_SHARE: f64 = 0.88;
+/// Fewest and most iterations.
+const ITERATIONS: [f64; 2] = [500.0, 200_000.0];
+/// Iterations below which a run is too short for its scene.
+const SHORT: f64 = 2000.0;
+/// Iterations of the score stage per unit of the score that a Gaussian can reach in them.
+const ITERATIONS_PER_SCORE: f64 = 400.0;
+
+/// The section `[auto]`: what was asked, and what came of it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AutoConfig {
+    /// Wall time of the training in minutes on this machine; absent: ten on processors, five on a graphics card. Read by the preset `auto` only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub minutes: Option<f64>,
+    /// The plan, a line per choice. Where it is stated, the settings are those of the file and none is chosen anew.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub plan: Vec<String>,
+}
+
+impl AutoConfig {
+    /// Refuses times that are not positive or longer than a month.
+    pub(crate) fn validate(&self) -> Result<()> {
+        match self.minutes {
+            Some(minutes) if !(minutes > 0.0 && minutes <= 43_200.0) => {
+                Err(Error::parameter("auto.minutes", format!("{minutes} minutes"), "Give a time above 0 and of at most 43,200 minutes"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Choices as a table of settings, in order.
+#[derive(Default)]
+struct Plan {
+    table: toml::Table,
+    choices: Vec<Choice>,
+}
+
+impl Plan {
+    fn add(&mut self, choice: Choice) -> Result<()> {
+        for (key, value) in &choice.settings {
+            config::set(&mut self.table, &format!("{key}={value}"))?;
+        }
+        self.choices.push(choice);
+        Ok(())
+    }
+    /// A line per choice that `layers` do not override.
+    fn lines(&self, layers: &Layers) -> Vec<String> {
+        let line = |choice: &Choice| {
+            let own: Vec<String> = choice.settings.iter().filter(|(key, _)| !layers.state(key)).map(|(key, value)| format!("{key} = {value}")).collect();
+            (!own.is_empty()).then(|| format!("{} ({})", own.join(", "), choice.reason))
+        };
+        self.choices.iter().filter_map(line).collect()
+    }
+}
+
+/// Opens the scene at `path` and settles the configuration of `layers`. Where they ask for the preset `auto` and hold no plan yet, the plan is made here.
+///
+/// # Errors
+/// What configuration, reader and images report.
+pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn EventSink) -> Result<(RunConfig, Arc<Scene>)> {
+    let asked = layers.config()?;
+    let read = |config: &RunConfig| Ok::<_, Error>(Arc::new(data::open(path, &config.scene, registry, &config.limits)?));
+    if !layers.want_plan() {
+        return Ok((asked.clone(), read(&asked)?));
+    }
+    let step = |done| events.emit(&Event::Progress { task: "look at the scene".into(), done, total: 3 });
+    step(0);
+    let mut plan = Plan::default();
+    let device = if layers.state("device") { asked.device.clone() } else { auto_device().0.to_string() };
+    plan.add(Choice { settings: vec![("device", device.clone().into())], reason: auto_device().1 })?;
+    let machine = Machine { threads: rayon::current_num_threads(), graphics: !matches!(device.as_str(), "flex" | "ndarray"), memory: memory() };
+    let minutes = asked.auto.minutes.unwrap_or(MINUTES[usize::from(machine.graphics)]);
+    let mut scene = read(&asked)?;
+    if let Some(choice) = choose::image_size(native_size(&scene), &asked.scene, machine, minutes) {
+        plan.add(choice)?;
+        scene = read(&layers.over(&plan.table).config()?)?;
+    }
+    step(1);
+    let facts = Facts::of(&scene)?;
+    step(2);
+    if let Some(choice) = choose::cache(&facts, scene.views.len(), &asked.scene, machine).filter(|_| !layers.state("scene.cache_mb")) {
+        plan.add(choice)?;
+        scene = read(&layers.over(&plan.table).config()?)?;
+    }
+    for choice in choose::choose(&facts, machine, minutes) {
+        plan.add(choice)?;
+    }
+    if !layers.state("train.iterations") {
+        let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &scene, registry)?;
+        plan.add(iterations(&facts, &layers.over(&plan.table).config()?, timing, minutes))?;
+    }
+    step(3);
+    let config = layers.over(&plan.table).config()?;
+    if facts.arrangement.has_several_cameras() && facts.moving.is_some() {
+        let score = config.train.iterations as f64 * config.train.shares[1] / config.train.shares.iter().sum::<f64>();
+        let zeta = (score / ITERATIONS_PER_SCORE).clamp(1.0, 7.0);
+        let reason = format!("what a score can reach in {score:.0} iterations of its stage");
+        plan.add(Choice { settings: vec![("train.zeta", toml::Value::Float((100.0 * zeta).round() / 100.0))], reason })?;
+    }
+    let mut config = layers.over(&plan.table).config()?;
+    let [width, height] = facts.size;
+    let seen = format!("{}: {} training images of {width}x{height} pixels, {} frames", facts.arrangement.describe(), facts.views, facts.frames);
+    config.auto.plan = [vec![seen], plan.lines(layers)].concat();
+    if (config.train.iterations as f64) < SHORT {
+        config
+            .auto
+            .plan
+            .push(format!("{} iterations are few: more minutes or smaller images (--minutes, scene.width) give a better model", config.train.iterations));
+    }
+    Ok((config, scene))
+}
+
+/// The iterations that `minutes` allow.
+fn iterations(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64) -> Choice {
+    let total: f64 = config.train.shares.iter().sum::<f64>().max(1e-9);
+    let main = config.train.shares[2] / total;
+    let moving = if facts.arrangement.has_several_cameras() { (2.0 * f64::from(facts.moving.unwrap_or(0.5))).min(1.0) } else { 1.0 };
+    let still = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
+    let moving = if still { 0.0 } else { moving };
+    let ms = timing.still + main * moving * (timing.moving - timing.still);
+    let count = (TRAINING_SHARE * minutes * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
+    let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
+    let reason = format!("{minutes} minutes at about {ms:.0} ms per iteration on this machine");
+    Choice { settings: vec![("train.iterations", toml::Value::Integer(count as i64))], reason }
+}
+
+/// Width and height in pixels of the median training camera.
+fn native_size(scene: &Scene) -> [u32; 2] {
+    let mut sizes: Vec<[u32; 2]> = scene.cameras.iter().map(|c| [c.width, c.height]).collect();
+    sizes.sort_unstable_by_key(|size| u64::from(size[0]) * u64::from(size[1]));
+    sizes.get(sizes.len() / 2).copied().unwrap_or([1, 1])
+}
+
+/// Memory of the machine in bytes, where the system says.
+fn memory() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    line.split_whitespace().next()?.parse::<u64>().ok().map(|kb| kb * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_stated_is_not_in_the_plan() {
+        let registry = Registry::collect().unwrap();
+        let layers = Layers::collect(&registry, Some(PRESET), None, &["train.batch=3".into()]).unwrap();
+        let mut plan = Plan::default();
+        plan.add(Choice { settings: vec![("train.batch", 1.into()), ("train.zeta", 2.5.into())], reason: "because".into() }).unwrap();
+        assert_eq!(plan.lines(&layers), ["train.zeta = 2.5 (because)"]);
+        let config = layers.over(&plan.table).config().unwrap();
+        assert_eq!((config.train.batch, config.train.zeta), (3, 2.5));
+    }
+
+    #[test]
+    fn times_are_checked() {
+        let with = |minutes| AutoConfig { minutes: Some(minutes), ..Default::default() }.validate();
+        assert!(with(3.0).is_ok() && with(0.0).is_err() && with(f64::NAN).is_err() && with(1e9).is_err());
+    }
+}

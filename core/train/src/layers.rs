@@ -1,0 +1,99 @@
+//! The layers of a configuration: preset, TOML file, overrides.
+
+use crate::auto::PRESET as AUTO;
+use crate::config::RunConfig;
+use cc4dgs_core::{Error, Registry, Result, config};
+use std::path::Path;
+
+/// What a user said of a run, as one table; what was not said is absent.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Layers {
+    table: toml::Table,
+}
+
+impl Layers {
+    /// Layers a preset, a TOML file and `key=value` overrides, in that order. Without `preset`, the preset that the file names.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for unknown presets, text that is not TOML and keys of earlier versions; [`Error::Io`] for the file.
+    pub fn collect(registry: &Registry, preset: Option<&str>, file: Option<&Path>, sets: &[String]) -> Result<Self> {
+        let from_file = match file {
+            Some(path) => {
+                let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+                config::parse_table(&path.display().to_string(), &text)?
+            }
+            None => toml::Table::new(),
+        };
+        let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
+        let mut table = match preset.map(str::to_string).or(named) {
+            Some(name) => registry.preset(&name)?,
+            None => toml::Table::new(),
+        };
+        config::merge(&mut table, &from_file);
+        config::set_all(&mut table, sets)?;
+        refuse_renamed(&table)?;
+        Ok(Self { table })
+    }
+    /// The configuration they make, read strictly; what they do not say has its default.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for unknown keys and values out of range.
+    pub fn config(&self) -> Result<RunConfig> {
+        let resolved: RunConfig = config::parse_section("configuration", &self.table)?;
+        resolved.validate()?;
+        Ok(resolved)
+    }
+    /// These layers over `base`.
+    pub fn over(&self, base: &toml::Table) -> Self {
+        let mut table = base.clone();
+        config::merge(&mut table, &self.table);
+        Self { table }
+    }
+    /// Whether they state the key at `path`, such as `train.iterations`.
+    pub fn state(&self, path: &str) -> bool {
+        let mut keys = path.split('.');
+        let first = keys.next().and_then(|key| self.table.get(key));
+        keys.fold(first, |value, key| value.and_then(|v| v.as_table()).and_then(|t| t.get(key))).is_some()
+    }
+    /// Whether the preset is `auto` (or `auto+METHOD`) and its plan is still to be made.
+    pub fn want_plan(&self) -> bool {
+        let preset = self.table.get("preset").and_then(|p| p.as_str()).unwrap_or_default();
+        preset.split('+').next() == Some(AUTO) && !self.state("auto.plan")
+    }
+}
+
+/// Keys of earlier versions and what replaces them.
+const RENAMED: [(&str, &str); 2] =
+    [("train.densify", "[density], such as density.max_gaussians"), ("train.lambda_c", "the weights of [[loss]] kind = \"l1\" and kind = \"dssim\"")];
+
+/// Refuses keys of earlier versions; the error names the new ones.
+fn refuse_renamed(table: &toml::Table) -> Result<()> {
+    for (old, new) in RENAMED {
+        let (section, key) = old.split_once('.').unwrap_or((old, ""));
+        if table.get(section).and_then(|s| s.as_table()).is_some_and(|s| s.contains_key(key)) {
+            return Err(Error::parameter(old, "this key was replaced", format!("Use {new}")));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn plans_are_asked_for_once() {
+        let registry = Registry::collect().unwrap();
+        let layers = |preset, sets: &[&str]| {
+            let sets: Vec<String> = sets.iter().map(ToString::to_string).collect();
+            Layers::collect(&registry, preset, None, &sets).unwrap()
+        };
+        assert!(layers(Some("auto"), &[]).want_plan() && layers(Some("auto+hexplane"), &[]).want_plan());
+        assert!(!layers(Some("demo"), &[]).want_plan() && !layers(None, &[]).want_plan());
+        let done = layers(Some("auto"), &["auto.plan=['chosen']", "train.iterations=7"]);
+        assert!(!done.want_plan() && done.state("train.iterations") && !done.state("train.batch") && !done.state("train.iterations.x"));
+        let base = "[train]\niterations = 3\nbatch = 4".parse().unwrap();
+        let config = done.over(&base).config().unwrap();
+        assert_eq!((config.train.iterations, config.train.batch), (7, 4));
+    }
+}

@@ -1,0 +1,79 @@
+//! The preset `auto`: plans for captures, and that no density control makes a training collapse.
+
+use burn::tensor::Device;
+use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
+use cc4dgs_core::{Event, Recorder, Registry, Scene, Silent, Split};
+use cc4dgs_play::Model;
+use cc4dgs_train::auto;
+use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::eval::evaluate;
+use cc4dgs_train::layers::Layers;
+use cc4dgs_train::train::{TrainJob, train};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// The plan for a capture at small size, with a stated number of iterations, so that nothing depends on how fast the machine is.
+fn planned(capture: &str, sets: &[&str], registry: &Registry) -> (RunConfig, Arc<Scene>) {
+    let sets: Vec<String> = ["scene.width=64", "device=flex", "train.log_every=10"].iter().chain(sets).map(ToString::to_string).collect();
+    let layers = Layers::collect(registry, Some(auto::PRESET), None, &sets).unwrap();
+    auto::open(Path::new(&format!("procedural:captures/{capture}")), &layers, registry, &Silent).unwrap()
+}
+
+fn trained(config: &RunConfig, scene: &Arc<Scene>, registry: &Registry) -> (Model, Vec<Event>) {
+    let (events, stop) = (Recorder::default(), AtomicBool::new(false));
+    let job = TrainJob { config, scene: scene.clone(), out: None, resume: false, registry, events: &events, stop: &stop };
+    let model = train(&job).unwrap().0;
+    (model, events.events())
+}
+
+/// Gaussians are neither lost nor multiplied without bound, and the held-out images are better than a grey blur, with each density control.
+#[test]
+fn density_control_does_not_collapse() {
+    let registry = Registry::collect().unwrap();
+    let controls: Vec<&str> = registry.plugins().into_iter().filter(|(kind, _)| *kind == "density").map(|(_, plugin)| plugin.name).collect();
+    assert!(controls.len() >= 2);
+    // PSNR in dB that each capture reaches at this size in 300 iterations, less a margin.
+    for (capture, floor_db) in [("handheld", 14.0), ("turntable", 14.0), ("rig", 14.0)] {
+        for control in &controls {
+            let density = format!("density={{kind='{control}'}}");
+            let (config, scene) = planned(capture, &["train.iterations=300", "init.count=1500", &density], &registry);
+            let (model, events) = trained(&config, &scene, &registry);
+            let begun = events.iter().find_map(|event| match event {
+                Event::StageStarted { gaussians, .. } => Some(*gaussians),
+                _ => None,
+            });
+            let (begun, ended) = (begun.unwrap(), model.gaussians.len());
+            assert!(2 * ended >= begun && ended <= 20 * begun, "{capture}, {control}: {begun} Gaussians became {ended}");
+            let psnr = evaluate(&model, &scene, Split::Test, 6, &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db;
+            assert!(psnr >= floor_db, "{capture}, {control}: {psnr:.2} dB, at least {floor_db} are expected");
+        }
+    }
+}
+
+/// What is special about a capture is found, and what is stated has precedence.
+#[test]
+fn plans_fit_the_capture() {
+    let registry = Registry::collect().unwrap();
+    let plan = |capture: &str| planned(capture, &["train.iterations=100"], &registry).0;
+    let kind = |section: &toml::Table| section["kind"].as_str().unwrap().to_string();
+    let photos = plan("photos");
+    assert_eq!(kind(&photos.deformer), "none");
+    let handheld = plan("handheld");
+    assert_eq!((kind(&handheld.deformer), handheld.train.iterations), ("cdf-basis".into(), 100));
+    assert_eq!(kind(&plan("exposure").appearance), "affine");
+    assert_eq!(kind(&plan("dome").appearance), "none");
+    let turntable = plan("turntable");
+    assert!(turntable.render.background.unwrap().iter().all(|c| *c > 0.97), "{:?}", turntable.render.background);
+    assert!(handheld.render.background.is_none());
+    // The plan is part of the configuration; planning again from it changes nothing.
+    let text = handheld.to_toml().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("config.toml");
+    std::fs::write(&file, &text).unwrap();
+    let layers = Layers::collect(&registry, None, Some(&file), &[]).unwrap();
+    assert!(!layers.want_plan() && !handheld.auto.plan.is_empty());
+    assert_eq!(layers.config().unwrap().to_toml().unwrap(), text);
+    let (other, _) = planned("handheld", &["train.iterations=100", "deformer.kind=hexplane", "train.batch=2"], &registry);
+    assert_eq!((kind(&other.deformer), other.train.batch), ("hexplane".into(), 2));
+}
