@@ -157,7 +157,8 @@ fn stages(facts: &Facts) -> Choice {
 fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
     let wanted = PER_DETAIL * facts.pixels() * f64::from(facts.detail);
     // Where everything moves, each costs several times as much.
-    let all_move = !facts.arrangement.has_several_cameras() && !stands_still(facts) && (stands_alone(facts) || facts.arrangement == Arrangement::OneCameraAnywhere);
+    let all_move =
+        !facts.arrangement.has_several_cameras() && !stands_still(facts) && (stands_alone(facts) || facts.arrangement == Arrangement::OneCameraAnywhere);
     let affordable = PER_THREAD_MINUTE * machine.speed() * minutes * if all_move { ALL_MOVE } else { 1.0 };
     let most = wanted.min(affordable).max(LEAST_GAUSSIANS);
     let most = (most / 500.0).ceil() * 500.0;

@@ -37,8 +37,7 @@ impl Context<'_> {
         let typical = all.get(all.len() / 2).copied().unwrap_or(0.0);
         let threshold = (OVER_TYPICAL * typical).max(LEAST);
         let moving = 1.0 - all.partition_point(|v| *v <= threshold) as f32 / all.len().max(1) as f32;
-        let message =
-            format!("{:.0} % of the pixels differ from the static reconstruction by more than {threshold:.3} (typical {typical:.3})", 100.0 * moving);
+        let message = format!("{:.0} % of the pixels differ from the static reconstruction by more than {threshold:.3} (typical {typical:.3})", 100.0 * moving);
         self.job.events.emit(&Event::Note { object: "motion".into(), message });
         let mask = |residual: Vec<f32>| residual.into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
         Ok(views.into_iter().zip(residuals).map(|(view, residual)| DynamicMask { view, mask: mask(residual) }).collect())

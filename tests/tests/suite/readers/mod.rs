@@ -11,3 +11,4 @@ mod invariance;
 mod procedural;
 mod real;
 mod selection;
+mod videos;
