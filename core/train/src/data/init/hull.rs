@@ -24,7 +24,7 @@ const MISSES_AT_ONE_TIME: [f32; 2] = [0.08, 0.2];
 /// The same across times.
 const MISSES_ACROSS_TIMES: [f32; 3] = [0.1, 0.25, 0.4];
 /// The shares for the box around everything that is foreground at some time, at one time and across times: what moves is often somewhere else.
-const MISSES_OF_BOX: [f32; 2] = [0.5, 0.8];
+const MISSES_OF_BOX: [f32; 2] = [0.5, 0.92];
 /// Points that make a hull.
 const ENOUGH: usize = 500;
 /// One in so many points inside the surface is kept.

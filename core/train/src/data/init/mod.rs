@@ -31,6 +31,8 @@ use views::{Foreground, WorkSet};
 const SHARE_HULL: f64 = 0.25;
 const SHARE_BETWEEN: f64 = 0.25;
 const SHARE_GUESSED: f64 = 0.05;
+/// Share of the wanted points that are random where there is nothing but foreground and no time has several cameras: what moves is in no hull.
+const SHARE_RANDOM: f64 = 0.25;
 /// Share of the wanted points that there are at least; random ones make up for the rest.
 const SHARE_AT_LEAST: f64 = 0.25;
 /// The fewest points that make a reconstruction.
@@ -146,8 +148,11 @@ pub fn find_points(scene: &Scene, source: InitSource, count: usize, seed: Seed) 
         ));
     }
     let wanted = [1.0, SHARE_BETWEEN, SHARE_HULL, SHARE_GUESSED.min(fused.unexplained)];
-    let shares = share_out(groups.each_ref().map(Vec::len), wanted, count);
-    let mut found = FoundPoints { across_times: set.arrangement == Arrangement::AcrossTimes, ..Default::default() };
+    let across_times = set.arrangement == Arrangement::AcrossTimes;
+    let moves_alone = source == InitSource::Auto && across_times && scene.frame_count > 1 && set.foreground == Foreground::Whole;
+    let reserved = if moves_alone { (SHARE_RANDOM * count as f64) as usize } else { 0 };
+    let shares = share_out(groups.each_ref().map(Vec::len), wanted, count - reserved);
+    let mut found = FoundPoints { across_times, ..Default::default() };
     found.matched = found.add(&groups[0][..shares[0]]);
     found.between = found.add(&groups[1][..shares[1]]);
     found.hull = found.add(&groups[2][..shares[2]]);
@@ -157,7 +162,7 @@ pub fn find_points(scene: &Scene, source: InitSource, count: usize, seed: Seed) 
         InitSource::Auto => ((count as f64 * SHARE_AT_LEAST) as usize).max(1),
         _ => 0,
     };
-    let missing = least.saturating_sub(found.cloud.positions.len());
+    let missing = least.saturating_sub(found.cloud.positions.len()).max(reserved);
     found.random = found.add(&volume::random_points(&set, missing, seed.child("random")));
     Ok(found)
 }

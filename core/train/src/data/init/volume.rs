@@ -13,7 +13,7 @@ const ATTEMPTS: usize = 32;
 /// Cameras that must see a point, where there are that many.
 const SEEN_BY: usize = 2;
 /// Share of the cameras that see foreground at a random point, where there is nothing but foreground.
-const MIN_FOREGROUND: f32 = 0.2;
+const MIN_FOREGROUND: f32 = 0.08;
 /// The nearest point, as a share of the distance of what the cameras look at: uniform in inverse depth, half of the points would be before twice the near end.
 const NEAREST: f64 = 0.5;
 
