@@ -191,7 +191,7 @@ fn random_points_are_in_view_and_leave_it_open() {
             if z > 0.0 && (0.0..160.0).contains(&u) && (0.0..120.0).contains(&v) {
                 seen += 1;
                 let pixels = size * camera.fx / z;
-                assert!(pixels < 0.041 * 160.0, "{pixels} pixels");
+                assert!(pixels < 1.01 * 160.0 * 4.0 / 3000f64.sqrt(), "{pixels} pixels");
                 depth += opacity * std::f64::consts::TAU * pixels * pixels / (160.0 * 120.0) / scene.cameras.len() as f64;
             }
         }

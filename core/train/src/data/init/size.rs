@@ -11,7 +11,7 @@ const MAX_CAMERAS: usize = 64;
 /// Largest standard deviation of a Gaussian, as a share of the width of the image, at the nearest camera that sees it.
 const MAX_WIDTH_SHARE: f64 = 0.04;
 /// Where Gaussians are few, they may be as large as this over the root of their number, to cover the image.
-const COVER: f64 = 1.6;
+const COVER: f64 = 4.0;
 /// Largest optical depth of uncertain Gaussians, averaged over the pixels of all cameras.
 const MAX_OPTICAL_DEPTH: f64 = 2.0;
 /// No opacity is reduced further: fainter Gaussians learn little and are pruned.
@@ -53,7 +53,7 @@ fn mean(host: &HostGaussians, row: usize) -> DVec3 {
 }
 
 /// Caps the scales of `host` at 4 % of the width of the image in the nearest training camera that sees each Gaussian (in the nearest camera, if none does; more
-/// if there are fewer than 1,600 Gaussians), and returns how many were larger.
+/// if there are fewer than 10,000 Gaussians), and returns how many were larger.
 pub fn limit_sizes(scene: &Scene, host: &mut HostGaussians) -> usize {
     let eyes = eyes(scene);
     let share = MAX_WIDTH_SHARE.max(COVER / (host.len().max(1) as f64).sqrt());
