@@ -37,7 +37,7 @@ pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn Ev
     let mut host = from_points(&points, config.train.sh_degree, config.init.opacity);
     let capped = limit_sizes(scene, &mut host);
     if capped > 0 {
-        message += &format!("; {capped} made smaller, to at most 4 % of the width of an image");
+        message += &format!("; {capped} made smaller, because each would cover much of an image");
     }
     if let Some(opacity) = limit_opacities(scene, &mut host, uncertain) {
         message += &format!("; the opacity of random ones lowered to {opacity:.3}, so that they do not hide each other");

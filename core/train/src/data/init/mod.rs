@@ -33,6 +33,9 @@ const SHARE_BETWEEN: f64 = 0.25;
 const SHARE_GUESSED: f64 = 0.05;
 /// Share of the wanted points that are random where there is nothing but foreground and no time has several cameras: what moves is in no hull.
 const SHARE_RANDOM: f64 = 0.25;
+/// The shares where there is nothing but foreground: then the hull is the best guess of all that moves.
+const SHARE_HULL_WHOLE: f64 = 0.7;
+const SHARE_BETWEEN_WHOLE: f64 = 0.1;
 /// Share of the wanted points that there are at least; random ones make up for the rest.
 const SHARE_AT_LEAST: f64 = 0.25;
 /// The fewest points that make a reconstruction.
@@ -111,9 +114,8 @@ pub fn find_points(scene: &Scene, source: InitSource, count: usize, seed: Seed) 
     }
     let mut set = WorkSet::load(scene, choice)?;
     let mut hull_points = Vec::new();
-    if source != InitSource::Random || set.foreground == Foreground::Whole {
-        let points = |hull: &Hull| if source == InitSource::Random { Vec::new() } else { hull.points(seed.child("hull")) };
-        let found = Hull::find(&set).map(|hull| (points(&hull), hull.bounds()));
+    if source != InitSource::Random {
+        let found = Hull::find(&set).map(|hull| (hull.points(seed.child("hull")), hull.bounds()));
         if let Some((points, (low, high))) = found {
             hull_points = points;
             if set.foreground == Foreground::Whole {
@@ -147,9 +149,11 @@ pub fn find_points(scene: &Scene, source: InitSource, count: usize, seed: Seed) 
             "Check the calibration and the order of the cameras, or start from random points",
         ));
     }
-    let wanted = [1.0, SHARE_BETWEEN, SHARE_HULL, SHARE_GUESSED.min(fused.unexplained)];
+    let whole = set.foreground == Foreground::Whole;
+    let [hull, between] = if whole { [SHARE_HULL_WHOLE, SHARE_BETWEEN_WHOLE] } else { [SHARE_HULL, SHARE_BETWEEN] };
+    let wanted = [1.0, between, hull, SHARE_GUESSED.min(fused.unexplained)];
     let across_times = set.arrangement == Arrangement::AcrossTimes;
-    let moves_alone = source == InitSource::Auto && across_times && scene.frame_count > 1 && set.foreground == Foreground::Whole;
+    let moves_alone = source == InitSource::Auto && across_times && scene.frame_count > 1 && whole;
     let reserved = if moves_alone { (SHARE_RANDOM * count as f64) as usize } else { 0 };
     let shares = share_out(groups.each_ref().map(Vec::len), wanted, count - reserved);
     let mut found = FoundPoints { across_times, ..Default::default() };

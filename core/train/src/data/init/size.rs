@@ -10,6 +10,8 @@ use std::ops::Range;
 const MAX_CAMERAS: usize = 64;
 /// Largest standard deviation of a Gaussian, as a share of the width of the image, at the nearest camera that sees it.
 const MAX_WIDTH_SHARE: f64 = 0.04;
+/// Where Gaussians are few, they may be as large as this over the root of their number, to cover the image.
+const COVER: f64 = 4.0;
 /// Largest optical depth of uncertain Gaussians, averaged over the pixels of all cameras.
 const MAX_OPTICAL_DEPTH: f64 = 2.0;
 /// No opacity is reduced further: fainter Gaussians learn little and are pruned.
@@ -50,17 +52,18 @@ fn mean(host: &HostGaussians, row: usize) -> DVec3 {
     DVec3::from(std::array::from_fn(|k| f64::from(host.means[3 * row + k])))
 }
 
-/// Caps the scales of `host` at 4 % of the width of the image in the nearest training camera that sees each Gaussian (in the nearest camera, if none does), and
-/// returns how many were larger.
+/// Caps the scales of `host` at 4 % of the width of the image in the nearest training camera that sees each Gaussian (in the nearest camera, if none does; more
+/// if there are fewer than 10,000 Gaussians), and returns how many were larger.
 pub fn limit_sizes(scene: &Scene, host: &mut HostGaussians) -> usize {
     let eyes = eyes(scene);
+    let share = MAX_WIDTH_SHARE.max(COVER / (host.len().max(1) as f64).sqrt());
     let most: Vec<f32> = (0..host.len())
         .into_par_iter()
         .map(|row| {
             let p = mean(host, row);
             let seen = eyes.iter().filter_map(|e| e.magnification(p)).fold(0.0, f64::max);
             let near = || eyes.iter().map(|e| e.camera.fx / (f64::from(e.camera.width) * e.distance(p))).fold(1e-12, f64::max);
-            (MAX_WIDTH_SHARE / if seen > 0.0 { seen } else { near() }).ln() as f32
+            (share / if seen > 0.0 { seen } else { near() }).ln() as f32
         })
         .collect();
     let mut capped = 0;

@@ -12,8 +12,8 @@ use rayon::prelude::*;
 const ATTEMPTS: usize = 32;
 /// Cameras that must see a point, where there are that many.
 const SEEN_BY: usize = 2;
-/// Share of the cameras that see foreground at a random point, where there is nothing but foreground.
-const MIN_FOREGROUND: f32 = 0.08;
+/// Share of the cameras that must see foreground at a point to give it a colour.
+const MIN_FOREGROUND: f32 = 0.2;
 /// The nearest point, as a share of the distance of what the cameras look at: uniform in inverse depth, half of the points would be before twice the near end.
 const NEAREST: f64 = 0.5;
 
@@ -25,26 +25,19 @@ pub(super) fn random_points(set: &WorkSet, count: usize, seed: Seed) -> Vec<Cand
 
 fn random_point(set: &WorkSet, seed: Seed) -> Candidate {
     let mut rng = seed.rng();
-    let whole = set.foreground == Foreground::Whole;
-    let mut best = Candidate { position: set.rig.point.as_vec3(), color: [0.5; 3], confidence: 0.0, depth: 0.0 };
+    let mut position = set.rig.point.as_vec3();
     for _ in 0..ATTEMPTS {
-        let position = if whole {
+        position = if set.foreground == Foreground::Whole {
             set.box_low + (set.box_high - set.box_low) * Vec3::new(rng.random(), rng.random(), rng.random())
         } else {
             let view = &set.views[rng.random_range(0..set.keys)];
             behind_pixel(set, view, [rng.random(), rng.random(), rng.random()])
         };
-        let seen = colors(set, position);
-        if seen.count < SEEN_BY.min(set.views.len()) {
-            continue;
-        }
-        best = Candidate { position, color: seen.mean, ..best };
-        // Things that move are foreground in some of the images only.
-        if !whole || seen.solid as f32 >= MIN_FOREGROUND * seen.count as f32 {
+        if set.views.iter().filter(|v| v.pixel_of(position).is_some()).take(SEEN_BY).count() >= SEEN_BY.min(set.views.len()) {
             break;
         }
     }
-    best
+    Candidate { position, color: mean_color(set, position), confidence: 0.0, depth: 0.0 }
 }
 
 /// The point at the shares `at` of width, height and range of inverse depths of `view`.
@@ -55,19 +48,13 @@ fn behind_pixel(set: &WorkSet, view: &WorkView, at: [f64; 3]) -> Vec3 {
     view.unproject(level, at[0] * level.width as f64, at[1] * level.height as f64, 1.0 / (least + (most - least) * at[2]))
 }
 
-/// What the images show where they see a point.
-struct Colors {
-    /// Images that see it.
-    count: usize,
-    /// Images that show something of the scene there.
-    solid: usize,
-    /// Mean colour of those; grey if there are none.
-    mean: [f32; 3],
-}
-
-fn colors(set: &WorkSet, p: Vec3) -> Colors {
-    let seen = || set.views.iter().filter_map(|v| v.pixel_of(p).map(|pixel| (v, pixel)));
-    let solid: Vec<[f32; 3]> = seen().filter(|(v, pixel)| v.solid(set.foreground, *pixel)).map(|(v, pixel)| v.fine().rgb[pixel]).collect();
-    let mean = std::array::from_fn(|k| solid.iter().map(|c| c[k]).sum::<f32>() / solid.len() as f32);
-    Colors { count: seen().count(), solid: solid.len(), mean: if solid.is_empty() { [0.5; 3] } else { mean } }
+/// Mean colour of the scene where the images see `p`; grey where hardly any of them shows something.
+fn mean_color(set: &WorkSet, p: Vec3) -> [f32; 3] {
+    let seen: Vec<Option<[f32; 3]>> =
+        set.views.iter().filter_map(|v| v.pixel_of(p).map(|pixel| v.solid(set.foreground, pixel).then(|| v.fine().rgb[pixel]))).collect();
+    let solid: Vec<[f32; 3]> = seen.iter().flatten().copied().collect();
+    if solid.is_empty() || (solid.len() as f32) < MIN_FOREGROUND * seen.len() as f32 {
+        return [0.5; 3];
+    }
+    std::array::from_fn(|k| solid.iter().map(|c| c[k]).sum::<f32>() / solid.len() as f32)
 }
