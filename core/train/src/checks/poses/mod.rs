@@ -162,7 +162,9 @@ impl Comparison {
             return Some(finding);
         }
         let outliers = self.outliers(&judged);
-        if !outliers.is_empty() && outliers.len() * 3 <= self.looks.len() {
+        let rest: Vec<bool> = judged.iter().filter(|(pair, _)| !outliers.contains(&pair.from) && !outliers.contains(&pair.to)).map(|j| j.1).collect();
+        let rest_fits = rest.iter().filter(|fits| !**fits).count() as f64 <= DOUBT * rest.len() as f64;
+        if !outliers.is_empty() && outliers.len() * 3 <= self.looks.len() && rest_fits {
             let names: Vec<String> = outliers.iter().map(|&index| scene.camera(self.views[index]).name.clone()).collect();
             let problem = format!("the poses of {} cameras do not fit those of their neighbours: {}", names.len(), listed(&names));
             return Some(Finding::doubt(Subject::Poses, problem, "Correct these poses or leave the images out"));
