@@ -174,7 +174,7 @@ impl Comparison {
         let problem = format!("{found}: a part of the cameras has other units, another origin or wrong poses");
         (share >= DOUBT).then(|| Finding::new(severity, Subject::Poses, problem, "Check that all poses come from one reconstruction, in one unit"))
     }
-    /// Images of which no pair fits, with at least two pairs that say so.
+    /// Images of which at least two pairs do not fit, and at most a quarter does: two wrong poses fit by chance at times.
     fn outliers(&self, judged: &[(&Pair, bool)]) -> Vec<usize> {
         let mut votes: BTreeMap<usize, [u32; 2]> = BTreeMap::new();
         for (pair, fits) in judged {
@@ -182,7 +182,7 @@ impl Comparison {
                 votes.entry(index).or_default()[usize::from(*fits)] += 1;
             }
         }
-        votes.into_iter().filter(|(_, [against, in_favour])| *against >= 2 && *in_favour == 0).map(|(index, _)| index).collect()
+        votes.into_iter().filter(|(_, [against, in_favour])| *against >= 2 && *against >= 3 * *in_favour).map(|(index, _)| index).collect()
     }
     /// A focal length that fits clearly better, pair by pair.
     fn focal_length(&self) -> Option<Finding> {
