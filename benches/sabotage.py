@@ -217,6 +217,8 @@ def main():
     for name in names:
         copy, run = args.out / name / "scene", args.out / name / "run"
         damage(name, args.scene, copy)
+        # A refused run writes no checkpoint; one of an earlier call must not be scored in its place.
+        shutil.rmtree(run, ignore_errors=True)
         options = [part for assignment in args.sets for part in ("--set", assignment)]
         if args.preset:
             options += ["--preset", args.preset]

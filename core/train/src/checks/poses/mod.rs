@@ -52,12 +52,13 @@ const REFUSE_PART: f64 = 0.3;
 const REFUSE_ALL: f64 = 0.5;
 /// Pairs that are needed to refuse a part.
 const LEAST_PAIRS_OF_PART: usize = 20;
-/// Other focal lengths that are tried, as factors; how much better one must fit, and how well.
+/// Other focal lengths that are tried, as factors, and the most pairs they are tried on.
 const FOCALS: [f64; 2] = [0.75, 1.33];
-const BETTER: f64 = 0.035;
-const RIGHT: f64 = 0.65;
-/// Pairs that focal lengths are tried on.
-const FOCAL_PAIRS: usize = 24;
+const FOCAL_PAIRS: usize = 36;
+/// Mean gain of a pair's share from which another focal length is right, and that gain over its standard error. Measured: gains of 0.10 to 0.29 and ratios of
+/// 2.4 to 10 for focal lengths that are off by 30 %, at most 0.01 and 1.1 for correct ones.
+const BETTER: f64 = 0.05;
+const BETTER_ERRORS: f64 = 3.0;
 
 /// Two images and how well they fit, by index into the compared views.
 struct Pair {
@@ -162,7 +163,9 @@ impl Comparison {
             return Some(finding);
         }
         let outliers = self.outliers(&judged);
-        if !outliers.is_empty() && outliers.len() * 3 <= self.looks.len() {
+        let rest: Vec<bool> = judged.iter().filter(|(pair, _)| !outliers.contains(&pair.from) && !outliers.contains(&pair.to)).map(|j| j.1).collect();
+        let rest_fits = rest.iter().filter(|fits| !**fits).count() as f64 <= DOUBT * rest.len() as f64;
+        if !outliers.is_empty() && outliers.len() * 3 <= self.looks.len() && rest_fits {
             let names: Vec<String> = outliers.iter().map(|&index| scene.camera(self.views[index]).name.clone()).collect();
             let problem = format!("the poses of {} cameras do not fit those of their neighbours: {}", names.len(), listed(&names));
             return Some(Finding::doubt(Subject::Poses, problem, "Correct these poses or leave the images out"));
@@ -171,7 +174,7 @@ impl Comparison {
         let problem = format!("{found}: a part of the cameras has other units, another origin or wrong poses");
         (share >= DOUBT).then(|| Finding::new(severity, Subject::Poses, problem, "Check that all poses come from one reconstruction, in one unit"))
     }
-    /// Images of which no pair fits, with at least two pairs that say so.
+    /// Images of which at least two pairs do not fit, and at most a quarter does: two wrong poses fit by chance at times.
     fn outliers(&self, judged: &[(&Pair, bool)]) -> Vec<usize> {
         let mut votes: BTreeMap<usize, [u32; 2]> = BTreeMap::new();
         for (pair, fits) in judged {
@@ -179,29 +182,25 @@ impl Comparison {
                 votes.entry(index).or_default()[usize::from(*fits)] += 1;
             }
         }
-        votes.into_iter().filter(|(_, [against, in_favour])| *against >= 2 && *in_favour == 0).map(|(index, _)| index).collect()
+        votes.into_iter().filter(|(_, [against, in_favour])| *against >= 2 && *against >= 3 * *in_favour).map(|(index, _)| index).collect()
     }
-    /// A focal length that fits clearly better.
+    /// A focal length that fits clearly better, pair by pair.
     fn focal_length(&self) -> Option<Finding> {
         let chosen: Vec<&Pair> = spread(&(0..self.pairs.len()).collect::<Vec<_>>(), FOCAL_PAIRS).into_iter().map(|index| &self.pairs[index]).collect();
-        let total = |factor: f64| {
-            let tallies: Vec<Tally> = chosen.par_iter().map(|pair| self.tally(pair.from, pair.to, factor)).collect();
-            let mut sum = Tally::default();
-            tallies.iter().for_each(|tally| sum.add(tally));
-            sum
+        let n = chosen.len() as f64;
+        let gains = |factor: f64| -> (f64, f64) {
+            let gains: Vec<f64> = chosen.par_iter().map(|pair| self.tally(pair.from, pair.to, factor).share() - pair.tally.share()).collect();
+            let mean = gains.iter().sum::<f64>() / n;
+            let variance = gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+            (mean, (variance / n).sqrt())
         };
-        let own = total(1.0);
-        let (factor, best) = FOCALS.into_iter().map(|factor| (factor, total(factor))).max_by(|a, b| a.1.share().total_cmp(&b.1.share()))?;
-        // Three standard errors of a share around a half; matches of one image depend on each other.
-        let uncertain = 1.5 / f64::from(own.matches().max(1)).sqrt();
-        if own.matches() < LEAST_ALL_MATCHES || best.share() < RIGHT.max(own.share() + BETTER + uncertain) {
+        let (factor, gain, error) =
+            FOCALS.into_iter().map(|factor| (factor, gains(factor))).map(|(f, (gain, error))| (f, gain, error)).max_by(|a, b| a.1.total_cmp(&b.1))?;
+        if chosen.len() < LEAST_PAIRS || gain < BETTER.max(BETTER_ERRORS * error) {
             return None;
         }
-        let problem = format!(
-            "focal lengths times about {factor} fit better: {:.0} % of the matches lie on epipolar lines, {:.0} % with those of the dataset",
-            100.0 * best.share(),
-            100.0 * own.share()
-        );
+        let problem =
+            format!("focal lengths times about {factor} fit better: {:.0} % more of the matches of neighbouring cameras lie on epipolar lines", 100.0 * gain);
         Some(Finding::refuse(Subject::Poses, problem, "Check the focal lengths, and that they belong to the size of these images"))
     }
 }
