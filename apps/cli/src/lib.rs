@@ -19,12 +19,13 @@ use std::ffi::OsString;
 use std::process::ExitCode;
 
 /// Runs the `cc4dgs` command on `args` (the program's name first) and returns its exit code: 0 done, 2 user error, 3 data error, 4 out of memory or
-/// over a limit, 5 back end, 6 a training that failed, 130 interruption. Every plug-in linked into the program takes part.
+/// over a limit, 5 backend, 6 a training that failed, 130 interruption. Every plug-in linked into the program takes part.
 pub fn run<I, T>(args: I) -> ExitCode
 where
     I: IntoIterator<Item = T>,
     T: Into<OsString> + Clone,
 {
+    quiet_drivers();
     let cli = match args::Cli::try_parse_from(args) {
         Ok(cli) => cli,
         Err(error) => {
@@ -40,5 +41,14 @@ where
             output.failure(&error);
             ExitCode::from(error.exit_code())
         }
+    }
+}
+
+/// Graphics drivers print errors of their own where there is no desktop session and this variable is missing. They only look for a socket in the folder.
+fn quiet_drivers() {
+    const FOLDER: &str = "XDG_RUNTIME_DIR";
+    if cfg!(target_os = "linux") && std::env::var_os(FOLDER).is_none() {
+        // SAFETY: called before this program starts threads; nothing else reads or writes the environment meanwhile.
+        unsafe { std::env::set_var(FOLDER, std::env::temp_dir()) };
     }
 }

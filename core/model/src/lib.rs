@@ -45,7 +45,9 @@ pub use offsets::Offsets;
 pub use optimizer::{Optimizer, OptimizerPlugin, OptimizerState, StepSettings, state_array};
 pub use preset::{PresetPlugin, PresetRole};
 pub use raster::{ParameterSpace, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, RenderStats, RenderWork, SplatColors, Splats};
-pub use reader::{Background, CameraRef, Distortion, ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, SAME_TIME, SceneOptions};
+pub use reader::{
+    Background, CameraRef, Distortion, ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, SAME_TIME, SceneOptions, SyncMode,
+};
 pub use registry::Registry;
 pub use scene::{FrameSource, PointCloud, Scene, Split, View};
 pub use schedule::{REFERENCE_ITERATIONS, Schedule, Stage};

@@ -96,14 +96,16 @@ fn cdf() -> toml::Table {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum InitSource {
-    /// The dataset's points, else photo-consistent ones if several cameras share a time, else random.
+    /// The dataset's points, else whatever the scene allows of the others, together.
     #[default]
     Auto,
     /// The dataset's points.
     Points,
-    /// Photo-consistent points of cameras that share a time.
+    /// Photo-consistent points of cameras that share a time, or of a moving camera at neighbouring times.
     Photo,
-    /// Random points in the scene's box.
+    /// The visual hull of the foreground: by masks, transparency or a plain background.
+    Hull,
+    /// Random points in the volume that the cameras see.
     Random,
 }
 
@@ -123,7 +125,7 @@ pub enum CoarseFrames {
 pub enum Dynamic {
     /// By dynamic score where a camera has several frames, else all.
     Auto,
-    /// By dynamic score.
+    /// By dynamic score, fitted to what changes in the images of fixed cameras, or to what a static reconstruction does not explain where none is fixed.
     Score,
     /// All of them.
     All,

@@ -1,48 +1,49 @@
-//! The first Gaussians: from the dataset's points, from photo-consistent points, or at random.
+//! The first Gaussians: at the dataset's points, or at points found from the images.
 
 use crate::config::{InitSource, RunConfig};
+use crate::data::init::{find_points, limit_opacities, limit_sizes};
 use crate::knn::mean_squared_distance_3nn;
 use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, Event, EventSink, HostGaussians, PointCloud, Result, Scene, Seed, Split};
-use rand::Rng;
+use cc4dgs_core::{Error, Event, EventSink, HostGaussians, PointCloud, Result, Scene, Seed};
 use rand::seq::SliceRandom;
 
 /// The degree-0 basis function of spherical harmonics.
 pub const SH_C0: f32 = 0.282_094_8;
 
-/// Gaussians for `scene` as `config.init` wants them, at most `init.count`.
+/// Gaussians for `scene` as `config.init` wants them, at most `init.count`. An [`Event::Note`] says where they come from.
 pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn EventSink) -> Result<HostGaussians> {
     let count = config.init.count.min(config.limits.max_gaussians as usize);
-    let shared_time = {
-        let mut cameras_of_frame = std::collections::BTreeMap::new();
-        for view in scene.split(Split::Train) {
-            *cameras_of_frame.entry(scene.views[view].frame).or_insert(0usize) += 1;
+    let own = scene.points.as_ref().filter(|p| !p.positions.is_empty());
+    let mut uncertain = 0..0;
+    let (points, mut message) = match (config.init.source, own) {
+        (InitSource::Auto | InitSource::Points, Some(points)) => {
+            let points = thin(points.clone(), count, seed.child("thin"));
+            let message = format!("{} points of the dataset", points.positions.len());
+            (points, message)
         }
-        cameras_of_frame.values().copied().max().unwrap_or(0) >= 4
-    };
-    let source = match (config.init.source, &scene.points) {
-        (InitSource::Auto, Some(points)) if !points.positions.is_empty() => InitSource::Points,
-        (InitSource::Auto, _) if shared_time => InitSource::Photo,
-        (InitSource::Auto, _) => InitSource::Random,
-        (other, _) => other,
-    };
-    let points = match source {
-        InitSource::Points => {
-            scene.points.clone().ok_or_else(|| Error::parameter("init.source", "the scene has no points", "Use init.source = \"photo\" or \"random\""))?
+        (InitSource::Points, None) => {
+            return Err(Error::parameter("init.source", "the scene has no points", "Use init.source = \"auto\", \"photo\", \"hull\" or \"random\""));
         }
-        InitSource::Photo => crate::data::init::photo_points(scene, count, seed.child("photo"))?,
-        _ => random_points(scene, count, seed.child("random"))?,
+        (source, _) => {
+            let found = find_points(scene, source, count, seed)?;
+            uncertain = found.cloud.positions.len() - found.random..found.cloud.positions.len();
+            let message = found.describe();
+            (found.cloud, message)
+        }
     };
-    let points = thin(points, count, seed.child("thin"));
     if points.positions.is_empty() {
-        return Err(Error::data(&scene.name, format!("init.source = {source:?} found no points"), "Use init.source = \"random\""));
+        return Err(Error::data(&scene.name, format!("init.source = {:?} found no points", config.init.source), "Use init.source = \"random\""));
     }
-    events.emit(&Event::Progress {
-        task: format!("initial Gaussians ({})", format!("{source:?}").to_lowercase()),
-        done: points.positions.len() as u64,
-        total: points.positions.len() as u64,
-    });
-    Ok(from_points(&points, config.train.sh_degree, config.init.opacity))
+    let mut host = from_points(&points, config.train.sh_degree, config.init.opacity);
+    let capped = limit_sizes(scene, &mut host);
+    if capped > 0 {
+        message += &format!("; {capped} made smaller, because each would cover much of an image");
+    }
+    if let Some(opacity) = limit_opacities(scene, &mut host, uncertain) {
+        message += &format!("; the opacity of random ones lowered to {opacity:.3}, so that they do not hide each other");
+    }
+    events.emit(&Event::Note { object: "initial Gaussians".into(), message });
+    Ok(host)
 }
 
 /// Gaussians at `points`: isotropic with the root of the mean squared distance to three neighbours, `opacity`, no rotation.
@@ -63,16 +64,6 @@ pub fn from_points(points: &PointCloud, sh_degree: usize, opacity: f32) -> HostG
         host.sh_dc.extend(points.colors[i].map(|c| (c - 0.5) / SH_C0));
     }
     host
-}
-
-fn random_points(scene: &Scene, count: usize, seed: Seed) -> Result<PointCloud> {
-    let Some((low, high)) = scene.init_box else {
-        return Err(Error::data(&scene.name, "the reader found no box to place random points in", "Give the scene initial points"));
-    };
-    let mut rng = seed.rng();
-    let positions = (0..count).map(|_| std::array::from_fn(|k| low[k] + (high[k] - low[k]) * rng.random::<f32>())).collect();
-    let colors = (0..count).map(|_| std::array::from_fn(|_| rng.random::<f32>() / 255.0 * SH_C0 + 0.5)).collect();
-    Ok(PointCloud { positions, colors })
 }
 
 fn thin(points: PointCloud, count: usize, seed: Seed) -> PointCloud {

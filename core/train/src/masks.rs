@@ -67,7 +67,7 @@ pub(crate) fn over_time(scene: &Scene, views: &[usize], threshold: f32, backgrou
 }
 
 /// 31x31 Gaussian of sigma 5 (OpenCV's automatic sigma), edges mirrored without repeating the border pixel.
-fn blur(image: &[f32], w: usize, h: usize) -> Vec<f32> {
+pub(crate) fn blur(image: &[f32], w: usize, h: usize) -> Vec<f32> {
     const RADIUS: isize = 15;
     let mut kernel: Vec<f32> = (-RADIUS..=RADIUS).map(|d| (-(d * d) as f32 / 50.0).exp()).collect();
     let norm: f32 = kernel.iter().sum();

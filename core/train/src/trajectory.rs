@@ -1,47 +1,41 @@
-//! Trajectory error on a synthetic scene with known motion: trajectories of its Gaussians against the true ones, and images where the motion is, object by object.
+//! Trajectory error on a synthetic scene with known motion: trajectories of its Gaussians against the true ones, and images where the motion is, body by body.
 
-use crate::data::procedural::{Motion, ProceduralScene, Shape};
+use crate::data::procedural::{Body, ProceduralScene, Viewpoint};
 use burn::tensor::Device;
 use cc4dgs_core::{Event, EventSink, HostGaussians, Registry, Result, Split};
 use cc4dgs_play::{Model, Player};
 use glam::DVec3;
 use serde::Serialize;
 
-/// Gaussians this near to a ball's surface at the first frame, as shares of its radius, belong to it.
+/// Gaussians this near to an object's surface when it is first there belong to it. 0 is the deepest point, 1 the surface.
 const NEAR_SURFACE: [f64; 2] = [0.7, 1.2];
 /// Gaussians below this opacity count as invisible.
 const LEAST_OPACITY: f32 = 0.1;
-/// Times at which the pixels that an object covers are collected.
+/// Times at which the pixels that a body covers are collected for cameras that take all frames.
 const MOMENTS: usize = 24;
 
-/// One swaying object.
+/// One moving body: a ball, or all parts of a figure.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MotionScore {
-    /// Index among the scene's objects.
+    /// What it is.
+    pub name: String,
+    /// Index of its first object among the scene's objects.
     pub object: usize,
-    /// Cycles of its motion over the sequence.
-    pub cycles: f64,
-    /// Gaussians on its surface at the first frame.
+    /// Cycles of its motion over the sequence, if it repeats.
+    pub cycles: Option<f64>,
+    /// Gaussians on its surface when it is first there.
     pub gaussians: usize,
-    /// Root-mean-square distance of their displacements since the first frame from the true ones, over all frames at which they can be seen, as a share of the
+    /// Root-mean-square distance of their displacements since then from the true ones, over all frames at which they can be seen, as a share of the
     /// true displacement's root-mean-square: 0 follows exactly, 1 is as good as not moving. None without Gaussians.
     pub trajectory_error: Option<f64>,
-    /// PSNR over the pixels that the object ever covers, all held-out cameras and frames, 8-bit.
+    /// PSNR over the pixels that the body covers, all held-out images, 8-bit: those it ever covers for a camera that takes all frames, those of the
+    /// image's own frame for a moving camera.
     pub psnr_db: f64,
 }
 
-/// Scores every swaying ball of `scene` at the times of its frames, in the coordinates of `scene`.
+/// Scores every body of `scene` at the times of its frames, in the coordinates of `scene`.
 pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry, device: &Device, events: &dyn EventSink) -> Result<Vec<MotionScore>> {
-    let balls: Vec<(usize, f64, f64)> = scene
-        .objects
-        .iter()
-        .enumerate()
-        .filter_map(|(index, object)| match (object.motion, object.shape) {
-            (Motion::Sway { cycles, .. }, Shape::Sphere { radius }) => Some((index, cycles, radius)),
-            _ => None,
-        })
-        .collect();
-    if balls.is_empty() {
+    if scene.bodies.is_empty() {
         return Ok(Vec::new());
     }
     let mut player = Player::new(model, registry, device)?.on(Some(scene.background));
@@ -50,27 +44,31 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
         model.to_dataset(&mut found);
         Result::Ok(found)
     };
-    let first = gaussians_at(&mut player, 0.0)?;
-    let owned: Vec<Vec<usize>> = balls.iter().map(|&(object, _, radius)| on_ball(scene, object, radius, &first)).collect();
-    let cameras: Vec<_> = scene.cameras().into_iter().filter(|(_, split)| *split == Split::Test).map(|(camera, _)| camera).collect();
-    let masks: Vec<Vec<Vec<bool>>> = cameras.iter().map(|camera| covered(scene, camera, &balls)).collect();
+    let mut followed = Vec::with_capacity(scene.bodies.len());
+    for body in &scene.bodies {
+        let start = first_time(scene, body);
+        let gaussians = gaussians_at(&mut player, start as f32)?;
+        followed.push(Followed { start, rows: on_body(scene, body, start, &gaussians), gaussians });
+    }
+    let held_out: Vec<Viewpoint> = scene.viewpoints().into_iter().filter(|v| v.split == Split::Test).collect();
+    let masks: Vec<Vec<Vec<bool>>> = held_out.iter().map(|viewpoint| covered(scene, viewpoint)).collect();
 
-    let mut distances = vec![[0.0f64; 2]; balls.len()];
-    let mut errors = vec![(0.0f64, 0u64); balls.len()];
+    let mut distances = vec![[0.0f64; 2]; scene.bodies.len()];
+    let mut errors = vec![(0.0f64, 0u64); scene.bodies.len()];
     for frame in 0..scene.frames {
         let time = scene.time(frame);
         let now = gaussians_at(&mut player, time as f32)?;
-        for ((&(object, _, _), rows), sums) in balls.iter().zip(&owned).zip(&mut distances) {
-            for &row in rows.iter().filter(|&&row| opacity(&now, row) >= LEAST_OPACITY) {
-                let start = point(&first, row);
-                let truth = scene.advect(object, start, 0.0, time) - start;
+        for (followed, sums) in followed.iter().zip(&mut distances) {
+            for &(row, object) in followed.rows.iter().filter(|&&(row, object)| scene.objects[object].is_there(time) && opacity(&now, row) >= LEAST_OPACITY) {
+                let start = point(&followed.gaussians, row);
+                let truth = scene.advect(object, start, followed.start, time) - start;
                 sums[0] += (point(&now, row) - start - truth).length_squared();
                 sums[1] += truth.length_squared();
             }
         }
-        for (camera, masks) in cameras.iter().zip(&masks) {
-            let found = player.frame(&model.normalisation.apply_camera(camera), time as f32)?;
-            let truth = scene.render(camera, time);
+        for (viewpoint, masks) in held_out.iter().zip(&masks).filter(|(v, _)| v.frame.is_none_or(|own| own == frame)) {
+            let found = player.frame(&model.normalisation.apply_camera(&viewpoint.camera), time as f32)?;
+            let truth = scene.render(&viewpoint.camera, time);
             for (mask, sum) in masks.iter().zip(&mut errors) {
                 for (pixel, _) in mask.iter().enumerate().filter(|(_, covered)| **covered) {
                     for c in 3 * pixel..3 * pixel + 3 {
@@ -82,14 +80,25 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
         }
         events.emit(&Event::Progress { task: "trajectories".into(), done: frame as u64 + 1, total: scene.frames as u64 });
     }
-    let scores = balls.iter().zip(owned).zip(distances).zip(errors).map(|(((&(object, cycles, _), rows), d), (error, count))| MotionScore {
-        object,
-        cycles,
-        gaussians: rows.len(),
+    let scores = scene.bodies.iter().zip(followed).zip(distances).zip(errors).map(|(((body, followed), d), (error, count))| MotionScore {
+        name: body.name.clone(),
+        object: body.objects.start,
+        cycles: body.cycles,
+        gaussians: followed.rows.len(),
         trajectory_error: (d[1] > 0.0).then(|| (d[0] / d[1]).sqrt()),
         psnr_db: 10.0 * (255.0f64.powi(2) * count.max(1) as f64 / error.max(1e-9)).log10(),
     });
     Ok(scores.collect())
+}
+
+/// The Gaussians of one body.
+struct Followed {
+    /// When the body is first there.
+    start: f64,
+    /// All Gaussians at that time.
+    gaussians: HostGaussians,
+    /// Those on the body, with the object they are on.
+    rows: Vec<(usize, usize)>,
 }
 
 fn point(g: &HostGaussians, row: usize) -> DVec3 {
@@ -100,21 +109,30 @@ fn opacity(g: &HostGaussians, row: usize) -> f32 {
     1.0 / (1.0 + (-g.opacity_logits[row]).exp())
 }
 
-/// The Gaussians on the ball's surface at time 0 that can be seen.
-fn on_ball(scene: &ProceduralScene, object: usize, radius: f64, g: &HostGaussians) -> Vec<usize> {
-    let pose = scene.objects[object].motion.pose(0.0);
-    let near = |row: &usize| (NEAR_SURFACE[0]..NEAR_SURFACE[1]).contains(&(pose.inverse_apply(point(g, *row)).length() / radius));
-    (0..g.len()).filter(|row| opacity(g, *row) >= LEAST_OPACITY && near(row)).collect()
+/// The time of the first frame at which the body is there.
+fn first_time(scene: &ProceduralScene, body: &Body) -> f64 {
+    let there = |time: &f64| body.objects.clone().any(|object| scene.objects[object].is_there(*time));
+    (0..scene.frames).map(|frame| scene.time(frame)).find(there).unwrap_or(0.0)
 }
 
-/// Per ball, the pixels it covers at some moment.
-fn covered(scene: &ProceduralScene, camera: &cc4dgs_core::Camera, balls: &[(usize, f64, f64)]) -> Vec<Vec<bool>> {
-    let pixels = (camera.width * camera.height) as usize;
-    let mut masks = vec![vec![false; pixels]; balls.len()];
-    for moment in 0..MOMENTS {
-        let seen = scene.tracer(moment as f64 / MOMENTS as f64).objects_seen(camera);
-        for (mask, &(object, _, _)) in masks.iter_mut().zip(balls) {
-            mask.iter_mut().zip(&seen).for_each(|(m, s)| *m |= *s == Some(object));
+/// The Gaussians on the body's surfaces at `time` that can be seen, each with the object it is nearest to.
+fn on_body(scene: &ProceduralScene, body: &Body, time: f64, g: &HostGaussians) -> Vec<(usize, usize)> {
+    let nearest = |row: usize| {
+        let shares = body.objects.clone().map(|object| (scene.depth_share(object, point(g, row), time), object));
+        shares.min_by(|a, b| (a.0 - 1.0).abs().total_cmp(&(b.0 - 1.0).abs())).filter(|(share, _)| (NEAR_SURFACE[0]..NEAR_SURFACE[1]).contains(share))
+    };
+    (0..g.len()).filter(|row| opacity(g, *row) >= LEAST_OPACITY).filter_map(|row| nearest(row).map(|(_, object)| (row, object))).collect()
+}
+
+/// Per body, the pixels it covers at some moment, or at the frame that the viewpoint takes.
+fn covered(scene: &ProceduralScene, viewpoint: &Viewpoint) -> Vec<Vec<bool>> {
+    let pixels = (viewpoint.camera.width * viewpoint.camera.height) as usize;
+    let mut masks = vec![vec![false; pixels]; scene.bodies.len()];
+    let moments = viewpoint.frame.map_or_else(|| (0..MOMENTS).map(|moment| moment as f64 / MOMENTS as f64).collect(), |frame| vec![scene.time(frame)]);
+    for moment in moments {
+        let seen = scene.tracer(moment).objects_seen(&viewpoint.camera);
+        for (mask, body) in masks.iter_mut().zip(&scene.bodies) {
+            mask.iter_mut().zip(&seen).for_each(|(m, s)| *m |= s.is_some_and(|object| body.objects.contains(&object)));
         }
     }
     masks
@@ -123,26 +141,57 @@ fn covered(scene: &ProceduralScene, camera: &cc4dgs_core::Camera, balls: &[(usiz
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::procedural::Shape;
+
+    /// A Gaussian on the surface of every object of the bodies, at the time its body is first there, and one where nothing is.
+    fn on_surfaces(scene: &ProceduralScene) -> HostGaussians {
+        let mut g = HostGaussians::default();
+        for body in &scene.bodies {
+            for object in body.objects.clone() {
+                let (shape, pose) = (scene.objects[object].shape, scene.objects[object].motion.pose(first_time(scene, body)));
+                let aside = if let Shape::Cuboid { half } = shape { half.x } else { shape.inner_radius() };
+                let at = scene.unit.apply(pose.apply(DVec3::X * aside).to_array());
+                g.means.extend(at.map(|v| v as f32));
+                g.opacity_logits.push(2.0);
+            }
+        }
+        g.means.extend([1e7; 3]);
+        g.opacity_logits.push(2.0);
+        g
+    }
 
     #[test]
     fn masks_cover_the_path_and_gaussians_belong_to_their_ball() {
         let scene = ProceduralScene::named("frequencies").unwrap();
-        let balls: Vec<usize> = (0..scene.objects.len()).filter(|&k| matches!(scene.objects[k].motion, Motion::Sway { .. })).collect();
-        assert_eq!(balls.len(), 5);
-        let mut g = HostGaussians::default();
-        for &ball in &balls {
-            let Shape::Sphere { radius } = scene.objects[ball].shape else { panic!("a ball") };
-            let at = scene.objects[ball].motion.pose(0.0).apply(DVec3::X * radius);
-            g.means.extend(at.as_vec3().to_array());
-            g.opacity_logits.push(2.0);
+        assert_eq!(scene.bodies.len(), 5);
+        let g = on_surfaces(&scene);
+        for (k, body) in scene.bodies.iter().enumerate() {
+            assert_eq!(on_body(&scene, body, 0.0, &g), [(k, body.objects.start)]);
         }
-        for (k, &ball) in balls.iter().enumerate() {
-            let Shape::Sphere { radius } = scene.objects[ball].shape else { panic!("a ball") };
-            assert_eq!(on_ball(&scene, ball, radius, &g), [k]);
-        }
-        let (camera, _) = scene.cameras().pop().unwrap();
-        let masks = covered(&scene, &camera, &[(balls[0], 1.0, 0.2)]);
-        let still = scene.tracer(0.0).objects_seen(&camera).iter().filter(|s| **s == Some(balls[0])).count();
+        let viewpoint = scene.viewpoints().pop().unwrap();
+        let masks = covered(&scene, &viewpoint);
+        let still = scene.tracer(0.0).objects_seen(&viewpoint.camera).iter().filter(|s| **s == Some(scene.bodies[0].objects.start)).count();
         assert!(masks[0].iter().filter(|m| **m).count() > still, "it moves");
+    }
+
+    #[test]
+    fn figures_are_followed_in_any_unit_and_bodies_that_come_later_too() {
+        for name in ["captures/dome", "captures/units", "captures/appear"] {
+            let scene = ProceduralScene::named(name).unwrap();
+            let g = on_surfaces(&scene);
+            for body in &scene.bodies {
+                let start = first_time(&scene, body);
+                let rows = on_body(&scene, body, start, &g);
+                assert!(rows.len() >= body.objects.len(), "{name}, {}: {rows:?}", body.name);
+                assert!(rows.iter().all(|(row, _)| *row + 1 < g.len()), "{name}, {}", body.name);
+                for (row, object) in rows {
+                    let later = scene.advect(object, point(&g, row), start, 1.0);
+                    assert!((0.7..1.2).contains(&scene.depth_share(object, later, 1.0)), "{name}, {}", body.name);
+                }
+            }
+        }
+        let late = ProceduralScene::named("captures/appear").unwrap();
+        let start = late.bodies.iter().find(|b| b.name == "crate that appears").map(|b| first_time(&late, b)).unwrap();
+        assert!((0.35..0.40).contains(&start), "{start}");
     }
 }

@@ -25,7 +25,7 @@ pub struct FullReport {
     pub sheet: Option<PathBuf>,
     #[serde(flatten)]
     pub eval: EvalReport,
-    /// Trajectory error per object, for built-in scenes with known motion.
+    /// Trajectory error per moving body, for built-in scenes with known motion.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionScore>,
     pub provenance: Provenance,
@@ -172,11 +172,12 @@ pub fn text(report: &FullReport) -> String {
     ];
     lines.retain(|line| !line.is_empty());
     if !report.motion.is_empty() {
-        lines.push("  cycles  PSNR dB  trajectory error  Gaussians".into());
+        lines.push("  moving object            cycles  PSNR dB  trajectory error  Gaussians".into());
     }
     lines.extend(report.motion.iter().map(|m| {
         let error = m.trajectory_error.map_or_else(|| "-".to_string(), |e| format!("{e:.3}"));
-        format!("  {:>6} {:>8.2} {error:>17} {:>10}", m.cycles, m.psnr_db, m.gaussians)
+        let cycles = m.cycles.map_or_else(|| "-".to_string(), |c| c.to_string());
+        format!("  {:<24} {cycles:>6} {:>8.2} {error:>17} {:>10}", m.name, m.psnr_db, m.gaussians)
     }));
     if let Some(path) = &report.sheet {
         lines.push(format!("  contact sheet {}", path.display()));

@@ -35,7 +35,7 @@ pub mod pose;
 mod raw;
 
 pub use lens::Distortion;
-pub use options::{Background, CameraRef, SceneOptions};
+pub use options::{Background, CameraRef, SceneOptions, SyncMode};
 pub use raw::{ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, SAME_TIME};
 
 use crate::{Limits, Plugin, Result, plugin_kind};

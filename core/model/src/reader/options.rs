@@ -2,6 +2,7 @@
 
 use crate::{Error, Result, unknown_name};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// A background colour: a name or RGB in 0..1.
@@ -43,6 +44,20 @@ pub enum CameraRef {
     Name(String),
 }
 
+/// Whether constant frame offsets between cameras are looked for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SyncMode {
+    /// Cameras that record videos are compared by the motion in them; an offset is undone where the evidence is clear, with a warning.
+    #[default]
+    Auto,
+    /// Frames are taken as the timestamps say.
+    Off,
+}
+
+/// Largest offset of a camera, in frames.
+const MOST_OFFSET: i32 = 1_000_000;
+
 /// How a dataset is opened. All keys are optional.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -75,6 +90,12 @@ pub struct SceneOptions {
     /// Folder for frames extracted from videos; the system's temporary folder if absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub video_cache: Option<PathBuf>,
+    /// `auto` finds constant frame offsets between videos of up to 5 s, from their first 900 frames; `off` does not look for any.
+    pub sync: SyncMode,
+    /// Frame offsets of cameras by name, in place of a search: with `cam03 = 4`, frame k + 4 of cam03 shows what the others show at frame k. Frames
+    /// that are not common to all cameras are dropped.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub offsets: BTreeMap<String, i32>,
 }
 
 impl Default for SceneOptions {
@@ -92,6 +113,8 @@ impl Default for SceneOptions {
             test_split: "test".into(),
             ffmpeg: "ffmpeg".into(),
             video_cache: None,
+            sync: SyncMode::Auto,
+            offsets: BTreeMap::new(),
         }
     }
 }
@@ -113,6 +136,9 @@ impl SceneOptions {
         }
         if let Some(background) = &self.background {
             background.rgb()?;
+        }
+        if let Some((name, frames)) = self.offsets.iter().find(|(_, o)| o.unsigned_abs() > MOST_OFFSET as u32) {
+            return Err(Error::parameter("scene.offsets", format!("{name} has {frames}, the limit is {MOST_OFFSET}"), "Write an offset in frames"));
         }
         Ok(())
     }
@@ -150,6 +176,7 @@ mod tests {
         assert!(SceneOptions { downscale: f64::NAN, ..Default::default() }.validate().is_err());
         assert!(SceneOptions { frames: Some([0, 4, 0]), ..Default::default() }.validate().is_err());
         assert!(SceneOptions { background: Some(Background::Rgb([0.0, 2.0, 0.0])), ..Default::default() }.validate().is_err());
+        assert!(SceneOptions { offsets: [("a".to_string(), i32::MIN)].into(), ..Default::default() }.validate().is_err());
         assert!(SceneOptions::default().validate().is_ok());
     }
 
@@ -159,6 +186,11 @@ mod tests {
         let options = read("background = \"black\"\nframes = [0, 30, 5]\ntest_cameras = [0, \"cam10\"]").unwrap();
         assert_eq!(options.background.unwrap().rgb().unwrap(), [0.0; 3]);
         assert_eq!(options.test_cameras.unwrap(), vec![CameraRef::Index(0), CameraRef::Name("cam10".into())]);
+        let options = read("sync = \"off\"\noffsets = { cam03 = 4, \"videos/a.mp4\" = -2 }").unwrap();
+        assert_eq!((options.sync, options.offsets["cam03"], options.offsets["videos/a.mp4"]), (SyncMode::Off, 4, -2));
+        assert!(read("sync = \"maybe\"").is_err());
+        let text = toml::to_string(&options).unwrap();
+        assert_eq!(read(&text).unwrap(), options, "{text}");
         assert!(read("widht = 3").unwrap_err().to_string().contains("widht"));
     }
 }

@@ -53,11 +53,11 @@ pub enum ImageSource {
         /// White is foreground. The file may be missing.
         mask: Option<PathBuf>,
     },
-    /// A frame of a video, decoded by `ffmpeg`.
+    /// A frame of a video, decoded by `ffmpeg` and turned as the file's display matrix says.
     Video {
         /// The video.
         path: PathBuf,
-        /// Frame of the video, 0-based.
+        /// Frame of the video in order of presentation, 0-based.
         frame: usize,
     },
     /// Any other source: computed images, another container, a network.

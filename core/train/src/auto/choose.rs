@@ -17,7 +17,9 @@ const PER_DETAIL: f64 = 0.8;
 /// Fewest Gaussians at most.
 const LEAST_GAUSSIANS: f64 = 4000.0;
 /// Gaussians that a thread can train in a minute.
-const PER_THREAD_MINUTE: f64 = 4000.0;
+const PER_THREAD_MINUTE: f64 = 2000.0;
+/// What that is where all of them move.
+const ALL_MOVE: f64 = 0.25;
 /// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
 const EXPOSURE: f32 = 0.09;
 /// Share of moving pixels below which a scene is static.
@@ -103,6 +105,11 @@ fn stands_still(facts: &Facts) -> bool {
     facts.frames <= 1 || facts.moving.is_some_and(|share| share < STATIC)
 }
 
+/// Whether the images show an object without surroundings.
+fn stands_alone(facts: &Facts) -> bool {
+    facts.plain.is_some() || facts.transparent > OBJECT
+}
+
 fn field(facts: &Facts, machine: Machine) -> Choice {
     if stands_still(facts) {
         return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
@@ -122,9 +129,13 @@ fn stages(facts: &Facts) -> Choice {
     let base = [("train.batch", Value::Integer(1))];
     let (settings, reason) = match facts.arrangement {
         _ if stands_still(facts) => (vec![("train.shares", shares([1.0, 0.0, 4.0])), ("train.coarse_frames", "all".into())], "a static scene".to_string()),
+        Arrangement::OneMovingCamera if !stands_alone(facts) => (
+            vec![("train.shares", shares([5.0, 2.0, 18.0])), ("train.coarse_frames", "all".into()), ("train.dynamic", "score".into())],
+            "one moving camera: all frames come at once, and what a static reconstruction does not explain may move".into(),
+        ),
         Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere => (
             vec![("train.shares", shares([2.0, 0.0, 18.0])), ("train.coarse_frames", "all".into()), ("train.dynamic", "all".into())],
-            format!("{}: a single image says nothing of depth, so all frames come at once and everything may move", facts.arrangement.describe()),
+            format!("{}: all frames come at once, and everything may move", facts.arrangement.describe()),
         ),
         Arrangement::Photos | Arrangement::Dome | Arrangement::Rig => {
             let smooth = if facts.frames < 12 { 0.0 } else { 0.05 };
@@ -145,17 +156,20 @@ fn stages(facts: &Facts) -> Choice {
 
 fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
     let wanted = PER_DETAIL * facts.pixels() * f64::from(facts.detail);
-    let affordable = PER_THREAD_MINUTE * machine.speed() * minutes;
+    // Where everything moves, each costs several times as much.
+    let all_move =
+        !facts.arrangement.has_several_cameras() && !stands_still(facts) && (stands_alone(facts) || facts.arrangement == Arrangement::OneCameraAnywhere);
+    let affordable = PER_THREAD_MINUTE * machine.speed() * minutes * if all_move { ALL_MOVE } else { 1.0 };
     let most = wanted.min(affordable).max(LEAST_GAUSSIANS);
     let most = (most / 500.0).ceil() * 500.0;
     let reason = format!("{:.0} % of the pixels show detail", 100.0 * facts.detail);
-    choice([("density.max_gaussians", integer(most)), ("init.count", integer(0.6 * most))], reason)
+    choice([("density.kind", "clone-split".into()), ("density.max_gaussians", integer(most)), ("init.count", integer(0.6 * most))], reason)
 }
 
 fn background(facts: &Facts) -> Option<Choice> {
     let (colour, reason) = match facts.plain {
         Some(colour) => (colour, "the images have a plain background of this colour"),
-        None if facts.transparent > OBJECT => ([1.0; 3], "the images are transparent"),
+        None if stands_alone(facts) => ([1.0; 3], "the images are transparent"),
         None => return None,
     };
     Some(choice([("render.background", Value::Array(colour.map(|c| float(f64::from(c))).to_vec()))], reason))
@@ -236,6 +250,7 @@ mod tests {
         let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
         let odd = choose(&odd, MACHINE, 5.0);
         assert_eq!(value(&odd, "train.dynamic"), Some("all".into()));
+        assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0), "train.dynamic"), Some("score".into()));
         assert!(value(&odd, "appearance.kind").is_some() && value(&odd, "train.mask_threshold").is_some() && value(&odd, "render.background").is_some());
     }
 

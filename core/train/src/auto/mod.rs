@@ -8,7 +8,7 @@ mod facts;
 pub use choose::{Choice, Machine};
 pub use facts::{Arrangement, Facts};
 
-use crate::config::RunConfig;
+use crate::config::{Dynamic, RunConfig};
 use crate::data;
 use crate::layers::Layers;
 use calibrate::{Timing, calibrate};
@@ -25,6 +25,8 @@ const MINUTES: [f64; 2] = [10.0, 5.0];
 const TRAINING_SHARE: f64 = 0.88;
 /// Fewest and most iterations.
 const ITERATIONS: [f64; 2] = [500.0, 200_000.0];
+/// Share of moving pixels that is expected where no camera stands still.
+const UNKNOWN_MOTION: f32 = 0.2;
 /// Iterations below which a run is too short for its scene.
 const SHORT: f64 = 2000.0;
 /// Iterations of the score stage per unit of the score that a Gaussian can reach in them.
@@ -117,7 +119,7 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
     }
     step(3);
     let config = layers.over(&plan.table).config()?;
-    if facts.arrangement.has_several_cameras() && facts.moving.is_some() {
+    if config.train.shares[1] > 0.0 {
         let score = config.train.iterations as f64 * config.train.shares[1] / config.train.shares.iter().sum::<f64>();
         let zeta = (score / ITERATIONS_PER_SCORE).clamp(1.0, 7.0);
         let reason = format!("what a score can reach in {score:.0} iterations of its stage");
@@ -140,7 +142,8 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
 fn iterations(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64) -> Choice {
     let total: f64 = config.train.shares.iter().sum::<f64>().max(1e-9);
     let main = config.train.shares[2] / total;
-    let moving = if facts.arrangement.has_several_cameras() { (2.0 * f64::from(facts.moving.unwrap_or(0.5))).min(1.0) } else { 1.0 };
+    let scored = config.train.dynamic != Dynamic::All;
+    let moving = if scored { (2.0 * f64::from(facts.moving.unwrap_or(UNKNOWN_MOTION))).min(1.0) } else { 1.0 };
     let still = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
     let moving = if still { 0.0 } else { moving };
     let ms = timing.still + main * moving * (timing.moving - timing.still);

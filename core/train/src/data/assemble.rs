@@ -1,5 +1,6 @@
 //! From what a reader hands over to a [`Scene`]: the steps all scenes share.
 
+use super::align::align;
 use super::camera_box::camera_box;
 use super::frames::{Job, Plan, SceneFrames};
 use super::normalise::{CAMERA_DISTANCE, normalisation};
@@ -27,6 +28,7 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, frame: Option<Similar
     }
     // Before views are chosen: the frame must not depend on the options.
     let frame = frame.unwrap_or_else(|| normalisation(&raw));
+    align(&mut raw, options, limits)?;
     let views = select(&mut raw, options)?;
     if !views.iter().any(|v| v.split == Split::Train) {
         let hint = raw.warnings.last().cloned().unwrap_or_default();
@@ -90,7 +92,7 @@ fn normalised_points(points: &RawPoints, frame: &Similarity, warnings: &mut Vec<
 }
 
 /// Brings the calibration to the size the images really have, if only the scale differs.
-fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: &mut Vec<String>) -> Result<[u32; 2]> {
+pub(super) fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: &mut Vec<String>) -> Result<[u32; 2]> {
     let [w, h] = camera.size.map(f64::from);
     let (sx, sy) = (f64::from(found.0) / w, f64::from(found.1) / h);
     if camera.size == [found.0, found.1] {

@@ -1,8 +1,10 @@
-//! COLMAP models, text or binary, with their sparse points. Static scenes; every eighth image is held out.
+//! COLMAP models, text or binary, with their sparse points. Every eighth image is held out. Scenes are static, unless each image has a video of its name.
 
+use super::assemble::fit_to_image;
 use super::nerfstudio::HOLD_OUT_EVERY;
+use super::video::{self, Footage};
 use super::{colmap_binary, colmap_text};
-use cc4dgs_core::reader::files::{file_name, read_bytes, read_text};
+use cc4dgs_core::reader::files::{file_name, list, read_bytes, read_text};
 use cc4dgs_core::reader::pose::{Matrix4, from_quaternion};
 use cc4dgs_core::{
     Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
@@ -117,12 +119,12 @@ inventory::submit! {
         info: Plugin {
             name: "colmap",
             version: "1",
-            summary: "COLMAP models, static",
+            summary: "COLMAP models, static or with a video per image",
             paper: "Structure-from-Motion Revisited (Schoenberger and Frahm 2016)",
             schema: "",
             capabilities: &[],
         },
-        looks_for: "sparse/0/cameras.bin or .txt, with images.* beside it and images in images/ (COLMAP)",
+        looks_for: "sparse/0/cameras.bin or .txt, with images.* beside it and images in images/, or a video of each image's name (COLMAP)",
         order: 600,
         probe,
         open,
@@ -133,7 +135,7 @@ fn probe(path: &Path) -> bool {
     model_folder(path).is_some()
 }
 
-fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     let folder = model_folder(path)
         .ok_or_else(|| Error::data(path.display().to_string(), "it holds no cameras.bin or cameras.txt", "Point to the folder above sparse/"))?;
     let object = folder.display().to_string();
@@ -143,6 +145,7 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     let folders = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()];
     let image_folder = folders.into_iter().find(|f| f.is_dir()).unwrap_or_else(|| path.join("images"));
     let hold_out = images.len() > 1;
+    let mut videos = videos(path, &images, options, limits, &mut scene.warnings)?.into_iter();
     for (index, image) in images.iter().enumerate() {
         let bad = |problem: String| Error::data(format!("{object}: image {}", image.name), problem, "Export the model again");
         let camera = cameras.get(&image.camera).ok_or_else(|| bad(format!("its camera {} is not in the model", image.camera)))?;
@@ -150,12 +153,34 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
         let size = camera.size.map(|v| u32::try_from(v).unwrap_or(u32::MAX));
         limits.check_pixels(&format!("{object}: camera {}", image.camera), camera.size[0], camera.size[1])?;
         let world_to_camera: Matrix4 = from_quaternion(image.rotation, image.translation).map_err(bad)?;
-        scene.cameras.push(RawCamera { name: image.name.clone(), size, focal, principal, distortion, world_to_camera });
+        let mut camera = RawCamera { name: image.name.clone(), size, focal, principal, distortion, world_to_camera };
         let split = if hold_out && index % HOLD_OUT_EVERY == 0 { Split::Test } else { Split::Train };
+        if let Some(footage) = videos.next() {
+            fit_to_image(&mut camera, (footage.size[0], footage.size[1]), &mut scene.warnings)?;
+            scene.cameras.push(camera);
+            let shown = footage.images.into_iter().enumerate().filter_map(|(frame, image)| image.map(|image| (frame, image)));
+            scene.views.extend(shown.map(|(frame, image)| RawView { camera: index, frame, time: None, split, image }));
+            continue;
+        }
+        scene.cameras.push(camera);
         let source = ImageSource::File { path: image_folder.join(&image.name), mask: None };
         scene.views.push(RawView { camera: index, frame: 0, time: Some(0.0), split, image: source });
     }
     Ok(scene)
+}
+
+/// The videos of the images, in their order: `cam00.mp4` for `cam00.png`, in the folder or in `videos/`. Empty unless each image has one of its own.
+fn videos(path: &Path, images: &[ColmapImage], options: &SceneOptions, limits: &Limits, warnings: &mut Vec<String>) -> Result<Vec<Footage>> {
+    let mut by_stem: BTreeMap<String, PathBuf> = BTreeMap::new();
+    for folder in [path.join("videos"), path.to_path_buf()].into_iter().filter(|f| f.is_dir()) {
+        for file in list(&folder, |p| video::is_video(p) && p.is_file())? {
+            let stem = file.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+            by_stem.insert(stem, file);
+        }
+    }
+    let of = |image: &ColmapImage| by_stem.remove(Path::new(&image.name).file_stem()?.to_str()?);
+    let found: Option<Vec<PathBuf>> = images.iter().map(of).collect();
+    found.map_or(Ok(Vec::new()), |found| video::footage(&found, options, limits, warnings))
 }
 
 /// The points of a COLMAP model beside another calibration, if both use the same world: every camera must have an image of its name whose

@@ -3,7 +3,7 @@
 use super::camera_box::frustum_box;
 use super::npy::read_npy;
 use super::{colmap, video};
-use cc4dgs_core::reader::files::{file_name, has_extension, image_size, is_image, list, read_bytes};
+use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_bytes};
 use cc4dgs_core::reader::pose::world_to_camera;
 use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use glam::{DMat3, DVec3};
@@ -12,7 +12,8 @@ use std::path::{Path, PathBuf};
 /// The images of one camera in time order.
 struct Footage {
     name: String,
-    images: Vec<ImageSource>,
+    /// `None` where it has no image at that instant.
+    images: Vec<Option<ImageSource>>,
     size: [u32; 2],
 }
 
@@ -48,7 +49,8 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     if let Some(i) = array.values.iter().position(|v| !v.is_finite()) {
         return Err(bad(format!("row {} holds {}", i / 17, array.values[i]), "Fetch the file again"));
     }
-    let footage = footage(path, options, limits)?;
+    let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    let footage = footage(path, options, limits, &mut scene.warnings)?;
     if footage.len() != array.shape[0] {
         let problem = format!(
             "it has {} rows, {} cameras were found ({})",
@@ -58,7 +60,6 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         );
         return Err(bad(problem, "Remove the row together with the camera"));
     }
-    let mut scene = RawScene { name: file_name(path), ..Default::default() };
     let frames = footage.iter().map(|f| f.images.len()).min().unwrap_or(0);
     if footage.iter().any(|f| f.images.len() != frames) {
         scene.warnings.push(format!("cameras have different numbers of frames; the first {frames} of each are used"));
@@ -70,7 +71,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         // The first camera in sorted order is held out (the protocol of Neural 3D Video).
         let split = if index == 0 { Split::Test } else { Split::Train };
         for (frame, image) in footage.images.into_iter().take(frames).enumerate() {
-            scene.views.push(RawView { camera: index, frame, time: None, split, image });
+            scene.views.extend(image.map(|image| RawView { camera: index, frame, time: None, split, image }));
         }
     }
     scene.points = colmap::points_in_same_world(path, &scene.cameras, limits)?;
@@ -107,7 +108,7 @@ fn stem(path: &Path) -> String {
 }
 
 /// Per-camera folders of frames win over videos (someone extracted them), videos over single images.
-fn footage(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Vec<Footage>> {
+fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut Vec<String>) -> Result<Vec<Footage>> {
     let mut found = Vec::new();
     let is_camera_folder = |p: &Path| p.is_dir() && file_name(p).starts_with("cam");
     for root in [path.to_path_buf(), path.join("frames")] {
@@ -124,16 +125,9 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Vec<F
         }
     }
     for root in [path.to_path_buf(), path.join("videos")] {
-        for file in list_if(&root, |p| has_extension(p, &["mp4", "mkv", "mov", "avi"]) && p.is_file())? {
-            let facts = video::probe(&file, options)?;
-            let frames = facts.frames.min(
-                options
-                    .frames
-                    .map_or(usize::MAX, |[start, count, stride]| if count == 0 { usize::MAX } else { start.saturating_add(count.saturating_mul(stride)) }),
-            );
-            let images = (0..frames).map(|frame| ImageSource::Video { path: file.clone(), frame }).collect();
-            found.push(Footage { name: stem(&file), size: facts.size, images });
-        }
+        let videos = list_if(&root, |p| video::is_video(p) && p.is_file())?;
+        let read = video::footage(&videos, options, limits, warnings)?;
+        found.extend(videos.iter().zip(read).map(|(v, f)| Footage { name: stem(v), size: f.size, images: f.images }));
         if !found.is_empty() {
             return Ok(found);
         }
@@ -150,8 +144,8 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Vec<F
     Ok(found)
 }
 
-fn files(paths: Vec<PathBuf>) -> Vec<ImageSource> {
-    paths.into_iter().map(|path| ImageSource::File { path, mask: None }).collect()
+fn files(paths: Vec<PathBuf>) -> Vec<Option<ImageSource>> {
+    paths.into_iter().map(|path| Some(ImageSource::File { path, mask: None })).collect()
 }
 
 fn list_if(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {

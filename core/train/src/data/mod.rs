@@ -3,6 +3,7 @@
 //! [`open`] asks each registered reader whether a path is its kind. Readers only parse; what all scenes share (choosing frames and cameras, resizing,
 //! undoing distortion, missing images, the cache) happens once, in [`assemble`].
 
+mod align;
 mod assemble;
 mod blender;
 mod camera_box;
@@ -20,6 +21,7 @@ mod panoptic;
 pub mod procedural;
 pub(crate) mod resample;
 mod select;
+mod sync;
 mod technicolor;
 mod undistort;
 mod video;

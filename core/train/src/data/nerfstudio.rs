@@ -1,9 +1,13 @@
-//! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Usually static.
+//! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Usually static; an entry that names a
+//! video is a camera with all frames of it.
 
+use super::assemble::fit_to_image;
+use super::video::{self, Footage};
 use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_json};
 use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
 use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Where the file names no split, every eighth image is held out, as is usual for static scenes.
@@ -98,7 +102,7 @@ inventory::submit! {
             schema: "",
             capabilities: &[],
         },
-        looks_for: "transforms.json (nerfstudio, instant-ngp), or the path of such a file",
+        looks_for: "transforms.json (nerfstudio, instant-ngp) that names images, or a video per camera; or the path of such a file",
         order: 500,
         probe,
         open,
@@ -109,7 +113,7 @@ fn probe(path: &Path) -> bool {
     path.join("transforms.json").is_file() || (path.is_file() && has_extension(path, &["json"]))
 }
 
-fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
+fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     let file = if path.is_file() { path.to_path_buf() } else { path.join("transforms.json") };
     let folder = file.parent().unwrap_or(Path::new("."));
     let object = file.display().to_string();
@@ -117,6 +121,8 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
     let mut frames: Vec<&Frame> = transforms.frames.iter().collect();
     frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
+    let mut videos = videos(&object, &frames, folder, options, limits, &mut scene.warnings)?;
+    let has_times = videos.is_empty();
     let named_split = !transforms.train_filenames.is_empty() || !transforms.test_filenames.is_empty();
     let mut missing = Vec::new();
     let mut seen = 0;
@@ -141,7 +147,15 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
         };
         seen += 1;
         let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
-        scene.cameras.push(camera(frame, &transforms.shared, &path, limits, &bad)?);
+        if let Some(footage) = videos.remove(&path) {
+            let mut camera = camera(frame, &transforms.shared, &|| Ok((footage.size[0], footage.size[1])), &bad)?;
+            fit_to_image(&mut camera, (footage.size[0], footage.size[1]), &mut scene.warnings)?;
+            let images = footage.images.into_iter().enumerate().filter_map(|(index, image)| image.map(|image| (index, image)));
+            scene.views.extend(images.map(|(index, image)| RawView { camera: scene.cameras.len(), frame: index, time: None, split, image }));
+            scene.cameras.push(camera);
+            continue;
+        }
+        scene.cameras.push(camera(frame, &transforms.shared, &|| image_size(&path, limits), &bad)?);
         times.push(frame.time);
         scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image: ImageSource::File { path, mask: None } });
     }
@@ -154,16 +168,40 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
             if missing.len() > 3 { ", …" } else { "" }
         ));
     }
-    scene.rank_times(&times, &object)?;
+    if has_times {
+        scene.rank_times(&times, &object)?;
+    }
     Ok(scene)
 }
 
-fn camera(frame: &Frame, shared: &Intrinsics, image: &Path, limits: &Limits, bad: &dyn Fn(String) -> Error) -> Result<RawCamera> {
+/// The videos that the frames name, if they do, by path.
+fn videos(
+    object: &str,
+    frames: &[&Frame],
+    folder: &Path,
+    options: &SceneOptions,
+    limits: &Limits,
+    warnings: &mut Vec<String>,
+) -> Result<BTreeMap<PathBuf, Footage>> {
+    let found: Vec<PathBuf> = frames.iter().map(|f| image_path(folder, &f.file_path)).filter(|p| p.is_file()).collect();
+    let paths: Vec<PathBuf> = found.iter().filter(|p| video::is_video(p)).cloned().collect();
+    let problem = if paths.iter().collect::<BTreeSet<_>>().len() < paths.len() {
+        "a video is named by two entries"
+    } else if !paths.is_empty() && paths.len() < found.len() {
+        "it names images and videos"
+    } else {
+        let footage = video::footage(&paths, options, limits, warnings)?;
+        return Ok(paths.into_iter().zip(footage).collect());
+    };
+    Err(Error::data(object, problem, "Write one entry per camera with its video, or one per image"))
+}
+
+fn camera(frame: &Frame, shared: &Intrinsics, image_size: &dyn Fn() -> Result<(u32, u32)>, bad: &dyn Fn(String) -> Error) -> Result<RawCamera> {
     let intrinsics = frame.own.over(shared);
     let (w, h) = match (intrinsics.w, intrinsics.h) {
         (Some(w), Some(h)) if w >= 1.0 && h >= 1.0 && w <= 1e6 && h <= 1e6 => (w, h),
         (None, None) => {
-            let (w, h) = image_size(image, limits)?;
+            let (w, h) = image_size()?;
             (f64::from(w), f64::from(h))
         }
         (w, h) => return Err(bad(format!("image size w {w:?}, h {h:?} is not a size"))),

@@ -7,6 +7,7 @@ mod log;
 mod losses;
 mod parameters;
 mod probe;
+mod residual;
 mod sampler;
 mod score;
 mod smoothness;
@@ -175,6 +176,10 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
             continue;
         }
         let stage_began = Instant::now();
+        // Where no camera stands still; the score stage leaves the geometry alone, so a resumed run finds the same masks.
+        if stage == Stage::Score && matches!(moving, Moving::Scored { .. }) && context.masks.is_empty() && context.lengths.length(stage) > 0 {
+            context.masks = context.residual_masks(&mut state)?;
+        }
         context.run_stage(stage, &mut state, &mut watch)?;
         stage_seconds.insert(stage.name().to_string(), stage_began.elapsed().as_secs_f64());
         if stage != Stage::Main {
@@ -215,14 +220,9 @@ fn decide_moving(job: &TrainJob) -> Moving {
         _ if static_scene => Moving::Nothing,
         Dynamic::None => Moving::Nothing,
         Dynamic::All => Moving::Everything,
-        _ if can_score => Moving::Scored { zeta: train.zeta },
-        wanted => {
-            if wanted == Dynamic::Score {
-                let message = "no training camera has two frames, so dynamic scores cannot be fitted: every Gaussian may move".to_string();
-                job.events.emit(&Event::Warning { object: "train.dynamic".into(), message });
-            }
-            Moving::Everything
-        }
+        Dynamic::Score => Moving::Scored { zeta: train.zeta },
+        Dynamic::Auto if can_score => Moving::Scored { zeta: train.zeta },
+        Dynamic::Auto => Moving::Everything,
     }
 }
 

@@ -110,7 +110,9 @@ fn llff_with_videos() {
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
         path.to_string_lossy().into_owned()
     };
-    script("ffprobe", "#!/bin/sh\necho 16,12,6\n".into());
+    let packets: Vec<String> = (0..6).map(|t| format!("{{\"pts_time\": \"{}.0\", \"flags\": \"K_\"}}", t)).collect();
+    let facts = format!("{{\"packets\": [{}], \"streams\": [{{\"width\": 16, \"height\": 12}}]}}", packets.join(","));
+    script("ffprobe", format!("#!/bin/sh\necho '{facts}'\n"));
     // The last argument is the pattern; the frames the filter selects are 1, 3, 5.
     let log = tools.path().join("log");
     let body = "for last; do :; done\nout=$(dirname \"$last\")\ncam=$(echo \"$*\" | grep -o 'cam0[0-9]' | head -1)\n";

@@ -1,7 +1,9 @@
 //! Dataset readers: each on a tiny scene written by the test, on untrusted bytes, and on real scenes if they are present.
 
+mod captures;
 pub mod common;
 mod conformance;
+mod first_points;
 mod formats;
 mod golden;
 mod hostile;
@@ -9,3 +11,4 @@ mod invariance;
 mod procedural;
 mod real;
 mod selection;
+mod videos;

@@ -1,8 +1,13 @@
-//! From depth maps to points: a depth counts when other views see the same surface there and none sees through it.
+//! From depth maps to points: a depth counts when other views see the same surface there and none sees through it. Between such depths others are
+//! interpolated, and where neither fits the images, the depth that looks least wrong is a guess.
 
 use super::Candidate;
+use super::choose::Arrangement;
 use super::sweep::DepthMap;
 use super::views::{WorkSet, WorkView};
+use cc4dgs_core::Seed;
+use glam::Vec3;
+use rand::Rng;
 use rayon::prelude::*;
 
 /// Correlation a depth needs to be believed.
@@ -11,72 +16,129 @@ const MIN_SCORE: f32 = 0.5;
 const PROOF_SCORE: f32 = 0.7;
 /// Largest mean colour difference between views, 0..1, for points between matches.
 const MAX_COLOR_DIFFERENCE: f32 = 0.10;
+/// Depths tried per guess.
+const GUESSES: usize = 8;
+/// The nearest guess, as a share of the distance of what the cameras look at: what is guessed nearer hides more than it explains.
+const NEAREST_GUESS: f64 = 0.5;
+
+/// The points of all depth maps.
+#[derive(Default)]
+pub(super) struct Fused {
+    /// Matched in several views.
+    pub matched: Vec<Candidate>,
+    /// On depth interpolated between matches.
+    pub between: Vec<Candidate>,
+    /// At the depth whose colours differ least, where nothing matches: things that move or shine.
+    pub guessed: Vec<Candidate>,
+    /// Share of the solid pixels that neither matched nor interpolated points explain.
+    pub unexplained: f64,
+}
 
 /// What the other views say about a point.
 #[derive(Default)]
 struct Verdict {
     agree: u32,
     through: u32,
+    /// Sum over those that agree of the inverse depth they see, over that of the point.
+    ratios: f32,
 }
 
-/// Points matched in several views, and points on depth interpolated between them.
-pub(super) fn fuse(set: &WorkSet, maps: &[DepthMap]) -> (Vec<Candidate>, Vec<Candidate>) {
-    let pairs: Vec<_> = (0..set.views.len()).into_par_iter().map(|i| fuse_view(set, maps, i)).collect();
-    let (mut matched, mut fill) = (Vec::new(), Vec::new());
-    for (m, f) in pairs {
-        matched.extend(m);
-        fill.extend(f);
+impl Verdict {
+    /// The inverse depth that the view and those that agree with it mean together.
+    fn mean(&self, own: f32) -> f32 {
+        own * (1.0 + self.ratios) / (1.0 + self.agree as f32)
     }
-    (matched, fill)
 }
 
-fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize) -> (Vec<Candidate>, Vec<Candidate>) {
+/// Asks all depth maps.
+pub(super) fn fuse(set: &WorkSet, maps: &[DepthMap], seed: Seed) -> Fused {
+    let parts: Vec<_> = (0..set.keys).into_par_iter().map(|i| fuse_view(set, maps, i, seed.index(i as u64))).collect();
+    let (mut all, mut explained, mut open) = (Fused::default(), 0usize, 0usize);
+    for (part, counts) in parts {
+        all.matched.extend(part.matched);
+        all.between.extend(part.between);
+        all.guessed.extend(part.guessed);
+        (explained, open) = (explained + counts[0], open + counts[1]);
+    }
+    all.unexplained = open as f64 / (explained + open).max(1) as f64;
+    all
+}
+
+/// The points of one depth map, and how many pixels of its lattice are explained and not.
+fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fused, [usize; 2]) {
     let (view, map) = (&set.views[index], &maps[index]);
     let level = view.fine();
-    let needed = if set.views.len() >= 6 { 2 } else { 1 };
-    let solid = |p: usize| view.opaque.as_ref().is_none_or(|o| o[p]);
-    let world = |p: usize, inverse: f32| {
+    let needed = if set.keys >= 6 { 2 } else { 1 };
+    let solid = |p: usize| view.solid(set.foreground, p);
+    let place = |p: usize, inverse: f32| {
         let (u, v) = ((p % level.width) as f64 + 0.5, (p / level.width) as f64 + 0.5);
-        view.unproject(level, u, v, 1.0 / f64::from(inverse.max(1e-9)))
+        let depth = 1.0 / f64::from(inverse.max(1e-9));
+        (view.unproject(level, u, v, depth), depth as f32)
     };
-    let mut matched = Vec::new();
+    let mut found = Fused::default();
     let mut known = vec![f32::NAN; map.inverse.len()];
+    // What matches best at the very near end would match better before it.
+    let nearest = (1.0 / view.depth_range[0]) as f32 - 0.5 * map.step;
     for (p, &inverse) in map.inverse.iter().enumerate() {
-        if map.score[p] < MIN_SCORE || !solid(p) {
+        if map.score[p] < MIN_SCORE || inverse >= nearest || !solid(p) {
             continue;
         }
-        let position = world(p, inverse);
-        let verdict = ask(set, maps, view, position);
+        let verdict = ask(set, maps, view, place(p, inverse).0);
         if verdict.agree >= needed && verdict.agree > verdict.through {
-            known[p] = inverse;
-            matched.push(Candidate { position, color: level.rgb[p], confidence: map.score[p] + 0.1 * verdict.agree as f32 });
+            known[p] = verdict.mean(inverse);
+            let (position, depth) = place(p, known[p]);
+            found.matched.push(Candidate { position, color: level.rgb[p], confidence: map.score[p] + 0.1 * verdict.agree as f32, depth });
         }
     }
     let smooth = interpolate(&known, level.width);
-    let mut fill = Vec::new();
+    let least = (1.0 / view.depth_range[1]) as f32;
+    let focus = super::choose::focus_depth(view.center, view.rotation.transpose() * glam::DVec3::Z, &set.rig);
+    let most = (1.0 / (NEAREST_GUESS * focus).max(view.depth_range[0])) as f32;
+    let mut rng = seed.rng();
+    let mut counts = [0, 0];
     // Every third pixel each way is enough between the matches.
-    for p in (0..smooth.len()).filter(|p| (p % level.width) % 3 == 1 && (p / level.width) % 3 == 1) {
-        if known[p].is_nan() && smooth[p].is_finite() && solid(p) {
-            let position = world(p, smooth[p]);
+    for p in (0..smooth.len()).filter(|p| (p % level.width) % 3 == 1 && (p / level.width) % 3 == 1 && solid(*p)) {
+        if known[p].is_finite() {
+            counts[0] += 1;
+            continue;
+        }
+        if smooth[p].is_finite() {
+            let (position, depth) = place(p, smooth[p]);
             let difference = color_difference(set, view, position, level.rgb[p]);
             if difference < MAX_COLOR_DIFFERENCE && ask(set, maps, view, position).through == 0 {
-                fill.push(Candidate { position, color: level.rgb[p], confidence: -difference });
+                found.between.push(Candidate { position, color: level.rgb[p], confidence: -difference, depth });
+                counts[0] += 1;
+                continue;
             }
         }
+        counts[1] += 1;
+        // What hides the surface around it is before it.
+        let from = if smooth[p].is_finite() && smooth[p] < 0.9 * most { smooth[p] } else { least };
+        let tried = (0..GUESSES).map(|i| from + (most - from) * (i as f32 + rng.random::<f32>()) / GUESSES as f32);
+        let guess = |inverse: f32| {
+            let (position, depth) = place(p, inverse);
+            Candidate { position, color: level.rgb[p], confidence: -color_difference(set, view, position, level.rgb[p]), depth }
+        };
+        let best = tried.map(guess).max_by(|a, b| a.confidence.total_cmp(&b.confidence));
+        let seen_through = |c: &Candidate| set.arrangement == Arrangement::OneTime && ask(set, maps, view, c.position).through > 0;
+        found.guessed.extend(best.filter(|c| c.confidence.is_finite() && !seen_through(c)));
     }
-    (matched, fill)
+    (found, counts)
 }
 
-fn ask(set: &WorkSet, maps: &[DepthMap], view: &WorkView, position: glam::Vec3) -> Verdict {
+fn ask(set: &WorkSet, maps: &[DepthMap], view: &WorkView, position: Vec3) -> Verdict {
     let mut verdict = Verdict::default();
-    for &other in &view.neighbours {
+    for &other in &view.witnesses {
         let (theirs, map) = (&set.views[other], &maps[other]);
         let Some((u, v, z)) = theirs.project(theirs.fine(), position) else { continue };
         let Some(p) = theirs.fine().pixel(u, v) else { continue };
         let (own, seen) = (1.0 / z, map.inverse[p]);
-        let tolerance = 2.0 * map.step + 0.01 * own;
+        let tolerance = map.step + 0.01 * own;
         if (own - seen).abs() < tolerance {
-            verdict.agree += u32::from(map.score[p] > 0.5 * MIN_SCORE);
+            if map.score[p] > 0.5 * MIN_SCORE {
+                verdict.agree += 1;
+                verdict.ratios += seen / own;
+            }
         } else if seen < own - 2.0 * tolerance && map.score[p] > PROOF_SCORE {
             verdict.through += 1;
         }
@@ -84,21 +146,18 @@ fn ask(set: &WorkSet, maps: &[DepthMap], view: &WorkView, position: glam::Vec3) 
     verdict
 }
 
-/// Mean colour difference to the two most similar neighbours that see the point; infinite if fewer do.
-fn color_difference(set: &WorkSet, view: &WorkView, position: glam::Vec3, color: [f32; 3]) -> f32 {
-    let mut differences: Vec<f32> = view
-        .neighbours
-        .iter()
-        .filter_map(|&other| {
-            let theirs = &set.views[other];
-            let (u, v, _) = theirs.project(theirs.fine(), position)?;
-            let c = theirs.fine().rgb[theirs.fine().pixel(u, v)?];
-            Some((0..3).map(|k| (c[k] - color[k]).abs()).sum::<f32>() / 3.0)
-        })
-        .collect();
+/// Mean colour difference to the two most similar partners that see the point (to the only one, if there is one); infinite if fewer do.
+fn color_difference(set: &WorkSet, view: &WorkView, position: Vec3, color: [f32; 3]) -> f32 {
+    let difference = |&other: &usize| {
+        let theirs = &set.views[other];
+        let c = theirs.fine().rgb[theirs.pixel_of(position)?];
+        Some((0..3).map(|k| (c[k] - color[k]).abs()).sum::<f32>() / 3.0)
+    };
+    let mut differences: Vec<f32> = view.partners.iter().filter_map(difference).collect();
     differences.sort_by(f32::total_cmp);
     match differences[..] {
         [a, b, ..] => 0.5 * (a + b),
+        [a] if view.partners.len() == 1 => a,
         _ => f32::INFINITY,
     }
 }

@@ -1,4 +1,4 @@
-//! Depth by plane sweep: at each candidate depth the neighbours are warped into a view and compared by normalised cross-correlation over 5x5 windows.
+//! Depth by plane sweep: at each candidate depth other views are warped into a view and compared by normalised cross-correlation over 5x5 windows.
 
 use super::views::{Level, WorkSet, WorkView};
 use rayon::prelude::*;
@@ -20,13 +20,13 @@ pub(super) struct DepthMap {
     pub step: f32,
 }
 
-/// The depth maps of all views.
+/// The depth maps of all keys.
 pub(super) fn depth_maps(set: &WorkSet) -> Vec<DepthMap> {
-    set.views.par_iter().map(|view| depth_map(set, view)).collect()
+    set.key_views().par_iter().map(|view| depth_map(set, view)).collect()
 }
 
 fn depth_map(set: &WorkSet, view: &WorkView) -> DepthMap {
-    let others: Vec<&WorkView> = view.neighbours.iter().map(|&i| &set.views[i]).collect();
+    let others: Vec<&WorkView> = view.partners.iter().map(|&i| &set.views[i]).collect();
     let [near, far] = view.depth_range;
     let (most, least) = ((1.0 / near) as f32, (1.0 / far) as f32);
     let baseline = others.iter().map(|o| (o.center - view.center).length()).fold(0.0, f64::max).max(1e-9);
@@ -94,11 +94,11 @@ impl Sweep<'_> {
             let offset = (plane as f32 - reach as f32) * step;
             second.fill(-1.0);
             for other in self.others {
-                // A neighbour with fewer levels is used at its finest.
+                // A view with fewer levels is used at its finest.
                 let theirs = &other.levels[self.level.min(other.levels.len() - 1)];
                 self.warp(own, other, theirs, base, offset, &mut warped);
                 window.correlate(own, &warped, &mut scratch, &mut ncc);
-                // The two best neighbours count: the others may be looking at something in between.
+                // The two best partners count: the others may be looking at something in between.
                 for ((first, second), &value) in scores.iter_mut().zip(&mut second).zip(&ncc) {
                     let v = if value.is_nan() { -1.0 } else { value };
                     *second = second.max(v.min(*first));

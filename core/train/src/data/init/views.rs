@@ -1,19 +1,18 @@
-//! The training images of one instant at several small sizes, with the geometry the sweep needs.
+//! The chosen training images at several small sizes, with the geometry that matching needs.
 
 use super::super::camera_box::camera_box;
+use super::super::focus::Focus;
 use super::super::resample::resize;
-use cc4dgs_core::{Camera, Error, Image8, Result, Scene, Split};
+use super::choose::{Arrangement, Choice, focus_depth};
+use cc4dgs_core::{Camera, Image8, Result, Scene};
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
 /// Pixels per image at each level, coarse to fine.
 const LEVEL_PIXELS: [f64; 3] = [6_000.0, 24_000.0, 96_000.0];
-/// The most images that get a depth map.
-const MAX_VIEWS: usize = 40;
-/// Neighbours an image is matched with.
-const NEIGHBOURS: usize = 4;
-/// The angle between viewing directions that matches best: wide enough for depth, narrow enough to look alike.
-const BEST_ANGLE_RAD: f64 = 0.2;
+/// Nearest and farthest depth that is looked at where the scene fills the images, as multiples of the distance of what the cameras look at: rooms and gardens
+/// reach several times farther.
+const FULL_RANGE: [f64; 2] = [0.15, 8.0];
 
 /// One image at one size.
 pub(super) struct Level {
@@ -27,25 +26,42 @@ pub(super) struct Level {
     pub k: DMat3,
 }
 
-/// One camera.
+/// One image.
 pub(super) struct WorkView {
     pub levels: Vec<Level>,
     pub rotation: DMat3,
     pub translation: DVec3,
     pub center: DVec3,
-    /// Indices of the views it is matched with.
-    pub neighbours: Vec<usize>,
-    /// Nearest and farthest depth of the scene's box.
+    /// Positions in [`WorkSet::views`] of the views it is matched with, and of the keys whose depth maps are asked. Empty for views that are no keys.
+    pub partners: Vec<usize>,
+    pub witnesses: Vec<usize>,
+    /// Nearest and farthest depth that is looked at.
     pub depth_range: [f64; 2],
-    /// Foreground, at the finest level.
+    /// Foreground, at the finest level; see [`super::foreground`].
     pub mask: Option<Vec<bool>>,
     /// Opaque pixels of images with alpha, at the finest level.
     pub opaque: Option<Vec<bool>>,
 }
 
+/// What the foreground masks of a set are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Foreground {
+    /// There are none: the scene fills the images.
+    Unknown,
+    /// The dataset marks what moves or matters; the rest is there as well.
+    Part,
+    /// There is nothing but the foreground, before transparency or a plain colour.
+    Whole,
+}
+
 /// All of them.
 pub(super) struct WorkSet {
+    /// Keys first.
     pub views: Vec<WorkView>,
+    pub keys: usize,
+    pub arrangement: Arrangement,
+    pub rig: Focus,
+    pub foreground: Foreground,
     pub box_low: Vec3,
     pub box_high: Vec3,
 }
@@ -80,6 +96,11 @@ impl WorkView {
         let q = level.k * c;
         Some(((q.x / c.z) as f32, (q.y / c.z) as f32, c.z as f32))
     }
+    /// Index of the pixel of the finest level that shows a world point, if any, whatever is in front of it.
+    pub fn pixel_of(&self, p: Vec3) -> Option<usize> {
+        let level = self.fine();
+        self.project(level, p).and_then(|(u, v, _)| level.pixel(u, v))
+    }
     /// The world point at `depth` behind image coordinates (u, v) of `level`.
     pub fn unproject(&self, level: &Level, u: f64, v: f64, depth: f64) -> Vec3 {
         let c = level.k.inverse() * DVec3::new(u, v, 1.0) * depth;
@@ -91,34 +112,62 @@ impl WorkView {
         let t = other.translation - r * self.translation;
         ((theirs.k * r * own.k.inverse()).as_mat3(), (theirs.k * t).as_vec3())
     }
+    /// Whether something of the scene can be at a pixel of the finest level.
+    pub fn solid(&self, foreground: Foreground, pixel: usize) -> bool {
+        let drawn = self.opaque.as_ref().is_none_or(|o| o[pixel]);
+        drawn && (foreground != Foreground::Whole || self.mask.as_ref().is_none_or(|m| m[pixel]))
+    }
 }
 
 impl WorkSet {
-    /// Loads the first instant with at least `min_views` training cameras.
-    pub fn load(scene: &Scene, min_views: usize) -> Result<Self> {
-        let mut by_frame: Vec<Vec<usize>> = vec![Vec::new(); scene.frame_count];
-        scene.split(Split::Train).into_iter().for_each(|v| by_frame[scene.views[v].frame].push(v));
-        let most = by_frame.iter().map(Vec::len).max().unwrap_or(0);
-        let Some(mut chosen) = by_frame.into_iter().find(|v| v.len() >= min_views) else {
-            return Err(Error::unsupported(
-                format!("points from the images of {}", scene.name),
-                format!("at no instant there are {min_views} training cameras, the most is {most}"),
-                "Start from random points",
-            ));
-        };
-        if chosen.len() > MAX_VIEWS {
-            let all = chosen.len();
-            chosen = (0..MAX_VIEWS).map(|i| chosen[i * all / MAX_VIEWS]).collect();
-        }
+    /// Loads the chosen views.
+    ///
+    /// # Errors
+    /// Whatever decoding the images meets.
+    pub fn load(scene: &Scene, choice: Choice) -> Result<Self> {
         let (low, high) = scene.init_box.unwrap_or_else(|| camera_box(scene));
-        let (low, high) = (Vec3::from(low), Vec3::from(high));
-        let mut views = chosen.par_iter().map(|&v| load_view(scene, v, low, high)).collect::<Result<Vec<_>>>()?;
-        let focus = (0.5 * (low + high)).as_dvec3();
-        let near: Vec<Vec<usize>> = (0..views.len()).map(|i| neighbours(&views, i, focus)).collect();
-        views.iter_mut().zip(near).for_each(|(view, near)| view.neighbours = near);
-        Ok(Self { views, box_low: low, box_high: high })
+        let mut views = choice.views.par_iter().map(|&v| load_view(scene, v)).collect::<Result<Vec<_>>>()?;
+        for ((view, partners), witnesses) in views.iter_mut().zip(choice.partners).zip(choice.witnesses) {
+            (view.partners, view.witnesses) = (partners, witnesses);
+        }
+        let foreground = super::foreground::find(&mut views);
+        let (box_low, box_high) = (Vec3::from(low), Vec3::from(high));
+        let mut set = Self { views, keys: choice.keys, arrangement: choice.arrangement, rig: choice.rig, foreground, box_low, box_high };
+        set.set_depth_ranges();
+        Ok(set)
     }
-    /// Edge of the cubes points are thinned to: about two pixels of the finest level at the middle of the scene.
+    /// Narrows the box to what the foreground can fill.
+    pub fn narrow(&mut self, low: Vec3, high: Vec3) {
+        (self.box_low, self.box_high) = (self.box_low.max(low), self.box_high.min(high));
+        self.set_depth_ranges();
+    }
+    /// The views that get depth maps.
+    pub fn key_views(&self) -> &[WorkView] {
+        &self.views[..self.keys]
+    }
+    fn set_depth_ranges(&mut self) {
+        for i in 0..self.views.len() {
+            self.views[i].depth_range = self.depth_range(&self.views[i]);
+        }
+    }
+    fn depth_range(&self, view: &WorkView) -> [f64; 2] {
+        let mut depths = [f64::INFINITY, f64::NEG_INFINITY];
+        for i in 0..8 {
+            let pick = |bit: usize, k: usize| f64::from(if i >> bit & 1 == 1 { self.box_high[k] } else { self.box_low[k] });
+            let z = (view.rotation * DVec3::new(pick(0, 0), pick(1, 1), pick(2, 2)) + view.translation).z;
+            depths = [depths[0].min(z), depths[1].max(z)];
+        }
+        if self.foreground == Foreground::Whole {
+            let far = depths[1].max(1e-3);
+            // Nothing useful is nearer than a twelfth of the far end; it would cost most of the planes.
+            return [depths[0].max(far / 12.0).min(0.9 * far), far];
+        }
+        let focus = focus_depth(view.center, view.rotation.transpose() * DVec3::Z, &self.rig);
+        let far = depths[1].max(FULL_RANGE[1] * focus);
+        let near = FULL_RANGE[0] * focus;
+        [if depths[0] > 0.0 { depths[0].clamp(0.3 * near, near) } else { near }, far]
+    }
+    /// Edge of the cubes that points at the distance of what the cameras look at are thinned to: about two pixels of the finest level.
     pub fn cell_size(&self) -> f32 {
         let focus = 0.5 * (self.box_low + self.box_high);
         let mut sizes: Vec<f32> = self.views.iter().map(|v| (v.center.as_vec3() - focus).length() / v.fine().k.x_axis.x as f32).collect();
@@ -127,7 +176,7 @@ impl WorkSet {
     }
 }
 
-fn load_view(scene: &Scene, view: usize, low: Vec3, high: Vec3) -> Result<WorkView> {
+fn load_view(scene: &Scene, view: usize) -> Result<WorkView> {
     let camera = scene.camera(view);
     let image = scene.frame(view)?;
     let pixels = f64::from(image.width) * f64::from(image.height);
@@ -152,28 +201,6 @@ fn load_view(scene: &Scene, view: usize, low: Vec3, high: Vec3) -> Result<WorkVi
         _ => None,
     };
     let (rotation, translation) = camera.rotation_translation();
-    let mut depths = [f64::INFINITY, f64::NEG_INFINITY];
-    for i in 0..8 {
-        let pick = |bit: usize, k: usize| f64::from(if i >> bit & 1 == 1 { high[k] } else { low[k] });
-        let z = (rotation * DVec3::new(pick(0, 0), pick(1, 1), pick(2, 2)) + translation).z;
-        depths = [depths[0].min(z), depths[1].max(z)];
-    }
-    let far = depths[1].max(1e-3);
-    // Nothing useful is nearer than a twelfth of the far end; it would cost most of the planes.
-    let near = depths[0].max(far / 12.0).min(0.9 * far);
-    Ok(WorkView { levels, rotation, translation, center: DVec3::from(camera.center_world()), neighbours: Vec::new(), depth_range: [near, far], mask, opaque })
-}
-
-/// The views whose direction to `focus` differs from that of view `i` by about [`BEST_ANGLE_RAD`].
-fn neighbours(views: &[WorkView], i: usize, focus: DVec3) -> Vec<usize> {
-    let own = (focus - views[i].center).normalize_or_zero();
-    let mut others: Vec<(f64, usize)> = (0..views.len())
-        .filter(|&j| j != i && (views[j].center - views[i].center).length() > 1e-9)
-        .map(|j| {
-            let angle = own.dot((focus - views[j].center).normalize_or_zero()).clamp(-1.0, 1.0).acos();
-            ((angle - BEST_ANGLE_RAD).abs(), j)
-        })
-        .collect();
-    others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    others.into_iter().take(NEIGHBOURS).map(|o| o.1).collect()
+    let center = DVec3::from(camera.center_world());
+    Ok(WorkView { levels, rotation, translation, center, partners: Vec::new(), witnesses: Vec::new(), depth_range: [0.0; 2], mask, opaque })
 }

@@ -1,5 +1,8 @@
 //! Analytic objects and how they move.
 
+use super::figure::{Figure, Part};
+use super::shapes::Shape;
+use super::textures::Texture;
 use glam::{DQuat, DVec3};
 use std::f64::consts::{PI, TAU};
 
@@ -13,6 +16,18 @@ pub struct Pose {
 }
 
 impl Pose {
+    /// At `translation`, not turned.
+    pub fn at(translation: DVec3) -> Self {
+        Self { rotation: DQuat::IDENTITY, translation }
+    }
+    /// About the origin.
+    pub fn turned(rotation: DQuat) -> Self {
+        Self { rotation, translation: DVec3::ZERO }
+    }
+    /// The placement in the world of something that is placed at `inner` in this frame.
+    pub fn then(&self, inner: Self) -> Self {
+        Self { rotation: self.rotation * inner.rotation, translation: self.apply(inner.translation) }
+    }
     /// World position of a local point.
     pub fn apply(&self, local: DVec3) -> DVec3 {
         self.rotation * local + self.translation
@@ -32,6 +47,15 @@ pub enum Motion {
         at: DVec3,
         /// Turn about z in radians.
         turn_rad: f64,
+    },
+    /// It stands, turned about any axis.
+    Placed(Pose),
+    /// It is a part of an articulated figure.
+    Part {
+        /// The figure, which says how all parts move.
+        figure: Figure,
+        /// Which part.
+        part: Part,
     },
     /// It travels an arc of a horizontal circle and hops on the way.
     Arc {
@@ -80,6 +104,8 @@ impl Motion {
     pub fn pose(&self, time_norm: f64) -> Pose {
         match *self {
             Self::Still { at, turn_rad } => Pose { rotation: DQuat::from_rotation_z(turn_rad), translation: at },
+            Self::Placed(pose) => pose,
+            Self::Part { figure, part } => figure.pose(part, time_norm),
             Self::Arc { center, radius, from_to_rad, hop, hops } => {
                 let angle = from_to_rad[0] + (from_to_rad[1] - from_to_rad[0]) * time_norm;
                 let rise = hop * (PI * hops * time_norm).sin().powi(2);
@@ -96,91 +122,7 @@ impl Motion {
     }
     /// Whether it never moves.
     pub fn is_still(&self) -> bool {
-        matches!(self, Self::Still { .. })
-    }
-}
-
-/// A solid around its local origin.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Shape {
-    /// A ball.
-    Sphere {
-        /// Radius in world units.
-        radius: f64,
-    },
-    /// A box.
-    Cuboid {
-        /// Half of each edge, in world units.
-        half: DVec3,
-    },
-}
-
-impl Shape {
-    /// The nearest hit of a local ray (unit direction) beyond a hair's breadth: distance and outward normal.
-    pub fn intersect(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
-        const NEAREST: f64 = 1e-6;
-        match *self {
-            Self::Sphere { radius } => {
-                let b = origin.dot(direction);
-                let disc = b * b - (origin.length_squared() - radius * radius);
-                if disc < 0.0 {
-                    return None;
-                }
-                let root = disc.sqrt();
-                let t = if -b - root > NEAREST { -b - root } else { -b + root };
-                (t > NEAREST).then(|| (t, (origin + direction * t) / radius))
-            }
-            Self::Cuboid { half } => {
-                let (mut near, mut far, mut normal) = (f64::NEG_INFINITY, f64::INFINITY, DVec3::ZERO);
-                for k in 0..3 {
-                    if direction[k].abs() < 1e-12 {
-                        if origin[k].abs() > half[k] {
-                            return None;
-                        }
-                        continue;
-                    }
-                    let (a, b) = ((-half[k] - origin[k]) / direction[k], (half[k] - origin[k]) / direction[k]);
-                    let (enter, leave) = (a.min(b), a.max(b));
-                    if enter > near {
-                        near = enter;
-                        normal = DVec3::ZERO;
-                        normal[k] = -direction[k].signum();
-                    }
-                    far = far.min(leave);
-                }
-                // From within a box nothing is drawn: no camera of the scene is in one.
-                (near <= far && near > NEAREST).then_some((near, normal))
-            }
-        }
-    }
-}
-
-/// Colour over the surface, a function of the local position.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Texture {
-    /// One colour.
-    Plain([f64; 3]),
-    /// Two colours in cubes of the given edge.
-    Checker([f64; 3], [f64; 3], f64),
-    /// Two colours in bands around the local z axis' meridians (first) and heights (second): number of bands per turn and per unit.
-    Bands([f64; 3], [f64; 3], f64, f64),
-}
-
-impl Texture {
-    /// The colour at a local point.
-    pub fn color(&self, p: DVec3) -> [f64; 3] {
-        match *self {
-            Self::Plain(c) => c,
-            Self::Checker(a, b, edge) => {
-                // Half an edge off, so that faces through the origin do not flicker between two cubes.
-                let cell = (p / edge + DVec3::splat(0.25)).floor();
-                if (cell.x + cell.y + cell.z).rem_euclid(2.0) < 0.5 { a } else { b }
-            }
-            Self::Bands(a, b, per_turn, per_unit) => {
-                let phase = p.y.atan2(p.x) / TAU * per_turn + p.z * per_unit;
-                if phase.rem_euclid(1.0) < 0.5 { a } else { b }
-            }
-        }
+        matches!(self, Self::Still { .. } | Self::Placed(_))
     }
 }
 
@@ -202,6 +144,22 @@ pub struct Object {
     pub material: Material,
     /// Its motion.
     pub motion: Motion,
+    /// It is there from the first of these times (included) to the second (excluded); [`ALWAYS`] for most.
+    pub visible: [f64; 2],
+}
+
+/// The times of an object that never comes or goes.
+pub const ALWAYS: [f64; 2] = [f64::NEG_INFINITY, f64::INFINITY];
+
+impl Object {
+    /// A matte object that is always there.
+    pub fn matte(shape: Shape, texture: Texture, motion: Motion) -> Self {
+        Self { shape, material: Material { texture, specular: 0.0 }, motion, visible: ALWAYS }
+    }
+    /// Whether it is there at `time_norm`.
+    pub fn is_there(&self, time_norm: f64) -> bool {
+        (self.visible[0]..self.visible[1]).contains(&time_norm)
+    }
 }
 
 /// The objects of the built-in scenes: a checkered floor, a standing box and ball, and three that move.
@@ -213,31 +171,37 @@ pub(super) fn playground() -> Vec<Object> {
             shape: Shape::Cuboid { half: DVec3::new(1.8, 1.8, 0.05) },
             material: matte(Texture::Checker([0.82, 0.80, 0.75], [0.30, 0.34, 0.38], 0.45)),
             motion: Motion::Still { at: DVec3::new(0.0, 0.0, -0.05), turn_rad: 0.0 },
+            visible: ALWAYS,
         },
         Object {
             shape: Shape::Cuboid { half: DVec3::new(0.30, 0.22, 0.45) },
             material: matte(Texture::Bands([0.85, 0.55, 0.20], [0.45, 0.20, 0.12], 0.0, 5.0)),
             motion: Motion::Still { at: DVec3::new(-0.95, 0.75, 0.45), turn_rad: 0.5 },
+            visible: ALWAYS,
         },
         Object {
             shape: Shape::Sphere { radius: 0.34 },
             material: glossy(Texture::Bands([0.15, 0.45, 0.30], [0.75, 0.85, 0.55], 8.0, 0.0)),
             motion: Motion::Still { at: DVec3::new(0.95, 0.95, 0.34), turn_rad: 0.0 },
+            visible: ALWAYS,
         },
         Object {
             shape: Shape::Sphere { radius: 0.28 },
             material: glossy(Texture::Checker([0.80, 0.15, 0.15], [0.95, 0.85, 0.80], 0.22)),
             motion: Motion::Arc { center: DVec3::new(0.0, 0.0, 0.28), radius: 1.15, from_to_rad: [-2.2, -1.3], hop: 0.3, hops: 1.0 },
+            visible: ALWAYS,
         },
         Object {
             shape: Shape::Cuboid { half: DVec3::new(0.26, 0.26, 0.26) },
             material: matte(Texture::Checker([0.20, 0.30, 0.75], [0.90, 0.90, 0.35], 0.26)),
             motion: Motion::Spin { at: DVec3::new(0.05, 0.05, 0.26), turns: 0.4 },
+            visible: ALWAYS,
         },
         Object {
             shape: Shape::Cuboid { half: DVec3::new(0.11, 0.11, 0.42) },
             material: matte(Texture::Bands([0.65, 0.25, 0.65], [0.95, 0.90, 0.95], 0.0, 6.0)),
             motion: Motion::Swing { pivot: DVec3::new(0.0, 0.1, 1.95), length: 0.75, amplitude_rad: 0.45, swings: 0.5 },
+            visible: ALWAYS,
         },
     ]
 }
@@ -251,6 +215,7 @@ pub(super) fn frequencies() -> Vec<Object> {
             shape: Shape::Sphere { radius: 0.26 },
             material: Material { texture: Texture::Checker(color, [0.95, 0.92, 0.85], 0.18), specular: 0.0 },
             motion: Motion::Sway { at: DVec3::new(1.05 * c, 1.05 * s, 0.70), reach: DVec3::Z * 0.25, cycles: f64::from(1 << k) },
+            visible: ALWAYS,
         }
     });
     playground().into_iter().take(1).chain(balls).collect()
@@ -259,15 +224,6 @@ pub(super) fn frequencies() -> Vec<Object> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn solids_are_hit_where_geometry_says() {
-        let (t, n) = Shape::Sphere { radius: 0.5 }.intersect(DVec3::new(0.0, 0.0, 3.0), -DVec3::Z).unwrap();
-        assert!((t - 2.5).abs() < 1e-12 && (n - DVec3::Z).length() < 1e-12);
-        let (t, n) = Shape::Cuboid { half: DVec3::new(1.0, 2.0, 3.0) }.intersect(DVec3::new(-5.0, 0.5, 0.5), DVec3::X).unwrap();
-        assert!((t - 4.0).abs() < 1e-12 && n == -DVec3::X);
-        assert!(Shape::Cuboid { half: DVec3::ONE }.intersect(DVec3::new(-5.0, 1.5, 0.0), DVec3::X).is_none());
-    }
 
     #[test]
     fn poses_are_rigid_and_invert() {

@@ -1,0 +1,114 @@
+//! Videos through the `ffmpeg` and `ffprobe` commands: what they contain ([`probe`]), their frames on a common clock ([`footage`]), extraction of
+//! single frames ([`VideoFrames`]), and the motion in them over time ([`motion`]).
+
+mod extract;
+mod motion;
+mod probe;
+mod timeline;
+
+pub(super) use extract::VideoFrames;
+pub(super) use motion::motion;
+pub(super) use probe::{VideoFacts, probe};
+use timeline::timeline;
+
+use cc4dgs_core::reader::files::{file_name, has_extension};
+use cc4dgs_core::{Error, ImageSource, Limits, Result, SceneOptions, Seed};
+use std::ffi::{OsStr, OsString};
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// The first video stream that is not a cover image.
+const STREAM: &str = "V:0";
+/// Brings selected frames to consecutive times, whatever their own: with an output rate of 25, no version of ffmpeg repeats or drops any.
+const CONSECUTIVE: &str = "settb=1/25,setpts=N";
+/// The most bytes of messages that are read from a command.
+const MESSAGES: u64 = 1 << 16;
+
+/// Whether the extension is that of a video.
+pub(super) fn is_video(path: &Path) -> bool {
+    has_extension(path, &["mp4", "mov", "m4v", "mkv", "webm", "avi"])
+}
+
+/// A video on the clock of its scene.
+pub(super) struct Footage {
+    /// Width and height in pixels, as displayed.
+    pub size: [u32; 2],
+    /// Its image at each instant; `None` where it has no frame near enough.
+    pub images: Vec<Option<ImageSource>>,
+}
+
+/// The images of the videos of one scene at common instants, so that image k of every video shows the same moment as far as their timestamps say.
+///
+/// Errors: [`Error::Data`] for files that are no videos, [`Error::Limit`] for frames over the limits, [`Error::Unsupported`] without `ffprobe`.
+pub(super) fn footage(videos: &[PathBuf], options: &SceneOptions, limits: &Limits, warnings: &mut Vec<String>) -> Result<Vec<Footage>> {
+    if videos.is_empty() {
+        return Ok(Vec::new());
+    }
+    let facts = videos.iter().map(|v| probe(v, options, limits)).collect::<Result<Vec<VideoFacts>>>()?;
+    let names: Vec<String> = videos.iter().map(|v| file_name(v)).collect();
+    let times: Vec<&[f64]> = facts.iter().map(|f| f.times.as_slice()).collect();
+    let common = timeline(&names, &times);
+    warnings.extend(common.notes);
+    let sources = |(video, frames): (&PathBuf, Vec<Option<usize>>)| -> Vec<Option<ImageSource>> {
+        frames.into_iter().map(|frame| frame.map(|frame| ImageSource::Video { path: video.clone(), frame })).collect()
+    };
+    Ok(facts.iter().zip(videos.iter().zip(common.frames)).map(|(f, found)| Footage { size: f.size, images: sources(found) }).collect())
+}
+
+/// A path as an input of ffmpeg: never an address or an option, whatever its name.
+fn input(video: &Path) -> OsString {
+    let mut text = OsString::from("file:");
+    text.push(video);
+    text
+}
+
+/// The folder for what is computed from videos.
+fn cache_folder(options: &SceneOptions) -> PathBuf {
+    options.video_cache.clone().unwrap_or_else(|| std::env::temp_dir().join("cc4dgs-frames"))
+}
+
+/// A name in the cache that changes with the video and with `what` is computed from it.
+fn cache_name(video: &Path, what: &str) -> Result<String> {
+    let full = video.canonicalize().map_err(|e| Error::io(video, e))?;
+    let meta = std::fs::metadata(&full).map_err(|e| Error::io(video, e))?;
+    let modified = meta.modified().ok().and_then(|t| t.duration_since(std::time::UNIX_EPOCH).ok()).map(|d| d.as_nanos()).unwrap_or(0);
+    let key = Seed::root(0).child(&format!("{}|{}|{modified}|{what}", full.display(), meta.len()));
+    let stem = video.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    Ok(format!("{stem}-{:016x}", key.value()))
+}
+
+/// Runs a command to its end and returns what it prints, at most `most` bytes.
+fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64) -> Result<Vec<u8>> {
+    let object = || format!("video {}", video.display());
+    let failed = |e: std::io::Error| Error::io(video, e);
+    // A file, because a pipe that nobody reads would stop the command.
+    let mut messages = tempfile::tempfile().map_err(failed)?;
+    let stderr = messages.try_clone().map_err(failed)?;
+    let mut child = Command::new(program).args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr).spawn().map_err(|e| {
+        Error::unsupported(
+            object(),
+            format!("the command {program} could not be started ({e})"),
+            "Install ffmpeg, set scene.ffmpeg to its path, or extract the frames to one folder per camera (cam00/0000.png …)",
+        )
+    })?;
+    let mut printed = Vec::new();
+    let read = child.stdout.take().map_or(Ok(0), |pipe| pipe.take(most.saturating_add(1)).read_to_end(&mut printed));
+    if read.is_err() || printed.len() as u64 > most {
+        let _ = child.kill();
+        let _ = child.wait();
+        read.map_err(failed)?;
+        return Err(Error::limit(format!("{}: output of {program}", object()), most.saturating_add(1), most, "Cut the video into shorter ones"));
+    }
+    let status = child.wait().map_err(failed)?;
+    if !status.success() {
+        let end = messages.seek(SeekFrom::End(0)).map_err(failed)?;
+        messages.seek(SeekFrom::Start(end.saturating_sub(MESSAGES))).map_err(failed)?;
+        let mut said = Vec::new();
+        messages.take(MESSAGES).read_to_end(&mut said).map_err(failed)?;
+        let said = String::from_utf8_lossy(&said);
+        let last = said.lines().rev().find(|l| !l.trim().is_empty()).unwrap_or("no message").chars().take(300).collect::<String>();
+        return Err(Error::data(object(), format!("{program} failed: {last}"), "Check the video, or extract its frames yourself"));
+    }
+    Ok(printed)
+}

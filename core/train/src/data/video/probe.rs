@@ -1,0 +1,233 @@
+//! What a video contains, as `ffprobe` says: size, orientation, times of the frames. Packets are listed, not decoded.
+
+use super::{STREAM, input, run};
+use cc4dgs_core::{Error, Limits, Result, SceneOptions};
+use serde::Deserialize;
+use std::ffi::OsStr;
+use std::path::Path;
+
+/// The most that is read of the list of packets: days of video.
+const MOST_PRINTED: u64 = 1 << 28;
+/// Tangent of one degree. ffmpeg takes angles that near to a multiple of 90 degrees as that multiple, and so do we.
+const TAN_ONE_DEGREE: f64 = 0.017_455;
+/// The rate of a video that states none. It cancels out where all videos of a scene state none.
+const DEFAULT_RATE: f64 = 25.0;
+
+/// What `ffprobe` says about a video.
+pub(crate) struct VideoFacts {
+    /// Width and height in pixels, as displayed.
+    pub size: [u32; 2],
+    /// Presentation times of the decoded frames in seconds, ascending.
+    pub times: Vec<f64>,
+    /// Whether each frame is a key frame.
+    pub keys: Vec<bool>,
+}
+
+/// One of the eight orientations of an image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Turn {
+    /// The ffmpeg filter that does it; empty for upright frames.
+    pub filter: &'static str,
+    /// Whether width and height change places.
+    pub swaps: bool,
+}
+
+#[derive(Deserialize)]
+struct Printed {
+    #[serde(default)]
+    packets: Vec<Packet>,
+    #[serde(default)]
+    streams: Vec<Stream>,
+}
+
+#[derive(Deserialize)]
+struct Packet {
+    pts_time: Option<String>,
+    #[serde(default)]
+    flags: String,
+}
+
+#[derive(Deserialize)]
+struct Stream {
+    #[serde(default)]
+    width: u64,
+    #[serde(default)]
+    height: u64,
+    r_frame_rate: Option<String>,
+    avg_frame_rate: Option<String>,
+    #[serde(default)]
+    side_data_list: Vec<SideData>,
+}
+
+#[derive(Deserialize)]
+struct SideData {
+    displaymatrix: Option<String>,
+    rotation: Option<f64>,
+}
+
+/// Size, orientation and times of a video.
+///
+/// Errors: [`Error::Data`] for a file without video, with no frame, or turned by other than multiples of 90 degrees, [`Error::Limit`] for large frames,
+/// [`Error::Unsupported`] without `ffprobe`.
+pub(crate) fn probe(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFacts> {
+    let printed = ask(video, options, "packet=pts_time,flags:stream=width,height,r_frame_rate,avg_frame_rate:stream_side_data=displaymatrix,rotation")?;
+    let bad = |problem: String, remedy: &str| Error::data(format!("video {}", video.display()), problem, remedy);
+    let Some(stream) = printed.streams.first() else { return Err(bad("it holds no video".into(), "Check the file")) };
+    if !(1..=1 << 16).contains(&stream.width) || !(1..=1 << 16).contains(&stream.height) {
+        return Err(bad(format!("its frames have {}x{} pixels, not 1 to 65536 each way", stream.width, stream.height), "Check the video"));
+    }
+    limits.check_pixels(&format!("video {}", video.display()), stream.width, stream.height)?;
+    let turn = stream.turn().map_err(|angle| bad(format!("it is displayed turned by {angle:.1} degrees"), "Turn it by a multiple of 90 degrees"))?;
+    let size = [stream.width as u32, stream.height as u32];
+    let (times, keys) = frame_times(&printed.packets, stream);
+    if times.is_empty() {
+        return Err(bad("it has no frame".into(), "Check the video"));
+    }
+    Ok(VideoFacts { size: if turn.swaps { [size[1], size[0]] } else { size }, times, keys })
+}
+
+/// How the frames of a video are turned, without listing its packets.
+pub(super) fn turn_of(video: &Path, options: &SceneOptions) -> Result<Turn> {
+    let printed = ask(video, options, "stream=width:stream_side_data=displaymatrix,rotation")?;
+    let turn = printed.streams.first().map_or(Ok(Turn::UPRIGHT), Stream::turn);
+    turn.map_err(|angle| {
+        Error::data(format!("video {}", video.display()), format!("it is displayed turned by {angle:.1} degrees"), "Turn it by a multiple of 90 degrees")
+    })
+}
+
+fn ask(video: &Path, options: &SceneOptions, entries: &str) -> Result<Printed> {
+    let ffprobe = match options.ffmpeg.strip_suffix("ffmpeg") {
+        Some(folder) => format!("{folder}ffprobe"),
+        None => "ffprobe".into(),
+    };
+    let arguments = ["-v", "error", "-protocol_whitelist", "file", "-select_streams", STREAM, "-show_entries", entries, "-of", "json=compact=1"];
+    let video_input = input(video);
+    let mut arguments = arguments.map(OsStr::new).to_vec();
+    arguments.push(&video_input);
+    let printed = run(&ffprobe, &arguments, video, MOST_PRINTED)?;
+    serde_json::from_slice(&printed).map_err(|e| {
+        let said: String = String::from_utf8_lossy(&printed).trim().chars().take(200).collect();
+        Error::data(format!("video {}", video.display()), format!("{ffprobe} said {said:?} ({e})"), "Check the video, and that ffprobe is the one of ffmpeg")
+    })
+}
+
+impl Turn {
+    const UPRIGHT: Self = Self { filter: "", swaps: false };
+
+    /// The turn of a display matrix: a point (x, y) of the frame is shown at (a x + c y, b x + d y), y downwards. The angle in degrees where it is none.
+    fn from_matrix([a, b, c, d]: [f64; 4]) -> Result<Self, f64> {
+        let (least, most) = (|x: f64, y: f64| x.abs().min(y.abs()), |x: f64, y: f64| x.abs().max(y.abs()));
+        if [a, b, c, d].iter().all(|v| *v == 0.0) {
+            return Ok(Self::UPRIGHT);
+        }
+        if least(a, d) > 0.0 && most(b, c) <= TAN_ONE_DEGREE * least(a, d) {
+            let filter = match (a < 0.0, d < 0.0) {
+                (false, false) => "",
+                (true, false) => "hflip",
+                (false, true) => "vflip",
+                (true, true) => "hflip,vflip",
+            };
+            return Ok(Self { filter, swaps: false });
+        }
+        if least(b, c) > 0.0 && most(a, d) <= TAN_ONE_DEGREE * least(b, c) {
+            let filter = match (b > 0.0, c > 0.0) {
+                (true, true) => "transpose=cclock_flip",
+                (true, false) => "transpose=clock",
+                (false, true) => "transpose=cclock",
+                (false, false) => "transpose=clock_flip",
+            };
+            return Ok(Self { filter, swaps: true });
+        }
+        Err(b.atan2(a).to_degrees())
+    }
+}
+
+impl Stream {
+    fn turn(&self) -> Result<Turn, f64> {
+        for data in &self.side_data_list {
+            if let Some(matrix) = data.displaymatrix.as_deref().and_then(display_matrix) {
+                return Turn::from_matrix(matrix);
+            }
+            if let Some(degrees) = data.rotation {
+                // ffprobe counts counterclockwise.
+                let (s, c) = (-degrees).to_radians().sin_cos();
+                return Turn::from_matrix([c, s, -s, c]);
+            }
+        }
+        Ok(Turn::UPRIGHT)
+    }
+    fn rate(&self) -> f64 {
+        let parse = |text: &Option<String>| {
+            let (n, d) = text.as_deref()?.split_once('/')?;
+            Some(n.parse::<f64>().ok()? / d.parse::<f64>().ok()?).filter(|r| (1e-3..=1e6).contains(r))
+        };
+        parse(&self.avg_frame_rate).or_else(|| parse(&self.r_frame_rate)).unwrap_or(DEFAULT_RATE)
+    }
+}
+
+/// The upper left 2x2 numbers of a display matrix, which ffprobe prints as three numbered lines of three integers.
+fn display_matrix(text: &str) -> Option<[f64; 4]> {
+    let rows: Vec<Vec<f64>> = text
+        .lines()
+        .filter_map(|line| line.split_once(':'))
+        .map(|(_, numbers)| numbers.split_whitespace().filter_map(|t| t.parse::<i64>().ok()).map(|v| v as f64).collect())
+        .collect();
+    match &rows[..] {
+        [first, second, _] if first.len() == 3 && second.len() == 3 => Some([first[0], first[1], second[0], second[1]]),
+        _ => None,
+    }
+}
+
+/// Times and key frames in the order of presentation. Packets that are only decoded, not shown, are left out.
+fn frame_times(packets: &[Packet], stream: &Stream) -> (Vec<f64>, Vec<bool>) {
+    let shown: Vec<&Packet> = packets.iter().filter(|p| !p.flags.contains('D')).collect();
+    let time = |p: &&Packet| p.pts_time.as_deref().and_then(|t| t.parse::<f64>().ok()).filter(|t| t.is_finite());
+    let stated: Option<Vec<f64>> = shown.iter().map(time).collect();
+    // Without times of all frames, their order is that of the packets, at a constant rate.
+    let times = stated.unwrap_or_else(|| (0..shown.len()).map(|i| i as f64 / stream.rate()).collect());
+    let mut frames: Vec<(f64, bool)> = times.into_iter().zip(shown.iter().map(|p| p.flags.contains('K'))).collect();
+    frames.sort_by(|a, b| a.0.total_cmp(&b.0));
+    frames.into_iter().unzip()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn display_matrices_are_one_of_eight_turns_or_refused() {
+        let turn = |m: [f64; 4]| Turn::from_matrix(m).map(|t| (t.filter, t.swaps));
+        let one = 65536.0;
+        assert_eq!(turn([one, 0.0, 0.0, one]), Ok(("", false)));
+        assert_eq!(turn([0.0; 4]), Ok(("", false)));
+        assert_eq!(turn([-one, 0.0, 0.0, -one]), Ok(("hflip,vflip", false)));
+        assert_eq!(turn([-one, 0.0, 0.0, one]), Ok(("hflip", false)));
+        assert_eq!(turn([0.0, one, -one, 0.0]), Ok(("transpose=clock", true)));
+        assert_eq!(turn([0.0, -one, one, 0.0]), Ok(("transpose=cclock", true)));
+        assert_eq!(turn([0.0, one, one, 0.0]), Ok(("transpose=cclock_flip", true)));
+        assert!((turn([46341.0, 46341.0, -46341.0, 46341.0]).unwrap_err() - 45.0).abs() < 1e-6);
+        assert!(turn([one, 0.0, 0.0, 0.0]).is_err(), "a flat matrix");
+        let text =
+            "\n00000000:            0       65536           0\n00000001:      -65536           0           0\n00000002:            0           0  1073741824\n";
+        assert_eq!(display_matrix(text), Some([0.0, one, -one, 0.0]));
+        assert_eq!(display_matrix("00000000: 1 2"), None);
+        let stream = |side: &str| serde_json::from_str::<Stream>(&format!("{{\"side_data_list\": [{side}]}}")).unwrap().turn();
+        assert_eq!(stream("{\"rotation\": -90}").unwrap().filter, "transpose=clock");
+        assert!(stream("{\"rotation\": 30}").is_err());
+        assert_eq!(stream("{}"), Ok(Turn::UPRIGHT));
+    }
+
+    #[test]
+    fn times_are_sorted_and_hidden_packets_left_out() {
+        let read =
+            |packets: &str, stream: &str| frame_times(&serde_json::from_str::<Vec<Packet>>(packets).unwrap(), &serde_json::from_str::<Stream>(stream).unwrap());
+        let packets = r#"[{"pts_time":"0.0","flags":"KD"},{"pts_time":"0.1","flags":"K_"},{"pts_time":"0.3","flags":"__"},{"pts_time":"0.2"}]"#;
+        assert_eq!(read(packets, "{}"), (vec![0.1, 0.2, 0.3], vec![true, false, false]));
+        // A time is missing, or no number: a constant rate.
+        for odd in ["{}", r#"{"pts_time":"nan"}"#] {
+            let (times, _) = read(&format!("[{odd},{{\"pts_time\":\"7\"}}]"), r#"{"avg_frame_rate":"0/0","r_frame_rate":"10/1"}"#);
+            assert_eq!(times, vec![0.0, 0.1]);
+        }
+        assert_eq!(read("[{},{}]", r#"{"avg_frame_rate":"1/0"}"#).0, vec![0.0, 1.0 / DEFAULT_RATE]);
+    }
+}

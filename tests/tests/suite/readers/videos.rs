@@ -1,0 +1,350 @@
+//! Videos as people bring them: turned, of variable or different frame rates, started at different moments. Each frame holds the number of the instant at
+//! which it was recorded, so that a test can tell what it sees. Skipped with a note where the ffmpeg command is missing.
+
+use super::common::*;
+use cc4dgs_core::{Image8, Limits, Scene, SceneOptions, Seed, SyncMode};
+use rand::Rng;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+const SIZE: (u32, u32) = (64, 48);
+const BITS: u32 = 10;
+
+/// Whether ffmpeg is here.
+fn ffmpeg() -> bool {
+    let here =
+        ["ffmpeg", "ffprobe"].iter().all(|c| Command::new(c).arg("-version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success()));
+    if !here {
+        eprintln!("skipped: the ffmpeg and ffprobe commands are absent");
+    }
+    here
+}
+
+/// Runs ffmpeg on `arguments`.
+fn encode(arguments: &[&str], out: &Path) {
+    let output = Command::new("ffmpeg").args(["-nostdin", "-v", "error", "-y"]).args(arguments).arg(out).stdin(Stdio::null()).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// Column of a box that moves in bursts, per instant.
+fn path(count: usize) -> Vec<u32> {
+    let mut rng = Seed::root(4).rng();
+    let (mut left, mut speed, mut x) = (0, 0.0f64, 20.0f64);
+    let step = |_| {
+        if left == 0 {
+            (left, speed) = (rng.random_range(3..20), rng.random_range(-4.0..4.0));
+        }
+        left -= 1;
+        if !(0.0..=48.0).contains(&(x + speed)) {
+            speed = -speed;
+        }
+        x += speed;
+        x.round() as u32
+    };
+    (0..count).map(step).collect()
+}
+
+/// A video of the given instants. Each camera sees the box at another height, every second one mirrored. The upper left corner is bright.
+fn record(out: &Path, camera: usize, instants: &[usize], rate: &str, more: &[&str]) {
+    let motion = path(1 << BITS);
+    let frames = tempfile::tempdir().unwrap();
+    for (index, &instant) in instants.iter().enumerate() {
+        let left = if camera.is_multiple_of(2) { motion[instant] } else { 48 - motion[instant] };
+        let top = 14 + 4 * camera as u32;
+        let image = image::GrayImage::from_fn(SIZE.0, SIZE.1, |x, y| {
+            let code = y < 6 && (2..2 + 6 * BITS).contains(&x) && instant >> ((x - 2) / 6) & 1 == 1;
+            let block = (left..left + 14).contains(&x) && (top..top + 14).contains(&y);
+            image::Luma([if block || (x < 8 && y > 40) {
+                230
+            } else if code {
+                130
+            } else {
+                40
+            }])
+        });
+        image.save(frames.path().join(format!("{index:04}.png"))).unwrap();
+    }
+    let pattern = frames.path().join("%04d.png");
+    let mut arguments = vec!["-framerate", rate, "-i", pattern.to_str().unwrap(), "-c:v", "mpeg4", "-q:v", "2", "-pix_fmt", "yuv420p", "-g", "24"];
+    arguments.extend(more);
+    encode(&arguments, out);
+}
+
+/// The instant a frame shows.
+fn instant(image: &Image8) -> usize {
+    let grey = |x: u32, y: u32| image.data[((y * image.width + x) * image.channels) as usize];
+    (0..BITS).map(|bit| usize::from(grey(5 + 6 * bit, 2) > 85) << bit).sum()
+}
+
+/// Per frame the instants that the cameras show, in their order.
+fn instants(scene: &Scene) -> BTreeMap<usize, Vec<Option<usize>>> {
+    let mut found: BTreeMap<usize, Vec<Option<usize>>> = BTreeMap::new();
+    for (view, v) in scene.views.iter().enumerate() {
+        found.entry(v.frame).or_insert_with(|| vec![None; scene.cameras.len()])[v.camera] = Some(instant(&scene.frame(view).unwrap()));
+    }
+    found
+}
+
+/// A folder for an N3DV scene of `cameras` cameras, and options with a cache of its own.
+fn rig(cameras: usize, size: (u32, u32)) -> (tempfile::TempDir, SceneOptions) {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[cameras, 17], &llff_rows(&ring(cameras, size.0, size.1)))).unwrap();
+    let options = SceneOptions { video_cache: Some(dir.path().join("cache")), ..Default::default() };
+    (dir, options)
+}
+
+fn video(dir: &tempfile::TempDir, camera: usize) -> PathBuf {
+    dir.path().join(format!("cam{camera:02}.mp4"))
+}
+
+fn opened(dir: &tempfile::TempDir, options: &SceneOptions) -> Scene {
+    open(dir.path(), options, &Limits::default()).unwrap()
+}
+
+#[test]
+fn constant_rates_keep_every_frame() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(2, SIZE);
+    (0..2).for_each(|c| record(&video(&dir, c), c, &(0..40).collect::<Vec<_>>(), "30000/1001", &[]));
+    let scene = opened(&dir, &options);
+    assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
+    assert_eq!(instants(&scene), (0..40).map(|k| (k, vec![Some(k); 2])).collect());
+    let some = opened(&dir, &SceneOptions { frames: Some([5, 6, 4]), ..options });
+    assert_eq!(instants(&some), (0..6).map(|k| (k, vec![Some(5 + 4 * k); 2])).collect());
+}
+
+/// Writes a display matrix into the header of an mp4 file.
+fn set_matrix(file: &Path, matrix: [f64; 4]) {
+    let mut bytes = std::fs::read(file).unwrap();
+    let header = bytes.windows(4).position(|w| w == b"tkhd").unwrap() + 4;
+    assert_eq!(bytes[header], 0, "version 0 of the track header");
+    let [a, b, c, d] = matrix.map(|v| (v * 65536.0) as i32);
+    for (index, value) in [a, b, 0, c, d, 0, 0, 0, 1 << 30].into_iter().enumerate() {
+        let at = header + 40 + 4 * index;
+        bytes[at..at + 4].copy_from_slice(&value.to_be_bytes());
+    }
+    std::fs::write(file, bytes).unwrap();
+}
+
+#[test]
+fn rotated_phones_are_upright() {
+    if !ffmpeg() {
+        return;
+    }
+    // Clockwise by 0, 90, 180 and 270 degrees: where the corner that is bright in the file, lower left, is displayed (right, bottom).
+    let turns = [([1.0, 0.0, 0.0, 1.0], (0, 1)), ([0.0, 1.0, -1.0, 0.0], (0, 0)), ([-1.0, 0.0, 0.0, -1.0], (1, 0)), ([0.0, -1.0, 1.0, 0.0], (1, 1))];
+    for (matrix, corner) in turns {
+        let size = if matrix[0] == 0.0 { (SIZE.1, SIZE.0) } else { SIZE };
+        let (dir, options) = rig(2, size);
+        for c in 0..2 {
+            record(&video(&dir, c), c, &[0, 1, 2], "30", &[]);
+            set_matrix(&video(&dir, c), matrix);
+        }
+        let scene = opened(&dir, &options);
+        assert_eq!((scene.cameras[0].width, scene.cameras[0].height), size);
+        let image = scene.frame(2).unwrap();
+        assert_eq!((image.width, image.height), size);
+        let at = |right: u32, bottom: u32| image.data[(((bottom * (size.1 - 5) + 2) * size.0 + right * (size.0 - 5) + 2) * 3) as usize];
+        let bright: Vec<(u32, u32)> = [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().filter(|(r, b)| at(*r, *b) > 180).collect();
+        assert_eq!(bright, [corner], "{matrix:?}");
+        // ffmpeg itself shows the same.
+        let shown = dir.path().join("shown.png");
+        encode(&["-i", video(&dir, 0).to_str().unwrap(), "-frames:v", "1"], &shown);
+        let shown = image::open(&shown).unwrap().into_rgb8();
+        let ours = scene.frame(0).unwrap();
+        assert_eq!(shown.dimensions(), size);
+        assert!(shown.as_raw().iter().zip(&ours.data).all(|(a, b)| a.abs_diff(*b) <= 2), "{matrix:?}");
+    }
+    // The calibration of the file's own size does not fit what is displayed.
+    let (dir, options) = rig(1, SIZE);
+    record(&video(&dir, 0), 0, &[0, 1], "30", &[]);
+    set_matrix(&video(&dir, 0), [0.0, 1.0, -1.0, 0.0]);
+    let message = open(dir.path(), &options, &Limits::default()).err().unwrap().to_string();
+    assert!(message.contains("48x64"), "{message}");
+    set_matrix(&video(&dir, 0), [0.7, 0.7, -0.7, 0.7]);
+    let message = open(dir.path(), &options, &Limits::default()).err().unwrap().to_string();
+    assert!(message.contains("45.0 degrees"), "{message}");
+}
+
+#[test]
+fn variable_rates_are_matched_by_time() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(2, SIZE);
+    let all: Vec<usize> = (0..48).collect();
+    record(&video(&dir, 0), 0, &all, "24", &[]);
+    // The recorder dropped frames, and the file says so. (ffmpeg writes mp4 at a constant rate unless told otherwise.)
+    record(&dir.path().join("cam01.mkv"), 1, &all, "24", &["-vf", "select='not(between(n,10,14)+eq(n,30))'"]);
+    let scene = opened(&dir, &options);
+    let dropped = |k: usize| (10..=14).contains(&k) || k == 30;
+    assert_eq!(instants(&scene), all.iter().map(|&k| (k, vec![Some(k), (!dropped(k)).then_some(k)])).collect());
+    assert!(scene.warnings.iter().any(|w| w.contains("cam01.mkv has a variable frame rate") && w.contains("6 of 48")), "{:?}", scene.warnings);
+    let strided = opened(&dir, &SceneOptions { frames: Some([0, 0, 3]), ..options });
+    assert_eq!(instants(&strided), (0..16).map(|k| (k, vec![Some(3 * k), (!dropped(3 * k)).then_some(3 * k)])).collect());
+}
+
+#[test]
+fn different_rates_are_brought_to_the_lowest() {
+    if !ffmpeg() {
+        return;
+    }
+    // Instants are sixtieths of a second.
+    let (dir, options) = rig(3, SIZE);
+    record(&video(&dir, 0), 0, &(0..60).collect::<Vec<_>>(), "60", &[]);
+    record(&video(&dir, 1), 1, &(0..30).map(|k| 2 * k).collect::<Vec<_>>(), "30", &[]);
+    record(&video(&dir, 2), 2, &(0..20).map(|k| 3 * k).collect::<Vec<_>>(), "20", &[]);
+    let scene = opened(&dir, &options);
+    let found = instants(&scene);
+    assert_eq!(found.len(), 20);
+    for (k, shown) in found {
+        assert_eq!((shown[0], shown[2]), (Some(3 * k), Some(3 * k)));
+        assert!(shown[1].unwrap().abs_diff(3 * k) <= 1, "frame {k}: {shown:?}");
+    }
+    assert!(scene.warnings.iter().any(|w| w.contains("different frame rates") && w.contains("20.00 frames per second")), "{:?}", scene.warnings);
+}
+
+#[test]
+fn start_times_count() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(2, SIZE);
+    let at = |camera: usize| dir.path().join(format!("cam{camera:02}.mkv"));
+    record(&at(0), 0, &(0..30).collect::<Vec<_>>(), "25", &[]);
+    record(&at(1), 1, &(5..35).collect::<Vec<_>>(), "25", &["-output_ts_offset", "0.2"]);
+    let scene = opened(&dir, &options);
+    assert_eq!(instants(&scene), (0..25).map(|k| (k, vec![Some(5 + k); 2])).collect());
+    assert!(scene.warnings.iter().any(|w| w.contains("matched by time")), "{:?}", scene.warnings);
+}
+
+#[test]
+fn offsets_between_cameras_are_undone() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(4, SIZE);
+    let starts = [30, 30, 22, 41];
+    starts.iter().enumerate().for_each(|(c, start)| record(&video(&dir, c), c, &(*start..start + 260).collect::<Vec<_>>(), "30", &[]));
+    let scene = opened(&dir, &options);
+    for (camera, offset) in [("cam02", "k+8"), ("cam03", "k-11")] {
+        assert!(scene.warnings.iter().any(|w| w.contains(camera) && w.contains(offset)), "{camera}: {:?}", scene.warnings);
+    }
+    // All cameras recorded from 41 to 281.
+    assert_eq!(instants(&scene), (0..241).map(|k| (k, vec![Some(41 + k); 4])).collect());
+    // The offsets do not depend on the frames that are chosen, and the second opening reads the cache.
+    let few = opened(&dir, &SceneOptions { frames: Some([7, 2, 5]), ..options.clone() });
+    assert_eq!(instants(&few), [(0, vec![Some(48); 4]), (1, vec![Some(53); 4])].into());
+    let off = opened(&dir, &SceneOptions { sync: SyncMode::Off, frames: Some([0, 2, 1]), ..options.clone() });
+    assert_eq!(instants(&off), (0..2).map(|k| (k, starts.iter().map(|s| Some(s + k)).collect())).collect());
+    let stated = SceneOptions { offsets: [("cam02".to_string(), 8)].into(), frames: Some([0, 2, 1]), ..options };
+    assert_eq!(instants(&opened(&dir, &stated)), (0..2).map(|k| (k, [30, 30, 30, 41].iter().map(|s| Some(s + k)).collect())).collect());
+}
+
+#[test]
+fn transforms_and_colmap_may_name_videos() {
+    if !ffmpeg() {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = ring(3, SIZE.0, SIZE.1);
+    for c in 0..3 {
+        std::fs::create_dir_all(dir.path().join("videos")).unwrap();
+        record(&dir.path().join(format!("videos/c{c}.mp4")), c, &(0..12).collect::<Vec<_>>(), "30", &[]);
+    }
+    let options = SceneOptions { video_cache: Some(dir.path().join("cache")), ..Default::default() };
+    let check = |scene: &Scene| {
+        assert_eq!((scene.cameras.len(), scene.frame_count), (3, 12));
+        assert_eq!(instants(scene), (0..12).map(|k| (k, vec![Some(k); 3])).collect());
+        (0..36).for_each(|view| same_pose(&dataset_camera(scene, view), &cameras[scene.views[view].camera]));
+    };
+    let frame = |(c, camera): (usize, &cc4dgs_core::Camera)| serde_json::json!({"file_path": format!("videos/c{c}.mp4"), "transform_matrix": opengl_camera_to_world(camera)});
+    let frames: Vec<_> = cameras.iter().enumerate().map(frame).collect();
+    let write = |frames: &[serde_json::Value]| {
+        // Calibrated at twice the size of the videos.
+        let document = serde_json::json!({"fl_x": 2.0 * cameras[0].fx, "cx": 64.0, "cy": 48.0, "w": 128, "h": 96, "frames": frames});
+        std::fs::write(dir.path().join("transforms.json"), document.to_string()).unwrap();
+    };
+    write(&frames);
+    let scene = opened(&dir, &options);
+    check(&scene);
+    assert_eq!((scene.camera(0).width, scene.camera(0).cx, scene.cameras[0].name.as_str()), (64, 32.0, "videos/c0.mp4"));
+    let refused = |extra: serde_json::Value| {
+        write(&[&frames[..], &[extra]].concat());
+        open(dir.path(), &options, &Limits::default()).err().unwrap().to_string()
+    };
+    assert!(refused(frames[1].clone()).contains("named by two entries"));
+    write_image(&dir.path().join("a.png"), 64, 48, 0);
+    assert!(refused(serde_json::json!({"file_path": "a.png", "transform_matrix": opengl_camera_to_world(&cameras[0])})).contains("images and videos"));
+
+    std::fs::remove_file(dir.path().join("transforms.json")).unwrap();
+    std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+    let names: Vec<String> = (0..3).map(|c| format!("c{c}.png")).collect();
+    for (file, bytes) in ["cameras", "images", "points3D"].iter().zip(colmap_binary(&cameras, &names)) {
+        std::fs::write(dir.path().join(format!("sparse/0/{file}.bin")), bytes).unwrap();
+    }
+    check(&opened(&dir, &options));
+}
+
+#[test]
+fn broken_videos_are_errors() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(1, SIZE);
+    let file = video(&dir, 0);
+    record(&file, 0, &(0..10).collect::<Vec<_>>(), "30", &[]);
+    let sound = std::fs::read(&file).unwrap();
+    let refuse = |bytes: &[u8], limits: &Limits| {
+        std::fs::write(&file, bytes).unwrap();
+        let error = open(dir.path(), &options, limits).and_then(|s| (0..s.views.len()).try_for_each(|v| s.frame(v).map(drop)));
+        error.unwrap_err().to_string()
+    };
+    assert!(refuse(b"", &Limits::default()).contains("cam00.mp4"));
+    assert!(refuse(b"no video at all", &Limits::default()).contains("ffprobe failed"));
+    assert!(refuse(&sound[..sound.len() / 3], &Limits::default()).contains("cam00.mp4"));
+    assert!(refuse(&sound, &Limits { max_pixels: 1000, ..Default::default() }).contains("3072"));
+    // Sound only.
+    let silence = dir.path().join("silence.m4a");
+    encode(&["-f", "lavfi", "-i", "anullsrc", "-t", "0.2", "-c:a", "aac"], &silence);
+    assert!(refuse(&std::fs::read(&silence).unwrap(), &Limits::default()).contains("holds no video"));
+}
+
+/// What a damaged or forged file may make ffprobe say.
+#[cfg(unix)]
+#[test]
+fn absurd_facts_are_errors() {
+    use std::os::unix::fs::PermissionsExt;
+    let (dir, options) = rig(2, SIZE);
+    let (probe, said) = (dir.path().join("ffprobe"), dir.path().join("said.json"));
+    std::fs::write(&probe, format!("#!/bin/sh\ncat {}\n", said.display())).unwrap();
+    std::fs::set_permissions(&probe, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let options = SceneOptions { ffmpeg: dir.path().join("ffmpeg").to_string_lossy().into_owned(), ..options };
+    (0..2).for_each(|c| std::fs::write(video(&dir, c), "x").unwrap());
+    let say = |text: &str| {
+        std::fs::write(&said, text).unwrap();
+        open(dir.path(), &options, &Limits::default()).map(|s| s.frame_count).map_err(|e| e.to_string())
+    };
+    let stream = r#""streams": [{"width": 64, "height": 48, "avg_frame_rate": "1/0", "r_frame_rate": "99999999999/1"}]"#;
+    for (text, problem) in [
+        ("", "ffprobe said"),
+        ("16,12,6", "ffprobe said"),
+        ("{}", "no video"),
+        (r#"{"streams": [{"width": 0, "height": 48}]}"#, "0x48"),
+        (r#"{"streams": [{"width": 99999999, "height": 48}]}"#, "99999999x48"),
+        (r#"{"streams": [{"width": -3, "height": 48}]}"#, "ffprobe said"),
+        (&format!("{{{stream}, \"packets\": []}}"), "no frame"),
+        (&format!("{{{stream}, \"packets\": [{{\"flags\": \"KD\"}}]}}"), "no frame"),
+    ] {
+        let message = say(text).unwrap_err();
+        assert!(message.contains(problem), "{text}: {message}");
+    }
+    let times =
+        |list: &[&str]| format!("{{{stream}, \"packets\": [{}]}}", list.iter().map(|t| format!("{{\"pts_time\": \"{t}\"}}")).collect::<Vec<_>>().join(","));
+    assert_eq!(say(&times(&["nan", "1", "2"])), Ok(3));
+    assert_eq!(say(&times(&["1e308", "-1e308"])), Ok(1));
+    assert!(say(&times(&["0", "0.000001", "0.000002", "1e18"])).is_ok_and(|count| count <= 17));
+}
