@@ -3,7 +3,7 @@
 use super::baselines::{MovingPixels, Yardstick, psnr_db};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
-use crate::train::{Context, TrainState};
+use crate::train::{Context, TrainJob, TrainState};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Stage};
 use cc4dgs_play::Moving;
@@ -74,6 +74,11 @@ impl Watch {
         self.refuse_failure(context, state, yardstick)?;
         let cap = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).and_then(|cap| usize::try_from(cap).ok());
         let validation = if self.validation.is_empty() { None } else { Some(scored(context, state, &self.validation, &mut 0.0)?) };
+        // A static scene may well state one time for all images; it is no cause of anything while the model is good.
+        let mut doubts = self.doubts.clone();
+        if let Some(warning) = same_time(context.job).filter(|_| end.psnr_db < GOOD_ENOUGH_DB) {
+            doubts.push(Finding::doubt(Subject::Times, warning.clone(), "Give each image its time"));
+        }
         let verdict = Evidence {
             train_psnr_db: end.psnr_db,
             late_psnr_db: self.scores.iter().find(|s| s.percent == LATE).map(|s| s.psnr_db),
@@ -83,7 +88,7 @@ impl Watch {
             gaussians: state.set.len(),
             cap,
             baselines: yardstick.baselines,
-            doubts: &self.doubts,
+            doubts: &doubts,
             warnings: &context.job.scene.warnings,
         }
         .verdict();
@@ -134,8 +139,7 @@ impl Watch {
         if weak && self.always(|s| s.psnr_db < baselines.blur_db) {
             return Err(self.failure(context, format!("{reached}, less than the images blurred 16 times ({:.1} dB)", baselines.blur_db)));
         }
-        let same_time = context.job.scene.warnings.iter().any(|warning| warning.starts_with(SAME_TIME));
-        let doubted = same_time || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times));
+        let doubted = same_time(context.job).is_some() || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times));
         if weak && doubted && end.psnr_db < baselines.blur_db + DOUBT_MARGIN_DB {
             let problem = format!("{reached}, hardly more than the images blurred 16 times ({:.1} dB)", baselines.blur_db);
             return Err(self.failure(context, problem));
@@ -177,6 +181,11 @@ impl Watch {
             }
         }
     }
+}
+
+/// The reader's warning that all images state one time.
+fn same_time<'a>(job: &'a TrainJob) -> Option<&'a String> {
+    job.scene.warnings.iter().find(|warning| warning.starts_with(SAME_TIME))
 }
 
 /// Mean PSNR in dB of the model on `views`; `detail` becomes the mean slope of its images over that of the true ones.
