@@ -130,8 +130,8 @@ mod tests {
         let noise: Vec<Vec<f32>> =
             (0..16u64).map(|i| (0..400u64).map(|k| ((i * 400 + k).wrapping_mul(2_654_435_761) % 997) as f32 / 997.0).collect()).collect();
         let still = vec![bar(50); 16];
-        assert!(shuffled(&scrambled));
-        for (name, images) in [("ordered", ordered), ("a fixed stride", mixed), ("repeated", repeated), ("noise", noise), ("still", still)] {
+        assert!(shuffled(&scrambled) && shuffled(&mixed));
+        for (name, images) in [("ordered", ordered), ("repeated", repeated), ("noise", noise), ("still", still)] {
             assert!(!shuffled(&images), "{name}");
         }
     }
