@@ -1,7 +1,7 @@
 //! Where the first points of a scene come from, how long it takes, and, for built-in scenes, how many lie on a surface.
 //!
 //! `init_points SCENE [SOURCE [COUNT [WIDTH]]]`, where SOURCE is `auto`, `photo`, `hull` or `random`.
-#![allow(clippy::print_stdout)]
+#![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
 use cc4dgs_core::{Limits, Registry, Scene, SceneOptions, Seed, Split};
 use cc4dgs_train::config::InitSource;

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 /// Cells per axis of the first look.
 const GRID: usize = 64;
 /// The most random points per cell that may hold surface, and in all such cells.
-const PER_CELL: usize = 48;
+const PER_CELL: usize = 200;
 const IN_ALL: usize = 400_000;
 /// The most masks that are asked.
 const MAX_MASKS: usize = 60;
@@ -125,8 +125,8 @@ impl<'a> Hull<'a> {
     fn points_of(&self, seed: Seed, misses: f32) -> Vec<Candidate> {
         // A cell's centre may miss a limb that crosses the cell; being nearly inside is enough for the first look.
         let nearly = (misses + 0.2).max(0.3);
-        let Some((low, high)) = self.extent(nearly) else { return Vec::new() };
-        let grid = Grid { low, size: (high - low) / GRID as f32 };
+        // The cells are those of the box of all times: where much moves, the shell is thick.
+        let grid = Grid { low: self.low, size: (self.high - self.low) / GRID as f32 };
         let full = self.full(&grid, nearly);
         let mut near = vec![false; full.len()];
         for (c, near) in near.iter_mut().enumerate() {
