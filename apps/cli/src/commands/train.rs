@@ -72,7 +72,9 @@ pub struct Trained {
 pub fn train_into(context: &Context, layers: &Layers, scene_path: &Path, out: &Path, existing: Existing) -> Result<Trained> {
     let stop = interrupt::stop_flag()?;
     check_folder(out, existing, "Go on with it (train --resume), start anew in its place (--overwrite), or choose another folder")?;
-    plugins::check(&layers.config()?, &context.registry)?;
+    if !layers.want_plan() {
+        plugins::check(&layers.config()?, &context.registry)?;
+    }
     let (config, scene) = auto::open(scene_path, layers, &context.registry, &context.listeners(None)?)?;
     plugins::check(&config, &context.registry)?;
     // Opened only now: a mistyped path must not wipe the log of an earlier run.

@@ -17,9 +17,11 @@ const PER_DETAIL: f64 = 0.8;
 /// Fewest Gaussians at most.
 const LEAST_GAUSSIANS: f64 = 4000.0;
 /// Gaussians that a thread can train in a minute.
-const PER_THREAD_MINUTE: f64 = 2000.0;
+const PER_THREAD_MINUTE: f64 = 4000.0;
 /// What that is where all of them move.
-const ALL_MOVE: f64 = 0.25;
+const ALL_MOVE: f64 = 0.12;
+/// Minutes of one thread below which the finest voxels are left out: decoding their vertices is most of a step.
+const SHORT: f64 = 16.0;
 /// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
 const EXPOSURE: f32 = 0.09;
 /// Share of moving pixels below which a scene is static.
@@ -92,7 +94,7 @@ pub(super) fn cache(facts: &Facts, all_views: usize, options: &SceneOptions, mac
 
 /// Every other setting but the number of iterations.
 pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64) -> Vec<Choice> {
-    let mut choices = vec![field(facts, machine), stages(facts), counts(facts, machine, minutes)];
+    let mut choices = vec![field(facts, machine, minutes), stages(facts), counts(facts, machine, minutes)];
     choices.extend(background(facts));
     choices.extend(near(facts));
     choices.extend(noise(facts));
@@ -110,7 +112,7 @@ fn stands_alone(facts: &Facts) -> bool {
     facts.plain.is_some() || facts.transparent > OBJECT
 }
 
-fn field(facts: &Facts, machine: Machine) -> Choice {
+fn field(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
     if stands_still(facts) {
         return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
     }
@@ -118,8 +120,10 @@ fn field(facts: &Facts, machine: Machine) -> Choice {
     let mut settings = vec![("deformer.kind", "cdf-basis".into()), ("deformer.time_bands", Value::Integer(bands))];
     if !machine.graphics {
         settings.push(("deformer.capacity", "small".into()));
-        settings.push(("deformer.resolutions", Value::Array([8, 16, 32, 64].map(Value::Integer).to_vec())));
-        settings.push(("deformer.hashes", Value::Integer(64)));
+        let short = machine.speed() * minutes < SHORT;
+        let resolutions: &[i64] = if short { &[8, 16, 32] } else { &[8, 16, 32, 64] };
+        settings.push(("deformer.resolutions", Value::Array(resolutions.iter().map(|&r| Value::Integer(r)).collect())));
+        settings.push(("deformer.hashes", Value::Integer(if short { 32 } else { 64 })));
     }
     choice(settings, format!("{} frames; the most accurate field for its time", facts.frames))
 }
@@ -155,7 +159,13 @@ fn stages(facts: &Facts) -> Choice {
 }
 
 fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
-    let wanted = PER_DETAIL * facts.pixels() * f64::from(facts.detail);
+    // Cameras around a scene, and one that walks through it, see different parts of it.
+    let parts = match facts.arrangement {
+        Arrangement::Rig | Arrangement::OneCameraAnywhere => 1.0,
+        _ if stands_alone(facts) => 1.0,
+        Arrangement::Photos | Arrangement::OneMovingCamera | Arrangement::Dome => 2.0,
+    };
+    let wanted = parts * PER_DETAIL * facts.pixels() * f64::from(facts.detail);
     // Where everything moves, each costs several times as much.
     let all_move =
         !facts.arrangement.has_several_cameras() && !stands_still(facts) && (stands_alone(facts) || facts.arrangement == Arrangement::OneCameraAnywhere);
