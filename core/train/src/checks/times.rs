@@ -124,13 +124,13 @@ mod tests {
     #[test]
     fn order_is_told_from_disorder_repetition_and_noise() {
         let ordered: Vec<Vec<f32>> = (0..16).map(|i| bar(20 * i)).collect();
-        let mixed: Vec<Vec<f32>> = (0..16).map(|i| bar(20 * (i * 7 % 16))).collect();
+        let strided: Vec<Vec<f32>> = (0..16).map(|i| bar(20 * (i * 7 % 16))).collect();
         let scrambled: Vec<Vec<f32>> = [3, 11, 0, 8, 14, 5, 1, 12, 7, 15, 2, 9, 4, 13, 6, 10].iter().map(|&i| bar(20 * i)).collect();
         let repeated: Vec<Vec<f32>> = (0..16).map(|i| bar([0, 150, 300, 150][i % 4])).collect();
         let noise: Vec<Vec<f32>> =
             (0..16u64).map(|i| (0..400u64).map(|k| ((i * 400 + k).wrapping_mul(2_654_435_761) % 997) as f32 / 997.0).collect()).collect();
         let still = vec![bar(50); 16];
-        assert!(shuffled(&scrambled) && shuffled(&mixed));
+        assert!(shuffled(&scrambled) && shuffled(&strided));
         for (name, images) in [("ordered", ordered), ("repeated", repeated), ("noise", noise), ("still", still)] {
             assert!(!shuffled(&images), "{name}");
         }
