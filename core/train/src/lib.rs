@@ -14,6 +14,7 @@ pub mod knn;
 pub mod layers;
 pub mod masks;
 pub mod presets;
+mod sample;
 pub mod schedule;
 pub mod train;
 pub mod trajectory;

@@ -5,7 +5,7 @@ use crate::args::Train;
 use crate::interrupt;
 use cc4dgs::plugins;
 use cc4dgs::runs::{EVENTS, Existing, check_folder};
-use cc4dgs_core::Result;
+use cc4dgs_core::{Error, Result};
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::layers::Layers;
@@ -38,6 +38,13 @@ pub fn run(context: &Context, args: &Train) -> Result<()> {
     let minutes = args.minutes.map(|minutes| format!("auto.minutes={minutes}"));
     let sets: Vec<String> = args.sets.iter().cloned().chain(minutes).collect();
     let layers = layers(context, preset, file, &sets, args.device.as_deref())?;
+    if args.minutes.is_some() && !layers.want_plan() {
+        return Err(Error::parameter(
+            "--minutes",
+            "only the preset auto plans for a time",
+            "Leave --preset, --config and --resume out, or set train.iterations",
+        ));
+    }
     let existing = match (args.resume, args.overwrite) {
         (true, _) => Existing::Resume,
         (false, true) => Existing::Overwrite,

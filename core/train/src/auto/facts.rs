@@ -1,6 +1,7 @@
 //! What can be known of a scene without training: its cameras, its images, and what differs between them.
 
 use crate::data::resize;
+use crate::sample::spread_from_first;
 use cc4dgs_core::{Image8, Result, Scene, Split};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -93,7 +94,7 @@ impl Facts {
         let cameras: BTreeSet<usize> = views.iter().map(|&v| scene.views[v].camera).collect();
         let mut sizes: Vec<[u32; 2]> = cameras.iter().map(|&c| [scene.cameras[c].width, scene.cameras[c].height]).collect();
         sizes.sort_unstable();
-        let looked: Vec<usize> = (0..LOOKS.min(views.len())).map(|i| views[i * views.len() / LOOKS.min(views.len())]).collect();
+        let looked = spread_from_first(&views, LOOKS);
         let images = looked.par_iter().map(|&view| small(scene, view)).collect::<Result<Vec<_>>>()?;
         let with_alpha = images.iter().filter(|image| image.channels == 4).map(transparent_share);
         let transparent = with_alpha.sum::<f32>() / images.len().max(1) as f32;
@@ -215,11 +216,10 @@ impl Motion {
         let mut of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         views.iter().for_each(|&v| of_camera.entry(scene.views[v].camera).or_default().push(v));
         let sequences: Vec<&Vec<usize>> = of_camera.values().filter(|v| v.len() >= 2).collect();
-        let spread = |count: usize, most: usize| (0..count.min(most)).map(move |i| i * count / count.min(most));
         let (mut noises, mut shares) = (Vec::new(), Vec::new());
-        for index in spread(sequences.len(), MOTION_LOOKS[0]) {
-            let sequence = sequences[index];
-            let frames = spread(sequence.len(), MOTION_LOOKS[1]).map(|i| small(scene, sequence[i]).map(|image| grey(&image))).collect::<Result<Vec<_>>>()?;
+        for sequence in spread_from_first(&sequences, MOTION_LOOKS[0]) {
+            let looked = spread_from_first(sequence, MOTION_LOOKS[1]);
+            let frames = looked.into_iter().map(|view| small(scene, view).map(|image| grey(&image))).collect::<Result<Vec<_>>>()?;
             let n = frames.len() as f32;
             let mut deviations: Vec<f32> = (0..frames[0].len())
                 .map(|p| {

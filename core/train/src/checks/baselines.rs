@@ -1,8 +1,8 @@
 //! What can be had without a model: the mean colour of an image, a blurred image, the mean image of a fixed camera. A model has to be better.
 
-use super::spread;
 use crate::data::resample::resize;
 use crate::masks::over_time;
+use crate::sample::spread;
 use cc4dgs_core::metrics::{Metric, Rounding};
 use cc4dgs_core::{Image8, Result, Scene, Split};
 use rayon::prelude::*;

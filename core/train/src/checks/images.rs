@@ -1,6 +1,7 @@
 //! Whether the images show anything.
 
-use super::{Finding, Subject, listed, spread};
+use super::{Finding, Subject, listed};
+use crate::sample::spread;
 use cc4dgs_core::{Image8, Result, Scene, Split};
 use rayon::prelude::*;
 

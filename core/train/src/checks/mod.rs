@@ -17,6 +17,7 @@ pub use verdict::{Judgement, Verdict};
 pub(crate) use watch::Watch;
 
 use crate::data::resample::resize;
+use crate::sample::spread;
 use cc4dgs_core::{Error, Event, EventSink, Image8, Result, Scene, Split};
 use std::sync::Arc;
 
@@ -125,21 +126,14 @@ pub(crate) fn hold_out(scene: &Arc<Scene>, count: usize) -> Result<(Arc<Scene>, 
     Ok((Arc::new(rest), views))
 }
 
-/// At most `count` of `items`, evenly spread, from the middle of equal parts.
-fn spread(items: &[usize], count: usize) -> Vec<usize> {
-    if items.len() <= count {
-        return items.to_vec();
-    }
-    (0..count).map(|i| items[(2 * i + 1) * items.len() / (2 * count)]).collect()
-}
-
-/// Grey values in 0..1 of `image` at about `pixels` pixels, row by row; alpha is composited over `background`.
-fn small_gray(image: &Image8, pixels: f64, background: [f32; 3]) -> Vec<f32> {
+/// Width, height and grey values in 0..1 of `image` at about `pixels` pixels, row by row; alpha is composited over `background`.
+fn small_gray(image: &Image8, pixels: f64, background: [f32; 3]) -> (u32, u32, Vec<f32>) {
     let scale = (pixels / (f64::from(image.width) * f64::from(image.height))).sqrt().min(1.0);
     let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
-    let planes = resize(image, size(image.width), size(image.height)).to_planes(background);
+    let small = resize(image, size(image.width), size(image.height));
+    let planes = small.to_planes(background);
     let n = planes.len() / 3;
-    (0..n).map(|p| (planes[p] + planes[n + p] + planes[2 * n + p]) / 3.0).collect()
+    (small.width, small.height, (0..n).map(|p| (planes[p] + planes[n + p] + planes[2 * n + p]) / 3.0).collect())
 }
 
 /// Up to four names, and how many more there are.
@@ -153,9 +147,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn samples_are_spread_and_lists_are_short() {
-        assert_eq!(spread(&[3, 4, 5], 5), [3, 4, 5]);
-        assert_eq!(spread(&(0..100).collect::<Vec<_>>(), 4), [12, 37, 62, 87]);
+    fn lists_are_short() {
         let names: Vec<String> = (0..6).map(|i| i.to_string()).collect();
         assert_eq!((listed(&names), listed(&names[..2])), ("0, 1, 2, 3 and 2 more".into(), "0, 1".into()));
     }

@@ -1,6 +1,7 @@
 //! Whether the times of the images can be right: one image per camera and time, frames in order.
 
-use super::{Finding, Severity, Subject, small_gray, spread};
+use super::{Finding, Severity, Subject, small_gray};
+use crate::sample::spread;
 use cc4dgs_core::{Result, Scene, Split};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -40,7 +41,7 @@ fn same_time(scene: &Scene, background: [f32; 3]) -> Result<Option<Finding>> {
     let differing = sampled
         .into_par_iter()
         .map(|views| {
-            let images = spread(views, 4).into_iter().map(|v| Ok(small_gray(&*scene.frame(v)?, PIXELS, background))).collect::<Result<Vec<_>>>()?;
+            let images = spread(views, 4).into_iter().map(|v| Ok(small_gray(&*scene.frame(v)?, PIXELS, background).2)).collect::<Result<Vec<_>>>()?;
             Ok(images[1..].iter().any(|other| differ(&images[0], other)).then_some(views))
         })
         .collect::<Result<Vec<_>>>()?;
@@ -83,7 +84,7 @@ fn out_of_order(scene: &Scene, background: [f32; 3]) -> Result<Option<Finding>> 
     for camera in spread(&of_camera.keys().copied().collect::<Vec<_>>(), CAMERAS) {
         let views = &of_camera[&camera];
         let images =
-            views[..views.len().min(FRAMES.1)].par_iter().map(|&v| Ok(small_gray(&*scene.frame(v)?, PIXELS, background))).collect::<Result<Vec<_>>>()?;
+            views[..views.len().min(FRAMES.1)].par_iter().map(|&v| Ok(small_gray(&*scene.frame(v)?, PIXELS, background).2)).collect::<Result<Vec<_>>>()?;
         if !shuffled(&images) {
             return Ok(None);
         }

@@ -1,11 +1,13 @@
 //! Keeps density control from destroying what is already fitted, whatever the control.
 //!
+//! - Gaussians with values that are not finite always go. Of the others:
 //! - Nothing is removed before the cameras of the stage had two passes to fit it: not in the first passes of a stage, and no Gaussian that is younger.
 //! - One round removes at most a quarter of the Gaussians.
 //! - A removal that costs more than 0.3 dB on training views at once is halved, the most opaque Gaussians being kept, and then left out.
 //! - After an opacity reset, the PSNR of training views must be back within a stated number of iterations; else the opacities return.
 
 use super::{Context, TrainState};
+use crate::sample::spread;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Error, Event, Result, Schedule};
@@ -97,6 +99,16 @@ impl Guard {
             reset.logits = plan.parents().iter().map(|&parent| reset.logits[parent]).collect();
         }
     }
+    /// Divides the rows that a plan removes: those that stay because they are too young or too many, and those that may go, the faintest first. Broken rows
+    /// (`is_broken`) are in neither: they go in any case.
+    fn divide(&self, removed: &[usize], logits: &[f32], is_broken: impl Fn(usize) -> bool, schedule: &Schedule) -> (Vec<usize>, Vec<usize>) {
+        let whole = removed.iter().copied().filter(|&row| !is_broken(row));
+        let (mut kept, mut going): (Vec<usize>, Vec<usize>) = whole.partition(|&row| self.is_young(row, schedule));
+        going.sort_by(|&a, &b| logits[a].total_cmp(&logits[b]).then(a.cmp(&b)));
+        let most = (MAX_REMOVED * logits.len() as f64).ceil() as usize;
+        kept.extend(going.split_off(going.len().min(most)));
+        (kept, going)
+    }
     /// Whether the Gaussian `row` is too young to be judged.
     fn is_young(&self, row: usize, schedule: &Schedule) -> bool {
         let patience = (PATIENCE_PASSES * schedule.pass).min(schedule.length / PATIENCE_SHARE).max(LEAST_PATIENCE);
@@ -127,12 +139,8 @@ impl Context<'_> {
 
     /// Those of the rows `removed` that stay.
     fn kept_after_all(&self, removed: &[usize], logits: &[f32], state: &mut TrainState, schedule: &Schedule) -> Result<Vec<usize>> {
-        let finite = |row: usize| logits[row].is_finite();
-        let (mut kept, mut going): (Vec<usize>, Vec<usize>) = removed.iter().partition(|&&row| finite(row) && state.guard.is_young(row, schedule));
-        // The faintest go first.
-        going.sort_by(|&a, &b| logits[a].total_cmp(&logits[b]).then(a.cmp(&b)));
-        let most = (MAX_REMOVED * logits.len() as f64).ceil() as usize;
-        kept.extend(going.split_off(going.len().min(most)));
+        let broken = broken_rows(state)?;
+        let (mut kept, mut going) = state.guard.divide(removed, logits, |row| broken[row], schedule);
         let faint = (FAINT / (1.0 - FAINT)).ln();
         let harmless = (going.len() as f64) < PROBED_SHARE * logits.len() as f64 && going.iter().all(|&row| logits[row] < faint);
         if !harmless {
@@ -187,8 +195,20 @@ impl Context<'_> {
     }
 
     fn probes(&self, schedule: &Schedule) -> Vec<usize> {
-        Self::evenly(&self.stage_views(schedule.stage), PROBES)
+        spread(&self.stage_views(schedule.stage), PROBES)
     }
+}
+
+/// The Gaussians with a value that is not finite `[N]`.
+fn broken_rows(state: &TrainState) -> Result<Vec<bool>> {
+    let mut broken = vec![false; state.set.len()];
+    for (name, values) in state.set.iter() {
+        let width = values.dims()[1].max(1);
+        for (row, values) in broken.iter_mut().zip(to_vec(values.clone(), name)?.chunks_exact(width)) {
+            *row |= values.iter().any(|v| !v.is_finite());
+        }
+    }
+    Ok(broken)
 }
 
 #[cfg(test)]
@@ -212,6 +232,18 @@ mod tests {
         assert!(Guard::restore(guard.state(), 3).is_err());
         let half: Vec<_> = guard.state().into_iter().filter(|(name, _)| name != "logits").collect();
         assert!(Guard::restore(half, 2).is_err());
+    }
+
+    #[test]
+    fn the_faintest_go_and_broken_ones_are_never_kept() {
+        let mut guard = Guard::default();
+        guard.begin_stage(8);
+        let at = |iteration| Schedule { iteration, pass: 1, ..Schedule::main(6000) };
+        let logits = [0.0, -1.0, -2.0, -3.0, f32::NAN, 1.0, 2.0, 3.0];
+        // Two of eight may go; row 4 goes whatever its age.
+        let divided = guard.divide(&[0, 1, 2, 3, 4], &logits, |row| row == 4, &at(5000));
+        assert_eq!(divided, (vec![1, 0], vec![3, 2]));
+        assert_eq!(guard.divide(&[0, 4], &logits, |row| row == 4, &at(1)), (vec![0], vec![]));
     }
 
     #[test]

@@ -6,11 +6,6 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Gaussians, Result, SpatialInput, Splats};
 
 impl Context<'_> {
-    /// `count` of `views`, evenly spread.
-    pub(crate) fn evenly(views: &[usize], count: usize) -> Vec<usize> {
-        let count = count.min(views.len());
-        (0..count).map(|i| views[(2 * i + 1) * views.len() / (2 * count)]).collect()
-    }
     /// Renders what the cameras of views record at given times (0..1). `gaussians` have the rows of `state`. Hands the index of each request and planes
     /// `[3,H,W]` to `each`.
     pub(crate) fn draw(

@@ -4,6 +4,7 @@
 
 use super::{Context, TrainState};
 use crate::masks::{DynamicMask, blur};
+use crate::sample::spread;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Event, Result, Split};
 
@@ -18,7 +19,7 @@ impl Context<'_> {
     /// Masks of training views, evenly spread over the sequence. The model of `state` is the static one of the coarse stage.
     pub(crate) fn residual_masks(&self, state: &mut TrainState) -> Result<Vec<DynamicMask>> {
         let scene = &self.job.scene;
-        let views = Self::evenly(&scene.split(Split::Train), VIEWS);
+        let views = spread(&scene.split(Split::Train), VIEWS);
         let background = self.job.config.background()?;
         let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
         let gaussians = state.set.gaussians()?;

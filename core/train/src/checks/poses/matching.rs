@@ -3,7 +3,7 @@
 //! A corner of one image must reappear on its epipolar line in the other. How well any line matches depends on the texture, so the true line competes with
 //! parallel lines of the same length: with wrong poses, the true line holds the best match no more often than the others.
 
-use crate::data::resample::resize;
+use super::super::small_gray;
 use cc4dgs_core::{Camera, Image8};
 use glam::{DMat3, DVec2, DVec3};
 
@@ -71,18 +71,12 @@ impl Tally {
 impl Look {
     /// The small version of `image`, seen by `camera`; alpha is composited over `background`.
     pub fn new(image: &Image8, camera: &Camera, background: [f32; 3]) -> Self {
-        let scale = (PIXELS / (f64::from(image.width) * f64::from(image.height))).sqrt().min(1.0);
-        let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
-        let small = resize(image, size(image.width), size(image.height));
-        let (width, height) = (small.width as usize, small.height as usize);
-        let planes = small.to_planes(background);
-        let n = width * height;
-        let gray = (0..n).map(|p| (planes[p] + planes[n + p] + planes[2 * n + p]) / 3.0).collect();
-        let camera = camera.resized(small.width, small.height);
+        let (width, height, gray) = small_gray(image, PIXELS, background);
+        let camera = camera.resized(width, height);
         let (rotation, translation) = camera.rotation_translation();
         let mut look = Self {
-            width,
-            height,
+            width: width as usize,
+            height: height as usize,
             gray,
             focal: DVec2::new(camera.fx, camera.fy),
             principal: DVec2::new(camera.cx, camera.cy),

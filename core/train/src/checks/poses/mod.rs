@@ -17,7 +17,8 @@
 mod matching;
 mod neighbours;
 
-use super::{Finding, Severity, Subject, listed, spread};
+use super::{Finding, Severity, Subject, listed};
+use crate::sample::spread;
 use cc4dgs_core::{Result, Scene, Split};
 use glam::DVec3;
 use matching::{Look, Tally};

@@ -2,6 +2,7 @@
 
 use super::super::focus::{Focus, focus};
 use super::super::normalise::CAMERA_DISTANCE;
+use crate::sample::spread_from_first;
 use cc4dgs_core::{Camera, Scene, Split};
 use glam::{DMat3, DVec3};
 
@@ -55,7 +56,7 @@ impl Choice {
         all.iter().for_each(|&v| by_frame[scene.views[v].frame].push(v));
         let most = by_frame.iter().map(Vec::len).max().unwrap_or(0);
         let size = rig.distance.unwrap_or(1.0);
-        let positions = |views: &[usize]| count_positions(scene, &spread(views, MAX_POSES), 1e-3 * size);
+        let positions = |views: &[usize]| count_positions(scene, &spread_from_first(views, MAX_POSES), 1e-3 * size);
         let wanted = most.min(ENOUGH_AT_ONE_TIME);
         let first = by_frame.into_iter().find(|v| v.len() >= wanted).unwrap_or_default();
         let at_one_time = positions(&first);
@@ -65,14 +66,14 @@ impl Choice {
         if positions(&all) >= 2 {
             return Self::matched(scene, Arrangement::AcrossTimes, &all, rig);
         }
-        let views = spread(&all, 4);
+        let views = spread_from_first(&all, 4);
         let none = vec![Vec::new(); views.len()];
         Self { arrangement: Arrangement::OnePose, keys: views.len(), views, partners: none.clone(), witnesses: none, rig }
     }
 
     /// Keys evenly spread over `pool`, with partners from all of it.
     fn matched(scene: &Scene, arrangement: Arrangement, pool: &[usize], rig: Focus) -> Self {
-        let keys = spread(pool, MAX_KEYS);
+        let keys = spread_from_first(pool, MAX_KEYS);
         let across = arrangement == Arrangement::AcrossTimes;
         let pose = |&v: &usize| Pose::new(scene.camera(v), f64::from(scene.views[v].time_norm), &rig);
         let own: Vec<Pose> = keys.iter().map(pose).collect();
@@ -103,12 +104,6 @@ fn rig(scene: &Scene, views: &[usize]) -> Focus {
     let ray = |&c: &usize| (DVec3::from(scene.cameras[c].center_world()), DVec3::from(scene.cameras[c].forward_world()).normalize_or_zero());
     // Scenes come in the normalised frame: that is how far ahead parallel cameras look.
     focus(&used.iter().map(ray).collect::<Vec<_>>(), Some(CAMERA_DISTANCE))
-}
-
-/// At most `most` of `items`, evenly spread.
-pub(super) fn spread<T: Copy>(items: &[T], most: usize) -> Vec<T> {
-    let n = items.len();
-    if n <= most { items.to_vec() } else { (0..most).map(|i| items[i * n / most]).collect() }
 }
 
 /// How many camera positions differ by more than `apart`.

@@ -3,8 +3,9 @@
 //! Masks of different times disagree where things move. The share of masks that may leave a point out grows until there is a hull.
 
 use super::Candidate;
-use super::choose::{Arrangement, spread};
+use super::choose::Arrangement;
 use super::views::{Foreground, WorkSet, WorkView};
+use crate::sample::spread_from_first;
 use cc4dgs_core::Seed;
 use glam::{Mat3, Vec3};
 use rand::Rng;
@@ -69,7 +70,7 @@ impl<'a> Hull<'a> {
     /// `None` if fewer than three views have masks or the masks have nothing in common.
     pub fn find(set: &'a WorkSet) -> Option<Self> {
         let masked: Vec<&WorkView> = set.views.iter().filter(|v| v.mask.is_some()).collect();
-        let masked: Vec<Masked> = spread(&masked, MAX_MASKS).into_iter().filter_map(Masked::new).collect();
+        let masked: Vec<Masked> = spread_from_first(&masked, MAX_MASKS).into_iter().filter_map(Masked::new).collect();
         if masked.len() < MIN_SEEING {
             return None;
         }

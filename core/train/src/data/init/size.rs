@@ -1,6 +1,6 @@
 //! Sizes and opacities that leave the image open: no first Gaussian covers much of a view, and uncertain ones do not pile up.
 
-use super::choose::spread;
+use crate::sample::spread_from_first;
 use cc4dgs_core::{Camera, HostGaussians, Scene, Split};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
@@ -45,7 +45,7 @@ fn eyes(scene: &Scene) -> Vec<Eye> {
         let (rotation, translation) = scene.cameras[c].rotation_translation();
         Eye { rotation, translation, camera: scene.cameras[c].clone() }
     };
-    spread(&used, MAX_CAMERAS).into_iter().map(eye).collect()
+    spread_from_first(&used, MAX_CAMERAS).into_iter().map(eye).collect()
 }
 
 fn mean(host: &HostGaussians, row: usize) -> DVec3 {
