@@ -109,6 +109,11 @@ impl HostGaussians {
             ("dynamic_scores", 1, &mut self.dynamic_scores),
         ]
     }
+    /// Whether every value of the Gaussian `row`, attributes of plug-ins included, is finite.
+    pub fn is_finite(&self, row: usize) -> bool {
+        let of_row = |width: usize, values: &[f32]| values[row * width..(row + 1) * width].iter().all(|v| v.is_finite());
+        self.columns().iter().all(|(_, width, values)| of_row(*width, values)) && self.extra.values().all(|a| of_row(a.width, &a.values))
+    }
     /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite. `object` names the Gaussians in errors.
     ///
     /// # Errors

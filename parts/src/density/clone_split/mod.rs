@@ -1,8 +1,8 @@
 //! Clone and split by screen gradient, prune by opacity, size and blending weight (3DGS; windows and weight pruning of Swift4D).
 
 mod rules;
-mod statistics;
 
+use super::statistics::Statistics;
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
@@ -10,7 +10,6 @@ use cc4dgs_core::{
 };
 use rules::{Due, round};
 use serde::Deserialize;
-use statistics::Statistics;
 
 const SCHEMA: &str = "\
 from = 500               # first round, in reference iterations of the stage (coarse 5,000, main 20,000)

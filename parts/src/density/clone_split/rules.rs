@@ -1,7 +1,8 @@
 //! One round: clone, split, prune.
 
 use super::Settings;
-use super::statistics::Statistics;
+use crate::density::halves::rotation;
+use crate::density::statistics::Statistics;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, HostGaussians, Result, Seed};
 use rand::Rng;
@@ -26,28 +27,28 @@ type Child = (usize, Option<[f32; 3]>);
 /// The plan of one round. `None` if every Gaussian would be removed; then all are kept.
 pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGaussians, due: Due, extent: f32, seed: Seed) -> Result<Option<DensityPlan>> {
     let n = host.len();
-    let gradient = to_vec(statistics.gradient_sum.clone(), "screen gradients")?;
-    let seen = to_vec(statistics.seen.clone(), "screen counts")?;
+    let gradient = statistics.mean_gradients()?;
     let weight = to_vec(statistics.max_weight.clone(), "blending weights")?;
     let largest = |i: usize| host.log_scales[3 * i..3 * i + 3].iter().fold(f32::NEG_INFINITY, |a, &b| a.max(b)).exp();
     let opacity = |i: usize| 1.0 / (1.0 + (-host.opacity_logits[i]).exp());
     let weak = |i: usize| due.prune_weight && weight[i] < settings.min_weight;
-    let finite = |i: usize| {
-        let of_row = |width: usize, values: &[f32]| values[i * width..(i + 1) * width].iter().all(|v| v.is_finite());
-        host.columns().iter().all(|(_, width, values)| of_row(*width, values)) && host.extra.values().all(|a| of_row(a.width, &a.values))
+    let dead = |i: usize| {
+        !host.is_finite(i) || opacity(i) < settings.min_opacity || (settings.max_scale_share > 0.0 && largest(i) > settings.max_scale_share * extent)
     };
-    let dead = |i: usize| !finite(i) || opacity(i) < settings.min_opacity || (settings.max_scale_share > 0.0 && largest(i) > settings.max_scale_share * extent);
 
     let mut plan = DensityPlan::new();
     let mut children: Vec<Child> = Vec::new();
     let capacity = settings.max_gaussians.saturating_sub(n);
-    for i in 0..n {
+    let mut wanting: Vec<usize> = (0..n).filter(|&i| due.grow && gradient[i] >= settings.gradient && !dead(i) && !weak(i)).collect();
+    // Near the upper bound, those with the largest gradients come first.
+    wanting.sort_by(|&a, &b| gradient[b].total_cmp(&gradient[a]).then(a.cmp(&b)));
+    let mut grows = vec![false; n];
+    wanting.iter().take(capacity).for_each(|&i| grows[i] = true);
+    for (i, &grows) in grows.iter().enumerate() {
         if dead(i) || weak(i) {
             plan.report.removed += 1;
             continue;
         }
-        let mean_gradient = if seen[i] > 0.0 { gradient[i] / seen[i] } else { 0.0 };
-        let grows = due.grow && mean_gradient >= settings.gradient && plan.report.cloned + plan.report.split < capacity;
         if !grows {
             plan.keep(i);
         } else if largest(i) <= settings.dense_share * extent {
@@ -69,18 +70,13 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
         let row = plan.copy(parent);
         let Some(normal) = normal else { continue };
         let (means, log_scales) = (&host.means[3 * parent..3 * parent + 3], &host.log_scales[3 * parent..3 * parent + 3]);
-        let sample = rotate(&host.quaternions[4 * parent..4 * parent + 4], std::array::from_fn(|a| normal[a] * log_scales[a].exp()));
-        plan.set(row, "means", &[means[0] + sample[0], means[1] + sample[1], means[2] + sample[2]]);
+        let sample = glam::Vec3::from_array(std::array::from_fn(|a| normal[a] * log_scales[a].exp()));
+        let mean = glam::Vec3::from_slice(means) + rotation(&host.quaternions[4 * parent..4 * parent + 4]) * sample;
+        plan.set(row, "means", &mean.to_array());
         let shrink = SPLIT_SHRINK.ln();
         plan.set(row, "log_scales", &[log_scales[0] - shrink, log_scales[1] - shrink, log_scales[2] - shrink]);
     }
     Ok(Some(plan))
-}
-
-fn rotate(q: &[f32], v: [f32; 3]) -> [f32; 3] {
-    let norm = q.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-12);
-    let rotation = glam::Quat::from_xyzw(q[1] / norm, q[2] / norm, q[3] / norm, q[0] / norm);
-    (rotation * glam::Vec3::from(v)).to_array()
 }
 
 fn standard_normal(rng: &mut impl Rng) -> f32 {

@@ -1,7 +1,7 @@
 //! Plug-ins that cc4dgs knows nothing of: two deformers, density control, a loss term, a reader and presets.
 
 mod faint;
-mod mcmc;
+mod relocate;
 mod preset;
 mod rig;
 mod sway;

@@ -29,7 +29,7 @@ fn the_deformers_conform() {
 #[test]
 fn the_density_control_conforms() {
     let registry = Registry::collect().unwrap();
-    assert_eq!(findings(|device| conformance::density(registry.density("mcmc").unwrap(), &Table::new(), device)), "");
+    assert_eq!(findings(|device| conformance::density(registry.density("relocate").unwrap(), &Table::new(), device)), "");
 }
 
 #[test]

@@ -20,9 +20,9 @@ impl Statistics {
         let zeros = || Tensor::<1>::zeros([count], device);
         Self { gradient_sum: zeros(), seen: zeros(), max_weight: zeros() }
     }
-    /// Adds one view.
+    /// Adds one view: its absolute screen gradients where they were collected, else the signed ones.
     pub fn add(&mut self, view: &ViewStatistics) {
-        if let Some(gradient) = &view.screen_gradient {
+        if let Some(gradient) = view.absolute_screen_gradient.as_ref().or(view.screen_gradient.as_ref()) {
             let n = gradient.dims()[0];
             // Converts the gradient per pixel of a loss divided by the number of views to the gradient of the view's own loss per unit of normalised device coordinates.
             let scale = view.views as f32 * 0.5;
@@ -36,6 +36,11 @@ impl Statistics {
         if let Some(weights) = &view.max_weights {
             self.max_weight = self.max_weight.clone().max_pair(weights.clone());
         }
+    }
+    /// Mean norm of the screen gradient over the views that saw a Gaussian; 0 where none did `[N]`.
+    pub fn mean_gradients(&self) -> Result<Vec<f32>> {
+        let (sums, seen) = (to_vec(self.gradient_sum.clone(), "screen gradients")?, to_vec(self.seen.clone(), "screen counts")?);
+        Ok(sums.into_iter().zip(seen).map(|(sum, seen)| if seen > 0.0 { sum / seen } else { 0.0 }).collect())
     }
     /// The statistics with which the Gaussians of `plan` start. Gradients start from zero after every round, weights after a weight pruning. New Gaussians have no
     /// weights yet; weight 1 protects them from the next weight pruning.
@@ -59,7 +64,7 @@ impl Statistics {
         let damaged =
             |name: &str, problem: String| Error::data(format!("density state '{name}'"), problem, "The checkpoint is damaged or of another density control");
         if arrays.len() != 3 {
-            return Err(damaged("clone-split", format!("there are {} arrays, expected 3", arrays.len())));
+            return Err(damaged("statistics", format!("there are {} arrays, expected 3", arrays.len())));
         }
         let take = |name: &str| match arrays.iter().find(|(n, _)| n == name) {
             Some((_, values)) if values.dims() == [count] => Ok(values.clone()),

@@ -1,4 +1,4 @@
-//! `mcmc`: density control after 3DGS-MCMC (Kheradmand et al. 2024). Faded Gaussians are moved onto visible ones, their number grows to a cap, and noise lets
+//! `relocate`: density control after 3DGS-MCMC (Kheradmand et al. 2024). Faded Gaussians are moved onto visible ones, their number grows to a cap, and noise lets
 //! faint ones explore.
 
 use cc4dgs_core::burn::tensor::{Device, Tensor, TensorData, activation::sigmoid};
@@ -12,7 +12,7 @@ use rand::Rng;
 
 #[derive(Deserialize)]
 #[serde(crate = "self::serde", default, deny_unknown_fields)]
-struct Mcmc {
+struct Relocate {
     every: usize,
     dead_below: f32,
     growth: f64,
@@ -20,13 +20,13 @@ struct Mcmc {
     noise: f32,
 }
 
-impl Default for Mcmc {
+impl Default for Relocate {
     fn default() -> Self {
         Self { every: 100, dead_below: 0.005, growth: 0.05, max_gaussians: 100_000, noise: 0.5 }
     }
 }
 
-impl DensityControl for Mcmc {
+impl DensityControl for Relocate {
     fn begin_stage(&mut self, _: usize, _: &Device) {}
     fn statistics(&self, _: &Schedule) -> Vec<Statistic> {
         // The image's gradients are not asked for, so they are not collected.
@@ -96,16 +96,16 @@ fn shared(opacity: f32, copies: u32) -> (f32, f32) {
 }
 
 fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
-    let control: Mcmc = config::parse_section("density mcmc", section)?;
+    let control: Relocate = config::parse_section("density relocate", section)?;
     let sound =
         control.every > 0 && (0.0..1.0).contains(&control.dead_below) && (0.0..=1.0).contains(&control.growth) && (0.0..=100.0).contains(&control.noise);
-    if sound { Ok(Box::new(control)) } else { Err(Error::parameter("density mcmc", "a setting is out of range", "See `plugins mcmc`")) }
+    if sound { Ok(Box::new(control)) } else { Err(Error::parameter("density relocate", "a setting is out of range", "See `plugins relocate`")) }
 }
 
 inventory::submit! {
     DensityPlugin {
         info: Plugin {
-            name: "mcmc", version: "1", summary: "moves faded Gaussians onto visible ones, grows to a cap, and adds noise", paper: "3DGS-MCMC (Kheradmand et al. 2024)",
+            name: "relocate", version: "1", summary: "moves faded Gaussians onto visible ones, grows to a cap, and adds noise", paper: "3DGS-MCMC (Kheradmand et al. 2024)",
             schema: "every = 100              # reference iterations\ndead_below = 0.005       # opacity\ngrowth = 0.05            # per round\nmax_gaussians = 100000\nnoise = 0.5              # of a Gaussian's size per step\n",
             capabilities: &[],
         },
