@@ -13,7 +13,11 @@ const OURS_ALONE: [&str; 3] = ["ffmpeg", "video_cache", "cache_mb"];
 /// # Errors
 /// [`Error::Parameter`] for an assignment that is no scene option, and whatever the reader reports.
 pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], registry: &Registry, limits: &Limits) -> Result<Scene> {
-    data::open_in(path, &options_as_trained(&model.provenance.config, sets)?, &model.normalisation, registry, limits)
+    let stored = &model.provenance.config;
+    let scene = data::open_in(path, &options_as_trained(stored, sets)?, &model.normalisation, registry, limits)?;
+    let count = stored.get("train").and_then(|t| t.get("validation")).and_then(toml::Value::as_integer).unwrap_or(0);
+    // Another scene may be too small for it; it then has no validation views.
+    Ok(data::hold_out(&scene, usize::try_from(count).unwrap_or(0)).unwrap_or(scene))
 }
 
 /// The scene options of a stored configuration, with `sets` (`scene.key=value`) laid over them. Models may come from untrusted sources: their configuration never

@@ -239,11 +239,13 @@ pub struct Plugins {
 #[derive(Debug, Args)]
 pub struct Doctor {}
 
-/// The two sides of a split.
+/// The parts of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum SplitArg {
     /// Images seen in training.
     Train,
+    /// Images kept out by train.validation, to choose settings by.
+    Validation,
     /// Images held out.
     Test,
 }
@@ -252,6 +254,7 @@ impl From<SplitArg> for cc4dgs_core::Split {
     fn from(split: SplitArg) -> Self {
         match split {
             SplitArg::Train => Self::Train,
+            SplitArg::Validation => Self::Validation,
             SplitArg::Test => Self::Test,
         }
     }

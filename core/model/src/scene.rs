@@ -11,7 +11,9 @@ use std::sync::{Arc, Mutex};
 pub enum Split {
     /// Used in training.
     Train,
-    /// Held out.
+    /// Kept out of training to choose settings by.
+    Validation,
+    /// Held out for the final score.
     Test,
 }
 

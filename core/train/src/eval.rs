@@ -132,7 +132,11 @@ pub fn evaluate(
         views = (0..max_views).map(|i| views[i * views.len() / max_views]).collect();
     }
     if views.is_empty() {
-        return Err(cc4dgs_core::Error::parameter("--split", format!("{} has no view of split {split:?}", scene.name), "Evaluate the other split"));
+        return Err(cc4dgs_core::Error::parameter(
+            "--split",
+            format!("{} has no view of split {split:?}", scene.name),
+            "Evaluate another split; validation views exist where the model was trained with train.validation",
+        ));
     }
     let background = model.background_on(scene.background);
     let mut player = Player::new(model, registry, device)?.on(scene.background);

@@ -65,6 +65,7 @@ pub fn run(context: &Context, args: &Eval) -> Result<()> {
 fn default_sheet(model: &Path, split: Split, json_file: Option<&Path>) -> PathBuf {
     let side = match split {
         Split::Train => "train",
+        Split::Validation => "validation",
         Split::Test => "test",
     };
     match json_file {

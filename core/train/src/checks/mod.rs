@@ -17,9 +17,7 @@ pub use verdict::{Judgement, Verdict};
 pub(crate) use watch::Watch;
 
 use crate::data::resample::resize;
-use crate::sample::spread;
-use cc4dgs_core::{Error, Event, EventSink, Image8, Result, Scene, Split};
-use std::sync::Arc;
+use cc4dgs_core::{Error, Event, EventSink, Image8, Result, Scene};
 
 /// How bad a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -100,30 +98,6 @@ pub(crate) fn examine(scene: &Scene, background: [f32; 3], events: &dyn EventSin
         }
         None => Ok(findings),
     }
-}
-
-/// `scene` without `count` of its training views, evenly spread, and these views. They count as held out in the scene that is returned.
-///
-/// # Errors
-/// [`Error::Parameter`] where fewer than two training views would be left.
-pub(crate) fn hold_out(scene: &Arc<Scene>, count: usize) -> Result<(Arc<Scene>, Vec<usize>)> {
-    if count == 0 {
-        return Ok((scene.clone(), Vec::new()));
-    }
-    let train = scene.split(Split::Train);
-    if count + 2 > train.len() {
-        return Err(Error::parameter(
-            "train.validation",
-            format!("{count} of {} training views cannot be spared", train.len()),
-            format!("Choose at most {}", train.len().saturating_sub(2)),
-        ));
-    }
-    let views = spread(&train, count);
-    let mut rest = Scene::clone(scene);
-    for &view in &views {
-        rest.views[view].split = Split::Test;
-    }
-    Ok((Arc::new(rest), views))
 }
 
 /// Width, height and grey values in 0..1 of `image` at about `pixels` pixels, row by row; alpha is composited over `background`.

@@ -3,9 +3,10 @@
 use super::baselines::{MovingPixels, Yardstick, psnr_db};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
+use crate::sample::spread;
 use crate::train::{Context, TrainJob, TrainState};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Stage};
+use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
 /// Shorter runs are not judged.
@@ -37,19 +38,18 @@ struct Score {
 /// Follows one run.
 pub(crate) struct Watch {
     doubts: Vec<Finding>,
-    validation: Vec<usize>,
     judged: bool,
     yardstick: Option<Yardstick>,
     scores: Vec<Score>,
 }
 
 impl Watch {
-    /// Watches the run of `context`, whose scene raised `doubts`; `validation` are views that training does not see.
-    pub fn new(context: &Context, doubts: Vec<Finding>, validation: Vec<usize>) -> Self {
+    /// Watches the run of `context`, whose scene raised `doubts`.
+    pub fn new(context: &Context, doubts: Vec<Finding>) -> Self {
         let train = &context.job.config.train;
         let drawn = context.lengths.length(Stage::Main) * train.batch;
         let judged = train.checks && train.iterations >= LEAST_ITERATIONS && drawn >= LEAST_PASSES * context.training_camera.len();
-        Self { doubts, validation, judged, yardstick: None, scores: Vec::new() }
+        Self { doubts, judged, yardstick: None, scores: Vec::new() }
     }
     /// To be called after every iteration; scores the model at half and at 85 % of the main stage.
     pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
@@ -73,7 +73,8 @@ impl Watch {
         let (Some(yardstick), Some(end)) = (&self.yardstick, self.scores.last()) else { return Ok(None) };
         self.refuse_failure(context, state, yardstick)?;
         let cap = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).and_then(|cap| usize::try_from(cap).ok());
-        let validation = if self.validation.is_empty() { None } else { Some(scored(context, state, &self.validation, &mut 0.0)?) };
+        let kept_out = spread(&context.job.scene.split(Split::Validation), context.job.config.train.validation);
+        let validation = if kept_out.is_empty() { None } else { Some(scored(context, state, &kept_out, &mut 0.0)?) };
         // A static scene may well state one time for all images; it is no cause of anything while the model is good.
         let mut doubts = self.doubts.clone();
         if let Some(warning) = same_time(context.job).filter(|_| end.psnr_db < GOOD_ENOUGH_DB) {

@@ -12,6 +12,7 @@ mod colmap_binary;
 mod colmap_text;
 mod focus;
 mod frames;
+mod hold_out;
 pub mod init;
 mod llff;
 mod nerfstudio;
@@ -28,6 +29,7 @@ mod video;
 
 pub use assemble::assemble;
 pub use camera_box::camera_box;
+pub use hold_out::hold_out;
 pub use resample::resize;
 pub use undistort::Undistort;
 
