@@ -2,6 +2,7 @@
 
 use crate::auto::AutoConfig;
 use crate::layers::Layers;
+pub use crate::train_config::{CoarseFrames, Dynamic, GaussianRates, TrainConfig};
 use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
 use cc4dgs_play::{RenderConfig, default_rasterizer};
 use serde::{Deserialize, Serialize};
@@ -109,30 +110,6 @@ pub enum InitSource {
     Random,
 }
 
-/// The frames that the coarse stage sees.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum CoarseFrames {
-    /// The first one (all where no time has several cameras).
-    First,
-    /// All of them.
-    All,
-}
-
-/// Which Gaussians may move.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Dynamic {
-    /// By dynamic score where a camera has several frames, else all.
-    Auto,
-    /// By dynamic score, fitted to what changes in the images of fixed cameras, or to what a static reconstruction does not explain where none is fixed.
-    Score,
-    /// All of them.
-    All,
-    /// None of them.
-    None,
-}
-
 /// Where the first Gaussians come from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -148,124 +125,6 @@ pub struct InitConfig {
 impl Default for InitConfig {
     fn default() -> Self {
         Self { source: InitSource::Auto, count: 40_000, opacity: 0.1 }
-    }
-}
-
-/// The three-stage trainer (paper Section V; Swift4D's rules). Counts marked "reference" are iterations of the 28,000-iteration
-/// schedule and scale with [`TrainConfig::iterations`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TrainConfig {
-    /// Iterations of all stages together: the one knob that scales every schedule.
-    pub iterations: usize,
-    /// Shares of coarse, score and main stage.
-    pub shares: [f64; 3],
-    /// Views per iteration.
-    pub batch: usize,
-    /// Frames the coarse stage sees.
-    pub coarse_frames: CoarseFrames,
-    /// Share of the main stage over which frames come in one after another, where the coarse stage saw the first frame only; 0 is all at once.
-    pub time_ramp: f64,
-    /// Standard deviation, in frames, of noise on the times the field is asked about; it falls to zero by half of the main stage (Deformable 3DGS: 0.1).
-    pub time_noise: f64,
-    /// Highest spherical-harmonics degree.
-    pub sh_degree: usize,
-    /// Reference iterations between two degrees.
-    pub sh_interval: usize,
-    /// Smoothness weight at the end of its ramp (the paper's lambda_r); 0 is off.
-    pub lambda_r: f32,
-    /// Switch smoothness on only when flicker is measured.
-    pub smooth_auto: bool,
-    /// Flicker above which `smooth_auto` acts: rms second difference of the motion per frame over its rms amplitude.
-    pub flicker_threshold: f32,
-    /// Half-width of the smoothness perturbation, normalised units (the paper's delta).
-    pub smooth_delta: f32,
-    /// Dynamic-score threshold (the paper's zeta).
-    pub zeta: f32,
-    /// Temporal standard deviation over which a pixel counts as dynamic.
-    pub mask_threshold: f32,
-    /// Which Gaussians may move.
-    pub dynamic: Dynamic,
-    /// Step only the Gaussians that a view of the iteration shows.
-    pub sparse_adam: bool,
-    /// Learning rates of the Gaussians.
-    pub lr: GaussianRates,
-    /// Check the scene before training and the result afterwards. A scene that cannot be reconstructed is refused, and a run that stays below simple baselines
-    /// fails; without checks both go on. Changes nothing else.
-    pub checks: bool,
-    /// Training views, evenly spread, that are kept out of training and scored at its end. Test views are never looked at.
-    pub validation: usize,
-    /// Iterations between two log events.
-    pub log_every: usize,
-    /// Iterations between two checkpoints; 0 writes only the last one.
-    pub checkpoint_every: usize,
-}
-
-impl Default for TrainConfig {
-    fn default() -> Self {
-        Self {
-            iterations: 28_000,
-            shares: [5.0, 3.0, 20.0],
-            batch: 2,
-            coarse_frames: CoarseFrames::First,
-            time_ramp: 0.0,
-            time_noise: 0.0,
-            sh_degree: 3,
-            sh_interval: 1000,
-            lambda_r: 0.05,
-            smooth_auto: true,
-            flicker_threshold: 0.5,
-            smooth_delta: 0.005,
-            zeta: 7.0,
-            mask_threshold: 0.02,
-            dynamic: Dynamic::Auto,
-            sparse_adam: true,
-            lr: GaussianRates::default(),
-            checks: true,
-            validation: 0,
-            log_every: 10,
-            checkpoint_every: 5000,
-        }
-    }
-}
-
-/// Adam's learning rates per attribute (Inria's, as Swift4D uses them).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct GaussianRates {
-    /// Positions at the first iteration of a stage, times the camera extent.
-    pub means: f64,
-    /// Positions at the last iteration of a stage, times the camera extent.
-    pub means_end: f64,
-    /// Log-scales.
-    pub log_scales: f64,
-    /// Quaternions.
-    pub quaternions: f64,
-    /// Opacity logits.
-    pub opacity: f64,
-    /// Degree-0 colour.
-    pub sh_dc: f64,
-    /// Higher colour coefficients.
-    pub sh_rest: f64,
-    /// Dynamic scores at the first iteration of their stage.
-    pub score: f64,
-    /// Attributes that plug-ins bring along.
-    pub extra: f64,
-}
-
-impl Default for GaussianRates {
-    fn default() -> Self {
-        Self {
-            means: 1.6e-4,
-            means_end: 1.6e-6,
-            log_scales: 5e-3,
-            quaternions: 1e-3,
-            opacity: 0.05,
-            sh_dc: 2.5e-3,
-            sh_rest: 1.25e-4,
-            score: 0.05,
-            extra: 2.5e-3,
-        }
     }
 }
 
@@ -309,26 +168,7 @@ impl RunConfig {
     pub(crate) fn validate(&self) -> Result<()> {
         self.scene.validate()?;
         self.auto.validate()?;
-        let t = &self.train;
-        let bad = |key: &str, problem: String, remedy: &str| Err(Error::parameter(format!("train.{key}"), problem, remedy));
-        if t.iterations == 0 || t.iterations > 10_000_000 {
-            return bad("iterations", format!("{} is not in 1..10,000,000", t.iterations), "Choose the number of training iterations");
-        }
-        if t.batch == 0 || t.batch > 64 {
-            return bad("batch", format!("{} is not in 1..64", t.batch), "Choose the number of views per iteration");
-        }
-        if t.sh_degree > 4 {
-            return bad("sh_degree", format!("{} is over 4", t.sh_degree), "Choose a degree of 0 to 4");
-        }
-        if t.shares.iter().any(|s| !s.is_finite() || *s < 0.0) || t.shares.iter().sum::<f64>() <= 0.0 {
-            return bad("shares", format!("{:?} are not shares", t.shares), "Give three numbers of which one is positive");
-        }
-        if !(0.0..=1.0).contains(&t.time_ramp) {
-            return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");
-        }
-        if !(0.0..=10.0).contains(&t.time_noise) {
-            return bad("time_noise", format!("{} frames", t.time_noise), "Give 0 to 10 frames");
-        }
+        self.train.validate()?;
         if let Some(near) = self.render.near.filter(|near| !near.is_finite() || *near < 0.0) {
             return Err(Error::parameter(
                 "render.near",

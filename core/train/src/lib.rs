@@ -17,4 +17,5 @@ pub mod presets;
 mod sample;
 pub mod schedule;
 pub mod train;
+mod train_config;
 pub mod trajectory;

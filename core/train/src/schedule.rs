@@ -3,6 +3,9 @@
 use crate::config::TrainConfig;
 use cc4dgs_core::{Schedule, Stage};
 
+/// Sizes per axis that images have before they have their full one, ascending; each for an equal part of the time.
+pub const IMAGE_SCALES: [f32; 3] = [0.25, 0.354, 0.5];
+
 /// Iterations of a run's stages.
 #[derive(Clone, Debug)]
 pub struct StageLengths {
@@ -12,6 +15,7 @@ pub struct StageLengths {
     sh_degree: usize,
     sh_interval: usize,
     extent: f32,
+    image_growth: f64,
 }
 
 impl StageLengths {
@@ -25,7 +29,15 @@ impl StageLengths {
         let mut lengths = shares.map(|s| (config.iterations as f64 * s / sum).round() as usize);
         // Rounding goes to the longest stage, so that the stages add up to the number asked for.
         lengths[2] = config.iterations.saturating_sub(lengths[0] + lengths[1]);
-        Self { lengths, total: config.iterations, passes: [1; 3], sh_degree: config.sh_degree, sh_interval: config.sh_interval, extent }
+        Self {
+            lengths,
+            total: config.iterations,
+            passes: [1; 3],
+            sh_degree: config.sh_degree,
+            sh_interval: config.sh_interval,
+            extent,
+            image_growth: config.image_growth,
+        }
     }
     /// Iterations of `stage`.
     pub fn length(&self, stage: Stage) -> usize {
@@ -34,6 +46,13 @@ impl StageLengths {
     /// States in how many iterations every camera of `stage` is drawn once.
     pub fn set_pass(&mut self, stage: Stage, iterations: usize) {
         self.passes[stage as usize] = iterations.max(1);
+    }
+    /// Size per axis of the images of an iteration (from 1), as a share of their full one. Scores are always fitted to full ones.
+    fn image_scale(&self, stage: Stage, iteration: usize) -> f32 {
+        let before = if stage == Stage::Main { self.lengths[Stage::Coarse as usize] } else { 0 };
+        let all = self.lengths[Stage::Coarse as usize] + self.lengths[Stage::Main as usize];
+        let share = (before + iteration.saturating_sub(1)) as f64 / (self.image_growth * all as f64);
+        if stage == Stage::Score || share.is_nan() || share >= 1.0 { 1.0 } else { IMAGE_SCALES[(share * IMAGE_SCALES.len() as f64) as usize] }
     }
     /// Where iteration `iteration` (from 1) of `stage` stands.
     pub fn schedule(&self, stage: Stage, iteration: usize) -> Schedule {
@@ -45,7 +64,7 @@ impl StageLengths {
             total: self.total,
             pass: self.passes[stage as usize],
             sh_degree: self.sh_degree,
-            image_scale: 1.0,
+            image_scale: self.image_scale(stage, iteration),
             extent: self.extent,
         };
         if stage == Stage::Coarse {
@@ -68,6 +87,10 @@ mod tests {
         let full = StageLengths::new(&TrainConfig::default(), true, 1.0);
         assert_eq!((full.length(Stage::Coarse), full.length(Stage::Score), full.length(Stage::Main)), (5000, 3000, 20_000));
         let degrees: Vec<usize> = [1, 1000, 1001, 5000].iter().map(|&i| full.schedule(Stage::Coarse, i).sh_degree).collect();
+        assert_eq!(full.schedule(Stage::Coarse, 1).image_scale, 1.0);
+        let growing = StageLengths::new(&TrainConfig { image_growth: 0.5, ..Default::default() }, true, 1.0);
+        let scale = |stage, iteration| growing.schedule(stage, iteration).image_scale;
+        assert_eq!((scale(Stage::Coarse, 1), scale(Stage::Score, 1), scale(Stage::Main, 7499), scale(Stage::Main, 7501)), (0.25, 1.0, 0.5, 1.0));
         assert_eq!((degrees, full.schedule(Stage::Main, 1).sh_degree), (vec![0, 0, 1, 3], 3));
     }
 }

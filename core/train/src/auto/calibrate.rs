@@ -1,34 +1,42 @@
 //! How long an iteration takes, found by training for a few.
 
-use crate::config::{Dynamic, InitSource, RunConfig};
+use crate::config::{Dynamic, RunConfig};
 use crate::train::{TrainJob, train};
-use cc4dgs_core::{Event, Recorder, Registry, Result, Scene};
+use cc4dgs_core::{Event, Recorder, Registry, Result, Scene, Split};
+use rayon::prelude::*;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
 
 /// Iterations of each stage that are timed, and how many one measurement takes.
-const ITERATIONS: usize = 24;
+const ITERATIONS: usize = 36;
 const PER_MEASUREMENT: usize = 4;
 /// Share of the largest number of Gaussians that a run has on average.
-const MEAN_GAUSSIANS: f64 = 0.8;
+const MEAN_GAUSSIANS: f64 = 0.9;
+/// The time of an iteration grows with the number of Gaussians to this power: images have the same number of pixels.
+const GROWTH_POWER: f64 = 0.7;
 
-/// Milliseconds of an iteration.
+/// Milliseconds: of an iteration, and of what comes before them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Timing {
     /// Where nothing moves.
     pub still: f64,
     /// Where everything moves.
     pub moving: f64,
+    /// All that comes before the first iteration.
+    pub start: f64,
 }
 
-/// Trains for a few iterations as `config` would, once without and once with motion, and forgets the result.
-pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Registry) -> Result<Timing> {
+/// Trains for a few iterations as `config` would, from the same first Gaussians, once without and once with motion, and forgets the result. Images are decoded
+/// before, for at most `patience`: most iterations of a run find theirs in the cache.
+pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Registry, patience: Duration) -> Result<Timing> {
+    let began = Instant::now();
+    scene.split(Split::Train).into_par_iter().filter(|_| began.elapsed() < patience).try_for_each(|view| scene.frame(view).map(drop))?;
     let mut trial = config.clone();
     let most = config.density.get("max_gaussians").and_then(|v| v.as_integer()).map_or(config.init.count, |v| v.max(1) as usize);
-    trial.init.count = (MEAN_GAUSSIANS * most as f64) as usize;
-    trial.init.source = if scene.points.is_some() { InitSource::Points } else { InitSource::Random };
     trial.density = toml::Table::from_iter([("kind".into(), "none".into())]);
     trial.train.iterations = 2 * ITERATIONS;
+    trial.train.batch = 1;
     trial.train.shares = [1.0, 0.0, 1.0];
     trial.train.dynamic = Dynamic::All;
     trial.train.lambda_r = 0.0;
@@ -36,10 +44,14 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     trial.train.checkpoint_every = 0;
     (trial.train.checks, trial.train.validation) = (false, 0);
     trial.auto = Default::default();
+    let began = Instant::now();
     let recorder = Recorder::default();
     let stop = AtomicBool::new(false);
-    train(&TrainJob { config: &trial, scene: scene.clone(), out: None, resume: false, registry, events: &recorder, stop: &stop })?;
+    let (model, _) = train(&TrainJob { config: &trial, scene: scene.clone(), out: None, resume: false, registry, events: &recorder, stop: &stop })?;
+    let all_ms = 1000.0 * began.elapsed().as_secs_f64();
     let events = recorder.events();
+    let iterations_ms: f64 =
+        events.iter().map(|event| if let Event::Iteration { ms, .. } = event { f64::from(*ms) * PER_MEASUREMENT as f64 } else { 0.0 }).sum();
     let median = |wanted: &str| {
         let mut times: Vec<f32> = events
             .iter()
@@ -52,6 +64,7 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
         times.sort_by(f32::total_cmp);
         times.get(times.len() / 2).copied().map(f64::from)
     };
-    let still = median("coarse").unwrap_or(1.0).max(0.01);
-    Ok(Timing { still, moving: median("main").unwrap_or(still).max(still) })
+    let grown = (MEAN_GAUSSIANS * most as f64 / model.gaussians.len().max(1) as f64).max(1.0).powf(GROWTH_POWER);
+    let still = grown * median("coarse").unwrap_or(1.0).max(0.01);
+    Ok(Timing { still, moving: (grown * median("main").unwrap_or(still)).max(still), start: (all_ms - iterations_ms).max(0.0) })
 }

@@ -16,17 +16,25 @@ use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, auto_device,
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 /// Name of the preset.
 pub const PRESET: &str = "auto";
 /// Minutes on processors and on a graphics card, where none are asked for.
 const MINUTES: [f64; 2] = [10.0, 5.0];
-/// Share of the time that training itself gets; reading, initial points and checkpoints take the rest.
-const TRAINING_SHARE: f64 = 0.88;
+/// Share of the time that is planned for; checkpoints and the verdict take the rest.
+const PLANNED_SHARE: f64 = 0.95;
+/// Largest share of the time for decoding images before the first iteration.
+const DECODING_SHARE: f64 = 0.1;
+/// Least share of the time for iterations, however long the plan and the first points take.
+const LEAST_SHARE: f64 = 0.4;
 /// Fewest and most iterations.
 const ITERATIONS: [f64; 2] = [500.0, 200_000.0];
 /// Share of moving pixels that is expected where no camera stands still.
-const UNKNOWN_MOTION: f32 = 0.2;
+const UNKNOWN_MOTION: f32 = 0.1;
+/// Views of an iteration take at least a half as long as the pass through the field that they share, but are not more than these.
+const FIELD_VIEWS: f64 = 2.0;
+const MOST_VIEWS: f64 = 8.0;
 /// Iterations below which a run is too short for its scene.
 const SHORT: f64 = 2000.0;
 /// Iterations of the score stage per unit of the score that a Gaussian can reach in them.
@@ -91,6 +99,7 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
     if !layers.want_plan() {
         return Ok((asked.clone(), read(&asked)?));
     }
+    let began = Instant::now();
     let step = |done| events.emit(&Event::Progress { task: "look at the scene".into(), done, total: 3 });
     step(0);
     let mut plan = Plan::default();
@@ -114,8 +123,13 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
         plan.add(choice)?;
     }
     if !layers.state("train.iterations") {
-        let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &scene, registry)?;
-        plan.add(iterations(&facts, &layers.over(&plan.table).config()?, timing, minutes))?;
+        let patience = Duration::from_secs_f64(DECODING_SHARE * 60.0 * minutes);
+        let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &scene, registry, patience)?;
+        let config = layers.over(&plan.table).config()?;
+        let spent = began.elapsed().as_secs_f64() / 60.0;
+        for choice in lengths(&facts, &config, timing, minutes, spent, layers.state("train.batch").then_some(config.train.batch)) {
+            plan.add(choice)?;
+        }
     }
     step(3);
     let config = layers.over(&plan.table).config()?;
@@ -138,19 +152,27 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
     Ok((config, scene))
 }
 
-/// The iterations that `minutes` allow.
-fn iterations(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64) -> Choice {
+/// How many views share a pass through the field, and the iterations that `minutes` allow, of which the plan has `spent` some. `batch` is the number that the user stated.
+fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spent: f64, batch: Option<usize>) -> [Choice; 2] {
     let total: f64 = config.train.shares.iter().sum::<f64>().max(1e-9);
     let main = config.train.shares[2] / total;
     let scored = config.train.dynamic != Dynamic::All;
     let moving = if scored { (2.0 * f64::from(facts.moving.unwrap_or(UNKNOWN_MOTION))).min(1.0) } else { 1.0 };
     let still = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
-    let moving = if still { 0.0 } else { moving };
-    let ms = timing.still + main * moving * (timing.moving - timing.still);
-    let count = (TRAINING_SHARE * minutes * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
+    let field = if still { 0.0 } else { moving * (timing.moving - timing.still) };
+    let views = batch.map_or((field / (FIELD_VIEWS * timing.still)).round().clamp(1.0, MOST_VIEWS), |batch| batch as f64);
+    let ms = (1.0 - main) * timing.still + main * (field + views * timing.still);
+    let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
+    let count = (left * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
     let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
-    let reason = format!("{minutes} minutes at about {ms:.0} ms per iteration on this machine");
-    Choice { settings: vec![("train.iterations", toml::Value::Integer(count as i64))], reason }
+    let rates = [("train.batch", toml::Value::Integer(views as i64)), ("train.coarse_batch", 1.into()), ("train.lr.batch_power", 0.5.into())];
+    [
+        Choice { settings: rates.to_vec(), reason: format!("a pass through the field takes {field:.0} ms, a view {:.0} ms", timing.still) },
+        Choice {
+            settings: vec![("train.iterations", toml::Value::Integer(count as i64))],
+            reason: format!("{left:.1} of {minutes} minutes at about {ms:.0} ms per iteration on this machine"),
+        },
+    ]
 }
 
 /// Width and height in pixels of the median training camera.

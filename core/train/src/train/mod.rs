@@ -7,6 +7,7 @@ mod log;
 mod losses;
 mod parameters;
 mod probe;
+mod pyramid;
 mod residual;
 mod sampler;
 mod score;
@@ -18,8 +19,9 @@ pub use guard::Guard;
 pub use state::{Parts, TrainState};
 
 use crate::checkpoint;
-use crate::checks::{Verdict, Watch, examine, hold_out};
+use crate::checks::{Verdict, Watch, examine};
 use crate::config::{CoarseFrames, Dynamic, RunConfig};
+use crate::data::hold_out;
 use crate::gaussian_set::GaussianSet;
 use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
@@ -31,6 +33,7 @@ use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, Moving};
 use losses::LossTerms;
+use pyramid::Pyramid;
 use sampler::{Prefetcher, Sampler};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -81,6 +84,7 @@ pub struct TrainReport {
 pub(crate) struct Context<'a> {
     pub job: &'a TrainJob<'a>,
     pub lengths: StageLengths,
+    pub pyramid: Pyramid,
     pub device: Device,
     pub rasterizer: Box<dyn Rasterizer>,
     pub losses: LossTerms,
@@ -101,8 +105,8 @@ pub(crate) struct Context<'a> {
 pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let began = Instant::now();
     let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
-    let (scene, validation) = hold_out(&job.scene, config.train.validation)?;
-    let job = &TrainJob { config, scene, out: job.out.clone(), ..*job };
+    let scene = hold_out(&job.scene, config.train.validation)?;
+    let job = &TrainJob { config, scene: Arc::new(scene), out: job.out.clone(), ..*job };
     if let Some(out) = &job.out {
         std::fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
         write_atomically(out.join(CONFIG), config.to_toml()?.as_bytes())?;
@@ -153,6 +157,7 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     };
     let mut context = Context {
         job,
+        pyramid: Pyramid::new(&job.scene, config)?,
         lengths: StageLengths::new(&config.train, matches!(moving, Moving::Scored { .. }), job.scene.extent()),
         rasterizer: job.registry.build_rasterizer(&config.rasterizer)?,
         losses: LossTerms::build(job.registry, &config.loss)?,
@@ -167,9 +172,9 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     for stage in Stage::ALL {
         let views = context.stage_views(stage);
         let cameras: std::collections::BTreeSet<usize> = views.iter().map(|&view| job.scene.views[view].camera).collect();
-        context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.batch));
+        context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.views_per_iteration(stage)));
     }
-    let mut watch = Watch::new(&context, doubts, validation);
+    let mut watch = Watch::new(&context, doubts);
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
         if stage < state.stage {
@@ -244,13 +249,13 @@ impl Context<'_> {
         }
         events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
         let began = Instant::now();
-        let mut sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), self.job.config.train.batch);
+        let mut sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), self.job.config.train.views_per_iteration(stage));
         // Only a canonical space that is the first frame can be left frame by frame.
         if stage == Stage::Main && self.stage_views(Stage::Coarse).len() < self.stage_views(Stage::Main).len() {
             let ramp = (self.job.config.train.time_ramp * length as f64).round() as usize;
             sampler = sampler.with_ramp(ramp, |view| self.job.scene.views[view].time_norm);
         }
-        let prefetcher = Prefetcher::new(self.job.scene.clone());
+        let prefetcher = Prefetcher::new();
         let mut log = log::Log::new(stage, length, self.job.config.train.log_every);
         let resumed_at = state.iteration;
         while state.iteration < length {
@@ -263,8 +268,8 @@ impl Context<'_> {
                 }));
             }
             let batch = sampler.batch(state.iteration);
-            prefetcher.want(sampler.batch(state.iteration + 1));
             let schedule = self.lengths.schedule(stage, state.iteration + 1);
+            prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
             match stage {
                 Stage::Score => self.score_step(state, &schedule, &mut log)?,
                 _ => {

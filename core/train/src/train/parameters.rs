@@ -4,6 +4,12 @@ use crate::gaussian_set::log_linear;
 use burn::tensor::{Gradients, Tensor};
 use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings};
 
+/// The learning rate of `group` at `progress` in 0..1 of the stage; `extent` is that of the cameras.
+pub(crate) fn rate(group: &ParameterGroup, progress: f64, extent: f64) -> f64 {
+    let warm = if group.warmup > 0.0 { (progress / group.warmup).min(1.0) } else { 1.0 };
+    log_linear(group.lr_start, group.lr_end, progress) * warm * if group.times_extent { extent } else { 1.0 }
+}
+
 /// Makes the weights leaves of the coming step; [`update`] undoes it.
 pub(crate) fn track(parameters: Vec<&mut Parameter>) {
     for parameter in parameters {
@@ -11,15 +17,15 @@ pub(crate) fn track(parameters: Vec<&mut Parameter>) {
     }
 }
 
-/// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `progress` is in 0..1 of the stage.
+/// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `rate` gives the learning
+/// rate of a group.
 pub(crate) fn update(
     prefix: &str,
     mut parameters: Vec<&mut Parameter>,
     groups: &[ParameterGroup],
     gradients: &Gradients,
     optimizer: &mut dyn Optimizer,
-    progress: f64,
-    extent: f64,
+    rate: impl Fn(&ParameterGroup) -> f64,
 ) -> Result<()> {
     let mut gradient_of: Vec<Option<Tensor<1>>> = parameters.iter().map(|p| p.value.grad(gradients)).collect();
     for (g, group) in groups.iter().enumerate().filter(|(_, group)| group.clip_norm > 0.0) {
@@ -41,9 +47,7 @@ pub(crate) fn update(
             continue;
         };
         let group = &groups[parameter.group];
-        let warm = if group.warmup > 0.0 { (progress / group.warmup).min(1.0) } else { 1.0 };
-        let lr = log_linear(group.lr_start, group.lr_end, progress) * warm * if group.times_extent { extent } else { 1.0 };
-        let settings = StepSettings { epsilon: group.epsilon, ..StepSettings::new(lr) };
+        let settings = StepSettings { epsilon: group.epsilon, ..StepSettings::new(rate(group)) };
         let count = value.dims()[0];
         let name = format!("{prefix}{}", parameter.name);
         parameter.value = optimizer.step(&name, value.reshape([count, 1]), gradient.reshape([count, 1]), &settings)?.reshape([count]);

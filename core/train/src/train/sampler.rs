@@ -59,25 +59,25 @@ impl Sampler {
     }
 }
 
-/// Decodes coming frames into the scene's cache on a thread of its own.
-pub struct Prefetcher(SyncSender<usize>);
+/// Decodes coming frames into the cache of their scene on a thread of its own.
+pub struct Prefetcher(SyncSender<(Arc<Scene>, usize)>);
 
 impl Prefetcher {
     /// Starts the thread; it ends with this value.
-    pub fn new(scene: Arc<Scene>) -> Self {
-        let (send, receive) = sync_channel::<usize>(16);
+    pub fn new() -> Self {
+        let (send, receive) = sync_channel::<(Arc<Scene>, usize)>(16);
         std::thread::spawn(move || {
-            for view in receive {
+            for (scene, view) in receive {
                 // A frame that cannot be read is reported by whoever needs it.
                 let _ = scene.frame(view);
             }
         });
         Self(send)
     }
-    /// Asks for `views`; never waits.
-    pub fn want(&self, views: Vec<usize>) {
+    /// Asks for `views` of `scene`; never waits.
+    pub fn want(&self, scene: &Arc<Scene>, views: Vec<usize>) {
         for view in views {
-            let _ = self.0.try_send(view);
+            let _ = self.0.try_send((scene.clone(), view));
         }
     }
 }

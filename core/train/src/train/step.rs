@@ -6,7 +6,9 @@ use super::{Context, TrainState, parameters};
 use crate::gaussian_set::{Leaves, gaussian_rate};
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, Event, LossInput, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics};
+use cc4dgs_core::{
+    Camera, Event, LossInput, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics,
+};
 use cc4dgs_play::MovingRows;
 use cc4dgs_play::model::ModelDeformer;
 use std::collections::BTreeMap;
@@ -30,7 +32,7 @@ impl Context<'_> {
     /// One iteration on the views of `batch`.
     pub(crate) fn photometric_step(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], log: &mut Log) -> Result<()> {
         let train = &self.job.config.train;
-        let scene = &self.job.scene;
+        let scene = self.pyramid.at(schedule.image_scale);
         let (n, progress) = (state.set.len(), schedule.progress());
         let rows = state.moving_rows(&self.device)?;
         let moves = state.deformer.as_ref().is_some_and(|d| !d.field.is_static()) && rows.count() > 0;
@@ -136,15 +138,17 @@ impl Context<'_> {
         let extent = f64::from(schedule.extent);
         let of_plugin: BTreeMap<String, f64> =
             state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
-        let rate = |name: &str| of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
+        let scale = train.rate_scale(schedule.stage);
+        let rate = |name: &str| scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
         self.step_gaussians(state, of_gaussians, |name| StepSettings { visible: visible.as_ref(), ..StepSettings::new(rate(name)) })?;
+        let of_group = |group: &ParameterGroup| scale * parameters::rate(group, progress, extent);
         let TrainState { deformer, appearance, optimizer, .. } = state;
         if let Some(deformer) = deformer.as_mut().filter(|_| deformed) {
             let groups = deformer.field.groups();
-            parameters::update("deformer/", deformer.field.parameters_mut(), &groups, &gradients, optimizer.as_mut(), progress, extent)?;
+            parameters::update("deformer/", deformer.field.parameters_mut(), &groups, &gradients, optimizer.as_mut(), of_group)?;
         }
         let groups = appearance.groups();
-        parameters::update("appearance/", appearance.parameters_mut(), &groups, &gradients, optimizer.as_mut(), progress, extent)?;
+        parameters::update("appearance/", appearance.parameters_mut(), &groups, &gradients, optimizer.as_mut(), of_group)?;
         log.step(self.job.events, schedule.iteration, state.set.len());
         Ok(())
     }

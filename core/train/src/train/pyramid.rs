@@ -1,0 +1,85 @@
+//! The scene with smaller images, for the first part of a run: coarse structure is found faster where images have few pixels (DashGaussian).
+
+use crate::config::RunConfig;
+use crate::data::resize;
+use crate::schedule::IMAGE_SCALES;
+use cc4dgs_core::{FrameSource, Image8, Result, Scene};
+use std::sync::Arc;
+
+/// The scene at every size of images that a run uses.
+pub(crate) struct Pyramid {
+    /// Scale per axis and the scene, ascending; the last is the scene itself.
+    levels: Vec<(f32, Arc<Scene>)>,
+}
+
+impl Pyramid {
+    /// The scene of `config` at every scale its schedule has. Images are shrunk when they are asked for.
+    pub(crate) fn new(scene: &Arc<Scene>, config: &RunConfig) -> Result<Self> {
+        let mut levels = Vec::new();
+        if config.train.image_growth > 0.0 {
+            for scale in IMAGE_SCALES {
+                levels.push((scale, Arc::new(shrunk(scene, scale, config.scene.cache_mb)?)));
+            }
+        }
+        levels.push((1.0, scene.clone()));
+        Ok(Self { levels })
+    }
+    /// The scene with images of `scale`, or the next larger ones there are.
+    pub(crate) fn at(&self, scale: f32) -> &Arc<Scene> {
+        let level = self.levels.partition_point(|(known, _)| *known < scale);
+        &self.levels[level.min(self.levels.len() - 1)].1
+    }
+}
+
+/// `scene` with images of `scale` per axis.
+fn shrunk(scene: &Arc<Scene>, scale: f32, cache_mb: u64) -> Result<Scene> {
+    let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
+    let cameras = scene.cameras.iter().map(|camera| camera.resized(side(camera.width), side(camera.height))).collect();
+    let cache_bytes = (cache_mb as f32 * 1e6 * scale * scale) as u64;
+    Scene::new(scene.name.clone(), cameras, scene.views.clone(), Arc::new(Shrunk { scene: scene.clone(), scale }), cache_bytes)
+}
+
+/// The images of a scene, smaller.
+struct Shrunk {
+    scene: Arc<Scene>,
+    scale: f32,
+}
+
+impl FrameSource for Shrunk {
+    fn load(&self, view: usize) -> Result<Image8> {
+        let image = self.scene.frame(view)?;
+        let side = |pixels: u32| ((pixels as f32 * self.scale).round() as u32).max(1);
+        Ok(resize(&image, side(image.width), side(image.height)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::{Camera, Split, View};
+
+    struct Flat;
+    impl FrameSource for Flat {
+        fn load(&self, _: usize) -> Result<Image8> {
+            Ok(Image8 { width: 40, height: 20, channels: 3, data: vec![9; 2400] })
+        }
+    }
+
+    #[test]
+    fn images_and_cameras_shrink_alike() {
+        let camera = Camera::look_at("a", (40, 20), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let views = vec![View { camera: 0, frame: 0, time_norm: 0.0, split: Split::Train }];
+        let scene = Arc::new(Scene::new("flat", vec![camera], views, Arc::new(Flat), 1 << 20).unwrap());
+        let mut config = RunConfig::resolve(Some("demo"), None, &[]).unwrap();
+        config.train.image_growth = 0.5;
+        let pyramid = Pyramid::new(&scene, &config).unwrap();
+        for scale in IMAGE_SCALES.into_iter().chain([1.0]) {
+            let level = pyramid.at(scale);
+            let image = level.frame(0).unwrap();
+            assert_eq!((image.width, image.height), (level.cameras[0].width, level.cameras[0].height));
+            assert_eq!(image.width, (40.0 * scale).round() as u32);
+        }
+        config.train.image_growth = 0.0;
+        assert_eq!(Pyramid::new(&scene, &config).unwrap().at(0.25).cameras[0].width, 40);
+    }
+}
