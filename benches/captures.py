@@ -40,6 +40,8 @@ def train(options, name, path, setting, minutes, extra):
         arguments += ["--preset", setting]
     if setting == "none" or setting.startswith("auto"):
         arguments += ["--minutes", str(minutes)]
+    if options.threads:
+        arguments += ["--threads", str(options.threads)]
     for text in extra:
         arguments += ["--set", text]
     train_log = out.with_suffix(".train.log")
@@ -72,6 +74,7 @@ def main():
     parser.add_argument("out", type=pathlib.Path)
     parser.add_argument("--bin", required=True)
     parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--threads", type=int, default=0, help="threads of each training; 0 takes all cores")
     parser.add_argument("--scene", action="append", default=[], metavar="NAME=PATH", help="a dataset beside the captures")
     parser.add_argument("--with", dest="settings", action="append", default=[], help="another setting: none, auto+METHOD, a preset")
     parser.add_argument("--without-auto", action="store_true")

@@ -33,8 +33,8 @@ fn density_control_does_not_collapse() {
     let registry = Registry::collect().unwrap();
     let controls: Vec<&str> = registry.plugins().into_iter().filter(|(kind, _)| *kind == "density").map(|(_, plugin)| plugin.name).collect();
     assert!(controls.len() >= 2);
-    // PSNR in dB that each capture reaches at this size in 300 iterations, less a margin.
-    for (capture, floor_db) in [("handheld", 14.0), ("turntable", 14.0), ("rig", 14.0)] {
+    // PSNR in dB that the worst control reaches on each capture at this size in 300 iterations, less 1.5 dB.
+    for (capture, floor_db) in [("handheld", 17.6), ("turntable", 16.3), ("rig", 17.9)] {
         for control in &controls {
             let density = format!("density={{kind='{control}'}}");
             let (config, scene) = planned(capture, &["train.iterations=300", "init.count=1500", &density], &registry);
@@ -46,7 +46,7 @@ fn density_control_does_not_collapse() {
             let (begun, ended) = (begun.unwrap(), model.gaussians.len());
             assert!(2 * ended >= begun && ended <= 20 * begun, "{capture}, {control}: {begun} Gaussians became {ended}");
             let psnr = evaluate(&model, &scene, Split::Test, 6, &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db;
-            eprintln!("{capture}, {control}: {psnr:.2} dB, {begun} Gaussians became {ended}");
+            println!("{capture}, {control}: {psnr:.2} dB, {begun} Gaussians became {ended}");
             assert!(psnr >= floor_db, "{capture}, {control}: {psnr:.2} dB, at least {floor_db} are expected");
         }
     }

@@ -1,0 +1,75 @@
+#!/usr/bin/env python3
+"""Compares settings at equal wall time on validation views, never on test views.
+
+    python3 benches/variants.py OUT --bin BIN --minutes 3 --scene rig=procedural:captures/rig:7 --variant batch=train.batch=4,train.lr.batch_power=0.5 [--seeds 2]
+
+Every scene is trained with the preset (`auto`) as it is, called `base`, and with each variant's settings on top. The plan gives each variant as many iterations as
+take the same time. Rows are kept in OUT/rows.json and not run again; a table of validation PSNR, and what each variant gains on `base`, is printed at the end.
+"""
+import argparse
+import json
+import pathlib
+import subprocess
+import sys
+import time
+
+
+def train(options, scene, path, name, settings, seed):
+    out = options.out / f"{scene}-{name}-{seed}"
+    report = out.with_suffix(".json")
+    arguments = ["train", "--scene", path, "--out", str(out), "--overwrite", "--quiet", "--preset", options.preset, f"--json={report}"]
+    if options.minutes > 0:
+        arguments += ["--minutes", str(options.minutes)]
+    for text in [f"train.validation={options.views}", f"seed={seed}", *options.sets, *settings]:
+        arguments += ["--set", text]
+    began = time.time()
+    with open(out.with_suffix(".log"), "w") as log:
+        code = subprocess.run([options.bin, *arguments], stdout=log, stderr=subprocess.STDOUT).returncode
+    row = {"scene": scene, "variant": name, "settings": settings, "seed": seed, "minutes": options.minutes, "exit": code, "seconds": round(time.time() - began, 1)}
+    if report.exists():
+        found = json.loads(report.read_text())
+        verdict = found.get("verdict") or {}
+        row |= {"gaussians": found.get("gaussians"), "moving": found.get("dynamic_gaussians")}
+        row |= {key: verdict.get(f"{key}_psnr_db") for key in ["train", "validation", "moving"] if verdict.get(f"{key}_psnr_db") is not None}
+    config = out / "config.toml"
+    if config.exists():
+        line = next((line for line in config.read_text().splitlines() if line.startswith("iterations = ")), "")
+        row["iterations"] = int(line.split("=")[1]) if line else None
+    return row
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=pathlib.Path)
+    parser.add_argument("--bin", required=True)
+    parser.add_argument("--preset", default="auto")
+    parser.add_argument("--minutes", type=float, default=3.0, help="0 leaves the iterations to the preset and the settings")
+    parser.add_argument("--views", type=int, default=12, help="validation views")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--scene", action="append", default=[], metavar="NAME=PATH", required=True)
+    parser.add_argument("--variant", action="append", default=[], metavar="NAME=KEY=VALUE,...")
+    parser.add_argument("--set", dest="sets", action="append", default=[], help="for every variant, `base` included")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    variants = [("base", [])] + [(text.split("=", 1)[0], text.split("=", 1)[1].split(",")) for text in options.variant]
+    kept = options.out / "rows.json"
+    rows = json.loads(kept.read_text()) if kept.exists() else []
+    table = {}
+    for scene, path in (text.split("=", 1) for text in options.scene):
+        for seed in range(options.seeds):
+            for name, settings in variants:
+                same = lambda r: (r["scene"], r["variant"], r["settings"], r["seed"], r["minutes"]) == (scene, name, settings, seed, options.minutes)
+                row = next((r for r in rows if same(r)), None)
+                if row is None:
+                    row = train(options, scene, path, name, settings, seed)
+                    rows.append(row)
+                    kept.write_text(json.dumps(rows, indent=1))
+                table[scene, name, seed] = row.get("validation")
+                base = table[scene, "base", seed]
+                gain = f"{row['validation'] - base:+.2f}" if row.get("validation") and base else "-"
+                print(f"{scene:12} {name:16} seed {seed}: validation {row.get('validation') or float('nan'):.2f} dB ({gain}), training {row.get('train') or float('nan'):.2f} dB, "
+                      f"{row.get('gaussians')} Gaussians ({row.get('moving')} move), {row.get('iterations')} iterations, {row['seconds']} s, exit {row['exit']}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
