@@ -4,6 +4,7 @@ pub mod basis;
 pub mod cdf;
 pub mod deform_mlp;
 pub mod embedding;
+pub mod free_time;
 pub mod grid4d;
 pub mod hexplane;
 pub mod native4d;

@@ -1,5 +1,6 @@
 //! Evaluation by the protocol of published tables: 8-bit images, metrics per image, then their means.
 
+use crate::blocks::{BlockScore, UsualImage};
 use crate::config::TrainConfig;
 use crate::masks::dynamic_masks;
 use burn::tensor::Device;
@@ -65,6 +66,8 @@ pub struct ImageScore {
     pub ssim: f64,
     /// The same over windows centred on pixels that see something move.
     pub ssim_dynamic: Option<f64>,
+    /// Blocks in which something moves; absent where the camera has few frames or nothing moves in this one.
+    pub blocks: Option<BlockScore>,
     /// Milliseconds.
     pub field_ms: f64,
     /// Milliseconds.
@@ -86,6 +89,10 @@ pub struct EvalReport {
     pub ssim: f64,
     /// Mean over the images that have it, of the windows centred on pixels that see something move.
     pub ssim_dynamic: Option<f64>,
+    /// PSNR of the worst moving block of an image, mean over the images that have one (`cc4dgs_train::blocks`).
+    pub psnr_worst_block_db: Option<f64>,
+    /// Share of all moving blocks whose render is nearer to what the camera usually sees than to the truth: what moves is missing there.
+    pub lost_blocks: Option<f64>,
     /// Mean over images, skimage's Gaussian convention.
     pub ssim_skimage: f64,
     /// Mean over images; absent where an image is too small for five scales.
@@ -152,6 +159,7 @@ pub fn evaluate(
         .filter(|m| m.mask.contains(&1.0))
         .map(|m| (scene.views[m.view].camera, m.mask.iter().map(|v| *v > 0.0).collect()))
         .collect();
+    let usual = usual_images(scene, split, background)?;
     let ssim_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit));
     let ssim_dynamic_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit).masked());
     let skimage_metric = metric(Metric::ssim(SsimConvention::Skimage, Rounding::EightBit));
@@ -179,6 +187,7 @@ pub fn evaluate(
             psnr_dynamic_db,
             ssim: ssim_metric.score_images(&truth, &render)?,
             ssim_dynamic,
+            blocks: usual.get(&scene.views[view].camera).and_then(|usual| usual.score(&truth, &render)),
             field_ms: time.field_ms,
             raster_ms: time.raster_ms,
         };
@@ -203,6 +212,8 @@ pub fn evaluate(
         psnr_dynamic_db: mean(images.iter().filter_map(|i| i.psnr_dynamic_db)),
         ssim: images.iter().map(|i| i.ssim).sum::<f64>() / n,
         ssim_dynamic: mean(images.iter().filter_map(|i| i.ssim_dynamic)),
+        psnr_worst_block_db: mean(images.iter().filter_map(|i| i.blocks).map(|b| b.worst_psnr_db)),
+        lost_blocks: lost_share(&images),
         ssim_skimage: skimage / n,
         ms_ssim: ms_ssim.map(|s| s / n),
         size_mb: model.size.into(),
@@ -221,6 +232,20 @@ pub fn evaluate(
         ]),
         images,
     })
+}
+
+/// What every camera of `split` with enough frames usually sees.
+fn usual_images(scene: &Scene, split: Split, background: [f32; 3]) -> Result<BTreeMap<usize, UsualImage>> {
+    let mut of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    scene.split(split).into_iter().for_each(|view| of_camera.entry(scene.views[view].camera).or_default().push(view));
+    let usual = of_camera.into_iter().map(|(camera, views)| Ok(UsualImage::of(scene, &views, background)?.map(|usual| (camera, usual))));
+    Ok(usual.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect())
+}
+
+/// The share of moving blocks that are lost.
+fn lost_share(images: &[ImageScore]) -> Option<f64> {
+    let (moving, lost) = images.iter().filter_map(|image| image.blocks).fold((0, 0), |(m, l), b| (m + b.moving, l + b.lost));
+    (moving > 0).then(|| lost as f64 / moving as f64)
 }
 
 fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {

@@ -2,6 +2,7 @@
 
 pub mod agreement;
 pub mod auto;
+pub mod blocks;
 pub mod checkpoint;
 pub mod checks;
 pub mod config;

@@ -61,6 +61,7 @@ methods! {
     "hexplane", "4DGS's planes", "4DGS (Wu et al. 2024)";
     "embedding", "E-D3DGS's learned vectors", "E-D3DGS (Bae et al. 2024)";
     "deform-mlp", "Deformable 3DGS's network", "Deformable 3DGS (Yang et al. 2024)";
+    "free-time", "velocities and lives of Gaussians", "FreeTimeGS; FreeTimeGS++; SharpTimeGS";
     "native-4d", "4D-GS's Gaussians of space and time", "4D-GS (Yang et al. 2024)";
     "cdf-basis", "this project's field, linear in functions of time", "this project";
     "none", "no deformation", "Kerbl et al. 2023 (3DGS)";
@@ -75,7 +76,7 @@ mod tests {
     fn every_family_and_method_resolves() {
         let registry = Registry::collect().unwrap();
         let names = |method: bool| registry.presets().filter(move |p| (p.role == PresetRole::Method) == method).map(|p| p.info.name).collect::<Vec<_>>();
-        assert_eq!((names(false).len(), names(true).len()), (8, 8));
+        assert_eq!((names(false).len(), names(true).len()), (8, 9));
         for family in names(false) {
             for method in names(true).into_iter().map(|name| format!("+{name}")).chain([String::new()]) {
                 let name = format!("{family}{method}");

@@ -19,6 +19,7 @@ fn small(name: &str) -> toml::Table {
         "embedding" => "gaussian_features = 6\ntime_features = 10\ntime_rows = 9\ncoarse_rows = 4\nwidth = 16",
         // The suite evaluates all times, so Gaussians must not be hidden initially.
         "native-4d" => "duration = 0.5\nharmonics = 1",
+        "free-time" => "half_width = 0.2\nfalloff = 0.5\ngate = 0.5",
         _ => "",
     };
     config::parse_table("test", text).unwrap()

@@ -164,6 +164,9 @@ pub fn text(report: &FullReport) -> String {
         e.psnr_dynamic_db
             .zip(e.ssim_dynamic)
             .map_or_else(String::new, |(psnr, ssim)| format!("  PSNR {psnr:.3} dB   SSIM {ssim:.4} (Inria) where something moves")),
+        e.psnr_worst_block_db.zip(e.lost_blocks).map_or_else(String::new, |(psnr, lost)| {
+            format!("  worst moving block of an image: {psnr:.2} dB in the mean; {:.1} % of the moving blocks lost", 100.0 * lost)
+        }),
         format!("  size {:.4} MB: deform {:.4} MB, point cloud {:.4} MB", e.size_mb.total, e.size_mb.deform, e.size_mb.point_cloud),
         format!("  {} Gaussians, {} of them dynamic", e.gaussians, e.dynamic_gaussians),
         format!(
