@@ -102,7 +102,8 @@ impl Embedding {
             let mut values = weights::glorot_with_bias(own.child("trunk"), input, w);
             for (i, head) in network.heads.iter().enumerate() {
                 values.extend(weights::glorot_with_bias(own.index(i as u64).child("first"), w, w));
-                values.extend(weights::glorot_with_bias(own.index(i as u64).child("second"), w, head[1]));
+                // As in `hexplane`: the published random layer tears the image apart at first.
+                values.extend(weights::silent(w, head[1]));
             }
             parameters.push(parameter(format!("net.{name}"), Part::Net, 0, values, device));
         }
@@ -226,7 +227,7 @@ inventory::submit! {
             summary: "learned vectors per Gaussian and per time, a coarse and a fine network",
             paper: "E-D3DGS (Bae et al. 2024)",
             schema: SCHEMA,
-            capabilities: &["differentiable", "per-gaussian-attributes"],
+            capabilities: &["differentiable", "starts-as-identity", "per-gaussian-attributes"],
         },
         build,
     }

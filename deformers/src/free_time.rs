@@ -94,7 +94,8 @@ impl Deformer for FreeTime {
         // Centres of life are spread over the sequence, and a tenth beyond either end.
         let starts = [(0.5, 0.6), (s.half_width.ln(), 0.0), (s.falloff.ln(), 0.0), (gate, 0.0), (0.0, 0.0)];
         let rates = [s.center_lr, s.width_lr, s.width_lr, s.gate_lr, s.velocity_lr];
-        let spec = |(((name, width), (start, spread)), lr)| AttributeSpec { spread, times_extent: name == "velocity", ..AttributeSpec::new(name, width, start, lr) };
+        let spec =
+            |(((name, width), (start, spread)), lr)| AttributeSpec { spread, times_extent: name == "velocity", ..AttributeSpec::new(name, width, start, lr) };
         ATTRIBUTES.into_iter().zip(starts).zip(rates).map(spec).collect()
     }
     fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {

@@ -116,7 +116,8 @@ impl HexPlane {
         for (i, head) in network.heads.iter().enumerate() {
             let own = seed.child("heads").index(i as u64);
             values.extend(weights::glorot_with_bias(own.child("first"), w, w));
-            values.extend(weights::glorot_with_bias(own.child("second"), w, head[1]));
+            // The published layer is random: its first offsets tear the image apart, and short runs never recover.
+            values.extend(weights::silent(w, head[1]));
         }
         parameters.push(parameter("net".into(), Part::Net, NET, values, device));
         Ok(Self { settings, context: context.clone(), planes, network: Arc::new(network), parameters })
@@ -227,7 +228,7 @@ inventory::submit! {
             summary: "six feature planes over space and time at two resolutions, multiplied",
             paper: "4DGS (Wu et al. 2024)",
             schema: SCHEMA,
-            capabilities: &["differentiable", "cached-spatial", "regularized"],
+            capabilities: &["differentiable", "starts-as-identity", "cached-spatial", "regularized"],
         },
         build,
     }

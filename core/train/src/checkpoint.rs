@@ -2,7 +2,7 @@
 
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
-use crate::train::{Guard, Parts, TrainState};
+use crate::train::{Guard, Neighbours, Parts, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
@@ -33,6 +33,9 @@ struct TrainingHeader {
     density: Vec<(String, usize)>,
     /// Arrays of the guard of density control with their lengths.
     guard: Vec<(String, usize)>,
+    /// Floats of the centres that strain is measured by.
+    #[serde(default)]
+    strain: usize,
     /// Arrays of the optimizer with their shapes.
     optimizer: Vec<(String, [usize; 2])>,
     /// Step counts of the optimizer.
@@ -45,6 +48,7 @@ struct TrainingArrays {
     appearance: Vec<Vec<f32>>,
     density: Vec<Vec<f32>>,
     guard: Vec<Vec<f32>>,
+    strain: Vec<f32>,
     optimizer: Vec<Vec<f32>>,
 }
 
@@ -97,6 +101,13 @@ impl Checkpoint {
         let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, parts);
         (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, model.field);
         state.guard = guard;
+        if !self.arrays.strain.is_empty() {
+            let moving = state.moving_rows(&self.device)?.count();
+            if self.arrays.strain.len() != 3 * moving {
+                return Err(damaged(format!("strain is measured by {} numbers for {moving} moving Gaussians", self.arrays.strain.len())));
+            }
+            state.neighbours = Neighbours::of(&self.arrays.strain, &self.device);
+        }
         Ok(state)
     }
 }
@@ -130,6 +141,10 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
         arrays.add_values(format!("guard/{name}"), vec![count], values)?;
         guard.push((name, count));
     }
+    let strain = state.neighbours.as_ref().map_or(&[][..], Neighbours::means);
+    if !strain.is_empty() {
+        arrays.add_values("strain".into(), vec![strain.len()], strain.to_vec())?;
+    }
     let optimizer_state = state.optimizer.state();
     let mut optimizer = Vec::new();
     for (name, values) in &optimizer_state.arrays {
@@ -158,6 +173,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             appearance,
             density,
             guard,
+            strain: strain.len(),
             optimizer,
             optimizer_steps: optimizer_state.steps,
         },
@@ -177,6 +193,7 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
         appearance: list("appearance", &training.appearance)?,
         density: list("density", &training.density)?,
         guard: list("guard", &training.guard)?,
+        strain: if training.strain > 0 { file.array("strain", Some(training.strain))? } else { Vec::new() },
         optimizer: optimizer.collect::<Result<_>>()?,
     };
     Ok(Checkpoint { model, training, arrays, device: device.clone() })

@@ -1,15 +1,29 @@
-//! Distances to the nearest neighbours, for initial scales.
+//! Nearest neighbours, for initial scales and for strain.
 
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Mean of the squared distances to the three nearest other points, per point (what 3DGS's simple-knn computes).
-/// Exact: a uniform grid searched ring by ring. Fewer than two points give 1.
+/// A neighbour: its index, and its squared distance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Neighbour {
+    /// Index of the point; meaningless where `squared` is infinite.
+    pub index: u32,
+    /// Squared distance; infinite where there are fewer points.
+    pub squared: f32,
+}
+
+/// Mean of the squared distances to the three nearest other points, per point (what 3DGS's simple-knn computes). Fewer than two points give 1.
 pub fn mean_squared_distance_3nn(points: &[[f32; 3]]) -> Vec<f32> {
+    let mean = |found: [Neighbour; 3]| {
+        let (sum, count) = found.iter().filter(|n| n.squared.is_finite()).fold((0.0, 0), |(sum, count), n| (sum + n.squared, count + 1));
+        if count > 0 { sum / count as f32 } else { 1.0 }
+    };
+    three_nearest(points).into_iter().map(mean).collect()
+}
+
+/// The three nearest other points of every point, nearest first. Exact: a uniform grid searched ring by ring.
+pub fn three_nearest(points: &[[f32; 3]]) -> Vec<[Neighbour; 3]> {
     let n = points.len();
-    if n < 2 {
-        return vec![1.0; n];
-    }
     let low: [f32; 3] = std::array::from_fn(|k| points.iter().map(|p| p[k]).fold(f32::INFINITY, f32::min));
     let high: [f32; 3] = std::array::from_fn(|k| points.iter().map(|p| p[k]).fold(f32::NEG_INFINITY, f32::max));
     let longest = (0..3).map(|k| high[k] - low[k]).fold(0.0f32, f32::max).max(1e-12);
@@ -26,32 +40,31 @@ pub fn mean_squared_distance_3nn(points: &[[f32; 3]]) -> Vec<f32> {
         .enumerate()
         .map(|(i, p)| {
             let home = key(p);
-            let mut best = [f32::INFINITY; 3];
+            let mut best = [Neighbour { index: 0, squared: f32::INFINITY }; 3];
             for ring in 0..=(cells as i32) {
                 // Everything nearer than (ring - 1) cells has been seen, because the point sits somewhere inside its own cell.
                 let safe = (ring - 1).max(0) as f32 * cell;
-                if ring > 0 && best[2] <= safe * safe {
+                if ring > 0 && best[2].squared <= safe * safe {
                     break;
                 }
                 for_ring(home, ring, |c| {
                     for &j in grid.get(&c).into_iter().flatten() {
                         if j as usize != i {
                             let q = &points[j as usize];
-                            insert(&mut best, (0..3).map(|k| (p[k] - q[k]) * (p[k] - q[k])).sum());
+                            insert(&mut best, Neighbour { index: j, squared: (0..3).map(|k| (p[k] - q[k]) * (p[k] - q[k])).sum() });
                         }
                     }
                 });
             }
-            let found: Vec<f32> = best.into_iter().filter(|d| d.is_finite()).collect();
-            found.iter().sum::<f32>() / found.len().max(1) as f32
+            best
         })
         .collect()
 }
 
-fn insert(best: &mut [f32; 3], d: f32) {
-    if d < best[2] {
-        best[2] = d;
-        best.sort_unstable_by(f32::total_cmp);
+fn insert(best: &mut [Neighbour; 3], found: Neighbour) {
+    if found.squared < best[2].squared {
+        best[2] = found;
+        best.sort_by(|a, b| a.squared.total_cmp(&b.squared));
     }
 }
 

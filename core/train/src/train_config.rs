@@ -60,6 +60,8 @@ pub struct TrainConfig {
     pub flicker_threshold: f32,
     /// Half-width of the smoothness perturbation, normalised units (the paper's delta).
     pub smooth_delta: f32,
+    /// Weight of the strain of neighbouring moving Gaussians: the squared change of their distance as a share of the canonical one; 0 is off.
+    pub strain: f32,
     /// Dynamic-score threshold (the paper's zeta).
     pub zeta: f32,
     /// Temporal standard deviation over which a pixel counts as dynamic.
@@ -98,6 +100,7 @@ impl Default for TrainConfig {
             smooth_auto: true,
             flicker_threshold: 0.5,
             smooth_delta: 0.005,
+            strain: 0.0,
             zeta: 7.0,
             mask_threshold: 0.02,
             dynamic: Dynamic::Auto,

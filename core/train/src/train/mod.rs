@@ -14,9 +14,11 @@ mod score;
 mod smoothness;
 mod state;
 mod step;
+mod strain;
 
 pub use guard::Guard;
 pub use state::{Parts, TrainState};
+pub(crate) use strain::Neighbours;
 
 use crate::checkpoint;
 use crate::checks::{Verdict, Watch, examine};

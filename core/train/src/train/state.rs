@@ -1,6 +1,7 @@
 //! Everything a run needs to continue to the same bytes.
 
 use super::guard::Guard;
+use super::strain::Neighbours;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
@@ -33,6 +34,7 @@ pub struct TrainState {
     /// Whether smoothness was switched on.
     pub smooth: bool,
     rows: Option<MovingRows>,
+    pub(crate) neighbours: Option<Neighbours>,
 }
 
 /// The parts of the trainer that have state.
@@ -63,6 +65,7 @@ impl TrainState {
             optimizer,
             smooth: false,
             rows: None,
+            neighbours: None,
         }
     }
     /// New optimizer state and statistics, as every stage starts with (Swift4D).
@@ -89,8 +92,18 @@ impl TrainState {
         let attributes = deformer.field.attributes().iter().map(|a| Ok(rows.select(self.set.get(&a.name)?.clone()))).collect::<Result<_>>()?;
         Ok(SpatialInput { means_world: rows.select(self.set.get("means")?.clone()), attributes })
     }
+    /// Pairs of neighbouring moving Gaussians as of the last change of the set; `None` where there are none.
+    pub(super) fn current_neighbours(&mut self, device: &Device) -> Result<Option<Neighbours>> {
+        if self.neighbours.is_none() {
+            let rows = self.moving_rows(device)?;
+            let means = to_vec(rows.select(self.set.get("means")?.clone()), "means")?;
+            self.neighbours = Neighbours::of(&means, device);
+        }
+        Ok(self.neighbours.clone())
+    }
     /// To be called whenever Gaussians or scores changed.
     pub fn invalidate_rows(&mut self) {
+        self.neighbours = None;
         self.rows = None;
     }
     /// The box of what moves: per-axis 0.1 to 99.9 percentile of the centres, padded by 5 %.

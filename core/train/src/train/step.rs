@@ -38,6 +38,7 @@ impl Context<'_> {
         let moves = state.deformer.as_ref().is_some_and(|d| !d.field.is_static()) && rows.count() > 0;
         self.decide_smoothness(state, schedule, moves)?;
 
+        let neighbours = if moves && train.strain > 0.0 { state.current_neighbours(&self.device)? } else { None };
         let leaves = state.set.leaves(|name| name != "dynamic_scores");
         let gaussians = leaves.gaussians()?;
         let autodiff = gaussians.means.device();
@@ -68,6 +69,10 @@ impl Context<'_> {
                     offsets.check(deformer.name(), rows.count())?;
                     if read {
                         offsets.check_finite(deformer.name())?;
+                    }
+                    if let (Some(neighbours), Some(means)) = (&neighbours, &offsets.means) {
+                        let term = neighbours.strain(means.clone()).mul_scalar(train.strain / batch.len() as f32);
+                        total = Some(total.map_or(term.clone(), |sum| sum + term));
                     }
                     offsets.apply(deformer.name(), &gaussians, rows.indices())?
                 }
