@@ -2,7 +2,7 @@
 
 use crate::blocks::{BlockScore, UsualImage};
 use crate::config::TrainConfig;
-use crate::masks::dynamic_masks;
+use crate::masks::{PUBLISHED_SIGMA, dynamic_masks};
 use burn::tensor::Device;
 use cc4dgs_core::metrics::{FrameSet, Metric, Rounding, SsimConvention};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
@@ -154,7 +154,7 @@ pub fn evaluate(
     let metric = |m: Metric| m.over(frames.clone());
     let psnr_metric = metric(Metric::psnr(Rounding::EightBit));
     let dynamic_metric = metric(Metric::psnr(Rounding::EightBit).masked());
-    let masks: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, background, events)?
+    let masks: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, PUBLISHED_SIGMA, background, events)?
         .into_iter()
         .filter(|m| m.mask.contains(&1.0))
         .map(|m| (scene.views[m.view].camera, m.mask.iter().map(|v| *v > 0.0).collect()))

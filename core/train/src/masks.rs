@@ -4,6 +4,9 @@ use cc4dgs_core::{Event, EventSink, Result, Scene, Split};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
+/// Standard deviation in pixels of the blur that published masks have: a 31x31 Gaussian with OpenCV's automatic sigma.
+pub const PUBLISHED_SIGMA: f32 = 5.0;
+
 /// The mask of one fixed camera over the whole sequence.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DynamicMask {
@@ -14,8 +17,8 @@ pub struct DynamicMask {
 }
 
 /// Masks of every camera of `split` that has at least two frames there: the population standard deviation over time, averaged over the channels,
-/// blurred by a 31x31 Gaussian of sigma 5, over `threshold`.
-pub fn dynamic_masks(scene: &Scene, split: Split, threshold: f32, background: [f32; 3], events: &dyn EventSink) -> Result<Vec<DynamicMask>> {
+/// blurred by a Gaussian of `sigma` pixels, over `threshold`.
+pub fn dynamic_masks(scene: &Scene, split: Split, threshold: f32, sigma: f32, background: [f32; 3], events: &dyn EventSink) -> Result<Vec<DynamicMask>> {
     let mut views_of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for view in scene.split(split) {
         views_of_camera.entry(scene.views[view].camera).or_default().push(view);
@@ -24,7 +27,7 @@ pub fn dynamic_masks(scene: &Scene, split: Split, threshold: f32, background: [f
     let total = views_of_camera.len() as u64;
     let mut masks = Vec::new();
     for views in views_of_camera.into_values() {
-        let mask = over_time(scene, &views, threshold, background)?.mask;
+        let mask = over_time(scene, &views, threshold, sigma, background)?.mask;
         masks.push(DynamicMask { view: views[0], mask });
         events.emit(&Event::Progress { task: "dynamic masks".into(), done: masks.len() as u64, total });
     }
@@ -40,7 +43,7 @@ pub(crate) struct OverTime {
 }
 
 /// Mean and mask of `views`, which are of one camera.
-pub(crate) fn over_time(scene: &Scene, views: &[usize], threshold: f32, background: [f32; 3]) -> Result<OverTime> {
+pub(crate) fn over_time(scene: &Scene, views: &[usize], threshold: f32, sigma: f32, background: [f32; 3]) -> Result<OverTime> {
     let camera = scene.camera(views[0]);
     let (w, h) = (camera.width as usize, camera.height as usize);
     let (mut sum, mut squares) = (vec![0.0f64; 3 * w * h], vec![0.0f64; 3 * w * h]);
@@ -62,14 +65,14 @@ pub(crate) fn over_time(scene: &Scene, views: &[usize], threshold: f32, backgrou
             (per_channel.sum::<f64>() / 3.0) as f32
         })
         .collect();
-    let mask = blur(&deviation, w, h).into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
+    let mask = blur(&deviation, w, h, sigma).into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
     Ok(OverTime { sum, mask })
 }
 
-/// 31x31 Gaussian of sigma 5 (OpenCV's automatic sigma), edges mirrored without repeating the border pixel.
-pub(crate) fn blur(image: &[f32], w: usize, h: usize) -> Vec<f32> {
-    const RADIUS: isize = 15;
-    let mut kernel: Vec<f32> = (-RADIUS..=RADIUS).map(|d| (-(d * d) as f32 / 50.0).exp()).collect();
+/// Gaussian of `sigma` pixels (above 0), cut off at three of them, edges mirrored without repeating the border pixel.
+pub(crate) fn blur(image: &[f32], w: usize, h: usize, sigma: f32) -> Vec<f32> {
+    let radius = (3.0 * sigma).ceil() as isize;
+    let mut kernel: Vec<f32> = (-radius..=radius).map(|d| (-(d * d) as f32 / (2.0 * sigma * sigma)).exp()).collect();
     let norm: f32 = kernel.iter().sum();
     kernel.iter_mut().for_each(|k| *k /= norm);
     let mirror = |i: isize, n: usize| -> usize {
@@ -84,7 +87,7 @@ pub(crate) fn blur(image: &[f32], w: usize, h: usize) -> Vec<f32> {
             .flat_map_iter(|line| {
                 let kernel = &kernel;
                 (0..along).map(move |i| {
-                    (0..kernel.len()).map(|k| kernel[k] * source[line * stride + mirror(i as isize + k as isize - RADIUS, along) * step]).sum::<f32>()
+                    (0..kernel.len()).map(|k| kernel[k] * source[line * stride + mirror(i as isize + k as isize - radius, along) * step]).sum::<f32>()
                 })
             })
             .collect()
@@ -100,13 +103,13 @@ mod tests {
 
     #[test]
     fn blur_keeps_constants_and_mass() {
-        let flat = blur(&vec![0.5; 40 * 20], 40, 20);
+        let flat = blur(&vec![0.5; 40 * 20], 40, 20, 5.0);
         assert!(flat.iter().all(|v| (v - 0.5).abs() < 1e-5));
         let mut point = vec![0.0; 101 * 101];
         point[50 * 101 + 50] = 1.0;
-        let blurred = blur(&point, 101, 101);
+        let blurred = blur(&point, 101, 101, 5.0);
         assert!((blurred.iter().sum::<f32>() - 1.0).abs() < 1e-4);
         assert_eq!(blurred[50 * 101 + 47], blurred[47 * 101 + 50]);
-        assert_eq!(blur(&[0.3], 1, 1).len(), 1);
+        assert_eq!(blur(&[0.3], 1, 1, 5.0).len(), 1);
     }
 }

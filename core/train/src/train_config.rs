@@ -1,5 +1,6 @@
 //! The configuration of the trainer, `[train]`.
 
+use crate::masks::PUBLISHED_SIGMA;
 use cc4dgs_core::{Error, Result, Stage};
 use serde::{Deserialize, Serialize};
 
@@ -66,6 +67,8 @@ pub struct TrainConfig {
     pub zeta: f32,
     /// Temporal standard deviation over which a pixel counts as dynamic.
     pub mask_threshold: f32,
+    /// Standard deviation in pixels of the Gaussian by which temporal deviations are blurred. Published masks have 5, for images 1,352 pixels wide.
+    pub mask_sigma: f32,
     /// Which Gaussians may move.
     pub dynamic: Dynamic,
     /// Step only the Gaussians that a view of the iteration shows.
@@ -103,6 +106,7 @@ impl Default for TrainConfig {
             strain: 0.0,
             zeta: 7.0,
             mask_threshold: 0.02,
+            mask_sigma: PUBLISHED_SIGMA,
             dynamic: Dynamic::Auto,
             sparse_adam: true,
             lr: GaussianRates::default(),
@@ -176,6 +180,9 @@ impl TrainConfig {
         }
         if t.shares.iter().any(|s| !s.is_finite() || *s < 0.0) || t.shares.iter().sum::<f64>() <= 0.0 {
             return bad("shares", format!("{:?} are not shares", t.shares), "Give three numbers of which one is positive");
+        }
+        if !(0.1..=100.0).contains(&t.mask_sigma) {
+            return bad("mask_sigma", format!("{} pixels", t.mask_sigma), "Give 0.1 to 100 pixels");
         }
         if !(0.0..=1.0).contains(&t.time_ramp) {
             return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");

@@ -1,6 +1,7 @@
 //! From what is known of a scene and a machine to settings, each with its reason.
 
 use super::facts::{Arrangement, Facts};
+use crate::masks::PUBLISHED_SIGMA;
 use cc4dgs_core::SceneOptions;
 use toml::Value;
 
@@ -26,6 +27,8 @@ const SHORT: f64 = 16.0;
 const EXPOSURE: f32 = 0.09;
 /// Share of moving pixels below which a scene is static.
 const STATIC: f32 = 2e-4;
+/// Width in pixels of the images that masks were published for (N3DV at half size).
+const PUBLISHED_WIDTH: f64 = 1352.0;
 /// Share of transparent pixels from which a scene is an object without surroundings.
 const OBJECT: f32 = 0.05;
 
@@ -98,6 +101,7 @@ pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64) -> Vec<Choic
     choices.extend(background(facts));
     choices.extend(near(facts));
     choices.extend(noise(facts));
+    choices.extend(masks(facts));
     choices.extend(exposure(facts));
     choices.extend(colour(facts));
     choices
@@ -204,6 +208,13 @@ fn noise(facts: &Facts) -> Option<Choice> {
     let threshold = 4.0 * noise;
     let reason = format!("the images have noise of {:.1} levels", 255.0 * noise);
     (threshold > 0.02 && !stands_still(facts)).then(|| choice([("train.mask_threshold", float(threshold.min(0.2)))], reason))
+}
+
+/// Masks of what moves as sharp as the published ones are on their images.
+fn masks(facts: &Facts) -> Option<Choice> {
+    let sigma = f64::from(PUBLISHED_SIGMA) * f64::from(facts.size[0]) / PUBLISHED_WIDTH;
+    let reason = "masks of what moves are blurred in proportion to the width of the images";
+    (facts.arrangement.has_several_cameras() && !stands_still(facts)).then(|| choice([("train.mask_sigma", float(sigma.clamp(0.7, 5.0)))], reason))
 }
 
 fn exposure(facts: &Facts) -> Option<Choice> {

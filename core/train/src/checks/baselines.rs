@@ -1,7 +1,7 @@
 //! What can be had without a model: the mean colour of an image, a blurred image, the mean image of a fixed camera. A model has to be better.
 
 use crate::data::resample::resize;
-use crate::masks::over_time;
+use crate::masks::{PUBLISHED_SIGMA, over_time};
 use crate::sample::spread;
 use cc4dgs_core::metrics::{Metric, Rounding};
 use cc4dgs_core::{Image8, Result, Scene, Split};
@@ -82,7 +82,7 @@ fn moving_pixels(scene: &Scene, threshold: f32, background: [f32; 3]) -> Result<
     let (mut moving, mut sum) = (Vec::new(), 0.0);
     for camera in spread(&of_camera.keys().copied().collect::<Vec<_>>(), MOVING_CAMERAS) {
         let frames = spread(&of_camera[&camera], MOVING_FRAMES);
-        let over_time = over_time(scene, &frames, threshold, background)?;
+        let over_time = over_time(scene, &frames, threshold, PUBLISHED_SIGMA, background)?;
         let mask: Vec<bool> = over_time.mask.iter().map(|v| *v > 0.0).collect();
         if mask.iter().filter(|m| **m).count() as f64 <= MOVING_SHARE * mask.len() as f64 {
             continue;

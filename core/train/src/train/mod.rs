@@ -136,7 +136,10 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
         optimizer: job.registry.build_optimizer(&config.optimizer)?,
     };
     let masks = match moving {
-        Moving::Scored { .. } => dynamic_masks(&job.scene, Split::Train, config.train.mask_threshold, config.background()?, job.events)?,
+        Moving::Scored { .. } => {
+            let train = &config.train;
+            dynamic_masks(&job.scene, Split::Train, train.mask_threshold, train.mask_sigma, config.background()?, job.events)?
+        }
         _ => Vec::new(),
     };
     let checkpoint = job.out.as_ref().map(|out| out.join(CHECKPOINT));

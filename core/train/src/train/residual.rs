@@ -3,7 +3,7 @@
 //! After the coarse stage most of a scene is reconstructed. What moved while the camera went by is not, and leaves large differences in the images.
 
 use super::{Context, TrainState};
-use crate::masks::{DynamicMask, blur};
+use crate::masks::{DynamicMask, PUBLISHED_SIGMA, blur};
 use crate::sample::spread;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Event, Result, Split};
@@ -30,7 +30,7 @@ impl Context<'_> {
             let (w, h) = (camera.width as usize, camera.height as usize);
             let truth = scene.frame(views[index])?.to_planes(background);
             let difference = |p: usize| (0..3).map(|k| (image[k * w * h + p] - truth[k * w * h + p]).abs()).sum::<f32>() / 3.0;
-            residuals.push(blur(&(0..w * h).map(difference).collect::<Vec<f32>>(), w, h));
+            residuals.push(blur(&(0..w * h).map(difference).collect::<Vec<f32>>(), w, h, PUBLISHED_SIGMA));
             Ok(())
         })?;
         let mut all: Vec<f32> = residuals.iter().flat_map(|r| r.iter().step_by(7)).copied().collect();
