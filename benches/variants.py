@@ -20,6 +20,8 @@ def train(options, scene, path, name, settings, seed):
     arguments = ["train", "--scene", path, "--out", str(out), "--overwrite", "--quiet", "--preset", options.preset, f"--json={report}"]
     if options.minutes > 0:
         arguments += ["--minutes", str(options.minutes)]
+    if options.threads:
+        arguments += ["--threads", str(options.threads)]
     for text in [f"train.validation={options.views}", f"seed={seed}", *options.sets, *settings]:
         arguments += ["--set", text]
     began = time.time()
@@ -45,6 +47,7 @@ def main():
     parser.add_argument("--preset", default="auto")
     parser.add_argument("--minutes", type=float, default=3.0, help="0 leaves the iterations to the preset and the settings")
     parser.add_argument("--views", type=int, default=12, help="validation views")
+    parser.add_argument("--threads", type=int, default=0, help="threads of each training; 0 takes all cores")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--scene", action="append", default=[], metavar="NAME=PATH", required=True)
     parser.add_argument("--variant", action="append", default=[], metavar="NAME=KEY=VALUE,...")
