@@ -31,7 +31,7 @@ def train(options, scene, path, name, settings, seed):
     if report.exists():
         found = json.loads(report.read_text())
         verdict = found.get("verdict") or {}
-        row |= {"gaussians": found.get("gaussians"), "moving": found.get("dynamic_gaussians")}
+        row |= {"gaussians": found.get("gaussians"), "moving_gaussians": found.get("dynamic_gaussians")}
         row |= {key: verdict.get(f"{key}_psnr_db") for key in ["train", "validation", "moving"] if verdict.get(f"{key}_psnr_db") is not None}
     config = out / "config.toml"
     if config.exists():
@@ -71,7 +71,7 @@ def main():
                 base = table[scene, "base", seed]
                 gain = f"{row['validation'] - base:+.2f}" if row.get("validation") and base else "-"
                 print(f"{scene:12} {name:16} seed {seed}: validation {row.get('validation') or float('nan'):.2f} dB ({gain}), training {row.get('train') or float('nan'):.2f} dB, "
-                      f"{row.get('gaussians')} Gaussians ({row.get('moving')} move), {row.get('iterations')} iterations, {row['seconds']} s, exit {row['exit']}", flush=True)
+                      f"{row.get('gaussians')} Gaussians ({row.get("moving_gaussians")} move), {row.get('iterations')} iterations, {row['seconds']} s, exit {row['exit']}", flush=True)
 
 
 if __name__ == "__main__":

@@ -69,6 +69,8 @@ pub struct TrainConfig {
     pub mask_threshold: f32,
     /// Standard deviation in pixels of the Gaussian by which temporal deviations are blurred. Published masks have 5, for images 1,352 pixels wide.
     pub mask_sigma: f32,
+    /// At a third and at two thirds of the main stage, scored Gaussians that move by less than so many pixels in every training camera are made static; 0 is off.
+    pub settle: f32,
     /// Which Gaussians may move.
     pub dynamic: Dynamic,
     /// Step only the Gaussians that a view of the iteration shows.
@@ -107,6 +109,7 @@ impl Default for TrainConfig {
             zeta: 7.0,
             mask_threshold: 0.02,
             mask_sigma: PUBLISHED_SIGMA,
+            settle: 0.0,
             dynamic: Dynamic::Auto,
             sparse_adam: true,
             lr: GaussianRates::default(),
@@ -180,6 +183,9 @@ impl TrainConfig {
         }
         if t.shares.iter().any(|s| !s.is_finite() || *s < 0.0) || t.shares.iter().sum::<f64>() <= 0.0 {
             return bad("shares", format!("{:?} are not shares", t.shares), "Give three numbers of which one is positive");
+        }
+        if !(t.settle >= 0.0 && t.settle.is_finite() && t.strain >= 0.0 && t.strain.is_finite()) {
+            return bad("settle, train.strain", format!("{} and {}", t.settle, t.strain), "Give finite numbers of 0 or more");
         }
         if !(0.1..=100.0).contains(&t.mask_sigma) {
             return bad("mask_sigma", format!("{} pixels", t.mask_sigma), "Give 0.1 to 100 pixels");

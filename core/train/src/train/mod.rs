@@ -11,6 +11,7 @@ mod pyramid;
 mod residual;
 mod sampler;
 mod score;
+mod settle;
 mod smoothness;
 mod state;
 mod step;
@@ -282,6 +283,7 @@ impl Context<'_> {
                     self.control_density(&schedule, state)?;
                 }
             }
+            self.settle(state, &schedule)?;
             state.iteration = schedule.iteration;
             watch.after_iteration(self, state, &schedule)?;
             let every = self.job.config.train.checkpoint_every;

@@ -1,0 +1,96 @@
+//! Gaussians that the deformer hardly moves are made static during the main stage, so that neither training nor playback pays for them.
+//!
+//! Scores say what may move before any motion is known. They err on the safe side: a floor that somebody walks over is seen to change.
+
+use super::{Context, TrainState};
+use crate::sample::spread;
+use burn::tensor::{Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Camera, Event, Result, Schedule, Split, Stage};
+use cc4dgs_play::Moving;
+
+/// When it is looked at: thirds of the main stage.
+const THIRDS: [usize; 2] = [1, 2];
+/// Times over the sequence, and training cameras, at which motion is looked at.
+const TIMES: usize = 13;
+const CAMERAS: usize = 24;
+/// Changes of other attributes up to this do not count: logarithms of scales, components of quaternions, logits, colour coefficients.
+const LEAST_CHANGE: f32 = 0.03;
+/// Least depth of a Gaussian in front of a camera, in units of the normalised frame.
+const LEAST_DEPTH: f64 = 0.05;
+
+impl Context<'_> {
+    /// Makes Gaussians static that move by less than `train.settle` pixels in every training camera, when the iteration is due.
+    pub(crate) fn settle(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        let most_px = self.job.config.train.settle;
+        let due = THIRDS.iter().any(|third| schedule.iteration == schedule.length * third / 3);
+        let Moving::Scored { zeta } = state.moving else { return Ok(()) };
+        if most_px <= 0.0 || schedule.stage != Stage::Main || !due {
+            return Ok(());
+        }
+        let rows = state.moving_rows(&self.device)?;
+        let Some(deformer) = state.deformer.as_ref().filter(|d| !d.field.is_static() && rows.count() > 0) else { return Ok(()) };
+        let features = deformer.field.spatial(&state.spatial_input(deformer, &rows)?)?.values;
+        let (mut shift, mut change) = (vec![0.0f32; rows.count()], vec![0.0f32; rows.count()]);
+        for k in 0..TIMES {
+            let mut offsets = deformer.field.deform(features.clone(), k as f32 / (TIMES - 1) as f32)?;
+            if let Some(means) = offsets.means.take() {
+                raise(&mut shift, &to_vec((means.clone() * means).sum_dim(1).sqrt(), "offsets")?);
+            }
+            if let Some(others) = offsets.concatenated() {
+                raise(&mut change, &to_vec(others.abs().max_dim(1), "offsets")?);
+            }
+        }
+        let mut scores = to_vec(state.set.get("dynamic_scores")?.clone(), "dynamic_scores")?;
+        let means = to_vec(state.set.get("means")?.clone(), "means")?;
+        let scene = &self.job.scene;
+        let cameras: Vec<&Camera> = spread(&scene.split(Split::Train), CAMERAS).into_iter().map(|view| scene.camera(view)).collect();
+        let moving = state.moving.rows(&scores).unwrap_or_default();
+        let mut settled = 0;
+        for (k, &row) in moving.iter().enumerate() {
+            let mean = [0, 1, 2].map(|axis| f64::from(means[3 * row + axis]));
+            let px = cameras.iter().map(|camera| f64::from(shift[k]) * pixels_per_unit(camera, mean)).fold(0.0, f64::max);
+            if px < f64::from(most_px) && change[k] < LEAST_CHANGE {
+                scores[row] = scores[row].min(zeta);
+                settled += 1;
+            }
+        }
+        // A deformer without Gaussians to move would end the stage's purpose; its motion may simply come late.
+        if settled == 0 || settled == moving.len() {
+            return Ok(());
+        }
+        let message = format!("{settled} of {} moving Gaussians move by less than {most_px} pixels: they stand still from now on", moving.len());
+        self.job.events.emit(&Event::Note { object: "deformer".into(), message });
+        let count = scores.len();
+        state.set.set("dynamic_scores", Tensor::from_data(TensorData::new(scores, [count, 1]), &self.device))?;
+        state.invalidate_rows();
+        Ok(())
+    }
+}
+
+/// Raises each of `most` to the value beside it.
+fn raise(most: &mut [f32], values: &[f32]) {
+    most.iter_mut().zip(values).for_each(|(m, v)| *m = m.max(*v));
+}
+
+/// Pixels of `camera` that a unit of length covers at `mean`; 0 behind it.
+fn pixels_per_unit(camera: &Camera, mean: [f64; 3]) -> f64 {
+    let row = &camera.world_to_camera[2];
+    let depth = row[0] * mean[0] + row[1] * mean[1] + row[2] * mean[2] + row[3];
+    if depth < LEAST_DEPTH { 0.0 } else { camera.fx.max(camera.fy) / depth }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_fall_with_depth() {
+        let camera = Camera::look_at("a", (100, 100), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        assert!((pixels_per_unit(&camera, [0.0; 3]) - camera.fx / 4.0).abs() < 1e-9);
+        assert_eq!(pixels_per_unit(&camera, [0.0, 0.0, -5.0]), 0.0);
+        let mut most = vec![1.0, 2.0];
+        raise(&mut most, &[3.0, f32::NAN]);
+        assert_eq!(most, [3.0, 2.0]);
+    }
+}
