@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compares settings at equal wall time on validation views, never on test views.
 
-    python3 benches/variants.py OUT --bin BIN --minutes 3 --scene rig=procedural:captures/rig:7 --variant batch=train.batch=4,train.lr.batch_power=0.5 [--seeds 2]
+    python3 benches/variants.py OUT --bin BIN --minutes 3 --scene rig=procedural:captures/rig:7 --variant 'batch=train.batch=4;train.lr.batch_power=0.5' [--seeds 2]
 
 Every scene is trained with the preset (`auto`) as it is, called `base`, and with each variant's settings on top. The plan gives each variant as many iterations as
 take the same time. Rows are kept in OUT/rows.json and not run again; a table of validation PSNR, and what each variant gains on `base`, is printed at the end.
@@ -50,11 +50,11 @@ def main():
     parser.add_argument("--threads", type=int, default=0, help="threads of each training; 0 takes all cores")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--scene", action="append", default=[], metavar="NAME=PATH", required=True)
-    parser.add_argument("--variant", action="append", default=[], metavar="NAME=KEY=VALUE,...")
+    parser.add_argument("--variant", action="append", default=[], metavar="NAME=KEY=VALUE;...")
     parser.add_argument("--set", dest="sets", action="append", default=[], help="for every variant, `base` included")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    variants = [("base", [])] + [(text.split("=", 1)[0], text.split("=", 1)[1].split(",")) for text in options.variant]
+    variants = [("base", [])] + [(text.split("=", 1)[0], text.split("=", 1)[1].split(";")) for text in options.variant]
     kept = options.out / "rows.json"
     rows = json.loads(kept.read_text()) if kept.exists() else []
     table = {}
@@ -71,7 +71,7 @@ def main():
                 base = table[scene, "base", seed]
                 gain = f"{row['validation'] - base:+.2f}" if row.get("validation") and base else "-"
                 print(f"{scene:12} {name:16} seed {seed}: validation {row.get('validation') or float('nan'):.2f} dB ({gain}), training {row.get('train') or float('nan'):.2f} dB, "
-                      f"{row.get('gaussians')} Gaussians ({row.get("moving_gaussians")} move), {row.get('iterations')} iterations, {row['seconds']} s, exit {row['exit']}", flush=True)
+                      f"{row.get('gaussians')} Gaussians ({row.get('moving_gaussians')} move), {row.get('iterations')} iterations, {row['seconds']} s, exit {row['exit']}", flush=True)
 
 
 if __name__ == "__main__":
