@@ -41,12 +41,18 @@ impl Context<'_> {
     }
 }
 
-/// Runs the command that was asked for.
+/// Stack of a thread in bytes: commands run on the pool's threads, so it is that of a main thread.
+const STACK: usize = 8 << 20;
+
+/// Runs the command that was asked for, on a thread of the pool: an operation in parallel then starts at once. From outside, each of the thousands of a training
+/// step would wake the pool's threads and wait for them.
 pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
-    if cli.threads > 0 {
-        // Where the pool already runs (a program calling `run` twice), it stays as it is: results do not depend on it.
-        rayon::ThreadPoolBuilder::new().num_threads(cli.threads.min(1024)).build_global().ok();
-    }
+    // Where the pool already runs (a program calling `run` twice), it stays as it is: results do not depend on it.
+    rayon::ThreadPoolBuilder::new().num_threads(cli.threads.min(1024)).stack_size(STACK).build_global().ok();
+    rayon::scope(|_| run(cli, output))
+}
+
+fn run(cli: &Cli, output: &Output) -> Result<()> {
     let context = Context { registry: Registry::collect()?, output, limits: limits(&cli.limits)?, limit_options: &cli.limits };
     match &cli.command {
         Command::Demo(args) => demo::run(&context, args),
