@@ -20,7 +20,7 @@ const LEAST_GAUSSIANS: f64 = 4000.0;
 /// Gaussians that a thread can train in a minute.
 const PER_THREAD_MINUTE: f64 = 4000.0;
 /// What that is where all of them move.
-const ALL_MOVE: f64 = 0.12;
+const ALL_MOVE: f64 = 0.3;
 /// Minutes of one thread below which the finest voxels are left out: decoding their vertices is most of a step.
 const SHORT: f64 = 16.0;
 /// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
@@ -120,7 +120,8 @@ fn field(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
     if stands_still(facts) {
         return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
     }
-    let bands = if facts.arrangement.has_several_cameras() && facts.frames > 100 { 6 } else { 4 };
+    // Where poses have nothing to do with each other, higher bands would learn every training time by itself and the times between not at all.
+    let bands = if facts.arrangement != Arrangement::OneCameraAnywhere && facts.frames > 100 { 6 } else { 4 };
     let mut settings = vec![("deformer.kind", "cdf-basis".into()), ("deformer.time_bands", Value::Integer(bands))];
     if !machine.graphics {
         settings.push(("deformer.capacity", "small".into()));
@@ -178,7 +179,7 @@ fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
     let most = wanted.min(affordable).max(LEAST_GAUSSIANS);
     let most = (most / 500.0).ceil() * 500.0;
     let reason = format!("{:.0} % of the pixels show detail", 100.0 * facts.detail);
-    choice([("density.kind", "clone-split".into()), ("density.max_gaussians", integer(most)), ("init.count", integer(0.6 * most))], reason)
+    choice([("density.kind", "mcmc".into()), ("density.max_gaussians", integer(most)), ("init.count", integer(0.6 * most))], reason)
 }
 
 fn background(facts: &Facts) -> Option<Choice> {
