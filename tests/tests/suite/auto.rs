@@ -62,6 +62,10 @@ fn plans_fit_the_capture() {
     assert_eq!(kind(&photos.deformer), "none");
     let handheld = plan("handheld");
     assert_eq!((kind(&handheld.deformer), handheld.train.iterations), ("cdf-basis".into(), 100));
+    // The upper bound of Gaussians is that of the control that is asked for, if it has one.
+    let with = |control: &str| planned("handheld", &["train.iterations=100", &format!("density.kind={control}")], &registry).0.density;
+    assert_eq!(with("clone-split")["max_gaussians"], handheld.density["max_gaussians"]);
+    assert!(!with("none").contains_key("max_gaussians"));
     assert_eq!(kind(&plan("exposure").appearance), "affine");
     assert_eq!(kind(&plan("dome").appearance), "none");
     let turntable = plan("turntable");

@@ -120,7 +120,7 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
         scene = read(&layers.over(&plan.table).config()?)?;
     }
     for choice in choose::choose(&facts, machine, minutes) {
-        plan.add(choice)?;
+        plan.add(for_density_of(layers, &asked, choice, registry)?)?;
     }
     if !layers.state("train.iterations") {
         let patience = Duration::from_secs_f64(DECODING_SHARE * 60.0 * minutes);
@@ -150,6 +150,18 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
             .push(format!("{} iterations are few: more minutes or smaller images (--minutes, scene.width) give a better model", config.train.iterations));
     }
     Ok((config, scene))
+}
+
+/// `choice` for the density control that `layers` state: its upper bound of Gaussians is the plan's too, where it has one.
+fn for_density_of(layers: &Layers, asked: &RunConfig, mut choice: Choice, registry: &Registry) -> Result<Choice> {
+    if !layers.state("density.kind") {
+        return Ok(choice);
+    }
+    let kind = asked.density.get("kind").and_then(|k| k.as_str()).unwrap_or_default();
+    let schema = config::parse_table("plug-in schema", registry.density(kind)?.info.schema)?;
+    choice.settings.retain(|(key, _)| key.strip_prefix("density.").is_none_or(|key| key == "kind" || schema.contains_key(key)));
+    choice.settings.iter_mut().filter(|(key, _)| *key == "density.kind").for_each(|(_, value)| *value = kind.into());
+    Ok(choice)
 }
 
 /// How many views share a pass through the field, and the iterations that `minutes` allow, of which the plan has `spent` some. `batch` is the number that the user stated.
