@@ -103,7 +103,7 @@ impl Embedding {
             for (i, head) in network.heads.iter().enumerate() {
                 values.extend(weights::glorot_with_bias(own.index(i as u64).child("first"), w, w));
                 // As in `hexplane`: the published random layer tears the image apart at first.
-                values.extend(weights::silent(w, head[1]));
+                values.extend(weights::zeros(w, head[1]));
             }
             parameters.push(parameter(format!("net.{name}"), Part::Net, 0, values, device));
         }

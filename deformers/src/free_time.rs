@@ -1,8 +1,8 @@
 //! Gaussians that are free in time (FreeTimeGS, with the gate of FreeTimeGS++ and the flat-topped life of SharpTimeGS).
 //!
 //! Each has a velocity and a life: a centre T, a half-width r during which it is fully there, and a falloff s. Its centre is mu + v (t - T), its opacity is
-//! multiplied by g + (1 - g) exp(-(max(|t - T| - r, 0) / s)^2). The gate g in 0..1 makes it last for ever; what lasts costs a penalty of nothing, what does not
-//! costs `gate_weight`, so that only what appears or moves becomes temporary.
+//! multiplied by g + (1 - g) exp(-(max(|t - T| - r, 0) / s)^2). A gate g of 1 keeps it at all times. The mean of 1 - g is penalised with the weight `gate_weight`, so
+//! that only what appears or moves becomes temporary.
 
 use crate::parts::centres::check_time;
 use burn::tensor::activation::sigmoid;

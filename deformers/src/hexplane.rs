@@ -117,7 +117,7 @@ impl HexPlane {
             let own = seed.child("heads").index(i as u64);
             values.extend(weights::glorot_with_bias(own.child("first"), w, w));
             // The published layer is random: its first offsets tear the image apart, and short runs never recover.
-            values.extend(weights::silent(w, head[1]));
+            values.extend(weights::zeros(w, head[1]));
         }
         parameters.push(parameter("net".into(), Part::Net, NET, values, device));
         Ok(Self { settings, context: context.clone(), planes, network: Arc::new(network), parameters })

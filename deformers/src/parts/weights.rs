@@ -63,14 +63,14 @@ pub fn film(seed: Seed, shape: &ReluShape, width: usize) -> Vec<f32> {
 }
 
 /// A last layer that gives nothing at first: W `[input, output]` and b `[output]` are zero.
-pub fn silent(input: usize, output: usize) -> Vec<f32> {
+pub fn zeros(input: usize, output: usize) -> Vec<f32> {
     vec![0.0; (input + 1) * output]
 }
 
 /// A head: its last layer is zero, so that nothing moves at first. Features are of order 1, so random heads would displace everything.
 pub fn head(seed: Seed, width: usize, output: usize) -> Vec<f32> {
     let mut out = rectified(seed, width, width);
-    out.extend(silent(width, output));
+    out.extend(zeros(width, output));
     out
 }
 

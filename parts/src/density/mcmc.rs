@@ -1,7 +1,7 @@
 //! A budget of Gaussians that goes where the images need it (3DGS-MCMC, with growth by score and halves along the longest axis as in ImprovedGS).
 //!
-//! Nothing is removed for good: faded Gaussians are given up, and as many others are split, drawn by their screen gradients. The budget grows with the root of
-//! the progress. Halves together draw what the whole drew, so that a round costs nothing.
+//! Faded Gaussians are removed, and as many others are split, drawn by their screen gradients. The budget grows with the root of the progress. The two halves of a
+//! split together draw nearly what the whole drew, so that a round costs little.
 
 use super::halves;
 use super::statistics::Statistics;
@@ -19,7 +19,7 @@ const SCHEMA: &str = "\
 from = 500               # first round, in reference iterations of the stage (coarse 5,000, main 20,000)
 until = 15000            # last round, in reference iterations of the main stage; the coarse stage has rounds to nine tenths
 every = 100              # reference iterations between two rounds
-min_opacity = 0.005      # fainter Gaussians are given up
+min_opacity = 0.005      # fainter Gaussians are removed, and the budget is spent on others
 growth = 0.1             # most Gaussians split in a round, as a share of all
 coarse_share = 0.6       # share of max_gaussians that the coarse stage grows to
 max_gaussians = 400000   # the budget at the end
@@ -143,7 +143,7 @@ impl DensityControl for Mcmc {
     }
 }
 
-/// The plan of one round: which of the Gaussians are given up, kept and split, so that there are at most `budget`. `scores` say who is split `[N]`.
+/// The plan of one round: which of the Gaussians are removed, kept and split, so that there are at most `budget`. `scores` say who is split `[N]`.
 fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], budget: usize, seed: Seed) -> DensityPlan {
     let n = host.len();
     let opacity = |row: usize| 1.0 / (1.0 + (-host.opacity_logits[row]).exp());
@@ -170,12 +170,12 @@ fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], budget: usiz
 /// `count` of `rows`, drawn without replacement in proportion to their `scores`; rows without a score are never drawn.
 fn drawn(rows: &[usize], scores: &[f32], count: usize, seed: Seed) -> Vec<usize> {
     let mut random = seed.rng();
-    // Waiting times of independent exponential clocks: the first to ring are a weighted draw (Efraimidis and Spirakis 2006).
-    let clock = |&row: &usize| {
+    // Exponential random numbers with the scores as rates: those with the smallest are a weighted draw (Efraimidis and Spirakis 2006).
+    let keyed = |&row: &usize| {
         let uniform: f32 = random.random();
         (-(1.0 - uniform).max(f32::MIN_POSITIVE).ln() / scores[row], row)
     };
-    let mut keyed: Vec<(f32, usize)> = rows.iter().map(clock).filter(|(_, row)| scores[*row] > 0.0 && scores[*row].is_finite()).collect();
+    let mut keyed: Vec<(f32, usize)> = rows.iter().map(keyed).filter(|(_, row)| scores[*row] > 0.0 && scores[*row].is_finite()).collect();
     keyed.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     keyed.into_iter().take(count).map(|(_, row)| row).collect()
 }

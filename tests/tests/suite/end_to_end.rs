@@ -251,6 +251,7 @@ fn every_field_trains_resumes_plays_and_is_archived() {
         let before = score(&model, &config).psnr_db;
         // A method of another crate has no floor here.
         let floor = FLOORS_DB.iter().find(|(name, _)| *name == method).map_or(15.0, |(_, floor)| *floor);
+        println!("{method}: {before:.2} dB");
         assert!(before >= floor, "{method}: {before} dB, at least {floor} are expected");
         let mut deform = Vec::new();
         for (precision, allowed) in [("fp32", 1e-3), ("fp16", 0.05), ("int8", 0.5)] {

@@ -130,6 +130,9 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
         for choice in lengths(&facts, &config, timing, minutes, spent, layers.state("train.batch").then_some(config.train.batch)) {
             plan.add(choice)?;
         }
+    } else {
+        let reason = "the iterations are stated, so none were timed: one view each";
+        plan.add(Choice { settings: vec![("train.batch", 1.into())], reason: reason.into() })?;
     }
     step(3);
     let config = layers.over(&plan.table).config()?;

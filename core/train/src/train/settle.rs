@@ -55,7 +55,7 @@ impl Context<'_> {
                 settled += 1;
             }
         }
-        // A deformer without Gaussians to move would end the stage's purpose; its motion may simply come late.
+        // Where all qualify, the deformer has not learned any motion yet.
         if settled == 0 || settled == moving.len() {
             return Ok(());
         }
