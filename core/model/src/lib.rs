@@ -11,6 +11,7 @@ mod deformer;
 mod density;
 mod device;
 pub mod gaussians;
+mod life;
 mod loss;
 pub mod metrics;
 mod module_deformer;
@@ -39,6 +40,7 @@ pub use deformer::{
 pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
 pub use device::{DEVICE_NAMES, parse_device};
 pub use gaussians::Gaussians;
+pub use life::{LIFE_ATTRIBUTES, Life, LifeAt, LifeSettings, gate_value};
 pub use loss::{Fusion, LossInput, LossPlugin, LossTerm};
 pub use module_deformer::ModuleDeformer;
 pub use offsets::Offsets;

@@ -1,5 +1,6 @@
 //! The registry: all linked plug-ins, collected into a value. Duplicate and unknown names are errors.
 
+use crate::life::{WithLife, take_life};
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, DensityControl, DensityPlugin,
     Entries, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer, RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin,
@@ -112,10 +113,15 @@ impl Registry {
     pub fn presets(&self) -> impl Iterator<Item = &'static PresetPlugin> + '_ {
         self.presets.iter()
     }
-    /// Builds the deformer of a `[deformer]` section (`kind` and its settings).
+    /// Builds the deformer of a `[deformer]` section: `kind`, its settings, and `life`, which gives the Gaussians of any deformer lives ([`crate::Life`]).
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
-        let (kind, settings) = split_kind("deformer", section)?;
-        (self.deformer(&kind)?.build)(&settings, context, device)
+        let (kind, mut settings) = split_kind("deformer", section)?;
+        let life = take_life(&mut settings)?;
+        let deformer = (self.deformer(&kind)?.build)(&settings, context, device)?;
+        Ok(match life {
+            Some(life) => Box::new(WithLife::new(deformer, life)?),
+            None => deformer,
+        })
     }
     /// Builds the rasterizer of a `[rasterizer]` section (`kind` and its settings).
     pub fn build_rasterizer(&self, section: &toml::Table) -> Result<Box<dyn Rasterizer>> {

@@ -71,6 +71,8 @@ pub struct TrainConfig {
     pub mask_sigma: f32,
     /// At a third and at two thirds of the main stage, scored Gaussians that move by less than so many pixels in every training camera are made static; 0 is off.
     pub settle: f32,
+    /// Twice during the main stage, look for compact things that are in training views and not drawn, and add Gaussians with lives along their tracks.
+    pub recover: bool,
     /// Which Gaussians may move.
     pub dynamic: Dynamic,
     /// Step only the Gaussians that a view of the iteration shows.
@@ -110,6 +112,7 @@ impl Default for TrainConfig {
             mask_threshold: 0.02,
             mask_sigma: PUBLISHED_SIGMA,
             settle: 0.0,
+            recover: false,
             dynamic: Dynamic::Auto,
             sparse_adam: true,
             lr: GaussianRates::default(),

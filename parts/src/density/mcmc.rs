@@ -104,7 +104,8 @@ impl DensityControl for Mcmc {
         Ok(Some(round(&self.settings, &gaussians.to_host()?, &scores, self.settings.budget(self.start, schedule), seed)))
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
-        if self.round {
+        // A round starts over; so do the statistics when somebody else changed the rows.
+        if self.round || !plan.keeps_all(self.statistics.seen.dims()[0]) {
             self.statistics = Statistics::zeros(plan.len(), device);
         }
         Ok(())

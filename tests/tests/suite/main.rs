@@ -18,6 +18,7 @@ mod golden_metrics;
 mod golden_raster;
 mod golden_training;
 mod image;
+mod lives;
 mod lookup;
 mod planted;
 mod raster;

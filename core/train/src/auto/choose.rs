@@ -142,8 +142,13 @@ fn stages(facts: &Facts) -> Choice {
             "one moving camera: all frames come at once, and what a static reconstruction does not explain may move".into(),
         ),
         Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere => (
-            vec![("train.shares", shares([2.0, 0.0, 18.0])), ("train.coarse_frames", "all".into()), ("train.dynamic", "all".into())],
-            format!("{}: all frames come at once, and everything may move", facts.arrangement.describe()),
+            vec![
+                ("train.shares", shares([2.0, 0.0, 18.0])),
+                ("train.coarse_frames", "all".into()),
+                ("train.dynamic", "all".into()),
+                ("train.recover", Value::Boolean(true)),
+            ],
+            format!("{}: all frames come at once, everything may move, and what crosses the scene is looked for", facts.arrangement.describe()),
         ),
         Arrangement::Photos | Arrangement::Dome | Arrangement::Rig => {
             let smooth = if facts.frames < 12 { 0.0 } else { 0.05 };
@@ -272,7 +277,7 @@ mod tests {
         assert_eq!(value(&photos, "deformer.kind"), Some("none".into()));
         let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
         let odd = choose(&odd, MACHINE, 5.0);
-        assert_eq!(value(&odd, "train.dynamic"), Some("all".into()));
+        assert_eq!((value(&odd, "train.dynamic"), value(&odd, "train.recover")), (Some("all".into()), Some(true.into())));
         assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0), "train.dynamic"), Some("score".into()));
         assert!(value(&odd, "appearance.kind").is_some() && value(&odd, "train.mask_threshold").is_some() && value(&odd, "render.background").is_some());
     }

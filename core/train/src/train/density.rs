@@ -30,7 +30,8 @@ impl Context<'_> {
         self.guard_reset(state, schedule)
     }
 
-    fn carry_out(&self, plan: &DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+    /// Makes the Gaussians those of `plan`, with their optimizer state.
+    pub(crate) fn carry_out(&self, plan: &DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let gaussians = state.set.gaussians()?;
         let keeps_all = plan.keeps_all(gaussians.len());
         state.set = GaussianSet::from_gaussians(&plan.apply(&gaussians)?);

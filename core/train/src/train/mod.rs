@@ -8,6 +8,7 @@ mod losses;
 mod parameters;
 mod probe;
 mod pyramid;
+mod recover;
 mod residual;
 mod sampler;
 mod score;
@@ -289,6 +290,7 @@ impl Context<'_> {
                 }
             }
             self.settle(state, &schedule)?;
+            self.recover(state, &schedule)?;
             state.iteration = schedule.iteration;
             watch.after_iteration(self, state, &schedule)?;
             let every = self.job.config.train.checkpoint_every;

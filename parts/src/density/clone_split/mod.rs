@@ -147,7 +147,8 @@ impl DensityControl for CloneSplit {
         Ok(plan)
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
-        if self.due.grow || self.due.prune_weight {
+        // Somebody else may have changed the rows.
+        if self.due.grow || self.due.prune_weight || !plan.keeps_all(self.statistics.seen.dims()[0]) {
             self.statistics = self.statistics.after(plan, self.due.prune_weight, device)?;
         }
         Ok(())

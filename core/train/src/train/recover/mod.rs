@@ -1,0 +1,136 @@
+//! Things that the model does not draw at all: a ball that crosses the scene is nowhere long enough for a static reconstruction, and once it is missing, no gradient
+//! brings it back.
+//!
+//! During the main stage, training views are rendered and compared. Compact regions that differ much are looked for in views of neighbouring times; where
+//! enough of them agree on a straight track, Gaussians are added along it, each with a velocity and a life of its own ([`cc4dgs_core::Life`]).
+
+mod blobs;
+mod seeds;
+mod tracks;
+
+use super::{Context, TrainState};
+use crate::masks::blur;
+use crate::sample::spread;
+use blobs::blobs;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Event, Result, Schedule, Split, Stage};
+use cc4dgs_play::model::ModelDeformer;
+use glam::DVec3;
+use std::collections::BTreeSet;
+use tracks::{Sighting, Track, best_track};
+
+/// When it is looked for: shares of the main stage.
+const SHARES: [f64; 2] = [0.15, 0.35];
+/// The most training views that are compared.
+const VIEWS: usize = 400;
+/// The most regions of a view, the largest ones.
+const BLOBS: usize = 6;
+/// Mean absolute difference over the channels from which a pixel is not drawn, of values in 0..1, and the blur in pixels before.
+const LOST: f32 = 0.12;
+const BLUR: f32 = 1.0;
+/// Images that a window of time has at least, and its least length in frames.
+const IMAGES: usize = 8;
+const LEAST_FRAMES: usize = 3;
+/// The most things at a time.
+const TRACKS: usize = 3;
+
+/// What a view shows and the model does not.
+struct Lost {
+    view: usize,
+    image: Vec<f32>,
+    sightings: Vec<Sighting>,
+}
+
+impl Context<'_> {
+    /// Adds Gaussians for what the model does not draw, when the iteration is due and `train.recover` is on.
+    pub(crate) fn recover(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        let due = SHARES.iter().any(|share| schedule.iteration == (share * schedule.length as f64).round() as usize);
+        if !self.job.config.train.recover || schedule.stage != Stage::Main || !due || state.deformer.is_none() {
+            return Ok(());
+        }
+        let lost = self.lost(state, schedule)?;
+        let sightings: Vec<Sighting> = lost.iter().flat_map(|l| l.sightings.iter().copied()).collect();
+        let frames = self.job.scene.frame_count.max(2);
+        let window = (IMAGES * frames).div_ceil(lost.len().max(1)).max(LEAST_FRAMES);
+        let stride = window.div_ceil(2);
+        let interval = 1.0 / (frames - 1) as f64;
+        let mut tracks: Vec<Track> = Vec::new();
+        for (index, frame) in (0..frames).step_by(stride).enumerate() {
+            let time = frame as f64 * interval;
+            let near = 0.5 * window as f64 * interval + 1e-9;
+            let mut among: Vec<usize> = (0..sightings.len()).filter(|&i| (sightings[i].time - time).abs() <= near).collect();
+            for k in 0..TRACKS {
+                let seed = self.seed.child("recover").index(schedule.iteration as u64).index(index as u64).index(k as u64);
+                let Some(track) = best_track(&sightings, &among, time, seed) else { break };
+                let used: BTreeSet<usize> = track.sightings.iter().copied().collect();
+                among.retain(|i| !used.contains(i));
+                tracks.push(track);
+            }
+        }
+        let message =
+            format!("{} compact regions of {} training views are not drawn; {} tracks of things that move", sightings.len(), lost.len(), tracks.len());
+        self.job.events.emit(&Event::Note { object: "recover".into(), message });
+        if tracks.is_empty() {
+            return Ok(());
+        }
+        self.give_lives(state)?;
+        let half_width = 0.5 * stride as f64 * interval;
+        let mut plan = seeds::plan(self, state, &lost, &sightings, &tracks, half_width)?;
+        plan.check("recover", &state.set.gaussians()?)?;
+        self.guard_plan(&mut plan, state, schedule)?;
+        self.carry_out(&plan, state, schedule)?;
+        state.density.executed(&plan, &self.device)
+    }
+
+    /// Training views and what the model does not draw of them.
+    fn lost(&self, state: &mut TrainState, schedule: &Schedule) -> Result<Vec<Lost>> {
+        let scene = &self.job.scene;
+        let views = spread(&scene.split(Split::Train), VIEWS);
+        let background = self.job.config.background()?;
+        let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
+        let gaussians = state.set.gaussians()?;
+        let mut lost = Vec::with_capacity(views.len());
+        self.draw(state, &gaussians, &requests, schedule.sh_degree, |index, drawn| {
+            let drawn = to_vec(drawn, "drawn view")?;
+            let view = views[index];
+            let camera = scene.camera(view);
+            let (w, h) = (camera.width as usize, camera.height as usize);
+            let image = scene.frame(view)?.to_planes(background);
+            let difference = |p: usize| (0..3).map(|k| (image[k * w * h + p] - drawn[k * w * h + p]).abs()).sum::<f32>() / 3.0;
+            let residual = blur(&(0..w * h).map(difference).collect::<Vec<f32>>(), w, h, BLUR);
+            let mask: Vec<bool> = residual.iter().map(|&v| v > LOST).collect();
+            let (rotation, _) = camera.rotation_translation();
+            let origin = DVec3::from(camera.center_world());
+            let focal = (camera.fx * camera.fy).sqrt();
+            let sighting = |blob: blobs::Blob| {
+                let [x, y] = blob.center_px;
+                let ray = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
+                let time = f64::from(scene.views[view].time_norm);
+                Sighting { image: index, time, origin, direction: rotation.transpose() * ray, size: blob.radius_px / focal, pixel: 1.0 / focal }
+            };
+            let sightings = blobs(&mask, w, BLOBS).into_iter().map(sighting).collect();
+            lost.push(Lost { view, image, sightings });
+            Ok(())
+        })?;
+        Ok(lost)
+    }
+
+    /// Gives the Gaussians lives, unless the deformer has them: those that are there last for ever.
+    fn give_lives(&self, state: &mut TrainState) -> Result<()> {
+        let Some(old) = &state.deformer else { return Ok(()) };
+        let has = |name: &str| old.field.attributes().iter().any(|a| a.name == name);
+        if cc4dgs_core::LIFE_ATTRIBUTES.iter().all(|(name, _)| has(name)) {
+            return Ok(());
+        }
+        let mut section = old.section.clone();
+        section.insert("life".into(), true.into());
+        let mut field = self.job.registry.build_deformer(&section, &old.context, &self.device)?;
+        for (to, from) in field.parameters_mut().into_iter().zip(old.field.parameters()) {
+            to.value = from.value.clone();
+        }
+        let context = old.context.clone();
+        state.set.add_attributes(&field.attributes(), self.seed.child("attributes"))?;
+        state.deformer = Some(ModelDeformer { field, section, context });
+        Ok(())
+    }
+}
