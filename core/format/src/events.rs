@@ -56,6 +56,19 @@ pub enum Event {
         /// Milliseconds per iteration since the last such event.
         ms: f32,
     },
+    /// Views that are kept out of training were scored.
+    Validated {
+        /// The stage.
+        stage: String,
+        /// Iteration within the stage.
+        iteration: usize,
+        /// Iterations of the stage.
+        of: usize,
+        /// Number of views.
+        views: usize,
+        /// Their mean PSNR in dB; images are not rounded to 8 bits.
+        psnr_db: f32,
+    },
     /// Density control changed the Gaussians.
     Densified {
         /// Iteration within the stage.

@@ -9,7 +9,7 @@ const COUNT: usize = 40;
 
 fn build(registry: &Registry, kind: &str, life: bool, device: &Device) -> cc4dgs_core::Result<Box<dyn Deformer>> {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 30, sh_degree: 1, seed: Seed::root(5) };
-    let mut section = cc4dgs_core::toml::Table::new();
+    let mut section = toml::Table::new();
     section.insert("kind".into(), kind.into());
     section.insert("life".into(), life.into());
     registry.build_deformer(&section, &context, device)

@@ -17,6 +17,7 @@ mod smoothness;
 mod state;
 mod step;
 mod strain;
+mod validate;
 
 pub use guard::Guard;
 pub use state::{Parts, TrainState};
@@ -293,6 +294,7 @@ impl Context<'_> {
             self.recover(state, &schedule)?;
             state.iteration = schedule.iteration;
             watch.after_iteration(self, state, &schedule)?;
+            self.validate(state, &schedule)?;
             let every = self.job.config.train.checkpoint_every;
             if every > 0 && state.iteration.is_multiple_of(every) && state.iteration < length {
                 self.save(state)?;
