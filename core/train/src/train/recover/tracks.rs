@@ -9,10 +9,11 @@ use rand::Rng;
 use std::collections::BTreeSet;
 
 /// Tracks that are tried.
-const TRIALS: usize = 400;
-/// Fewest images that must agree, and the share of the images of the window that show anything.
+const TRIALS: usize = 2000;
+/// Fewest images that must agree; the share of the images of the window that show anything; and how many are enough in any case.
 const LEAST_IMAGES: usize = 4;
 const LEAST_SHARE: f64 = 0.5;
+const ENOUGH_IMAGES: usize = 8;
 /// A ray agrees when it passes within this share of the radius, plus so many pixels.
 const WITHIN_RADIUS: f64 = 0.5;
 const WITHIN_PIXELS: f64 = 1.0;
@@ -64,7 +65,7 @@ impl Track {
 /// The track around `time` that most images agree on, of the sightings with the indices `among`.
 pub(super) fn best_track(sightings: &[Sighting], among: &[usize], time: f64, seed: Seed) -> Option<Track> {
     let images: BTreeSet<usize> = among.iter().map(|&i| sightings[i].image).collect();
-    let needed = LEAST_IMAGES.max((LEAST_SHARE * images.len() as f64).ceil() as usize);
+    let needed = ((LEAST_SHARE * images.len() as f64).ceil() as usize).clamp(LEAST_IMAGES, ENOUGH_IMAGES);
     if images.len() < needed {
         return None;
     }

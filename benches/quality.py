@@ -1,0 +1,114 @@
+#!/usr/bin/env python3
+"""Long trainings of published scenes with `auto`, each scored once on its test views, with curves of validation PSNR against wall time.
+
+    python3 benches/quality.py OUT --bin BIN --data DATA [--only mutant-5,...] [--threads N] [--set KEY=VALUE ...] [--curves]
+
+DATA holds `dnerf_mutant` and `panoptic_basketball`. Every run is trained for its minutes of wall time, then evaluated on the test split. An interrupted run is
+resumed from its checkpoint when the script is called again; a finished one is not repeated. With `--curves` every run is trained a second time with views kept
+out of training, and its log holds the curve. The three medians of `bench step` are measured before every run. Results are kept in OUT/rows.json.
+"""
+import argparse
+import json
+import pathlib
+import subprocess
+import sys
+import time
+
+# Name, scene, minutes, settings, and the PSNR in dB it is meant to reach.
+RUNS = [
+    ("mutant-5", "dnerf_mutant", 5, ["scene.width=400"], 36.2),
+    ("mutant-30", "dnerf_mutant", 30, ["scene.width=400"], 40.0),
+    ("basketball-6", "panoptic_basketball", 6, ["scene.width=640", "scene.frames=[0,30,1]"], 26.2),
+    ("basketball-25", "panoptic_basketball", 25, ["scene.width=640", "scene.frames=[0,30,1]"], 27.0),
+    ("mutant-800-90", "dnerf_mutant", 90, ["scene.width=800"], 40.5),
+    ("basketball-all-180", "panoptic_basketball", 180, ["scene.width=640"], 28.0),
+]
+CURVES = ["train.validation=12"]
+
+
+def medians(options, out):
+    """Median milliseconds of `bench step` by case, or None where it fails."""
+    report = out.with_suffix(".step.json")
+    arguments = [options.bin, "bench", "step", "--repeats", "5", "--quiet", f"--json={report}"]
+    if options.threads:
+        arguments += ["--threads", str(options.threads)]
+    if subprocess.run(arguments, stdout=subprocess.DEVNULL).returncode != 0:
+        return None
+    return json.loads(report.read_text())
+
+
+def train(options, name, scene, minutes, settings):
+    out = options.out / name
+    path = str(options.data / scene)
+    log = out.with_suffix(".train.log")
+    step = medians(options, out)
+    arguments = ["train", "--scene", path, "--out", str(out), "--quiet", f"--json={out.with_suffix('.train.json')}"]
+    resumed = (out / "checkpoint").exists()
+    if resumed:
+        arguments += ["--resume"]
+    else:
+        arguments += ["--overwrite", "--minutes", str(minutes)]
+        for text in [*settings, "train.checkpoint_every=2000", *options.sets]:
+            arguments += ["--set", text]
+    if options.threads:
+        arguments += ["--threads", str(options.threads)]
+    began = time.time()
+    with open(log, "a") as file:
+        code = subprocess.run([options.bin, *arguments], stdout=file, stderr=subprocess.STDOUT).returncode
+    row = {"name": name, "scene": scene, "minutes": minutes, "settings": [*settings, *options.sets], "exit": code, "resumed": resumed}
+    row |= {"seconds": round(time.time() - began, 1), "bench_step": step, "curve": curve(out / "events.jsonl")}
+    report = out.with_suffix(".eval.json")
+    evaluation = [options.bin, "eval", str(out), "--scene", path, "--split", "test", f"--json={report}", "--sheet", str(out.with_suffix(".png")), "--quiet"]
+    with open(out.with_suffix(".eval.log"), "w") as file:
+        if code == 0 and subprocess.run(evaluation, stdout=file, stderr=subprocess.STDOUT).returncode == 0:
+            found = json.loads(report.read_text())
+            keys = ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "blocks"]
+            row |= {key: found.get(key) for key in keys}
+    config = out / "config.toml"
+    row["plan"] = [line.strip().strip("',\"") for line in config.read_text().splitlines() if line.strip()[:1] in "\"'"] if config.exists() else []
+    return row
+
+
+def curve(log):
+    """Seconds and PSNR of validation views, of a run with views kept out of training."""
+    points = []
+    if log.exists():
+        for line in log.read_text().splitlines():
+            event = json.loads(line)
+            if event.get("event") == "validated":
+                points.append([round(event["seconds"], 1), round(event["psnr_db"], 3)])
+    return points
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=pathlib.Path)
+    parser.add_argument("--bin", required=True)
+    parser.add_argument("--data", type=pathlib.Path, required=True)
+    parser.add_argument("--only", default="", help="names of runs, with commas")
+    parser.add_argument("--threads", type=int, default=0, help="threads of each training; 0 takes all cores")
+    parser.add_argument("--curves", action="store_true")
+    parser.add_argument("--set", dest="sets", action="append", default=[], help="handed to every training")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    kept = options.out / "rows.json"
+    rows = json.loads(kept.read_text()) if kept.exists() else []
+    below = []
+    for name, scene, minutes, settings, aim in RUNS:
+        if options.only and name not in options.only.split(","):
+            continue
+        for name, settings in [(name, settings)] + ([(f"{name}-curve", settings + CURVES)] if options.curves else []):
+            row = next((r for r in rows if r["name"] == name and r["exit"] == 0), None)
+            if row is None:
+                row = train(options, name, scene, minutes, settings)
+                rows = [r for r in rows if r["name"] != name] + [row]
+                kept.write_text(json.dumps(rows, indent=1))
+            psnr = row.get("psnr_db")
+            print(f"{name:24} {psnr or float('nan'):.2f} dB (aim {aim}), SSIM {row.get('ssim') or float('nan'):.4f}, {row.get('gaussians')} Gaussians, {row['seconds']} s, exit {row['exit']}", flush=True)
+            if psnr is None or psnr < aim:
+                below.append(name)
+    return 1 if below else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
