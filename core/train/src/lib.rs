@@ -17,6 +17,7 @@ pub mod masks;
 pub mod presets;
 mod sample;
 pub mod schedule;
+pub mod sweep;
 pub mod train;
 mod train_config;
 pub mod trajectory;
