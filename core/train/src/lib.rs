@@ -15,6 +15,7 @@ pub mod knn;
 pub mod layers;
 pub mod masks;
 pub mod presets;
+pub mod report;
 mod sample;
 pub mod schedule;
 pub mod sweep;
