@@ -72,15 +72,14 @@ struct Seen {
 impl Seen {
     fn of(image: &Planes, pixels_per_degree: f64) -> Self {
         let width = image.width();
-        let xyz: Vec<[f64; 3]> = (0..width * image.height())
-            .into_par_iter()
-            .map(|i| to_xyz([0, 1, 2].map(|c| linear(image.plane(c)[i].clamp(0.0, 1.0)))))
-            .collect();
+        let xyz: Vec<[f64; 3]> =
+            (0..width * image.height()).into_par_iter().map(|i| to_xyz([0, 1, 2].map(|c| linear(image.plane(c)[i].clamp(0.0, 1.0))))).collect();
         // Relative to white, X and Z against Y: the linearised opponent colours of the filters. Scale and offset of the paper's YCxCz cancel in linear filters.
         let white = to_xyz([1.0; 3]);
         let opponent = |f: fn([f64; 3]) -> f64| xyz.par_iter().map(|v| f([0, 1, 2].map(|c| v[c] / white[c]))).collect::<Vec<f64>>();
         let channels = [opponent(|v| v[1]), opponent(|v| v[0] - v[1]), opponent(|v| v[1] - v[2])];
-        let filtered: Vec<Vec<f64>> = channels.iter().zip(SENSITIVITY).map(|(plane, gaussians)| sensitivity(plane, width, gaussians, pixels_per_degree)).collect();
+        let filtered: Vec<Vec<f64>> =
+            channels.iter().zip(SENSITIVITY).map(|(plane, gaussians)| sensitivity(plane, width, gaussians, pixels_per_degree)).collect();
         let colours = (0..xyz.len())
             .into_par_iter()
             .map(|i| {
@@ -139,7 +138,17 @@ fn taps(radius: usize, value: impl Fn(f64) -> f64) -> Vec<f64> {
 fn balanced(taps: Vec<f64>) -> Vec<f64> {
     let positive: f64 = taps.iter().filter(|t| **t > 0.0).sum();
     let negative: f64 = -taps.iter().filter(|t| **t < 0.0).sum::<f64>();
-    taps.into_iter().map(|t| if t > 0.0 { t / positive } else if t < 0.0 { t / negative } else { 0.0 }).collect()
+    taps.into_iter()
+        .map(|t| {
+            if t > 0.0 {
+                t / positive
+            } else if t < 0.0 {
+                t / negative
+            } else {
+                0.0
+            }
+        })
+        .collect()
 }
 
 /// Filters along rows; beyond the border the nearest pixel continues.

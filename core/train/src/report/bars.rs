@@ -104,7 +104,8 @@ pub fn swatch(colour: &str, name: &str) -> String {
 }
 
 fn label(svg: &mut String, y: f64, name: &str) {
-    let short: String = if name.chars().count() > LABEL_CHARACTERS { name.chars().take(LABEL_CHARACTERS - 1).chain(['…']).collect() } else { name.to_string() };
+    let short: String =
+        if name.chars().count() > LABEL_CHARACTERS { name.chars().take(LABEL_CHARACTERS - 1).chain(['…']).collect() } else { name.to_string() };
     _ = write!(svg, "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\"><title>{}</title>{}</text>", LABEL - 8.0, y + 15.0, html(name), html(&short));
 }
 
@@ -112,7 +113,11 @@ fn axis(svg: &mut String, scale: &Scale, height: f64, title: &str) {
     let bottom = height - BOTTOM;
     for (value, label) in scale.ticks() {
         let at = scale.at(value);
-        _ = write!(svg, "<path class=\"grid\" d=\"M{at:.1} {TOP}V{bottom:.1}\"/><text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>", bottom + 16.0);
+        _ = write!(
+            svg,
+            "<path class=\"grid\" d=\"M{at:.1} {TOP}V{bottom:.1}\"/><text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>",
+            bottom + 16.0
+        );
     }
     _ = write!(svg, "<path class=\"axis\" d=\"M{LABEL} {bottom:.1}H{:.1}\"/>", WIDTH - 60.0);
     _ = write!(svg, "<text class=\"title\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>", (LABEL + WIDTH - 60.0) / 2.0, height - 8.0, html(title));

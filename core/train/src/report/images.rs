@@ -37,7 +37,9 @@ pub fn gallery(folder: &Path, scene: &str, rows: &[Row], views: usize) -> Result
     let Some((_, first)) = shown.first() else { return Ok(String::new()) };
     let usable: Vec<usize> = (0..first.images.len()).filter(|i| shown.iter().all(|(_, cell)| file_of(folder, cell, *i).is_some())).collect();
     let wanted = views.min(usable.len());
-    let mut out = String::from("<h3>Images</h3>\n<p class=\"note\">First seed; per training the codec with the highest PSNR. Squares are enlarged below: where all renders together err most. Whole images are JPEG, squares are exact.</p>\n");
+    let mut out = String::from(
+        "<h3>Images</h3>\n<p class=\"note\">First seed; per training the codec with the highest PSNR. Squares are enlarged below: where all renders together err most. Whole images are JPEG, squares are exact.</p>\n",
+    );
     for view in (0..wanted).map(|i| usable[i * usable.len() / wanted]) {
         out += &sheet(folder, scene, &shown, view)?;
     }
@@ -89,7 +91,8 @@ fn read_pair(folder: &Path, truth: &str, render: &str) -> Result<(Image8, Image8
 }
 
 fn url(image: &Image8) -> Result<String> {
-    let rgb = RgbImage::from_raw(image.width, image.height, image.data.clone()).ok_or_else(|| Error::backend("report", "an image of another size", "Report this"))?;
+    let rgb =
+        RgbImage::from_raw(image.width, image.height, image.data.clone()).ok_or_else(|| Error::backend("report", "an image of another size", "Report this"))?;
     let height = (u64::from(image.height) * u64::from(SHOWN_WIDTH) / u64::from(image.width)).max(1) as u32;
     let rgb = if image.width > SHOWN_WIDTH { imageops::thumbnail(&rgb, SHOWN_WIDTH, height) } else { rgb };
     let mut bytes = Vec::new();
@@ -142,8 +145,14 @@ fn sheet(folder: &Path, scene: &str, shown: &[(&Row, &CellResult)], view: usize)
         }
     }
     let Some((_, image, truth, _)) = cards.first() else { return Ok(String::new()) };
-    if let Some((row, ..)) = cards.iter().find(|(_, other, t, _)| (t.width, t.height, other.frame, &other.camera) != (truth.width, truth.height, image.frame, &image.camera)) {
-        return Err(Error::data(format!("{scene}, image {view} of {}", row.name()), "another view than in the other results of this scene", "Score all cells on the same views"));
+    if let Some((row, ..)) =
+        cards.iter().find(|(_, other, t, _)| (t.width, t.height, other.frame, &other.camera) != (truth.width, truth.height, image.frame, &image.camera))
+    {
+        return Err(Error::data(
+            format!("{scene}, image {view} of {}", row.name()),
+            "another view than in the other results of this scene",
+            "Score all cells on the same views",
+        ));
     }
     let renders: Vec<Image8> = cards.iter().map(|(.., render)| render.clone()).collect();
     let square = worst_square(truth, &renders);
@@ -172,7 +181,7 @@ fn sheet(folder: &Path, scene: &str, shown: &[(&Row, &CellResult)], view: usize)
     }
     let title = format!("{scene}, camera {}, frame {}", image.camera, image.frame);
     Ok(format!(
-        "<section class=\"view\"><h4>{}</h4><div class=\"slider\" hidden><div class=\"pair\"><img class=\"below\" alt=\"ground truth\"><img class=\"above\" alt=\"render\"></div><label>left ground truth, right <select></select> <input type=\"range\" min=\"0\" max=\"100\" value=\"50\" aria-label=\"border between ground truth and render\"></label></div><div class=\"cards\">{body}</div><p class=\"note\">Right of each square: mean absolute difference, brightest at {ERROR_SCALE}.</p></section>\n",
+        "<section class=\"view\"><h4>{}</h4><div class=\"compare\"><div class=\"slider\" hidden><div class=\"pair\"><img class=\"below\" alt=\"ground truth\"><img class=\"above\" alt=\"render\"></div><label>left ground truth, right <select></select> <input type=\"range\" min=\"0\" max=\"100\" value=\"50\" aria-label=\"border between ground truth and render\"></label></div><div class=\"cards\">{body}</div></div><p class=\"note\">Right of each square: mean absolute difference, brightest at {ERROR_SCALE}.</p></section>\n",
         html(&title)
     ))
 }
@@ -198,7 +207,11 @@ fn flicker(folder: &Path, shown: &[(&Row, &CellResult)]) -> Result<String> {
             sums.resize(now.0.data.len() / 3, 0);
             if let Some((truth, render)) = &before {
                 if truth.data.len() != now.0.data.len() {
-                    return Err(Error::data(format!("{}, camera {camera}", row.name()), "its images differ in size", "Remove the files and run the cell again"));
+                    return Err(Error::data(
+                        format!("{}, camera {camera}", row.name()),
+                        "its images differ in size",
+                        "Remove the files and run the cell again",
+                    ));
                 }
                 let change = |i: usize| (i32::from(now.1.data[i]) - i32::from(render.data[i])) - (i32::from(now.0.data[i]) - i32::from(truth.data[i]));
                 sums.iter_mut().enumerate().for_each(|(p, sum)| *sum += (0..3).map(|c| u64::from(change(3 * p + c).unsigned_abs())).sum::<u64>());

@@ -105,7 +105,10 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let mut links = anchors.clone();
     links.extend([("protocols".to_string(), "protocols".to_string()), ("published".to_string(), "reported by papers".to_string())]);
     let mut body = page::contents(&links) + &page::facts(&results) + &key.legend();
-    let mut markdown = format!("# {}\n\nMean ± sample standard deviation over seeds; best of a column in bold. ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n", text::markdown(&title));
+    let mut markdown = format!(
+        "# {}\n\nMean ± sample standard deviation over seeds; best of a column in bold. ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n",
+        text::markdown(&title)
+    );
     let mut latex = String::from("% Mean and sample standard deviation over seeds. MB are 10^6 bytes.\n");
     for (i, (scene, rows)) in scenes.iter().enumerate() {
         let table = tables::summary(scene, rows);
@@ -164,7 +167,8 @@ fn chosen(results: Vec<CellResult>, only: &[String]) -> Result<Vec<CellResult>> 
     let mut wanted: std::collections::BTreeMap<&str, Vec<&str>> = std::collections::BTreeMap::new();
     for text in only {
         let pair = text.split_once('=').filter(|(key, _)| KEYS.contains(key));
-        let (key, value) = pair.ok_or_else(|| Error::parameter("--where", text.clone(), format!("Write KEY=VALUE with one of the keys {}", KEYS.join(", "))))?;
+        let (key, value) =
+            pair.ok_or_else(|| Error::parameter("--where", text.clone(), format!("Write KEY=VALUE with one of the keys {}", KEYS.join(", "))))?;
         wanted.entry(key).or_default().push(value);
     }
     let of = |r: &CellResult, key: &str| match key {

@@ -36,10 +36,15 @@ pub fn facts(results: &[CellResult]) -> String {
         let adapter = d.adapter.as_ref().map_or_else(String::new, |name| format!(" on {name}, driver {}", d.driver.as_deref().unwrap_or("unknown")));
         format!("{}{adapter}; {}, {} threads, {}", d.name, if d.processor.is_empty() { "unknown processor" } else { &d.processor }, d.threads, d.system)
     };
-    let data = |r: &CellResult| format!("{}: {} (xxh3 {}), {}x{}, {} frames", r.axes.scene, r.provenance.data.path, r.provenance.data.hash, r.image_size[0], r.image_size[1], r.frames);
+    let data = |r: &CellResult| {
+        format!("{}: {} (xxh3 {}), {}x{}, {} frames", r.axes.scene, r.provenance.data.path, r.provenance.data.hash, r.image_size[0], r.image_size[1], r.frames)
+    };
     let rows = [
         ("sweep", set(&|r| r.sweep.clone())),
-        ("results", format!("{} cells of {} trainings, seeds {}", results.len(), trainings.len(), seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", "))),
+        (
+            "results",
+            format!("{} cells of {} trainings, seeds {}", results.len(), trainings.len(), seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")),
+        ),
         ("program", set(&|r| format!("cc4dgs {}, commit {}", r.provenance.version, commit(r)))),
         ("device", set(&device)),
         ("split", set(&|r| format!("{:?}", r.split).to_lowercase())),
@@ -62,6 +67,11 @@ pub fn protocols(results: &[CellResult]) -> String {
         });
         metrics.entry(name).or_default().insert(entries.collect::<Vec<_>>().join(", "));
     }
-    let rows: String = metrics.iter().map(|(name, texts)| format!("<tr><th>{}</th><td>{}</td></tr>\n", html(name), html(&texts.iter().cloned().collect::<Vec<_>>().join("; ")))).collect();
-    format!("<table class=\"facts\">\n{rows}</table>\n<p class=\"note\">MB are 10⁶ bytes of the archive on disk. Times are wall times on the device above, synchronised; a frame is the mean of all frames but the first. ↑ high is better, ↓ low is better; ± is the sample standard deviation over seeds.</p>\n")
+    let rows: String = metrics
+        .iter()
+        .map(|(name, texts)| format!("<tr><th>{}</th><td>{}</td></tr>\n", html(name), html(&texts.iter().cloned().collect::<Vec<_>>().join("; "))))
+        .collect();
+    format!(
+        "<table class=\"facts\">\n{rows}</table>\n<p class=\"note\">MB are 10⁶ bytes of the archive on disk. Times are wall times on the device above, synchronised; a frame is the mean of all frames but the first. ↑ high is better, ↓ low is better; ± is the sample standard deviation over seeds.</p>\n"
+    )
 }

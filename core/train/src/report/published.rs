@@ -56,7 +56,8 @@ pub fn tables() -> Result<Vec<Table>> {
         }
         let Some(table) = tables.last_mut() else { continue };
         for row in source.rows {
-            let numbers = [row.psnr, row.ssim, row.lpips, row.size, row.fps, row.training].map(|text| Cell::plain(if text.is_empty() { "–".into() } else { text }));
+            let numbers =
+                [row.psnr, row.ssim, row.lpips, row.size, row.fps, row.training].map(|text| Cell::plain(if text.is_empty() { "–".into() } else { text }));
             table.rows.push([vec![Cell::plain(row.method)], numbers.into(), vec![Cell::plain(source.source.clone())]].concat());
         }
     }

@@ -51,10 +51,10 @@ quantities! {
     LPIPS: "lpips", "LPIPS", "", 4, Lower, |c| metric(c, "lpips");
     FLIP: "flip", "FLIP", "", 4, Lower, |c| metric(c, "flip");
     SIZE: "size_mb", "size", "MB", 3, Lower, |c| Some(c.size_mb());
-    FRAME: "frame_ms", "frame", "ms", 2, Lower, |c| Some(c.cost.frame_ms.mean);
-    TRAINING: "training_minutes", "training", "min", 2, Lower, |c| Some(c.cost.training_seconds / 60.0);
-    ENCODE: "encode_s", "encode", "s", 2, Lower, |c| Some(c.cost.encode_seconds);
-    DECODE: "decode_s", "decode", "s", 2, Lower, |c| Some(c.cost.decode_seconds);
+    FRAME: "frame_ms", "frame time", "ms", 2, Lower, |c| Some(c.cost.frame_ms.mean);
+    TRAINING: "training_minutes", "training time", "min", 2, Lower, |c| Some(c.cost.training_seconds / 60.0);
+    ENCODE: "encode_s", "encoding time", "s", 2, Lower, |c| Some(c.cost.encode_seconds);
+    DECODE: "decode_s", "decoding time", "s", 2, Lower, |c| Some(c.cost.decode_seconds);
     MEMORY: "peak_memory_mb", "peak memory", "MB", 0, Lower, |c| c.cost.peak_memory_mb;
     GAUSSIANS: "gaussians", "Gaussians", "", 0, Neither, |c| Some(c.gaussians as f64);
 }

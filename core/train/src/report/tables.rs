@@ -101,14 +101,20 @@ impl Table {
     /// As HTML.
     pub fn html(&self) -> String {
         let class = |column: usize| if self.text_columns.contains(&column) { " class=\"text\"" } else { "" };
-        let head: String = self.head.iter().enumerate().map(|(i, name)| format!("<th{}>{}</th>", class(i), text::html(name))).collect();
+        let head: String = self
+            .head
+            .iter()
+            .enumerate()
+            .map(|(i, name)| format!("<th{}>{}</th>", class(i), text::html(&name.replace(" ↑", "\u{a0}↑").replace(" ↓", "\u{a0}↓"))))
+            .collect();
         let mut out = format!("<div class=\"table\"><table><thead><tr>{head}</tr></thead><tbody>\n");
         for row in &self.rows {
             let cells: String = row
                 .iter()
                 .enumerate()
                 .map(|(i, cell)| {
-                    let content = text::html(&cell.text);
+                    // A narrow column breaks before the deviation, not within.
+                    let content = text::html(&cell.text.replace("± ", "±\u{a0}"));
                     let content = if cell.best { format!("<b>{content}</b>") } else { content };
                     format!("<td{}>{content}</td>", class(i))
                 })

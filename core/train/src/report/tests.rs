@@ -48,7 +48,8 @@ fn sweep(folder: &Path) -> Vec<CellResult> {
         cc4dgs_core::Image8 { width: 32, height: 24, channels: 3, data }
     };
     for frame in 0..3u32 {
-        let write = |name: &str, shade: &dyn Fn(u32, u32) -> u8| crate::images::write_png(folder.join(format!("images/{name}/{frame}.png")), &image(shade)).unwrap();
+        let write =
+            |name: &str, shade: &dyn Fn(u32, u32) -> u8| crate::images::write_png(folder.join(format!("images/{name}/{frame}.png")), &image(shade)).unwrap();
         write("truth", &|x, y| (4 * x + y) as u8);
         // Right but for one corner, and flickering by ten levels.
         write("cdf", &|x, y| if x > 24 && y > 16 { 255 } else { (4 * x + y) as u8 });
@@ -76,7 +77,20 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
     assert_eq!(std::fs::read_to_string(&out).unwrap(), first.html);
     assert_eq!(std::fs::read_to_string(&files.csv).unwrap(), first.csv);
     assert_eq!(first, report(folder.path(), &ReportOptions::default()).unwrap());
-    for part in ["Rate and distortion", "Pareto front", "archive (MB)", "PSNR (dB)", "wall time (s)", "time (ms)", "size (MB)", "iteration", "frame", "Flicker", "slider", "reported, not run"] {
+    for part in [
+        "Rate and distortion",
+        "Pareto front",
+        "archive (MB)",
+        "PSNR (dB)",
+        "wall time (s)",
+        "time (ms)",
+        "size (MB)",
+        "iteration",
+        "frame",
+        "Flicker",
+        "slider",
+        "reported, not run",
+    ] {
         assert!(first.html.contains(part), "{part}");
     }
     for wrong in ["NaN", "inf\"", "http://", "https://", "<link", "src=\"/"] {

@@ -102,7 +102,10 @@ mod tests {
         assert_eq!(html(evil), "&lt;script&gt;alert(&#39;1&#39;)&lt;/script&gt; &amp; &quot;x&quot; \u{fffd}\u{fffd}");
         assert_eq!(markdown("a|b_c<d>\n"), "a\\|b\\_c&lt;d&gt;\u{fffd}");
         assert_eq!(latex("50% of $x_1$ \\input{y}^~é"), "50\\% of \\$x\\_1\\$ \\textbackslash{}input\\{y\\}\\textasciicircum{}\\textasciitilde{}?");
-        assert_eq!((csv("a,b"), csv("say \"x\""), csv("=1+1"), csv("-3.5"), csv("plain")), ("\"a,b\"".into(), "\"say \"\"x\"\"\"".into(), "'=1+1".into(), "-3.5".into(), "plain".into()));
+        assert_eq!(
+            (csv("a,b"), csv("say \"x\""), csv("=1+1"), csv("-3.5"), csv("plain")),
+            ("\"a,b\"".into(), "\"say \"\"x\"\"\"".into(), "'=1+1".into(), "-3.5".into(), "plain".into())
+        );
     }
 
     #[test]

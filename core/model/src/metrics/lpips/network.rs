@@ -147,7 +147,8 @@ mod tests {
                     for channel in 0..conv.inputs {
                         for ky in 0..conv.kernel {
                             for kx in 0..conv.kernel {
-                                let (sy, sx) = ((y * conv.stride + ky) as isize - conv.padding as isize, (x * conv.stride + kx) as isize - conv.padding as isize);
+                                let (sy, sx) =
+                                    ((y * conv.stride + ky) as isize - conv.padding as isize, (x * conv.stride + kx) as isize - conv.padding as isize);
                                 if (0..input.height as isize).contains(&sy) && (0..input.width as isize).contains(&sx) {
                                     let weight = conv.weight[((output * conv.inputs + channel) * conv.kernel + ky) * conv.kernel + kx];
                                     let value = input.values[(channel * input.height + sy as usize) * input.width + sx as usize];
@@ -165,7 +166,9 @@ mod tests {
 
     #[test]
     fn convolutions_equal_their_definition() {
-        for (inputs, outputs, kernel, stride, padding, height, width) in [(3, 5, 11, 4, 2, 23, 31), (4, 6, 5, 1, 2, 7, 9), (5, 3, 3, 1, 1, 1, 4), (2, 2, 3, 2, 0, 40, 700)] {
+        for (inputs, outputs, kernel, stride, padding, height, width) in
+            [(3, 5, 11, 4, 2, 23, 31), (4, 6, 5, 1, 2, 7, 9), (5, 3, 3, 1, 1, 1, 4), (2, 2, 3, 2, 0, 40, 700)]
+        {
             let (weight, bias) = (random("weight", outputs * inputs * kernel * kernel), random("bias", outputs));
             let conv = Conv { weight, bias, inputs, outputs, kernel, stride, padding };
             let input = Map { channels: inputs, height, width, values: random("input", inputs * height * width) };

@@ -74,9 +74,17 @@ fn damaged_weights_are_refused_by_name() {
     for cut in [0, 7, 100, whole.len() - 1] {
         assert!(said(&whole[..cut]).contains("safetensors"), "cut at {cut}");
     }
-    let transposed = synthetic(0.01, |name, shape, _| if name == "conv1.weight" { shape.reverse() });
+    let transposed = synthetic(0.01, |name, shape, _| {
+        if name == "conv1.weight" {
+            shape.reverse()
+        }
+    });
     assert!(said(&transposed).contains("conv1.weight"));
-    let infinite = synthetic(0.01, |name, _, data| if name == "linear3.weight" { data[..2].copy_from_slice(&half::f16::INFINITY.to_le_bytes()) });
+    let infinite = synthetic(0.01, |name, _, data| {
+        if name == "linear3.weight" {
+            data[..2].copy_from_slice(&half::f16::INFINITY.to_le_bytes())
+        }
+    });
     assert!(said(&infinite).contains("linear3.weight"));
     let empty = serialize(std::iter::empty::<(&str, TensorView)>(), None).unwrap();
     assert!(said(&empty).contains("conv0.weight"));

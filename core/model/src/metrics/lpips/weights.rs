@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// Shape and step of the five convolutions of AlexNet: inputs, outputs, kernel, stride, padding.
-pub(super) const LAYERS: [(usize, usize, usize, usize, usize); 5] = [(3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1)];
+pub(super) const LAYERS: [(usize, usize, usize, usize, usize); 5] =
+    [(3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1)];
 
 /// The file is 4.9 MB; a larger one is something else.
 const MAX_BYTES: u64 = 32 << 20;
