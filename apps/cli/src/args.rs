@@ -43,6 +43,8 @@ pub enum Command {
     Render(Render),
     /// Measure a model against the images of a scene.
     Eval(Eval),
+    /// Make an HTML page, and CSV, Markdown and LaTeX tables, from the results of a sweep.
+    Report(Report),
     /// Show what a model (checkpoint, archive, PLY, SPZ) or a scene contains.
     Info(Info),
     /// List the plug-ins, or show one with its settings.
@@ -220,6 +222,39 @@ pub struct Eval {
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
+}
+
+#[derive(Debug, Args)]
+pub struct Report {
+    /// The folder of a sweep, a folder of results, or one file of them.
+    #[arg(value_name = "DIR")]
+    pub results: PathBuf,
+    /// The page; tables are written beside it as .csv, .md and .tex. DIR/report.html by default.
+    #[arg(long, value_name = "FILE.html")]
+    pub out: Option<PathBuf>,
+    /// Heading of the page.
+    #[arg(long, value_name = "TEXT")]
+    pub title: Option<String>,
+    /// Whose images the page contains, where the folder has them.
+    #[arg(long, value_enum, default_value_t = ImagesArg::BuiltIn)]
+    pub images: ImagesArg,
+    /// Views per scene to show images of.
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..=100))]
+    pub views: u16,
+    /// Only results with this scene, method, setting, codec, seed, device or split; may be given several times.
+    #[arg(long = "where", value_name = "KEY=VALUE")]
+    pub only: Vec<String>,
+}
+
+/// Whose images a report contains.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ImagesArg {
+    /// No images.
+    None,
+    /// Those of built-in scenes, which may be published.
+    BuiltIn,
+    /// All, third-party scenes among them: keep such a page on your machine.
+    All,
 }
 
 #[derive(Debug, Args)]

@@ -4,7 +4,7 @@ use crate::blocks::{BlockScore, UsualImage};
 use crate::config::TrainConfig;
 use crate::masks::{PUBLISHED_SIGMA, dynamic_masks};
 use burn::tensor::Device;
-use cc4dgs_core::metrics::{FrameSet, Metric, Rounding, SsimConvention};
+use cc4dgs_core::metrics::{FLIP_PIXELS_PER_DEGREE, FrameSet, Metric, Rounding, SsimConvention, installed_lpips};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::player::{FrameTime, PlayWork};
@@ -66,6 +66,10 @@ pub struct ImageScore {
     pub ssim: f64,
     /// The same over windows centred on pixels that see something move.
     pub ssim_dynamic: Option<f64>,
+    /// Learned perceptual distance; absent where [`EvalReport::lpips_absent`] says why.
+    pub lpips: Option<f64>,
+    /// Visible difference on flipping between the images.
+    pub flip: f64,
     /// Blocks in which something moves; absent where the camera has few frames or nothing moves in this one.
     pub blocks: Option<BlockScore>,
     /// Milliseconds.
@@ -97,6 +101,13 @@ pub struct EvalReport {
     pub ssim_skimage: f64,
     /// Mean over images; absent where an image is too small for five scales.
     pub ms_ssim: Option<f64>,
+    /// Learned perceptual distance (AlexNet, v0.1; lower is better), mean over images.
+    pub lpips: Option<f64>,
+    /// Why `lpips` is absent: no weights, or images that are too small.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips_absent: Option<String>,
+    /// Visible difference on flipping between the images (lower is better), mean over images.
+    pub flip: f64,
     /// Sizes.
     pub size_mb: SizeMb,
     /// Times.
@@ -164,6 +175,8 @@ pub fn evaluate(
     let ssim_dynamic_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit).masked());
     let skimage_metric = metric(Metric::ssim(SsimConvention::Skimage, Rounding::EightBit));
     let ms_ssim_metric = metric(Metric::ms_ssim(Rounding::EightBit));
+    let flip_metric = metric(Metric::flip(FLIP_PIXELS_PER_DEGREE, Rounding::EightBit));
+    let mut lpips_metric = installed_lpips().map(|found| metric(Metric::lpips(found.network.clone(), Rounding::EightBit))).map_err(str::to_string);
     for (done, &view) in views.iter().enumerate() {
         let camera = scene.camera(view);
         let (output, time) = player.render(camera, scene.views[view].time_norm)?;
@@ -174,6 +187,15 @@ pub fn evaluate(
         skimage += skimage_metric.score_images(&truth, &render)?;
         let multi_scale = ms_ssim_metric.score_images(&truth, &render).ok();
         ms_ssim = ms_ssim.zip(multi_scale).map(|(sum, value)| sum + value);
+        let lpips = match lpips_metric.as_ref().map(|metric| metric.score_images(&truth, &render)) {
+            Ok(Ok(value)) => Some(value),
+            // Cameras may differ in size. A mean over some of them would be compared with means over all.
+            Ok(Err(e)) => {
+                lpips_metric = Err(e.to_string());
+                None
+            }
+            Err(_) => None,
+        };
         let mask = masks.get(&scene.views[view].camera);
         let shape = [3, camera.height as usize, camera.width as usize];
         let planes = mask.map(|mask| ([&truth, &render].map(|image| image.to_planes(background)), mask));
@@ -187,6 +209,8 @@ pub fn evaluate(
             psnr_dynamic_db,
             ssim: ssim_metric.score_images(&truth, &render)?,
             ssim_dynamic,
+            lpips,
+            flip: flip_metric.score_images(&truth, &render)?,
             blocks: usual.get(&scene.views[view].camera).and_then(|usual| usual.score(&truth, &render)),
             field_ms: time.field_ms,
             raster_ms: time.raster_ms,
@@ -196,6 +220,16 @@ pub fn evaluate(
         times.push(time);
         events.emit(&Event::Progress { task: "evaluate".into(), done: done as u64 + 1, total: views.len() as u64 });
     }
+    let mut metrics = BTreeMap::from([
+        ("psnr_db", psnr_metric),
+        ("psnr_dynamic_db", dynamic_metric),
+        ("ssim", ssim_metric),
+        ("ssim_dynamic", ssim_dynamic_metric),
+        ("ssim_skimage", skimage_metric),
+        ("ms_ssim", ms_ssim_metric),
+        ("flip", flip_metric),
+    ]);
+    let lpips_absent = lpips_metric.map(|metric| metrics.insert("lpips", metric)).err();
     let n = images.len() as f64;
     let steady = if times.len() > 1 { &times[1..] } else { &times[..] };
     let frame_ms = FrameMs {
@@ -216,20 +250,16 @@ pub fn evaluate(
         lost_blocks: lost_share(&images),
         ssim_skimage: skimage / n,
         ms_ssim: ms_ssim.map(|s| s / n),
+        lpips: if lpips_absent.is_none() { mean(images.iter().filter_map(|i| i.lpips)) } else { None },
+        lpips_absent,
+        flip: images.iter().map(|i| i.flip).sum::<f64>() / n,
         size_mb: model.size.into(),
         frame_ms,
         gaussians: model.gaussians.len(),
         dynamic_gaussians: player.moving(),
         work: player.work,
-        protocol: "8-bit RGB images, range 255; PSNR over all pixels and channels; SSIM 11x11 Gaussian sigma 1.5, zero padding (Inria); means over images; times on the stated device, synchronised, first frame apart",
-        metrics: BTreeMap::from([
-            ("psnr_db", psnr_metric),
-            ("psnr_dynamic_db", dynamic_metric),
-            ("ssim", ssim_metric),
-            ("ssim_dynamic", ssim_dynamic_metric),
-            ("ssim_skimage", skimage_metric),
-            ("ms_ssim", ms_ssim_metric),
-        ]),
+        protocol: "8-bit RGB images, range 255; PSNR over all pixels and channels; SSIM 11x11 Gaussian sigma 1.5, zero padding (Inria); LPIPS v0.1 on AlexNet; FLIP at 67 pixels per degree; means over images; times on the stated device, synchronised, first frame apart",
+        metrics,
         images,
     })
 }

@@ -4,8 +4,10 @@ use super::Context;
 use burn::tensor::Device;
 use cc4dgs::video;
 use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::metrics::{WeightsId, installed_lpips, lpips_places};
 use cc4dgs_core::{Adapter, Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, adapters, auto_device, parse_device};
 use serde::Serialize;
+use std::path::PathBuf;
 use std::time::Instant;
 
 /// The reference rasterizer: slow, in float64.
@@ -27,8 +29,26 @@ struct Report {
     auto: &'static str,
     auto_reason: String,
     ffmpeg: Option<String>,
+    lpips: LpipsReport,
     self_check: Vec<Check>,
     healthy: bool,
+}
+
+/// The weights of LPIPS, which are not part of the program.
+#[derive(Serialize)]
+struct LpipsReport {
+    /// The file in use, or `built in`.
+    source: Option<String>,
+    weights: Option<&'static WeightsId>,
+    /// Why there are none.
+    absent: Option<&'static str>,
+    /// The files that are looked at, in order.
+    places: Vec<PathBuf>,
+}
+
+fn lpips() -> LpipsReport {
+    let found = installed_lpips();
+    LpipsReport { source: found.map(|f| f.source.clone()).ok(), weights: found.map(|f| f.network.id()).ok(), absent: found.err(), places: lpips_places() }
 }
 
 #[derive(Serialize)]
@@ -83,6 +103,7 @@ pub fn run(context: &Context) -> Result<()> {
         auto,
         auto_reason,
         ffmpeg: video::ffmpeg_version().ok(),
+        lpips: lpips(),
         self_check,
         healthy,
     };
@@ -99,6 +120,10 @@ fn text(r: &Report) -> String {
     lines.extend(r.adapters.iter().enumerate().map(|(i, a)| adapter_text(i, a)));
     lines.push(format!("device auto     takes {}: {}", r.auto, r.auto_reason));
     lines.push(format!("ffmpeg: {}", r.ffmpeg.as_deref().unwrap_or("not found (needed only for videos)")));
+    lines.push(match (&r.lpips.source, r.lpips.weights) {
+        (Some(source), Some(weights)) => format!("LPIPS: weights {source} ({} v{}, xxh3 {})", weights.network, weights.version, weights.xxh3),
+        _ => r.lpips.absent.unwrap_or_default().to_string(),
+    });
     lines.extend(r.self_check.iter().map(|c| {
         let result = match (&c.problem, c.max_difference) {
             (Some(problem), _) => format!("FAILED: {problem}"),

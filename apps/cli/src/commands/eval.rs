@@ -161,6 +161,10 @@ pub fn text(report: &FullReport) -> String {
     let mut lines = vec![
         format!("{} on {} ({} images)", report.model.display(), e.scene, e.images.len()),
         format!("  PSNR {:.3} dB   SSIM {:.4} (Inria) {:.4} (skimage)   MS-SSIM {ms_ssim}", e.psnr_db, e.ssim, e.ssim_skimage),
+        match &e.lpips_absent {
+            None => format!("  LPIPS {} (AlexNet)   FLIP {:.4}", e.lpips.map_or_else(|| "-".to_string(), |v| format!("{v:.4}")), e.flip),
+            Some(reason) => format!("  FLIP {:.4}   {reason}", e.flip),
+        },
         e.psnr_dynamic_db
             .zip(e.ssim_dynamic)
             .map_or_else(String::new, |(psnr, ssim)| format!("  PSNR {psnr:.3} dB   SSIM {ssim:.4} (Inria) where something moves")),

@@ -9,6 +9,7 @@ mod eval;
 mod info;
 mod plugins;
 mod render;
+mod report;
 mod storage;
 mod train;
 
@@ -61,6 +62,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),
+        Command::Report(args) => report::run(&context, args),
         Command::Info(args) => info::run(&context, args),
         Command::Plugins(args) => plugins::run(&context, args),
         Command::Doctor(_) => doctor::run(&context),

@@ -1,8 +1,9 @@
 //! A metric and everything that its score depends on.
 
-use super::{Planes, SsimConvention, ms_ssim, psnr, ssim};
+use super::{Lpips, Planes, SsimConvention, WeightsId, flip, ms_ssim, psnr, ssim};
 use crate::{Error, Image8, Result, Split};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
+use std::sync::Arc;
 
 /// Which formula.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -14,6 +15,10 @@ pub enum MetricKind {
     Ssim,
     /// Multi-scale structural similarity (pytorch-msssim, float64 window).
     MsSsim,
+    /// The learned perceptual distance, version 0.1 on AlexNet: lower is better.
+    Lpips,
+    /// The visible difference on flipping between the images, mean over pixels: lower is better.
+    Flip,
 }
 
 /// Rounding of pixel values before they are compared.
@@ -85,13 +90,32 @@ pub struct Protocol {
     pub mask: MaskRule,
     /// The images that the mean is over, once known.
     pub frames: Option<FrameSet>,
+    /// The network, for learned metrics.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub weights: Option<WeightsId>,
+    /// How much of the image the eye sees, for metrics with a viewing distance.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pixels_per_degree: Option<f64>,
 }
 
 /// A metric with its [`Protocol`]. Only the constructors below create one, so the protocol always states what is computed.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(transparent)]
+#[derive(Clone, Debug)]
 pub struct Metric {
     protocol: Protocol,
+    /// Of LPIPS.
+    network: Option<Arc<Lpips>>,
+}
+
+impl PartialEq for Metric {
+    fn eq(&self, other: &Self) -> bool {
+        self.protocol == other.protocol
+    }
+}
+
+impl Serialize for Metric {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        self.protocol.serialize(serializer)
+    }
 }
 
 impl Metric {
@@ -106,6 +130,18 @@ impl Metric {
     /// MS-SSIM of data range 1.
     pub fn ms_ssim(rounding: Rounding) -> Self {
         Self::new(MetricKind::MsSsim, None, rounding, Some(SsimConvention::Skimage.window()), Some(Padding::Valid))
+    }
+    /// LPIPS of colours in 0..1, which the network sees in -1..1.
+    pub fn lpips(network: Arc<Lpips>, rounding: Rounding) -> Self {
+        let mut metric = Self::new(MetricKind::Lpips, None, rounding, None, None);
+        metric.protocol.weights = Some(network.id().clone());
+        Self { network: Some(network), ..metric }
+    }
+    /// FLIP of images in sRGB, seen with `pixels_per_degree` (usually [`super::FLIP_PIXELS_PER_DEGREE`]).
+    pub fn flip(pixels_per_degree: f64, rounding: Rounding) -> Self {
+        let mut metric = Self::new(MetricKind::Flip, None, rounding, None, None);
+        metric.protocol.pixels_per_degree = Some(pixels_per_degree);
+        metric
     }
     /// The same metric over masked pixels only.
     pub fn masked(mut self) -> Self {
@@ -151,16 +187,33 @@ impl Metric {
         self.compute(&Planes::from_image8(reference)?, &Planes::from_image8(render)?, None)
     }
     fn compute(&self, reference: &Planes, render: &Planes, mask: Option<&[bool]>) -> Result<f64> {
-        match (self.protocol.metric, self.protocol.convention) {
-            (MetricKind::Psnr, _) => psnr(reference, render, mask),
-            (MetricKind::Ssim, convention) => ssim(reference, render, convention.unwrap_or(SsimConvention::Skimage), mask),
-            (MetricKind::MsSsim, _) if mask.is_some() => {
-                Err(Error::unsupported("MS-SSIM with a mask", "there is no established definition of masks at pooled scales", "Use SSIM for masked pixels"))
+        match self.protocol.metric {
+            MetricKind::Psnr => psnr(reference, render, mask),
+            MetricKind::Ssim => ssim(reference, render, self.protocol.convention.unwrap_or(SsimConvention::Skimage), mask),
+            kind if mask.is_some() => {
+                Err(Error::unsupported(format!("{kind:?} with a mask"), "there is no established definition of it", "Use SSIM for masked pixels"))
             }
-            (MetricKind::MsSsim, _) => ms_ssim(reference, render),
+            MetricKind::MsSsim => ms_ssim(reference, render),
+            MetricKind::Lpips => match &self.network {
+                Some(network) => network.distance(reference, render),
+                None => Err(Error::parameter("LPIPS", "the metric has no network", "Make it with Metric::lpips")),
+            },
+            MetricKind::Flip => flip(reference, render, self.protocol.pixels_per_degree.unwrap_or(super::FLIP_PIXELS_PER_DEGREE)),
         }
     }
     fn new(metric: MetricKind, convention: Option<SsimConvention>, rounding: Rounding, window: Option<Window>, padding: Option<Padding>) -> Self {
-        Self { protocol: Protocol { metric, convention, data_range: 1.0, rounding, window, padding, mask: MaskRule::Whole, frames: None } }
+        let protocol = Protocol {
+            metric,
+            convention,
+            data_range: 1.0,
+            rounding,
+            window,
+            padding,
+            mask: MaskRule::Whole,
+            frames: None,
+            weights: None,
+            pixels_per_degree: None,
+        };
+        Self { protocol, network: None }
     }
 }

@@ -1,0 +1,76 @@
+//! Where the weights of LPIPS are looked for.
+
+use super::Lpips;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
+
+/// Names a weights file; nothing else is looked at then.
+pub const LPIPS_VARIABLE: &str = "CC4DGS_LPIPS";
+/// Name of the weights file in the other places.
+pub const LPIPS_FILE: &str = "lpips-alexnet.safetensors";
+
+/// The weights of this program, and where they are from.
+#[derive(Clone, Debug)]
+pub struct InstalledLpips {
+    /// The network.
+    pub network: Arc<Lpips>,
+    /// The file, or `built in`.
+    pub source: String,
+}
+
+/// The files that [`installed_lpips`] looks at, in order: the one that the variable `CC4DGS_LPIPS` names, or else `lpips-alexnet.safetensors` in the
+/// user's data folder (`$XDG_DATA_HOME/cc4dgs` or `~/.local/share/cc4dgs`; `~/Library/Application Support/cc4dgs` on macOS, `%APPDATA%\cc4dgs` on Windows)
+/// and in the folder of the program.
+pub fn lpips_places() -> Vec<PathBuf> {
+    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    if let Some(file) = variable(LPIPS_VARIABLE) {
+        return vec![file];
+    }
+    let data = if cfg!(windows) {
+        variable("APPDATA")
+    } else if cfg!(target_os = "macos") {
+        variable("HOME").map(|home| home.join("Library/Application Support"))
+    } else {
+        variable("XDG_DATA_HOME").or_else(|| variable("HOME").map(|home| home.join(".local/share")))
+    };
+    let beside = std::env::current_exe().ok().and_then(|program| Some(program.parent()?.to_path_buf()));
+    data.map(|folder| folder.join("cc4dgs")).into_iter().chain(beside).map(|folder| folder.join(LPIPS_FILE)).collect()
+}
+
+/// The weights that this process uses, read once: of the first file of [`lpips_places`] that exists, else those that the feature `embed-lpips` built in.
+///
+/// # Errors
+/// A sentence that says why there are none: no file exists, or the first one is unreadable.
+pub fn installed_lpips() -> Result<&'static InstalledLpips, &'static str> {
+    static FOUND: OnceLock<Result<InstalledLpips, String>> = OnceLock::new();
+    FOUND.get_or_init(find).as_ref().map_err(String::as_str)
+}
+
+fn find() -> Result<InstalledLpips, String> {
+    let places = lpips_places();
+    let named = std::env::var_os(LPIPS_VARIABLE).is_some_and(|v| !v.is_empty());
+    if let Some(file) = places.iter().find(|file| named || file.is_file()) {
+        let network = Lpips::read(file).map_err(|e| format!("LPIPS is not measured: {e}"))?;
+        return Ok(InstalledLpips { network: Arc::new(network), source: file.display().to_string() });
+    }
+    match embedded() {
+        Some(bytes) => {
+            let network = Lpips::from_bytes(bytes).map_err(|e| format!("LPIPS is not measured: the weights built in: {e}"))?;
+            Ok(InstalledLpips { network: Arc::new(network), source: "built in".into() })
+        }
+        None => Err(format!(
+            "LPIPS is not measured: its weights are neither built in nor at {}. Make the file with benches/lpips_weights.py, or name one in {LPIPS_VARIABLE}",
+            places.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(" or ")
+        )),
+    }
+}
+
+#[cfg(feature = "embed-lpips")]
+fn embedded() -> Option<&'static [u8]> {
+    Some(include_bytes!(env!("CC4DGS_LPIPS", "the feature embed-lpips needs the variable CC4DGS_LPIPS: the absolute path of the weights file to build in")))
+}
+
+#[cfg(not(feature = "embed-lpips"))]
+fn embedded() -> Option<&'static [u8]> {
+    None
+}

@@ -1,0 +1,207 @@
+//! The plots of a scene, made from its rows.
+
+use super::bars::{Bars, Strips, swatch};
+use super::pareto::front;
+use super::plot::{Axis, COLOURS, Plot, Point, Series, marker};
+use super::rows::{Better, DECODE, ENCODE, FRAME, LPIPS, PSNR, Quantity, Row, SIZE, SSIM, TRAINING};
+use super::text::html;
+use crate::sweep::CellResult;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// One colour per training and one marker per codec, the same in all plots of a report.
+#[derive(Debug)]
+pub struct Key {
+    trainings: Vec<String>,
+    codecs: Vec<String>,
+}
+
+impl Key {
+    /// Of all rows of a report.
+    pub fn of<'a>(rows: impl Iterator<Item = &'a Row<'a>>) -> Self {
+        let (trainings, codecs): (BTreeSet<String>, BTreeSet<String>) = rows.map(|row| (row.training(), row.codec.to_string())).unzip();
+        Self { trainings: trainings.into_iter().collect(), codecs: codecs.into_iter().collect() }
+    }
+    /// Index of the colour of a training.
+    pub fn colour(&self, row: &Row) -> usize {
+        self.trainings.iter().position(|name| *name == row.training()).unwrap_or(0)
+    }
+    fn marker(&self, row: &Row) -> usize {
+        self.codecs.iter().position(|name| name == row.codec).unwrap_or(0)
+    }
+    /// What colours and shapes mean.
+    pub fn legend(&self) -> String {
+        let colours: String = self.trainings.iter().enumerate().map(|(i, name)| swatch(COLOURS[i % COLOURS.len()], name)).collect();
+        let shape =
+            |i: usize, name: &String| format!("<span><svg viewBox=\"0 0 14 14\" class=\"swatch\">{}</svg>{}</span> ", marker(i, 7.0, 7.0, "#333"), html(name));
+        let shapes: String = self.codecs.iter().enumerate().map(|(i, name)| shape(i, name)).collect();
+        format!("<p class=\"legend\"><i>training:</i> {colours}</p><p class=\"legend\"><i>codec:</i> {shapes}</p>\n")
+    }
+}
+
+/// All figures of a scene but images, as HTML.
+pub fn figures(rows: &[Row], key: &Key) -> String {
+    let mut out = String::from(
+        "<h3>Rate and distortion</h3>\n<p class=\"note\">A point is the mean over seeds, its whisker the least and the largest seed. Lines join the settings and profiles of one method with one codec.</p>\n<div class=\"figures\">",
+    );
+    let plots = |plots: &mut dyn Iterator<Item = Plot>| plots.filter(|plot| !plot.is_empty()).map(|plot| plot.figure()).collect::<String>();
+    out += &plots(&mut [&PSNR, &SSIM, &LPIPS].into_iter().map(|metric| rate_distortion(rows, metric, key)));
+    out += "</div>\n<h3>Time and size against error</h3>\n<p class=\"note\">Ringed points are on the Pareto front: nothing here is better in one of the two without being worse in the other. Left is cheaper. Training time is shown with the codec of the highest PSNR.</p>\n";
+    let best: Vec<Row> = best_codecs(rows).into_iter().cloned().collect();
+    for metric in [&PSNR, &LPIPS] {
+        let costs = [(&FRAME, rows), (&TRAINING, &best), (&ENCODE, rows), (&DECODE, rows), (&SIZE, rows)];
+        let figures = plots(&mut costs.into_iter().map(|(cost, rows)| pareto(rows, cost, metric, key)));
+        out += &format!("<div class=\"figures\">{figures}</div>\n");
+    }
+    out += "<h3>Where time and bytes go</h3>\n<div class=\"figures bars\">";
+    out += &stage_bars(rows).figure();
+    out += &frame_bars(rows).figure();
+    out += &storage_bars(rows).figure();
+    out += "</div>\n<h3>Training, frames, seeds</h3>\n<div class=\"figures\">";
+    out += &plots(&mut [training_curves(rows, key, false), training_curves(rows, key, true), per_frame(rows, key)].into_iter());
+    out += "</div>\n<div class=\"figures bars\">";
+    if rows.iter().any(|row| row.cells.len() > 1) {
+        let values = |row: &Row| row.cells.iter().filter_map(|cell| PSNR.of(cell)).collect();
+        let lines = rows.iter().map(|row| (row.name(), key.colour(row), values(row))).collect();
+        out += &Strips { title: "Every seed, and the mean".into(), axis: PSNR.title(), lines }.figure();
+    }
+    out + "</div>\n"
+}
+
+fn point(row: &Row, cost: &Quantity, metric: &Quantity) -> Option<Point> {
+    let (x, y) = (row.spread(cost)?, row.spread(metric)?);
+    let hint = format!("{}: {} {}, {} {}", row.name(), x.text(cost.digits), cost.title(), y.text(metric.digits), metric.title());
+    Some(Point { x: x.mean, y: y.mean, y_range: Some((y.low, y.high)), hint })
+}
+
+fn points(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key) -> Vec<Series> {
+    let series = |row: &Row| {
+        let points = point(row, cost, metric).into_iter().collect();
+        Series { colour: key.colour(row), marker: Some(key.marker(row)), line: false, points }
+    };
+    rows.iter().map(series).collect()
+}
+
+fn metric_axis(metric: &Quantity) -> Axis {
+    let arrow = if metric.better == Better::Lower { ", lower is better" } else { "" };
+    Axis::linear(format!("{}{arrow}", metric.title()))
+}
+
+fn rate_distortion(rows: &[Row], metric: &Quantity, key: &Key) -> Plot {
+    let mut curves: BTreeMap<(&str, &str), Vec<(usize, Point)>> = BTreeMap::new();
+    for row in rows {
+        if let Some(point) = point(row, &SIZE, metric) {
+            curves.entry((row.method, row.codec_family())).or_default().push((key.colour(row), point));
+        }
+    }
+    let mut series: Vec<Series> = curves
+        .into_values()
+        .filter(|points| points.len() > 1)
+        .map(|mut points| {
+            points.sort_by(|a, b| a.1.x.total_cmp(&b.1.x));
+            Series { colour: points[0].0, marker: None, line: true, points: points.into_iter().map(|(_, p)| p).collect() }
+        })
+        .collect();
+    series.extend(points(rows, &SIZE, metric, key));
+    Plot { title: format!("{} against size", metric.name), x: Axis::ranged("archive (MB)"), y: metric_axis(metric), series, front: Vec::new() }
+}
+
+fn pareto(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key) -> Plot {
+    let means: Vec<(f64, f64)> = rows.iter().filter_map(|row| point(row, cost, metric)).map(|p| (p.x, p.y)).collect();
+    let best = front(&means, metric.better == Better::Lower).into_iter().map(|i| means[i]).collect();
+    Plot {
+        title: format!("{} against {}", metric.name, cost.name),
+        x: Axis::ranged(cost.title()),
+        y: metric_axis(metric),
+        series: points(rows, cost, metric, key),
+        front: best,
+    }
+}
+
+/// The first row of each training: all its codecs share the training.
+fn trainings<'r, 'a>(rows: &'r [Row<'a>]) -> Vec<&'r Row<'a>> {
+    let mut seen = BTreeSet::new();
+    rows.iter().filter(|row| seen.insert(row.training_key())).collect()
+}
+
+/// The row of each training with the highest mean PSNR.
+pub fn best_codecs<'r, 'a>(rows: &'r [Row<'a>]) -> Vec<&'r Row<'a>> {
+    let psnr = |row: &Row| row.spread(&PSNR).map_or(f64::NEG_INFINITY, |s| s.mean);
+    let best = |first: &'r Row<'a>| {
+        let of_training = rows.iter().filter(|row| row.training_key() == first.training_key());
+        of_training.fold(first, |best, row| if psnr(row) > psnr(best) { row } else { best })
+    };
+    trainings(rows).into_iter().map(best).collect()
+}
+
+fn mean(row: &Row, value: impl Fn(&CellResult) -> f64) -> f64 {
+    row.cells.iter().map(|cell| value(cell).max(0.0)).sum::<f64>() / row.cells.len() as f64
+}
+
+fn stage_bars(rows: &[Row]) -> Bars {
+    let mut stages: Vec<String> = ["coarse", "score", "main"].map(str::to_string).to_vec();
+    let named: BTreeSet<&String> = rows.iter().flat_map(|row| &row.cells).flat_map(|cell| cell.cost.stage_seconds.keys()).collect();
+    stages.retain(|stage| named.contains(stage));
+    let others: Vec<String> = named.into_iter().filter(|stage| !stages.contains(stage)).cloned().collect();
+    stages.extend(others);
+    let stage_sum = |cell: &CellResult| cell.cost.stage_seconds.values().sum::<f64>();
+    let values = |row: &Row| {
+        let mut parts: Vec<f64> = stages.iter().map(|stage| mean(row, |cell| cell.cost.stage_seconds.get(stage).copied().unwrap_or(0.0))).collect();
+        parts.push(mean(row, |cell| cell.cost.training_seconds - stage_sum(cell)));
+        parts
+    };
+    let lines = trainings(rows).into_iter().map(|row| (row.training(), values(row))).collect();
+    let parts = stages.iter().cloned().chain(["reading, checks, saving".to_string()]).collect();
+    Bars { title: "Training by stage, mean over seeds".into(), axis: "wall time (s)".into(), parts, lines }
+}
+
+fn frame_bars(rows: &[Row]) -> Bars {
+    let values = |row: &Row| vec![mean(row, |cell| cell.cost.frame_ms.field), mean(row, |cell| cell.cost.frame_ms.raster)];
+    let lines = best_codecs(rows).into_iter().map(|row| (row.name(), values(row))).collect();
+    let parts = ["deformer", "rasterizer"].map(str::to_string).to_vec();
+    Bars { title: "A frame after the first, median; codec with the highest PSNR".into(), axis: "time (ms)".into(), parts, lines }
+}
+
+fn storage_bars(rows: &[Row]) -> Bars {
+    let values = |row: &Row| {
+        let part = |bytes: fn(&CellResult) -> u64| mean(row, |cell| bytes(cell) as f64 / 1e6);
+        let other = |cell: &CellResult| cell.storage.total_bytes.saturating_sub(cell.storage.deform_bytes).saturating_sub(cell.storage.point_cloud_bytes);
+        vec![part(|cell| cell.storage.deform_bytes), part(|cell| cell.storage.point_cloud_bytes), part(other)]
+    };
+    let lines = rows.iter().map(|row| (row.name(), values(row))).collect();
+    let parts = ["deformer", "Gaussians", "header and metadata"].map(str::to_string).to_vec();
+    Bars { title: "Archive by part, mean over seeds".into(), axis: "size (MB)".into(), parts, lines }
+}
+
+fn training_curves(rows: &[Row], key: &Key, by_time: bool) -> Plot {
+    let mut series = Vec::new();
+    for row in trainings(rows) {
+        for cell in &row.cells {
+            let x = |i: usize| if by_time { cell.cost.curve_seconds[i] / 60.0 } else { cell.curve.iteration[i] as f64 };
+            let points = cell.curve.psnr_db.iter().enumerate().map(|(i, y)| Point { x: x(i), y: *y, y_range: None, hint: String::new() }).collect();
+            series.push(Series { colour: key.colour(row), marker: None, line: true, points });
+        }
+    }
+    let (title, x) =
+        if by_time { ("Training views by time, a line per seed", "wall time (min)") } else { ("Training views by iteration, a line per seed", "iteration") };
+    Plot { title: title.into(), x: Axis::linear(x), y: Axis::linear("PSNR of training views (dB)"), series, front: Vec::new() }
+}
+
+fn per_frame(rows: &[Row], key: &Key) -> Plot {
+    let mut series = Vec::new();
+    for row in best_codecs(rows) {
+        let mut frames: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
+        for image in row.cells.iter().flat_map(|cell| &cell.images) {
+            if let Some(psnr) = image.scores.get(PSNR.key) {
+                let (sum, count) = frames.entry(image.frame).or_default();
+                (*sum, *count) = (*sum + psnr, *count + 1.0);
+            }
+        }
+        let point = |(frame, (sum, count)): (usize, (f64, f64))| Point { x: frame as f64, y: sum / count, y_range: None, hint: String::new() };
+        let points: Vec<Point> = frames.into_iter().map(point).collect();
+        if points.len() > 1 {
+            series.push(Series { colour: key.colour(row), marker: None, line: true, points });
+        }
+    }
+    let title = "Held-out views over the sequence, mean over cameras and seeds".into();
+    Plot { title, x: Axis::linear("frame"), y: Axis::linear(PSNR.title()), series, front: Vec::new() }
+}

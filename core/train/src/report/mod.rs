@@ -1,0 +1,192 @@
+//! Reports: an HTML page that needs no network, and tables as CSV, Markdown and LaTeX, from results of sweeps. Equal results give equal bytes.
+
+mod bars;
+mod charts;
+mod images;
+mod page;
+mod pareto;
+mod plot;
+mod published;
+mod rows;
+mod tables;
+mod text;
+
+pub use rows::{Better, QUANTITIES, Quantity, Row, Spread, rows};
+pub use tables::{Cell, Table};
+
+use crate::sweep::{CellResult, RESULTS, check_comparable, read_results};
+use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::{Error, Result};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// Whose images a report shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ImageChoice {
+    /// Nobody's.
+    None,
+    /// Those of built-in scenes, which may be published.
+    BuiltIn,
+    /// All that the folder has. Images of third-party datasets stay on the machine.
+    All,
+}
+
+/// What a report shows.
+#[derive(Clone, Debug)]
+pub struct ReportOptions {
+    /// Heading; the names of the sweeps where absent.
+    pub title: Option<String>,
+    /// Whose images.
+    pub images: ImageChoice,
+    /// Views per scene.
+    pub views: usize,
+    /// `KEY=VALUE` with the keys `scene`, `method`, `setting`, `codec`, `seed`, `device`, `split`: only results that have all of them; several values of a key
+    /// are alternatives.
+    pub only: Vec<String>,
+}
+
+impl Default for ReportOptions {
+    fn default() -> Self {
+        Self { title: None, images: ImageChoice::BuiltIn, views: 3, only: Vec::new() }
+    }
+}
+
+/// The text of a report's files.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Report {
+    /// The page.
+    pub html: String,
+    /// All rows.
+    pub csv: String,
+    /// The tables of the page.
+    pub markdown: String,
+    /// The tables of the page.
+    pub latex: String,
+    /// Results that it is made of.
+    pub cells: usize,
+}
+
+/// The files of a report.
+#[derive(Clone, Debug, Serialize)]
+pub struct ReportFiles {
+    /// The page.
+    pub html: PathBuf,
+    /// All rows.
+    pub csv: PathBuf,
+    /// The tables.
+    pub markdown: PathBuf,
+    /// The tables.
+    pub latex: PathBuf,
+    /// Results that it is made of.
+    pub cells: usize,
+    /// Size of the page in bytes.
+    pub html_bytes: usize,
+}
+
+/// Makes the report of the results in `path` (see [`read_results`]). The folder of images is `path` itself, the folder of a file, or that of a folder called
+/// `results`.
+///
+/// # Errors
+/// What reading reports; [`Error::Data`] for results that do not belong into one table, and for damaged images; [`Error::Parameter`] for options.
+pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
+    let results = chosen(read_results(path)?, &options.only)?;
+    check_comparable(&results)?;
+    let scenes = rows(&results)?;
+    let beside = path.is_file() || path.file_name().is_some_and(|name| name == RESULTS);
+    let folder = if beside { path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")) } else { path };
+    let public = images::built_in(&scenes);
+    let key = charts::Key::of(scenes.values().flatten());
+
+    let title = options.title.clone().unwrap_or_else(|| {
+        let sweeps: std::collections::BTreeSet<&str> = results.iter().map(|r| r.sweep.as_str()).collect();
+        format!("Results: {}", sweeps.into_iter().collect::<Vec<_>>().join(", "))
+    });
+    let anchors: Vec<(String, String)> = scenes.keys().enumerate().map(|(i, scene)| (format!("scene-{i}"), scene.to_string())).collect();
+    let mut links = anchors.clone();
+    links.extend([("protocols".to_string(), "protocols".to_string()), ("published".to_string(), "reported by papers".to_string())]);
+    let mut body = page::contents(&links) + &page::facts(&results) + &key.legend();
+    let mut markdown = format!(
+        "# {}\n\nMean ± sample standard deviation over seeds; best of a column in bold. ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n",
+        text::markdown(&title)
+    );
+    let mut latex = String::from("% Mean and sample standard deviation over seeds. MB are 10^6 bytes.\n");
+    for (i, (scene, rows)) in scenes.iter().enumerate() {
+        let table = tables::summary(scene, rows);
+        markdown += &table.markdown();
+        latex += &table.latex();
+        let class = if i == 0 { " class=\"first\"" } else { "" };
+        body += &format!("<h2 id=\"scene-{i}\"{class}>{}</h2>\n", text::html(scene));
+        body += &table.html();
+        body += &charts::figures(rows, &key);
+        if options.images == ImageChoice::All || (options.images == ImageChoice::BuiltIn && public.contains(scene)) {
+            body += &images::gallery(folder, scene, rows, options.views)?;
+        }
+    }
+    body += "<h2 id=\"protocols\">Protocols</h2>\n";
+    body += &page::protocols(&results);
+    body += &format!("<h2 id=\"published\">Reported by papers</h2>\n<p class=\"warning\">{}</p>\n<div class=\"reported\">\n", text::html(published::NOTICE));
+    markdown += &format!("# Reported by papers\n\n{}\n\n", text::markdown(published::NOTICE));
+    for table in published::tables()? {
+        body += &format!("<h3>{}</h3>\n{}", text::html(&table.title), table.html());
+        markdown += &table.markdown();
+        latex += &table.latex();
+    }
+    body += "</div>\n";
+    Ok(Report { html: page::page(&title, &body), csv: tables::csv(&scenes), markdown, latex, cells: results.len() })
+}
+
+/// Makes a report and writes the page to `out`, and the tables beside it as `.csv`, `.md` and `.tex`.
+///
+/// # Errors
+/// As [`report`], and [`Error::Io`]; [`Error::Parameter`] where `out` does not end in `.html`.
+pub fn write_report(path: &Path, out: &Path, options: &ReportOptions) -> Result<ReportFiles> {
+    if out.extension().is_none_or(|extension| extension != "html") {
+        return Err(Error::parameter("--out", format!("{} does not end in .html", out.display()), "Name an HTML file; the tables are written beside it"));
+    }
+    let report = report(path, options)?;
+    if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+    }
+    let write = |extension: &str, text: &str| {
+        let file = out.with_extension(extension);
+        write_atomically(&file, text.as_bytes()).map(|()| file)
+    };
+    Ok(ReportFiles {
+        csv: write("csv", &report.csv)?,
+        markdown: write("md", &report.markdown)?,
+        latex: write("tex", &report.latex)?,
+        html: write("html", &report.html)?,
+        cells: report.cells,
+        html_bytes: report.html.len(),
+    })
+}
+
+/// The results that `only` asks for.
+fn chosen(results: Vec<CellResult>, only: &[String]) -> Result<Vec<CellResult>> {
+    const KEYS: [&str; 7] = ["scene", "method", "setting", "codec", "seed", "device", "split"];
+    let mut wanted: std::collections::BTreeMap<&str, Vec<&str>> = std::collections::BTreeMap::new();
+    for text in only {
+        let pair = text.split_once('=').filter(|(key, _)| KEYS.contains(key));
+        let (key, value) =
+            pair.ok_or_else(|| Error::parameter("--where", text.clone(), format!("Write KEY=VALUE with one of the keys {}", KEYS.join(", "))))?;
+        wanted.entry(key).or_default().push(value);
+    }
+    let of = |r: &CellResult, key: &str| match key {
+        "scene" => r.axes.scene.clone(),
+        "method" => r.axes.method.clone(),
+        "setting" => r.axes.setting.clone(),
+        "codec" => r.axes.codec.clone(),
+        "seed" => r.axes.seed.to_string(),
+        "device" => r.provenance.device.name.clone(),
+        _ => format!("{:?}", r.split).to_lowercase(),
+    };
+    let total = results.len();
+    let kept: Vec<CellResult> = results.into_iter().filter(|r| wanted.iter().all(|(key, values)| values.contains(&of(r, key).as_str()))).collect();
+    if kept.is_empty() {
+        return Err(Error::parameter("--where", format!("none of {total} results has {}", only.join(" and ")), "Compare with the axes of the results"));
+    }
+    Ok(kept)
+}
+
+#[cfg(test)]
+mod tests;

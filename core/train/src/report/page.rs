@@ -1,0 +1,77 @@
+//! The HTML page: style, the script of the sliders, and the facts about how the results were made.
+
+use super::text::html;
+use crate::sweep::CellResult;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+
+/// The page around `body`. Nothing is loaded from anywhere: the content security policy forbids it.
+pub fn page(title: &str, body: &str) -> String {
+    let title = html(title);
+    format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n<title>{title}</title>\n<style>\n{STYLE}</style></head><body>\n<h1>{title}</h1>\n{body}<script>\n{SCRIPT}</script>\n</body></html>\n"
+    )
+}
+
+const STYLE: &str = include_str!("page.css");
+const SCRIPT: &str = include_str!("page.js");
+
+/// A line of contents.
+pub fn contents(entries: &[(String, String)]) -> String {
+    let links: Vec<String> = entries.iter().map(|(anchor, name)| format!("<a href=\"#{}\">{}</a>", html(anchor), html(name))).collect();
+    format!("<nav>{}</nav>\n", links.join(" · "))
+}
+
+/// How the results were made: program, device, data, protocols.
+pub fn facts(results: &[CellResult]) -> String {
+    let set = |value: &dyn Fn(&CellResult) -> String| {
+        let values: BTreeSet<String> = results.iter().map(value).collect();
+        values.into_iter().collect::<Vec<_>>().join("; ")
+    };
+    let trainings: BTreeSet<&str> = results.iter().map(|r| r.training.as_str()).collect();
+    let seeds: BTreeSet<u64> = results.iter().map(|r| r.axes.seed).collect();
+    let commit = |r: &CellResult| if r.provenance.commit.is_empty() { "unknown".to_string() } else { r.provenance.commit.clone() };
+    let device = |r: &CellResult| {
+        let d = &r.provenance.device;
+        let adapter = d.adapter.as_ref().map_or_else(String::new, |name| format!(" on {name}, driver {}", d.driver.as_deref().unwrap_or("unknown")));
+        format!("{}{adapter}; {}, {} threads, {}", d.name, if d.processor.is_empty() { "unknown processor" } else { &d.processor }, d.threads, d.system)
+    };
+    let data = |r: &CellResult| {
+        format!("{}: {} (xxh3 {}), {}x{}, {} frames", r.axes.scene, r.provenance.data.path, r.provenance.data.hash, r.image_size[0], r.image_size[1], r.frames)
+    };
+    let rows = [
+        ("sweep", set(&|r| r.sweep.clone())),
+        (
+            "results",
+            format!("{} cells of {} trainings, seeds {}", results.len(), trainings.len(), seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")),
+        ),
+        ("program", set(&|r| format!("cc4dgs {}, commit {}", r.provenance.version, commit(r)))),
+        ("device", set(&device)),
+        ("split", set(&|r| format!("{:?}", r.split).to_lowercase())),
+        ("data", set(&data)),
+    ];
+    let mut out = String::from("<table class=\"facts\">\n");
+    for (name, value) in rows {
+        _ = writeln!(out, "<tr><th>{name}</th><td>{}</td></tr>", html(&value));
+    }
+    out + "</table>\n"
+}
+
+/// The protocol of every metric, from the results themselves.
+pub fn protocols(results: &[CellResult]) -> String {
+    let mut metrics: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
+    for (name, score) in results.iter().flat_map(|r| &r.metrics) {
+        let entries = score.protocol.iter().filter(|(key, value)| !value.is_null() && *key != "frames").map(|(key, value)| {
+            let text = value.as_str().map_or_else(|| value.to_string(), str::to_string);
+            format!("{} {text}", key.replace('_', " "))
+        });
+        metrics.entry(name).or_default().insert(entries.collect::<Vec<_>>().join(", "));
+    }
+    let rows: String = metrics
+        .iter()
+        .map(|(name, texts)| format!("<tr><th>{}</th><td>{}</td></tr>\n", html(name), html(&texts.iter().cloned().collect::<Vec<_>>().join("; "))))
+        .collect();
+    format!(
+        "<table class=\"facts\">\n{rows}</table>\n<p class=\"note\">MB are 10⁶ bytes of the archive on disk. Times are wall times on the device above, synchronised; a frame is the mean of all frames but the first. ↑ high is better, ↓ low is better; ± is the sample standard deviation over seeds.</p>\n"
+    )
+}

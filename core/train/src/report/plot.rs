@@ -1,0 +1,273 @@
+//! Plots as inline SVG: axes with ticks and titles, lines, markers, bands of spread.
+
+use super::text::{html, short};
+use std::fmt::Write;
+
+/// Colours that stay apart for colour-blind readers and in print; beyond their number they repeat.
+pub const COLOURS: [&str; 12] =
+    ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#5b3e96", "#8c510a", "#3f3f3f", "#b2182b", "#7a8c00", "#00796b"];
+/// Number of shapes of [`marker`].
+pub const MARKERS: usize = 8;
+
+/// Size in pixels of the drawing, which scales with the page.
+const WIDTH: f64 = 430.0;
+const HEIGHT: f64 = 300.0;
+const LEFT: f64 = 62.0;
+const RIGHT: f64 = 14.0;
+const TOP: f64 = 12.0;
+const BOTTOM: f64 = 46.0;
+
+/// One axis.
+#[derive(Clone, Debug)]
+pub struct Axis {
+    /// What it shows, with the unit.
+    pub title: String,
+    /// Logarithmic where all values are positive and span more than a factor of eight.
+    pub may_be_log: bool,
+}
+
+impl Axis {
+    /// A linear axis.
+    pub fn linear(title: impl Into<String>) -> Self {
+        Self { title: title.into(), may_be_log: false }
+    }
+    /// An axis that is logarithmic where that helps.
+    pub fn ranged(title: impl Into<String>) -> Self {
+        Self { title: title.into(), may_be_log: true }
+    }
+}
+
+/// A point with what is said of it.
+#[derive(Clone, Debug)]
+pub struct Point {
+    pub x: f64,
+    pub y: f64,
+    /// Least and largest y over seeds.
+    pub y_range: Option<(f64, f64)>,
+    /// Shown when the mouse rests on it.
+    pub hint: String,
+}
+
+/// Points of one kind.
+#[derive(Clone, Debug)]
+pub struct Series {
+    /// Index into [`COLOURS`].
+    pub colour: usize,
+    /// Index of the [`marker`]; none for plain lines.
+    pub marker: Option<usize>,
+    /// Whether the points are joined.
+    pub line: bool,
+    pub points: Vec<Point>,
+}
+
+/// A plot.
+#[derive(Clone, Debug)]
+pub struct Plot {
+    /// What it says, above it.
+    pub title: String,
+    pub x: Axis,
+    pub y: Axis,
+    pub series: Vec<Series>,
+    /// Corners of a Pareto front, from left to right.
+    pub front: Vec<(f64, f64)>,
+}
+
+/// Maps values of an axis to pixels.
+#[derive(Debug)]
+pub(super) struct Scale {
+    low: f64,
+    high: f64,
+    log: bool,
+    from: f64,
+    to: f64,
+}
+
+impl Scale {
+    /// Covers `values` with a margin, between the pixels `from` and `to`.
+    pub(super) fn new(values: impl Iterator<Item = f64>, may_be_log: bool, from: f64, to: f64) -> Self {
+        let (mut low, mut high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+        if low > high {
+            (low, high) = (0.0, 1.0);
+        }
+        let log = may_be_log && low > 0.0 && high > 8.0 * low;
+        if log {
+            let margin = (high / low).powf(0.06);
+            (low, high) = (low / margin, high * margin);
+        } else {
+            let margin = if high > low { 0.06 * (high - low) } else { (0.05 * high.abs()).max(1e-3) };
+            // Counts and times do not go below zero.
+            let floor = if low >= 0.0 { 0.0 } else { f64::NEG_INFINITY };
+            (low, high) = ((low - margin).max(floor), high + margin);
+        }
+        Self { low, high, log, from, to }
+    }
+    pub(super) fn at(&self, value: f64) -> f64 {
+        let f = |v: f64| if self.log { v.max(f64::MIN_POSITIVE).ln() } else { v };
+        self.from + (f(value) - f(self.low)) / (f(self.high) - f(self.low)) * (self.to - self.from)
+    }
+    /// Ticks with their labels.
+    pub(super) fn ticks(&self) -> Vec<(f64, String)> {
+        let label = |v: f64, step: f64| {
+            let plain = v == 0.0 || (1e-4..1e6).contains(&v.abs());
+            if plain { short(v, (-step.abs().log10().floor()).clamp(0.0, 6.0) as usize) } else { format!("{v:e}") }
+        };
+        if !self.log {
+            let step = nice_step((self.high - self.low) / 5.0);
+            let (first, last) = ((self.low / step).ceil() as i64, (self.high / step).floor() as i64);
+            return (first..=last.min(first + 20)).map(|i| (i as f64 * step, label(i as f64 * step, step))).collect();
+        }
+        // From the power below: a value of it may still lie inside.
+        let decades = self.low.log10().floor() as i32..=self.high.log10().ceil() as i32;
+        let within = |v: &f64| (self.low..=self.high).contains(v);
+        let of = |digits: &[f64]| -> Vec<f64> { decades.clone().flat_map(|d| digits.iter().map(move |k| k * 10f64.powi(d))).filter(within).collect() };
+        let mut values = of(&[1.0, 2.0, 5.0]);
+        if values.len() > 7 {
+            values = of(&[1.0]);
+            let every = values.len().div_ceil(7);
+            values = values.into_iter().step_by(every).collect();
+        }
+        values.into_iter().map(|v| (v, label(v, 10f64.powf(v.log10().floor())))).collect()
+    }
+}
+
+/// 1, 2 or 5 times a power of ten, at least `least`.
+fn nice_step(least: f64) -> f64 {
+    let power = 10f64.powf(least.max(1e-9).log10().floor());
+    [1.0, 2.0, 5.0, 10.0].into_iter().map(|k| k * power).find(|step| *step >= least * 0.999).unwrap_or(10.0 * power)
+}
+
+/// The opening tag of a drawing with a name for readers that do not see it.
+pub(super) fn open_svg(width: f64, height: f64, name: &str) -> String {
+    format!("<svg viewBox=\"0 0 {width:.0} {height:.0}\" role=\"img\" aria-label=\"{}\">", html(name))
+}
+
+/// A marker at a point: circle, square, triangle, diamond, inverted triangle, plus, cross, ring.
+pub fn marker(kind: usize, x: f64, y: f64, colour: &str) -> String {
+    let path = |d: String| format!("<path d=\"{d}\" fill=\"{colour}\"/>");
+    let stroke = |d: String| format!("<path d=\"{d}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"2.4\"/>");
+    match kind % MARKERS {
+        0 => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4.5\" fill=\"{colour}\"/>"),
+        1 => format!("<rect x=\"{:.1}\" y=\"{:.1}\" width=\"8\" height=\"8\" fill=\"{colour}\"/>", x - 4.0, y - 4.0),
+        2 => path(format!("M{x:.1} {:.1}l5 9h-10z", y - 5.5)),
+        3 => path(format!("M{x:.1} {:.1}l5.5 5.5l-5.5 5.5l-5.5 -5.5z", y - 5.5)),
+        4 => path(format!("M{x:.1} {:.1}l5 -9h-10z", y + 5.5)),
+        5 => stroke(format!("M{:.1} {y:.1}h10M{x:.1} {:.1}v10", x - 5.0, y - 5.0)),
+        6 => stroke(format!("M{:.1} {:.1}l8 8m0 -8l-8 8", x - 4.0, y - 4.0)),
+        _ => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"#fff\" stroke=\"{colour}\" stroke-width=\"2.2\"/>"),
+    }
+}
+
+impl Plot {
+    /// Whether there is anything to draw.
+    pub fn is_empty(&self) -> bool {
+        self.series.iter().all(|s| s.points.is_empty())
+    }
+    /// A figure with the drawing.
+    pub fn figure(&self) -> String {
+        let points = || self.series.iter().flat_map(|s| &s.points);
+        let x = Scale::new(points().map(|p| p.x), self.x.may_be_log, LEFT, WIDTH - RIGHT);
+        let heights = points().flat_map(|p| [Some(p.y), p.y_range.map(|r| r.0), p.y_range.map(|r| r.1)]).flatten();
+        let y = Scale::new(heights, self.y.may_be_log, HEIGHT - BOTTOM, TOP);
+        let mut svg = open_svg(WIDTH, HEIGHT, &format!("{}: {} against {}", self.title, self.y.title, self.x.title));
+        self.axes(&mut svg, &x, &y);
+        if self.front.len() > 1 {
+            let corners = self.front.windows(2).map(|w| format!("H{:.1}V{:.1}", x.at(w[1].0), y.at(w[1].1))).collect::<String>();
+            let (first_x, first_y) = self.front[0];
+            _ = write!(svg, "<path class=\"front\" d=\"M{:.1} {:.1}{corners}\"/>", x.at(first_x), y.at(first_y));
+        }
+        for series in &self.series {
+            draw(&mut svg, series, &x, &y);
+        }
+        for (at_x, at_y) in &self.front {
+            _ = write!(svg, "<circle class=\"onfront\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"8\"/>", x.at(*at_x), y.at(*at_y));
+        }
+        format!("<figure><figcaption>{}</figcaption>{svg}</svg></figure>\n", html(&self.title))
+    }
+    fn axes(&self, svg: &mut String, x: &Scale, y: &Scale) {
+        let (bottom, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);
+        for (value, label) in x.ticks() {
+            let at = x.at(value);
+            _ = write!(
+                svg,
+                "<path class=\"grid\" d=\"M{at:.1} {TOP}V{bottom}\"/><text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{label}</text>",
+                bottom + 16.0
+            );
+        }
+        for (value, label) in y.ticks() {
+            let at = y.at(value);
+            _ = write!(
+                svg,
+                "<path class=\"grid\" d=\"M{LEFT} {at:.1}H{right}\"/><text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{label}</text>",
+                LEFT - 6.0,
+                at + 4.0
+            );
+        }
+        _ = write!(svg, "<path class=\"axis\" d=\"M{LEFT} {TOP}V{bottom}H{right}\"/>");
+        let log = |scale: &Scale| if scale.log { ", logarithmic" } else { "" };
+        _ = write!(
+            svg,
+            "<text class=\"title\" x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}{}</text>",
+            (LEFT + right) / 2.0,
+            HEIGHT - 8.0,
+            html(&self.x.title),
+            log(x)
+        );
+        let middle = (TOP + bottom) / 2.0;
+        _ = write!(
+            svg,
+            "<text class=\"title\" x=\"14\" y=\"{middle:.1}\" text-anchor=\"middle\" transform=\"rotate(-90 14 {middle:.1})\">{}{}</text>",
+            html(&self.y.title),
+            log(y)
+        );
+    }
+}
+
+fn draw(svg: &mut String, series: &Series, x: &Scale, y: &Scale) {
+    let colour = COLOURS[series.colour % COLOURS.len()];
+    if series.line && series.points.len() > 1 {
+        let path: Vec<String> = series.points.iter().map(|p| format!("{:.1} {:.1}", x.at(p.x), y.at(p.y))).collect();
+        _ = write!(svg, "<path class=\"line\" stroke=\"{colour}\" d=\"M{}\"/>", path.join("L"));
+    }
+    for p in &series.points {
+        let (at_x, at_y) = (x.at(p.x), y.at(p.y));
+        let range = p.y_range.filter(|(low, high)| high > low);
+        let whisker = range.map(|(low, high)| format!("<path class=\"range\" stroke=\"{colour}\" d=\"M{at_x:.1} {:.1}V{:.1}\"/>", y.at(low), y.at(high)));
+        if let Some(kind) = series.marker {
+            let shape = marker(kind, at_x, at_y, colour);
+            _ = write!(svg, "<g><title>{}</title>{}{shape}</g>", html(&p.hint), whisker.unwrap_or_default());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scales_cover_their_values_and_ticks_lie_inside() {
+        for values in [vec![3.0], vec![0.0, 0.0], vec![0.001, 900.0], vec![-5.0, 4.0], vec![1e-9, 1e12], vec![31.24, 31.25], vec![]] {
+            for log in [false, true] {
+                let scale = Scale::new(values.iter().copied(), log, 10.0, 210.0);
+                for v in &values {
+                    assert!((10.0..=210.0).contains(&scale.at(*v)), "{v} of {values:?}");
+                }
+                let ticks = scale.ticks();
+                assert!((1..=22).contains(&ticks.len()), "{values:?}: {ticks:?}");
+                assert!(ticks.iter().all(|(v, _)| (9.9..=210.1).contains(&scale.at(*v))), "{values:?}: {ticks:?}");
+                assert!(ticks.windows(2).all(|w| w[0].1 != w[1].1), "{values:?}: {ticks:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_plot_names_its_axes_and_escapes_its_hints() {
+        let point = Point { x: 1.0, y: 30.0, y_range: Some((29.0, 31.0)), hint: "<b>".into() };
+        let series = Series { colour: 0, marker: Some(2), line: true, points: vec![point] };
+        let plot = Plot { title: "a & b".into(), x: Axis::ranged("size (MB)"), y: Axis::linear("PSNR (dB)"), series: vec![series], front: vec![(1.0, 30.0)] };
+        let svg = plot.figure();
+        for part in ["size (MB)", "PSNR (dB)", "a &amp; b", "&lt;b&gt;", "class=\"range\"", "class=\"onfront\""] {
+            assert!(svg.contains(part), "{part} in {svg}");
+        }
+        assert!(!svg.contains("<b>") && !svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    }
+}

@@ -1,0 +1,186 @@
+//! Tables of results as HTML, Markdown, LaTeX and CSV.
+
+use super::rows::{Better, QUANTITIES, Quantity, Row};
+use super::text;
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+/// One cell.
+#[derive(Clone, Debug)]
+pub struct Cell {
+    /// As shown.
+    pub text: String,
+    /// Whether it is the best of its column.
+    pub best: bool,
+}
+
+impl Cell {
+    /// A cell that is not marked.
+    pub fn plain(text: String) -> Self {
+        Self { text, best: false }
+    }
+}
+
+/// A table.
+#[derive(Clone, Debug)]
+pub struct Table {
+    /// What it shows.
+    pub title: String,
+    /// Names of the columns.
+    pub head: Vec<String>,
+    /// Columns of text; the others are aligned as numbers.
+    pub text_columns: Vec<usize>,
+    /// As long as `head`.
+    pub rows: Vec<Vec<Cell>>,
+    /// Below it.
+    pub notes: Vec<String>,
+}
+
+/// The rows of a scene with every quantity that one of them has: mean and sample standard deviation over seeds, the best mean of a column marked.
+pub fn summary(scene: &str, rows: &[Row]) -> Table {
+    let settings = rows.iter().any(|row| row.setting != "base");
+    let mut head: Vec<String> = ["method", "setting", "codec", "seeds"].map(str::to_string).to_vec();
+    if !settings {
+        head.remove(1);
+    }
+    let text_columns = (0..head.len() - 1).collect();
+    let mut lines: Vec<Vec<Cell>> = rows
+        .iter()
+        .map(|row| {
+            let mark = if row.hopeless() { " †" } else { "" };
+            let mut line = vec![format!("{}{mark}", row.method), row.setting.to_string(), row.codec.to_string(), row.cells.len().to_string()];
+            if !settings {
+                line.remove(1);
+            }
+            line.into_iter().map(Cell::plain).collect()
+        })
+        .collect();
+    for quantity in QUANTITIES {
+        let spreads: Vec<_> = rows.iter().map(|row| row.spread(quantity)).collect();
+        if spreads.iter().all(Option::is_none) {
+            continue;
+        }
+        let arrow = match quantity.better {
+            Better::Higher => " ↑",
+            Better::Lower => " ↓",
+            Better::Neither => "",
+        };
+        head.push(format!("{}{arrow}", quantity.title()));
+        let rounded = |mean: f64| format!("{mean:.*}", quantity.digits);
+        let best = best(quantity, spreads.iter().flatten().map(|s| s.mean)).map(rounded);
+        for (line, spread) in lines.iter_mut().zip(&spreads) {
+            let text = spread.map_or_else(|| "–".to_string(), |s| s.text(quantity.digits));
+            let is_best = rows.len() > 1 && spread.is_some_and(|s| Some(rounded(s.mean)) == best);
+            line.push(Cell { text, best: is_best });
+        }
+    }
+    let mut notes = Vec::new();
+    let hopeless: Vec<String> = rows
+        .iter()
+        .filter(|row| row.hopeless())
+        .map(|row| {
+            let why = row.cells.iter().find_map(|cell| cell.message.clone()).unwrap_or_else(|| "below simple baselines".into());
+            format!("† {}: {why}", row.training())
+        })
+        .collect();
+    notes.extend(hopeless.into_iter().collect::<std::collections::BTreeSet<_>>());
+    let absent: BTreeMap<&str, &str> = rows.iter().flat_map(|r| &r.cells).flat_map(|c| &c.absent).map(|(name, why)| (name.as_str(), why.as_str())).collect();
+    notes.extend(absent.into_iter().map(|(name, why)| format!("{name} is missing where it says –: {why}")));
+    Table { title: scene.to_string(), head, text_columns, rows: lines, notes }
+}
+
+fn best(quantity: &Quantity, means: impl Iterator<Item = f64>) -> Option<f64> {
+    match quantity.better {
+        Better::Higher => means.max_by(f64::total_cmp),
+        Better::Lower => means.min_by(f64::total_cmp),
+        Better::Neither => None,
+    }
+}
+
+impl Table {
+    /// As HTML.
+    pub fn html(&self) -> String {
+        let class = |column: usize| if self.text_columns.contains(&column) { " class=\"text\"" } else { "" };
+        let head: String = self
+            .head
+            .iter()
+            .enumerate()
+            .map(|(i, name)| format!("<th{}>{}</th>", class(i), text::html(&name.replace(" ↑", "\u{a0}↑").replace(" ↓", "\u{a0}↓"))))
+            .collect();
+        let mut out = format!("<div class=\"table\"><table><thead><tr>{head}</tr></thead><tbody>\n");
+        for row in &self.rows {
+            let cells: String = row
+                .iter()
+                .enumerate()
+                .map(|(i, cell)| {
+                    // A narrow column breaks before the deviation, not within.
+                    let content = text::html(&cell.text.replace("± ", "±\u{a0}"));
+                    let content = if cell.best { format!("<b>{content}</b>") } else { content };
+                    format!("<td{}>{content}</td>", class(i))
+                })
+                .collect();
+            _ = writeln!(out, "<tr>{cells}</tr>");
+        }
+        out.push_str("</tbody></table></div>\n");
+        for note in &self.notes {
+            _ = writeln!(out, "<p class=\"note\">{}</p>", text::html(note));
+        }
+        out
+    }
+    /// As Markdown.
+    pub fn markdown(&self) -> String {
+        let line = |cells: &mut dyn Iterator<Item = String>| format!("| {} |\n", cells.collect::<Vec<_>>().join(" | "));
+        let mut out = format!("## {}\n\n", text::markdown(&self.title));
+        out += &line(&mut self.head.iter().map(|name| text::markdown(name)));
+        out += &line(&mut (0..self.head.len()).map(|i| if self.text_columns.contains(&i) { "---".into() } else { "---:".into() }));
+        for row in &self.rows {
+            out += &line(&mut row.iter().map(|cell| {
+                let content = text::markdown(&cell.text);
+                if cell.best { format!("**{content}**") } else { content }
+            }));
+        }
+        for note in &self.notes {
+            _ = write!(out, "\n{}\n", text::markdown(note));
+        }
+        out + "\n"
+    }
+    /// As a LaTeX table; it needs no packages.
+    pub fn latex(&self) -> String {
+        let columns: String = (0..self.head.len()).map(|i| if self.text_columns.contains(&i) { 'l' } else { 'r' }).collect();
+        let mut out = format!("\\begin{{table}}\n\\centering\n\\caption{{{}}}\n\\begin{{tabular}}{{{columns}}}\n\\hline\n", text::latex(&self.title));
+        let line = |cells: &mut dyn Iterator<Item = String>| cells.collect::<Vec<_>>().join(" & ") + " \\\\\n";
+        out += &line(&mut self.head.iter().map(|name| text::latex(name)));
+        out += "\\hline\n";
+        for row in &self.rows {
+            out += &line(&mut row.iter().map(|cell| {
+                let content = text::latex(&cell.text);
+                if cell.best { format!("\\textbf{{{content}}}") } else { content }
+            }));
+        }
+        out += "\\hline\n\\end{tabular}\n";
+        for note in &self.notes {
+            _ = write!(out, "\n{}\n", text::latex(note));
+        }
+        out + "\\end{table}\n\n"
+    }
+}
+
+/// All rows of all scenes as CSV: the axes, the number of seeds, then mean, sample standard deviation, least and largest value of every quantity. Missing
+/// values are empty.
+pub fn csv(scenes: &BTreeMap<&str, Vec<Row>>) -> String {
+    let mut head: Vec<String> = ["scene", "method", "setting", "codec", "outcome", "seeds"].map(str::to_string).to_vec();
+    head.extend(QUANTITIES.iter().flat_map(|q| ["mean", "deviation", "low", "high"].map(|part| format!("{}_{part}", q.key))));
+    let mut out = head.join(",") + "\n";
+    for row in scenes.values().flatten() {
+        let outcome = if row.hopeless() { "hopeless" } else { "done" };
+        let mut fields: Vec<String> = [row.scene, row.method, row.setting, row.codec, outcome].map(text::csv).to_vec();
+        fields.push(row.cells.len().to_string());
+        for quantity in QUANTITIES {
+            let spread = row.spread(quantity);
+            let part = |f: &dyn Fn(&super::rows::Spread) -> Option<f64>| spread.as_ref().and_then(f).map_or_else(String::new, |v| v.to_string());
+            fields.extend([part(&|s| Some(s.mean)), part(&|s| s.deviation), part(&|s| Some(s.low)), part(&|s| Some(s.high))]);
+        }
+        out += &(fields.join(",") + "\n");
+    }
+    out
+}

@@ -1,0 +1,204 @@
+use super::*;
+use crate::sweep::{ImageResult, Outcome};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+const EVIL: &str = "<script>alert(1)</script>&\"'|`$x_1$\u{202e}";
+
+/// The example of the documentation, changed.
+fn cell(id: &str, change: impl FnOnce(&mut CellResult)) -> CellResult {
+    let text = include_str!("../../../../docs/results.md");
+    let json = text.split("```json\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+    let mut cell = CellResult::from_json("docs/results.md", json).unwrap();
+    cell.id = id.into();
+    change(&mut cell);
+    cell
+}
+
+/// Two methods, two codecs, two seeds on a scene that is built in, with images of three frames.
+fn sweep(folder: &Path) -> Vec<CellResult> {
+    let mut cells = Vec::new();
+    for (m, method) in ["cdf", "hexplane"].into_iter().enumerate() {
+        for (c, codec) in ["cca:default", "cca:low"].into_iter().enumerate() {
+            for seed in 0..2u64 {
+                cells.push(cell(&format!("{method}-{c}-{seed}"), |r| {
+                    r.axes = crate::sweep::Axes { scene: "tiny".into(), method: method.into(), setting: "base".into(), codec: codec.into(), seed };
+                    (r.provenance.data.path, r.provenance.data.files) = ("procedural:tiny".into(), 0);
+                    let psnr = 30.0 + m as f64 - 0.5 * c as f64 + 0.2 * seed as f64;
+                    r.metrics.get_mut("psnr_db").unwrap().value = psnr;
+                    r.storage.total_bytes = 700_000 - 200_000 * c as u64 + 100_000 * m as u64;
+                    r.training = format!("{method}-{seed}");
+                    r.images = (0..3)
+                        .map(|frame| ImageResult {
+                            camera: "c0".into(),
+                            frame,
+                            time_norm: frame as f32 / 2.0,
+                            scores: BTreeMap::from([("psnr_db".into(), psnr + frame as f64)]),
+                            blocks: None,
+                            truth: Some(format!("images/truth/{frame}.png")),
+                            render: Some(format!("images/{method}/{frame}.png")),
+                        })
+                        .collect();
+                }));
+            }
+        }
+    }
+    let image = |shade: &dyn Fn(u32, u32) -> u8| {
+        let data = (0..24 * 32).flat_map(|i| [shade(i % 32, i / 32); 3]).collect();
+        cc4dgs_core::Image8 { width: 32, height: 24, channels: 3, data }
+    };
+    for frame in 0..3u32 {
+        let write =
+            |name: &str, shade: &dyn Fn(u32, u32) -> u8| crate::images::write_png(folder.join(format!("images/{name}/{frame}.png")), &image(shade)).unwrap();
+        write("truth", &|x, y| (4 * x + y) as u8);
+        // Right but for one corner, and flickering by ten levels.
+        write("cdf", &|x, y| if x > 24 && y > 16 { 255 } else { (4 * x + y) as u8 });
+        write("hexplane", &|x, y| (4 * x + y + 10 * (frame % 2)) as u8);
+    }
+    cells
+}
+
+fn write(folder: &Path, cells: &[CellResult]) {
+    let results = folder.join("results");
+    std::fs::create_dir_all(&results).unwrap();
+    for (i, cell) in cells.iter().enumerate() {
+        cell.write(&results.join(format!("{i}.json"))).unwrap();
+    }
+}
+
+#[test]
+fn a_report_has_all_parts_and_equal_bytes_again() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), &sweep(folder.path()));
+    let out = folder.path().join("deep/report.html");
+    let files = write_report(folder.path(), &out, &ReportOptions::default()).unwrap();
+    assert_eq!(files.cells, 8);
+    let first = report(folder.path(), &ReportOptions::default()).unwrap();
+    assert_eq!(std::fs::read_to_string(&out).unwrap(), first.html);
+    assert_eq!(std::fs::read_to_string(&files.csv).unwrap(), first.csv);
+    assert_eq!(first, report(folder.path(), &ReportOptions::default()).unwrap());
+    for part in [
+        "Rate and distortion",
+        "Pareto front",
+        "archive (MB)",
+        "PSNR (dB)",
+        "wall time (s)",
+        "time (ms)",
+        "size (MB)",
+        "iteration",
+        "frame",
+        "Flicker",
+        "slider",
+        "reported, not run",
+    ] {
+        assert!(first.html.contains(part), "{part}");
+    }
+    for wrong in ["NaN", "inf\"", "http://", "https://", "<link", "src=\"/"] {
+        assert!(!first.html.contains(wrong), "{wrong}");
+    }
+    // 4 rows; the mean of 31.0 and 31.2, the better of the two methods, is marked.
+    assert_eq!(first.csv.lines().count(), 5);
+    assert!(first.csv.lines().nth(3).unwrap().starts_with("tiny,hexplane,base,cca:default,done,2,31.1,"), "{}", first.csv);
+    assert!(first.markdown.contains("**31.10 ± 0.14**") && first.latex.contains("\\textbf{31.10 $\\pm$ 0.14}"), "{}", first.markdown);
+    // Numbers of papers are in tables of their own, below the notice.
+    let notice = first.markdown.find("Reported by papers").unwrap();
+    assert!(first.markdown.find("CC-4DGS").unwrap() > notice && !first.csv.contains("CC-4DGS"));
+}
+
+#[test]
+fn images_are_shown_where_they_may_be_and_flicker_is_measured() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cells = sweep(folder.path());
+    write(folder.path(), &cells);
+    let html = |images| report(folder.path(), &ReportOptions { images, views: 2, ..Default::default() }).unwrap().html;
+    let count = |html: &str| html.matches("data:image/").count();
+    // Two views of a truth (whole and square) and two renders (and an error map each), and a flicker map for each render.
+    assert_eq!(count(&html(ImageChoice::BuiltIn)), 2 * (2 + 2 * 3) + 2);
+    assert_eq!(count(&html(ImageChoice::None)), 0);
+    let shown = html(ImageChoice::BuiltIn);
+    assert!(shown.contains("camera c0: 10.00 of 255 levels") && shown.contains("camera c0: 0.00 of 255 levels"));
+    // The square lies where the renders err: right and below.
+    let style = shown.split("class=\"square\" style=\"left:").nth(1).unwrap();
+    assert!(style.split('%').next().unwrap().parse::<f64>().unwrap() > 40.0, "{}", &style[..60]);
+    // A third-party scene is shown only on request.
+    cells.iter_mut().for_each(|c| c.provenance.data.files = 3);
+    write(folder.path(), &cells);
+    assert_eq!((count(&html(ImageChoice::BuiltIn)), count(&html(ImageChoice::All))), (0, 18));
+    // Without the files there is nothing to show.
+    std::fs::remove_dir_all(folder.path().join("images")).unwrap();
+    assert_eq!(count(&html(ImageChoice::All)), 0);
+}
+
+#[test]
+fn strings_of_results_cannot_leave_their_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cells = sweep(folder.path());
+    for cell in &mut cells {
+        cell.sweep = EVIL.into();
+        cell.axes.scene = EVIL.into();
+        cell.axes.method = format!("{}{EVIL}", cell.axes.method);
+        cell.axes.codec = format!("{}{EVIL}", cell.axes.codec);
+        (cell.outcome, cell.message) = (Outcome::Hopeless, Some(EVIL.into()));
+        cell.absent = BTreeMap::from([(EVIL.into(), EVIL.into())]);
+        cell.provenance.commit = EVIL.into();
+        cell.provenance.data.path = EVIL.into();
+        cell.provenance.device.processor = EVIL.into();
+        cell.cost.stage_seconds.insert(EVIL.into(), 3.0);
+        cell.metrics.get_mut("ssim").unwrap().protocol.insert(EVIL.into(), EVIL.into());
+        cell.images.iter_mut().for_each(|image| image.camera = EVIL.into());
+    }
+    write(folder.path(), &cells);
+    let made = report(folder.path(), &ReportOptions { images: ImageChoice::All, ..Default::default() }).unwrap();
+    assert!(made.html.contains("&lt;script&gt;alert(1)") && !made.html.contains("<script>alert") && !made.html.contains('\u{202e}'));
+    assert_eq!(made.html.matches("<script>").count(), 1, "our own");
+    assert!(!made.markdown.contains("<script>") && made.markdown.contains("\\|"));
+    assert!(!made.latex.contains("$x_1$") && made.latex.contains("\\$x\\_1\\$"));
+    assert!(made.csv.contains("\"<script>") || made.csv.contains("\"\"'"), "quotes are doubled");
+}
+
+#[test]
+fn what_does_not_belong_together_is_refused() {
+    let outer = tempfile::tempdir().unwrap();
+    let folder = outer.path().join("sweep");
+    let refused = |change: &dyn Fn(&mut Vec<CellResult>)| {
+        let mut cells = sweep(&folder);
+        change(&mut cells);
+        std::fs::remove_dir_all(folder.join("results")).ok();
+        write(&folder, &cells);
+        report(&folder, &ReportOptions { images: ImageChoice::All, ..Default::default() }).unwrap_err().to_string()
+    };
+    assert!(refused(&|cells| cells[0].provenance.device.threads = 9).contains("two devices"));
+    assert!(refused(&|cells| cells[1].axes.seed = 0).contains("two results"));
+    assert!(refused(&|cells| cells[0].metrics.get_mut("psnr_db").unwrap().value = 1e300).contains("1e300"));
+    let flat = cc4dgs_core::Image8 { width: 32, height: 24, channels: 3, data: vec![7; 32 * 24 * 3] };
+    crate::images::write_png(outer.path().join("private.png"), &flat).unwrap();
+    let outside = refused(&|cells| cells.iter_mut().for_each(|c| c.images[0].truth = Some("../private.png".into())));
+    assert!(outside.contains("outside the folder") && outside.contains("private.png"), "{outside}");
+    let cells = sweep(&folder);
+    std::fs::write(folder.join("images/cdf/1.png"), b"no image").unwrap();
+    std::fs::remove_dir_all(folder.join("results")).unwrap();
+    write(&folder, &cells);
+    let error = report(&folder, &ReportOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("not a PNG image") && error.contains("images/cdf/1.png"), "{error}");
+    let options = |text: &str| ReportOptions { only: vec![text.into()], images: ImageChoice::None, ..Default::default() };
+    assert_eq!(report(&folder, &options("method=cdf")).unwrap().cells, 4);
+    assert!(report(&folder, &options("method=none")).unwrap_err().to_string().contains("none of 8"));
+    assert!(report(&folder, &options("colour=red")).unwrap_err().to_string().contains("scene"));
+    assert!(write_report(&folder, Path::new("report.txt"), &options("seed=0")).is_err());
+}
+
+#[test]
+fn numbers_over_seeds() {
+    let spread = Spread::of(&[1.0, 2.0, 6.0]).unwrap();
+    assert_eq!((spread.mean, spread.low, spread.high), (3.0, 1.0, 6.0));
+    assert!((spread.deviation.unwrap() - 7f64.sqrt()).abs() < 1e-12);
+    assert_eq!((Spread::of(&[]), Spread::of(&[4.0]).unwrap().text(1)), (None, "4.0".into()));
+    // A mean over some of the seeds would hide a gap.
+    let (a, mut b) = (cell("a", |_| ()), cell("b", |r| r.axes.seed = 1));
+    b.metrics.remove("ssim");
+    let results = [a, b];
+    let scenes = rows(&results).unwrap();
+    let row = &scenes["mutant"][0];
+    assert_eq!((row.cells.len(), row.spread(&rows::SSIM)), (2, None));
+    assert!(row.spread(&rows::PSNR).is_some());
+}

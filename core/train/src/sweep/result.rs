@@ -1,0 +1,335 @@
+//! The result of one cell of a sweep: what was measured, how, and where it came from. `docs/results.md` describes the file.
+//!
+//! Everything that differs between two equal runs (wall times, memory, clock) is in [`CellResult::cost`]; the rest of the file is the same to the byte.
+
+use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::{Error, Result, Split};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Value of [`CellResult::kind`].
+pub const KIND: &str = "cc4dgs-result";
+/// The version of the schema that this program writes and reads.
+pub const SCHEMA: u32 = 1;
+
+/// One cell: a training, stored by a codec, decoded, and scored on one side of the split.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CellResult {
+    /// [`KIND`].
+    pub kind: String,
+    /// [`SCHEMA`].
+    pub schema: u32,
+    /// The cell: XXH3-64 of configuration, data fingerprint, code version, seed, codec and scored views; 16 hexadecimal digits.
+    pub id: String,
+    /// The training that the cell used, named in the same way; cells of several codecs share it.
+    pub training: String,
+    /// Name of the grid.
+    pub sweep: String,
+    /// Where the cell is in its grid.
+    pub axes: Axes,
+    /// Whether the training is worth having.
+    pub outcome: Outcome,
+    /// Why a training is hopeless.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub message: Option<String>,
+    /// What it was made from.
+    pub provenance: ResultProvenance,
+    /// The scored side of the split.
+    pub split: Split,
+    /// Width and height in pixels of the first scored image.
+    pub image_size: [u32; 2],
+    /// Frames of the sequence.
+    pub frames: usize,
+    /// Training iterations of all stages.
+    pub iterations: usize,
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Of which the deformer moves.
+    pub dynamic_gaussians: usize,
+    /// Means over the scored images by name: `psnr_db`, `ssim`, `ms_ssim`, `lpips`, `flip`, `psnr_dynamic_db`, …
+    pub metrics: BTreeMap<String, Score>,
+    /// Metrics that could not be computed, each with the reason.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub absent: BTreeMap<String, String>,
+    /// Blocks of the images in which something moves, where there are any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub blocks: Option<Blocks>,
+    /// Per scored image.
+    pub images: Vec<ImageResult>,
+    /// Bytes by part.
+    pub storage: Storage,
+    /// How the training went; absent for runs that are too short to be judged.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<Value>,
+    /// Training PSNR on the way.
+    pub curve: Curve,
+    /// What it took: the only part that differs between equal runs.
+    pub cost: Cost,
+}
+
+/// Coordinates of a cell in its grid, by the names that the grid gives.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Axes {
+    /// The dataset.
+    pub scene: String,
+    /// The preset: how it is trained.
+    pub method: String,
+    /// Changes of that preset; `base` where the grid has none.
+    pub setting: String,
+    /// How it is stored.
+    pub codec: String,
+    /// Root of the seed tree.
+    pub seed: u64,
+}
+
+/// Whether a training is worth having.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Outcome {
+    /// Trained and scored.
+    Done,
+    /// Scored, but the training ended below simple baselines (exit code 6 of `cc4dgs train`).
+    Hopeless,
+}
+
+/// What a result was made from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ResultProvenance {
+    /// Version of the program.
+    pub version: String,
+    /// Commit of the program; empty if unknown, with `-dirty` where files were changed.
+    pub commit: String,
+    /// XXH3-64 of `configuration`, 16 hexadecimal digits.
+    pub configuration_hash: String,
+    /// The whole configuration of the training, as `config.toml` has it.
+    pub configuration: Value,
+    /// How the model was stored.
+    pub codec: CodecChoice,
+    /// The dataset.
+    pub data: DataFingerprint,
+    /// What it was computed on.
+    pub device: DeviceFacts,
+}
+
+/// A codec with its settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CodecChoice {
+    /// `NAME[:PROFILE]`.
+    pub codec: String,
+    /// Weight codec of the deformer.
+    pub field_weights: String,
+    /// Settings over the profile's.
+    #[serde(default)]
+    pub settings: toml::Table,
+}
+
+/// A dataset by its content.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DataFingerprint {
+    /// The dataset as the grid names it.
+    pub path: String,
+    /// XXH3-64 of the names and contents of all files, 16 hexadecimal digits; of the name alone for built-in scenes.
+    pub hash: String,
+    /// Number of files; 0 for built-in scenes.
+    pub files: u64,
+    /// Their bytes together.
+    pub bytes: u64,
+}
+
+/// What a result was computed on. Results of different devices are not put into one table.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DeviceFacts {
+    /// Name of the device: `flex`, `ndarray`, `wgpu`, `cuda`.
+    pub name: String,
+    /// The graphics adapter, where one computes.
+    pub adapter: Option<String>,
+    /// Its driver with version.
+    pub driver: Option<String>,
+    /// Model of the processor, as the system names it; empty if unknown.
+    pub processor: String,
+    /// Threads of the processor that computed.
+    pub threads: usize,
+    /// Operating system and architecture, such as `linux x86_64`.
+    pub system: String,
+}
+
+/// The mean of a metric over the scored images.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Score {
+    /// The mean.
+    pub value: f64,
+    /// Everything it depends on besides the images ([`cc4dgs_core::metrics::Protocol`]): formula, convention, range, rounding, window, padding, mask, frames.
+    pub protocol: Map<String, Value>,
+}
+
+/// Blocks of the images in which something moves ([`crate::blocks`]).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Blocks {
+    /// PSNR of the worst moving block of an image, mean over images, dB.
+    pub worst_psnr_db: f64,
+    /// Share of the moving blocks whose render is nearer to what the camera usually sees than to the truth.
+    pub lost: f64,
+}
+
+/// One scored image.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ImageResult {
+    /// Name of the camera.
+    pub camera: String,
+    /// Frame, 0-based.
+    pub frame: usize,
+    /// Time in 0..1.
+    pub time_norm: f32,
+    /// Scores by the names of [`CellResult::metrics`], to five decimals; what an image cannot have is missing.
+    pub scores: BTreeMap<String, f64>,
+    /// Moving blocks, of which lost, and PSNR of the worst in dB.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub blocks: Option<(usize, usize, f64)>,
+    /// Ground truth as a PNG file relative to the sweep's folder. These files stay local.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub truth: Option<String>,
+    /// The render, likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub render: Option<String>,
+}
+
+/// Bytes by part.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Storage {
+    /// The archive on disk.
+    pub total_bytes: u64,
+    /// Streams of the deformer.
+    pub deform_bytes: u64,
+    /// Streams of the Gaussians.
+    pub point_cloud_bytes: u64,
+    /// Float32 size of the deformer's spatial encoding (the paper's Deform-Grid).
+    pub deform_grid_f32_bytes: u64,
+    /// Float32 size of the rest of the deformer (the paper's Deform-Net).
+    pub deform_net_f32_bytes: u64,
+    /// Float32 size of the Gaussians.
+    pub point_cloud_f32_bytes: u64,
+    /// The streams of the archive.
+    pub streams: Vec<StreamBytes>,
+}
+
+/// One stream of an archive.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StreamBytes {
+    /// Its name.
+    pub name: String,
+    /// `canonical`, `field`, `meta` or `other`.
+    pub kind: String,
+    /// On disk.
+    pub stored_bytes: u64,
+    /// Decoded.
+    pub decoded_bytes: u64,
+}
+
+/// Training PSNR on the way, at most [`Curve::MOST_POINTS`] points: columns of equal length.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Curve {
+    /// Iteration over all stages, from 1.
+    pub iteration: Vec<usize>,
+    /// PSNR of the training views of recent iterations, smoothed, dB; images are not rounded to 8 bits.
+    pub psnr_db: Vec<f64>,
+    /// Gaussians.
+    pub gaussians: Vec<usize>,
+}
+
+impl Curve {
+    /// Most points of a curve.
+    pub const MOST_POINTS: usize = 100;
+}
+
+/// What a result took. Seconds of wall time.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Cost {
+    /// The training with all that belongs to it, repeated work after interruptions included.
+    pub training_seconds: f64,
+    /// Stages of the training: `coarse`, `score`, `main`.
+    pub stage_seconds: BTreeMap<String, f64>,
+    /// Times at which the training went on after an interruption.
+    pub resumed: usize,
+    /// Seconds since the training began, for each point of [`CellResult::curve`].
+    pub curve_seconds: Vec<f64>,
+    /// Codec and writing of the archive.
+    pub encode_seconds: f64,
+    /// Reading the archive back into a model.
+    pub decode_seconds: f64,
+    /// Rendering and scoring the images.
+    pub evaluation_seconds: f64,
+    /// Milliseconds of a frame.
+    pub frame_ms: FrameMs,
+    /// Milliseconds of each scored image, deformer and rasterizer together, in the order of [`CellResult::images`].
+    pub frame_ms_each: Vec<f64>,
+    /// Most memory of the process that scored, MB (10^6 bytes), if the system says.
+    pub peak_memory_mb: Option<f64>,
+    /// When the result was written, seconds since 1970.
+    pub finished_unix: u64,
+}
+
+/// Milliseconds of a frame on the device, synchronised.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct FrameMs {
+    /// Mean of all frames but the first.
+    pub mean: f64,
+    /// Deformer, first frame: spatial features are computed.
+    pub field_first: f64,
+    /// Rasterizer, first frame.
+    pub raster_first: f64,
+    /// Deformer, median of the other frames.
+    pub field: f64,
+    /// Rasterizer, median of the other frames.
+    pub raster: f64,
+}
+
+impl CellResult {
+    /// The result as one line of JSON.
+    ///
+    /// # Errors
+    /// [`Error::Backend`] for numbers that JSON cannot write.
+    pub fn to_line(&self) -> Result<String> {
+        serde_json::to_string(self).map_err(|e| Error::backend("result", e.to_string(), "Report this: every result should have a JSON form"))
+    }
+    /// Writes the result to `path`, all or nothing.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, path: &Path) -> Result<()> {
+        write_atomically(path, (self.to_line()? + "\n").as_bytes())
+    }
+    /// Reads one result from JSON text; `object` names it in errors.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] for another version of the schema, [`Error::Data`] for text that is no result.
+    pub fn from_json(object: &str, text: &str) -> Result<Self> {
+        let damaged = |problem: String| Error::data(object, problem, "Remove the file and run the cell again");
+        #[derive(Deserialize)]
+        struct Head {
+            #[serde(default)]
+            kind: String,
+            schema: Option<u32>,
+        }
+        let head: Head = serde_json::from_str(text).map_err(|e| damaged(e.to_string()))?;
+        match (head.kind.as_str(), head.schema) {
+            (KIND, Some(SCHEMA)) => {}
+            (KIND, Some(other)) => {
+                let problem = format!("it has version {other} of the result schema, this program reads version {SCHEMA}");
+                return Err(Error::unsupported(object, problem, "Use the program that wrote it, or run the cell again"));
+            }
+            (other, _) => return Err(damaged(format!("its kind is \"{other}\", a result has \"{KIND}\""))),
+        }
+        let result: Self = serde_json::from_str(text).map_err(|e| damaged(e.to_string()))?;
+        let points = result.curve.iteration.len();
+        if [result.curve.psnr_db.len(), result.curve.gaussians.len(), result.cost.curve_seconds.len()].iter().any(|len| *len != points) {
+            return Err(damaged("the columns of its training curve differ in length".into()));
+        }
+        Ok(result)
+    }
+    /// Megabytes (10^6 bytes) of the archive.
+    pub fn size_mb(&self) -> f64 {
+        self.storage.total_bytes as f64 / 1e6
+    }
+}
