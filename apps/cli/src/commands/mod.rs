@@ -6,6 +6,7 @@ mod decompress;
 mod demo;
 mod doctor;
 mod eval;
+mod export;
 mod info;
 mod plugins;
 mod render;
@@ -58,6 +59,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Demo(args) => demo::run(&context, args),
         Command::Train(args) => train::run(&context, args),
         Command::Compress(args) => compress::run(&context, args),
+        Command::Export(args) => export::run(&context, args),
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),
