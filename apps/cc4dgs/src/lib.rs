@@ -27,6 +27,7 @@ pub mod plugins;
 pub mod runs;
 pub mod scenes;
 mod session;
+pub mod stress;
 pub mod video;
 
 pub use cc4dgs_play::Orbit;

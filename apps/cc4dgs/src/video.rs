@@ -64,7 +64,7 @@ pub struct VideoWriter {
 
 struct Running {
     ffmpeg: Child,
-    part: tempfile::TempPath,
+    part: Option<tempfile::TempPath>,
     size: (u32, u32),
 }
 
@@ -119,9 +119,7 @@ impl VideoWriter {
         };
         drop(running.ffmpeg.stdin.take());
         running.ended()?;
-        // Moved out of a value that is dropped: an empty path takes its place.
-        let part = std::mem::replace(&mut running.part, tempfile::TempPath::from_path(PathBuf::new()));
-        part.persist(&self.out).map_err(|e| Error::io(&self.out, e.error))
+        running.part.take().map_or(Ok(()), |part| part.persist(&self.out)).map_err(|e| Error::io(&self.out, e.error))
     }
     fn start(&self, (width, height): (u32, u32)) -> Result<Running> {
         let part = temporary(&self.out)?;
@@ -132,7 +130,7 @@ impl VideoWriter {
             command.args(["-crf", &crf.to_string()]);
         }
         let ffmpeg = command.arg(&part).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(absent)?;
-        Ok(Running { ffmpeg, part, size: (width, height) })
+        Ok(Running { ffmpeg, part: Some(part), size: (width, height) })
     }
 }
 

@@ -51,6 +51,8 @@ pub enum Command {
     Plugins(Plugins),
     /// Check this machine: processor, threads, devices, ffmpeg, and an image drawn by two rasterizers.
     Doctor(Doctor),
+    /// Try float32 against float64 under conditions that break floating point. Ends with 5 where a result is neither finite nor an error.
+    Stress(Stress),
     /// Measure speed.
     Bench(Bench),
 }
@@ -274,6 +276,16 @@ pub struct Plugins {
 
 #[derive(Debug, Args)]
 pub struct Doctor {}
+
+#[derive(Debug, Args)]
+pub struct Stress {
+    /// Device to test: auto, flex, ndarray, wgpu, cuda.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// A million optimizer steps instead of twenty thousand.
+    #[arg(long)]
+    pub full: bool,
+}
 
 /// The parts of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

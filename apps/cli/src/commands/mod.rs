@@ -11,6 +11,7 @@ mod info;
 mod plugins;
 mod render;
 mod storage;
+mod stress;
 mod train;
 
 use crate::args::{BenchWhat, Cli, Command};
@@ -66,6 +67,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Info(args) => info::run(&context, args),
         Command::Plugins(args) => plugins::run(&context, args),
         Command::Doctor(_) => doctor::run(&context),
+        Command::Stress(args) => stress::run(&context, args),
         Command::Bench(args) => match &args.what {
             BenchWhat::Step(args) => bench::step(&context, args),
             BenchWhat::Frame(args) => bench::frame(&context, args),
