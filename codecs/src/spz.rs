@@ -1,6 +1,6 @@
 //! `spz`: Niantic's format as a codec. The file itself is [`cc4dgs_format::spz`]; additional streams hold what SPZ cannot.
 
-use cc4dgs_format::spz::{LARGEST, from_spz, to_spz};
+use cc4dgs_format::spz::{LARGEST, SpzOptions, from_spz, to_spz};
 use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams, open, relative_rms};
 use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
 use serde::Deserialize;
@@ -9,6 +9,8 @@ use serde::Deserialize;
 const SCORES: usize = 6;
 /// Version of the streams around the file.
 const VERSION: u8 = 2;
+/// Version of the SPZ file: its bytes are this codec's stored form.
+const FILE_VERSION: u32 = 3;
 /// The stream that is an SPZ file.
 const FILE: &str = "spz";
 /// The stream of columns that SPZ cannot hold: always the dynamic scores, and any column whose loss in SPZ is larger than declared.
@@ -33,7 +35,7 @@ impl AttributeCodec for Spz {
         Shape::of(gaussians).write(&mut meta)?;
         let mut held = gaussians.clone();
         held.means.iter_mut().for_each(|v| *v = v.clamp(-LARGEST, LARGEST));
-        let file = to_spz(&held, self.sh1_bits, self.sh_rest_bits)?;
+        let file = to_spz(&held, &SpzOptions { sh1_bits: self.sh1_bits, sh_rest_bits: self.sh_rest_bits, ..SpzOptions::version(FILE_VERSION) })?;
         let found = from_spz("SPZ just written", &file, &context.limits)?;
         let losses = self.losses();
         let mut beside = Vec::new();

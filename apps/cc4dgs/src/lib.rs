@@ -20,12 +20,14 @@
 //! The crate re-exports the parts of the framework and links the plug-ins that come with it; plug-ins of your own are found as soon as their crate is
 //! linked. The `cc4dgs` command is built on this crate; a program that wants the whole command line depends on `cc4dgs-cli` instead.
 
+pub mod export;
 mod model;
 
 pub mod plugins;
 pub mod runs;
 pub mod scenes;
 mod session;
+pub mod stress;
 pub mod video;
 
 pub use cc4dgs_play::Orbit;
@@ -41,6 +43,7 @@ pub use cc4dgs_backends as backends;
 pub use cc4dgs_codecs as codecs;
 pub use cc4dgs_core as core;
 pub use cc4dgs_deformers as deformers;
+pub use cc4dgs_exporters as exporters;
 pub use cc4dgs_parts as parts;
 pub use cc4dgs_play as play;
 pub use cc4dgs_train as train;

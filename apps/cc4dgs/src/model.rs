@@ -20,6 +20,10 @@ impl Model {
     pub fn new(inner: cc4dgs_play::model::Model, session: Session) -> Self {
         Self { inner, session }
     }
+    /// The session it belongs to.
+    pub fn session(&self) -> &Session {
+        &self.session
+    }
     /// Writes a `.cc4d` archive with the codec `name` or `name:profile` and returns its size in bytes. The file appears complete or not at all.
     ///
     /// # Errors

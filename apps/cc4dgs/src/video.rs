@@ -1,8 +1,9 @@
 //! Videos through the `ffmpeg` command.
 
-use cc4dgs_core::{Error, Result};
-use std::path::Path;
-use std::process::{Command, Stdio};
+use cc4dgs_core::{Error, Image8, Result};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
 
 const REMEDY: &str = "Install ffmpeg (Debian: apt install ffmpeg), or use the PNG frames without a video";
 
@@ -29,28 +30,151 @@ pub fn frame_name(index: usize) -> String {
 /// # Errors
 /// [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] with its last message where it fails, [`Error::Io`] for a folder that cannot be written.
 pub fn encode(frames: &Path, count: usize, fps: u32, out: &Path) -> Result<()> {
-    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let part = tempfile::Builder::new().prefix(".cc4dgs-").suffix(".mp4").tempfile_in(folder).map_err(|e| Error::io(folder, e))?.into_temp_path();
-    let result = Command::new("ffmpeg")
-        .args(["-y", "-loglevel", "error", "-framerate", &fps.to_string(), "-start_number", "0"])
-        .arg("-i")
-        .arg(frames.join("frame_%05d.png"))
-        .args(["-frames:v", &count.to_string()])
-        // Players want 4:2:0 colour, which needs even sides.
-        .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-movflags", "+faststart"])
-        .arg(&part)
-        .stdin(Stdio::null())
-        .output();
-    match result {
-        Ok(o) if o.status.success() => part.persist(out).map_err(|e| Error::io(out, e.error)),
-        Ok(o) => {
-            let said = String::from_utf8_lossy(&o.stderr);
-            Err(Error::backend(
-                "ffmpeg",
-                format!("it ended with {}: {}", o.status, said.trim().lines().last().unwrap_or("no message")),
-                "The PNG frames are complete; encode them by hand",
-            ))
-        }
-        Err(e) => Err(Error::unsupported("ffmpeg", format!("the command does not start: {e}"), REMEDY)),
+    let part = temporary(out)?;
+    let mut command = ffmpeg();
+    command.args(["-framerate", &fps.to_string(), "-start_number", "0", "-i"]).arg(frames.join("frame_%05d.png")).args(["-frames:v", &count.to_string()]);
+    let output = command.args(CODEC).arg(&part).stdin(Stdio::null()).output().map_err(absent)?;
+    check(&output)?;
+    part.persist(out).map_err(|e| Error::io(out, e.error))
+}
+
+/// Encoding that players agree on: 4:2:0 colour, which needs even sides, and the index in front. Nothing of the day or the program is written.
+const CODEC: [&str; 12] = [
+    "-vf",
+    "pad=ceil(iw/2)*2:ceil(ih/2)*2",
+    "-pix_fmt",
+    "yuv420p",
+    "-movflags",
+    "+faststart",
+    "-fflags",
+    "+bitexact",
+    "-flags:v",
+    "+bitexact",
+    "-map_metadata",
+    "-1",
+];
+
+/// A video that is fed image by image; no image is stored. It appears once it is finished.
+pub struct VideoWriter {
+    out: PathBuf,
+    fps: u32,
+    crf: Option<u32>,
+    running: Option<Running>,
+}
+
+struct Running {
+    ffmpeg: Child,
+    part: Option<tempfile::TempPath>,
+    size: (u32, u32),
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // A video that is not finished is not wanted; after `finish`, the process is gone already.
+        self.ffmpeg.kill().ok();
+        self.ffmpeg.wait().ok();
     }
+}
+
+impl VideoWriter {
+    /// The video `out` with `fps` images per second. Nothing is started before the first image.
+    pub fn new(out: impl Into<PathBuf>, fps: u32) -> Self {
+        Self { out: out.into(), fps, crf: None, running: None }
+    }
+    /// The same with the quality `crf` of x264: 0 is lossless, 51 the worst; ffmpeg's default is 23.
+    pub fn quality(self, crf: u32) -> Self {
+        Self { crf: Some(crf), ..self }
+    }
+    /// Appends an RGB image; all have the size of the first.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] without ffmpeg, [`Error::Backend`] where it fails, [`Error::Data`] for an image of another size or with alpha.
+    pub fn add(&mut self, image: &Image8) -> Result<()> {
+        image.validate("image of a video")?;
+        let size = (image.width, image.height);
+        if image.channels != 3 {
+            return Err(Error::data("image of a video", format!("{} channels", image.channels), "Give RGB images"));
+        }
+        let mut running = match self.running.take() {
+            Some(running) => running,
+            None => self.start(size)?,
+        };
+        if running.size != size {
+            let problem = format!("{}x{} pixels after images of {}x{}", size.0, size.1, running.size.0, running.size.1);
+            return Err(Error::data("image of a video", problem, "Give all images one size (--size)"));
+        }
+        let Some(Ok(())) = running.ffmpeg.stdin.as_mut().map(|pipe| pipe.write_all(&image.data)) else {
+            return Err(running.failure());
+        };
+        self.running = Some(running);
+        Ok(())
+    }
+    /// Ends the video and gives it its name.
+    ///
+    /// # Errors
+    /// [`Error::Backend`] where ffmpeg fails, [`Error::Parameter`] for a video without images, [`Error::Io`].
+    pub fn finish(mut self) -> Result<()> {
+        let Some(mut running) = self.running.take() else {
+            return Err(Error::parameter("video", "there are no images", "Add at least one"));
+        };
+        drop(running.ffmpeg.stdin.take());
+        running.ended()?;
+        running.part.take().map_or(Ok(()), |part| part.persist(&self.out)).map_err(|e| Error::io(&self.out, e.error))
+    }
+    fn start(&self, (width, height): (u32, u32)) -> Result<Running> {
+        let part = temporary(&self.out)?;
+        let mut command = ffmpeg();
+        command.args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &format!("{width}x{height}")]);
+        command.args(["-framerate", &self.fps.to_string(), "-i", "-"]).args(CODEC);
+        if let Some(crf) = self.crf {
+            command.args(["-crf", &crf.to_string()]);
+        }
+        let ffmpeg = command.arg(&part).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().map_err(absent)?;
+        Ok(Running { ffmpeg, part: Some(part), size: (width, height) })
+    }
+}
+
+impl Running {
+    /// Waits for the end of the process.
+    fn ended(&mut self) -> Result<()> {
+        let mut said = Vec::new();
+        if let Some(mut pipe) = self.ffmpeg.stderr.take() {
+            std::io::Read::read_to_end(&mut pipe, &mut said).ok();
+        }
+        let status = self.ffmpeg.wait().map_err(|e| Error::io("ffmpeg", e))?;
+        check(&Output { status, stdout: Vec::new(), stderr: said })
+    }
+    /// Why the process took no more images.
+    fn failure(&mut self) -> Error {
+        drop(self.ffmpeg.stdin.take());
+        let ended = self.ended().err();
+        ended.unwrap_or_else(|| Error::backend("ffmpeg", "it ended before the last image", "Render PNG frames and encode them by hand"))
+    }
+}
+
+/// ffmpeg without questions, and with errors as its only messages.
+fn ffmpeg() -> Command {
+    let mut command = Command::new("ffmpeg");
+    command.args(["-y", "-loglevel", "error"]);
+    command
+}
+
+/// A temporary name beside `out`.
+fn temporary(out: &Path) -> Result<tempfile::TempPath> {
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let part = tempfile::Builder::new().prefix(".cc4dgs-").suffix(".mp4").tempfile_in(folder).map_err(|e| Error::io(folder, e))?;
+    Ok(part.into_temp_path())
+}
+
+fn absent(error: std::io::Error) -> Error {
+    Error::unsupported("ffmpeg", format!("the command does not start: {error}"), REMEDY)
+}
+
+fn check(output: &Output) -> Result<()> {
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = String::from_utf8_lossy(&output.stderr);
+    let problem = format!("it ended with {}: {}", output.status, said.trim().lines().last().unwrap_or("no message"));
+    Err(Error::backend("ffmpeg", problem, "Render PNG frames and encode them by hand"))
 }

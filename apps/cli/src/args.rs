@@ -37,9 +37,11 @@ pub enum Command {
     Train(Train),
     /// Store a trained model as a .cc4d archive.
     Compress(Compress),
-    /// Write the canonical Gaussians of an archive as a PLY file.
+    /// Write a model in the file format of other programs: PLY, SPZ, SOG, glTF, splatV, MP4.
+    Export(Export),
+    /// The same as `export ply` or `export spz`, by the ending of the file; replaces it where it exists.
     Decompress(Decompress),
-    /// Render a model to PNG frames, and to a video if asked.
+    /// Render a model to PNG frames, and to a video if asked; `export mp4` makes the video alone.
     Render(Render),
     /// Measure a model against the images of a scene.
     Eval(Eval),
@@ -51,6 +53,8 @@ pub enum Command {
     Plugins(Plugins),
     /// Check this machine: processor, threads, devices, ffmpeg, and an image drawn by two rasterizers.
     Doctor(Doctor),
+    /// Try float32 against float64 under conditions that break floating point. Ends with 5 where a result is neither finite nor an error.
+    Stress(Stress),
     /// Measure speed.
     Bench(Bench),
 }
@@ -154,16 +158,29 @@ pub struct Render {
     /// Folder for the frames, frame_00000.png and on.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    #[command(flatten)]
+    pub shots: Shots,
+    /// Scene options over those the model was trained with, such as scene.width=800; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Also make a video of the frames with the ffmpeg command.
+    #[arg(long, value_name = "F.mp4")]
+    pub mp4: Option<PathBuf>,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+}
+
+/// What to draw: an orbit, or the views of a dataset.
+#[derive(Debug, Args)]
+pub struct Shots {
     /// Take the cameras and times of this dataset instead of an orbit around the model.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
     /// Which side of the dataset's split.
     #[arg(long, value_enum, default_value_t = SplitArg::Test)]
     pub split: SplitArg,
-    /// Scene options over those the model was trained with, such as scene.width=800; may be given several times.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    pub sets: Vec<String>,
-    /// Frames to render: of the orbit (default 60), or at most so many of the dataset, evenly spread.
+    /// Frames: of the orbit (default 60), or at most so many of the dataset, evenly spread.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
     /// Image size in pixels; for datasets the default is their own.
@@ -175,12 +192,33 @@ pub struct Render {
     /// The axis of the world that points up, for the orbit.
     #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]
     pub up: UpArg,
-    /// Also make a video of the frames with the ffmpeg command.
-    #[arg(long, value_name = "F.mp4")]
-    pub mp4: Option<PathBuf>,
-    /// Frames per second of the video.
+    /// Frames per second of a video.
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=240))]
     pub fps: u32,
+}
+
+#[derive(Debug, Args)]
+pub struct Export {
+    /// The format: ply, ply-sequence, spz, sog, gltf, splatv, mp4; `cc4dgs plugins` lists all, with their settings.
+    #[arg(value_name = "FORMAT")]
+    pub format: String,
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The file to write; a folder for ply-sequence.
+    #[arg(long, value_name = "PATH")]
+    pub out: PathBuf,
+    /// Replace PATH where it exists.
+    #[arg(long)]
+    pub overwrite: bool,
+    /// The instant (0 to 1) that formats without motion hold; without it, the canonical Gaussians.
+    #[arg(long, value_name = "T")]
+    pub time: Option<f32>,
+    /// Override a setting of the exporter (palette=8192), or with --scene a scene option (scene.width=800); may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    #[command(flatten)]
+    pub shots: Shots,
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
@@ -273,6 +311,16 @@ pub struct Plugins {
 
 #[derive(Debug, Args)]
 pub struct Doctor {}
+
+#[derive(Debug, Args)]
+pub struct Stress {
+    /// Device to test: auto, flex, ndarray, wgpu, cuda.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// A million optimizer steps instead of twenty thousand.
+    #[arg(long)]
+    pub full: bool,
+}
 
 /// The parts of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

@@ -13,6 +13,7 @@ mod interrupt;
 mod listeners;
 mod models;
 mod output;
+mod shots;
 
 use clap::Parser;
 use std::ffi::OsString;

@@ -1,4 +1,4 @@
-//! The stored form of cc4dgs: Gaussians as plain arrays, the `.cc4d` archive, the codec traits, PLY and SPZ.
+//! The stored form of cc4dgs: Gaussians as plain arrays, the `.cc4d` archive, the codec and exporter traits, PLY and SPZ.
 //!
 //! This crate does not depend on burn, and on `wasm32` not on C libraries. It is all that a codec or a small player needs. To add a codec, implement
 //! [`AttributeCodec`] (or [`WeightCodec`]) and submit a [`CodecPlugin`] ([`WeightCodecPlugin`]) through `inventory::submit!`. [`storage`] has building blocks
@@ -13,6 +13,7 @@ pub mod conformance;
 mod deformer_context;
 mod error;
 mod events;
+pub mod exporter;
 pub mod gaussians;
 mod image;
 mod limits;
@@ -31,6 +32,7 @@ pub use codec_context::{CodecContext, EvaluateDeformer, RenderModel, RenderedPla
 pub use deformer_context::DeformerContext;
 pub use error::{Error, Result};
 pub use events::{Event, EventSink, Fanout, Recorder, Silent};
+pub use exporter::{ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin};
 pub use gaussians::{ExtraAttribute, HostGaussians, NeededRows};
 pub use image::Image8;
 pub use limits::Limits;

@@ -63,6 +63,24 @@ pub fn write(path: impl AsRef<Path>, gaussians: &HostGaussians, include_dynamic:
 
 /// The bytes that [`write()`] writes.
 pub fn to_bytes(gaussians: &HostGaussians, include_dynamic: bool) -> Result<Vec<u8>> {
+    to_bytes_with(gaussians, &PlyOptions { dynamic: include_dynamic, antialiased: false })
+}
+
+/// How a PLY file is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PlyOptions {
+    /// Append the property `dynamic`.
+    pub dynamic: bool,
+    /// Say in a comment that the model wants Mip-Splatting's 2D filter, as viewers expect it.
+    pub antialiased: bool,
+}
+
+/// The bytes of a PLY file.
+///
+/// # Errors
+/// [`Error::Data`] for invalid Gaussians.
+pub fn to_bytes_with(gaussians: &HostGaussians, options: &PlyOptions) -> Result<Vec<u8>> {
+    let include_dynamic = options.dynamic;
     gaussians.validate("Gaussians to write", &Limits { max_gaussians: u64::MAX, ..Limits::default() })?;
     let k = sh_rest_len(gaussians.sh_degree);
     let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(String::from).into();
@@ -76,7 +94,8 @@ pub fn to_bytes(gaussians: &HostGaussians, include_dynamic: bool) -> Result<Vec<
     }
     let n = gaussians.len();
     let properties: String = names.iter().map(|name| format!("property float {name}\n")).collect();
-    let mut out = format!("ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n").into_bytes();
+    let comment = if options.antialiased { "comment SplatRenderMode: mip\n" } else { "" };
+    let mut out = format!("ply\nformat binary_little_endian 1.0\n{comment}element vertex {n}\n{properties}end_header\n").into_bytes();
     out.reserve(4 * names.len() * n);
     for i in 0..n {
         let mut put = |values: &[f32]| values.iter().for_each(|v| out.extend(v.to_le_bytes()));

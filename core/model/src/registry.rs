@@ -3,8 +3,8 @@
 use crate::life::{WithLife, take_life};
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, DensityControl, DensityPlugin,
-    Entries, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer, RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin,
-    split_kind,
+    Entries, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer, RasterizerPlugin, ReaderPlugin, Result,
+    WeightCodec, WeightCodecPlugin, split_kind,
 };
 use burn::tensor::Device;
 
@@ -12,6 +12,7 @@ use burn::tensor::Device;
 pub struct Registry {
     deformers: Entries<DeformerPlugin>,
     codecs: Entries<CodecPlugin>,
+    exporters: Entries<ExporterPlugin>,
     rasterizers: Entries<RasterizerPlugin>,
     density: Entries<DensityPlugin>,
     losses: Entries<LossPlugin>,
@@ -31,6 +32,7 @@ impl Registry {
         Ok(Self {
             deformers: Entries::collect()?,
             codecs: Entries::collect()?,
+            exporters: Entries::collect()?,
             rasterizers: Entries::collect()?,
             density: Entries::collect()?,
             losses: Entries::collect()?,
@@ -43,7 +45,8 @@ impl Registry {
     }
     /// All entries as (kind, facts), sorted.
     pub fn plugins(&self) -> Vec<(&'static str, &'static Plugin)> {
-        let model = self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts());
+        let model =
+            self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts()).chain(self.exporters.facts());
         let training = self.density.facts().chain(self.losses.facts()).chain(self.appearances.facts()).chain(self.optimizers.facts());
         model.chain(training).chain(self.readers.facts()).chain(self.presets.facts()).collect()
     }
@@ -54,6 +57,14 @@ impl Registry {
     /// The codec called `name`.
     pub fn codec(&self, name: &str) -> Result<&'static CodecPlugin> {
         self.codecs.get(name)
+    }
+    /// The exporter called `name`.
+    pub fn exporter(&self, name: &str) -> Result<&'static ExporterPlugin> {
+        self.exporters.get(name)
+    }
+    /// All exporters, sorted by name.
+    pub fn exporters(&self) -> impl Iterator<Item = &'static ExporterPlugin> + '_ {
+        self.exporters.iter()
     }
     /// The rasterizer called `name`.
     pub fn rasterizer(&self, name: &str) -> Result<&'static RasterizerPlugin> {
@@ -132,6 +143,10 @@ impl Registry {
     pub fn build_codec(&self, spec: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
         (self.codec(name)?.build)(profile, settings)
+    }
+    /// Builds the exporter called `name` with `settings`.
+    pub fn build_exporter(&self, name: &str, settings: &toml::Table) -> Result<Box<dyn Exporter>> {
+        (self.exporter(name)?.build)(settings)
     }
     /// Builds the weight codec called `name` with `settings`.
     pub fn build_weight_codec(&self, name: &str, settings: &toml::Table) -> Result<Box<dyn WeightCodec>> {

@@ -2,6 +2,7 @@
 
 use crate::checkpoint::CHECKPOINT;
 use cc4dgs_core::archive::MAGIC;
+use cc4dgs_core::spz::PLAIN_MAGIC;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
 use std::io::Read;
@@ -9,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 /// Bytes that tell all kinds apart.
 const HEAD_BYTES: u64 = 9;
-/// How SPZ files start: they are gzip streams.
+/// How SPZ files up to version 3 start: they are gzip streams.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 
 /// What a model is stored as.
@@ -35,7 +36,7 @@ impl SourceKind {
             Some(Self::Archive)
         } else if head.starts_with(b"ply\n") || head.starts_with(b"ply\r") {
             Some(Self::Ply)
-        } else if head.starts_with(&GZIP) {
+        } else if head.starts_with(&GZIP) || head.starts_with(&PLAIN_MAGIC) {
             Some(Self::Spz)
         } else {
             safetensors.then_some(Self::Checkpoint)
@@ -88,6 +89,7 @@ mod tests {
         assert_eq!(of(b"ply\nformat binary_little_endian 1.0"), Some(SourceKind::Ply));
         assert_eq!(of(b"ply\r\nforma"), Some(SourceKind::Ply));
         assert_eq!(of(b"\x1f\x8b\x08\0\0\0\0\0\x02"), Some(SourceKind::Spz));
+        assert_eq!(of(b"NGSP\x04\0\0\0\x01"), Some(SourceKind::Spz));
         assert_eq!(of(b"\x10\x02\0\0\0\0\0\0{"), Some(SourceKind::Checkpoint));
         for other in [&b""[..], b"ply", b"{\"frames\":", b"\x89PNG\r\n\x1a\n\0", b"\x10\x02\0\0\0\0\0\0", b"\x10\x02\0\0\0\0\x01\0{"] {
             assert_eq!(of(other), None, "{other:?}");

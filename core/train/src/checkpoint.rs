@@ -2,7 +2,7 @@
 
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
-use crate::train::{Guard, Neighbours, Parts, TrainState};
+use crate::train::{Guard, Neighbours, Parts, RateFactors, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
@@ -40,6 +40,9 @@ struct TrainingHeader {
     optimizer: Vec<(String, [usize; 2])>,
     /// Step counts of the optimizer.
     optimizer_steps: BTreeMap<String, u64>,
+    /// Learning rates that the watchdog lowered, by part.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    rates: BTreeMap<String, f64>,
 }
 
 /// Arrays of training by part.
@@ -101,6 +104,10 @@ impl Checkpoint {
         let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, parts);
         (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, model.field);
         state.guard = guard;
+        if let Some((part, rate)) = training.rates.iter().find(|(_, rate)| !(0.0..=1.0).contains(*rate)) {
+            return Err(damaged(format!("the learning rate of {part} is lowered by the factor {rate}")));
+        }
+        state.rates = RateFactors(training.rates);
         if !self.arrays.strain.is_empty() {
             let moving = state.moving_rows(&self.device)?.count();
             if self.arrays.strain.len() != 3 * moving {
@@ -176,6 +183,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             strain: strain.len(),
             optimizer,
             optimizer_steps: optimizer_state.steps,
+            rates: state.rates.0.clone(),
         },
     };
     arrays.write(path, &header)

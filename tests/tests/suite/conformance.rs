@@ -1,5 +1,6 @@
 //! Every registered plug-in with the conformance suites that `cc4dgs-core` exports.
 
+use cc4dgs::video::ffmpeg_version;
 use cc4dgs_backends as _;
 use cc4dgs_codecs as _;
 use cc4dgs_core::{Registry, config, conformance};
@@ -62,6 +63,18 @@ fn every_weight_codec_conforms() {
     let names: Vec<&str> = registry.plugins().into_iter().filter(|(kind, _)| *kind == "weight-codec").map(|(_, p)| p.name).collect();
     let findings: Vec<String> = names.iter().flat_map(|name| conformance::weight_codec(registry.weight_codec(name).unwrap(), &toml::Table::new())).collect();
     assert!(findings.is_empty() && names.len() >= 3, "{names:?}\n{}", findings.join("\n"));
+}
+
+#[test]
+fn every_exporter_conforms() {
+    let registry = Registry::collect().unwrap();
+    let drawn = ffmpeg_version().is_ok();
+    if !drawn {
+        eprintln!("ffmpeg is absent: videos are left out");
+    }
+    let plugins: Vec<_> = registry.exporters().filter(|p| drawn || !p.info.capabilities.contains(&"images")).collect();
+    let findings: Vec<String> = plugins.iter().flat_map(|plugin| conformance::exporter(plugin, &toml::Table::new())).collect();
+    assert!(findings.is_empty() && plugins.len() >= 6, "{} exporters\n{}", plugins.len(), findings.join("\n"));
 }
 
 #[test]

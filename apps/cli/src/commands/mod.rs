@@ -6,11 +6,13 @@ mod decompress;
 mod demo;
 mod doctor;
 mod eval;
+mod export;
 mod info;
 mod plugins;
 mod render;
 mod report;
 mod storage;
+mod stress;
 mod train;
 
 use crate::args::{BenchWhat, Cli, Command};
@@ -59,6 +61,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Demo(args) => demo::run(&context, args),
         Command::Train(args) => train::run(&context, args),
         Command::Compress(args) => compress::run(&context, args),
+        Command::Export(args) => export::run(&context, args),
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),
@@ -66,6 +69,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Info(args) => info::run(&context, args),
         Command::Plugins(args) => plugins::run(&context, args),
         Command::Doctor(_) => doctor::run(&context),
+        Command::Stress(args) => stress::run(&context, args),
         Command::Bench(args) => match &args.what {
             BenchWhat::Step(args) => bench::step(&context, args),
             BenchWhat::Frame(args) => bench::frame(&context, args),

@@ -1,13 +1,11 @@
 //! `cc4dgs render`.
 
-use super::{Context, create_parent, evenly};
+use super::{Context, create_parent};
 use crate::args::Render;
-use crate::interrupt;
 use crate::models::load_model;
-use cc4dgs::Orbit;
-use cc4dgs::scenes::open_as_trained;
-use cc4dgs::video;
-use cc4dgs_core::{Camera, Error, Event, EventSink, Result};
+use crate::{interrupt, shots};
+use cc4dgs::video::{self, VideoWriter};
+use cc4dgs_core::{Error, Event, EventSink, Result};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::images::write_png;
 use serde::Serialize;
@@ -38,21 +36,30 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     let stop = interrupt::stop_flag()?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    let (shots, background) = shots(context, args, &loaded.model)?;
+    let (shots, background) = shots::choose(context, &args.shots, &args.sets, &loaded.model)?;
     std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
     let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(background);
+    let mut video = match &args.mp4 {
+        Some(path) => {
+            create_parent(path)?;
+            Some(VideoWriter::new(path, args.shots.fps))
+        }
+        None => None,
+    };
     let mut times = Vec::with_capacity(shots.len());
     for (index, (camera, time_norm)) in shots.iter().enumerate() {
         interrupt::check(stop, &format!("after {index} of {} frames in {}", shots.len(), args.out.display()))?;
         let (output, time) = player.render(camera, *time_norm)?;
         let image = player.download(output.planes)?;
         write_png(args.out.join(video::frame_name(index)), &image)?;
+        if let Some(video) = &mut video {
+            video.add(&image)?;
+        }
         times.push(time);
         events.emit(&Event::Progress { task: "render".into(), done: index as u64 + 1, total: shots.len() as u64 });
     }
-    if let Some(path) = &args.mp4 {
-        create_parent(path)?;
-        video::encode(&args.out, shots.len(), args.fps, path)?;
+    if let Some(video) = video {
+        video.finish()?;
     }
     let steady = if times.len() > 1 { &times[1..] } else { &times[..] };
     let mean = |pick: fn(&cc4dgs_play::player::FrameTime) -> f64| steady.iter().map(pick).sum::<f64>() / steady.len() as f64;
@@ -74,32 +81,4 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
             report.frame_ms.raster
         )
     })
-}
-
-/// Cameras and normalised times, and the background of the scene they are from.
-type Shots = (Vec<(Camera, f32)>, Option<[f32; 3]>);
-
-/// Chooses what to render.
-fn shots(context: &Context, args: &Render, model: &cc4dgs_play::model::Model) -> Result<Shots> {
-    let Some(path) = &args.scene else {
-        if !args.sets.is_empty() {
-            return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));
-        }
-        let standard = Orbit::default();
-        let frames = args.frames.map_or(standard.frames, |n| n as usize);
-        let orbit = Orbit { size: args.size.unwrap_or(standard.size), frames, turns: args.turns, up: args.up.into() };
-        let cameras = orbit.around(&model.gaussians)?;
-        return Ok((cameras.into_iter().enumerate().map(|(i, camera)| (camera, orbit.time(i))).collect(), None));
-    };
-    let scene = open_as_trained(path, model, &args.sets, &context.registry, &context.limits)?;
-    let views = scene.split(args.split.into());
-    if views.is_empty() {
-        return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));
-    }
-    let wanted = args.frames.map_or(views.len(), |n| n as usize);
-    let shot = |i: usize| {
-        let camera = scene.camera(views[i]);
-        (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[views[i]].time_norm)
-    };
-    Ok((evenly(views.len(), wanted).into_iter().map(shot).collect(), scene.background))
 }

@@ -21,7 +21,7 @@ mod manifest;
 mod packing;
 mod read;
 mod write;
-mod zstandard;
+pub(crate) mod zstandard;
 
 pub use bytes::ByteReader;
 pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, Manifest, Provenance, RasterizerEntry};

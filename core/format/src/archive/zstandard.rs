@@ -19,13 +19,13 @@ use c_library as library;
 use rust_library as library;
 
 /// One frame of `bytes`.
-pub(super) fn compress(bytes: &[u8]) -> Result<Vec<u8>> {
+pub(crate) fn compress(bytes: &[u8]) -> Result<Vec<u8>> {
     library::compress(bytes).map_err(|problem| Error::backend("Zstandard", problem, "Free some memory and try again"))
 }
 
 /// Decodes `frame`, which must be a single frame that fills the bytes: at most `decoded_len` + 1 bytes, so that the caller sees a frame that is too long.
 /// The error is the problem as text.
-pub(super) fn decompress(frame: &[u8], decoded_len: u64) -> Result<Vec<u8>, String> {
+pub(crate) fn decompress(frame: &[u8], decoded_len: u64) -> Result<Vec<u8>, String> {
     let window = check_window(frame, decoded_len)?;
     library::decompress(frame, decoded_len, window)
 }

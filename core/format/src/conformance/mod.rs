@@ -1,11 +1,15 @@
-//! Conformance suites for codecs. Call them from a test of the plug-in's own crate.
+//! Conformance suites for codecs and exporters. Call them from a test of the plug-in's own crate.
 //!
 //! Each returns a list of findings, one line each; an empty list means that the plug-in passed. They generate their own inputs and need no data.
 
 mod codec;
+#[cfg(not(target_arch = "wasm32"))]
+mod exporter;
 mod weight_codec;
 
 pub use codec::codec;
+#[cfg(not(target_arch = "wasm32"))]
+pub use exporter::{MovingModel, export_facts, exporter};
 pub use weight_codec::weight_codec;
 
 use crate::Seed;

@@ -13,7 +13,7 @@ mod rasterizer;
 mod reader;
 
 pub use appearance::appearance;
-pub use cc4dgs_format::conformance::{codec, weight_codec};
+pub use cc4dgs_format::conformance::{codec, exporter, weight_codec};
 pub use deformer::deformer;
 pub use density::density;
 pub use loss::loss;

@@ -1,6 +1,6 @@
 //! Numbers of a stage, gathered between two log events.
 
-use cc4dgs_core::{Error, Event, EventSink, Result, Schedule, Stage};
+use cc4dgs_core::{Event, EventSink, Stage};
 use std::time::Instant;
 
 /// Gathers numbers between two log events.
@@ -27,16 +27,8 @@ impl Log {
         self.psnr_sum.0 += psnr_db;
         self.psnr_sum.1 += 1;
     }
-    pub(crate) fn loss(&mut self, loss: f32, schedule: &Schedule) -> Result<()> {
-        if !loss.is_finite() {
-            return Err(Error::backend(
-                format!("loss of stage {} at iteration {}", schedule.stage.name(), schedule.iteration),
-                format!("it is {loss}"),
-                "Lower the learning rates (train.lr) or resume from the last checkpoint with another seed",
-            ));
-        }
+    pub(crate) fn loss(&mut self, loss: f32) {
         self.loss = if self.loss == 0.0 { loss } else { 0.9 * self.loss + 0.1 * loss };
-        Ok(())
     }
     pub(crate) fn count_deformer(&mut self, decoded: u64, reused: u64, moved: u64, still: u64) {
         self.work[0].0 += decoded;

@@ -1,10 +1,18 @@
 //! The loss of a run: a weighted sum of the terms that the configuration lists.
 
+use super::watchdog::is_finite;
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, LossInput, LossTerm, Registry, Result, split_kind};
 
 /// Loss terms with their weights.
-pub(crate) struct LossTerms(Vec<(f64, Box<dyn LossTerm>)>);
+pub(crate) struct LossTerms(Vec<Term>);
+
+/// A term with its name.
+struct Term {
+    name: String,
+    weight: f64,
+    term: Box<dyn LossTerm>,
+}
 
 /// One `[[loss]]` section, read.
 struct Listed {
@@ -26,19 +34,20 @@ impl LossTerms {
             let index_of = |kind: &&str| listed.iter().position(|term| term.kind == **kind && term.settings.is_empty());
             let Some(mut found) = fusion.kinds.iter().map(index_of).collect::<Option<Vec<usize>>>() else { continue };
             let weights: Vec<f64> = found.iter().map(|&index| listed[index].weight).collect();
-            terms.push((1.0, (fusion.build)(&weights)?));
+            terms.push(Term { name: fusion.kinds.join(" + "), weight: 1.0, term: (fusion.build)(&weights)? });
             found.sort_unstable();
             found.into_iter().rev().for_each(|index| drop(listed.remove(index)));
         }
         for term in &listed {
-            terms.push((term.weight, (registry.loss(&term.kind)?.build)(&term.settings)?));
+            let built = (registry.loss(&term.kind)?.build)(&term.settings)?;
+            terms.push(Term { name: term.kind.clone(), weight: term.weight, term: built });
         }
         Ok(Self(terms))
     }
     /// The weighted sum `[1]` for one view.
     pub fn value(&self, input: &LossInput) -> Result<Tensor<1>> {
         let mut total: Option<Tensor<1>> = None;
-        for (weight, term) in &self.0 {
+        for Term { weight, term, .. } in &self.0 {
             let Some(value) = term.value(input)? else { continue };
             let value = if *weight == 1.0 { value } else { value.mul_scalar(*weight) };
             total = Some(match total {
@@ -47,6 +56,15 @@ impl LossTerms {
             });
         }
         Ok(total.unwrap_or_else(|| Tensor::zeros([1], &input.planes.device())))
+    }
+    /// Name of the first term whose value is not finite.
+    pub fn broken(&self, input: &LossInput) -> Result<Option<&str>> {
+        for Term { name, term, .. } in &self.0 {
+            if term.value(input)?.is_some_and(|value| !is_finite(&value)) {
+                return Ok(Some(name));
+            }
+        }
+        Ok(None)
     }
 }
 

@@ -18,10 +18,12 @@ mod state;
 mod step;
 mod strain;
 mod validate;
+mod watchdog;
 
 pub use guard::Guard;
 pub use state::{Parts, TrainState};
 pub(crate) use strain::Neighbours;
+pub use watchdog::RateFactors;
 
 use crate::checkpoint;
 use crate::checks::{Verdict, Watch, examine};
@@ -46,6 +48,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
+use watchdog::Watchdog;
 
 /// Name of the configuration inside a run's folder.
 pub const CONFIG: &str = "config.toml";
@@ -104,7 +107,7 @@ pub(crate) struct Context<'a> {
 /// Trains. With a folder, `config.toml` and `checkpoint` are written into it.
 ///
 /// # Errors
-/// [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when the loss or the offsets are no longer numbers,
+/// [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with lower rates,
 /// [`Error::Data`] for a scene that cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines (the checkpoint is kept),
 /// and whatever the scene, the plug-ins or the disk report.
 pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
@@ -271,6 +274,7 @@ impl Context<'_> {
         let prefetcher = Prefetcher::new();
         let mut log = log::Log::new(stage, length, self.job.config.train.log_every);
         let resumed_at = state.iteration;
+        let mut watchdog = Watchdog::new(state);
         while state.iteration < length {
             if self.job.stop.load(Ordering::Relaxed) {
                 self.save(state)?;
@@ -283,20 +287,29 @@ impl Context<'_> {
             let batch = sampler.batch(state.iteration);
             let schedule = self.lengths.schedule(stage, state.iteration + 1);
             prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
-            match stage {
-                Stage::Score => self.score_step(state, &schedule, &mut log)?,
-                _ => {
-                    self.photometric_step(&schedule, state, &batch, &mut log)?;
+            let check = watchdog.checks(schedule.iteration);
+            let trouble = match stage {
+                Stage::Score => self.score_step(state, &schedule, check, &mut log)?,
+                _ => self.photometric_step(&schedule, state, &batch, check, &mut log)?,
+            };
+            if trouble.is_none() {
+                if stage != Stage::Score {
                     self.control_density(&schedule, state)?;
                 }
+                self.settle(state, &schedule)?;
+                self.recover(state, &schedule)?;
             }
-            self.settle(state, &schedule)?;
-            self.recover(state, &schedule)?;
             state.iteration = schedule.iteration;
+            let every = self.job.config.train.checkpoint_every;
+            let saves = every > 0 && state.iteration.is_multiple_of(every) && state.iteration < length;
+            watchdog.after_iteration(self, state, trouble, length, saves)?;
+            if state.iteration < schedule.iteration {
+                // Back at an earlier state.
+                continue;
+            }
             watch.after_iteration(self, state, &schedule)?;
             self.validate(state, &schedule)?;
-            let every = self.job.config.train.checkpoint_every;
-            if every > 0 && state.iteration.is_multiple_of(every) && state.iteration < length {
+            if saves {
                 self.save(state)?;
             }
         }

@@ -1,6 +1,7 @@
 //! One step of the score stage: dynamic scores are blended like colours and fitted to the temporal-deviation masks (Swift4D).
 
 use super::log::Log;
+use super::watchdog::Trouble;
 use super::{Context, TrainState};
 use crate::gaussian_set::log_linear;
 use burn::tensor::{Tensor, TensorData};
@@ -8,8 +9,8 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{LossInput, Result, Schedule, SplatColors, Splats, StepSettings};
 
 impl Context<'_> {
-    /// One iteration: one camera, black background, gradient to the scores alone.
-    pub(crate) fn score_step(&self, state: &mut TrainState, schedule: &Schedule, log: &mut Log) -> Result<()> {
+    /// One iteration: one camera, black background, gradient to the scores alone. Returns what is not finite, where that is looked at.
+    pub(crate) fn score_step(&self, state: &mut TrainState, schedule: &Schedule, check: bool, log: &mut Log) -> Result<Option<Trouble>> {
         let iteration = schedule.iteration;
         // Drawn without replacement and refilled, as a permutation per round over the cameras.
         let k = self.masks.len();
@@ -36,18 +37,24 @@ impl Context<'_> {
             time_norm,
             schedule,
         })?;
-        if log.due(iteration) {
-            log.loss(to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN), schedule)?;
+        if log.due(iteration) || check {
+            let value = to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN);
+            if !value.is_finite() {
+                return Ok(Some(Trouble::of("gaussians/dynamic_scores", "the loss of the dynamic scores")));
+            }
+            if log.due(iteration) {
+                log.loss(value);
+            }
         }
         let gradients = leaves.gradients(&loss.backward());
         drop((leaves, gaussians, splats, loss));
         // 0.05 -> 0.005 over 30,000 steps of which 3,000 run; shorter stages take larger steps so that scores can still reach zeta.
         let rate = self.job.config.train.lr.score;
         let stretch = (3000.0 / schedule.length as f64).clamp(1.0, 4.0);
-        let lr = log_linear(rate, 0.1 * rate, 0.1 * schedule.progress()) * stretch;
+        let lr = log_linear(rate, 0.1 * rate, 0.1 * schedule.progress()) * stretch * state.rates.of_gaussians("dynamic_scores");
         self.step_gaussians(state, gradients, |_| StepSettings { visible: Some(&output.stats.radii), ..StepSettings::new(lr) })?;
         state.invalidate_rows();
         log.step(self.job.events, iteration, state.set.len());
-        Ok(())
+        Ok(None)
     }
 }

@@ -2,6 +2,7 @@
 
 use super::guard::Guard;
 use super::strain::Neighbours;
+use super::watchdog::RateFactors;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
@@ -33,6 +34,8 @@ pub struct TrainState {
     pub optimizer: Box<dyn Optimizer>,
     /// Whether smoothness was switched on.
     pub smooth: bool,
+    /// Learning rates that the watchdog lowered.
+    pub rates: RateFactors,
     rows: Option<MovingRows>,
     pub(crate) neighbours: Option<Neighbours>,
 }
@@ -64,6 +67,7 @@ impl TrainState {
             guard,
             optimizer,
             smooth: false,
+            rates: RateFactors::default(),
             rows: None,
             neighbours: None,
         }

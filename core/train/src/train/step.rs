@@ -2,12 +2,14 @@
 
 use super::log::Log;
 use super::smoothness::{flicker, smoothness};
+use super::watchdog::{Trouble, is_finite};
 use super::{Context, TrainState, parameters};
 use crate::gaussian_set::{Leaves, gaussian_rate};
-use burn::tensor::{Int, Tensor, TensorData};
+use burn::tensor::{Gradients, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, Event, LossInput, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics,
+    Camera, Error, Event, LossInput, Parameter, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings,
+    ViewStatistics,
 };
 use cc4dgs_play::MovingRows;
 use cc4dgs_play::model::ModelDeformer;
@@ -29,8 +31,9 @@ struct Rendered<'a> {
 }
 
 impl Context<'_> {
-    /// One iteration on the views of `batch`.
-    pub(crate) fn photometric_step(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], log: &mut Log) -> Result<()> {
+    /// One iteration on the views of `batch`. Losses and offsets are looked at where they are logged and where `check` asks for it, gradients where `check` does;
+    /// what is not finite is returned, and the parameters are then as they were or unfit for use.
+    pub(crate) fn photometric_step(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], check: bool, log: &mut Log) -> Result<Option<Trouble>> {
         let train = &self.job.config.train;
         let scene = self.pyramid.at(schedule.image_scale);
         let (n, progress) = (state.set.len(), schedule.progress());
@@ -67,8 +70,11 @@ impl Context<'_> {
                 (Some(spatial), Some(deformer)) => {
                     let offsets = deformer.field.deform(spatial.features.clone(), self.noisy_time(time_norm, schedule, view))?;
                     offsets.check(deformer.name(), rows.count())?;
-                    if read {
-                        offsets.check_finite(deformer.name())?;
+                    if read || check {
+                        // The check names the head; the way out is the watchdog's.
+                        if let Err(Error::Backend { object, .. }) = offsets.check_finite(deformer.name()) {
+                            return Ok(Some(Trouble::of("deformer", format!("the offsets of {object}"))));
+                        }
                     }
                     if let (Some(neighbours), Some(means)) = (&neighbours, &offsets.means) {
                         let term = neighbours.strain(means.clone()).mul_scalar(train.strain / batch.len() as f32);
@@ -87,7 +93,12 @@ impl Context<'_> {
             let planes = state.appearance.apply(output.planes, self.training_camera.get(&scene.views[view].camera).copied())?;
             let target = Tensor::<3>::from_inner(self.rasterizer.upload(&scene.frame(view)?, background_rgb, &self.device));
             let radii = output.stats.radii;
-            let loss = self.losses.value(&LossInput { planes: &planes, target: &target, gaussians: &drawn, radii: &radii, time_norm, schedule })?;
+            let input = LossInput { planes: &planes, target: &target, gaussians: &drawn, radii: &radii, time_norm, schedule };
+            let loss = self.losses.value(&input)?;
+            if (read || check) && !is_finite(&loss) {
+                let part = if is_finite(&planes) { self.losses.broken(&input)?.map(|term| format!("the loss term {term}")) } else { None };
+                return Ok(Some(Trouble::new(part.unwrap_or_else(|| format!("the image of camera {}", camera.name)))));
+            }
             if read {
                 log.psnr(psnr_db(planes, target)?);
             }
@@ -102,7 +113,7 @@ impl Context<'_> {
             });
             rendered.push(Rendered { screen_probe, absolute_screen_probe, radii, max_weights: output.stats.max_weights, camera });
         }
-        let Some(mut loss) = total else { return Ok(()) };
+        let Some(mut loss) = total else { return Ok(None) };
         if let (Some(deformer), Some(&view), Some(spatial)) = (&state.deformer, batch.first(), &spatial) {
             let time_norm = scene.views[view].time_norm;
             if state.smooth {
@@ -118,8 +129,15 @@ impl Context<'_> {
         if let Some(term) = state.appearance.regularizer()? {
             loss = loss + term;
         }
-        if read {
-            log.loss(to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN), schedule)?;
+        if read || check {
+            let value = to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN);
+            if !value.is_finite() {
+                // The terms of the images are finite, so it is one of the others.
+                return Ok(Some(Trouble::new("the regularizer of deformer or appearance model, or smoothness")));
+            }
+            if read {
+                log.loss(value);
+            }
         }
 
         let gradients = loss.backward();
@@ -130,6 +148,9 @@ impl Context<'_> {
             state.density.observe(&ViewStatistics { radii, screen_gradient, absolute_screen_gradient, max_weights, size, views: batch.len() })?;
         }
         let of_gaussians = leaves.gradients(&gradients);
+        if check && let Some(trouble) = broken_gradient(state, &of_gaussians, &gradients) {
+            return Ok(Some(trouble));
+        }
         let deformed = spatial.is_some();
         // Whoever else holds the values would keep the optimizer from working in place.
         drop((leaves, gaussians, loss, spatial));
@@ -144,18 +165,23 @@ impl Context<'_> {
         let of_plugin: BTreeMap<String, f64> =
             state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
         let scale = train.rate_scale(schedule.stage);
-        let rate = |name: &str| scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
+        let rates = state.rates.clone();
+        let rate =
+            |name: &str| rates.of_gaussians(name) * scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
         self.step_gaussians(state, of_gaussians, |name| StepSettings { visible: visible.as_ref(), ..StepSettings::new(rate(name)) })?;
         let of_group = |group: &ParameterGroup| scale * parameters::rate(group, progress, extent);
         let TrainState { deformer, appearance, optimizer, .. } = state;
         if let Some(deformer) = deformer.as_mut().filter(|_| deformed) {
             let groups = deformer.field.groups();
-            parameters::update("deformer/", deformer.field.parameters_mut(), &groups, &gradients, optimizer.as_mut(), of_group)?;
+            parameters::update("deformer/", deformer.field.parameters_mut(), &groups, &gradients, optimizer.as_mut(), |group| {
+                rates.of_deformer() * of_group(group)
+            })?;
         }
         let groups = appearance.groups();
+        let of_group = |group: &ParameterGroup| rates.of_appearance() * of_group(group);
         parameters::update("appearance/", appearance.parameters_mut(), &groups, &gradients, optimizer.as_mut(), of_group)?;
         log.step(self.job.events, schedule.iteration, state.set.len());
-        Ok(())
+        Ok(None)
     }
 
     /// One optimizer step of the Gaussians' attributes that have a gradient.
@@ -223,6 +249,19 @@ fn spatial_pass(deformer: &ModelDeformer, leaves: &Leaves, rows: &MovingRows, lo
     let (work, moving) = (spatial.work, rows.count() as u64);
     log.count_deformer(work.vertices_decoded, work.vertices_queried - work.vertices_decoded, moving, total as u64 - moving);
     Ok(Spatial { input, features: spatial.values })
+}
+
+/// The first gradient that is not finite.
+fn broken_gradient(state: &TrainState, of_gaussians: &[(String, Tensor<2>)], gradients: &Gradients) -> Option<Trouble> {
+    if let Some((name, _)) = of_gaussians.iter().find(|(_, gradient)| !is_finite(gradient)) {
+        return Some(Trouble::of(format!("gaussians/{name}"), format!("the gradient of {name}")));
+    }
+    let deformer = state.deformer.iter().flat_map(|d| d.field.parameters()).map(|p| ("deformer", p));
+    let mut weights = deformer.chain(state.appearance.parameters().into_iter().map(|p| ("appearance", p)));
+    // Weights that took no part in the step are not tracked.
+    let broken = |p: &Parameter| p.value.is_require_grad() && p.value.grad(gradients).is_some_and(|gradient| !is_finite(&gradient));
+    let (part, parameter) = weights.find(|(_, p)| broken(p))?;
+    Some(Trouble::of(part, format!("the gradient of the weights '{}' of {part}", parameter.name)))
 }
 
 /// PSNR in dB of the first three of `planes` against `target`, unrounded, data range 1; at most 100 dB, where float32 images stop differing.

@@ -1,0 +1,203 @@
+//! Writing models in the file formats of other programs.
+//!
+//! The formats are plug-ins ([`cc4dgs_core::Exporter`]); this module feeds them: Gaussians at any time through the model's deformer, in the coordinates of the
+//! dataset, and rendered images.
+
+mod mp4;
+
+use crate::{Model, Orbit};
+use burn::tensor::Device;
+use cc4dgs_core::exporter::export;
+use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, HostGaussians, Image8, Registry, Result};
+use cc4dgs_play::model::Model as PlayModel;
+use cc4dgs_play::player::Player;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// What to export of a model.
+#[derive(Clone, Debug)]
+pub struct ExportRequest {
+    /// The instant (0..1) that formats without motion hold; `None` is the canonical model.
+    pub time_norm: Option<f32>,
+    /// Frames of formats that hold several; as many as the model was trained with where absent. Frame k of n is at time k / n.
+    pub frames: Option<usize>,
+    /// Frames per second of videos.
+    pub frames_per_second: f64,
+    /// The signed unit axis of the world that points up.
+    pub up: [f64; 3],
+    /// Cameras (in the model's frame) and times of rendered images.
+    pub shots: Vec<(Camera, f32)>,
+    /// Background of rendered images where the model has none.
+    pub background: Option<[f32; 3]>,
+}
+
+impl Default for ExportRequest {
+    fn default() -> Self {
+        Self { time_norm: None, frames: None, frames_per_second: 30.0, up: [0.0, 0.0, 1.0], shots: Vec::new(), background: None }
+    }
+}
+
+/// An export to run.
+pub struct ExportJob<'a> {
+    /// The model.
+    pub model: &'a PlayModel,
+    /// Name of the exporter.
+    pub format: &'a str,
+    /// Its settings.
+    pub settings: &'a toml::Table,
+    /// What to export.
+    pub request: ExportRequest,
+    /// The file or folder to write.
+    pub out: &'a Path,
+    /// Replace it where it exists.
+    pub overwrite: bool,
+    /// The linked plug-ins.
+    pub registry: &'a Registry,
+    /// The device of deformer and rasterizer.
+    pub device: &'a Device,
+    /// Receives progress, and that the file was saved.
+    pub events: &'a dyn EventSink,
+    /// Ends the export with [`Error::Interrupted`] once it is set.
+    pub stop: &'a AtomicBool,
+}
+
+/// What was exported.
+#[derive(Clone, Debug, Serialize)]
+pub struct ExportReport {
+    /// The file or folder.
+    pub file: PathBuf,
+    /// Name of the exporter.
+    pub format: String,
+    /// What the format cannot carry of this model, in one sentence.
+    pub lost: String,
+    /// Gaussians per file; 0 for images.
+    pub gaussians: usize,
+    /// Spherical-harmonics degree that was kept.
+    pub sh_degree: usize,
+    /// Frames.
+    pub frames: usize,
+    /// The instant, where one was asked for.
+    pub time: Option<f32>,
+    /// Size on disk.
+    pub bytes: u64,
+    /// The same in MB = 10⁶ bytes.
+    pub size_mb: f64,
+    /// What was measured or left out while writing.
+    pub notes: Vec<String>,
+}
+
+impl ExportJob<'_> {
+    /// Writes the file or folder; it appears complete or not at all.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for unknown formats, settings and times, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
+    /// cannot hold; what device and disk report.
+    pub fn run(&self) -> Result<ExportReport> {
+        let plugin = self.registry.exporter(self.format)?;
+        let exporter = (plugin.build)(self.settings)?;
+        if let Some(time) = self.request.time_norm.filter(|t| !(0.0..=1.0).contains(t)) {
+            let remedy = "Give the normalised time, 0 for the first frame and 1 for the last";
+            return Err(Error::parameter("time", format!("{time} is not in 0..1"), remedy));
+        }
+        let mut source = ModelSource::new(self)?;
+        let lost = exporter.loses(source.facts());
+        let (exported, bytes) = export(exporter.as_ref(), plugin.target, &mut source, self.out, self.overwrite)?;
+        self.events.emit(&Event::Saved { path: self.out.display().to_string(), bytes });
+        Ok(ExportReport {
+            file: self.out.to_path_buf(),
+            format: self.format.to_string(),
+            lost,
+            gaussians: exported.gaussians,
+            sh_degree: exported.sh_degree,
+            frames: exported.frames,
+            time: self.request.time_norm,
+            bytes,
+            size_mb: bytes as f64 / 1e6,
+            notes: exported.notes,
+        })
+    }
+}
+
+/// A model as exporters see it.
+struct ModelSource<'a> {
+    job: &'a ExportJob<'a>,
+    player: Player<'a>,
+    facts: ExportFacts,
+}
+
+impl<'a> ModelSource<'a> {
+    fn new(job: &'a ExportJob<'a>) -> Result<Self> {
+        let (model, request) = (job.model, &job.request);
+        let player = Player::new(model, job.registry, job.device)?.on(request.background);
+        let frames = request.frames.unwrap_or(model.frame_count).max(1);
+        let orbit = Orbit { frames: 1, up: request.up, ..Orbit::default() };
+        // A camera is a convenience; models that no orbit can look at have none.
+        let home = request.shots.first().map(|(camera, _)| camera.clone()).or_else(|| orbit.around(&model.gaussians).ok()?.pop());
+        let facts = ExportFacts {
+            name: job.out.file_stem().map_or_else(|| "model".into(), |stem| stem.to_string_lossy().into_owned()),
+            gaussians: model.gaussians.len(),
+            moving: player.moving(),
+            sh_degree: model.gaussians.sh_degree,
+            time_norm: request.time_norm,
+            times_norm: (0..frames).map(|k| k as f32 / frames as f32).collect(),
+            frames_per_second: request.frames_per_second,
+            antialiased: model.render.antialiased,
+            up: request.up,
+            home: home.map(|camera| model.normalisation.inverse().apply_camera(&camera)),
+            images: request.shots.len(),
+        };
+        Ok(Self { job, player, facts })
+    }
+}
+
+impl ExportSource for ModelSource<'_> {
+    fn facts(&self) -> &ExportFacts {
+        &self.facts
+    }
+    fn gaussians(&mut self, time_norm: Option<f32>) -> Result<HostGaussians> {
+        let mut gaussians = match time_norm {
+            None => self.job.model.gaussians.clone(),
+            Some(time) => self.player.gaussians_at(time)?.to_host()?,
+        };
+        self.job.model.to_dataset(&mut gaussians);
+        Ok(gaussians)
+    }
+    fn image(&mut self, index: usize) -> Result<Image8> {
+        match self.job.request.shots.get(index) {
+            Some((camera, time)) => self.player.frame(camera, *time),
+            None => Err(Error::parameter("image", format!("{index} of {}", self.facts.images), "Ask for an image that is there")),
+        }
+    }
+    fn progress(&mut self, done: usize, total: usize) -> Result<()> {
+        if self.job.stop.load(Ordering::Relaxed) {
+            return Err(Error::Interrupted(format!("after {done} of {total} parts of {}", self.job.out.display())));
+        }
+        self.job.events.emit(&Event::Progress { task: format!("export {}", self.job.format), done: done as u64, total: total as u64 });
+        Ok(())
+    }
+}
+
+impl Model {
+    /// Writes the model in the format of the exporter `format` (`ply`, `spz`, `sog`, `gltf`, `splatv`, …) with its default settings. The file appears complete
+    /// or not at all and must not exist. [`ExportJob`] has the other choices.
+    ///
+    /// # Errors
+    /// As [`ExportJob::run`].
+    pub fn export(&self, format: &str, path: impl AsRef<Path>) -> Result<ExportReport> {
+        let session = self.session();
+        ExportJob {
+            model: self,
+            format,
+            settings: &toml::Table::new(),
+            request: ExportRequest::default(),
+            out: path.as_ref(),
+            overwrite: false,
+            registry: session.registry(),
+            device: session.device(),
+            events: session.events(),
+            stop: &AtomicBool::new(false),
+        }
+        .run()
+    }
+}

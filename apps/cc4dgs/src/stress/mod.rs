@@ -1,0 +1,163 @@
+//! Numerical stress: float32 kernels against float64 over conditions that break floating point.
+//!
+//! Each condition is tried at one or more levels (an offset of 1e2, 1e3, … units). A result *behaves* if every number is finite, or if the call returns an
+//! error; it must not panic. Where a float64 oracle exists, the error is the 95th percentile of the absolute differences over the largest absolute value of the
+//! oracle, so that a pixel at which a comparison fell the other way does not hide the digits of the others; the share of values that differ by more than 1 % is
+//! stated beside it. The *limit* of a condition is the first level at which the error is over 1 %.
+
+mod raster;
+mod scenes;
+mod weights;
+
+use burn::tensor::Device;
+use cc4dgs_core::{Registry, Result};
+use serde::Serialize;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// An error above this counts as the limit of a kernel: 1 % of the largest value.
+pub const LIMIT: f64 = 0.01;
+
+/// What to run.
+pub struct StressJob<'a> {
+    /// The linked plug-ins.
+    pub registry: &'a Registry,
+    /// The device under test.
+    pub device: &'a Device,
+    /// The device of the oracle: one for processors.
+    pub host: &'a Device,
+    /// Name of the rasterizer under test.
+    pub rasterizer: &'a str,
+    /// Name of the rasterizer that computes in float64 on the host.
+    pub oracle: &'a str,
+    /// Name of the optimizer.
+    pub optimizer: &'a str,
+    /// Optimizer steps with vanishing gradients.
+    pub steps: usize,
+}
+
+/// A condition at one level.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct StressCase {
+    /// The part under test: rasterizer, gradients, a deformer, the optimizer, a weight codec, a loss term.
+    pub part: String,
+    /// The condition.
+    pub condition: String,
+    /// Its level.
+    pub level: String,
+    /// 95th percentile of the error, relative to the oracle's largest value; absent without an oracle or without numbers.
+    pub error: Option<f64>,
+    /// Share of the values that differ by more than 1 % of the oracle's largest.
+    pub outliers: Option<f64>,
+    /// Whether every number was finite, or the call returned an error.
+    pub behaves: bool,
+    /// `finite`, `infinite as the exact value`, the error's text, or what went wrong.
+    pub outcome: String,
+}
+
+/// All cases of a run.
+#[derive(Clone, Debug, Serialize)]
+pub struct StressReport {
+    /// In the order in which they ran.
+    pub cases: Vec<StressCase>,
+}
+
+impl StressReport {
+    /// Cases that do not behave.
+    pub fn failures(&self) -> impl Iterator<Item = &StressCase> {
+        self.cases.iter().filter(|case| !case.behaves)
+    }
+    /// The first level of each (part, condition) with an oracle at which the error is over [`LIMIT`]; `None` where there is no such level.
+    pub fn limits(&self) -> Vec<(&str, &str, Option<&str>)> {
+        let mut limits: Vec<(&str, &str, Option<&str>)> = Vec::new();
+        for case in &self.cases {
+            let Some(error) = case.error else { continue };
+            let over = (!(error <= LIMIT)).then_some(case.level.as_str());
+            match limits.iter_mut().find(|(part, condition, _)| *part == case.part && *condition == case.condition) {
+                Some((_, _, limit)) => *limit = limit.or(over),
+                None => limits.push((&case.part, &case.condition, over)),
+            }
+        }
+        limits
+    }
+}
+
+/// Runs all conditions. `progress` is told each case as it ends.
+///
+/// # Errors
+/// Names that the registry does not know. What a condition does is a case of the report, never an error.
+pub fn stress(job: &StressJob, progress: &mut dyn FnMut(&StressCase)) -> Result<StressReport> {
+    let mut report = StressReport { cases: Vec::new() };
+    let mut note = |case: StressCase| {
+        progress(&case);
+        report.cases.push(case);
+    };
+    raster::run(job, &mut note)?;
+    weights::run(job, &mut note)?;
+    Ok(report)
+}
+
+/// Values under test, and those of an oracle if there is one.
+type Compared = (Vec<f32>, Option<Vec<f32>>);
+
+/// Runs `work` and judges its values.
+fn case(part: &str, condition: &str, level: impl Into<String>, work: impl FnOnce() -> Result<Compared>) -> StressCase {
+    let empty =
+        StressCase { part: part.into(), condition: condition.into(), level: level.into(), error: None, outliers: None, behaves: true, outcome: String::new() };
+    match catch_unwind(AssertUnwindSafe(work)) {
+        Err(_) => StressCase { behaves: false, outcome: "it panics".into(), ..empty },
+        Ok(Err(e)) => StressCase { outcome: format!("error: {e}"), ..empty },
+        Ok(Ok((found, oracle))) => judge(empty, &found, oracle.as_deref()),
+    }
+}
+
+fn judge(case: StressCase, found: &[f32], oracle: Option<&[f32]>) -> StressCase {
+    let broken = |value: f32, exact: Option<&f32>| !value.is_finite() && exact.is_none_or(|exact| exact.is_finite());
+    if oracle.is_some_and(|oracle| oracle.len() != found.len()) {
+        return StressCase { behaves: false, outcome: "it has another number of values than the oracle".into(), ..case };
+    }
+    let wrong = found.iter().enumerate().filter(|(i, v)| broken(**v, oracle.and_then(|o| o.get(*i)))).count();
+    if wrong > 0 {
+        return StressCase { behaves: false, outcome: format!("{wrong} of {} values are not finite", found.len()), ..case };
+    }
+    let Some(oracle) = oracle else {
+        return StressCase { outcome: "finite".into(), ..case };
+    };
+    let largest = oracle.iter().filter(|v| v.is_finite()).fold(0.0f64, |a, v| a.max(f64::from(v.abs())));
+    let scale = if largest > 0.0 { largest } else { 1.0 };
+    let mut errors: Vec<f64> =
+        found.iter().zip(oracle).filter(|(a, b)| a.is_finite() && b.is_finite()).map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs() / scale).collect();
+    errors.sort_unstable_by(f64::total_cmp);
+    let outcome = if errors.len() == found.len() { "finite" } else { "infinite as the exact value" };
+    let (error, outliers) = match errors.len() {
+        0 => (None, None),
+        n => (Some(errors[(n - 1) * 95 / 100]), Some(errors.iter().filter(|e| **e > LIMIT).count() as f64 / n as f64)),
+    };
+    StressCase { error, outliers, outcome: outcome.into(), ..case }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Error;
+
+    #[test]
+    fn results_are_judged() {
+        let judged = |work: fn() -> Result<Compared>| case("p", "c", "l", work);
+        let good = judged(|| Ok((vec![1.0, 2.0, 4.04], Some(vec![1.0, 2.0, 4.0]))));
+        assert!(good.behaves && (good.error.unwrap() - 0.0).abs() < 1e-9, "{good:?}");
+        assert!((good.outliers.unwrap() - 1.0 / 3.0).abs() < 1e-9 || good.outliers == Some(0.0), "{good:?}");
+        assert!(!judged(|| Ok((vec![f32::NAN], None))).behaves);
+        assert!(!judged(|| Ok((vec![f32::INFINITY], Some(vec![1.0])))).behaves);
+        assert!(judged(|| Ok((vec![f32::INFINITY], Some(vec![f32::INFINITY])))).behaves);
+        assert!(judged(|| Err(Error::data("x", "y", "z"))).behaves);
+        assert!(!judged(|| panic!("on purpose")).behaves);
+        assert!(!judged(|| Ok((vec![1.0], Some(Vec::new())))).behaves);
+    }
+
+    #[test]
+    fn the_first_level_over_the_limit_is_found() {
+        let at = |level: &str, error| StressCase { error: Some(error), ..case("p", "c", level, || Ok((vec![0.0], None))) };
+        let report = StressReport { cases: vec![at("1e2", 1e-5), at("1e3", 0.02), at("1e4", 0.5)] };
+        assert_eq!(report.limits(), [("p", "c", Some("1e3"))]);
+    }
+}

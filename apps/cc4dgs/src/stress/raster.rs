@@ -1,0 +1,60 @@
+//! The rasterizer, forward and backward, against the one in float64.
+
+use super::scenes::{Hard, all};
+use super::{Compared, StressCase, StressJob, case};
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::format::conformance::uniform;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Gaussians, Rasterizer, RenderSettings, Result, Seed, Splats, split_kind, toml};
+
+pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
+    let build = |name: &str| -> Result<Box<dyn Rasterizer>> {
+        let (kind, settings) = split_kind("rasterizer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
+        (job.registry.rasterizer(&kind)?.build)(&settings)
+    };
+    let (tested, oracle) = (build(job.rasterizer)?, build(job.oracle)?);
+    for hard in all() {
+        let compare = |values: fn(&dyn Rasterizer, &Device, &Hard) -> Result<Vec<f32>>| -> Result<Compared> {
+            let exact = values(oracle.as_ref(), job.host, &hard)?;
+            Ok((values(tested.as_ref(), job.device, &hard)?, Some(exact)))
+        };
+        note(case("rasterizer", hard.condition, &hard.level, || compare(planes)));
+        note(case("gradients", hard.condition, &hard.level, || compare(gradients)));
+    }
+    Ok(())
+}
+
+/// Planes of the image.
+fn planes(rasterizer: &dyn Rasterizer, device: &Device, hard: &Hard) -> Result<Vec<f32>> {
+    let g = Gaussians::from_host(&hard.gaussians, device);
+    let output = rasterizer.render(&Splats::from_gaussians(&g, 1), &hard.camera, &RenderSettings::default())?;
+    // Without depth, whose scale would hide the colours.
+    to_vec(output.planes.narrow(0, 0, 4), "planes")
+}
+
+/// Gradients of a weighted sum of the planes with respect to all attributes, each over its largest value, so that all count alike.
+fn gradients(rasterizer: &dyn Rasterizer, device: &Device, hard: &Hard) -> Result<Vec<f32>> {
+    let tracked = device.clone().autodiff();
+    let mut g = Gaussians::from_host(&hard.gaussians, &tracked);
+    g.means = g.means.require_grad();
+    g.log_scales = g.log_scales.require_grad();
+    g.quaternions = g.quaternions.require_grad();
+    g.opacity_logits = g.opacity_logits.require_grad();
+    g.sh_dc = g.sh_dc.require_grad();
+    let output = rasterizer.render(&Splats::from_gaussians(&g, 1), &hard.camera, &RenderSettings::default())?;
+    let [_, height, width] = output.planes.dims();
+    let upstream: Vec<f32> = (0..5 * height * width).map(|k| if k < 4 * height * width { uniform(Seed::root(6), k) } else { 0.0 }).collect();
+    let weights = Tensor::<3>::from_data(TensorData::new(upstream, [5, height, width]), &tracked);
+    let found = (output.planes * weights).sum().backward();
+    let mut out = Vec::new();
+    let means = g.means.grad(&found).map(|t| to_vec(t, "gradient"));
+    let others = [g.log_scales.grad(&found), g.quaternions.grad(&found), g.sh_dc.grad(&found)].map(|t| t.map(|t| to_vec(t, "gradient")));
+    let opacity = g.opacity_logits.grad(&found).map(|t| to_vec(t, "gradient"));
+    for gradient in [means, opacity].into_iter().chain(others).flatten() {
+        let gradient = gradient?;
+        let largest = gradient.iter().filter(|v| v.is_finite()).fold(0.0f32, |a, v| a.max(v.abs()));
+        let scale = if largest > 0.0 { largest } else { 1.0 };
+        out.extend(gradient.into_iter().map(|v| v / scale));
+    }
+    Ok(out)
+}

@@ -1,0 +1,129 @@
+//! Deformers, the optimizer, weight codecs and loss terms.
+
+use super::{Compared, StressCase, StressJob, case};
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use cc4dgs_core::format::conformance::uniform;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{
+    CodecContext, DeformerContext, Gaussians, HostGaussians, Limits, LossInput, Result, Schedule, Seed, Silent, SpatialInput, StepSettings, WeightArray,
+    split_kind, toml,
+};
+
+/// Centres per deformer.
+const POINTS: usize = 120;
+/// Values per optimizer run.
+const VALUES: usize = 64;
+
+pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
+    for (kind, plugin) in job.registry.plugins() {
+        match kind {
+            "deformer" => deformer(job, plugin.name, note),
+            "weight-codec" => weight_codec(job, plugin.name, note),
+            "loss" => loss(job, plugin.name, note),
+            _ => {}
+        }
+    }
+    for (level, decay) in [("constant 1e-3", 1.0f64), ("vanishing", 0.999), ("1e-30", f64::NAN)] {
+        note(case(&format!("optimizer {}", job.optimizer), &format!("{} steps", job.steps), level, || optimizer(job, decay)));
+    }
+    Ok(())
+}
+
+/// Times at the ends and beyond, and centres on the faces of voxels, in the corners of the box, and outside.
+fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
+    let part = format!("deformer {name}");
+    let places: [(&str, fn(usize) -> [f32; 3]); 4] = [
+        // Multiples of 1/64 lie on the faces of grids of any power of two.
+        ("centres on the faces of voxels", |i| [i % 9, i / 9 % 9, i / 81].map(|k| k as f32 / 4.0 - 1.0)),
+        ("centres at the box", |i| [i & 1, i >> 1 & 1, i >> 2 & 1].map(|k| if k == 0 { -1.0 } else { 1.0 })),
+        ("centres outside the box", |i| [0, 1, 2].map(|k| 50.0 * uniform(Seed::root(4).index(i as u64), k))),
+        ("centres far outside the box", |i| [0, 1, 2].map(|k| 1e30 * uniform(Seed::root(5).index(i as u64), k))),
+    ];
+    for (condition, place) in places {
+        for time in [0.0f32, 0.5, 1.0, 1.0f32.next_up(), -1.0, 2.0, 1e6, f32::NAN] {
+            let values = |device: &Device| -> Result<Vec<f32>> {
+                let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
+                let (kind, settings) = split_kind("deformer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
+                let deformer = (job.registry.deformer(&kind)?.build)(&settings, &context, device)?;
+                let means: Vec<f32> = (0..POINTS).flat_map(place).collect();
+                let attributes = deformer.attributes().iter().map(|a| Tensor::<2>::full([POINTS, a.width], a.start, device)).collect();
+                let input = SpatialInput { means_world: Tensor::from_data(TensorData::new(means, [POINTS, 3]), device), attributes };
+                let offsets = deformer.deform(deformer.spatial(&input)?.values, time)?;
+                offsets.concatenated().map_or(Ok(Vec::new()), |all| to_vec(all, "offsets"))
+            };
+            // The other device computes the same formulas in float32.
+            let both = || Ok((values(job.device)?, Some(values(job.host)?)));
+            note(case(&part, condition, format!("time {time}"), both));
+        }
+    }
+}
+
+/// Many steps with gradients that vanish, against float64.
+fn optimizer(job: &StressJob, decay: f64) -> Result<Compared> {
+    let section = toml::Table::from_iter([("kind".into(), job.optimizer.into())]);
+    let mut optimizer = job.registry.build_optimizer(&section)?;
+    let first: Vec<f32> = (0..VALUES).map(|k| 1e-3 * uniform(Seed::root(9), k)).collect();
+    let start: Vec<f32> = (0..VALUES).map(|k| uniform(Seed::root(10), k)).collect();
+    let settings = StepSettings::new(1e-4);
+    let tensor = |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, [VALUES, 1]), job.device);
+    let at = |step: usize, k: usize| -> f32 { if decay.is_nan() { 1e-30 } else { (f64::from(first[k]) * decay.powi(step.min(100_000) as i32)) as f32 } };
+    let mut value = tensor(start.clone());
+    let (mut exact, mut m, mut v) = (start.iter().map(|x| f64::from(*x)).collect::<Vec<_>>(), vec![0.0f64; VALUES], vec![0.0f64; VALUES]);
+    let (beta1, beta2) = (0.9f64, 0.999f64);
+    for step in 1..=job.steps {
+        let gradient: Vec<f32> = (0..VALUES).map(|k| at(step - 1, k)).collect();
+        for (k, g) in gradient.iter().enumerate() {
+            let g = f64::from(*g);
+            m[k] = beta1 * m[k] + (1.0 - beta1) * g;
+            v[k] = beta2 * v[k] + (1.0 - beta2) * g * g;
+            let (m_hat, v_hat) = (m[k] / (1.0 - beta1.powi(step as i32)), v[k] / (1.0 - beta2.powi(step as i32)));
+            exact[k] -= settings.lr * m_hat / (v_hat.sqrt() + settings.epsilon);
+        }
+        value = optimizer.step("stress", value, tensor(gradient), &settings)?;
+    }
+    Ok((to_vec(value, "values")?, Some(exact.into_iter().map(|x| x as f32).collect())))
+}
+
+/// Weights that half precision can hardly hold.
+fn weight_codec(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
+    for (level, scale) in [("1e-30", 1e-30f32), ("1e-8", 1e-8), ("1e-4", 1e-4), ("1", 1.0), ("6e4", 6e4), ("1e6", 1e6), ("1e30", 1e30)] {
+        note(case(&format!("weight codec {name}"), "size of the weights", level, || {
+            let codec = job.registry.build_weight_codec(name, &toml::Table::new())?;
+            let values: Vec<f32> = (0..500).map(|k| scale * uniform(Seed::root(12), k)).collect();
+            let context = CodecContext::new(Seed::root(1), Limits::default(), &Silent);
+            let streams = codec.encode(&[WeightArray { name: "w".into(), shape: vec![500], values: values.clone() }], &context)?;
+            let found = codec.decode(&streams, &context)?.into_iter().flat_map(|array| array.values).collect();
+            Ok((found, Some(values)))
+        }));
+    }
+}
+
+/// Images whose values explode. What a loss makes of them is bounded by the watchdog of the trainer; here it must not panic, and be finite where float32 can be.
+fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
+    const SIZE: [usize; 2] = [17, 23];
+    for level in [0.0f32, 1.0, 1e4, 1e10, 1e18] {
+        note(case(&format!("loss {name}"), "exploding images", format!("{level:e}"), || {
+            let term = (job.registry.loss(name)?.build)(&toml::Table::new())?;
+            let pixels = SIZE[0] * SIZE[1];
+            let draw = |seed: u64, count: usize| -> Vec<f32> { (0..count).map(|k| 0.5 + 0.5 * uniform(Seed::root(seed), k)).collect() };
+            let planes = draw(1, 5 * pixels).into_iter().map(|v| level * v).collect::<Vec<_>>();
+            let planes = Tensor::<3>::from_data(TensorData::new(planes, [5, SIZE[0], SIZE[1]]), job.device);
+            let target = Tensor::<3>::from_data(TensorData::new(draw(2, 3 * pixels), [3, SIZE[0], SIZE[1]]), job.device);
+            let host = HostGaussians {
+                means: vec![0.0; 3],
+                log_scales: vec![-2.0; 3],
+                quaternions: vec![1.0, 0.0, 0.0, 0.0],
+                opacity_logits: vec![0.0],
+                sh_dc: vec![0.0; 3],
+                dynamic_scores: vec![0.0],
+                ..Default::default()
+            };
+            let gaussians = Gaussians::from_host(&host, job.device);
+            let radii = Tensor::<1, Int>::from_data(TensorData::new(vec![3i64], [1]), job.device);
+            let schedule = Schedule::main(100);
+            let input = LossInput { planes: &planes, target: &target, gaussians: &gaussians, radii: &radii, time_norm: 0.5, schedule: &schedule };
+            let value = term.value(&input)?.map_or(Ok(vec![0.0]), |value| to_vec(value, "loss"))?;
+            Ok((value, None))
+        }));
+    }
+}

@@ -1,0 +1,102 @@
+//! What a training does with values that are not finite, with loss terms that produce them on purpose.
+#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
+
+use burn::tensor::Tensor;
+use cc4dgs::{Error, Event, RunConfig, Session};
+use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory, toml};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+/// Calls of the term that breaks once.
+static ONCE: AtomicUsize = AtomicUsize::new(0);
+
+/// Adds NaN to the loss: `when = "once"` in one call at iteration 130 of the main stage, `"always"` from there on, `"opaque"` where an opacity logit is over 30.
+#[derive(serde::Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Poison {
+    when: String,
+}
+
+impl Default for Poison {
+    fn default() -> Self {
+        Self { when: "never".into() }
+    }
+}
+
+impl LossTerm for Poison {
+    fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
+        let late = input.schedule.stage == cc4dgs_core::Stage::Main && input.schedule.iteration >= 130;
+        let breaks = match self.when.as_str() {
+            // Two views of the same iteration, or the search for the term's name, may call it again.
+            "once" => late && input.schedule.iteration == 130 && ONCE.fetch_add(1, Ordering::SeqCst) < 2,
+            "always" => late,
+            "opaque" => input.gaussians.opacity_logits.clone().inner().max().into_scalar::<f32>() > 30.0,
+            _ => false,
+        };
+        Ok(breaks.then(|| input.planes.clone().sum().mul_scalar(f32::NAN)))
+    }
+}
+
+fn build(settings: &toml::Table) -> Result<Box<dyn LossTerm>> {
+    Ok(Box::new(config::parse_section::<Poison>("loss poison", settings)?))
+}
+
+inventory::submit! {
+    LossPlugin {
+        info: Plugin { name: "poison", version: "1", summary: "NaN on demand", paper: "a test", schema: "when = \"never\"\n", capabilities: &[] },
+        build,
+        fuses: None,
+    }
+}
+
+struct Run {
+    outcome: std::result::Result<cc4dgs::HostGaussians, Error>,
+    warnings: Vec<String>,
+}
+
+/// A short training with the term; `sets` are further settings.
+fn run(when: &str, sets: &[&str]) -> Run {
+    let heard: Arc<Mutex<Vec<String>>> = Arc::default();
+    let listener = heard.clone();
+    let session = Session::builder().device("flex").on_event(move |event| {
+        if let Event::Warning { object, message } = event
+            && object == "watchdog"
+        {
+            listener.lock().unwrap().push(message.clone());
+        }
+    });
+    let session = session.build().unwrap();
+    let loss = format!("loss=[{{kind='l1', weight=0.8}}, {{kind='dssim', weight=0.2}}, {{kind='poison', weight=1.0, when='{when}'}}]");
+    let sets: Vec<&str> = [loss.as_str(), "train.iterations=600", "train.checkpoint_every=0", "train.log_every=10"].iter().chain(sets).copied().collect();
+    let config: RunConfig = session.config("demo", &sets).unwrap();
+    let scene = session.read_scene("procedural:tiny", &config.scene).unwrap();
+    let outcome = session.train(&config, scene, None).map(|model| model.gaussians.clone());
+    let warnings = heard.lock().unwrap().clone();
+    Run { outcome, warnings }
+}
+
+#[test]
+fn a_loss_that_breaks_once_leaves_no_trace_in_the_result() {
+    let (whole, broken) = (run("never", &[]), run("once", &[]));
+    assert!(whole.warnings.is_empty(), "{:?}", whole.warnings);
+    assert!(broken.warnings.iter().any(|w| w.contains("poison") && w.contains("back to iteration 100")), "{:?}", broken.warnings);
+    assert!(broken.warnings.iter().all(|w| !w.contains("learns")), "nothing is to blame: {:?}", broken.warnings);
+    assert!(whole.outcome.unwrap() == broken.outcome.unwrap(), "the repeated iterations gave other bytes");
+}
+
+#[test]
+fn a_loss_that_stays_broken_ends_the_run_with_its_name() {
+    let broken = run("always", &[]);
+    let error = broken.outcome.unwrap_err();
+    assert!(matches!(&error, Error::Backend { .. }) && error.to_string().contains("poison") && error.to_string().contains("lowered 5 times"), "{error}");
+    assert_eq!(broken.warnings.iter().filter(|w| w.contains("learns")).count(), 5, "{:?}", broken.warnings);
+    assert!(broken.warnings.iter().any(|w| w.contains("iteration 130")), "the first broken iteration is found: {:?}", broken.warnings);
+}
+
+#[test]
+fn the_part_that_runs_away_is_slowed_down() {
+    let saved = run("opaque", &["train.lr.opacity=3.0"]);
+    assert!(saved.warnings.iter().any(|w| w.contains("gaussians/opacity_logits learns 0.25 times")), "{:?}", saved.warnings);
+    let gaussians = saved.outcome.unwrap();
+    assert!(!gaussians.is_empty() && gaussians.opacity_logits.iter().all(|o| o.is_finite()));
+}

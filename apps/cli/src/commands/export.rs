@@ -1,0 +1,74 @@
+//! `cc4dgs export`.
+
+use super::Context;
+use crate::args::Export;
+use crate::models::load_model;
+use crate::{interrupt, shots};
+use cc4dgs::export::{ExportJob, ExportRequest};
+use cc4dgs_core::{Error, ExportTarget, Result, config};
+use std::path::Path;
+
+pub fn run(context: &Context, args: &Export) -> Result<()> {
+    let plugin = context.registry.exporter(&args.format)?;
+    let (scene_sets, exporter_sets): (Vec<String>, Vec<String>) = args.sets.iter().cloned().partition(|set| set.starts_with("scene."));
+    let mut settings = toml::Table::new();
+    config::set_all(&mut settings, &exporter_sets)?;
+    // Mistakes are found before anything long begins.
+    context.registry.build_exporter(&args.format, &settings)?;
+    check_name(&args.out, plugin.target, &args.format)?;
+    let events = context.listeners(None)?;
+    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let (shots, background) = match shots::choose(context, &args.shots, &scene_sets, &loaded.model) {
+        // Formats of Gaussians are written for models that no orbit can look at, too.
+        Err(Error::Data { .. }) if args.shots.scene.is_none() => (Vec::new(), None),
+        chosen => chosen?,
+    };
+    let request = ExportRequest {
+        time_norm: args.time,
+        frames: args.shots.frames.map(|n| n as usize),
+        frames_per_second: f64::from(args.shots.fps),
+        up: args.shots.up.into(),
+        shots,
+        background,
+    };
+    finish(
+        context,
+        &ExportJob {
+            model: &loaded.model,
+            format: &args.format,
+            settings: &settings,
+            request,
+            out: &args.out,
+            overwrite: args.overwrite,
+            registry: &context.registry,
+            device: &loaded.device,
+            events: &events,
+            stop: interrupt::stop_flag()?,
+        },
+    )
+}
+
+/// Runs the job and reports it.
+pub fn finish(context: &Context, job: &ExportJob) -> Result<()> {
+    let report = job.run()?;
+    context.output.result(&report, || {
+        let what = match (report.gaussians, report.frames) {
+            (0, frames) => format!("{frames} frames"),
+            (gaussians, 0 | 1) => format!("{gaussians} Gaussians"),
+            (gaussians, frames) => format!("{gaussians} Gaussians, {frames} instants"),
+        };
+        let first = format!("{}: {what}, {:.3} MB", report.file.display(), report.size_mb);
+        [first, report.lost.clone()].into_iter().chain(report.notes.clone()).collect::<Vec<_>>().join("\n")
+    })
+}
+
+/// Other programs go by the ending of a file.
+fn check_name(out: &Path, target: ExportTarget, format: &str) -> Result<()> {
+    match target {
+        ExportTarget::File(extension) if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case(extension)) => {
+            let remedy = format!("Name it {}", out.with_extension(extension).display());
+            Err(Error::parameter(format!("--out {}", out.display()), format!("{format} files end in .{extension}"), remedy))
+        }
+        _ => Ok(()),
+    }
+}

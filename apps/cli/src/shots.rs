@@ -1,0 +1,36 @@
+//! The cameras and times that a command renders: an orbit around the model, or the views of a dataset.
+
+use crate::args::Shots;
+use crate::commands::{Context, evenly};
+use cc4dgs::Orbit;
+use cc4dgs::scenes::open_as_trained;
+use cc4dgs_core::{Camera, Error, Result};
+use cc4dgs_play::model::Model;
+
+/// Cameras and normalised times, and the background of the scene they are from.
+pub type Chosen = (Vec<(Camera, f32)>, Option<[f32; 3]>);
+
+/// What to render of `model`; `sets` are scene options.
+pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model) -> Result<Chosen> {
+    let Some(path) = &args.scene else {
+        if !sets.is_empty() {
+            return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));
+        }
+        let standard = Orbit::default();
+        let frames = args.frames.map_or(standard.frames, |n| n as usize);
+        let orbit = Orbit { size: args.size.unwrap_or(standard.size), frames, turns: args.turns, up: args.up.into() };
+        let cameras = orbit.around(&model.gaussians)?;
+        return Ok((cameras.into_iter().enumerate().map(|(i, camera)| (camera, orbit.time(i))).collect(), None));
+    };
+    let scene = open_as_trained(path, model, sets, &context.registry, &context.limits)?;
+    let views = scene.split(args.split.into());
+    if views.is_empty() {
+        return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));
+    }
+    let wanted = args.frames.map_or(views.len(), |n| n as usize);
+    let shot = |i: usize| {
+        let camera = scene.camera(views[i]);
+        (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[views[i]].time_norm)
+    };
+    Ok((evenly(views.len(), wanted).into_iter().map(shot).collect(), scene.background))
+}

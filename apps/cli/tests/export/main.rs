@@ -1,0 +1,182 @@
+//! `cc4dgs export` as a process, and what readers written from the formats' descriptions find in its files.
+#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
+
+mod read;
+
+use cc4dgs::{HostGaussians, Image8, Model, Orbit, Session};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+fn run(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_cc4dgs")).args(args).stdin(Stdio::null()).output().expect("the program starts")
+}
+
+fn succeed(args: &[&str]) -> Output {
+    let output = run(args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    output
+}
+
+fn fail(args: &[&str], code: i32) -> String {
+    let output = run(args);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {said}");
+    said
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// A small model that moves and whose harmonics have degree `sh_degree`.
+fn train(out: &Path, sh_degree: usize) {
+    let degree = format!("train.sh_degree={sh_degree}");
+    let sets = ["train.iterations=500", "train.checkpoint_every=0", "train.dynamic=all", degree.as_str()];
+    let mut args = vec!["train", "--scene", "procedural:tiny", "--preset", "demo+cdf-basis", "--device", "flex", "--out", text(out), "-q"];
+    args.extend(sets.iter().flat_map(|set| ["--set", set]));
+    succeed(&args);
+}
+
+/// Draws the model, and the same cameras with other Gaussians (of the dataset's coordinates) in its place.
+struct Judge {
+    session: Session,
+    run: PathBuf,
+    model: Model,
+}
+
+impl Judge {
+    fn new(run: &Path) -> Self {
+        let session = Session::builder().device("flex").build().unwrap();
+        Self { model: session.open(run).unwrap(), session, run: run.to_path_buf() }
+    }
+    fn images(&self, model: &Model, time: f32) -> Vec<Image8> {
+        let orbit = Orbit { size: (96, 72), frames: 3, ..Orbit::default() };
+        let cameras = orbit.around(&self.model.gaussians).unwrap();
+        let mut player = self.session.player(model).unwrap();
+        cameras.iter().map(|camera| player.frame(camera, time).unwrap()).collect()
+    }
+    /// PSNR in dB of `gaussians` against the model at `time`; `None` is the canonical model.
+    fn psnr(&self, mut gaussians: HostGaussians, time: Option<f32>) -> f64 {
+        let standing_in = |gaussians: HostGaussians| {
+            let mut other = self.session.open(&self.run).unwrap();
+            (other.gaussians, other.field) = (gaussians, None);
+            other
+        };
+        self.model.normalisation.apply_gaussians(&mut gaussians);
+        let found = self.images(&standing_in(gaussians), 0.0);
+        let expected = match time {
+            Some(time) => self.images(&self.model, time),
+            None => self.images(&standing_in(self.model.gaussians.clone()), 0.0),
+        };
+        let squares = expected.iter().zip(&found).flat_map(|(a, b)| a.data.iter().zip(&b.data)).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2));
+        let (sum, count) = squares.fold((0.0, 0.0), |(sum, count), square| (sum + square, count + 1.0));
+        10.0 * (255.0f64.powi(2) * count / f64::max(sum, 0.25)).log10()
+    }
+}
+
+#[test]
+fn formats_hold_what_the_model_draws() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let (dir, flat) = (at("run"), at("flat"));
+    train(&dir, 2);
+    train(&flat, 0);
+    let judge = Judge::new(&dir);
+    let export = |model: &Path, format: &str, name: &str, more: &[&str]| -> (PathBuf, Value) {
+        let out = at(name);
+        let mut args = vec!["export", format, text(model), "--out", text(&out), "--device", "flex", "-q", "--json"];
+        args.extend(more);
+        let report: Value = serde_json::from_slice(&succeed(&args).stdout).unwrap();
+        assert!(report["lost"].as_str().unwrap().ends_with('.') && report["format"] == format, "{report}");
+        (out, report)
+    };
+    let (_, report) = export(&dir, "ply", "a.ply", &[]);
+    assert!(report["lost"].as_str().unwrap().contains("motion"), "{report}");
+    // At an instant and canonical; the bound is what the format allows.
+    for (format, extension, least) in [("ply", "ply", 70.0), ("gltf", "glb", 70.0), ("spz", "spz", 45.0), ("sog", "sog", 45.0)] {
+        for time in [None, Some(0.5f32)] {
+            let name = format!("{format}-{}.{extension}", time.is_some());
+            let (path, _) = export(&dir, format, &name, if time.is_some() { &["--time", "0.5"] } else { &[] });
+            let psnr = judge.psnr(read::any(&path), time);
+            eprintln!("{format} at {time:?}: {psnr:.1} dB");
+            assert!(psnr >= least, "{format} at {time:?}: {psnr} dB");
+        }
+    }
+    let (path, _) = export(&dir, "spz", "old.spz", &["--set", "version=3"]);
+    assert!(judge.psnr(read::any(&path), None) >= 45.0);
+    // A sequence is the model at the times of its frames.
+    let (path, report) = export(&dir, "ply-sequence", "frames", &["--frames", "4"]);
+    assert_eq!((std::fs::read_dir(&path).unwrap().count(), &report["frames"]), (4, &Value::from(4)));
+    for k in [0usize, 3] {
+        assert!(judge.psnr(read::any(&path.join(format!("frames_{k:04}.ply"))), Some(k as f32 / 4.0)) >= 70.0);
+    }
+    // Motion as cubics; colours without harmonics are held to it.
+    let judge = Judge::new(&flat);
+    let (path, report) = export(&flat, "splatv", "a.splatv", &[]);
+    assert!(report["notes"][0].as_str().unwrap().contains("instants"), "{report}");
+    for time in [0.0, 0.3, 0.6, 1.0] {
+        let psnr = judge.psnr(read::splatv(&path, time), Some(time));
+        eprintln!("splatv at {time}: {psnr:.1} dB");
+        assert!(psnr >= 38.0, "splatv at {time}: {psnr} dB");
+    }
+}
+
+#[test]
+fn exports_are_refused_before_work_and_never_replace_unasked() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    train(&at("run"), 0);
+    let (dir, out) = (at("run"), at("a.ply"));
+    let export = |format: &str, out: &Path, more: &[&str]| -> Vec<String> {
+        ["export", format, text(&dir), "--out", text(out), "-q", "--device", "flex"].iter().chain(more).map(ToString::to_string).collect()
+    };
+    let refused = |args: Vec<String>| fail(&args.iter().map(String::as_str).collect::<Vec<_>>(), 2);
+    assert!(refused(export("plyy", &out, &[])).contains("ply"));
+    assert!(refused(export("spz", &out, &[])).contains("a.spz"));
+    assert!(refused(export("spz", &at("a.spz"), &["--set", "version=9"])).contains("version"));
+    assert!(refused(export("ply", &out, &["--set", "dynamics=false"])).contains("dynamics"));
+    assert!(refused(export("ply", &out, &["--time", "1.5"])).contains("0..1"));
+    assert!(!out.exists());
+    std::fs::write(&out, "mine").unwrap();
+    assert!(refused(export("ply", &out, &[])).contains("--overwrite"));
+    assert_eq!(std::fs::read(&out).unwrap(), b"mine");
+    let overwrite = export("ply", &out, &["--overwrite"]);
+    succeed(&overwrite.iter().map(String::as_str).collect::<Vec<_>>());
+    assert!(std::fs::read(&out).unwrap().starts_with(b"ply\n"));
+    // A folder that holds a run is not an export.
+    assert!(refused(export("ply-sequence", &dir, &["--overwrite"])).contains("no .ply file"));
+    assert!(dir.join("checkpoint").is_file());
+    // The alias writes the same bytes, and replaces as ever.
+    let alias = at("b.ply");
+    for _ in 0..2 {
+        succeed(&["decompress", text(&dir), "--out", text(&alias), "-q"]);
+    }
+    assert!(std::fs::read(&alias).unwrap() == std::fs::read(&out).unwrap());
+}
+
+#[test]
+fn videos_have_their_images() {
+    if Command::new("ffmpeg").arg("-version").output().is_err() {
+        eprintln!("ffmpeg is absent: skipped");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    train(&at("run"), 0);
+    let (dir, video, captured) = (at("run"), at("orbit.mp4"), at("captured.mp4"));
+    let size = ["--frames", "5", "--size", "50x39", "--fps", "5", "--device", "flex", "-q"];
+    succeed(&[&["export", "mp4", text(&dir), "--out", text(&video)], &size[..]].concat());
+    succeed(&["export", "mp4", text(&dir), "--out", text(&captured), "--scene", "procedural:tiny", "--frames", "3", "--device", "flex", "-q"]);
+    let frames = at("frames");
+    let both = at("both.mp4");
+    succeed(&[&["render", text(&dir), "--out", text(&frames), "--mp4", text(&both)], &size[..]].concat());
+    for (file, count, width) in [(&video, 5, Some(50)), (&captured, 3, None), (&both, 5, Some(50))] {
+        let probe = Command::new("ffprobe").args(["-v", "error", "-count_frames", "-show_streams", "-of", "json"]).arg(file).output().unwrap();
+        let probe: Value = serde_json::from_slice(&probe.stdout).unwrap();
+        let stream = &probe["streams"][0];
+        assert_eq!((&stream["codec_name"], &stream["nb_read_frames"]), (&Value::from("h264"), &Value::from(count.to_string())), "{probe}");
+        assert!(width.is_none_or(|width| stream["width"] == width && stream["height"] == 40), "{probe}");
+    }
+    assert_eq!(std::fs::read_dir(&frames).unwrap().count(), 5);
+}

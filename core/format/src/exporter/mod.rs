@@ -1,0 +1,116 @@
+//! The exporter trait: a model in the file formats of other programs.
+//!
+//! An exporter reads Gaussians, or rendered images, from an [`ExportSource`] and writes one file or one folder. [`export`] runs it on a temporary name and
+//! renames the result, so that an exporter need not care about interrupted or failed writes.
+
+mod place;
+
+#[cfg(not(target_arch = "wasm32"))]
+pub use place::export;
+
+use crate::plugin::Plugin;
+use crate::{Camera, HostGaussians, Image8, Result};
+use serde::Serialize;
+use std::path::Path;
+
+/// What an exporter writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ExportTarget {
+    /// One file, whose name ends in this extension (without a dot).
+    File(&'static str),
+    /// A folder of files, all with this extension (without a dot).
+    Folder(&'static str),
+}
+
+/// What an exporter may know before it asks for any Gaussians.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ExportFacts {
+    /// Name of the model, fit for file names.
+    pub name: String,
+    /// Number of Gaussians.
+    pub gaussians: usize,
+    /// How many of them move. They come first in [`ExportSource::gaussians`] at a time.
+    pub moving: usize,
+    /// Spherical-harmonics degree, 0 to 4.
+    pub sh_degree: usize,
+    /// The instant that formats without motion hold, 0..1; `None` is the canonical model.
+    pub time_norm: Option<f32>,
+    /// Normalised times of the frames that formats with motion hold; at least one.
+    pub times_norm: Vec<f32>,
+    /// Frames per second.
+    pub frames_per_second: f64,
+    /// Whether the model wants Mip-Splatting's 2D filter.
+    pub antialiased: bool,
+    /// The signed unit axis of the world that points up.
+    pub up: [f64; 3],
+    /// A camera to look at the model from.
+    pub home: Option<Camera>,
+    /// Images that [`ExportSource::image`] can render; 0 where it cannot.
+    pub images: usize,
+}
+
+impl ExportFacts {
+    /// What a format loses that holds one instant without motion, as the beginning of a sentence without a full stop.
+    pub fn still(&self) -> String {
+        let what = self.time_norm.map_or_else(|| "the canonical Gaussians".to_string(), |t| format!("the Gaussians at time {t}"));
+        if self.moving == 0 { format!("It holds {what}") } else { format!("It holds {what}; the motion of {} of {} is lost", self.moving, self.gaussians) }
+    }
+}
+
+/// Where an exporter takes a model from. Gaussians are in the coordinates of the dataset.
+pub trait ExportSource {
+    /// What is known of the model and of the request.
+    fn facts(&self) -> &ExportFacts;
+    /// The Gaussians at a time in 0..1, or the canonical ones. At a time the moving ones come first, and the order is the same for every time.
+    ///
+    /// # Errors
+    /// What the deformer and the device report.
+    fn gaussians(&mut self, time_norm: Option<f32>) -> Result<HostGaussians>;
+    /// The image `index` of [`ExportFacts::images`], RGB.
+    ///
+    /// # Errors
+    /// What the renderer reports; [`Error::Unsupported`](crate::Error::Unsupported) where there is none.
+    fn image(&mut self, index: usize) -> Result<Image8>;
+    /// Reports `done` of `total` pieces of work.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`](crate::Error::Interrupted) where the user wants to stop.
+    fn progress(&mut self, done: usize, total: usize) -> Result<()>;
+}
+
+/// What was written.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Exported {
+    /// Gaussians per file; 0 for images.
+    pub gaussians: usize,
+    /// Spherical-harmonics degree that was kept.
+    pub sh_degree: usize,
+    /// Frames.
+    pub frames: usize,
+    /// Sentences about what was measured or left out while writing.
+    pub notes: Vec<String>,
+}
+
+/// A file format of other programs.
+pub trait Exporter: Send + Sync {
+    /// What the format cannot carry of this model, in one sentence.
+    fn loses(&self, facts: &ExportFacts) -> String;
+    /// Writes the file `path`, or files into the existing empty folder `path`. Equal Gaussians and settings give equal bytes.
+    ///
+    /// # Errors
+    /// [`Error::Data`](crate::Error::Data) and [`Error::Limit`](crate::Error::Limit) for models that the format cannot hold, [`Error::Io`](crate::Error::Io), and
+    /// those of the source.
+    fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported>;
+}
+
+/// An exporter in the registry.
+pub struct ExporterPlugin {
+    /// Name, version and other facts. The version is that of the format.
+    pub info: Plugin,
+    /// What it writes.
+    pub target: ExportTarget,
+    /// Builds it from its settings.
+    pub build: fn(&toml::Table) -> Result<Box<dyn Exporter>>,
+}
+crate::plugin_kind!(ExporterPlugin, "exporter");

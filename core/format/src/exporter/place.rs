@@ -1,0 +1,139 @@
+//! Bringing an export to its name: complete or not at all.
+#![cfg(not(target_arch = "wasm32"))]
+
+use super::{ExportSource, ExportTarget, Exported, Exporter};
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// Runs `exporter` on a temporary name beside `path`, and renames. Returns what it reported and the bytes on disk. An existing `path` is replaced only if
+/// `overwrite` is set, and a folder only if all it holds are files with the exporter's extension.
+///
+/// # Errors
+/// [`Error::Parameter`] for a `path` that may not be replaced, [`Error::Io`], and those of [`Exporter::write`].
+pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn ExportSource, path: &Path, overwrite: bool) -> Result<(Exported, u64)> {
+    check(path, target, overwrite)?;
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let Some(name) = path.file_name() else {
+        return Err(Error::parameter("export", format!("{} is no name to write to", path.display()), "Give the name of the file or folder to write"));
+    };
+    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+    let beside = tempfile::Builder::new().prefix(".cc4dgs-").suffix(".part").tempdir_in(folder).map_err(|e| Error::io(folder, e))?;
+    let part = beside.path().join(name);
+    if let ExportTarget::Folder(_) = target {
+        std::fs::create_dir(&part).map_err(|e| Error::io(&part, e))?;
+    }
+    let exported = exporter.write(source, &part)?;
+    let files = files(&part)?;
+    let mut bytes = 0;
+    for file in &files {
+        // On the disk before it has its name.
+        let synced = std::fs::File::open(file).and_then(|f| f.sync_all().and_then(|()| f.metadata()));
+        bytes += synced.map_err(|e| Error::io(path, e))?.len();
+    }
+    // The folder was empty so far, so its old content can wait there; it goes with the temporary folder.
+    let old = beside.path().join(".replaced");
+    let replaced = path.is_dir();
+    if replaced {
+        std::fs::rename(path, &old).map_err(|e| Error::io(path, e))?;
+    }
+    if let Err(e) = std::fs::rename(&part, path) {
+        if replaced {
+            std::fs::rename(&old, path).ok();
+        }
+        return Err(Error::io(path, e));
+    }
+    Ok((exported, bytes))
+}
+
+/// Refuses a `path` that may not be replaced.
+fn check(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
+    let refuse = |problem: &str, remedy: &str| Err(Error::parameter(path.display().to_string(), problem, remedy));
+    let Ok(found) = std::fs::symlink_metadata(path) else { return Ok(()) };
+    if !overwrite {
+        return refuse("it exists already", "Give another name, or --overwrite to replace it");
+    }
+    match target {
+        ExportTarget::File(_) if found.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
+        ExportTarget::Folder(_) if !found.is_dir() => refuse("it is a file, and this format is a folder of files", "Give the name of a folder"),
+        ExportTarget::Folder(extension) => match files(path)?.iter().find(|file| file.extension().is_none_or(|e| e != extension)) {
+            Some(other) => {
+                let problem = format!("the folder also holds {}, which is no .{extension} file", other.display());
+                refuse(&problem, "Give another folder; only exports are replaced")
+            }
+            None => Ok(()),
+        },
+        ExportTarget::File(_) => Ok(()),
+    }
+}
+
+/// The file itself, or everything in the folder, sorted.
+fn files(path: &Path) -> Result<Vec<PathBuf>> {
+    if !path.is_dir() {
+        return Ok(vec![path.to_path_buf()]);
+    }
+    let entries = std::fs::read_dir(path).and_then(|entries| entries.map(|e| e.map(|e| e.path())).collect::<std::io::Result<Vec<_>>>());
+    let mut entries = entries.map_err(|e| Error::io(path, e))?;
+    entries.sort();
+    Ok(entries)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ExportFacts, HostGaussians, Image8};
+
+    struct Nothing(ExportFacts);
+    impl ExportSource for Nothing {
+        fn facts(&self) -> &ExportFacts {
+            &self.0
+        }
+        fn gaussians(&mut self, _: Option<f32>) -> Result<HostGaussians> {
+            Ok(HostGaussians::default())
+        }
+        fn image(&mut self, _: usize) -> Result<Image8> {
+            Err(Error::unsupported("image", "none", "None"))
+        }
+        fn progress(&mut self, _: usize, _: usize) -> Result<()> {
+            Ok(())
+        }
+    }
+
+    /// Writes its text into the file, or into two files of the folder; then fails if told so.
+    struct Text(&'static str, bool);
+    impl Exporter for Text {
+        fn loses(&self, _: &ExportFacts) -> String {
+            "All of it.".into()
+        }
+        fn write(&self, _: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
+            let files = if path.is_dir() { vec![path.join("a.txt"), path.join("b.txt")] } else { vec![path.to_path_buf()] };
+            files.iter().try_for_each(|file| std::fs::write(file, self.0)).map_err(|e| Error::io(path, e))?;
+            if self.1 { Err(Error::data("text", "it fails", "Nothing")) } else { Ok(Exported::default()) }
+        }
+    }
+
+    #[test]
+    fn exports_appear_complete_or_not_at_all() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut source = Nothing(crate::conformance::export_facts(0, 0));
+        let mut run = |text, fails, target, name: &str, overwrite| export(&Text(text, fails), target, &mut source, &folder.path().join(name), overwrite);
+        let (file, dir) = (ExportTarget::File("txt"), ExportTarget::Folder("txt"));
+        for (target, name) in [(file, "deep/one.txt"), (dir, "deep/many")] {
+            let copies = if target == file { 1 } else { 2 };
+            assert!(run("first", true, target, name, false).is_err());
+            assert!(!folder.path().join(name).exists(), "a failed export leaves nothing");
+            assert_eq!(run("first", false, target, name, false).unwrap().1, 5 * copies);
+            assert!(run("second", false, target, name, false).unwrap_err().to_string().contains("--overwrite"));
+            assert!(run("second", true, target, name, true).is_err());
+            let first = if target == file { name.to_string() } else { format!("{name}/b.txt") };
+            assert_eq!(std::fs::read_to_string(folder.path().join(&first)).unwrap(), "first");
+            assert_eq!(run("third!", false, target, name, true).unwrap().1, 6 * copies);
+            assert_eq!(std::fs::read_to_string(folder.path().join(&first)).unwrap(), "third!");
+        }
+        assert_eq!(std::fs::read_dir(folder.path().join("deep")).unwrap().count(), 2, "no temporary names are left");
+        // What was not exported is never replaced.
+        std::fs::write(folder.path().join("deep/many/notes.md"), "mine").unwrap();
+        assert!(run("x", false, dir, "deep/many", true).unwrap_err().to_string().contains("notes.md"));
+        assert!(run("x", false, file, "deep/many", true).is_err());
+        assert!(run("x", false, dir, "deep/one.txt", true).is_err());
+    }
+}

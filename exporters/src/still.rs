@@ -1,0 +1,57 @@
+//! What exporters of one instant share.
+
+use cc4dgs_format::{Error, ExportFacts, ExportSource, HostGaussians, Limits, Result};
+use std::path::Path;
+
+/// The Gaussians of the instant that is asked for, refused where they are invalid.
+pub fn instant(source: &mut dyn ExportSource, format: &str) -> Result<HostGaussians> {
+    let time = source.facts().time_norm;
+    let gaussians = source.gaussians(time)?;
+    check(&gaussians, format)?;
+    source.progress(1, 1)?;
+    Ok(gaussians)
+}
+
+/// Refuses Gaussians that are not finite or have arrays of unequal lengths.
+pub fn check(gaussians: &HostGaussians, format: &str) -> Result<()> {
+    gaussians.validate(&format!("Gaussians to write as {format}"), &Limits { max_gaussians: u64::MAX, ..Limits::default() })
+}
+
+/// Writes `bytes` to `path`.
+pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    std::fs::write(path, bytes).map_err(|e| Error::io(path, e))
+}
+
+/// The parts of what is lost as one sentence; empty parts are left out.
+pub fn sentence(facts: &ExportFacts, parts: &[(bool, &str)]) -> String {
+    let lost: Vec<&str> = parts.iter().filter(|(applies, _)| *applies).map(|(_, part)| *part).collect();
+    let rest = match lost.as_slice() {
+        [] => String::new(),
+        [one] => format!(", without {one}"),
+        [most @ .., last] => format!(", without {} and {last}", most.join(", ")),
+    };
+    format!("{}{rest}.", facts.still())
+}
+
+/// The quaternion (w,x,y,z) with length one; `None` where it has no length, and the Gaussian is not drawn.
+pub fn unit(q: &[f32; 4]) -> Option<[f32; 4]> {
+    let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    (norm > 1e-15 && norm.is_finite()).then(|| q.map(|v| (f64::from(v) / norm) as f32))
+}
+
+/// Opacity in 0..1.
+pub fn sigmoid(logit: f32) -> f32 {
+    1.0 / (1.0 + (-logit).exp())
+}
+
+/// Colour of the degree-0 coefficients in bytes.
+pub fn color_bytes(dc: &[f32; 3]) -> [u8; 3] {
+    /// 1 / (2 sqrt(pi)), the constant basis function.
+    const SH_C0: f32 = 0.282_094_8;
+    dc.map(|c| byte(c * SH_C0 + 0.5))
+}
+
+/// A number in 0..1 in a byte.
+pub fn byte(value: f32) -> u8 {
+    (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
