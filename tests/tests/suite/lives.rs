@@ -56,7 +56,9 @@ fn what_lasts_is_moved_by_the_deformer_alone() {
             if plain.is_static() {
                 assert!(got.iter().all(|v| *v == 0.0), "{kind}");
             } else if let Some(means) = offsets(plain.as_ref(), &own, time).means {
-                assert_eq!(got, to_vec(means, "means").unwrap(), "{kind} at {time}");
+                // Playback's layout of coefficients sums in another order.
+                let expected = to_vec(means, "means").unwrap();
+                assert!(got.iter().zip(&expected).all(|(a, b)| (a - b).abs() <= 1e-5), "{kind} at {time}: {got:?} {expected:?}");
             }
         }
     }
