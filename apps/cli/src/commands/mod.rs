@@ -9,6 +9,7 @@ mod eval;
 mod export;
 mod info;
 mod plugins;
+mod prune;
 mod render;
 mod report;
 mod storage;
@@ -62,6 +63,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Train(args) => train::run(&context, args),
         Command::Compress(args) => compress::run(&context, args),
         Command::Export(args) => export::run(&context, args),
+        Command::Prune(args) => prune::run(&context, args),
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),
