@@ -16,7 +16,8 @@ pub mod source;
 
 pub use archive::{ArchiveOptions, attribute_width};
 pub use model::Model;
-pub use moving::{Moving, MovingRows};
+pub use cc4dgs_core::Moving;
+pub use moving::MovingRows;
 pub use orbit::Orbit;
 pub use player::Player;
 pub use render::{RenderConfig, default_rasterizer};
