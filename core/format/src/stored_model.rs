@@ -37,8 +37,7 @@ impl StoredModel {
         let gaussians = read_gaussians(object, archive, limits, events)?;
         let moving = Moving::of_manifest(object, &manifest)?;
         let streams = archive.read_kind(StreamKind::Playback)?;
-        let playback =
-            if streams.is_empty() { None } else { Some(PlaybackLayer::decode(&streams, gaussians.len(), gaussians.sh_degree, limits)?) };
+        let playback = if streams.is_empty() { None } else { Some(PlaybackLayer::decode(&streams, gaussians.len(), gaussians.sh_degree, limits)?) };
         Ok(Self { manifest, gaussians, moving, playback })
     }
     /// Whether the model moves, so that it needs a deformer or a playback layer.

@@ -5,18 +5,20 @@
 //! the other way.
 
 mod archive;
+pub mod bake;
 pub mod checkpoint;
 pub mod codec_services;
 pub mod model;
 mod moving;
 mod orbit;
 pub mod player;
+pub mod presentation;
 mod render;
 pub mod source;
 
 pub use archive::{ArchiveOptions, attribute_width};
-pub use model::Model;
 pub use cc4dgs_core::Moving;
+pub use model::Model;
 pub use moving::MovingRows;
 pub use orbit::Orbit;
 pub use player::Player;

@@ -68,7 +68,12 @@ impl Track {
     /// The sums of `ranks` that [`Track::starts`] holds.
     pub fn starts_of(ranks: &[u8]) -> Vec<u32> {
         let mut sum = 0u32;
-        std::iter::once(0).chain(ranks.iter().map(|&r| { sum += u32::from(r); sum })).collect()
+        std::iter::once(0)
+            .chain(ranks.iter().map(|&r| {
+                sum += u32::from(r);
+                sum
+            }))
+            .collect()
     }
     /// The number of functions R.
     pub fn function_count(&self) -> usize {
@@ -213,7 +218,10 @@ mod tests {
     #[test]
     fn times_fall_into_segments_and_are_interpolated() {
         let layer = layer();
-        let at = |t: f32| { let w = layer.weights_at(t); (w.segment, w.sample, w.fraction) };
+        let at = |t: f32| {
+            let w = layer.weights_at(t);
+            (w.segment, w.sample, w.fraction)
+        };
         assert_eq!([at(-1.0), at(0.125), at(0.5), at(0.625), at(1.0), at(7.0)], [(0, 0, 0.0), (0, 0, 0.5), (1, 0, 0.0), (1, 0, 0.5), (1, 2, 0.0), (1, 2, 0.0)]);
         assert_eq!(at(f32::NAN).1, 0);
     }

@@ -87,7 +87,11 @@ impl PlaybackLayer {
         meta.extend((rows.len() as u32).to_le_bytes());
         let mut out = Vec::new();
         let mut add = |name: String, bytes: Vec<u8>| out.push(Stream { name, bytes });
-        let gaps = rows.iter().scan(0u32, |next, &row| { let gap = row - *next; *next = row + 1; Some(gap) });
+        let gaps = rows.iter().scan(0u32, |next, &row| {
+            let gap = row - *next;
+            *next = row + 1;
+            Some(gap)
+        });
         add(ROWS.into(), gaps.flat_map(u32::to_le_bytes).collect());
         for (k, (last, tracks)) in segments.iter().enumerate() {
             meta.extend((*last as u16).to_le_bytes());
