@@ -50,8 +50,7 @@ fn baked(context: &Context, args: &View, path: &Path, folder: &Path, events: &dy
     let stored = &archive.manifest().presentation;
     let options = BakeOptions { max_error: args.max_error.parse()?, cameras: &stored.cameras };
     let baked = bake(&loaded.model, &options, &loaded.device, events)?;
-    let presentation =
-        if *stored == Presentation::default() { presentation::of_gaussians(&loaded.model.gaussians, [0.0, 0.0, 1.0])? } else { stored.clone() };
+    let presentation = if *stored == Presentation::default() { presentation::of_gaussians(&loaded.model.gaussians, [0.0, 0.0, 1.0])? } else { stored.clone() };
     let out = folder.join("baked.cc4d");
     write_archive(&archive, Additions { baked: baked.as_ref(), presentation, poster: None, without_field: true }, &out)?;
     let archive = Archive::open(&out, &context.limits)?;

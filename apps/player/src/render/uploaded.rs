@@ -33,8 +33,7 @@ pub(super) struct Uploaded {
 }
 
 fn group(device: &wgpu::Device, layout: &wgpu::BindGroupLayout, buffers: &[&wgpu::Buffer]) -> wgpu::BindGroup {
-    let entry = |(binding, buffer): (usize, &&wgpu::Buffer)| wgpu::BindGroupEntry { binding: binding as u32, resource: buffer.as_entire_binding() };
-    let entries: Vec<_> = buffers.iter().enumerate().map(entry).collect();
+    let entries: Vec<wgpu::BindGroupEntry> = (0..).zip(buffers).map(|(binding, b)| wgpu::BindGroupEntry { binding, resource: b.as_entire_binding() }).collect();
     device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout, entries: &entries })
 }
 

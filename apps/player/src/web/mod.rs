@@ -17,9 +17,16 @@ fn error(error: impl std::fmt::Display) -> JsError {
     JsError::new(&error.to_string())
 }
 
+unsafe extern "C" {
+    /// The linker's: runs the constructors that register codecs. Where nobody calls it, every exported function would.
+    fn __wasm_call_ctors();
+}
+
 /// Runs once, when the module is loaded: panics go to the console with their text.
 #[wasm_bindgen(start)]
 fn start() {
+    // SAFETY: called once, before any other function of the module.
+    unsafe { __wasm_call_ctors() };
     std::panic::set_hook(Box::new(|info| web_sys::console::error_1(&info.to_string().into())));
 }
 
@@ -27,13 +34,7 @@ fn start() {
 #[allow(clippy::large_enum_variant, reason = "there is one player")]
 enum Output {
     /// A canvas with WebGPU.
-    WebGpu {
-        surface: wgpu::Surface<'static>,
-        configuration: wgpu::SurfaceConfiguration,
-        renderer: Renderer,
-        adapter: String,
-        lost: Arc<AtomicBool>,
-    },
+    WebGpu { surface: wgpu::Surface<'static>, configuration: wgpu::SurfaceConfiguration, renderer: Renderer, adapter: String, lost: Arc<AtomicBool> },
     /// The page draws with WebGL2 from these arrays.
     Plain(Option<Scene>),
 }

@@ -6,7 +6,9 @@ use rayon::prelude::*;
 use std::ops::RangeInclusive;
 
 /// Root-mean-square error over the tolerance that the choice of segments aims at.
-const AIM: f64 = 0.3;
+const AIM: f32 = 0.3;
+/// Gaussians whose needs are looked at for it.
+const COST_ROWS: usize = 384;
 /// Numbers of segments that are tried, and the fewest samples of a segment.
 const SEGMENTS: [usize; 5] = [1, 2, 4, 8, 16];
 const FEWEST_SAMPLES: usize = 6;
@@ -26,17 +28,15 @@ pub(super) struct HeadFunctions {
     /// The integers that stand for them.
     pub(super) coded: Vec<i16>,
     /// Sums of the squares that each function explains.
+    #[cfg(test)]
     energies: Vec<f64>,
-    /// Gaussians that they were found from.
-    rows: usize,
 }
 
 impl HeadFunctions {
     /// The functions of the samples `span` of `offsets`.
     pub(super) fn of(offsets: &HeadOffsets, span: RangeInclusive<usize>) -> Self {
         let (first, n) = (*span.start(), span.end() - span.start() + 1);
-        let rows = offsets.values.len() / (offsets.samples * offsets.width).max(1);
-        let (energies, vectors) = eigen(gram(offsets, first, n), n);
+        let (_energies, vectors) = eigen(gram(offsets, first, n), n);
         let (mut values, mut coded, mut peaks) = (Vec::new(), Vec::new(), Vec::new());
         for function in vectors.chunks_exact(n).take(MAX_FUNCTIONS) {
             let peak = function.iter().fold(0.0f64, |a, v| a.max(v.abs())) as f32;
@@ -45,17 +45,40 @@ impl HeadFunctions {
             coded.extend(integers);
             peaks.push(peak);
         }
-        Self { head: offsets.head, width: offsets.width, samples: n, values, peaks, coded, energies, rows }
-    }
-    /// An estimate of the coefficients and function samples that `moving` Gaussians need, in numbers.
-    fn cost(&self, moving: usize) -> f64 {
-        let allowed = AIM * AIM * (self.rows * self.samples) as f64;
-        let (mut left, mut rank) = (self.energies.iter().sum::<f64>(), 0);
-        while rank < self.energies.len() && left > allowed {
-            left -= self.energies[rank];
-            rank += 1;
+        Self {
+            head: offsets.head,
+            width: offsets.width,
+            samples: n,
+            values,
+            peaks,
+            coded,
+            #[cfg(test)]
+            energies: _energies,
         }
-        (rank * (moving * self.width + self.samples)) as f64
+    }
+    /// An estimate of what `moving` Gaussians need in the segment that begins at sample `first`, in numbers: the functions that Gaussians of the sample need,
+    /// and the functions themselves.
+    fn cost(&self, offsets: &HeadOffsets, first: usize, moving: usize) -> f64 {
+        let (n, width, row_len) = (self.samples, self.width, offsets.samples * offsets.width);
+        let rows: Vec<&[f32]> = offsets.values.chunks_exact(row_len).collect();
+        let few: Vec<&[f32]> = rows.iter().step_by(rows.len().div_ceil(COST_ROWS).max(1)).map(|row| &row[first * width..(first + n) * width]).collect();
+        let rank_of = |row: &[f32]| {
+            let mut left = row.iter().map(|v| v * v).sum::<f32>();
+            let mut rank = 0;
+            for function in self.values.chunks_exact(n) {
+                if left <= AIM * AIM * n as f32 {
+                    break;
+                }
+                let part = |c: usize| function.iter().enumerate().map(|(k, f)| f * row[k * width + c]).sum::<f32>().powi(2);
+                left -= (0..width).map(part).sum::<f32>();
+                rank += 1;
+            }
+            rank
+        };
+        let ranks: Vec<usize> = few.iter().map(|row| rank_of(row)).collect();
+        let most = ranks.iter().copied().max().unwrap_or(0);
+        let mean = ranks.iter().sum::<usize>() as f64 / ranks.len().max(1) as f64;
+        mean * (moving * width) as f64 + (most * n) as f64
     }
 }
 
@@ -64,7 +87,7 @@ pub(super) fn segment_ends(sample: &Offsets, samples: usize, moving: usize) -> V
     let ends = |count: usize| -> Vec<usize> { (0..=count).map(|k| k * (samples - 1) / count).collect() };
     let allowed = |count: usize| count == 1 || (samples - 1) / count >= FEWEST_SAMPLES;
     let least = (samples - 1).div_ceil(MAX_FUNCTIONS - 1).max(1);
-    let cost = |count: usize| -> f64 { ends(count).windows(2).flat_map(|w| sample.heads.iter().map(|h| HeadFunctions::of(h, w[0]..=w[1]).cost(moving))).sum() };
+    let cost = |count: usize| -> f64 { ends(count).windows(2).flat_map(|w| sample.heads.iter().map(|h| HeadFunctions::of(h, w[0]..=w[1]).cost(h, w[0], moving))).sum() };
     let counts: Vec<usize> = SEGMENTS.into_iter().filter(|&c| c >= least && allowed(c)).collect();
     let costs: Vec<f64> = counts.par_iter().map(|&c| cost(c)).collect();
     // A tie goes to fewer segments.
