@@ -1,8 +1,14 @@
 //! The command line.
 
 mod bench;
+mod play;
+mod prune;
 
 pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLoss, BenchPlay, BenchSort, BenchStep, BenchWhat};
+pub use play::Bake;
+#[cfg(feature = "view")]
+pub use play::View;
+pub use prune::Prune;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -41,6 +47,11 @@ pub enum Command {
     Export(Export),
     /// Remove the Gaussians that contribute least, under a budget of PSNR.
     Prune(Prune),
+    /// Add a playback layer to a model's archive, so that players without the deformer can play it.
+    Bake(Bake),
+    /// Play a model in a window.
+    #[cfg(feature = "view")]
+    View(View),
     /// The same as `export ply` or `export spz`, by the ending of the file; replaces it where it exists.
     Decompress(Decompress),
     /// Render a model to PNG frames, and to a video if asked; `export mp4` makes the video alone.
@@ -131,31 +142,6 @@ pub struct Compress {
     /// Device the field is loaded on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
-}
-
-#[derive(Debug, Args)]
-pub struct Prune {
-    /// A run's folder, a checkpoint or an archive.
-    #[arg(value_name = "MODEL")]
-    pub model: PathBuf,
-    /// The dataset that the model was trained on.
-    #[arg(long, value_name = "PATH")]
-    pub scene: PathBuf,
-    /// Largest loss of PSNR in dB, on validation views where the model was trained with some (train.validation), else on training views.
-    #[arg(long, value_name = "DB", default_value = "0.1dB", value_parser = parse_decibels)]
-    pub max_drop: f64,
-    /// The archive to write, lossless; compress it as you would the model.
-    #[arg(long, value_name = "F.cc4d")]
-    pub out: PathBuf,
-    /// Device to render on.
-    #[arg(long, value_name = "NAME", default_value = "flex")]
-    pub device: String,
-}
-
-/// A number of decibels, with or without the unit.
-fn parse_decibels(text: &str) -> Result<f64, String> {
-    let number = text.strip_suffix("dB").unwrap_or(text).trim().parse::<f64>().ok().filter(|v| *v > 0.0 && v.is_finite());
-    number.ok_or_else(|| format!("'{text}' is no positive number of dB, such as 0.1dB"))
 }
 
 #[derive(Debug, Args)]

@@ -17,6 +17,8 @@ pub mod exporter;
 pub mod gaussians;
 mod image;
 mod limits;
+mod moving;
+pub mod playback;
 mod plugin;
 pub mod ply;
 mod rules;
@@ -24,6 +26,7 @@ mod seed;
 mod similarity;
 pub mod spz;
 pub mod storage;
+mod stored_model;
 mod weight_codec;
 
 pub use camera::Camera;
@@ -36,9 +39,11 @@ pub use exporter::{ExportFacts, ExportSource, ExportTarget, Exported, Exporter, 
 pub use gaussians::{ExtraAttribute, HostGaussians, NeededRows};
 pub use image::Image8;
 pub use limits::Limits;
+pub use moving::Moving;
 pub use plugin::{Entries, Plugin, PluginEntry, split_kind, unknown_name};
 pub use rules::Rules;
 pub use seed::Seed;
 pub use similarity::Similarity;
+pub use stored_model::{MOVING, StoredModel, read_gaussians};
 pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin};
 pub use {inventory, serde, toml};

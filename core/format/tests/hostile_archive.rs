@@ -340,7 +340,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 256, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
     fn archives_round_trip(streams in proptest::collection::vec((0u8..5, proptest::collection::vec(any::<u8>(), 0..600)), 0..6)) {
-        let kind = |k: u8| [StreamKind::Canonical, StreamKind::Field, StreamKind::Meta, StreamKind::Other(3), StreamKind::Other(255)][usize::from(k)];
+        let kind = |k: u8| [StreamKind::Canonical, StreamKind::Field, StreamKind::Meta, StreamKind::Playback, StreamKind::Other(255)][usize::from(k)];
         let mut writer = ArchiveWriter::new(manifest());
         for (i, (k, bytes)) in streams.iter().enumerate() {
             writer = writer.add(kind(*k), Stream { name: format!("s{i}"), bytes: bytes.clone() });

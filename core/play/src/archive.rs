@@ -7,16 +7,13 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
-    WeightArray, split_kind,
+    AttributeCodec, CodecContext, DeclaredLoss, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews, WeightArray, read_gaussians, split_kind,
 };
 use serde::Serialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Key of the manifest's `extra` under which [`Moving`] is stored.
-const MOVING: &str = "moving";
 /// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
 const ATTRIBUTES: &str = "attributes";
 
@@ -42,23 +39,7 @@ impl Model {
         let archive = Archive::open(path, limits)?;
         let object = path.display().to_string();
         let manifest = archive.manifest().clone();
-        let spec = format!("{}:{}", manifest.codec.name, manifest.codec.profile);
-        let codec = linked(&object, "codec", &manifest.codec.name, Some(&manifest.codec.version), registry)?;
-        check_version(&object, "codec", &manifest.codec.name, &manifest.codec.version, codec)?;
-        let codec = registry.build_codec(&spec, &manifest.codec.settings)?;
-        let context = CodecContext::new(codec_seed(manifest.provenance.seed), *limits, events);
-        let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
-        gaussians.validate(&object, limits)?;
-        if gaussians.len() as u64 != manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
-            let problem = format!(
-                "the manifest says {} Gaussians of degree {}, the streams hold {} of degree {}",
-                manifest.gaussian_count,
-                manifest.sh_degree,
-                gaussians.len(),
-                gaussians.sh_degree
-            );
-            return Err(Error::data(object, problem, "The archive is damaged; fetch it again"));
-        }
+        let gaussians = read_gaussians(&object, &archive, limits, events)?;
         let field = match &manifest.deformer {
             None => None,
             Some(entry) => {
@@ -72,12 +53,7 @@ impl Model {
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
             }
         };
-        let moving = match manifest.extra.get(MOVING) {
-            Some(value) => {
-                serde_json::from_value(value.clone()).map_err(|e| Error::data(&object, format!("moving: {e}"), "The archive is damaged; fetch it again"))?
-            }
-            None => Moving::Scored { zeta: manifest.dynamic_threshold },
-        };
+        let moving = Moving::of_manifest(&object, &manifest)?;
         let mut rasterizer = manifest.rasterizer.settings.clone();
         rasterizer.insert("kind".into(), manifest.rasterizer.name.clone().into());
         let of_kind = |kind| archive.stream_sizes().iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();

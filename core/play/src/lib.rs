@@ -5,19 +5,22 @@
 //! the other way.
 
 mod archive;
+pub mod bake;
 pub mod checkpoint;
 pub mod codec_services;
 pub mod model;
 mod moving;
 mod orbit;
 pub mod player;
+pub mod presentation;
 pub mod prune;
 mod render;
 pub mod source;
 
 pub use archive::{ArchiveOptions, attribute_width};
+pub use cc4dgs_core::Moving;
 pub use model::Model;
-pub use moving::{Moving, MovingRows};
+pub use moving::MovingRows;
 pub use orbit::Orbit;
 pub use player::Player;
 pub use render::{RenderConfig, default_rasterizer};

@@ -31,7 +31,7 @@ pub struct CompressReport {
 #[derive(Serialize)]
 pub struct StreamSize {
     pub name: String,
-    /// `canonical`, `field`, `meta` or `other`.
+    /// `canonical`, `field`, `meta`, `playback`, `poster` or `other`.
     pub kind: &'static str,
     pub decoded_bytes: u64,
     pub stored_bytes: u64,
@@ -43,6 +43,8 @@ impl From<StreamInfo> for StreamSize {
             StreamKind::Canonical => "canonical",
             StreamKind::Field => "field",
             StreamKind::Meta => "meta",
+            StreamKind::Playback => "playback",
+            StreamKind::Poster => "poster",
             StreamKind::Other(_) => "other",
         };
         Self { name: info.name, kind, decoded_bytes: info.decoded_bytes, stored_bytes: info.stored_bytes }

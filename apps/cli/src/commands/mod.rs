@@ -1,5 +1,6 @@
 //! The commands.
 
+mod bake;
 mod bench;
 mod compress;
 mod decompress;
@@ -15,6 +16,8 @@ mod report;
 mod storage;
 mod stress;
 mod train;
+#[cfg(feature = "view")]
+mod view;
 
 use crate::args::{BenchWhat, Cli, Command};
 use crate::listeners::{JsonLines, Progress};
@@ -53,17 +56,30 @@ const STACK: usize = 8 << 20;
 pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
     // Where the pool already runs (a program calling `run` twice), it stays as it is: results do not depend on it.
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.min(1024)).stack_size(STACK).build_global().ok();
+    #[cfg(feature = "view")]
+    if let Command::View(args) = &cli.command {
+        // The window belongs on the main thread.
+        let content = rayon::scope(|_| view::prepare(&context(cli, output)?, args))?;
+        return view::show(args, content);
+    }
     rayon::scope(|_| run(cli, output))
 }
 
+fn context<'a>(cli: &'a Cli, output: &'a Output) -> Result<Context<'a>> {
+    Ok(Context { registry: Registry::collect()?, output, limits: limits(&cli.limits)?, limit_options: &cli.limits })
+}
+
 fn run(cli: &Cli, output: &Output) -> Result<()> {
-    let context = Context { registry: Registry::collect()?, output, limits: limits(&cli.limits)?, limit_options: &cli.limits };
+    let context = context(cli, output)?;
     match &cli.command {
         Command::Demo(args) => demo::run(&context, args),
         Command::Train(args) => train::run(&context, args),
         Command::Compress(args) => compress::run(&context, args),
         Command::Export(args) => export::run(&context, args),
         Command::Prune(args) => prune::run(&context, args),
+        Command::Bake(args) => bake::run(&context, args),
+        #[cfg(feature = "view")]
+        Command::View(args) => view::show(args, view::prepare(&context, args)?),
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),

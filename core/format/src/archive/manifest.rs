@@ -1,5 +1,6 @@
 //! The manifest of an archive.
 
+use super::Presentation;
 use crate::{DeformerContext, Error, Limits, Result, Rules, Similarity};
 use serde::{Deserialize, Serialize};
 
@@ -93,9 +94,16 @@ pub struct Manifest {
     pub gaussian_count: u64,
     /// The origin of the model.
     pub provenance: Provenance,
+    /// How a player shows it.
+    #[serde(default, skip_serializing_if = "is_empty")]
+    pub presentation: Presentation,
     /// Additional data of writers.
     #[serde(default)]
     pub extra: serde_json::Map<String, serde_json::Value>,
+}
+
+fn is_empty(presentation: &Presentation) -> bool {
+    *presentation == Presentation::default()
 }
 
 impl Manifest {
@@ -126,6 +134,7 @@ impl Manifest {
         }
         limits.check_gaussians(object, self.gaussian_count)?;
         self.normalisation.validate(object)?;
+        self.presentation.validate(object)?;
         if self.sh_degree > 4 {
             return Err(damaged(object, format!("spherical-harmonics degree {} is over 4", self.sh_degree)));
         }

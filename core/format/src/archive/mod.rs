@@ -19,6 +19,7 @@
 mod bytes;
 mod manifest;
 mod packing;
+mod presentation;
 mod read;
 mod write;
 pub(crate) mod zstandard;
@@ -26,6 +27,7 @@ pub(crate) mod zstandard;
 pub use bytes::ByteReader;
 pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, Manifest, Provenance, RasterizerEntry};
 pub use packing::estimate_stored_len;
+pub use presentation::{MAX_CAMERAS, Presentation};
 pub use read::{Archive, StreamInfo};
 pub use write::{ArchiveWriter, write_atomically};
 
@@ -44,6 +46,10 @@ pub enum StreamKind {
     Field,
     /// Any other data of this version.
     Meta,
+    /// The playback layer: see [`crate::playback`].
+    Playback,
+    /// A small PNG or JPEG to show while the rest is fetched.
+    Poster,
     /// A kind of a later version; readers skip it.
     Other(u8),
 }
@@ -54,6 +60,8 @@ impl StreamKind {
             Self::Canonical => 0,
             Self::Field => 1,
             Self::Meta => 2,
+            Self::Playback => 3,
+            Self::Poster => 4,
             Self::Other(code) => code,
         }
     }
@@ -62,6 +70,8 @@ impl StreamKind {
             0 => Self::Canonical,
             1 => Self::Field,
             2 => Self::Meta,
+            3 => Self::Playback,
+            4 => Self::Poster,
             other => Self::Other(other),
         }
     }

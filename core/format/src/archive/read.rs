@@ -22,6 +22,8 @@ pub struct StreamInfo {
     pub decoded_bytes: u64,
     /// Size in bytes in the file.
     pub stored_bytes: u64,
+    /// First byte in the file, so that programs can fetch the stream alone.
+    pub offset: u64,
 }
 
 struct Entry {
@@ -29,7 +31,6 @@ struct Entry {
     shuffle: u8,
     encoding: Encoding,
     checksum: u64,
-    offset: u64,
 }
 
 enum Source {
@@ -95,6 +96,23 @@ impl Archive {
     pub fn from_bytes(object: impl Into<String>, bytes: Vec<u8>, limits: &Limits) -> Result<Self> {
         Self::from_source(object.into(), Source::Memory(bytes), limits)
     }
+    /// Bytes from the start of a file to the end of its header, from its first [`Archive::PREFIX_BYTES`]; `object` names it in errors. With them,
+    /// and `total` bytes altogether, [`Archive::from_bytes`] reads the manifest and the directory; streams that are missing fail their checksum when they are read.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for a file that is no archive, [`Error::Limit`].
+    pub fn header_end(object: &str, prefix: &[u8], limits: &Limits) -> Result<u64> {
+        let mut reader = ByteReader::new(object, prefix);
+        if reader.take(8)? != MAGIC {
+            return Err(Error::data(object, "it is not a .cc4d archive (wrong magic bytes)", "Check the address"));
+        }
+        reader.u32()?;
+        let header = u64::from(reader.u32()?);
+        limits.check_bytes(&format!("header of {object}"), header)?;
+        Ok(Self::PREFIX_BYTES as u64 + header)
+    }
+    /// Bytes before the header.
+    pub const PREFIX_BYTES: usize = PREFIX_BYTES;
     fn from_source(object: String, source: Source, limits: &Limits) -> Result<Self> {
         let total = source.len(&object)?;
         if total < PREFIX_BYTES as u64 {
@@ -153,7 +171,7 @@ impl Archive {
         let object = format!("stream '{}' of {}", entry.info.name, self.object);
         self.limits.check_bytes(&object, entry.info.decoded_bytes)?;
         self.limits.check_bytes(&object, entry.info.stored_bytes)?;
-        let stored = self.source.read(&object, entry.offset, entry.info.stored_bytes)?;
+        let stored = self.source.read(&object, entry.info.offset, entry.info.stored_bytes)?;
         if xxh3_64(&stored) != entry.checksum {
             return Err(damaged(&object, "its checksum does not match".into()));
         }
@@ -184,7 +202,7 @@ fn read_directory(reader: &mut ByteReader, start: u64, total: u64) -> Result<Vec
         if !names.insert(name.clone()) {
             return Err(reader.error(format!("two streams are called '{name}'")));
         }
-        entries.push(Entry { info: StreamInfo { name, kind, decoded_bytes, stored_bytes }, shuffle, encoding, checksum, offset });
+        entries.push(Entry { info: StreamInfo { name, kind, decoded_bytes, stored_bytes, offset }, shuffle, encoding, checksum });
         offset += stored_bytes;
     }
     if offset != total {

@@ -1,0 +1,56 @@
+//! Arguments of `bake` and `view`.
+
+use super::UpArg;
+use clap::Args;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub struct Bake {
+    /// An archive, a run's folder or a checkpoint.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The archive to write.
+    #[arg(long, value_name = "F.cc4d")]
+    pub out: PathBuf,
+    /// How far a point of a Gaussian may be off: pixels in the nearest camera that sees it (0.1px), or a length in units of the model (0.002).
+    #[arg(long, value_name = "E", default_value = "0.1px")]
+    pub max_error: String,
+    /// The dataset that the model was trained on: its cameras are those of --max-error, and players offer them. Without it, an orbit round the model.
+    #[arg(long, value_name = "PATH")]
+    pub scene: Option<PathBuf>,
+    /// Codec of the Gaussians, where MODEL is no archive yet.
+    #[arg(long, value_name = "NAME[:PROFILE]", default_value = "quantize:high")]
+    pub codec: String,
+    /// Weight codec of the field, where MODEL is no archive yet.
+    #[arg(long, value_name = "NAME", default_value = "fp16")]
+    pub field_weights: String,
+    /// Leave the deformer's weights out: smaller, for players that read the layer only.
+    #[arg(long)]
+    pub without_field: bool,
+    /// Frames per second of the recording; 30 where nobody says.
+    #[arg(long, value_name = "N")]
+    pub fps: Option<f32>,
+    /// The signed axis that points up: x, -x, y, -y, z or -z. By default that of the scene's cameras, or z.
+    #[arg(long, value_enum, allow_hyphen_values = true)]
+    pub up: Option<UpArg>,
+    /// Leave out the small image that players show first.
+    #[arg(long)]
+    pub no_poster: bool,
+    /// Device the field is evaluated on.
+    #[arg(long, value_name = "NAME", default_value = "flex")]
+    pub device: String,
+}
+
+#[cfg(feature = "view")]
+#[derive(Debug, Args)]
+pub struct View {
+    /// An archive, a run's folder, a checkpoint, a PLY or an SPZ file.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// How far a point of a Gaussian may be off where motion has to be baked first; as for `bake`.
+    #[arg(long, value_name = "E", default_value = "0.1px")]
+    pub max_error: String,
+    /// Device that motion is baked on.
+    #[arg(long, value_name = "NAME", default_value = "flex")]
+    pub device: String,
+}

@@ -1,0 +1,80 @@
+//! Time of playback.
+
+/// A clock over a sequence: plays, loops, seeks, steps. Time is normalised, 0 for the first frame and 1 for the last.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Clock {
+    /// Normalised time, 0..1.
+    pub time: f32,
+    /// Whether it runs.
+    pub playing: bool,
+    /// Multiple of the recorded speed; negative runs backwards.
+    pub speed: f32,
+    /// Whether it starts again at the end; else it stops there.
+    pub looping: bool,
+    /// Seconds from time 0 to 1.
+    pub seconds: f32,
+    /// Frames of the sequence.
+    pub frames: usize,
+}
+
+impl Clock {
+    /// A clock at the start of a sequence of `frames` frames that lasts `seconds`.
+    pub fn new(frames: usize, seconds: f32) -> Self {
+        Self { time: 0.0, playing: false, speed: 1.0, looping: true, seconds: seconds.max(1e-3), frames: frames.max(1) }
+    }
+    /// Moves on by `elapsed_s` seconds of the real clock; whether time changed.
+    pub fn tick(&mut self, elapsed_s: f32) -> bool {
+        if !self.playing || self.frames < 2 || !(elapsed_s > 0.0) {
+            return false;
+        }
+        let next = self.time + elapsed_s * self.speed / self.seconds;
+        if (0.0..=1.0).contains(&next) {
+            self.time = next;
+        } else if self.looping {
+            self.time = next.rem_euclid(1.0);
+        } else {
+            self.time = next.clamp(0.0, 1.0);
+            self.playing = false;
+        }
+        true
+    }
+    /// Goes to a normalised time; what is no number is the start.
+    pub fn seek(&mut self, time_norm: f32) {
+        self.time = if time_norm.is_nan() { 0.0 } else { time_norm.clamp(0.0, 1.0) };
+    }
+    /// Goes to the nearest frame and `frames` on, and stops.
+    pub fn step(&mut self, frames: i32) {
+        self.playing = false;
+        let last = self.frames.saturating_sub(1).max(1) as f32;
+        self.seek(((self.time * last).round() + frames as f32) / last);
+    }
+    /// Index of the nearest frame.
+    pub fn frame(&self) -> usize {
+        (self.time * (self.frames.saturating_sub(1)) as f32).round() as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_plays_loops_stops_and_steps() {
+        let mut clock = Clock::new(11, 2.0);
+        assert!(!clock.tick(1.0));
+        clock.playing = true;
+        assert!(clock.tick(1.0) && (clock.time - 0.5).abs() < 1e-6 && clock.frame() == 5);
+        clock.tick(1.5);
+        assert!((clock.time - 0.25).abs() < 1e-6);
+        (clock.looping, clock.speed) = (false, 10.0);
+        clock.tick(1.0);
+        assert_eq!((clock.time, clock.playing), (1.0, false));
+        clock.seek(0.34);
+        clock.step(-1);
+        assert!((clock.time - 0.2).abs() < 1e-6);
+        clock.step(-5);
+        assert_eq!(clock.time, 0.0);
+        clock.seek(f32::NAN);
+        assert_eq!(clock.time, 0.0);
+    }
+}

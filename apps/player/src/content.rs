@@ -1,0 +1,236 @@
+//! What a file holds, in the form that the GPU reads.
+
+use cc4dgs_format::archive::{Archive, MAGIC, Presentation, StreamKind};
+use cc4dgs_format::gaussians::sh_rest_len;
+use cc4dgs_format::playback::{Head, PlaybackLayer};
+use cc4dgs_format::{Error, HostGaussians, Limits, Result, Rules, Silent, StoredModel, ply, spz};
+
+/// Floats of a Gaussian in [`Scene::gaussians`].
+pub(crate) const GAUSSIAN_FLOATS: usize = 16;
+
+/// A file's model with everything a player wants to know of it.
+pub struct Content {
+    /// The Gaussians and their motion.
+    pub scene: Scene,
+    /// Clock and cameras.
+    pub presentation: Presentation,
+    /// Frames of the sequence.
+    pub frame_count: usize,
+    /// Whether the model moves, but the file has no playback layer: it is shown as it stands.
+    pub lacks_motion: bool,
+    /// Size of the file in bytes.
+    pub bytes: u64,
+}
+
+/// Gaussians in the layout of the shaders, moving ones first.
+pub struct Scene {
+    /// Gaussians N.
+    pub count: usize,
+    /// Moving Gaussians M, the first ones.
+    pub moving: usize,
+    /// Spherical-harmonics degree, 0 to 4.
+    pub sh_degree: usize,
+    /// Lower and upper corner of the canonical centres.
+    pub bounds: [[f32; 3]; 2],
+    /// Background, RGB in 0..1.
+    pub background: [f32; 3],
+    /// Smallest depth drawn.
+    pub near: f32,
+    /// Cap of alpha.
+    pub alpha_max: f32,
+    /// Whether opacity is scaled by the share of the footprint that the pixel blur added.
+    pub antialiased: bool,
+    /// Whether a square of 3 sigma in whole tiles limits footprints (Inria's rules).
+    pub square: bool,
+    /// Per Gaussian: centre, opacity in 0..1; log-scales, 0; unit quaternion; degree 0, 0.
+    pub(crate) gaussians: Vec<f32>,
+    /// Coefficients of degree 1 and up as pairs of half floats, [`Scene::harmonics_words`] per Gaussian.
+    pub(crate) harmonics: Vec<u32>,
+    /// Sums of ranks of all tracks, M + 1 each.
+    pub(crate) starts: Vec<u32>,
+    /// Coefficients of all tracks.
+    pub(crate) coefficients: Vec<f32>,
+    /// The functions of the layer; its coefficients are in `coefficients`.
+    pub(crate) layer: Option<PlaybackLayer>,
+    /// Per segment and head, where its starts and coefficients begin.
+    pub(crate) tracks: Vec<[Option<(u32, u32)>; 5]>,
+}
+
+impl Content {
+    /// Reads an archive, a PLY file of 3D Gaussian splatting or an SPZ file, by its first bytes; `object` names it in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for files that are damaged or none of these, [`Error::Limit`], [`Error::Unsupported`].
+    pub fn read(object: &str, bytes: Vec<u8>, limits: &Limits) -> Result<Self> {
+        let size = bytes.len() as u64;
+        limits.check_bytes(object, size)?;
+        if bytes.starts_with(&MAGIC) {
+            return Self::of_archive(object, &Archive::from_bytes(object, bytes, limits)?, limits);
+        }
+        let gaussians = if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
+            ply::from_bytes(object, &bytes, limits)?.0
+        } else if bytes.starts_with(&[0x1f, 0x8b]) {
+            spz::from_spz(object, &bytes, limits)?
+        } else {
+            let remedy = "Give a .cc4d archive, a PLY file of 3D Gaussian splatting or an SPZ file";
+            return Err(Error::data(object, "it begins like no model", remedy));
+        };
+        gaussians.validate(object, limits)?;
+        let scene = Scene::new(&gaussians, None)?;
+        Ok(Self { scene, presentation: Presentation::default(), frame_count: 1, lacks_motion: false, bytes: size })
+    }
+    /// The model of an archive.
+    ///
+    /// # Errors
+    /// As [`StoredModel::read`].
+    pub fn of_archive(object: &str, archive: &Archive, limits: &Limits) -> Result<Self> {
+        crate::link();
+        Self::of_model(StoredModel::read(object, archive, limits, &Silent)?, archive.total_bytes()?)
+    }
+    /// The same of a model that was read already; `bytes` is the size of its file.
+    ///
+    /// # Errors
+    /// As [`Scene::new`].
+    pub fn of_model(model: StoredModel, bytes: u64) -> Result<Self> {
+        let lacks_motion = model.playback.is_none() && model.moves();
+        let (manifest, moves) = (&model.manifest, model.playback.is_some());
+        let mut scene = Scene::new(&model.gaussians, model.playback)?;
+        let rules = manifest.rasterizer.rules;
+        scene.background = manifest.background;
+        scene.antialiased = manifest.rasterizer.antialiased;
+        scene.square = rules == Rules::Inria;
+        scene.near = manifest.rasterizer.near.unwrap_or(if scene.square { 0.2 } else { 0.01 });
+        scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
+        let frame_count = if moves { manifest.frame_count } else { 1 };
+        Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, bytes })
+    }
+    /// The small image to show while the rest is fetched, PNG or JPEG bytes, if the archive has one.
+    ///
+    /// # Errors
+    /// As [`Archive::read_kind`].
+    pub fn poster(archive: &Archive) -> Result<Option<Vec<u8>>> {
+        Ok(archive.read_kind(StreamKind::Poster)?.into_iter().next().map(|s| s.bytes))
+    }
+}
+
+impl Scene {
+    /// Arranges `gaussians` and the layer that moves them. Rendering settings are the defaults of 3D Gaussian splatting files.
+    ///
+    /// # Errors
+    /// [`Error::Limit`] for more coefficients than a 32-bit index reaches.
+    pub fn new(gaussians: &HostGaussians, layer: Option<PlaybackLayer>) -> Result<Self> {
+        let n = gaussians.len();
+        let mut still = vec![true; n];
+        let rows: Vec<usize> = layer.iter().flat_map(|l| &l.rows).map(|&r| r as usize).collect();
+        rows.iter().for_each(|&row| still[row] = false);
+        let order: Vec<usize> = rows.iter().copied().chain((0..n).filter(|&i| still[i])).collect();
+        let mut out = Self {
+            count: n,
+            moving: rows.len(),
+            sh_degree: gaussians.sh_degree,
+            bounds: bounds(&gaussians.means),
+            background: [0.0; 3],
+            near: 0.01,
+            alpha_max: 0.99,
+            antialiased: false,
+            square: false,
+            gaussians: Vec::with_capacity(GAUSSIAN_FLOATS * n),
+            harmonics: Vec::new(),
+            starts: Vec::new(),
+            coefficients: Vec::new(),
+            layer: None,
+            tracks: Vec::new(),
+        };
+        let rest = 3 * sh_rest_len(gaussians.sh_degree);
+        out.harmonics.reserve(n * out.harmonics_words());
+        for &i in &order {
+            let q = &gaussians.quaternions[4 * i..4 * i + 4];
+            let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+            // Without a direction there is no rotation: the Gaussian is culled.
+            let unit = |v: f32| if norm > 1e-15 { v / norm } else { 0.0 };
+            let opacity = 1.0 / (1.0 + (-gaussians.opacity_logits[i]).exp());
+            let (m, s, d) = (&gaussians.means[3 * i..3 * i + 3], &gaussians.log_scales[3 * i..3 * i + 3], &gaussians.sh_dc[3 * i..3 * i + 3]);
+            out.gaussians.extend([m[0], m[1], m[2], opacity, s[0], s[1], s[2], 0.0]);
+            out.gaussians.extend([unit(q[0]), unit(q[1]), unit(q[2]), unit(q[3]), d[0], d[1], d[2], 0.0]);
+            out.harmonics.extend(gaussians.sh_rest[rest * i..rest * (i + 1)].chunks(2).map(pair_of_halves));
+        }
+        if let Some(layer) = layer {
+            out.set_layer(layer)?;
+        }
+        Ok(out)
+    }
+    /// Words of harmonics per Gaussian.
+    pub(crate) fn harmonics_words(&self) -> usize {
+        (3 * sh_rest_len(self.sh_degree)).div_ceil(2)
+    }
+    fn set_layer(&mut self, mut layer: PlaybackLayer) -> Result<()> {
+        for segment in &mut layer.segments {
+            let mut tracks = [None; 5];
+            for track in &mut segment.tracks {
+                let at = Head::ALL.iter().position(|h| *h == track.head).unwrap_or(0);
+                tracks[at] = Some((self.starts.len() as u32, self.coefficients.len() as u32));
+                self.starts.append(&mut track.starts);
+                self.coefficients.append(&mut track.coefficients);
+                track.ranks = Vec::new();
+            }
+            self.tracks.push(tracks);
+        }
+        let most = u64::from(u32::MAX);
+        if self.coefficients.len().max(self.starts.len()) as u64 > most {
+            return Err(Error::limit("playback layer", self.coefficients.len() as u64, most, "Bake with a larger --max-error"));
+        }
+        self.layer = Some(layer);
+        Ok(())
+    }
+    /// Bytes on the GPU that describe the model.
+    pub fn gpu_bytes(&self) -> u64 {
+        4 * (self.gaussians.len() + self.harmonics.len() + self.starts.len() + self.coefficients.len()) as u64
+    }
+}
+
+fn pair_of_halves(pair: &[f32]) -> u32 {
+    let half = |k: usize| u32::from(half::f16::from_f32(pair.get(k).copied().unwrap_or(0.0).clamp(-65504.0, 65504.0)).to_bits());
+    half(0) | half(1) << 16
+}
+
+fn bounds(means: &[f32]) -> [[f32; 3]; 2] {
+    if means.is_empty() {
+        return [[0.0; 3]; 2];
+    }
+    let fold = |start: f32, pick: fn(f32, f32) -> f32| std::array::from_fn(|k| means.iter().skip(k).step_by(3).copied().fold(start, pick));
+    [fold(f32::INFINITY, f32::min), fold(f32::NEG_INFINITY, f32::max)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_format::playback::{Segment, Track};
+
+    #[test]
+    fn moving_gaussians_come_first_and_keep_their_coefficients() {
+        let gaussians = HostGaussians {
+            means: (0..12).map(|v| v as f32).collect(),
+            log_scales: vec![-3.0; 12],
+            quaternions: [2.0, 0.0, 0.0, 0.0].repeat(4),
+            opacity_logits: vec![0.0; 4],
+            sh_dc: vec![0.1; 12],
+            dynamic_scores: vec![0.0; 4],
+            ..Default::default()
+        };
+        let ranks = vec![1, 2];
+        let track = Track { head: Head::Means, functions: vec![0.0, 1.0, 1.0, 0.0], starts: Track::starts_of(&ranks), ranks, coefficients: vec![1.0; 9] };
+        let layer = PlaybackLayer { rows: vec![1, 3], samples: 2, sh_degree: 0, segments: vec![Segment { first: 0, last: 1, tracks: vec![track] }] };
+        let scene = Scene::new(&gaussians, Some(layer)).unwrap();
+        let xs: Vec<f32> = scene.gaussians.chunks(GAUSSIAN_FLOATS).map(|g| g[0]).collect();
+        assert_eq!((scene.moving, xs), (2, vec![3.0, 9.0, 0.0, 6.0]));
+        assert_eq!((scene.gaussians[3], scene.gaussians[8], &scene.starts), (0.5, 1.0, &vec![0, 1, 3]));
+        assert_eq!(scene.tracks[0][0], Some((0, 0)));
+        assert_eq!(scene.bounds, [[0.0, 1.0, 2.0], [9.0, 10.0, 11.0]]);
+    }
+
+    #[test]
+    fn foreign_bytes_are_named() {
+        let error = Content::read("x.bin", vec![1, 2, 3], &Limits::default()).err().unwrap().to_string();
+        assert!(error.contains("x.bin") && error.contains("begins like no model"), "{error}");
+    }
+}

@@ -1,0 +1,190 @@
+//! Where the user looks from: orbiting a point, or flying.
+
+use cc4dgs_format::Camera;
+use cc4dgs_format::archive::Presentation;
+use glam::{DMat3, DVec3};
+
+/// Full horizontal angle where no camera says another, in radians.
+const FOV_X: f64 = 0.9;
+/// Nearest to a pole that orbiting comes, in radians.
+const POLE: f64 = 0.03;
+
+/// A free camera with a point that it orbits.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Navigator {
+    /// Camera centre.
+    pub eye: DVec3,
+    /// The point that is orbited.
+    pub target: DVec3,
+    /// Unit vector that points up.
+    pub up: DVec3,
+    /// Full vertical angle in radians.
+    pub fov_y: f64,
+    /// Rotation of the camera around its viewing direction that captured cameras may have, in radians; 0 after the user orbits.
+    roll: f64,
+    home: Option<Camera>,
+}
+
+impl Navigator {
+    /// Starts at the home camera of `shown`; without one, beside the box from `lower` to `upper`.
+    pub fn new(shown: &Presentation, lower: [f32; 3], upper: [f32; 3]) -> Self {
+        let of = |v: [f32; 3]| DVec3::from(v.map(f64::from));
+        let (middle, radius) = (0.5 * (of(lower) + of(upper)), 0.5 * (of(upper) - of(lower)).length().max(1e-3));
+        let up = shown.up.map_or(DVec3::Z, of).try_normalize().unwrap_or(DVec3::Z);
+        let side = up.any_orthonormal_vector();
+        let target = shown.target.map_or(middle, of);
+        let mut out = Self { eye: target + 1.8 * radius * (side + 0.35 * up).normalize(), target, up, fov_y: FOV_X, roll: 0.0, home: shown.home.clone() };
+        out.reset();
+        out
+    }
+    /// Back to the home camera.
+    pub fn reset(&mut self) {
+        if let Some(home) = self.home.clone() {
+            self.go_to(&home);
+        }
+    }
+    /// Takes the place of `camera`; the orbited point becomes the one on its axis that is nearest to the old one.
+    pub fn go_to(&mut self, camera: &Camera) {
+        let eye = DVec3::from(camera.center_world());
+        let forward = DVec3::from(camera.forward_world());
+        let along = (self.target - eye).dot(forward);
+        let distance = if along > 1e-3 { along } else { (self.target - eye).length().max(1e-2) };
+        self.eye = eye;
+        self.target = eye + distance * forward;
+        self.fov_y = 2.0 * (0.5 * f64::from(camera.height) / camera.fy).atan();
+        let (right, down) = self.axes();
+        let m = camera.world_to_camera;
+        let row = DVec3::new(m[0][0], m[0][1], m[0][2]);
+        self.roll = row.dot(down).atan2(row.dot(right));
+    }
+    fn forward(&self) -> DVec3 {
+        (self.target - self.eye).try_normalize().unwrap_or(DVec3::X)
+    }
+    /// Right and down of a camera without roll.
+    fn axes(&self) -> (DVec3, DVec3) {
+        let forward = self.forward();
+        let right = forward.cross(self.up).try_normalize().unwrap_or_else(|| forward.any_orthonormal_vector());
+        (right, forward.cross(right))
+    }
+    /// Orbits by angles in radians: to the right, and upwards.
+    pub fn orbit(&mut self, right: f64, upwards: f64) {
+        self.roll = 0.0;
+        let arm = self.eye - self.target;
+        let distance = arm.length();
+        let height = (arm.dot(self.up) / distance.max(1e-9)).clamp(-1.0, 1.0).asin();
+        let raised = (height + upwards).clamp(-std::f64::consts::FRAC_PI_2 + POLE, std::f64::consts::FRAC_PI_2 - POLE);
+        let flat = (arm - arm.dot(self.up) * self.up).try_normalize().unwrap_or_else(|| self.up.any_orthonormal_vector());
+        let turned = DMat3::from_axis_angle(self.up, right) * flat;
+        self.eye = self.target + distance * (raised.cos() * turned + raised.sin() * self.up);
+    }
+    /// Turns in place by angles in radians: to the right, and upwards.
+    pub fn look(&mut self, right: f64, upwards: f64) {
+        let (eye, target) = (self.eye, self.target);
+        // Looking around is orbiting of the target around the eye.
+        (self.eye, self.target) = (target, eye);
+        self.orbit(-right, upwards);
+        (self.eye, self.target) = (eye, self.eye);
+    }
+    /// Moves eye and target along the image: shares of its height.
+    pub fn pan(&mut self, right: f64, down: f64) {
+        let height = 2.0 * (0.5 * self.fov_y).tan() * (self.target - self.eye).length();
+        let (r, d) = self.axes();
+        let by = height * (right * r + down * d);
+        self.eye += by;
+        self.target += by;
+    }
+    /// Divides the distance to the target by `factor`.
+    pub fn zoom(&mut self, factor: f64) {
+        if factor.is_finite() && factor > 0.0 {
+            let arm = self.eye - self.target;
+            self.eye = self.target + arm / factor.clamp(0.01, 100.0);
+        }
+    }
+    /// Flies: shares of the distance to the target, to the right, up and forward.
+    pub fn fly(&mut self, right: f64, up: f64, forward: f64) {
+        let distance = (self.target - self.eye).length();
+        let (r, d) = self.axes();
+        let by = distance * (right * r - up * d + forward * self.forward());
+        self.eye += by;
+        self.target += by;
+    }
+    /// The camera for an image of this size in pixels.
+    pub fn camera(&self, width: u32, height: u32) -> Camera {
+        let (width, height) = (width.max(1), height.max(1));
+        let (flat_right, flat_down) = self.axes();
+        let (s, c) = self.roll.sin_cos();
+        let (right, down) = (c * flat_right + s * flat_down, c * flat_down - s * flat_right);
+        let row = |a: DVec3| [a.x, a.y, a.z, -a.dot(self.eye)];
+        let focal = 0.5 * f64::from(height) / (0.5 * self.fov_y).tan();
+        Camera {
+            name: "view".into(),
+            width,
+            height,
+            fx: focal,
+            fy: focal,
+            cx: 0.5 * f64::from(width),
+            cy: 0.5 * f64::from(height),
+            world_to_camera: [row(right), row(down), row(self.forward()), [0.0, 0.0, 0.0, 1.0]],
+        }
+    }
+    /// Eye, target and vertical angle, for links.
+    pub fn pose(&self) -> [f64; 7] {
+        let (e, t) = (self.eye, self.target);
+        [e.x, e.y, e.z, t.x, t.y, t.z, self.fov_y]
+    }
+    /// Takes a pose of [`Navigator::pose`]; poses that are not finite or see nothing are ignored.
+    pub fn set_pose(&mut self, pose: [f64; 7]) {
+        let (eye, target) = (DVec3::new(pose[0], pose[1], pose[2]), DVec3::new(pose[3], pose[4], pose[5]));
+        if pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && (0.01..3.1).contains(&pose[6]) {
+            (self.eye, self.target, self.fov_y, self.roll) = (eye, target, pose[6], 0.0);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn home() -> Camera {
+        Camera::look_at("home", (640, 480), 0.8, [3.0, 1.0, 2.0], [0.2, 0.1, 0.3], [0.0, 0.0, 1.0])
+    }
+
+    #[test]
+    fn home_is_the_camera_it_was_told_of() {
+        let shown = Presentation { home: Some(home()), up: Some([0.0, 0.0, 1.0]), target: Some([0.2, 0.1, 0.3]), ..Default::default() };
+        let mut navigator = Navigator::new(&shown, [-1.0; 3], [1.0; 3]);
+        let close = |a: &Camera, b: &Camera| {
+            let pairs = a.world_to_camera.iter().flatten().zip(b.world_to_camera.iter().flatten());
+            pairs.fold(0.0f64, |worst, (x, y)| worst.max((x - y).abs())) + (a.fx - b.fx).abs()
+        };
+        assert!(close(&navigator.camera(640, 480), &home()) < 1e-9);
+        navigator.orbit(0.3, 0.2);
+        navigator.camera(640, 480).validate().unwrap();
+        assert!(close(&navigator.camera(640, 480), &home()) > 0.1);
+        assert!(((navigator.eye - navigator.target).length() - (DVec3::new(2.8, 0.9, 1.7)).length()).abs() < 1e-9);
+        navigator.reset();
+        assert!(close(&navigator.camera(640, 480), &home()) < 1e-9);
+        // Rolled cameras keep their roll.
+        let rolled = Camera::look_at("rolled", (640, 480), 0.8, [3.0, 1.0, 2.0], [0.2, 0.1, 0.3], [0.3, 0.1, 1.0]);
+        navigator.go_to(&rolled);
+        assert!(close(&navigator.camera(640, 480), &rolled) < 1e-9);
+    }
+
+    #[test]
+    fn no_gesture_loses_the_scene() {
+        let mut navigator = Navigator::new(&Presentation::default(), [-1.0; 3], [1.0; 3]);
+        for _ in 0..50 {
+            navigator.orbit(0.4, 0.7);
+            navigator.look(0.1, -0.9);
+            navigator.pan(0.1, -0.2);
+            navigator.zoom(1.1);
+            navigator.fly(0.0, 0.1, 0.1);
+            navigator.camera(10, 10).validate().unwrap();
+        }
+        let pose = navigator.pose();
+        navigator.set_pose([f64::NAN; 7]);
+        assert_eq!(navigator.pose(), pose);
+        navigator.zoom(f64::NAN);
+        assert_eq!(navigator.pose(), pose);
+    }
+}

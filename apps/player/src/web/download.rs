@@ -1,0 +1,100 @@
+//! An archive that arrives in pieces.
+
+use super::error;
+use crate::Content;
+use cc4dgs_format::archive::{Archive, StreamKind};
+use cc4dgs_format::playback::PlaybackLayer;
+use cc4dgs_format::{Error, Limits, Moving, Result, Silent, StoredModel, read_gaussians};
+use wasm_bindgen::prelude::*;
+
+/// Bytes of an archive, some of which are still missing. The page fetches ranges, in the order that [`Download::streams`] suggests.
+#[wasm_bindgen]
+pub struct Download {
+    name: String,
+    bytes: Vec<u8>,
+    archive: Option<Archive>,
+    /// The Gaussians, decoded once.
+    model: Option<StoredModel>,
+}
+
+#[wasm_bindgen]
+impl Download {
+    /// An archive of `total` bytes of which nothing has arrived; `name` names it in errors.
+    #[wasm_bindgen(constructor)]
+    pub fn new(name: String, total: f64) -> std::result::Result<Download, JsError> {
+        let most = super::LIMITS.max_bytes as f64;
+        if !(0.0..=most).contains(&total) {
+            return Err(error(Error::limit(name, total.max(0.0) as u64, most as u64, "Open it on the desktop")));
+        }
+        let mut bytes = Vec::new();
+        bytes.try_reserve_exact(total as usize).map_err(error)?;
+        bytes.resize(total as usize, 0);
+        Ok(Self { name, bytes, archive: None, model: None })
+    }
+    /// Stores bytes that arrived; what lies outside the file is ignored.
+    pub fn put(&mut self, offset: usize, piece: &[u8]) {
+        let end = offset.saturating_add(piece.len()).min(self.bytes.len());
+        if offset < end {
+            self.bytes[offset..end].copy_from_slice(&piece[..end - offset]);
+            self.archive = None;
+        }
+    }
+    /// Bytes to the end of the header, once the first 24 have arrived.
+    #[wasm_bindgen(js_name = headerEnd)]
+    pub fn header_end(&self) -> std::result::Result<f64, JsError> {
+        let prefix = &self.bytes[..self.bytes.len().min(Archive::PREFIX_BYTES)];
+        Ok(Archive::header_end(&self.name, prefix, &super::LIMITS).map_err(error)? as f64)
+    }
+    /// The streams as JSON: name, kind, first byte and bytes of each. The header must have arrived.
+    pub fn streams(&mut self) -> std::result::Result<String, JsError> {
+        let streams = self.opened().map_err(error)?.stream_sizes();
+        let kind = |kind| match kind {
+            StreamKind::Canonical => "canonical",
+            StreamKind::Playback => "playback",
+            StreamKind::Poster => "poster",
+            _ => "other",
+        };
+        let list: Vec<_> =
+            streams.iter().map(|s| serde_json::json!({ "name": s.name, "kind": kind(s.kind), "offset": s.offset, "bytes": s.stored_bytes })).collect();
+        Ok(serde_json::Value::from(list).to_string())
+    }
+    /// The poster's bytes (PNG or JPEG), if the archive has one and it has arrived.
+    pub fn poster(&mut self) -> std::result::Result<Option<Vec<u8>>, JsError> {
+        Content::poster(self.opened().map_err(error)?).map_err(error)
+    }
+}
+
+impl Download {
+    fn opened(&mut self) -> Result<&Archive> {
+        if self.archive.is_none() {
+            self.archive = Some(Archive::from_bytes(self.name.clone(), self.bytes.clone(), &super::LIMITS)?);
+        }
+        self.archive.as_ref().ok_or_else(|| Error::data(self.name.clone(), "nothing has arrived", "Load it again"))
+    }
+    /// What the archive holds, with its motion or still without.
+    pub(super) fn content(&mut self, motion: bool, limits: &Limits) -> Result<Content> {
+        crate::link();
+        let name = self.name.clone();
+        let known = self.model.take();
+        let archive = self.opened()?;
+        let mut model = match known {
+            Some(model) => model,
+            None => {
+                let manifest = archive.manifest().clone();
+                let gaussians = read_gaussians(&name, archive, limits, &Silent)?;
+                let moving = Moving::of_manifest(&name, &manifest)?;
+                StoredModel { manifest, gaussians, moving, playback: None }
+            }
+        };
+        let bytes = archive.total_bytes()?;
+        if motion {
+            let streams = archive.read_kind(StreamKind::Playback)?;
+            if !streams.is_empty() {
+                model.playback = Some(PlaybackLayer::decode(&streams, model.gaussians.len(), model.gaussians.sh_degree, limits)?);
+            }
+            return Content::of_model(model, bytes);
+        }
+        self.model = Some(model.clone());
+        Ok(Content { lacks_motion: false, ..Content::of_model(model, bytes)? })
+    }
+}

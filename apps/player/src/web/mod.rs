@@ -1,0 +1,374 @@
+//! The player in a browser: what the page's JavaScript calls. Gestures, buttons and fetching are the page's, everything else is here.
+
+mod download;
+mod plain;
+
+use crate::{Clock, Content, Mode, Navigator, Renderer, Scene, View, request_device};
+use cc4dgs_format::{Camera, Image8, Limits};
+use download::Download;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use wasm_bindgen::prelude::*;
+
+/// Memory of a browser's tab is small.
+const LIMITS: Limits = Limits { max_bytes: 1 << 30, max_gaussians: 8_000_000, max_pixels: 64 << 20, max_depth: 64 };
+
+fn error(error: impl std::fmt::Display) -> JsError {
+    JsError::new(&error.to_string())
+}
+
+unsafe extern "C" {
+    /// The linker's: runs the constructors that register codecs. Where nobody calls it, every exported function would.
+    fn __wasm_call_ctors();
+}
+
+/// Runs once, when the module is loaded: panics go to the console with their text.
+#[wasm_bindgen(start)]
+fn start() {
+    // SAFETY: called once, before any other function of the module.
+    unsafe { __wasm_call_ctors() };
+    std::panic::set_hook(Box::new(|info| web_sys::console::error_1(&info.to_string().into())));
+}
+
+/// Where images go.
+#[allow(clippy::large_enum_variant, reason = "there is one player")]
+enum Output {
+    /// A canvas with WebGPU.
+    WebGpu { surface: wgpu::Surface<'static>, configuration: wgpu::SurfaceConfiguration, renderer: Renderer, adapter: String, lost: Arc<AtomicBool> },
+    /// The page draws with WebGL2 from these arrays.
+    Plain(Option<Scene>),
+}
+
+/// A player on a canvas.
+#[wasm_bindgen]
+pub struct Player {
+    output: Output,
+    /// Of the canvas, in pixels.
+    size: (u32, u32),
+    navigator: Navigator,
+    clock: Clock,
+    cameras: Vec<Camera>,
+    /// What is drawn; camera and time are those of navigator and clock.
+    look: View,
+    /// Pixels drawn per pixel of the canvas, each way.
+    resolution: f32,
+}
+
+#[wasm_bindgen]
+impl Player {
+    /// A player that draws on `canvas` with WebGPU. Rejects where the browser has no adapter.
+    pub async fn create(canvas: web_sys::HtmlCanvasElement) -> Result<Player, JsError> {
+        let (width, height) = (canvas.width().max(1), canvas.height().max(1));
+        let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
+        descriptor.backends = wgpu::Backends::BROWSER_WEBGPU;
+        let instance = wgpu::Instance::new(descriptor);
+        let surface = instance.create_surface(wgpu::SurfaceTarget::Canvas(canvas)).map_err(error)?;
+        let (adapter, device, queue) = request_device(&instance, Some(&surface)).await.map_err(error)?;
+        let mut configuration = surface.get_default_config(&adapter, width, height).ok_or_else(|| JsError::new("the canvas cannot be drawn on"))?;
+        configuration.format = configuration.format.remove_srgb_suffix();
+        surface.configure(&device, &configuration);
+        let lost = Arc::new(AtomicBool::new(false));
+        let flag = lost.clone();
+        device.set_device_lost_callback(move |_, _| flag.store(true, Ordering::Relaxed));
+        device.on_uncaptured_error(Arc::new(|e: wgpu::Error| web_sys::console::error_1(&e.to_string().into())));
+        let renderer = Renderer::new(device, queue, configuration.format);
+        let adapter = format!("{} {}", adapter.get_info().name, adapter.get_info().driver).trim().to_string();
+        Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost }, (width, height)))
+    }
+    /// A player that decodes, keeps time and navigates, for a page that draws by itself.
+    pub fn plain(width: u32, height: u32) -> Player {
+        Self::on(Output::Plain(None), (width.max(1), height.max(1)))
+    }
+    fn on(output: Output, size: (u32, u32)) -> Self {
+        let navigator = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]);
+        let look = View::new(navigator.camera(size.0, size.1), 0.0);
+        Self { output, size, navigator, clock: Clock::new(1, 1.0), cameras: Vec::new(), look, resolution: 1.0 }
+    }
+    /// Opens a whole file: an archive, a PLY or an SPZ file. Returns facts as JSON.
+    pub fn open(&mut self, name: &str, bytes: Vec<u8>) -> Result<String, JsError> {
+        let content = Content::read(name, bytes, &LIMITS).map_err(error)?;
+        self.show(content, true)
+    }
+    /// Shows what has arrived of `download`: the Gaussians, and their motion once that is there. Returns facts as JSON.
+    #[wasm_bindgen(js_name = openPart)]
+    pub fn open_part(&mut self, download: &mut Download, motion: bool, first: bool) -> Result<String, JsError> {
+        let content = download.content(motion, &LIMITS).map_err(error)?;
+        self.show(content, first)
+    }
+    fn show(&mut self, content: Content, first: bool) -> Result<String, JsError> {
+        let Content { scene, presentation, frame_count, lacks_motion, bytes } = content;
+        let (count, moving, sh_degree, gpu_bytes, [lower, upper]) = (scene.count, scene.moving, scene.sh_degree, scene.gpu_bytes(), scene.bounds);
+        match &mut self.output {
+            Output::WebGpu { renderer, .. } => renderer.load(scene).map_err(error)?,
+            Output::Plain(kept) => *kept = Some(scene),
+        }
+        let seconds = presentation.seconds_of(frame_count);
+        if first {
+            self.navigator = Navigator::new(&presentation, lower, upper);
+            self.clock = Clock::new(frame_count, seconds);
+        }
+        (self.clock.frames, self.clock.seconds) = (frame_count.max(1), seconds.max(1e-3));
+        self.cameras = presentation.cameras;
+        let names: Vec<&str> = self.cameras.iter().map(|c| c.name.as_str()).collect();
+        let facts = serde_json::json!({
+            "gaussians": count, "moving": moving, "shDegree": sh_degree, "gpuBytes": gpu_bytes, "bytes": bytes, "frames": frame_count, "seconds": seconds,
+            "framesPerSecond": frame_count.saturating_sub(1).max(1) as f32 / seconds.max(1e-3), "cameras": names, "lacksMotion": lacks_motion,
+        });
+        Ok(facts.to_string())
+    }
+    /// Resizes the canvas' buffer to pixels.
+    pub fn resize(&mut self, width: u32, height: u32) {
+        self.size = (width.max(1), height.max(1));
+        if let Output::WebGpu { surface, configuration, renderer, .. } = &mut self.output {
+            let most = renderer.device().limits().max_texture_dimension_2d;
+            self.size = (self.size.0.min(most), self.size.1.min(most));
+            (configuration.width, configuration.height) = self.size;
+            surface.configure(renderer.device(), configuration);
+        }
+    }
+    fn view(&self) -> View {
+        let scaled = |v: u32| ((v as f32 * self.resolution).round() as u32).max(1);
+        let camera = self.navigator.camera(scaled(self.size.0), scaled(self.size.1));
+        View { camera, time: self.clock.time, ..self.look.clone() }
+    }
+    /// The current view, or the one through `camera` (JSON) and at `time`.
+    fn view_of(&self, camera: Option<String>, time: Option<f32>) -> Result<View, JsError> {
+        let mut view = self.view();
+        if let Some(json) = camera {
+            view.camera = serde_json::from_str(&json).map_err(error)?;
+            view.camera.validate().map_err(error)?;
+            LIMITS.check_pixels("captured image", view.camera.width.into(), view.camera.height.into()).map_err(error)?;
+        }
+        view.time = time.unwrap_or(view.time);
+        Ok(view)
+    }
+    /// Draws a frame on the canvas; nothing where the page draws.
+    pub fn draw(&mut self) {
+        use wgpu::CurrentSurfaceTexture::{Suboptimal, Success};
+        let view = self.view();
+        let Output::WebGpu { surface, renderer, lost, .. } = &mut self.output else { return };
+        if lost.load(Ordering::Relaxed) {
+            return;
+        }
+        if let Success(frame) | Suboptimal(frame) = surface.get_current_texture() {
+            renderer.draw(&view, &frame.texture.create_view(&Default::default()));
+            renderer.queue().present(frame);
+        }
+    }
+    fn plain_scene(&self) -> Option<&Scene> {
+        if let Output::Plain(scene) = &self.output { scene.as_ref() } else { None }
+    }
+    /// For WebGL2: the Gaussians (0) or the coefficients (1).
+    #[wasm_bindgen(js_name = plainFloats)]
+    pub fn plain_floats(&self, which: usize) -> Vec<f32> {
+        self.plain_scene().map_or_else(Vec::new, |s| if which == 0 { s.gaussians.clone() } else { s.coefficients.clone() })
+    }
+    /// For WebGL2: the harmonics (0) or the starts (1).
+    #[wasm_bindgen(js_name = plainWords)]
+    pub fn plain_words(&self, which: usize) -> Vec<u32> {
+        self.plain_scene().map_or_else(Vec::new, |s| if which == 0 { s.harmonics.clone() } else { s.starts.clone() })
+    }
+    /// For WebGL2: the uniforms of a frame.
+    #[wasm_bindgen(js_name = plainFrame)]
+    pub fn plain_frame(&self, camera: Option<String>, time: Option<f32>) -> Result<Vec<u8>, JsError> {
+        let view = self.view_of(camera, time)?;
+        let empty;
+        let scene = match self.plain_scene() {
+            Some(scene) => scene,
+            None => {
+                empty = Scene::new(&Default::default(), None).map_err(error)?;
+                &empty
+            }
+        };
+        Ok(plain::frame(scene, &view))
+    }
+    /// For WebGL2: φ at a time.
+    #[wasm_bindgen(js_name = plainFunctions)]
+    pub fn plain_functions(&self, time: Option<f32>) -> Vec<f32> {
+        self.plain_scene().map_or_else(Vec::new, |s| crate::render::functions(s, time.unwrap_or(self.clock.time)).0)
+    }
+    /// For WebGL2: the Gaussians before the camera, farthest first.
+    #[wasm_bindgen(js_name = plainOrder)]
+    pub fn plain_order(&self, camera: Option<String>, time: Option<f32>) -> Result<Vec<u32>, JsError> {
+        let view = self.view_of(camera, time)?;
+        Ok(self.plain_scene().map_or_else(Vec::new, |s| plain::order(s, &view)))
+    }
+    /// Moves the clock on; whether time changed.
+    pub fn tick(&mut self, elapsed_s: f32) -> bool {
+        self.clock.tick(elapsed_s)
+    }
+    /// Whether the device is lost: create a new player.
+    #[wasm_bindgen(getter)]
+    pub fn lost(&self) -> bool {
+        matches!(&self.output, Output::WebGpu { lost, .. } if lost.load(Ordering::Relaxed))
+    }
+    /// Loses the device on purpose, for tests.
+    #[wasm_bindgen(js_name = loseDevice)]
+    pub fn lose_device(&self) {
+        if let Output::WebGpu { renderer, .. } = &self.output {
+            renderer.device().destroy();
+        }
+    }
+    /// The adapter's name.
+    #[wasm_bindgen(getter)]
+    pub fn adapter(&self) -> String {
+        if let Output::WebGpu { adapter, .. } = &self.output { adapter.clone() } else { String::new() }
+    }
+    /// Normalised time, 0..1.
+    #[wasm_bindgen(getter)]
+    pub fn time(&self) -> f32 {
+        self.clock.time
+    }
+    /// Index of the nearest frame.
+    #[wasm_bindgen(getter)]
+    pub fn frame(&self) -> usize {
+        self.clock.frame()
+    }
+    /// Whether time runs.
+    #[wasm_bindgen(getter)]
+    pub fn playing(&self) -> bool {
+        self.clock.playing
+    }
+    /// Plays or pauses; at the end, playing starts again.
+    #[wasm_bindgen(setter)]
+    pub fn set_playing(&mut self, on: bool) {
+        self.clock.playing = on;
+        if on && !self.clock.looping && self.clock.time >= 1.0 {
+            self.clock.time = 0.0;
+        }
+    }
+    /// Multiple of the recorded speed.
+    #[wasm_bindgen(setter)]
+    pub fn set_speed(&mut self, speed: f32) {
+        self.clock.speed = if speed.is_finite() { speed } else { 1.0 };
+    }
+    /// Whether time starts again at the end.
+    #[wasm_bindgen(setter)]
+    pub fn set_looping(&mut self, on: bool) {
+        self.clock.looping = on;
+    }
+    /// Goes to a normalised time.
+    pub fn seek(&mut self, time_norm: f32) {
+        self.clock.seek(time_norm);
+    }
+    /// Goes some frames on, or back, and stops.
+    pub fn step(&mut self, frames: i32) {
+        self.clock.step(frames);
+    }
+    /// Orbits by angles in radians.
+    pub fn orbit(&mut self, right: f64, upwards: f64) {
+        self.navigator.orbit(right, upwards);
+    }
+    /// Turns in place by angles in radians.
+    pub fn look(&mut self, right: f64, upwards: f64) {
+        self.navigator.look(right, upwards);
+    }
+    /// Moves along the image, by shares of its height.
+    pub fn pan(&mut self, right: f64, down: f64) {
+        self.navigator.pan(right, down);
+    }
+    /// Divides the distance to the orbited point.
+    pub fn zoom(&mut self, factor: f64) {
+        self.navigator.zoom(factor);
+    }
+    /// Flies by shares of the distance to the orbited point.
+    pub fn fly(&mut self, right: f64, up: f64, forward: f64) {
+        self.navigator.fly(right, up, forward);
+    }
+    /// Back to the home camera.
+    pub fn reset(&mut self) {
+        self.navigator.reset();
+    }
+    /// Takes the place of a capture camera.
+    #[wasm_bindgen(js_name = goTo)]
+    pub fn go_to(&mut self, index: usize) {
+        if let Some(camera) = self.cameras.get(index) {
+            self.navigator.go_to(camera);
+        }
+    }
+    /// Eye, target and vertical angle: seven numbers.
+    #[wasm_bindgen(getter)]
+    pub fn pose(&self) -> Vec<f64> {
+        self.navigator.pose().to_vec()
+    }
+    /// Takes a pose of the getter.
+    #[wasm_bindgen(setter)]
+    pub fn set_pose(&mut self, pose: Vec<f64>) {
+        if let Ok(pose) = pose.try_into() {
+            self.navigator.set_pose(pose);
+        }
+    }
+    /// Factor of all scales.
+    #[wasm_bindgen(setter)]
+    pub fn set_scale(&mut self, scale: f32) {
+        self.look.scale = if scale.is_finite() { scale.clamp(0.01, 10.0) } else { 1.0 };
+    }
+    /// Largest degree of spherical harmonics that is evaluated.
+    #[wasm_bindgen(setter, js_name = shDegree)]
+    pub fn set_sh_degree(&mut self, degree: usize) {
+        self.look.sh_degree = degree;
+    }
+    /// Pixels drawn per pixel of the canvas, each way.
+    #[wasm_bindgen(setter)]
+    pub fn set_resolution(&mut self, share: f32) {
+        self.resolution = if share.is_finite() { share.clamp(0.1, 2.0) } else { 1.0 };
+    }
+    /// Whether moving Gaussians are tinted.
+    #[wasm_bindgen(setter)]
+    pub fn set_tint(&mut self, on: bool) {
+        self.look.tint = on;
+    }
+    /// Whether depth is shown instead of colour.
+    #[wasm_bindgen(setter)]
+    pub fn set_depth(&mut self, on: bool) {
+        self.look.mode = if on { Mode::Depth } else { Mode::Color };
+    }
+    /// The RGBA pixels of the current view at the size of the canvas, or through `camera` (JSON of a camera) at `time`; a promise of a `Picture`.
+    pub fn capture(&mut self, camera: Option<String>, time: Option<f32>) -> Result<js_sys::Promise, JsError> {
+        let view = self.view_of(camera, time)?;
+        let Output::WebGpu { renderer, .. } = &mut self.output else { return Err(JsError::new("the page draws by itself")) };
+        Ok(js_sys::Promise::new(&mut |resolve, reject| {
+            renderer.capture(&view, move |image| {
+                let called = match image {
+                    Ok(image) => resolve.call1(&JsValue::NULL, &Picture { image }.into()),
+                    Err(e) => reject.call1(&JsValue::NULL, &error(e).into()),
+                };
+                drop(called);
+            });
+        }))
+    }
+    /// How many Gaussians the last frame drew; a promise of a number.
+    #[wasm_bindgen(js_name = countVisible)]
+    pub fn count_visible(&self) -> js_sys::Promise {
+        js_sys::Promise::new(&mut |resolve, _| {
+            if let Output::WebGpu { renderer, .. } = &self.output {
+                renderer.count_visible(move |count| drop(resolve.call1(&JsValue::NULL, &count.into())));
+            }
+        })
+    }
+}
+
+/// Pixels.
+#[wasm_bindgen]
+pub struct Picture {
+    image: Image8,
+}
+
+#[wasm_bindgen]
+impl Picture {
+    /// Pixels per row.
+    #[wasm_bindgen(getter)]
+    pub fn width(&self) -> u32 {
+        self.image.width
+    }
+    /// Rows.
+    #[wasm_bindgen(getter)]
+    pub fn height(&self) -> u32 {
+        self.image.height
+    }
+    /// Red, green, blue, 255 per pixel.
+    #[wasm_bindgen(getter)]
+    pub fn rgba(&self) -> wasm_bindgen::Clamped<Vec<u8>> {
+        wasm_bindgen::Clamped(self.image.data.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect())
+    }
+}

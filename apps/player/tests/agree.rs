@@ -1,0 +1,127 @@
+//! Images of the player against those of the tile renderer, of a small model trained here and baked.
+
+use cc4dgs::core::Limits;
+use cc4dgs::core::archive::Archive;
+use cc4dgs::core::metrics::{Metric, Rounding};
+use cc4dgs::play::bake::{Additions, BakeOptions, MaxError, bake, write_archive};
+use cc4dgs::play::presentation;
+use cc4dgs::{Camera, Orbit, Session};
+use cc4dgs_player::{Content, Mode, Renderer, View, request_device};
+use std::path::{Path, PathBuf};
+
+const TIMES: [f32; 3] = [0.0, 0.37, 1.0];
+/// Decibels of agreement that are asked for, and iterations that train a model good enough to tell images apart.
+const LEAST_DB: f64 = 45.0;
+const ITERATIONS: usize = 300;
+
+/// A renderer without a window; `None` where there is no adapter and none is required.
+fn renderer() -> Option<Renderer> {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    match pollster::block_on(request_device(&instance, None)) {
+        Ok((_, device, queue)) => Some(Renderer::new(device, queue, wgpu::TextureFormat::Rgba8Unorm)),
+        Err(e) if std::env::var_os("CC4DGS_REQUIRE_WGPU").is_some() => panic!("{e}"),
+        Err(_) => None,
+    }
+}
+
+fn cameras(session: &Session, path: &Path) -> Vec<Camera> {
+    let model = session.open(path).unwrap();
+    let all = Orbit { size: (300, 220), frames: 5, ..Orbit::default() }.around(&model.gaussians).unwrap();
+    vec![all[0].clone(), all[2].clone()]
+}
+
+/// An archive of a small trained model with the deformer that `overrides` choose, with a playback layer.
+fn baked(session: &Session, folder: &Path, overrides: &[&str]) -> (PathBuf, f32) {
+    let iterations = format!("train.iterations={ITERATIONS}");
+    let overrides: Vec<&str> = overrides.iter().copied().chain([iterations.as_str(), "train.dynamic=all", "train.checks=false"]).collect();
+    let config = session.config("demo", &overrides).unwrap();
+    let scene = session.read_scene("procedural:tiny", &config.scene).unwrap();
+    let model = session.train(&config, scene, None).unwrap();
+    let (plain, out) = (folder.join("plain.cc4d"), folder.join("baked.cc4d"));
+    model.save(&plain, "quantize:high").unwrap();
+    let stored = session.open(&plain).unwrap();
+    let options = BakeOptions { max_error: MaxError::Pixels(0.1), cameras: &[] };
+    let baked = bake(&stored, &options, session.device(), session.events()).unwrap().unwrap();
+    let additions = Additions {
+        baked: Some(&baked),
+        presentation: presentation::of_gaussians(&stored.gaussians, [0.0, 0.0, 1.0]).unwrap(),
+        poster: None,
+        without_field: false,
+    };
+    write_archive(&Archive::open(&plain, &Limits::default()).unwrap(), additions, &out).unwrap();
+    (out, baked.report.at_samples)
+}
+
+fn agrees(deformer: &[&str]) {
+    let Some(mut renderer) = renderer() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let session = Session::builder().device("flex").build().unwrap();
+    let (path, error) = baked(&session, folder.path(), deformer);
+    assert!(error <= 1.0, "the layer is off by {error} of its bound");
+    let content = Content::read("model", std::fs::read(&path).unwrap(), &Limits::default()).unwrap();
+    assert!(content.scene.moving > 0 && !content.lacks_motion && content.presentation.home.is_some());
+    renderer.load(content.scene).unwrap();
+    let model = session.open(&path).unwrap();
+    let mut player = session.player(&model).unwrap();
+    let (mut least, mut motion) = (f64::INFINITY, f64::INFINITY);
+    for camera in cameras(&session, &path) {
+        let mut first = None;
+        for time in TIMES {
+            let wanted = player.frame(&camera, time).unwrap();
+            let found = renderer.image(&View::new(camera.clone(), time)).unwrap();
+            let psnr = Metric::psnr(Rounding::EightBit);
+            least = least.min(psnr.score_images(&wanted, &found).unwrap());
+            let first = first.get_or_insert_with(|| wanted.clone());
+            if time > 0.0 {
+                motion = motion.min(psnr.score_images(first, &wanted).unwrap());
+            }
+            assert_eq!(found.data, renderer.image(&View::new(camera.clone(), time)).unwrap().data, "equal frames are equal bytes");
+        }
+    }
+    assert!(least >= LEAST_DB, "{deformer:?}: {least:.1} dB between player and tile renderer");
+    // The images differ over time by much more than the renderers do, so agreement says something about motion.
+    assert!(motion < LEAST_DB - 5.0, "{deformer:?}: hardly anything moves ({motion:.1} dB)");
+}
+
+#[test]
+fn images_of_a_field_that_is_linear_in_its_functions_agree() {
+    agrees(&["deformer.kind=cdf-basis"]);
+}
+
+#[test]
+fn images_of_gaussians_that_appear_and_vanish_agree() {
+    agrees(&["deformer.kind=native-4d"]);
+}
+
+#[test]
+fn options_change_what_is_drawn() {
+    let Some(mut renderer) = renderer() else { return };
+    let mut gaussians = cc4dgs::HostGaussians {
+        means: vec![0.0, 0.0, 0.0, 0.0, 0.6, 0.0],
+        log_scales: vec![-2.0; 6],
+        quaternions: [1.0, 0.0, 0.0, 0.0].repeat(2),
+        opacity_logits: vec![3.0; 2],
+        sh_dc: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+        dynamic_scores: vec![0.0; 2],
+        ..Default::default()
+    };
+    let camera = Camera::look_at("t", (64, 48), 0.8, [3.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
+    let bytes = cc4dgs::core::ply::to_bytes(&gaussians, true).unwrap();
+    renderer.load(Content::read("two.ply", bytes, &Limits::default()).unwrap().scene).unwrap();
+    let plain = View::new(camera.clone(), 0.0);
+    let image = renderer.image(&plain).unwrap();
+    let light = |data: &[u8]| data.iter().map(|v| u64::from(*v)).sum::<u64>();
+    assert!(light(&image.data) > 10_000);
+    assert!(light(&renderer.image(&View { scale: 0.5, ..plain.clone() }).unwrap().data) < light(&image.data));
+    assert_ne!(renderer.image(&View { mode: Mode::Depth, ..plain.clone() }).unwrap().data, image.data);
+    assert_eq!(renderer.image(&View { tint: true, ..plain.clone() }).unwrap().data, image.data, "nothing moves, so nothing is tinted");
+    assert!(light(&renderer.image(&View { background: Some([1.0; 3]), ..plain.clone() }).unwrap().data) > light(&image.data));
+    // Gaussians that are far away, behind the camera, or of size and rotation zero are no harm.
+    gaussians.means = vec![1e30, 0.0, 0.0, 9.0, 0.0, 0.0];
+    gaussians.quaternions[0] = 0.0;
+    let bytes = cc4dgs::core::ply::to_bytes(&gaussians, true).unwrap();
+    renderer.load(Content::read("two.ply", bytes, &Limits::default()).unwrap().scene).unwrap();
+    assert_eq!(light(&renderer.image(&plain).unwrap().data), 0);
+    renderer.unload();
+    assert_eq!(light(&renderer.image(&plain).unwrap().data), 0);
+}

@@ -1,0 +1,133 @@
+// The controls as HTML elements.
+
+function element(tag, properties = {}, ...children) {
+    const { attributes = {}, ...own } = properties;
+    const made = Object.assign(document.createElement(tag), own);
+    Object.entries(attributes).forEach(([name, value]) => made.setAttribute(name, value));
+    made.append(...children);
+    return made;
+}
+
+const labelled = label => ({ attributes: { "aria-label": label }, title: label });
+const megabytes = bytes => (bytes >= 1e6 ? `${(bytes / 1e6).toFixed(2)} MB` : `${(bytes / 1e3).toFixed(1)} kB`);
+
+export function build(container, player) {
+    const button = (text, label, onclick) => element("button", { type: "button", textContent: text, onclick, ...labelled(label) });
+    const canvas = element("canvas", { tabIndex: 0, ...labelled("3D view. Drag to orbit, wheel or pinch to zoom, shift-drag or two fingers to pan.") });
+    canvas.removeAttribute("title");
+    const poster = element("img", { className: "poster", alt: "", hidden: true });
+    const title = element("div", { className: "title" });
+    const file = element("input", { type: "file", accept: ".cc4d,.ply,.spz", ...labelled("Open a file"), onchange: () => { if (file.files[0]) open(file.files[0]); file.value = ""; } });
+    const openLabel = element("label", { className: "open" }, "Open", file);
+    const play = button("▶", "Play", () => player.toggle());
+    const time = element("input", { type: "range", min: 0, max: 1, step: 0.0005, value: 0, className: "time", ...labelled("Time"), oninput: () => player.seek(Number(time.value)) });
+    const clock = element("output", { textContent: "–" });
+    const speeds = [0.1, 0.25, 0.5, 1, 2, 4];
+    const speed = element("select", { className: "wide", ...labelled("Speed"), onchange: () => player.set("speed", Number(speed.value)) },
+        ...speeds.map(v => element("option", { value: v, textContent: `${v}×`, selected: v === 1 })));
+    const loop = button("⟳", "Loop", () => player.set("looping", !player.settings.looping));
+    const gear = button("☰", "Settings", () => { panel.hidden = !panel.hidden; gear.setAttribute("aria-expanded", String(!panel.hidden)); });
+    gear.setAttribute("aria-expanded", "false");
+    const bar = element("div", { className: "bar", attributes: { role: "group", "aria-label": "Playback" } },
+        play, button("⏮", "One frame back", () => player.step(-1)), button("⏭", "One frame on", () => player.step(1)), time, clock, speed, loop);
+
+    const slider = (label, name, min, max, step, text) => {
+        const value = element("span");
+        const input = element("input", { type: "range", min, max, step, value: player.settings[name], oninput: () => player.set(name, Number(input.value)) });
+        return { row: element("label", {}, label, input, value), show: v => { input.value = v; value.textContent = text(v); input.setAttribute("aria-valuetext", text(v)); }, input };
+    };
+    const check = (label, name) => {
+        const input = element("input", { type: "checkbox", onchange: () => player.set(name, input.checked) });
+        return { row: element("label", { className: "check" }, input, label), show: v => { input.checked = v; } };
+    };
+    const controls = {
+        scale: slider("Size", "scale", 0.1, 2, 0.05, v => `${Math.round(v * 100)} %`),
+        shDegree: slider("SH degree", "shDegree", 0, 4, 1, v => String(v)),
+        resolution: slider("Resolution", "resolution", 0.25, 2, 0.05, v => `${Math.round(v * 100)} %`),
+        tint: check("Tint what moves", "tint"),
+        depth: check("Depth", "depth"),
+    };
+    const camera = element("select", { ...labelled("Camera"), onchange: () => { player.goTo(Number(camera.value)); } });
+    const fly = button("Fly", "Fly with W A S D Q E, drag to look", () => player.set("flying", !player.flying));
+    const share = button("Copy link", "Copy a link with time and pose", async () => {
+        const link = player.link();
+        history.replaceState(null, "", link);
+        try { await navigator.clipboard.writeText(link); share.textContent = "Copied"; } catch { share.textContent = "In address bar"; }
+        setTimeout(() => { share.textContent = "Copy link"; }, 1500);
+    });
+    const stats = element("p", { className: "stats" });
+    const panel = element("section", { className: "panel", hidden: true, ...labelled("Settings") },
+        element("label", {}, "Camera", camera),
+        element("div", { className: "row" }, button("Reset", "Back to the home camera", () => { camera.value = -1; player.reset(); }), fly),
+        ...Object.values(controls).map(c => c.row),
+        element("div", { className: "row" }, button("PNG", "Save the image as PNG", () => player.savePng()), share),
+        stats);
+    panel.removeAttribute("title");
+    const note = element("div", { className: "note", attributes: { role: "status" } });
+    const progress = element("div", { className: "progress", hidden: true, attributes: { role: "progressbar", "aria-label": "Loading" } });
+    const top = element("div", { className: "top" }, title, openLabel, gear);
+    const root = element("div", { className: "cc" }, canvas, poster, progress, top, panel, bar, note);
+    container.replaceChildren(root);
+
+    const open = source => player.load(source).catch(() => {});
+    const say = (text, error) => {
+        note.hidden = !text;
+        note.className = error ? "note error" : "note";
+        note.setAttribute("role", error ? "alert" : "status");
+        note.replaceChildren(element("p", { textContent: text ?? "" }), ...(text && player.facts ? [button("Close", "Close", () => { note.hidden = true; })] : []));
+    };
+    let depth = 0;
+    const drag = (name, run) => root.addEventListener(name, e => { e.preventDefault(); run(e); root.classList.toggle("dropping", depth > 0); });
+    drag("dragenter", () => depth++);
+    drag("dragleave", () => depth--);
+    drag("dragover", () => {});
+    drag("drop", e => { depth = 0; if (e.dataTransfer.files[0]) open(e.dataTransfer.files[0]); });
+
+    const ui = {
+        root, canvas,
+        title: text => { title.textContent = text; document.title = `${text} – cc4dgs player`; },
+        error: text => say(text, true),
+        note: text => say(text, false),
+        loading: on => { progress.hidden = !on; if (on) { progress.style.width = "2%"; if (!player.facts) say("Loading …"); } },
+        progress: share => { const percent = Math.round(100 * Math.min(share, 1)); progress.style.width = `${percent}%`; progress.setAttribute("aria-valuenow", percent); },
+        poster: bytes => {
+            if (poster.src) URL.revokeObjectURL(poster.src);
+            poster.hidden = !bytes;
+            if (bytes) { poster.src = URL.createObjectURL(new Blob([bytes])); note.hidden = true; } else poster.removeAttribute("src");
+        },
+        facts: facts => {
+            note.hidden = true;
+            const still = facts.frames < 2;
+            bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = still; });
+            time.step = still ? 1 : 0.0005;
+            camera.replaceChildren(element("option", { value: -1, textContent: "Home" }), ...facts.cameras.map((name, i) => element("option", { value: i, textContent: name })));
+            controls.shDegree.input.max = facts.shDegree;
+            player.settings.shDegree = Math.min(player.settings.shDegree, facts.shDegree);
+            ui.settings({ ...player.settings, flying: player.flying });
+            ui.time({ time: player.time, frame: player.gpu.frame, seconds: player.time * facts.seconds }, facts);
+        },
+        time: ({ time: t, frame, seconds }, facts) => {
+            if (document.activeElement !== time || Math.abs(time.value - t) > 0.001) time.value = t;
+            const text = facts && facts.frames > 1 ? `${frame + 1} / ${facts.frames} · ${seconds.toFixed(2)} s` : "still";
+            clock.textContent = text;
+            time.setAttribute("aria-valuetext", `frame ${frame + 1}, ${seconds.toFixed(2)} seconds`);
+        },
+        playing: on => { play.textContent = on ? "❚❚" : "▶"; play.title = on ? "Pause" : "Play"; play.setAttribute("aria-label", play.title); },
+        settings: values => {
+            Object.entries(controls).forEach(([name, control]) => control.show(values[name]));
+            loop.setAttribute("aria-pressed", String(values.looping));
+            fly.setAttribute("aria-pressed", String(values.flying));
+            speed.value = values.speed;
+        },
+        wantsStatistics: () => !panel.hidden,
+        statistics: s => {
+            stats.textContent = `${s.rate.toFixed(0)} frames/s, ${s.visible.toLocaleString("en")} of ${s.gaussians.toLocaleString("en")} Gaussians drawn\n` +
+                `${s.moving.toLocaleString("en")} move, ${megabytes(s.received ?? s.bytes)} fetched of ${megabytes(s.bytes)}, ${megabytes(s.gpuBytes)} on the GPU\n${s.adapter ?? ""}`;
+        },
+        closePanel: () => { panel.hidden = true; gear.setAttribute("aria-expanded", "false"); },
+    };
+    ui.settings({ ...player.settings, flying: false });
+    bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = true; });
+    say("Open a .cc4d, .ply or .spz file, or drop one here.");
+    return ui;
+}

@@ -1,0 +1,121 @@
+// Fetches a model and shows what has arrived: poster, then the Gaussians, then their motion. Ranges where the server has them, else the whole file; streams that only
+// the desktop needs are not fetched.
+
+const FIRST = 65536;
+const MAGIC = [0x89, 0x43, 0x43, 0x34, 0x44, 0x0d, 0x0a, 0x1a];
+
+/// Calls `sink(offset, bytes)` with all that arrives of `response`, which begins at byte `offset`, until it returns false.
+async function drain(response, offset, sink) {
+    if (!response.body) {
+        const bytes = new Uint8Array(await response.arrayBuffer());
+        sink(offset, bytes);
+        return offset + bytes.length;
+    }
+    const reader = response.body.getReader();
+    for (;;) {
+        const { done, value } = await reader.read();
+        if (done) return offset;
+        const go = sink(offset, value);
+        offset += value.length;
+        if (go === false) { await reader.cancel(); return offset; }
+    }
+}
+
+/// What of an archive has arrived, and what can be shown of it.
+class Progress {
+    constructor(wasm, name, total, show) {
+        this.download = new wasm.Download(name, total);
+        this.show = show;
+        this.total = total;
+        this.arrived = 0;
+        this.header = 0;
+        this.streams = null;
+        this.shown = { poster: false, base: false, motion: false };
+    }
+    end(kind) { return Math.max(0, ...this.streams.filter(s => s.kind === kind).map(s => s.offset + s.bytes)); }
+    /// Bytes that a player needs; the rest of the file is not fetched.
+    get needed() { return this.streams ? Math.max(this.header, this.end("canonical"), this.end("playback")) : this.total; }
+    put(offset, bytes) {
+        this.download.put(offset, bytes);
+        this.arrived = Math.max(this.arrived, offset + bytes.length);
+        return this.advance();
+    }
+    /// Shows what newly can be; false once nothing more is needed.
+    advance() {
+        if (!this.header && this.arrived >= Math.min(24, this.total)) this.header = this.download.headerEnd();
+        if (this.header && !this.streams && this.arrived >= Math.min(this.header, this.total)) this.streams = JSON.parse(this.download.streams());
+        if (!this.streams) return true;
+        const has = kind => this.arrived >= this.end(kind);
+        if (!this.shown.poster && this.end("poster") && has("poster")) { this.shown.poster = true; this.show.poster(this.download.poster()); }
+        this.show.progress(this.arrived / this.needed, this.arrived);
+        const motion = this.arrived >= this.needed;
+        // A file that is there as a whole is decoded once.
+        if (!motion && !this.shown.base && has("canonical")) { this.shown.base = true; this.show.part(this.download, false, true); }
+        if (motion && !this.shown.motion) {
+            this.shown.motion = true;
+            this.show.part(this.download, true, !this.shown.base);
+            return false;
+        }
+        return true;
+    }
+    finish() {
+        const done = this.shown.motion;
+        this.download.free();
+        if (!done) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
+    }
+}
+
+function isArchive(bytes) { return MAGIC.every((b, i) => bytes[i] === b); }
+
+/// Loads `url`; `show` has poster(bytes), part(download, motion, first), whole(name, bytes), progress(share, bytes).
+export async function loadUrl(wasm, url, show, signal) {
+    const name = decodeURIComponent(new URL(url, location.href).pathname.split("/").pop() || "model");
+    const get = async headers => {
+        let response;
+        try { response = await fetch(url, { headers, signal }); } catch (e) {
+            if (e.name === "AbortError") throw e;
+            throw new Error(`${name} could not be fetched (${e.message}). Check the address; the server must allow this page to read it.`);
+        }
+        if (!response.ok) throw new Error(`${name} could not be fetched: the server answered ${response.status}. Check the address.`);
+        return response;
+    };
+    const first = await get({ Range: `bytes=0-${FIRST - 1}` });
+    const range = first.status === 206 && /\/(\d+)$/.exec(first.headers.get("Content-Range") || "");
+    if (!range) return loadBody(wasm, name, first, show);
+    const total = Number(range[1]);
+    const start = new Uint8Array(await first.arrayBuffer());
+    if (!isArchive(start)) {
+        if (start.length >= total) return show.whole(name, start);
+        return loadBody(wasm, name, await get({}), show);
+    }
+    const progress = new Progress(wasm, name, total, show);
+    let more = progress.put(0, start);
+    while (more && progress.arrived < total) {
+        // The header first, then everything that is needed.
+        const end = progress.streams ? progress.needed : Math.max(progress.header, 24);
+        const part = await get({ Range: `bytes=${progress.arrived}-${Math.max(end, progress.arrived + 1) - 1}` });
+        if (part.status !== 206) { progress.download.free(); return loadBody(wasm, name, part, show); }
+        const before = progress.arrived;
+        await drain(part, before, (offset, bytes) => (more = progress.put(offset, bytes)));
+        if (progress.arrived === before) break;
+    }
+    progress.finish();
+}
+
+/// The whole file in one answer.
+async function loadBody(wasm, name, response, show) {
+    const total = Number(response.headers.get("Content-Length")) || 0;
+    const encoded = response.headers.get("Content-Encoding");
+    const pieces = [];
+    let progress = null, size = 0;
+    await drain(response, 0, (offset, bytes) => {
+        size += bytes.length;
+        if (!progress && offset === 0 && total && !encoded && isArchive(bytes)) progress = new Progress(wasm, name, total, show);
+        if (progress) return progress.put(offset, bytes);
+        pieces.push(bytes);
+        show.progress(total ? size / total : 0.5, size);
+        return true;
+    });
+    if (progress) return progress.finish();
+    show.whole(name, await new Blob(pieces).arrayBuffer().then(b => new Uint8Array(b)));
+}

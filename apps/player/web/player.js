@@ -1,0 +1,251 @@
+// The player as a page and as a small library:
+//
+//     const player = await createPlayer(element, { src: "model.cc4d", autoplay: true });
+//     player.on("time", ({ time, frame }) => …);  player.seek(0.5);  player.play();  await player.load("other.cc4d");
+//
+// Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" { message }, "progress" { share, bytes }.
+// Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
+
+import init, * as wasm from "./cc4dgs_player.js";
+import { loadUrl } from "./loading.js";
+import { addGestures, addKeys } from "./gestures.js";
+import { WebGl } from "./webgl.js";
+import { build } from "./controls.js";
+
+let ready;
+
+export async function createPlayer(container, options = {}) {
+    const query = new URLSearchParams(location.search);
+    const { src = query.get("src") ?? undefined, autoplay = query.has("autoplay"), backend = query.get("backend") } = options;
+    const player = new Page(container, backend);
+    try {
+        ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined);
+        await ready;
+        await player.start();
+        if (src) await player.load(src);
+        player.followLink();
+        if (autoplay && src) player.play();
+    } catch (e) {
+        player.fail(e);
+    }
+    return player;
+}
+
+class Page {
+    constructor(container, backend) {
+        this.backend = backend;
+        this.listeners = {};
+        this.gpu = null;
+        this.facts = null;
+        this.source = null;
+        this.dirty = true;
+        this.settings = { speed: 1, looping: true, scale: 1, shDegree: 4, resolution: 1, tint: false, depth: false };
+        this.flying = false;
+        this.ui = build(container, this);
+    }
+    async start() {
+        await this.startDevice();
+        this.apply();
+        const act = {
+            mode: () => (this.flying ? "fly" : "orbit"),
+            ...Object.fromEntries(["orbit", "look", "pan", "zoom", "fly"].map(name => [name, (...values) => { this.gpu?.[name](...values); this.dirty = true; }])),
+        };
+        if (!this.flyKeys) {
+            addGestures(this.ui.canvas, act);
+            this.flyKeys = addKeys(this.ui.root, act, this.commands(act));
+            new ResizeObserver(() => this.resize()).observe(this.ui.canvas);
+            this.ui.canvas.addEventListener("webglcontextlost", e => e.preventDefault());
+            requestAnimationFrame(now => this.loop(now));
+        }
+        this.resize();
+    }
+    // WebGPU where there is an adapter, else WebGL2.
+    async startDevice() {
+        const forced = this.backend === "webgl";
+        if (!forced && await navigator.gpu?.requestAdapter()) {
+            this.gpu = await wasm.Player.create(this.ui.canvas);
+            return;
+        }
+        // A lost context stays that of its canvas until the browser restores it.
+        if (this.gl?.lost) await new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
+        this.gl = new WebGl(this.ui.canvas);
+        this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height);
+    }
+    commands(act) {
+        return {
+            " ": () => this.toggle(), "k": () => this.toggle(), ",": () => this.step(-1), ".": () => this.step(1),
+            ArrowLeft: () => act.orbit(-0.08, 0), ArrowRight: () => act.orbit(0.08, 0), ArrowUp: () => act.orbit(0, 0.08), ArrowDown: () => act.orbit(0, -0.08),
+            "+": () => act.zoom(1.1), "=": () => act.zoom(1.1), "-": () => act.zoom(1 / 1.1), Home: () => this.seek(0), End: () => this.seek(1),
+            "r": () => this.reset(), "f": () => this.set("flying", !this.flying), "t": () => this.set("tint", !this.settings.tint),
+            "z": () => this.set("depth", !this.settings.depth), "p": () => this.savePng(), "Escape": () => this.ui.closePanel(),
+        };
+    }
+    // Events
+    on(name, listener) { (this.listeners[name] ??= new Set()).add(listener); return () => this.listeners[name].delete(listener); }
+    emit(name, detail) { this.listeners[name]?.forEach(listener => listener(detail)); }
+    fail(e) {
+        if (e?.name === "AbortError") return;
+        const message = (e?.message || String(e)).trim();
+        this.ui.error(message);
+        this.emit("error", { message });
+    }
+    // Loading
+    async load(source, name) {
+        this.abort?.abort();
+        this.abort = new AbortController();
+        const { signal } = this.abort;
+        const again = source === this.source && this.facts;
+        const kept = again ? { pose: this.gpu.pose, time: this.gpu.time } : null;
+        this.source = source;
+        this.ui.loading(true);
+        const show = {
+            poster: bytes => { if (bytes && !this.facts) this.ui.poster(bytes); },
+            part: (download, motion, first) => this.loaded(JSON.parse(this.gpu.openPart(download, motion, first))),
+            whole: (name, bytes) => this.loaded(JSON.parse(this.gpu.open(name, bytes))),
+            progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
+        };
+        try {
+            if (!again) this.facts = null;
+            if (typeof source === "string") {
+                this.ui.title(decodeURIComponent(source.split(/[?#]/)[0].split("/").pop()));
+                await loadUrl(wasm, source, show, signal);
+            } else {
+                const label = name ?? source.name ?? "model";
+                const bytes = source instanceof Uint8Array ? source : new Uint8Array(await (source.arrayBuffer?.() ?? source));
+                this.ui.title(label);
+                this.received = bytes.length;
+                show.whole(label, bytes);
+            }
+            if (kept) { this.gpu.pose = kept.pose; this.gpu.seek(kept.time); }
+            this.ui.error(null);
+            if (this.facts.lacksMotion) this.ui.note("This archive has no playback layer, so it stands still here. Add one with: cc4dgs bake MODEL --out FILE.cc4d");
+            this.emit("loaded", this.facts);
+            return this.facts;
+        } catch (e) {
+            if (signal.aborted) return null;
+            this.source = null;
+            this.fail(e);
+            throw e;
+        } finally {
+            this.ui.loading(false);
+        }
+    }
+    loaded(facts) {
+        this.facts = facts;
+        this.gl?.load(this.gpu);
+        this.ui.facts(facts);
+        this.apply();
+        this.draw();
+        this.ui.poster(null);
+    }
+    // Time
+    get time() { return this.gpu?.time ?? 0; }
+    get playing() { return this.gpu?.playing ?? false; }
+    play() { this.setPlaying(true); }
+    pause() { this.setPlaying(false); }
+    toggle() { this.setPlaying(!this.playing); }
+    setPlaying(on) {
+        if (!this.gpu) return;
+        this.gpu.playing = on && (this.facts?.frames ?? 1) > 1;
+        this.ui.playing(this.gpu.playing);
+        this.emit(this.gpu.playing ? "play" : "pause", {});
+    }
+    seek(time) { this.gpu?.seek(time); this.timeChanged(); }
+    step(frames) { this.gpu?.step(frames); this.ui.playing(false); this.timeChanged(); }
+    timeChanged() {
+        this.dirty = true;
+        if (!this.gpu) return;
+        const detail = { time: this.gpu.time, frame: this.gpu.frame, seconds: this.gpu.time * (this.facts?.seconds ?? 0) };
+        this.ui.time(detail, this.facts);
+        this.emit("time", detail);
+    }
+    // View
+    reset() { this.gpu?.reset(); this.dirty = true; }
+    goTo(index) { if (index < 0) this.reset(); else this.gpu?.goTo(index); this.dirty = true; }
+    set(name, value) {
+        if (name === "flying") this.flying = value; else this.settings[name] = value;
+        this.ui.settings({ ...this.settings, flying: this.flying });
+        this.apply();
+    }
+    apply() { if (this.gpu) Object.assign(this.gpu, this.settings); this.dirty = true; }
+    resize() {
+        const { canvas } = this.ui;
+        const ratio = Math.min(window.devicePixelRatio || 1, 2);
+        const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio))];
+        if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+        this.gpu?.resize(width, height);
+        this.draw();
+    }
+    draw() { if (this.gl) { if (this.gpu) this.gl.draw(this.gpu); } else this.gpu?.draw(); this.dirty = false; this.drawn = (this.drawn ?? 0) + 1; }
+    loop(now) {
+        const elapsed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
+        this.last = now;
+        if (this.gpu && (this.gl ? this.gl.lost : this.gpu.lost)) this.recover();
+        else if (this.gpu) {
+            const was = this.gpu.playing;
+            if (this.gpu.tick(elapsed)) this.timeChanged();
+            if (was && !this.gpu.playing) { this.ui.playing(false); this.emit("pause", {}); }
+            if (this.flyKeys(elapsed)) this.dirty = true;
+            if (this.dirty) this.draw();
+            this.statistics(now);
+        }
+        requestAnimationFrame(next => this.loop(next));
+    }
+    statistics(now) {
+        if (now - (this.counted ?? 0) < 1000) return;
+        const rate = (this.drawn ?? 0) * 1000 / (now - (this.counted ?? now - 1000));
+        [this.counted, this.drawn] = [now, 0];
+        if (this.facts && this.ui.wantsStatistics()) {
+            (this.gl ? Promise.resolve(this.gl.visible) : this.gpu.countVisible()).then(visible => this.ui.statistics({ ...this.facts, rate, visible, received: this.received, adapter: this.gl?.name ?? this.gpu?.adapter }));
+        }
+    }
+    // A lost device: a new one, and the same model at the same time and pose.
+    async recover() {
+        const [old, source] = [this.gpu, this.source];
+        const kept = { pose: old.pose, time: old.time, playing: old.playing };
+        this.gpu = null;
+        try {
+            old.free();
+            await this.start();
+            if (source) {
+                this.facts = null;
+                await this.load(source);
+                this.gpu.pose = kept.pose;
+                this.seek(kept.time);
+                this.setPlaying(kept.playing);
+            }
+            this.emit("recovered", {});
+        } catch (e) { this.fail(e); }
+    }
+    // Pictures and links
+    async picture(camera, time) {
+        const json = camera ? JSON.stringify(camera) : undefined;
+        if (this.gl) return this.gl.picture(this.gpu, json, time);
+        const picture = await this.gpu.capture(json, time);
+        const out = { width: picture.width, height: picture.height, data: picture.rgba };
+        picture.free();
+        return out;
+    }
+    async savePng() {
+        if (!this.facts) return;
+        const { width, height, data } = await this.picture();
+        const canvas = Object.assign(document.createElement("canvas"), { width, height });
+        canvas.getContext("2d").putImageData(new ImageData(data, width, height), 0, 0);
+        const link = Object.assign(document.createElement("a"), { href: canvas.toDataURL("image/png"), download: `frame_${String(this.gpu.frame).padStart(4, "0")}.png` });
+        link.click();
+    }
+    link() {
+        const url = new URL(location.href);
+        if (typeof this.source === "string") url.searchParams.set("src", this.source);
+        const digits = v => Number(v.toPrecision(6));
+        url.hash = `t=${digits(this.time)}&pose=${Array.from(this.gpu.pose, digits).join(",")}`;
+        return url.href;
+    }
+    followLink() {
+        const hash = new URLSearchParams(location.hash.slice(1));
+        const pose = hash.get("pose")?.split(",").map(Number);
+        if (pose?.length === 7 && this.gpu) this.gpu.pose = new Float64Array(pose);
+        if (hash.has("t")) this.seek(Number(hash.get("t")));
+        this.dirty = true;
+    }
+}

@@ -1,0 +1,57 @@
+//! Archives with a playback layer.
+
+use super::Baked;
+use cc4dgs_core::archive::{Archive, ArchiveWriter, Presentation, StreamKind};
+use cc4dgs_core::{Error, Result, Stream};
+use std::path::Path;
+
+/// Key of the manifest's `extra` with the figures of the layer.
+pub const PLAYBACK: &str = "playback";
+
+/// What [`write_archive`] adds to an archive.
+pub struct Additions<'a> {
+    /// The layer; `None` for models that do not move.
+    pub baked: Option<&'a Baked>,
+    /// How a player shows it.
+    pub presentation: Presentation,
+    /// PNG or JPEG bytes.
+    pub poster: Option<Vec<u8>>,
+    /// Whether the deformer's weights are left out. The archive then plays where its layer is read, and stands still for programs that need the deformer.
+    pub without_field: bool,
+}
+
+/// Writes `archive` with `additions` to `path` and returns its size in bytes. A layer or poster that it has already is replaced. Streams come in the order in which a
+/// player needs them: poster, Gaussians, playback layer, field, all others.
+///
+/// # Errors
+/// What reading and writing report.
+pub fn write_archive(archive: &Archive, additions: Additions, path: &Path) -> Result<u64> {
+    let mut manifest = archive.manifest().clone();
+    manifest.presentation = additions.presentation;
+    manifest.extra.remove(PLAYBACK);
+    if let Some(baked) = additions.baked {
+        let report = serde_json::to_value(&baked.report).map_err(|e| Error::backend("playback layer", e.to_string(), "Report this"))?;
+        manifest.extra.insert(PLAYBACK.into(), report);
+    }
+    let mut writer = ArchiveWriter::new(manifest);
+    if let Some(bytes) = additions.poster {
+        writer = writer.add(StreamKind::Poster, Stream { name: "poster".into(), bytes });
+    }
+    writer = writer.add_all(StreamKind::Canonical, archive.read_kind(StreamKind::Canonical)?);
+    writer = writer.add_all(StreamKind::Playback, additions.baked.iter().flat_map(|b| b.streams.iter().cloned()));
+    let mut kinds = vec![StreamKind::Meta];
+    if !additions.without_field {
+        kinds.insert(0, StreamKind::Field);
+    }
+    for stream in archive.stream_sizes() {
+        if let StreamKind::Other(_) = stream.kind
+            && !kinds.contains(&stream.kind)
+        {
+            kinds.push(stream.kind);
+        }
+    }
+    for kind in kinds {
+        writer = writer.add_all(kind, archive.read_kind(kind)?);
+    }
+    writer.write_to(path)
+}

@@ -1,0 +1,84 @@
+//! How players show a model: its home camera, the cameras of its recording, the axis that points up.
+
+use crate::Orbit;
+use cc4dgs_core::archive::{MAX_CAMERAS, Presentation};
+use cc4dgs_core::{Camera, HostGaussians, Result};
+use glam::{DMat3, DVec3};
+
+/// Size of home cameras in pixels; players resize them to their window.
+const HOME: (u32, u32) = (960, 720);
+/// Iterations of the power method for the upward axis.
+const ITERATIONS: usize = 200;
+
+/// The presentation of a model that was recorded by `cameras`, all in the coordinates of the model, whose origin they look at. The first is the home camera; the others
+/// are thinned out to the number that archives hold.
+pub fn of_cameras(cameras: &[Camera], up: Option<[f64; 3]>) -> Presentation {
+    let up = up.map_or_else(|| upward(cameras), DVec3::from);
+    let step = cameras.len().div_ceil(MAX_CAMERAS).max(1);
+    Presentation {
+        up: Some(up.as_vec3().to_array()),
+        target: Some([0.0; 3]),
+        home: cameras.first().cloned(),
+        cameras: cameras.iter().step_by(step).cloned().collect(),
+        ..Presentation::default()
+    }
+}
+
+/// The presentation of a model whose cameras are unknown: an orbit round its middle, with `up` a signed axis.
+///
+/// # Errors
+/// As [`Orbit::around`].
+pub fn of_gaussians(gaussians: &HostGaussians, up: [f64; 3]) -> Result<Presentation> {
+    let orbit = Orbit { size: HOME, frames: 8, up, ..Orbit::default() };
+    let cameras = orbit.around(gaussians)?;
+    // Opposite cameras of a circle look down at its axis from the same height, so their viewing rays meet at the middle.
+    let (a, b) = (&cameras[0], &cameras[4]);
+    let (eye, forward, other) = (DVec3::from(a.center_world()), DVec3::from(a.forward_world()), DVec3::from(b.center_world()));
+    let flat = 0.5 * (other - eye);
+    let along = flat.length_squared() / flat.dot(forward).max(1e-12);
+    let target = eye + along * forward;
+    Ok(Presentation { up: Some(up.map(|v| v as f32)), target: Some(target.as_vec3().to_array()), home: cameras.into_iter().next(), ..Presentation::default() })
+}
+
+/// The direction that is up for all cameras: perpendicular to their rows of pixels, as nearly as can be.
+fn upward(cameras: &[Camera]) -> DVec3 {
+    let row = |c: &Camera, r: usize| DVec3::new(c.world_to_camera[r][0], c.world_to_camera[r][1], c.world_to_camera[r][2]);
+    let mean = -cameras.iter().map(|c| row(c, 1)).sum::<DVec3>();
+    let scatter = cameras.iter().map(|c| row(c, 0)).fold(DMat3::ZERO, |sum, r| sum + DMat3::from_cols(r * r.x, r * r.y, r * r.z));
+    // The smallest eigenvector, by the power method on the matrix that has it as its largest.
+    let flipped = DMat3::IDENTITY * (1.001 * cameras.len() as f64) - scatter;
+    let start = mean.try_normalize().unwrap_or(DVec3::Z);
+    let mut up = start;
+    for _ in 0..ITERATIONS {
+        up = (flipped * up).try_normalize().unwrap_or(start);
+    }
+    if up.dot(start) < 0.0 { -up } else { up }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn up_is_that_of_upright_cameras_whatever_they_look_at() {
+        let camera = |eye: [f64; 3]| Camera::look_at("t", (8, 8), 1.0, eye, [0.0; 3], [0.0, -1.0, 0.0]);
+        let rig = [camera([3.0, -2.5, 0.0]), camera([0.0, -2.0, 3.0]), camera([2.0, -3.0, 2.0])];
+        let up = of_cameras(&rig, None).up.unwrap();
+        assert!((up[1] + 1.0).abs() < 1e-3, "{up:?}");
+        let one = of_cameras(&rig[..1], None);
+        one.validate("t").unwrap();
+        assert!(one.up.unwrap()[1] < -0.5);
+    }
+
+    #[test]
+    fn an_orbit_is_home_where_no_camera_is_known() {
+        let gaussians = HostGaussians { means: vec![2.0, 3.0, 4.0, 2.5, 3.0, 4.0], opacity_logits: vec![3.0; 2], ..Default::default() };
+        let shown = of_gaussians(&gaussians, [0.0, 0.0, 1.0]).unwrap();
+        shown.validate("t").unwrap();
+        let (camera, target) = (shown.home.unwrap(), shown.target.unwrap());
+        let seen: [f64; 3] =
+            std::array::from_fn(|r| (0..3).map(|c| camera.world_to_camera[r][c] * f64::from(target[c])).sum::<f64>() + camera.world_to_camera[r][3]);
+        assert!(seen[2] > 0.0 && seen[0].abs() < 1e-4 && seen[1].abs() < 1e-4, "{seen:?}");
+        assert!((target[2] - 4.0).abs() < 1e-3);
+    }
+}
