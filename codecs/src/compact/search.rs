@@ -31,7 +31,15 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
             let remedy = "Allow more, or remove Gaussians with `cc4dgs prune`";
             return Err(Error::parameter(object, format!("{} bytes are the least that it reached", found.bytes), remedy));
         }
-        note(context, format!("{:.4} MB of Gaussians of {} MB allowed, steps {:.3} times the estimated ones", found.bytes as f64 / 1e6, settings.max_size_mb, found.quality / start));
+        note(
+            context,
+            format!(
+                "{:.4} MB of Gaussians of {} MB allowed, steps {:.3} times the estimated ones",
+                found.bytes as f64 / 1e6,
+                settings.max_size_mb,
+                found.quality / start
+            ),
+        );
         return Ok(found);
     }
     let (Some(views), Some(renderer)) = (context.views.filter(|v| !v.is_empty()), context.renderer) else {
@@ -45,7 +53,8 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
         return job.attempt(start);
     }
     let before = Losses::of(job.gaussians, views, renderer)?;
-    let drop_of = |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&streams::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
+    let drop_of =
+        |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&streams::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
     let best = std::cell::Cell::new((0.0, f64::NAN));
     let allowed = |attempt: &Attempt| {
         let drop = drop_of(attempt)?;
