@@ -40,31 +40,38 @@ impl Key {
 
 /// All figures of a scene but images, as HTML.
 pub fn figures(rows: &[Row], key: &Key) -> String {
-    let mut out = String::from(
-        "<h3>Rate and distortion</h3>\n<p class=\"note\">A point is the mean over seeds, its whisker the least and the largest seed. Lines join the settings and profiles of one method with one codec.</p>\n<div class=\"figures\">",
-    );
-    let plots = |plots: &mut dyn Iterator<Item = Plot>| plots.filter(|plot| !plot.is_empty()).map(|plot| plot.figure()).collect::<String>();
+    let plots = |plots: &mut dyn Iterator<Item = Plot>| grid("", plots.filter(|plot| !plot.is_empty()).map(|plot| plot.figure()).collect());
+    let note = "A point is the mean over seeds, its whisker the least and the largest seed. Lines join the settings and profiles of one method with one codec.";
+    let mut out = heading("Rate and distortion", note) + &key.legend();
     out += &plots(&mut [&PSNR, &SSIM, &LPIPS].into_iter().map(|metric| rate_distortion(rows, metric, key)));
-    out += "</div>\n<h3>Time and size against error</h3>\n<p class=\"note\">Ringed points are on the Pareto front: nothing here is better in one of the two without being worse in the other. Left is cheaper. Training time is shown with the codec of the highest PSNR.</p>\n";
+
+    let note = "Ringed points are on the Pareto front: nothing here is better in one of the two without being worse in the other. Left is cheaper. Training time is shown with the codec of the highest PSNR.";
+    out += &(heading("Time and size against error", note) + &key.legend());
     let best: Vec<Row> = best_codecs(rows).into_iter().cloned().collect();
     for metric in [&PSNR, &LPIPS] {
         let costs = [(&FRAME, rows), (&TRAINING, &best), (&ENCODE, rows), (&DECODE, rows), (&SIZE, rows)];
-        let figures = plots(&mut costs.into_iter().map(|(cost, rows)| pareto(rows, cost, metric, key)));
-        out += &format!("<div class=\"figures\">{figures}</div>\n");
+        out += &plots(&mut costs.into_iter().map(|(cost, rows)| pareto(rows, cost, metric, key)));
     }
-    out += "<h3>Where time and bytes go</h3>\n<div class=\"figures bars\">";
-    out += &stage_bars(rows).figure();
-    out += &frame_bars(rows).figure();
-    out += &storage_bars(rows).figure();
-    out += "</div>\n<h3>Training, frames, seeds</h3>\n<div class=\"figures\">";
+
+    out += &heading("Where time and bytes go", "");
+    out += &grid(" bars", [stage_bars(rows), frame_bars(rows), storage_bars(rows)].map(|bars| bars.figure()).concat());
+    out += &(heading("Training, frames, seeds", "") + &key.legend());
     out += &plots(&mut [training_curves(rows, key, false), training_curves(rows, key, true), per_frame(rows, key)].into_iter());
-    out += "</div>\n<div class=\"figures bars\">";
     if rows.iter().any(|row| row.cells.len() > 1) {
         let values = |row: &Row| row.cells.iter().filter_map(|cell| PSNR.of(cell)).collect();
         let lines = rows.iter().map(|row| (row.name(), key.colour(row), values(row))).collect();
-        out += &Strips { title: "Every seed, and the mean".into(), axis: PSNR.title(), lines }.figure();
+        out += &grid(" bars", Strips { title: "Every seed, and the mean".into(), axis: PSNR.title(), lines }.figure());
     }
-    out + "</div>\n"
+    out
+}
+
+fn heading(title: &str, note: &str) -> String {
+    let note = if note.is_empty() { String::new() } else { format!("<p class=\"note\">{note}</p>\n") };
+    format!("<h3>{title}</h3>\n{note}")
+}
+
+fn grid(class: &str, figures: String) -> String {
+    format!("<div class=\"figures{class}\">\n{figures}</div>\n")
 }
 
 fn point(row: &Row, cost: &Quantity, metric: &Quantity) -> Option<Point> {

@@ -104,7 +104,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let anchors: Vec<(String, String)> = scenes.keys().enumerate().map(|(i, scene)| (format!("scene-{i}"), scene.to_string())).collect();
     let mut links = anchors.clone();
     links.extend([("protocols".to_string(), "protocols".to_string()), ("published".to_string(), "reported by papers".to_string())]);
-    let mut body = page::contents(&links) + &page::facts(&results) + &key.legend();
+    let mut body = page::contents(&links) + &page::facts(&results);
     let mut markdown = format!(
         "# {}\n\nMean ± sample standard deviation over seeds; best of a column in bold. ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n",
         text::markdown(&title)
