@@ -51,7 +51,12 @@ pub fn of_gaussians(gaussians: &HostGaussians, up: [f64; 3]) -> Result<Presentat
     let flat = 0.5 * (other - eye);
     let along = flat.length_squared() / flat.dot(forward).max(1e-12);
     let target = eye + along * forward;
-    Ok(Presentation { up: Some(up.map(|v| v as f32)), target: Some(target.as_vec3().to_array()), home: cameras.first().map(storable), ..Presentation::default() })
+    Ok(Presentation {
+        up: Some(up.map(|v| v as f32)),
+        target: Some(target.as_vec3().to_array()),
+        home: cameras.first().map(storable),
+        ..Presentation::default()
+    })
 }
 
 /// The direction that is up for all cameras: perpendicular to their rows of pixels, as nearly as can be.

@@ -87,7 +87,9 @@ pub(super) fn segment_ends(sample: &Offsets, samples: usize, moving: usize) -> V
     let ends = |count: usize| -> Vec<usize> { (0..=count).map(|k| k * (samples - 1) / count).collect() };
     let allowed = |count: usize| count == 1 || (samples - 1) / count >= FEWEST_SAMPLES;
     let least = (samples - 1).div_ceil(MAX_FUNCTIONS - 1).max(1);
-    let cost = |count: usize| -> f64 { ends(count).windows(2).flat_map(|w| sample.heads.iter().map(|h| HeadFunctions::of(h, w[0]..=w[1]).cost(h, w[0], moving))).sum() };
+    let cost = |count: usize| -> f64 {
+        ends(count).windows(2).flat_map(|w| sample.heads.iter().map(|h| HeadFunctions::of(h, w[0]..=w[1]).cost(h, w[0], moving))).sum()
+    };
     let counts: Vec<usize> = SEGMENTS.into_iter().filter(|&c| c >= least && allowed(c)).collect();
     let costs: Vec<f64> = counts.par_iter().map(|&c| cost(c)).collect();
     // A tie goes to fewer segments.
