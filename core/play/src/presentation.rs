@@ -10,6 +10,20 @@ const HOME: (u32, u32) = (960, 720);
 /// Iterations of the power method for the upward axis.
 const ITERATIONS: usize = 200;
 
+/// `value` with nine significant digits: cameras are stored as decimals, and these come back as they were.
+fn rounded(value: f64) -> f64 {
+    format!("{value:.8e}").parse().unwrap_or(value)
+}
+
+/// `camera` as it will be read back from an archive.
+fn storable(camera: &Camera) -> Camera {
+    let mut out = camera.clone();
+    for value in [&mut out.fx, &mut out.fy, &mut out.cx, &mut out.cy].into_iter().chain(out.world_to_camera.iter_mut().flatten()) {
+        *value = rounded(*value);
+    }
+    out
+}
+
 /// The presentation of a model that was recorded by `cameras`, all in the coordinates of the model, whose origin they look at. The first is the home camera; the others
 /// are thinned out to the number that archives hold.
 pub fn of_cameras(cameras: &[Camera], up: Option<[f64; 3]>) -> Presentation {
@@ -18,8 +32,8 @@ pub fn of_cameras(cameras: &[Camera], up: Option<[f64; 3]>) -> Presentation {
     Presentation {
         up: Some(up.as_vec3().to_array()),
         target: Some([0.0; 3]),
-        home: cameras.first().cloned(),
-        cameras: cameras.iter().step_by(step).cloned().collect(),
+        home: cameras.first().map(storable),
+        cameras: cameras.iter().step_by(step).map(storable).collect(),
         ..Presentation::default()
     }
 }
@@ -37,7 +51,12 @@ pub fn of_gaussians(gaussians: &HostGaussians, up: [f64; 3]) -> Result<Presentat
     let flat = 0.5 * (other - eye);
     let along = flat.length_squared() / flat.dot(forward).max(1e-12);
     let target = eye + along * forward;
-    Ok(Presentation { up: Some(up.map(|v| v as f32)), target: Some(target.as_vec3().to_array()), home: cameras.into_iter().next(), ..Presentation::default() })
+    Ok(Presentation {
+        up: Some(up.map(|v| v as f32)),
+        target: Some(target.as_vec3().to_array()),
+        home: cameras.first().map(storable),
+        ..Presentation::default()
+    })
 }
 
 /// The direction that is up for all cameras: perpendicular to their rows of pixels, as nearly as can be.
@@ -58,6 +77,7 @@ fn upward(cameras: &[Camera]) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::archive::Manifest;
 
     #[test]
     fn up_is_that_of_upright_cameras_whatever_they_look_at() {
@@ -67,6 +87,9 @@ mod tests {
         assert!((up[1] + 1.0).abs() < 1e-3, "{up:?}");
         let one = of_cameras(&rig[..1], None);
         one.validate("t").unwrap();
+        // Cameras survive being written as decimals.
+        let manifest = Manifest { frame_count: 1, presentation: of_cameras(&rig, None), ..Default::default() };
+        manifest.to_json().unwrap();
         assert!(one.up.unwrap()[1] < -0.5);
     }
 

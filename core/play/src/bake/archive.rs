@@ -30,7 +30,9 @@ pub fn write_archive(archive: &Archive, additions: Additions, path: &Path) -> Re
     manifest.presentation = additions.presentation;
     manifest.extra.remove(PLAYBACK);
     if let Some(baked) = additions.baked {
-        let report = serde_json::to_value(&baked.report).map_err(|e| Error::backend("playback layer", e.to_string(), "Report this"))?;
+        // By way of text, so that numbers have the digits of a float32 and come back as they were.
+        let report = serde_json::to_string(&baked.report).and_then(|text| serde_json::from_str(&text));
+        let report = report.map_err(|e| Error::backend("playback layer", e.to_string(), "Report this"))?;
         manifest.extra.insert(PLAYBACK.into(), report);
     }
     let mut writer = ArchiveWriter::new(manifest);
