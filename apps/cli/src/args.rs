@@ -1,8 +1,10 @@
 //! The command line.
 
 mod bench;
+mod sweep;
 
 pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLoss, BenchPlay, BenchSort, BenchStep, BenchWhat};
+pub use sweep::{SchedulerArg, Sweep, SweepCollect, SweepEmit, SweepPlan, SweepRun, SweepWhat};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
@@ -49,6 +51,8 @@ pub enum Command {
     Plugins(Plugins),
     /// Check this machine: processor, threads, devices, ffmpeg, and an image drawn by two rasterizers.
     Doctor(Doctor),
+    /// Run a grid of scenes, methods, settings, codecs and seeds, and make its tables.
+    Sweep(Sweep),
     /// Measure speed.
     Bench(Bench),
 }

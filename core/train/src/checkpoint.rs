@@ -2,7 +2,7 @@
 
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
-use crate::train::{Guard, Neighbours, Parts, TrainState};
+use crate::train::{Guard, Neighbours, Parts, Record, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
@@ -38,6 +38,9 @@ struct TrainingHeader {
     strain: usize,
     /// Arrays of the optimizer with their shapes.
     optimizer: Vec<(String, [usize; 2])>,
+    /// The run's own numbers.
+    #[serde(default)]
+    record: Record,
     /// Step counts of the optimizer.
     optimizer_steps: BTreeMap<String, u64>,
 }
@@ -100,7 +103,7 @@ impl Checkpoint {
         parts.optimizer.restore(OptimizerState { arrays, steps: training.optimizer_steps })?;
         let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, parts);
         (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, model.field);
-        state.guard = guard;
+        (state.guard, state.record) = (guard, training.record);
         if !self.arrays.strain.is_empty() {
             let moving = state.moving_rows(&self.device)?.count();
             if self.arrays.strain.len() != 3 * moving {
@@ -174,6 +177,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             density,
             guard,
             strain: strain.len(),
+            record: state.record.clone(),
             optimizer,
             optimizer_steps: optimizer_state.steps,
         },

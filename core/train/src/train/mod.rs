@@ -8,6 +8,7 @@ mod losses;
 mod parameters;
 mod probe;
 mod pyramid;
+mod record;
 mod residual;
 mod sampler;
 mod score;
@@ -18,6 +19,8 @@ mod step;
 mod strain;
 
 pub use guard::Guard;
+pub use record::Record;
+pub(crate) use record::Score;
 pub use state::{Parts, TrainState};
 pub(crate) use strain::Neighbours;
 
@@ -185,7 +188,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         let cameras: std::collections::BTreeSet<usize> = views.iter().map(|&view| job.scene.views[view].camera).collect();
         context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.views_per_iteration(stage)));
     }
-    let mut watch = Watch::new(&context, doubts);
+    let mut watch = Watch::new(&context, doubts, &state.record);
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
         if stage < state.stage {
@@ -267,10 +270,11 @@ impl Context<'_> {
             sampler = sampler.with_ramp(ramp, |view| self.job.scene.views[view].time_norm);
         }
         let prefetcher = Prefetcher::new();
-        let mut log = log::Log::new(stage, length, self.job.config.train.log_every);
         let resumed_at = state.iteration;
+        let mut log = log::Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
         while state.iteration < length {
             if self.job.stop.load(Ordering::Relaxed) {
+                state.record.log = log.record();
                 self.save(state)?;
                 let at = format!("at iteration {} of stage {}", state.iteration, stage.name());
                 return Err(Error::Interrupted(match &self.checkpoint {
@@ -293,10 +297,12 @@ impl Context<'_> {
             watch.after_iteration(self, state, &schedule)?;
             let every = self.job.config.train.checkpoint_every;
             if every > 0 && state.iteration.is_multiple_of(every) && state.iteration < length {
+                state.record.log = log.record();
                 self.save(state)?;
             }
         }
         log.finish(events);
+        state.record.log = Default::default();
         if stage == Stage::Main && state.iteration > resumed_at {
             self.simplify(state)?;
         }

@@ -1,6 +1,7 @@
 //! Everything a run needs to continue to the same bytes.
 
 use super::guard::Guard;
+use super::record::Record;
 use super::strain::Neighbours;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
@@ -33,6 +34,8 @@ pub struct TrainState {
     pub optimizer: Box<dyn Optimizer>,
     /// Whether smoothness was switched on.
     pub smooth: bool,
+    /// Its own numbers.
+    pub record: Record,
     rows: Option<MovingRows>,
     pub(crate) neighbours: Option<Neighbours>,
 }
@@ -64,6 +67,7 @@ impl TrainState {
             guard,
             optimizer,
             smooth: false,
+            record: Record::default(),
             rows: None,
             neighbours: None,
         }
