@@ -2,11 +2,9 @@
 
 use cc4dgs_core::{Error, Result};
 use cc4dgs_play::checkpoint::CHECKPOINT;
+pub use cc4dgs_train::event_log::EVENTS;
 use cc4dgs_train::train::CONFIG;
 use std::path::Path;
-
-/// Name of the log inside a run's folder: one JSON object per event and line.
-pub const EVENTS: &str = "events.jsonl";
 
 /// What to do where the folder holds a run already.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

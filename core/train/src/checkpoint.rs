@@ -2,7 +2,7 @@
 
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
-use crate::train::{Guard, Neighbours, Parts, RateFactors, TrainState};
+use crate::train::{Guard, Neighbours, Parts, RateFactors, Record, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
@@ -38,6 +38,9 @@ struct TrainingHeader {
     strain: usize,
     /// Arrays of the optimizer with their shapes.
     optimizer: Vec<(String, [usize; 2])>,
+    /// The run's own numbers.
+    #[serde(default)]
+    record: Record,
     /// Step counts of the optimizer.
     optimizer_steps: BTreeMap<String, u64>,
     /// Learning rates that the watchdog lowered, by part.
@@ -103,7 +106,7 @@ impl Checkpoint {
         parts.optimizer.restore(OptimizerState { arrays, steps: training.optimizer_steps })?;
         let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, parts);
         (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, model.field);
-        state.guard = guard;
+        (state.guard, state.record) = (guard, training.record);
         if let Some((part, rate)) = training.rates.iter().find(|(_, rate)| !(0.0..=1.0).contains(*rate)) {
             return Err(damaged(format!("the learning rate of {part} is lowered by the factor {rate}")));
         }
@@ -181,6 +184,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             density,
             guard,
             strain: strain.len(),
+            record: state.record.clone(),
             optimizer,
             optimizer_steps: optimizer_state.steps,
             rates: state.rates.0.clone(),

@@ -49,6 +49,10 @@ impl Layers {
         config::merge(&mut table, &self.table);
         Self { table }
     }
+    /// What was said, as one table.
+    pub fn table(&self) -> &toml::Table {
+        &self.table
+    }
     /// Whether they state the key at `path`, such as `train.iterations`.
     pub fn state(&self, path: &str) -> bool {
         let mut keys = path.split('.');

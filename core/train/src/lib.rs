@@ -8,6 +8,7 @@ pub mod checks;
 pub mod config;
 pub mod data;
 pub mod eval;
+pub mod event_log;
 pub mod gaussian_set;
 pub mod images;
 pub mod init;

@@ -15,14 +15,16 @@ mod render;
 mod report;
 mod storage;
 mod stress;
+mod sweep;
 mod train;
 #[cfg(feature = "view")]
 mod view;
 
-use crate::args::{BenchWhat, Cli, Command};
-use crate::listeners::{JsonLines, Progress};
+use crate::args::{BenchWhat, Cli, Command, SweepWhat};
+use crate::listeners::Progress;
 use crate::output::Output;
 use cc4dgs_core::{Error, EventSink, Fanout, Limits, Registry, Result, config};
+use cc4dgs_train::event_log::JsonLines;
 use std::path::Path;
 
 /// What every command is handed.
@@ -88,6 +90,12 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Plugins(args) => plugins::run(&context, args),
         Command::Doctor(_) => doctor::run(&context),
         Command::Stress(args) => stress::run(&context, args),
+        Command::Sweep(args) => match &args.what {
+            SweepWhat::Plan(args) => sweep::plan(&context, args),
+            SweepWhat::Run(args) => sweep::run(&context, args, cli.threads),
+            SweepWhat::Collect(args) => sweep::collect(&context, args),
+            SweepWhat::Emit(args) => sweep::emit(&context, args, cli.threads),
+        },
         Command::Bench(args) => match &args.what {
             BenchWhat::Step(args) => bench::step(&context, args),
             BenchWhat::Frame(args) => bench::frame(&context, args),

@@ -6,7 +6,7 @@ use crate::sample::spread;
 use cc4dgs_core::metrics::{Metric, Rounding};
 use cc4dgs_core::{Image8, Result, Scene, Split};
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// The most training views that are scored.
@@ -24,7 +24,7 @@ const MOVING_VIEWS: usize = 2;
 const MOVING_SHARE: f64 = 0.003;
 
 /// PSNR of the baselines in dB, means over the scored training views.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Baselines {
     /// Each image replaced by its mean colour.
     pub mean_colour_db: f64,

@@ -1,7 +1,7 @@
 //! How a training went, in words.
 
 use super::{Baselines, Finding};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// A training score this much over that of the validation views is over-fitting, dB.
 const GAP_DB: f64 = 4.0;
@@ -13,7 +13,7 @@ const DETAIL: f64 = 0.7;
 const AT_CAP: f64 = 0.95;
 
 /// The outcome of a training.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Judgement {
     /// Nothing speaks against the model.
@@ -29,7 +29,7 @@ pub enum Judgement {
 }
 
 /// What a training reached. PSNR in dB, means over views, images not rounded.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Verdict {
     /// In a word.
     pub judgement: Judgement,

@@ -4,7 +4,7 @@ use super::baselines::{MovingPixels, Yardstick, psnr_db};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::sample::spread;
-use crate::train::{Context, TrainJob, TrainState};
+use crate::train::{Context, Record, Score, TrainJob, TrainState};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
@@ -23,18 +23,6 @@ const MOTION_GAIN_DB: f64 = 0.3;
 /// What a model must gain on the blurred images where poses or times are in doubt, dB.
 const DOUBT_MARGIN_DB: f64 = 3.0;
 
-/// A model's scores at one moment.
-struct Score {
-    /// Share of the main stage, percent.
-    percent: usize,
-    psnr_db: f64,
-    moving_db: Option<f64>,
-    /// Moving pixels in images of other times.
-    frozen_db: Option<f64>,
-    /// Mean slope over that of the truth.
-    detail: f64,
-}
-
 /// Follows one run.
 pub(crate) struct Watch {
     doubts: Vec<Finding>,
@@ -44,12 +32,12 @@ pub(crate) struct Watch {
 }
 
 impl Watch {
-    /// Watches the run of `context`, whose scene raised `doubts`.
-    pub fn new(context: &Context, doubts: Vec<Finding>) -> Self {
+    /// Watches the run of `context`, whose scene raised `doubts`, from where `record` ends.
+    pub fn new(context: &Context, doubts: Vec<Finding>, record: &Record) -> Self {
         let train = &context.job.config.train;
         let drawn = context.lengths.length(Stage::Main) * train.batch;
         let judged = train.checks && train.iterations >= LEAST_ITERATIONS && drawn >= LEAST_PASSES * context.training_camera.len();
-        Self { doubts, judged, yardstick: None, scores: Vec::new() }
+        Self { doubts, judged, yardstick: None, scores: record.scores.clone() }
     }
     /// To be called after every iteration; scores the model at half and at 85 % of the main stage.
     pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
@@ -57,7 +45,11 @@ impl Watch {
             return Ok(());
         }
         match [HALF, LATE].into_iter().find(|percent| schedule.iteration == schedule.length * percent / 100) {
-            Some(percent) => self.score(context, state, percent),
+            Some(percent) => {
+                self.score(context, state, percent)?;
+                state.record.scores.clone_from(&self.scores);
+                Ok(())
+            }
             None => Ok(()),
         }
     }
@@ -125,7 +117,7 @@ impl Watch {
         self.scores.push(Score { percent, psnr_db: psnr, moving_db: mean(sums[0]), frozen_db: mean(0.5 * (sums[1] + sums[2])), detail });
         Ok(())
     }
-    /// Whether all scores that decide (half of the main stage, where this call saw it, and its end) are below a baseline.
+    /// Whether all scores that decide (half of the main stage and its end) are below a baseline.
     fn always(&self, below: impl Fn(&Score) -> bool) -> bool {
         self.scores.iter().filter(|s| s.percent != LATE).all(below)
     }

@@ -1,10 +1,35 @@
 //! Sweeps: a grid of scenes, methods, settings, codecs and seeds, its results, and their tables.
+//!
+//! A grid ([`Grid`]) is expanded into a plan ([`Plan`]) of trainings and cells; [`run_training`] runs a training with its cells, in any process and any number
+//! of times; [`collect`] checks that every cell is there and makes the tables. `docs/sweeps.md` is the manual, `docs/results.md` the form of a result.
 
+mod cell;
+mod collect;
+mod emit;
+mod facts;
+mod folder;
+mod grid;
+mod hash;
+mod lock;
+mod plan;
 mod read;
 mod result;
+mod run;
+mod table;
+mod training;
 
+pub use collect::{Collection, Missing, Tables, collect, select, write_tables};
+pub use emit::{EmitOptions, INTERRUPTED, Scheduler, emit};
+pub use facts::{device_facts, fingerprint};
+pub use folder::{Failure, SweepFolder};
+pub use grid::{CodecAxis, Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
+pub use lock::TrainingLock;
+pub use plan::{PLAN, Plan, PlannedCell, PlannedTraining};
 pub use read::{RESULTS, check_comparable, read_results};
 pub use result::{
     Axes, Blocks, CellResult, CodecChoice, Cost, Curve, DataFingerprint, DeviceFacts, FrameMs, ImageResult, KIND, Outcome, ResultProvenance, SCHEMA, Score,
     Storage, StreamBytes,
 };
+pub use run::{Busy, TrainingState, run_training, summary};
+pub use table::{Spread, csv, markdown};
+pub use training::Worker;

@@ -1,5 +1,6 @@
 //! Numbers of a stage, gathered between two log events.
 
+use super::record::LogRecord;
 use cc4dgs_core::{Event, EventSink, Stage};
 use std::time::Instant;
 
@@ -18,6 +19,22 @@ pub(crate) struct Log {
 impl Log {
     pub(crate) fn new(stage: Stage, length: usize, every: usize) -> Self {
         Self { stage, length, every: every.max(1), loss: 0.0, psnr_db: 0.0, psnr_sum: (0.0, 0), since: (Instant::now(), 0), work: [(0, 0); 3] }
+    }
+    /// The log as it was at `iteration`, when the checkpoint with `record` was written.
+    pub(crate) fn resumed(mut self, record: LogRecord, iteration: usize) -> Self {
+        (self.loss, self.psnr_db) = (f32::from_bits(record.loss_bits), f32::from_bits(record.psnr_db_bits));
+        self.psnr_sum = (f32::from_bits(record.psnr_sum_bits), record.psnr_views);
+        self.since.1 = iteration;
+        self
+    }
+    /// What a checkpoint keeps of it.
+    pub(crate) fn record(&self) -> LogRecord {
+        LogRecord {
+            loss_bits: self.loss.to_bits(),
+            psnr_db_bits: self.psnr_db.to_bits(),
+            psnr_sum_bits: self.psnr_sum.0.to_bits(),
+            psnr_views: self.psnr_sum.1,
+        }
     }
     /// Whether this iteration's numbers are read back.
     pub(crate) fn due(&self, iteration: usize) -> bool {

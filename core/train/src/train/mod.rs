@@ -8,6 +8,7 @@ mod losses;
 mod parameters;
 mod probe;
 mod pyramid;
+mod record;
 mod recover;
 mod residual;
 mod sampler;
@@ -21,6 +22,8 @@ mod validate;
 mod watchdog;
 
 pub use guard::Guard;
+pub use record::Record;
+pub(crate) use record::Score;
 pub use state::{Parts, TrainState};
 pub(crate) use strain::Neighbours;
 pub use watchdog::RateFactors;
@@ -190,7 +193,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         let cameras: std::collections::BTreeSet<usize> = views.iter().map(|&view| job.scene.views[view].camera).collect();
         context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.views_per_iteration(stage)));
     }
-    let mut watch = Watch::new(&context, doubts);
+    let mut watch = Watch::new(&context, doubts, &state.record);
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
         if stage < state.stage {
@@ -272,11 +275,12 @@ impl Context<'_> {
             sampler = sampler.with_ramp(ramp, |view| self.job.scene.views[view].time_norm);
         }
         let prefetcher = Prefetcher::new();
-        let mut log = log::Log::new(stage, length, self.job.config.train.log_every);
         let resumed_at = state.iteration;
         let mut watchdog = Watchdog::new(state);
+        let mut log = log::Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
         while state.iteration < length {
             if self.job.stop.load(Ordering::Relaxed) {
+                state.record.log = log.record();
                 self.save(state)?;
                 let at = format!("at iteration {} of stage {}", state.iteration, stage.name());
                 return Err(Error::Interrupted(match &self.checkpoint {
@@ -310,10 +314,12 @@ impl Context<'_> {
             watch.after_iteration(self, state, &schedule)?;
             self.validate(state, &schedule)?;
             if saves {
+                state.record.log = log.record();
                 self.save(state)?;
             }
         }
         log.finish(events);
+        state.record.log = Default::default();
         if stage == Stage::Main && state.iteration > resumed_at {
             self.simplify(state)?;
         }

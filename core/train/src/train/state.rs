@@ -1,6 +1,7 @@
 //! Everything a run needs to continue to the same bytes.
 
 use super::guard::Guard;
+use super::record::Record;
 use super::strain::Neighbours;
 use super::watchdog::RateFactors;
 use crate::gaussian_set::GaussianSet;
@@ -36,6 +37,8 @@ pub struct TrainState {
     pub smooth: bool,
     /// Learning rates that the watchdog lowered.
     pub rates: RateFactors,
+    /// Its own numbers.
+    pub record: Record,
     rows: Option<MovingRows>,
     pub(crate) neighbours: Option<Neighbours>,
 }
@@ -68,6 +71,7 @@ impl TrainState {
             optimizer,
             smooth: false,
             rates: RateFactors::default(),
+            record: Record::default(),
             rows: None,
             neighbours: None,
         }

@@ -1,0 +1,98 @@
+//! Arguments of `decompress`, `render` and `export`: models in the formats of other programs.
+
+use super::UpArg;
+use clap::Args;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub struct Decompress {
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The file to write: PLY in the layout of 3DGS, or Niantic's SPZ where it ends in .spz.
+    #[arg(long, value_name = "F.ply|F.spz")]
+    pub out: PathBuf,
+    /// Leave the dynamic scores out, for viewers that insist on the 62 floats of static 3DGS.
+    #[arg(long)]
+    pub no_dynamic: bool,
+    /// The Gaussians as deformed at this time (0 to 1) instead of the canonical ones.
+    #[arg(long, value_name = "T")]
+    pub time: Option<f32>,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "flex")]
+    pub device: String,
+}
+
+#[derive(Debug, Args)]
+pub struct Render {
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// Folder for the frames, frame_00000.png and on.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    #[command(flatten)]
+    pub shots: Shots,
+    /// Scene options over those the model was trained with, such as scene.width=800; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    /// Also make a video of the frames with the ffmpeg command.
+    #[arg(long, value_name = "F.mp4")]
+    pub mp4: Option<PathBuf>,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+}
+
+/// What to draw: an orbit, or the views of a dataset.
+#[derive(Debug, Args)]
+pub struct Shots {
+    /// Take the cameras and times of this dataset instead of an orbit around the model.
+    #[arg(long, value_name = "PATH")]
+    pub scene: Option<PathBuf>,
+    /// Which side of the dataset's split.
+    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
+    pub split: SplitArg,
+    /// Frames: of the orbit (default 60), or at most so many of the dataset, evenly spread.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: Option<u32>,
+    /// Image size in pixels; for datasets the default is their own.
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    pub size: Option<(u32, u32)>,
+    /// Full turns of the orbit while time runs from 0 to 1.
+    #[arg(long, value_name = "TURNS", default_value_t = 1.0)]
+    pub turns: f64,
+    /// The axis of the world that points up, for the orbit.
+    #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]
+    pub up: UpArg,
+    /// Frames per second of a video.
+    #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=240))]
+    pub fps: u32,
+}
+
+#[derive(Debug, Args)]
+pub struct Export {
+    /// The format: ply, ply-sequence, spz, sog, gltf, splatv, mp4; `cc4dgs plugins` lists all, with their settings.
+    #[arg(value_name = "FORMAT")]
+    pub format: String,
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The file to write; a folder for ply-sequence.
+    #[arg(long, value_name = "PATH")]
+    pub out: PathBuf,
+    /// Replace PATH where it exists.
+    #[arg(long)]
+    pub overwrite: bool,
+    /// The instant (0 to 1) that formats without motion hold; without it, the canonical Gaussians.
+    #[arg(long, value_name = "T")]
+    pub time: Option<f32>,
+    /// Override a setting of the exporter (palette=8192), or with --scene a scene option (scene.width=800); may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
+    #[command(flatten)]
+    pub shots: Shots,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+}

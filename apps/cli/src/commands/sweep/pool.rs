@@ -1,0 +1,255 @@
+//! A pool of processes of this program on one machine: each works on one training with its cells.
+
+use super::BUSY;
+use crate::commands::Context;
+use crate::interrupt;
+use cc4dgs_core::{Error, Event, EventSink, Result};
+use cc4dgs_train::sweep::{Failure, INTERRUPTED, Plan, SweepFolder};
+use serde::Serialize;
+use std::collections::VecDeque;
+use std::fs::OpenOptions;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+/// Between two looks at the processes.
+const TICK: Duration = Duration::from_millis(100);
+/// Before a training that another process works on is tried again.
+const BUSY_PAUSE: Duration = Duration::from_secs(1);
+/// A process that was asked to stop is ended after this.
+const GRACE: Duration = Duration::from_secs(120);
+/// Most failed trainings that the error names.
+const NAMED: usize = 8;
+
+/// A process at work.
+struct Job {
+    index: usize,
+    child: Child,
+    began: Instant,
+}
+
+#[derive(Serialize)]
+struct PoolReport {
+    finished: usize,
+    planned: usize,
+    seconds: f64,
+}
+
+/// How far the pool is.
+struct Pool<'a> {
+    context: &'a Context<'a>,
+    plan: &'a Plan,
+    folder: &'a SweepFolder,
+    threads: usize,
+    events: &'a dyn EventSink,
+    queue: VecDeque<usize>,
+    running: Vec<Job>,
+    /// Seconds of the trainings that finished here.
+    seconds: Vec<f64>,
+    failed: Vec<(usize, Failure)>,
+    not_before: Instant,
+}
+
+/// Runs all trainings that lack a result, at most `jobs` at a time.
+pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<usize>, threads: usize) -> Result<()> {
+    plan.check_program()?;
+    folder.create()?;
+    let stop = interrupt::stop_flag()?;
+    let events = context.listeners(None)?;
+    let began = Instant::now();
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let jobs = jobs.unwrap_or(if threads == 0 { 1 } else { (cores / threads).max(1) });
+    let queue = folder.open_trainings(plan).into();
+    let (running, seconds, failed, not_before) = (Vec::new(), Vec::new(), Vec::new(), began);
+    let mut pool = Pool { context, plan, folder, threads, events: &events, queue, running, seconds, failed, not_before };
+    pool.progress();
+    loop {
+        if stop.load(Ordering::Relaxed) {
+            pool.stop();
+            let text = format!("{} of {} cells are finished; the next run does the others", pool.finished(), plan.cells.len());
+            return Err(Error::Interrupted(text));
+        }
+        while pool.running.len() < jobs && Instant::now() >= pool.not_before {
+            let Some(index) = pool.queue.pop_front() else { break };
+            pool.start(index)?;
+        }
+        if pool.running.is_empty() && pool.queue.is_empty() {
+            break;
+        }
+        pool.look(jobs)?;
+        std::thread::sleep(TICK);
+    }
+    if !pool.failed.is_empty() {
+        return Err(pool.error());
+    }
+    let report = PoolReport { finished: pool.finished(), planned: plan.cells.len(), seconds: began.elapsed().as_secs_f64() };
+    context
+        .output
+        .result(&report, || format!("{} of {} cells are finished; tables: cc4dgs sweep collect {}", report.finished, report.planned, folder.root().display()))
+}
+
+impl Pool<'_> {
+    fn finished(&self) -> usize {
+        self.plan.cells.iter().filter(|cell| self.folder.finished(cell).is_some()).count()
+    }
+    fn progress(&self) {
+        let (done, total) = (self.finished() as u64, self.plan.cells.len() as u64);
+        self.events.emit(&Event::Progress { task: "sweep".into(), done, total });
+    }
+    fn note(&self, index: usize, message: String) {
+        self.events.emit(&Event::Note { object: self.plan.trainings[index].label(), message });
+    }
+    /// Starts a process for the training at `index`. Its messages go to the training's log.
+    fn start(&mut self, index: usize) -> Result<()> {
+        let log_path = self.folder.log(&self.plan.trainings[index].id);
+        let io = |e| Error::io(&log_path, e);
+        let log = OpenOptions::new().create(true).append(true).open(&log_path).map_err(io)?;
+        let program = std::env::current_exe().map_err(|e| Error::io("the program", e))?;
+        let mut command = Command::new(&program);
+        command.args(["--quiet", "--threads", &self.threads.to_string()]);
+        command.args(self.context.limit_options.iter().flat_map(|limit| ["--limit", limit]));
+        command.args(["sweep", "run"]).arg(self.folder.root()).args(["--index", &index.to_string(), "--no-wait"]);
+        command.stdin(Stdio::null()).stdout(log.try_clone().map_err(io)?).stderr(log);
+        // A group of its own: Ctrl-C reaches this process alone, which then asks each child once.
+        #[cfg(unix)]
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        let child = command.spawn().map_err(|e| Error::io(&program, e))?;
+        self.running.push(Job { index, child, began: Instant::now() });
+        Ok(())
+    }
+    /// Takes note of the processes that have ended.
+    fn look(&mut self, jobs: usize) -> Result<()> {
+        let mut at = 0;
+        while at < self.running.len() {
+            let Some(status) = self.running[at].child.try_wait().map_err(|e| Error::io("a process of the sweep", e))? else {
+                at += 1;
+                continue;
+            };
+            let job = self.running.swap_remove(at);
+            self.ended(&job, status, jobs)?;
+        }
+        Ok(())
+    }
+    fn ended(&mut self, job: &Job, status: ExitStatus, jobs: usize) -> Result<()> {
+        let training = &self.plan.trainings[job.index];
+        let complete = self.plan.cells_of(&training.id).all(|cell| self.folder.finished(cell).is_some());
+        match status.code() {
+            // A hopeless training has results too.
+            _ if complete => {
+                let seconds = job.began.elapsed().as_secs_f64();
+                self.seconds.push(seconds);
+                let hopeless = if status.success() { "" } else { ", hopeless" };
+                self.note(job.index, format!("done in {}{hopeless}; {}", duration(seconds), self.left(jobs)));
+            }
+            Some(code) if code == i32::from(BUSY) => {
+                self.queue.push_back(job.index);
+                self.not_before = Instant::now() + BUSY_PAUSE;
+            }
+            _ => {
+                let failure = self.failure(job.index, status);
+                self.folder.set_failure(&training.id, Some(&failure))?;
+                self.note(job.index, format!("failed with exit code {}: {}", failure.exit_code, failure.message));
+                self.failed.push((job.index, failure));
+            }
+        }
+        self.progress();
+        Ok(())
+    }
+    /// What a process said before it failed; a process that was ended from outside said nothing.
+    fn failure(&self, index: usize, status: ExitStatus) -> Failure {
+        let id = &self.plan.trainings[index].id;
+        let log = std::fs::read_to_string(self.folder.log(id)).unwrap_or_default();
+        let last = log.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").to_string();
+        match (status.code(), signal(status)) {
+            (Some(code), _) => match self.folder.failure(id) {
+                Some(said) if i32::from(said.exit_code) == code => said,
+                _ => Failure { exit_code: u8::try_from(code).unwrap_or(1), message: last },
+            },
+            (None, Some(9)) => Failure { exit_code: 4, message: "the process was killed, most likely because memory ran out; use fewer --jobs".into() },
+            (None, Some(6)) if last.contains("memory allocation") => Failure { exit_code: 4, message: last },
+            (None, Some(2 | 15)) => Failure { exit_code: INTERRUPTED, message: "the process was asked to stop".into() },
+            (None, other) => Failure { exit_code: 1, message: format!("the process was ended by signal {}: {last}", other.unwrap_or(0)) },
+        }
+    }
+    /// Trainings done and the time that the others will take.
+    fn left(&self, jobs: usize) -> String {
+        let waiting = self.queue.len() + self.running.len();
+        let text = format!("{} of {} cells, {waiting} trainings left", self.finished(), self.plan.cells.len());
+        if waiting == 0 || self.seconds.is_empty() {
+            return text;
+        }
+        let mean = self.seconds.iter().sum::<f64>() / self.seconds.len() as f64;
+        let under_way: f64 = self.running.iter().map(|job| job.began.elapsed().as_secs_f64().min(mean)).sum();
+        format!("{text}, about {} to go", duration((mean * waiting as f64 - under_way) / jobs.min(waiting) as f64))
+    }
+    /// Asks all processes to stop, waits for their checkpoints, and ends those that do not.
+    fn stop(&mut self) {
+        for job in &mut self.running {
+            ask_to_stop(&mut job.child);
+        }
+        let until = Instant::now() + GRACE;
+        for job in &mut self.running {
+            while Instant::now() < until && matches!(job.child.try_wait(), Ok(None)) {
+                std::thread::sleep(TICK);
+            }
+            job.child.kill().ok();
+            job.child.wait().ok();
+        }
+    }
+    /// The failures as one error with the exit code of the first.
+    fn error(&self) -> Error {
+        let named: Vec<String> = self.failed.iter().take(NAMED).map(|(index, f)| format!("{}: {}", self.plan.trainings[*index].label(), f.message)).collect();
+        let more = self.failed.len().saturating_sub(NAMED);
+        let rest = if more > 0 { format!("; and {more} more") } else { String::new() };
+        let object = format!("sweep {}", self.folder.root().display());
+        let problem = format!("{} of {} trainings failed: {}{rest}", self.failed.len(), self.plan.trainings.len(), named.join("; "));
+        let remedy = "The folder logs has what each said; running the sweep again tries these and nothing else";
+        match self.failed.first().map_or(1, |(_, failure)| failure.exit_code) {
+            2 => Error::parameter(object, problem, remedy),
+            3 => Error::data(object, problem, remedy),
+            4 => Error::io(self.folder.root(), std::io::Error::new(std::io::ErrorKind::OutOfMemory, problem)),
+            INTERRUPTED => Error::Interrupted(problem),
+            _ => Error::backend(object, problem, remedy),
+        }
+    }
+}
+
+#[cfg(unix)]
+fn signal(status: ExitStatus) -> Option<i32> {
+    std::os::unix::process::ExitStatusExt::signal(&status)
+}
+
+#[cfg(not(unix))]
+fn signal(_: ExitStatus) -> Option<i32> {
+    None
+}
+
+#[cfg(unix)]
+fn ask_to_stop(child: &mut Child) {
+    // A process that has just ended cannot be asked.
+    Command::new("kill").args(["-TERM", &child.id().to_string()]).stdin(Stdio::null()).stderr(Stdio::null()).status().ok();
+}
+
+#[cfg(not(unix))]
+fn ask_to_stop(child: &mut Child) {
+    child.kill().ok();
+}
+
+/// Seconds for people.
+fn duration(seconds: f64) -> String {
+    match seconds.max(0.0) {
+        s if s < 100.0 => format!("{s:.0} s"),
+        s if s < 6000.0 => format!("{:.0} min", s / 60.0),
+        s => format!("{:.1} h", s / 3600.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_are_short() {
+        assert_eq!([-1.0, 59.4, 600.0, 7200.0].map(duration), ["0 s", "59 s", "10 min", "2.0 h"]);
+    }
+}

@@ -1,0 +1,178 @@
+//! The log of a run, `events.jsonl`: one JSON object per line and event.
+
+use cc4dgs_core::{Error, Event, EventSink, Result, Stage};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::Path;
+use std::sync::Mutex;
+use std::time::Instant;
+
+/// Name of the log inside a run's folder.
+pub const EVENTS: &str = "events.jsonl";
+
+/// Appends events to a file, each with the seconds since the command began. A line is written at once and whole, so that the log can be followed
+/// and survives a crash.
+pub struct JsonLines {
+    file: Mutex<File>,
+    began: Instant,
+}
+
+#[derive(Serialize)]
+struct Line<'a> {
+    seconds: f64,
+    #[serde(flatten)]
+    event: &'a Event,
+}
+
+impl JsonLines {
+    /// Opens the log at `path`; a resumed run goes on where the log ended, any other starts it anew.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn open(path: &Path, append: bool) -> Result<Self> {
+        if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
+            std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+        }
+        let file = OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path).map_err(|e| Error::io(path, e))?;
+        Ok(Self { file: Mutex::new(file), began: Instant::now() })
+    }
+}
+
+impl EventSink for JsonLines {
+    fn emit(&self, event: &Event) {
+        let line = Line { seconds: (self.began.elapsed().as_secs_f64() * 1e3).round() / 1e3, event };
+        if let (Ok(mut text), Ok(mut file)) = (serde_json::to_string(&line), self.file.lock()) {
+            text.push('\n');
+            // A full disk must not end a training run; the checkpoint will report it.
+            file.write_all(text.as_bytes()).ok();
+        }
+    }
+}
+
+/// What the log of a training says of the training, interruptions included.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct History {
+    /// Wall seconds of all processes that worked on it, each up to its last event.
+    pub seconds: f64,
+    /// Of those, seconds per stage.
+    pub stage_seconds: BTreeMap<String, f64>,
+    /// Times at which it went on after an interruption.
+    pub resumed: usize,
+    /// What it reached on the way. An iteration that was repeated after an interruption is there once.
+    pub points: Vec<HistoryPoint>,
+}
+
+/// A training at one iteration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HistoryPoint {
+    /// Over all stages, from 1.
+    pub iteration: usize,
+    /// Seconds since the training began.
+    pub seconds: f64,
+    /// PSNR of training views in dB, smoothed.
+    pub psnr_db: f32,
+    /// Gaussians.
+    pub gaussians: usize,
+}
+
+#[derive(Deserialize)]
+struct ReadLine {
+    seconds: f64,
+    #[serde(flatten)]
+    event: Event,
+}
+
+/// Reads the log of a training. Lines that a crash has cut are skipped; the score stage, which compares masks, has no points.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn read_history(path: &Path) -> Result<History> {
+    let text = std::fs::read(path).map_err(|e| Error::io(path, e))?;
+    let mut history = History::default();
+    let mut points: BTreeMap<usize, HistoryPoint> = BTreeMap::new();
+    // Iterations before each stage, and seconds of the processes before this one.
+    let mut before: BTreeMap<String, usize> = BTreeMap::new();
+    let (mut iterations, mut earlier, mut last, mut starts) = (0, 0.0, 0.0, 0usize);
+    let mut stage: Option<String> = None;
+    for line in String::from_utf8_lossy(&text).lines() {
+        let Ok(ReadLine { seconds, event }) = serde_json::from_str::<ReadLine>(line) else { continue };
+        if seconds < last {
+            (earlier, last, stage) = (earlier + last, 0.0, None);
+        }
+        if let Some(stage) = &stage {
+            *history.stage_seconds.entry(stage.clone()).or_default() += seconds - last;
+        }
+        last = seconds;
+        match event {
+            Event::RunStarted { command, .. } if command == "train" => starts += 1,
+            Event::StageStarted { stage: name, iterations: length, .. } => {
+                if !before.contains_key(&name) {
+                    before.insert(name.clone(), iterations);
+                    iterations += length;
+                }
+                stage = Some(name);
+            }
+            Event::StageFinished { .. } => stage = None,
+            Event::Iteration { stage, iteration, psnr_db, gaussians, .. } if stage != Stage::Score.name() => {
+                let iteration = before.get(&stage).copied().unwrap_or(0) + iteration;
+                points.insert(iteration, HistoryPoint { iteration, seconds: earlier + seconds, psnr_db, gaussians });
+            }
+            _ => {}
+        }
+    }
+    history.seconds = earlier + last;
+    history.resumed = starts.saturating_sub(1);
+    history.points = points.into_values().collect();
+    Ok(history)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_history_outlives_interruptions() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(EVENTS);
+        let line = |seconds: f64, event: Event| serde_json::to_string(&Line { seconds, event: &event }).unwrap() + "\n";
+        let run = || Event::RunStarted { command: "train".into(), device: "flex".into(), seed: 0 };
+        let start = |stage: &str, iterations| Event::StageStarted { stage: stage.into(), iterations, gaussians: 5 };
+        let step = |stage: &str, iteration, psnr_db| Event::Iteration { stage: stage.into(), iteration, of: 20, loss: 0.0, psnr_db, gaussians: 5, ms: 1.0 };
+        let end = |stage: &str| Event::StageFinished { stage: stage.into(), seconds: 1.0, gaussians: 5 };
+        let mut text: String =
+            [(0.5, run()), (1.0, start("coarse", 10)), (2.0, step("coarse", 10, 20.0)), (3.0, end("coarse"))].map(|(s, e)| line(s, e)).concat();
+        text += &[(4.0, start("score", 10)), (5.0, step("score", 10, 1.0)), (6.0, end("score")), (7.0, start("main", 20)), (8.0, step("main", 10, 25.0))]
+            .map(|(s, e)| line(s, e))
+            .concat();
+        // Killed in the middle of a line; the stage is resumed before that iteration.
+        text += "{\"seconds\":8.5,\"eve";
+        text += &("\n".to_string()
+            + &[(0.1, run()), (0.2, start("main", 20)), (1.2, step("main", 10, 26.0)), (2.2, step("main", 20, 30.0)), (2.7, end("main"))]
+                .map(|(s, e)| line(s, e))
+                .concat());
+        std::fs::write(&path, text).unwrap();
+        let history = read_history(&path).unwrap();
+        let points: Vec<(usize, f32)> = history.points.iter().map(|p| (p.iteration, p.psnr_db)).collect();
+        assert_eq!(points, [(10, 20.0), (30, 26.0), (40, 30.0)]);
+        assert_eq!((history.resumed, history.points[1].seconds), (1, 9.2));
+        assert!((history.seconds - 10.7).abs() < 1e-9 && (history.stage_seconds["main"] - 3.5).abs() < 1e-9, "{history:?}");
+        assert_eq!(history.stage_seconds["coarse"], 2.0);
+    }
+
+    #[test]
+    fn lines_are_events_with_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run/events.jsonl");
+        let event = Event::Saved { path: "x".into(), bytes: 7 };
+        JsonLines::open(&path, false).unwrap().emit(&event);
+        JsonLines::open(&path, true).unwrap().emit(&event);
+        let text = std::fs::read_to_string(&path).unwrap();
+        let lines: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+        assert_eq!(lines.len(), 2, "{text}");
+        assert!(lines.iter().all(|l| l["event"] == "saved" && l["bytes"] == 7 && l["seconds"].is_f64()), "{text}");
+        JsonLines::open(&path, false).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "");
+    }
+}

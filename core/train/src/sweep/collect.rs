@@ -1,0 +1,203 @@
+//! Puts the results of a sweep together: checks that every cell is there exactly once, and makes the tables.
+
+use super::folder::SweepFolder;
+use super::plan::Plan;
+use super::read::RESULTS;
+use super::result::CellResult;
+use super::table::{csv, markdown};
+use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::{Error, Result};
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+/// Most missing cells that an error names.
+const NAMED: usize = 8;
+
+/// A cell without a result.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Missing {
+    /// The cell.
+    pub cell: String,
+    /// Its place in the grid.
+    pub place: String,
+    /// Why it is missing.
+    pub reason: String,
+}
+
+/// How complete a sweep is.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Collection {
+    /// Results of the plan's cells, in its order.
+    #[serde(skip)]
+    pub results: Vec<CellResult>,
+    /// Number of results.
+    pub finished: usize,
+    /// Cells of the plan.
+    pub planned: usize,
+    /// Cells without a result.
+    pub missing: Vec<Missing>,
+    /// Files in the folder of results that are of no cell of the plan, by name.
+    pub foreign: Vec<String>,
+}
+
+/// What [`write_tables`] wrote.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Tables {
+    /// All results, one per line.
+    pub results: PathBuf,
+    /// Markdown.
+    pub markdown: PathBuf,
+    /// CSV.
+    pub csv: PathBuf,
+}
+
+/// Looks for the result of every cell of `plan`.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn collect(folder: &SweepFolder, plan: &Plan) -> Result<Collection> {
+    let trainings: BTreeMap<&str, _> = plan.trainings.iter().map(|t| (t.id.as_str(), t)).collect();
+    let (mut results, mut missing) = (Vec::new(), Vec::new());
+    let mut states: BTreeMap<&str, String> = BTreeMap::new();
+    for cell in &plan.cells {
+        match folder.finished(cell) {
+            Some(result) => results.push(result),
+            None => {
+                let state = states.entry(&cell.training).or_insert_with(|| folder.state(&cell.training));
+                let damaged = if folder.result(&cell.id).exists() { "its file is damaged; " } else { "" };
+                let place = trainings.get(cell.training.as_str()).map_or_else(String::new, |t| format!("{} {}", t.label(), cell.codec));
+                missing.push(Missing { cell: cell.id.clone(), place, reason: format!("{damaged}{state}") });
+            }
+        }
+    }
+    let own: BTreeSet<String> = plan.cells.iter().map(|cell| format!("{}.json", cell.id)).collect();
+    let inner = folder.root().join(RESULTS);
+    let mut foreign = Vec::new();
+    if inner.is_dir() {
+        for entry in std::fs::read_dir(&inner).map_err(|e| Error::io(&inner, e))? {
+            let name = entry.map_err(|e| Error::io(&inner, e))?.file_name().to_string_lossy().into_owned();
+            // Hidden files are writes that were cut off.
+            if !own.contains(&name) && !name.starts_with('.') {
+                foreign.push(name);
+            }
+        }
+    }
+    foreign.sort();
+    Ok(Collection { finished: results.len(), planned: plan.cells.len(), results, missing, foreign })
+}
+
+impl Collection {
+    /// Refuses a sweep that is not complete.
+    ///
+    /// # Errors
+    /// [`Error::Data`] that names missing cells and why they are missing.
+    pub fn check_complete(&self, folder: &SweepFolder) -> Result<()> {
+        if self.missing.is_empty() {
+            return Ok(());
+        }
+        let named: Vec<String> = self.missing.iter().take(NAMED).map(|m| format!("{} ({}): {}", m.cell, m.place, m.reason)).collect();
+        let more = self.missing.len().saturating_sub(NAMED);
+        let rest = if more > 0 { format!("; and {more} more") } else { String::new() };
+        let problem = format!("{} of {} cells are missing: {}{rest}", self.missing.len(), self.planned, named.join("; "));
+        let remedy = "Run it again: cc4dgs sweep run DIR does what is missing and nothing else; --partial makes tables of what is there";
+        Err(Error::data(format!("sweep {}", folder.root().display()), problem, remedy))
+    }
+}
+
+/// Writes `results` (one file, a line each) and their tables into the sweep's folder.
+///
+/// # Errors
+/// As [`markdown`], and [`Error::Io`].
+pub fn write_tables(folder: &SweepFolder, results: &[CellResult]) -> Result<Tables> {
+    let (table, comma_separated) = (markdown(results)?, csv(results)?);
+    let lines: String = results.iter().map(|r| r.to_line().map(|line| line + "\n")).collect::<Result<Vec<_>>>()?.concat();
+    let at = |name: &str| folder.root().join(name);
+    let tables = Tables { results: at("results.jsonl"), markdown: at("table.md"), csv: at("table.csv") };
+    write_atomically(&tables.results, lines.as_bytes())?;
+    write_atomically(&tables.markdown, table.as_bytes())?;
+    write_atomically(&tables.csv, comma_separated.as_bytes())?;
+    Ok(tables)
+}
+
+/// The results for which every `KEY=VALUE` of `conditions` holds. Keys: scene, method, setting, codec, seed, device.
+///
+/// # Errors
+/// [`Error::Parameter`] for other keys, and for conditions that no result meets.
+pub fn select(results: Vec<CellResult>, conditions: &[String]) -> Result<Vec<CellResult>> {
+    const KEYS: &str = "Keys are scene, method, setting, codec, seed and device";
+    let mut kept = results;
+    for condition in conditions {
+        let object = format!("--where {condition}");
+        let Some((key, value)) = condition.split_once('=') else { return Err(Error::parameter(object, "no '=' found", "Write --where KEY=VALUE")) };
+        let of = |r: &CellResult| match key {
+            "scene" => Some(r.axes.scene.clone()),
+            "method" => Some(r.axes.method.clone()),
+            "setting" => Some(r.axes.setting.clone()),
+            "codec" => Some(r.axes.codec.clone()),
+            "seed" => Some(r.axes.seed.to_string()),
+            "device" => Some(r.provenance.device.name.clone()),
+            _ => None,
+        };
+        let present: BTreeSet<String> = kept.iter().filter_map(of).collect();
+        if present.is_empty() && !kept.is_empty() {
+            return Err(Error::parameter(object, format!("'{key}' is no key"), KEYS));
+        }
+        kept.retain(|r| of(r).as_deref() == Some(value));
+        if kept.is_empty() {
+            let known = present.into_iter().collect::<Vec<_>>().join(", ");
+            return Err(Error::parameter(object, "no result meets it", format!("There are: {known}")));
+        }
+    }
+    Ok(kept)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::plan::tests::example as plan;
+    use super::super::read::tests::cell;
+    use super::*;
+
+    #[test]
+    fn what_is_missing_is_named_with_its_reason() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = SweepFolder::new(root.path());
+        folder.create().unwrap();
+        let plan = plan();
+        let all: Vec<CellResult> = plan
+            .cells
+            .iter()
+            .map(|planned| {
+                cell(&planned.id, |r| {
+                    r.training.clone_from(&planned.training);
+                    r.axes.codec.clone_from(&planned.codec);
+                })
+            })
+            .collect();
+        all[0].write(&folder.result(&all[0].id)).unwrap();
+        std::fs::write(folder.result(&all[1].id), "{").unwrap();
+        std::fs::write(root.path().join("results/other.json"), "{}").unwrap();
+        let partial = collect(&folder, &plan).unwrap();
+        assert_eq!((partial.finished, partial.planned, partial.foreign.as_slice()), (1, 2, &["other.json".to_string()][..]));
+        let message = partial.check_complete(&folder).unwrap_err().to_string();
+        assert!([all[1].id.as_str(), "tiny own base seed 0 half", "damaged", "not begun"].iter().all(|part| message.contains(part)), "{message}");
+        all[1].write(&folder.result(&all[1].id)).unwrap();
+        let complete = collect(&folder, &plan).unwrap();
+        complete.check_complete(&folder).unwrap();
+        assert_eq!(complete.results, all);
+        let tables = write_tables(&folder, &complete.results).unwrap();
+        assert_eq!(super::super::read_results(&tables.results).unwrap().len(), 2);
+        assert!(std::fs::read_to_string(tables.markdown).unwrap().contains("| half |"));
+    }
+
+    #[test]
+    fn conditions_select() {
+        let results = || vec![cell("a", |r| r.axes.seed = 0), cell("b", |r| r.axes.seed = 7)];
+        let of = |conditions: &[&str]| select(results(), &conditions.iter().map(ToString::to_string).collect::<Vec<_>>());
+        assert_eq!(of(&[]).unwrap().len(), 2);
+        assert_eq!(of(&["seed=7", "device=flex"]).unwrap()[0].id, "b");
+        assert!(of(&["seed=8"]).unwrap_err().to_string().contains("0, 7"));
+        assert!(of(&["sead=8"]).unwrap_err().to_string().contains("Keys are"));
+        assert!(of(&["seed"]).unwrap_err().to_string().contains("KEY=VALUE"));
+    }
+}

@@ -1,0 +1,211 @@
+//! What a sweep runs on: datasets by content, devices by name.
+
+use super::hash::ContentHash;
+use super::result::{DataFingerprint, DeviceFacts};
+use cc4dgs_core::{Error, Registry, Result, adapters, auto_device};
+use rayon::prelude::*;
+use std::path::{Path, PathBuf};
+use xxhash_rust::xxh3::Xxh3;
+
+/// Deepest folder of a dataset, and most files: a link that leads in a circle ends here.
+const MOST_DEPTH: usize = 32;
+const MOST_FILES: usize = 5_000_000;
+
+/// The path a grid's text stands for: an environment variable at its start is replaced, as in `$CC4DGS_DATA/mutant`.
+///
+/// # Errors
+/// [`Error::Parameter`] for a variable that is not set.
+pub fn locate(text: &str) -> Result<PathBuf> {
+    let Some(rest) = text.strip_prefix('$') else { return Ok(PathBuf::from(text)) };
+    let (variable, tail) = rest.split_once('/').unwrap_or((rest, ""));
+    match std::env::var_os(variable) {
+        Some(value) if !value.is_empty() => Ok(if tail.is_empty() { PathBuf::from(value) } else { Path::new(&value).join(tail) }),
+        _ => Err(Error::parameter(format!("scene {text}"), format!("the environment variable {variable} is not set"), "Set it to the folder of the datasets")),
+    }
+}
+
+/// A file of a dataset: name relative to the dataset, and bytes.
+struct DataFile {
+    name: String,
+    path: PathBuf,
+    bytes: u64,
+}
+
+/// All files of `root` in the order of their names; hidden ones are left out.
+fn list(root: &Path) -> Result<Vec<DataFile>> {
+    let mut files = Vec::new();
+    let mut folders = vec![(root.to_path_buf(), String::new(), 0)];
+    while let Some((folder, prefix, depth)) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).map_err(|e| Error::io(&folder, e))? {
+            let path = entry.map_err(|e| Error::io(&folder, e))?.path();
+            let Some(name) = path.file_name().map(|name| name.to_string_lossy().into_owned()).filter(|name| !name.starts_with('.')) else { continue };
+            let facts = std::fs::metadata(&path).map_err(|e| Error::io(&path, e))?;
+            let name = format!("{prefix}{name}");
+            if facts.is_dir() && depth < MOST_DEPTH {
+                folders.push((path, name + "/", depth + 1));
+            } else if facts.is_file() {
+                files.push(DataFile { name, bytes: facts.len(), path });
+            }
+            if files.len() > MOST_FILES {
+                return Err(Error::limit(
+                    format!("dataset {}: files", root.display()),
+                    files.len() as u64,
+                    MOST_FILES as u64,
+                    "Name the folder of one dataset",
+                ));
+            }
+        }
+    }
+    files.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(files)
+}
+
+/// Names and sizes of a dataset's files as one name: what is compared before a training begins, because it costs little.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn listing(path: &Path) -> Result<String> {
+    let mut hash = ContentHash::default();
+    if path.is_dir() {
+        for file in list(path)? {
+            hash.part(file.name.as_bytes());
+            hash.part(&file.bytes.to_le_bytes());
+        }
+    } else if let Ok(facts) = std::fs::metadata(path) {
+        hash.part(&facts.len().to_le_bytes());
+    }
+    Ok(hash.name())
+}
+
+/// The fingerprint of the dataset that `text` names: names and contents of all files, or the name of a built-in scene.
+///
+/// # Errors
+/// [`Error::Parameter`] for a path that no reader recognises, [`Error::Io`].
+pub fn fingerprint(text: &str, registry: &Registry) -> Result<DataFingerprint> {
+    let path = locate(text)?;
+    let readers = registry.readers();
+    let recognised = readers.iter().any(|reader| (reader.probe)(&path));
+    if !path.exists() && !recognised {
+        return Err(Error::parameter(format!("scene {text}"), "no such file or folder", "Check the path, or use `procedural:NAME` for a built-in scene"));
+    }
+    if !recognised {
+        let known: Vec<String> = readers.iter().map(|r| format!("{} looks for {}", r.info.name, r.looks_for)).collect();
+        return Err(Error::parameter(format!("scene {text}"), "no reader recognises it", format!("Known formats: {}", known.join("; "))));
+    }
+    let mut hash = ContentHash::default();
+    if !path.exists() {
+        hash.part(text.as_bytes());
+        return Ok(DataFingerprint { path: text.into(), hash: hash.name(), files: 0, bytes: 0 });
+    }
+    let files = if path.is_dir() {
+        list(&path)?
+    } else {
+        let bytes = std::fs::metadata(&path).map_err(|e| Error::io(&path, e))?.len();
+        vec![DataFile { name: String::new(), bytes, path: path.clone() }]
+    };
+    let contents: Vec<u64> = files.par_iter().map(|file| content(&file.path)).collect::<Result<_>>()?;
+    for (file, content) in files.iter().zip(&contents) {
+        hash.part(file.name.as_bytes());
+        hash.part(&content.to_le_bytes());
+    }
+    let bytes = files.iter().map(|file| file.bytes).sum();
+    Ok(DataFingerprint { path: text.into(), hash: hash.name(), files: files.len() as u64, bytes })
+}
+
+fn content(path: &Path) -> Result<u64> {
+    let mut file = std::fs::File::open(path).map_err(|e| Error::io(path, e))?;
+    let mut hash = Xxh3::new();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match std::io::Read::read(&mut file, &mut buffer).map_err(|e| Error::io(path, e))? {
+            0 => return Ok(hash.digest()),
+            count => hash.update(&buffer[..count]),
+        }
+    }
+}
+
+/// What the device `name` is on this machine.
+pub fn device_facts(name: &str) -> DeviceFacts {
+    let name = if name == "auto" { auto_device().0 } else { name };
+    let index = name.strip_prefix("wgpu").map(|rest| rest.strip_prefix(':').and_then(|index| index.parse().ok()).unwrap_or(0));
+    let (adapter, driver) = match index.and_then(|index: usize| adapters().get(index)) {
+        Some(adapter) => (Some(format!("{} ({})", adapter.name, adapter.api)), Some(adapter.driver.clone())),
+        None if name == "cuda" => nvidia(),
+        None => (None, None),
+    };
+    DeviceFacts {
+        name: name.into(),
+        adapter,
+        driver,
+        processor: processor(),
+        threads: rayon::current_num_threads(),
+        system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+    }
+}
+
+/// Model of the processor, where the system has a file that says.
+fn processor() -> String {
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let value = |key: &str| text.lines().find(|line| line.starts_with(key)).and_then(|line| line.split_once(':')).map(|(_, value)| value.trim().to_string());
+    value("model name").or_else(|| value("Model")).unwrap_or_default()
+}
+
+/// Model of the first NVIDIA card and version of the driver, where the driver's files say.
+fn nvidia() -> (Option<String>, Option<String>) {
+    let folder = Path::new("/proc/driver/nvidia");
+    let version = std::fs::read_to_string(folder.join("version")).ok().and_then(|text| text.lines().next().map(str::to_string));
+    let mut cards: Vec<PathBuf> =
+        std::fs::read_dir(folder.join("gpus")).map(|d| d.flatten().map(|e| e.path().join("information")).collect()).unwrap_or_default();
+    cards.sort();
+    let text = cards.first().and_then(|card| std::fs::read_to_string(card).ok()).unwrap_or_default();
+    let model = text.lines().find_map(|line| line.strip_prefix("Model:")).map(|model| model.trim().to_string());
+    (model, version)
+}
+
+/// Most memory that this process has had, MB (10^6 bytes).
+pub fn peak_memory_mb() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    line.split_whitespace().next()?.parse::<f64>().ok().map(|kib| kib * 1024.0 / 1e6)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fingerprint_follows_names_and_contents() {
+        let registry = Registry::collect().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("transforms_train.json"), "{}").unwrap();
+        std::fs::create_dir(at("train")).unwrap();
+        std::fs::write(at("train/a.png"), "image").unwrap();
+        let text = folder.path().to_str().unwrap();
+        let of = || fingerprint(text, &registry).unwrap();
+        let (first, first_listing) = (of(), listing(folder.path()).unwrap());
+        assert_eq!((first.files, first.bytes), (2, 7));
+        std::fs::write(at(".hidden"), "x").unwrap();
+        assert_eq!(of(), first, "hidden files are no data");
+        std::fs::write(at("train/a.png"), "IMAGE").unwrap();
+        assert_ne!(of().hash, first.hash, "content of the same length");
+        assert_eq!(listing(folder.path()).unwrap(), first_listing);
+        std::fs::write(at("train/a.png"), "image").unwrap();
+        std::fs::rename(at("train/a.png"), at("train/b.png")).unwrap();
+        assert_ne!(of().hash, first.hash, "another name");
+        assert_ne!(listing(folder.path()).unwrap(), first_listing);
+    }
+
+    #[test]
+    fn built_in_scenes_have_a_fingerprint_and_wrong_paths_none() {
+        let registry = Registry::collect().unwrap();
+        let tiny = fingerprint("procedural:tiny", &registry).unwrap();
+        assert_eq!((tiny.files, tiny.path.as_str()), (0, "procedural:tiny"));
+        assert_ne!(tiny.hash, fingerprint("procedural", &registry).unwrap().hash);
+        assert!(fingerprint("no/such/folder", &registry).unwrap_err().to_string().contains("no such"));
+        let message = locate("$CC4DGS_NO_SUCH_VARIABLE/x").unwrap_err().to_string();
+        assert!(message.contains("CC4DGS_NO_SUCH_VARIABLE is not set"), "{message}");
+        let facts = device_facts("flex");
+        assert!(facts.name == "flex" && facts.adapter.is_none() && facts.threads > 0, "{facts:?}");
+    }
+}

@@ -1,0 +1,388 @@
+//! From a grid to trainings and cells, each named by what it is made of.
+
+use super::facts::{fingerprint, listing, locate};
+use super::grid::{Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
+use super::hash::name_of;
+use super::result::{CodecChoice, DataFingerprint};
+use crate::config::RunConfig;
+use crate::layers::Layers;
+use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::{Error, Registry, Result, config};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Value of [`Plan::kind`].
+const KIND: &str = "cc4dgs-sweep";
+/// Version of the file that this program writes and reads.
+const SCHEMA: u32 = 1;
+/// Name of the plan inside a sweep's folder.
+pub const PLAN: &str = "plan.json";
+/// Largest plan, bytes.
+const MOST_BYTES: u64 = 1 << 30;
+
+/// A training of a sweep; cells of several codecs share it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PlannedTraining {
+    /// XXH3-64 of configuration, data fingerprint, code version and seed.
+    pub id: String,
+    /// Name of the scene.
+    pub scene: String,
+    /// Name of the method.
+    pub method: String,
+    /// Name of the setting.
+    pub setting: String,
+    /// Root of the seed tree.
+    pub seed: u64,
+    /// The preset.
+    pub preset: String,
+    /// Overrides of the preset, in order.
+    pub sets: Vec<String>,
+    /// The dataset.
+    pub data: DataFingerprint,
+    /// Names and sizes of its files.
+    pub listing: String,
+}
+
+impl PlannedTraining {
+    /// Its place in the grid, for messages.
+    pub fn label(&self) -> String {
+        format!("{} {} {} seed {}", self.scene, self.method, self.setting, self.seed)
+    }
+    /// What was said of it.
+    ///
+    /// # Errors
+    /// As [`Layers::collect`].
+    pub fn layers(&self, registry: &Registry) -> Result<Layers> {
+        Layers::collect(registry, Some(&self.preset), None, &self.sets)
+    }
+}
+
+/// A cell of a sweep.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PlannedCell {
+    /// XXH3-64 of training, codec and scored views.
+    pub id: String,
+    /// The training.
+    pub training: String,
+    /// Name of the codec.
+    pub codec: String,
+    /// The codec.
+    pub choice: CodecChoice,
+}
+
+/// All trainings and cells of a grid.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Plan {
+    /// `cc4dgs-sweep`.
+    pub kind: String,
+    /// Version of this file.
+    pub schema: u32,
+    /// Name of the grid.
+    pub name: String,
+    /// Version of the program.
+    pub version: String,
+    /// Commit of the program; empty if unknown.
+    pub commit: String,
+    /// What cells are scored on.
+    pub split: ScoredViews,
+    /// Most images that are scored; 0 is all.
+    pub max_views: usize,
+    /// Images of each cell that are kept.
+    pub images: usize,
+    /// Wall minutes that the grid states for a training of size 1.
+    pub minutes: Option<f64>,
+    /// The trainings, in the order of their indices.
+    pub trainings: Vec<PlannedTraining>,
+    /// The cells, those of a training together.
+    pub cells: Vec<PlannedCell>,
+}
+
+/// Version and commit of this program.
+pub(super) fn code_version() -> (&'static str, &'static str) {
+    (env!("CARGO_PKG_VERSION"), env!("CC4DGS_COMMIT"))
+}
+
+impl Plan {
+    /// Expands `grid`. Every configuration is read strictly; where it is known before the scene is looked at, `check` is asked about it too.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] that names the place in the grid, the wrong key or value, and the remedy; [`Error::Io`] for unreadable datasets.
+    pub fn expand(grid: &Grid, registry: &Registry, check: &dyn Fn(&RunConfig) -> Result<()>) -> Result<Self> {
+        let (version, commit) = code_version();
+        let codecs = codecs(grid, registry)?;
+        let mut plan = Self {
+            kind: KIND.into(),
+            schema: SCHEMA,
+            name: grid.name.clone(),
+            version: version.into(),
+            commit: commit.into(),
+            split: grid.split,
+            max_views: grid.max_views,
+            images: grid.images,
+            minutes: grid.minutes,
+            trainings: Vec::new(),
+            cells: Vec::new(),
+        };
+        let mut labels: BTreeMap<String, String> = BTreeMap::new();
+        for scene in &grid.scene {
+            let data = fingerprint(&scene.path, registry)?;
+            let listing = listing(&locate(&scene.path)?)?;
+            for (method, setting) in grid.method.iter().flat_map(|method| grid.setting.iter().map(move |setting| (method, setting))) {
+                for &seed in &grid.seeds {
+                    let mut training = planned(grid, scene, method, setting, seed, data.clone(), listing.clone());
+                    let stated = stated(grid, &training, registry, check).map_err(|error| at(&training, error))?;
+                    training.id = name_of(&(&stated, &data.hash, version, commit, seed))?;
+                    if let Some(other) = labels.insert(training.id.clone(), training.label()) {
+                        let problem = format!("'{}' and '{other}' are the same training", training.label());
+                        return Err(Error::parameter(format!("grid {}", grid.name), problem, "Remove one, or change its settings"));
+                    }
+                    for (name, choice) in &codecs {
+                        let id = name_of(&(&training.id, choice, grid.split, grid.max_views, grid.images))?;
+                        plan.cells.push(PlannedCell { id, training: training.id.clone(), codec: name.clone(), choice: choice.clone() });
+                    }
+                    plan.trainings.push(training);
+                }
+            }
+        }
+        Ok(plan)
+    }
+    /// The cells of a training.
+    pub fn cells_of<'a>(&'a self, training: &'a str) -> impl Iterator<Item = &'a PlannedCell> {
+        self.cells.iter().filter(move |cell| cell.training == training)
+    }
+    /// Writes the plan into the folder of a sweep.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+        let json = serde_json::to_string_pretty(self).map_err(|e| Error::backend("plan", e.to_string(), "Report this: every plan should have a JSON form"))?;
+        write_atomically(folder.join(PLAN), (json + "\n").as_bytes())
+    }
+    /// Reads the plan of the sweep in `folder`.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for a folder without one, [`Error::Unsupported`] for another version of the file, [`Error::Data`] for a damaged one.
+    pub fn read(folder: &Path) -> Result<Self> {
+        let path = folder.join(PLAN);
+        let object = path.display().to_string();
+        if !path.is_file() {
+            return Err(Error::parameter(format!("sweep {}", folder.display()), "there is no plan.json", "Make one: cc4dgs sweep plan GRID.toml --out DIR"));
+        }
+        let bytes = std::fs::metadata(&path).map_err(|e| Error::io(&path, e))?.len();
+        if bytes > MOST_BYTES {
+            return Err(Error::limit(object, bytes, MOST_BYTES, "Make the plan again"));
+        }
+        let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
+        let damaged = |problem: String| Error::data(&object, problem, "Make the plan again: cc4dgs sweep plan GRID.toml --out DIR");
+        #[derive(Deserialize)]
+        struct Head {
+            kind: String,
+            schema: u32,
+        }
+        let head: Head = serde_json::from_str(&text).map_err(|e| damaged(e.to_string()))?;
+        if head.kind != KIND {
+            return Err(damaged(format!("its kind is \"{}\", a plan has \"{KIND}\"", head.kind)));
+        }
+        if head.schema != SCHEMA {
+            let problem = format!("it has version {}, this program reads version {SCHEMA}", head.schema);
+            return Err(Error::unsupported(object, problem, "Make the plan again with this program"));
+        }
+        let plan: Self = serde_json::from_str(&text).map_err(|e| damaged(e.to_string()))?;
+        // Names become paths.
+        let is_id = |id: &str| id.len() == 16 && id.bytes().all(|b| b.is_ascii_hexdigit());
+        let ids = plan.trainings.iter().map(|t| &t.id).chain(plan.cells.iter().flat_map(|c| [&c.id, &c.training]));
+        if let Some(id) = ids.into_iter().find(|id| !is_id(id)) {
+            return Err(damaged(format!("'{id}' is no name of a training or cell")));
+        }
+        Ok(plan)
+    }
+    /// Refuses a plan of another version of the program: results would be of a mixture.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] that names both versions.
+    pub fn check_program(&self) -> Result<()> {
+        let (version, commit) = code_version();
+        if (self.version.as_str(), self.commit.as_str()) == (version, commit) {
+            return Ok(());
+        }
+        let problem = format!("it was planned by cc4dgs {} ({}), this program is {version} ({commit})", self.version, self.commit);
+        Err(Error::parameter(format!("sweep {}", self.name), problem, "Plan again with this program (finished cells of the old one stay), or use the old one"))
+    }
+}
+
+/// The codecs of a grid, built once to find mistakes.
+fn codecs(grid: &Grid, registry: &Registry) -> Result<Vec<(String, CodecChoice)>> {
+    let of = |axis: &super::grid::CodecAxis| {
+        let choice = axis.choice()?;
+        registry.build_codec(&choice.codec, &choice.settings)?;
+        registry.weight_codec(&choice.field_weights)?;
+        Ok((axis.name.clone(), choice))
+    };
+    grid.codec.iter().map(|axis| of(axis).map_err(|error| within(&format!("grid {}, codec '{}'", grid.name, axis.name), error))).collect()
+}
+
+/// Everything about a training but its name.
+fn planned(grid: &Grid, scene: &SceneAxis, method: &MethodAxis, setting: &SettingAxis, seed: u64, data: DataFingerprint, listing: String) -> PlannedTraining {
+    let preset = match method.preset.strip_prefix('+') {
+        Some("") => scene.family.clone(),
+        Some(method) => format!("{}+{method}", scene.family),
+        None => method.preset.clone(),
+    };
+    let size = scene.size * method.size * setting.size;
+    let mut sets = [grid.set.as_slice(), &scene.set, &method.set, &setting.set].concat();
+    if let Some(iterations) = grid.iterations {
+        sets.push(format!("train.iterations={}", (iterations as f64 * size).round().max(1.0)));
+    }
+    if let Some(minutes) = grid.minutes {
+        sets.push(format!("auto.minutes={:?}", minutes * size));
+    }
+    if grid.validation_views() > 0 {
+        sets.push(format!("train.validation={}", grid.validation_views()));
+    }
+    sets.extend([format!("device={}", grid.device), format!("seed={seed}")]);
+    let (scene, method, setting) = (scene.name.clone(), method.name.clone(), setting.name.clone());
+    PlannedTraining { id: String::new(), scene, method, setting, seed, preset, sets, data, listing }
+}
+
+/// The configuration as far as it is known before the scene is looked at: all of it, or what the preset `auto` is told.
+fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &dyn Fn(&RunConfig) -> Result<()>) -> Result<toml::Table> {
+    let layers = training.layers(registry)?;
+    let known = layers.config()?;
+    if layers.want_plan() {
+        if layers.state("deformer.kind") {
+            check(&known)?;
+        }
+        return Ok(layers.table().clone());
+    }
+    if grid.minutes.is_some() {
+        let problem = format!("preset {} cannot be sized in minutes", training.preset);
+        return Err(Error::parameter("minutes", problem, "Use a preset auto or auto+METHOD, or size the grid in iterations"));
+    }
+    check(&known)?;
+    config::parse_table("configuration", &known.completed(registry)?.to_toml()?)
+}
+
+/// `error` with the training it is about.
+fn at(training: &PlannedTraining, error: Error) -> Error {
+    within(&format!("training '{}' (preset {})", training.label(), training.preset), error)
+}
+
+/// `error` with where it happened.
+fn within(place: &str, error: Error) -> Error {
+    match error {
+        Error::Parameter { object, problem, remedy } => Error::parameter(format!("{place}: {object}"), problem, remedy),
+        other => other,
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    pub(in crate::sweep) fn grid(text: &str) -> Grid {
+        let base = "name = 'g'\n[[scene]]\nname = 'tiny'\npath = 'procedural:tiny'\nfamily = 'demo'\n";
+        let (top, tables) = text.split_once("---").unwrap_or(("", text));
+        Grid::parse("g.toml", &format!("{top}{base}{tables}")).unwrap()
+    }
+    fn expand(text: &str) -> Result<Plan> {
+        Plan::expand(&grid(text), &Registry::collect().unwrap(), &|_| Ok(()))
+    }
+    const METHODS: &str = "[[method]]\nname = 'own'\npreset = '+'\n[[method]]\nname = 'planes'\npreset = '+hexplane'\n";
+    // This crate links no codecs, so grids of its own tests have none that could be built; the plan of trainings is what is tested here.
+    const CODEC: &str = "[[codec]]\nname = 'c'\ncodec = 'none-linked'\n";
+
+    /// The plan of trainings of a grid whose codecs are not built.
+    fn trainings(text: &str) -> Result<Vec<(PlannedTraining, toml::Table)>> {
+        let (grid, registry) = (grid(text), Registry::collect().unwrap());
+        let data = fingerprint(&grid.scene[0].path, &registry)?;
+        let mut all = Vec::new();
+        for (method, setting) in grid.method.iter().flat_map(|m| grid.setting.iter().map(move |s| (m, s))) {
+            for &seed in &grid.seeds {
+                let training = planned(&grid, &grid.scene[0], method, setting, seed, data.clone(), String::new());
+                let layers = training.layers(&registry)?;
+                layers.config().map_err(|error| at(&training, error))?;
+                all.push((training, layers.table().clone()));
+            }
+        }
+        Ok(all)
+    }
+
+    #[test]
+    fn axes_are_multiplied_and_sized() {
+        let text = format!(
+            "iterations = 100\nseeds = [3, 4]\nset = ['train.batch=2']\n---{METHODS}[[setting]]\nname = 'small'\n[[setting]]\nname = 'large'\nsize = 2.5\nset = ['train.sh_degree=1']\n{CODEC}"
+        );
+        let all = trainings(&text).unwrap();
+        assert_eq!(all.len(), 8);
+        let labels: Vec<String> = all.iter().map(|(t, _)| t.label()).collect();
+        assert_eq!((labels[0].as_str(), labels[7].as_str()), ("tiny own small seed 3", "tiny planes large seed 4"));
+        assert_eq!((all[0].0.preset.as_str(), all[4].0.preset.as_str()), ("demo", "demo+hexplane"));
+        let train = |index: usize, key: &str| all[index].1["train"][key].as_integer().unwrap();
+        assert_eq!((train(0, "iterations"), train(2, "iterations"), train(2, "sh_degree"), train(7, "batch")), (100, 250, 1, 2));
+        assert_eq!((all[1].1["seed"].as_integer(), all[1].1["device"].as_str()), (Some(4), Some("flex")));
+        let validation = trainings(&format!("split = 'validation'\n---{METHODS}{CODEC}")).unwrap();
+        assert_eq!(validation[0].1["train"]["validation"].as_integer(), Some(12));
+    }
+
+    #[test]
+    fn mistakes_name_their_place() {
+        let wrong = format!("{METHODS}[[setting]]\nname = 'typo'\nset = ['train.iteratons=5']\n{CODEC}");
+        let message = trainings(&wrong).unwrap_err().to_string();
+        assert!(message.contains("tiny own typo") && message.contains("iteratons"), "{message}");
+        let message = expand(&format!("{METHODS}{CODEC}")).unwrap_err().to_string();
+        assert!(message.contains("codec 'c'") && message.contains("none-linked"), "{message}");
+    }
+
+    #[test]
+    fn plans_are_read_strictly() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(Plan::read(folder.path()).unwrap_err().to_string().contains("sweep plan"));
+        let plan = example();
+        plan.write(folder.path()).unwrap();
+        assert_eq!(Plan::read(folder.path()).unwrap(), plan);
+        plan.check_program().unwrap();
+        let other = Plan { commit: "other".into(), ..plan.clone() };
+        let message = other.check_program().unwrap_err().to_string();
+        assert!(message.contains("other") && message.contains("Plan again"), "{message}");
+        let write = |from: &str, to: &str| {
+            let text = std::fs::read_to_string(folder.path().join(PLAN)).unwrap();
+            std::fs::write(folder.path().join(PLAN), text.replace(from, to)).unwrap();
+            Plan::read(folder.path()).unwrap_err()
+        };
+        assert!(write("00000000000000c0", "../../etc/passwd").to_string().contains("passwd"));
+        assert!(matches!(write("\"schema\": 1", "\"schema\": 9"), Error::Unsupported { .. }));
+        assert!(matches!(write(KIND, "other"), Error::Data { .. }));
+    }
+
+    /// A plan of one training with two cells.
+    pub(in crate::sweep) fn example() -> Plan {
+        let (version, commit) = code_version();
+        let choice = CodecChoice { codec: "raw".into(), field_weights: "fp32".into(), settings: toml::Table::new() };
+        let cell = |id: &str, codec: &str| PlannedCell { id: id.into(), training: "00000000000000a0".into(), codec: codec.into(), choice: choice.clone() };
+        Plan {
+            kind: KIND.into(),
+            schema: SCHEMA,
+            name: "g".into(),
+            version: version.into(),
+            commit: commit.into(),
+            split: ScoredViews::Test,
+            max_views: 0,
+            images: 0,
+            minutes: None,
+            trainings: vec![PlannedTraining {
+                id: "00000000000000a0".into(),
+                scene: "tiny".into(),
+                method: "own".into(),
+                setting: "base".into(),
+                seed: 0,
+                preset: "demo".into(),
+                sets: Vec::new(),
+                data: DataFingerprint { path: "procedural:tiny".into(), hash: "0".into(), files: 0, bytes: 0 },
+                listing: String::new(),
+            }],
+            cells: vec![cell("00000000000000c0", "raw"), cell("00000000000000c1", "half")],
+        }
+    }
+}

@@ -1,0 +1,218 @@
+//! Tables of results: mean and spread over seeds, as Markdown and CSV.
+
+use super::read::check_comparable;
+use super::result::{CellResult, Outcome};
+use cc4dgs_core::{Error, Result};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+
+/// Metrics that the Markdown table shows where they are measured, with their headings and decimals; the CSV table has all.
+const SHOWN: [(&str, &str, usize); 6] = [
+    ("psnr_db", "PSNR dB", 2),
+    ("psnr_dynamic_db", "moving pixels dB", 2),
+    ("ssim", "SSIM", 4),
+    ("ms_ssim", "MS-SSIM", 4),
+    ("lpips", "LPIPS", 4),
+    ("flip", "FLIP", 4),
+];
+
+/// Mean and sample standard deviation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Spread {
+    /// Mean.
+    pub mean: f64,
+    /// Sample standard deviation; `None` of one value.
+    pub deviation: Option<f64>,
+    /// Number of values.
+    pub count: usize,
+}
+
+impl Spread {
+    /// Of `values`; `None` where there are none.
+    pub fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
+        let values: Vec<f64> = values.into_iter().collect();
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
+        (!values.is_empty()).then(|| Self { mean, deviation: (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()), count: values.len() })
+    }
+    fn text(&self, decimals: usize) -> String {
+        match self.deviation {
+            Some(deviation) => format!("{:.decimals$} ± {deviation:.decimals$}", self.mean),
+            None => format!("{:.decimals$}", self.mean),
+        }
+    }
+}
+
+/// Results of one scene, method, setting and codec, over seeds.
+struct Row<'a> {
+    axes: [&'a str; 4],
+    results: Vec<&'a CellResult>,
+}
+
+impl Row<'_> {
+    fn spread(&self, value: impl Fn(&CellResult) -> Option<f64>) -> Option<Spread> {
+        Spread::of(self.results.iter().filter_map(|r| value(r)))
+    }
+}
+
+fn rows(results: &[CellResult]) -> Result<Vec<Row<'_>>> {
+    check_comparable(results)?;
+    let mut rows: BTreeMap<[&str; 4], Vec<&CellResult>> = BTreeMap::new();
+    for result in results {
+        let a = &result.axes;
+        let same = rows.entry([&a.scene, &a.method, &a.setting, &a.codec]).or_default();
+        if let Some(other) = same.iter().find(|other| other.axes.seed == a.seed) {
+            let place = format!("{} {} {} {} seed {}", a.scene, a.method, a.setting, a.codec, a.seed);
+            let problem = format!("the cells {} and {} have the same place in a grid ({place})", other.id, result.id);
+            return Err(Error::data("table of results", problem, "Make a table of each sweep or version of the program"));
+        }
+        same.push(result);
+    }
+    Ok(rows.into_iter().map(|(axes, results)| Row { axes, results }).collect())
+}
+
+/// A Markdown table per scene, and the conditions under which they were measured.
+///
+/// # Errors
+/// As [`check_comparable`], and [`Error::Data`] for two results of the same place in a grid.
+pub fn markdown(results: &[CellResult]) -> Result<String> {
+    let rows = rows(results)?;
+    let Some(first) = results.first() else { return Ok(String::new()) };
+    let metrics: Vec<_> = SHOWN.into_iter().filter(|(name, ..)| results.iter().any(|r| r.metrics.contains_key(*name))).collect();
+    let mut text = format!("# {}\n\n", first.sweep);
+    let device = &first.provenance.device;
+    let adapter = device.adapter.as_ref().map_or_else(String::new, |adapter| format!(" on {adapter}"));
+    let commits: BTreeSet<&str> = results.iter().map(|r| r.provenance.commit.as_str()).collect();
+    // Writing to a string cannot fail.
+    let _ = writeln!(
+        text,
+        "Mean and sample standard deviation over seeds. Device {}{adapter}, {}, {} threads, {}. Commit {}. Scored on {} views, images rounded to 8 bits. \
+         Seconds and milliseconds are wall time on that machine; MB are 10^6 bytes.",
+        device.name,
+        if device.processor.is_empty() { "unknown processor" } else { &device.processor },
+        device.threads,
+        device.system,
+        commits.into_iter().collect::<Vec<_>>().join(", "),
+        format!("{:?}", first.split).to_lowercase(),
+    );
+    let scenes: BTreeSet<&str> = rows.iter().map(|row| row.axes[0]).collect();
+    for scene in scenes {
+        let of_scene: Vec<&Row> = rows.iter().filter(|row| row.axes[0] == scene).collect();
+        let size = of_scene[0].results[0].image_size;
+        let images = of_scene[0].results[0].images.len();
+        let _ = writeln!(text, "\n## {scene}\n\n{images} images of {}x{} pixels.\n", size[0], size[1]);
+        let mut headings = vec!["method", "setting", "codec", "seeds"];
+        headings.extend(metrics.iter().map(|m| m.1));
+        headings.extend(["MB", "Gaussians", "training s", "encode s", "decode s", "frame ms", ""]);
+        let _ = writeln!(text, "| {} |\n|{}", headings.join(" | "), " --- |".repeat(headings.len()));
+        for row in of_scene {
+            let shown = |spread: Option<Spread>, decimals| spread.map_or_else(|| "-".to_string(), |s| s.text(decimals));
+            let mut cells: Vec<String> = row.axes[1..].iter().map(ToString::to_string).collect();
+            cells.push(row.results.len().to_string());
+            cells.extend(metrics.iter().map(|(name, _, decimals)| shown(row.spread(|r| r.metrics.get(*name).map(|s| s.value)), *decimals)));
+            cells.push(shown(row.spread(|r| Some(r.size_mb())), 3));
+            cells.push(shown(row.spread(|r| Some(r.gaussians as f64)), 0));
+            cells.push(shown(row.spread(|r| Some(r.cost.training_seconds)), 1));
+            cells.push(shown(row.spread(|r| Some(r.cost.encode_seconds)), 2));
+            cells.push(shown(row.spread(|r| Some(r.cost.decode_seconds)), 2));
+            cells.push(shown(row.spread(|r| Some(r.cost.frame_ms.mean)), 2));
+            let hopeless = row.results.iter().filter(|r| r.outcome == Outcome::Hopeless).count();
+            cells.push(if hopeless > 0 { format!("{hopeless} hopeless") } else { String::new() });
+            let _ = writeln!(text, "| {} |", cells.join(" | "));
+        }
+    }
+    Ok(text)
+}
+
+/// One CSV table of all results: mean and deviation over seeds of every metric.
+///
+/// # Errors
+/// As [`markdown`].
+pub fn csv(results: &[CellResult]) -> Result<String> {
+    type Value = dyn Fn(&CellResult) -> Option<f64>;
+    let rows = rows(results)?;
+    let metrics: BTreeSet<&String> = results.iter().flat_map(|r| r.metrics.keys()).collect();
+    let mut columns: Vec<(String, Box<Value>)> = Vec::new();
+    for name in metrics {
+        let key = name.clone();
+        columns.push((name.clone(), Box::new(move |r: &CellResult| r.metrics.get(&key).map(|s| s.value))));
+    }
+    let fixed: [(&str, fn(&CellResult) -> Option<f64>); 14] = [
+        ("worst_block_psnr_db", |r| r.blocks.map(|b| b.worst_psnr_db)),
+        ("lost_blocks", |r| r.blocks.map(|b| b.lost)),
+        ("size_mb", |r| Some(r.size_mb())),
+        ("deform_mb", |r| Some(r.storage.deform_bytes as f64 / 1e6)),
+        ("point_cloud_mb", |r| Some(r.storage.point_cloud_bytes as f64 / 1e6)),
+        ("gaussians", |r| Some(r.gaussians as f64)),
+        ("dynamic_gaussians", |r| Some(r.dynamic_gaussians as f64)),
+        ("iterations", |r| Some(r.iterations as f64)),
+        ("training_seconds", |r| Some(r.cost.training_seconds)),
+        ("encode_seconds", |r| Some(r.cost.encode_seconds)),
+        ("decode_seconds", |r| Some(r.cost.decode_seconds)),
+        ("frame_ms", |r| Some(r.cost.frame_ms.mean)),
+        ("peak_memory_mb", |r| r.cost.peak_memory_mb),
+        ("hopeless", |r| Some(f64::from(u8::from(r.outcome == Outcome::Hopeless)))),
+    ];
+    columns.extend(fixed.into_iter().map(|(name, value)| (name.to_string(), Box::new(value) as Box<Value>)));
+    let names = columns.iter().map(|(name, _)| format!("{name},{name}_sd"));
+    let mut text = format!("scene,method,setting,codec,seeds,{}\n", names.collect::<Vec<_>>().join(","));
+    for row in rows {
+        let number = |value: Option<f64>| value.map_or_else(String::new, |v| format!("{v}"));
+        let values = columns.iter().map(|(_, value)| {
+            let spread = row.spread(value);
+            format!("{},{}", number(spread.map(|s| s.mean)), number(spread.and_then(|s| s.deviation)))
+        });
+        let _ = writeln!(text, "{},{},{}", row.axes.join(","), row.results.len(), values.collect::<Vec<_>>().join(","));
+    }
+    Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::read::tests::cell;
+    use super::*;
+
+    fn two_seeds() -> Vec<CellResult> {
+        let with = |id: &str, seed, psnr: f64| {
+            cell(id, |r| {
+                r.axes.seed = seed;
+                r.metrics.get_mut("psnr_db").unwrap().value = psnr;
+            })
+        };
+        vec![with("a", 0, 30.0), with("b", 1, 32.0), cell("c", |r| (r.axes.codec, r.outcome) = ("raw".into(), Outcome::Hopeless))]
+    }
+
+    #[test]
+    fn spreads_are_sample_deviations() {
+        assert_eq!(Spread::of([]), None);
+        assert_eq!(Spread::of([3.0]), Some(Spread { mean: 3.0, deviation: None, count: 1 }));
+        let spread = Spread::of([1.0, 2.0, 3.0, 6.0]).unwrap();
+        assert_eq!((spread.mean, spread.count), (3.0, 4));
+        assert!((spread.deviation.unwrap() - (14.0f64 / 3.0).sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn tables_join_seeds() {
+        let results = two_seeds();
+        let table = markdown(&results).unwrap();
+        assert!(table.contains("| cdf | base | cca | 2 | 31.00 ± 1.41 |") && table.contains("| cdf | base | raw | 1 | 31.25 |"), "{table}");
+        assert!(table.contains("1 hopeless") && table.contains("flex") && table.contains("1 images of 400x400"), "{table}");
+        assert!(!table.contains("LPIPS"), "no result has it: {table}");
+        let csv = csv(&results).unwrap();
+        let lines: Vec<Vec<&str>> = csv.lines().map(|line| line.split(',').collect()).collect();
+        assert!(lines.len() == 3 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");
+        let psnr = lines[0].iter().position(|name| *name == "psnr_db").unwrap();
+        assert_eq!((lines[1][4], lines[1][psnr], lines[2][psnr + 1]), ("2", "31", ""));
+    }
+
+    #[test]
+    fn mixtures_have_no_table() {
+        let mut results = two_seeds();
+        results[1].provenance.device.name = "wgpu".into();
+        assert!(markdown(&results).unwrap_err().to_string().contains("devices") && csv(&results).is_err());
+        let mut results = two_seeds();
+        results[1].axes.seed = 0;
+        assert!(markdown(&results).unwrap_err().to_string().contains("same place"));
+    }
+}

@@ -1,0 +1,159 @@
+//! Runs a training of a sweep, or goes on with one that was interrupted.
+
+use super::facts::{listing, locate, peak_memory_mb};
+use super::folder::SweepFolder;
+use super::plan::PlannedTraining;
+use super::result::{Curve, Outcome};
+use crate::auto;
+use crate::checkpoint::read_config;
+use crate::checks::Verdict;
+use crate::config::RunConfig;
+use crate::event_log::{EVENTS, History, JsonLines, read_history};
+use crate::layers::Layers;
+use crate::train::{CONFIG, TrainJob, train};
+use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::{Error, Event, EventSink, Registry, Result};
+use cc4dgs_play::checkpoint::CHECKPOINT;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+/// What a finished training leaves beside its checkpoint.
+pub const FINISHED: &str = "training.json";
+/// Checkpoints on the way, where the grid does not say: one in so many of the iterations, and between so many iterations.
+const CHECKPOINTS: usize = 8;
+const CHECKPOINT_EVERY: [usize; 2] = [50, 2000];
+
+/// A finished training.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct FinishedTraining {
+    pub outcome: Outcome,
+    pub message: Option<String>,
+    pub iterations: usize,
+    pub verdict: Option<Verdict>,
+    pub curve: Curve,
+    pub curve_seconds: Vec<f64>,
+    pub seconds: f64,
+    pub stage_seconds: BTreeMap<String, f64>,
+    pub resumed: usize,
+    pub peak_memory_mb: Option<f64>,
+}
+
+/// What runs need.
+pub struct Worker<'a> {
+    /// Where plug-ins are found.
+    pub registry: &'a Registry,
+    /// Where events go.
+    pub events: &'a dyn EventSink,
+    /// Set to stop at a safe point.
+    pub stop: &'a AtomicBool,
+}
+
+/// Sends events to the log of a training and to a listener.
+struct Both<'a>(&'a JsonLines, &'a dyn EventSink);
+
+impl EventSink for Both<'_> {
+    fn emit(&self, event: &Event) {
+        self.0.emit(event);
+        self.1.emit(event);
+    }
+}
+
+/// Trains, goes on with what an interrupted process left, or reads what a finished one left. The caller holds the lock.
+pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &PlannedTraining) -> Result<FinishedTraining> {
+    let run = folder.training(&training.id);
+    let record = run.join(FINISHED);
+    if record.is_file() {
+        return read_finished(&record);
+    }
+    let path = locate(&training.data.path)?;
+    if listing(&path)? != training.listing {
+        let problem = "names or sizes of its files are not those of the plan";
+        return Err(Error::data(format!("scene {}", training.data.path), problem, "Restore the dataset, or make the plan again"));
+    }
+    std::fs::create_dir_all(&run).map_err(|e| Error::io(&run, e))?;
+    // Once the configuration is written, it decides: a plan of the preset `auto` is made once.
+    let own = run.join(CONFIG);
+    let begun = own.is_file();
+    let resume = run.join(CHECKPOINT).is_file();
+    let log = JsonLines::open(&run.join(EVENTS), begun)?;
+    let events = Both(&log, worker.events);
+    let (config, scene) = if begun {
+        auto::open(&path, &Layers::collect(worker.registry, None, Some(&own), &[])?, worker.registry, &events)?
+    } else {
+        let layers = training.layers(worker.registry)?;
+        let (mut config, scene) = auto::open(&path, &layers, worker.registry, &events)?;
+        if !layers.state("train.checkpoint_every") {
+            config.train.checkpoint_every = (config.train.iterations / CHECKPOINTS).clamp(CHECKPOINT_EVERY[0], CHECKPOINT_EVERY[1]);
+        }
+        (config, scene)
+    };
+    let job = TrainJob { config: &config, scene, out: Some(run.clone()), resume, registry: worker.registry, events: &events, stop: worker.stop };
+    let (outcome, message, verdict) = match train(&job) {
+        Ok((_, report)) => (Outcome::Done, None, report.verdict),
+        // The checkpoint is there, so the cells can be scored all the same.
+        Err(error @ Error::Failed { .. }) => (Outcome::Hopeless, Some(error.to_string()), None),
+        Err(other) => return Err(other),
+    };
+    let history = read_history(&run.join(EVENTS))?;
+    let (curve, curve_seconds) = curve(&history);
+    let finished = FinishedTraining {
+        outcome,
+        message,
+        iterations: config.train.iterations,
+        verdict,
+        curve,
+        curve_seconds,
+        seconds: history.seconds,
+        stage_seconds: history.stage_seconds,
+        resumed: history.resumed,
+        peak_memory_mb: peak_memory_mb(),
+    };
+    let json =
+        serde_json::to_string(&finished).map_err(|e| Error::backend("training", e.to_string(), "Report this: every training should have a JSON form"))?;
+    write_atomically(&record, json.as_bytes())?;
+    // From the file, as after an interruption: numbers that went through JSON may differ in the last digit.
+    read_finished(&record)
+}
+
+pub(super) fn read_finished(path: &Path) -> Result<FinishedTraining> {
+    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    serde_json::from_str(&text).map_err(|e| Error::data(path.display().to_string(), e.to_string(), "Remove the folder of this training and run it again"))
+}
+
+/// The configuration that a training ran with.
+pub(super) fn config_of(folder: &SweepFolder, training: &PlannedTraining) -> Result<RunConfig> {
+    read_config(&folder.training(&training.id))
+}
+
+/// At most [`Curve::MOST_POINTS`] points of a history, the last one among them, and their seconds.
+fn curve(history: &History) -> (Curve, Vec<f64>) {
+    let n = history.points.len();
+    let wanted = n.min(Curve::MOST_POINTS);
+    let picked: Vec<_> = (1..=wanted).map(|i| history.points[i * n / wanted - 1]).collect();
+    let decimals = |value: f64, digits: i32| (value * 10f64.powi(digits)).round() / 10f64.powi(digits);
+    let curve = Curve {
+        iteration: picked.iter().map(|p| p.iteration).collect(),
+        psnr_db: picked.iter().map(|p| decimals(f64::from(p.psnr_db), 4)).collect(),
+        gaussians: picked.iter().map(|p| p.gaussians).collect(),
+    };
+    (curve, picked.iter().map(|p| decimals(p.seconds, 3)).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::event_log::HistoryPoint;
+
+    #[test]
+    fn curves_are_short_and_end_where_the_training_does() {
+        let point = |iteration| HistoryPoint { iteration, seconds: iteration as f64, psnr_db: 20.0, gaussians: 1 };
+        let of = |count: usize| curve(&History { points: (1..=count).map(point).collect(), ..Default::default() });
+        assert_eq!(of(0).0, Curve::default());
+        assert_eq!(of(3).0.iteration, [1, 2, 3]);
+        let (long, seconds) = of(1234);
+        assert_eq!((long.iteration.len(), long.iteration.last(), seconds.last()), (Curve::MOST_POINTS, Some(&1234), Some(&1234.0)));
+        assert!(long.iteration.windows(2).all(|pair| pair[0] < pair[1]));
+    }
+}
