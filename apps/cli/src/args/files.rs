@@ -1,6 +1,6 @@
 //! Arguments of `decompress`, `render` and `export`: models in the formats of other programs.
 
-use super::UpArg;
+use super::{SplitArg, UpArg};
 use clap::Args;
 use std::path::PathBuf;
 

@@ -206,6 +206,8 @@ fn storage(path: &Path, model: &Model, config: &RunConfig) -> Result<Storage> {
         StreamKind::Canonical => "canonical",
         StreamKind::Field => "field",
         StreamKind::Meta => "meta",
+        StreamKind::Playback => "playback",
+        StreamKind::Poster => "poster",
         StreamKind::Other(_) => "other",
     };
     Ok(Storage {
