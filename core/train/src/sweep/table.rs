@@ -131,6 +131,7 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
 /// As [`markdown`].
 pub fn csv(results: &[CellResult]) -> Result<String> {
     type Value = dyn Fn(&CellResult) -> Option<f64>;
+    type Fixed = fn(&CellResult) -> Option<f64>;
     let rows = rows(results)?;
     let metrics: BTreeSet<&String> = results.iter().flat_map(|r| r.metrics.keys()).collect();
     let mut columns: Vec<(String, Box<Value>)> = Vec::new();
@@ -138,7 +139,7 @@ pub fn csv(results: &[CellResult]) -> Result<String> {
         let key = name.clone();
         columns.push((name.clone(), Box::new(move |r: &CellResult| r.metrics.get(&key).map(|s| s.value))));
     }
-    let fixed: [(&str, fn(&CellResult) -> Option<f64>); 14] = [
+    let fixed: [(&str, Fixed); 14] = [
         ("worst_block_psnr_db", |r| r.blocks.map(|b| b.worst_psnr_db)),
         ("lost_blocks", |r| r.blocks.map(|b| b.lost)),
         ("size_mb", |r| Some(r.size_mb())),
