@@ -1,7 +1,7 @@
 //! The log of a run, `events.jsonl`: one JSON object per line and event.
 
 use cc4dgs_core::{Error, Event, EventSink, Result, Stage};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -77,11 +77,10 @@ pub struct HistoryPoint {
     pub gaussians: usize,
 }
 
-#[derive(Deserialize)]
-struct ReadLine {
-    seconds: f64,
-    #[serde(flatten)]
-    event: Event,
+/// The seconds and the event of a line; `None` where it was cut. An event may have a key `seconds` of its own, so the line's is taken off first.
+fn read_line(line: &str) -> Option<(f64, Event)> {
+    let (seconds, event) = line.strip_prefix("{\"seconds\":")?.split_once(',')?;
+    Some((seconds.parse().ok()?, serde_json::from_str(&format!("{{{event}")).ok()?))
 }
 
 /// Reads the log of a training. Lines that a crash has cut are skipped; the score stage, which compares masks, has no points.
@@ -97,7 +96,7 @@ pub fn read_history(path: &Path) -> Result<History> {
     let (mut iterations, mut earlier, mut last, mut starts) = (0, 0.0, 0.0, 0usize);
     let mut stage: Option<String> = None;
     for line in String::from_utf8_lossy(&text).lines() {
-        let Ok(ReadLine { seconds, event }) = serde_json::from_str::<ReadLine>(line) else { continue };
+        let Some((seconds, event)) = read_line(line) else { continue };
         if seconds < last {
             (earlier, last, stage) = (earlier + last, 0.0, None);
         }
