@@ -5,13 +5,15 @@
 //! * `quantize`: each component quantised separately; the baseline for lossy codecs.
 //! * `vq`: codebooks for shape and colour, as in CompGS.
 //! * `sorted-image`: Gaussians sorted into a square, their columns stored as images.
+//! * `compact`: steps by what is seen, adaptive entropy coding; the smallest files.
 //! * `spz`: Niantic's format, which viewers read.
 //!
-//! Weight codecs for the weights of deformers: `fp32`, `fp16`, `int8`.
+//! Weight codecs for the weights of deformers: `fp32`, `fp16`, `int8`, `compact`.
 //!
 //! All register themselves; link this crate (`use cc4dgs_codecs as _;`, or [`link`] on wasm32) and look them up with [`cc4dgs_format::Entries`].
 
 pub mod cca;
+mod compact;
 mod grid_sort;
 pub mod kmeans;
 pub mod morton;
@@ -25,6 +27,7 @@ mod weights;
 /// Keeps every plug-in of this crate in the program. Linkers for wasm32 drop object files that nothing refers to, and no code refers to a plug-in. On other
 /// targets `use cc4dgs_codecs as _;` is enough.
 pub fn link() {
-    let codecs = [cca::build, quantize::build, raw::build, sorted_image::build, spz::build, vq::build];
-    std::hint::black_box((codecs, weights::build_fp32 as fn(&_) -> _));
+    let codecs = [cca::build, compact::build, quantize::build, raw::build, sorted_image::build, spz::build, vq::build];
+    let weight_codecs: [fn(&_) -> _; 2] = [weights::build_fp32, compact::build_weights];
+    std::hint::black_box((codecs, weight_codecs));
 }

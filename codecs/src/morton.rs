@@ -30,13 +30,23 @@ pub fn order(means: &[f32]) -> Vec<usize> {
 }
 
 /// Puts two zero bits between the low 21 bits of `v`.
-fn spread(v: u64) -> u64 {
+pub(crate) fn spread(v: u64) -> u64 {
     let v = v & 0x1f_ffff;
     let v = (v | v << 32) & 0x1f_0000_0000_ffff;
     let v = (v | v << 16) & 0x1f_0000_ff00_00ff;
     let v = (v | v << 8) & 0x100f_00f0_0f00_f00f;
     let v = (v | v << 4) & 0x10c3_0c30_c30c_30c3;
     (v | v << 2) & 0x1249_2492_4924_9249
+}
+
+/// Undoes [`spread`]; the bits between are ignored.
+pub(crate) fn gather(v: u64) -> u64 {
+    let v = v & 0x1249_2492_4924_9249;
+    let v = (v | v >> 2) & 0x10c3_0c30_c30c_30c3;
+    let v = (v | v >> 4) & 0x100f_00f0_0f00_f00f;
+    let v = (v | v >> 8) & 0x1f_0000_ff00_00ff;
+    let v = (v | v >> 16) & 0x1f_0000_0000_ffff;
+    (v | v >> 32) & 0x1f_ffff
 }
 
 #[cfg(test)]
@@ -48,6 +58,7 @@ mod tests {
         for bit in 0..21 {
             assert_eq!(spread(1 << bit), 1 << (3 * bit));
         }
+        assert!((0..21).all(|bit| gather(spread(1 << bit) | 6 << (3 * bit)) == 1 << bit));
         assert_eq!(spread(0x1f_ffff), (0..21).fold(0, |a, b| a | 1u64 << (3 * b)));
     }
 

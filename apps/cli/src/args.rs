@@ -37,6 +37,8 @@ pub enum Command {
     Train(Train),
     /// Store a trained model as a .cc4d archive.
     Compress(Compress),
+    /// Remove the Gaussians that contribute least, under a budget of PSNR.
+    Prune(Prune),
     /// Write the canonical Gaussians of an archive as a PLY file.
     Decompress(Decompress),
     /// Render a model to PNG frames, and to a video if asked.
@@ -105,13 +107,13 @@ pub struct Compress {
     /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
-    /// Codec, with its profile after a colon.
+    /// Codec, with its profile after a colon, such as compact:max-drop=0.05dB or compact:max-size=5MB.
     #[arg(long, value_name = "NAME[:PROFILE]", default_value = "cca:default")]
     pub codec: String,
     /// Override a setting of the codec; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// Weight codec of the field, such as fp32, fp16 or int8; see `cc4dgs plugins`.
+    /// Weight codec of the field, such as fp32, fp16, int8 or compact; see `cc4dgs plugins`.
     #[arg(long, value_name = "NAME", default_value = "fp32")]
     pub field_weights: String,
     /// The dataset that the model was trained on, for codecs that make use of its training views.
@@ -123,6 +125,31 @@ pub struct Compress {
     /// Device the field is loaded on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
+}
+
+#[derive(Debug, Args)]
+pub struct Prune {
+    /// A run's folder, a checkpoint or an archive.
+    #[arg(value_name = "MODEL")]
+    pub model: PathBuf,
+    /// The dataset that the model was trained on.
+    #[arg(long, value_name = "PATH")]
+    pub scene: PathBuf,
+    /// Largest loss of PSNR in dB, on validation views where the model was trained with some (train.validation), else on training views.
+    #[arg(long, value_name = "DB", default_value = "0.1dB", value_parser = parse_decibels)]
+    pub max_drop: f64,
+    /// The archive to write, lossless; compress it as you would the model.
+    #[arg(long, value_name = "F.cc4d")]
+    pub out: PathBuf,
+    /// Device to render on.
+    #[arg(long, value_name = "NAME", default_value = "flex")]
+    pub device: String,
+}
+
+/// A number of decibels, with or without the unit.
+fn parse_decibels(text: &str) -> Result<f64, String> {
+    let number = text.strip_suffix("dB").unwrap_or(text).trim().parse::<f64>().ok().filter(|v| *v > 0.0 && v.is_finite());
+    number.ok_or_else(|| format!("'{text}' is no positive number of dB, such as 0.1dB"))
 }
 
 #[derive(Debug, Args)]

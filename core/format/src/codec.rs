@@ -32,6 +32,10 @@ pub trait AttributeCodec: Send + Sync {
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>;
     /// The largest error of each attribute. Attributes that are not listed are bit-exact.
     fn losses(&self) -> Vec<DeclaredLoss>;
+    /// Whether a decoded score is above [`CodecContext::dynamic_threshold`] if and only if the given one was, wherever the context of encoding states the threshold.
+    fn keeps_motion(&self) -> bool {
+        false
+    }
 }
 
 /// An attribute codec in the registry.

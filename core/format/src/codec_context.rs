@@ -17,12 +17,14 @@ pub struct CodecContext<'a> {
     pub renderer: Option<&'a dyn RenderModel>,
     /// The deformer of the model; `None` for static models.
     pub deformer: Option<&'a dyn EvaluateDeformer>,
+    /// A Gaussian may move if and only if its dynamic score is above this: minus infinity if all may, infinity if none does. `None` if that is not known.
+    pub dynamic_threshold: Option<f32>,
 }
 
 impl<'a> CodecContext<'a> {
     /// A context without scene, renderer and deformer, as for decoding.
     pub fn new(seed: Seed, limits: Limits, events: &'a dyn EventSink) -> Self {
-        Self { seed, limits, events, views: None, renderer: None, deformer: None }
+        Self { seed, limits, events, views: None, renderer: None, deformer: None, dynamic_threshold: None }
     }
 }
 
@@ -44,6 +46,15 @@ pub trait TrainingViews {
 pub trait RenderModel {
     /// Renders `gaussians`, deformed to `time_norm` (0..1), with `camera`. `gaussians` must have the extra attributes that the deformer reads.
     fn render(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<RenderedPlanes>;
+    /// The colour behind everything, RGB in 0..1.
+    fn background(&self) -> [f32; 3];
+    /// An unbiased estimate, for every value of every column, of the sum over pixels and channels of the squared derivative of the image by that value as it is
+    /// drawn, that is, after deformation. The estimate is the square of the derivative of a sum with signs drawn from `seed` (Hutchinson 1989); averages over
+    /// views or Gaussians are accurate. `None` if the renderer has no derivatives.
+    fn squared_derivatives(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32, seed: Seed) -> Result<Option<HostGaussians>> {
+        let _ = (gaussians, camera, time_norm, seed);
+        Ok(None)
+    }
 }
 
 /// A deformer as a function from canonical Gaussians to deformed ones.

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    CodecContext, DeclaredLoss, Deformer, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
+    AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
     WeightArray, split_kind,
 };
 use serde::Serialize;
@@ -118,9 +118,15 @@ impl Model {
             views: views.as_ref().map(|v| v as &dyn TrainingViews),
             renderer: services.as_ref().map(|s| s as &dyn cc4dgs_core::RenderModel),
             deformer: services.as_ref().filter(|_| self.field.is_some()).map(|s| s as &dyn cc4dgs_core::EvaluateDeformer),
+            dynamic_threshold: Some(match self.moving {
+                _ if self.field.as_ref().is_none_or(|f| f.field.is_static()) => f32::INFINITY,
+                Moving::Everything => f32::NEG_INFINITY,
+                Moving::Nothing => f32::INFINITY,
+                Moving::Scored { zeta } => zeta,
+            }),
             ..CodecContext::new(seed, *limits, events)
         };
-        let streams = codec.encode(&self.for_codec(&codec.losses()), &context(codec_seed(self.provenance.seed)))?;
+        let streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
         // A field that moves nothing is not stored.
         let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
         let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
@@ -172,11 +178,12 @@ impl Model {
         }
         writer.write_to(path)
     }
-    /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move. `losses` are the codec's.
-    fn for_codec(&self, losses: &[DeclaredLoss]) -> HostGaussians {
+    /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
+    fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {
         let mut out = self.gaussians.clone();
         let Some(field) = &self.field else { return out };
         // A score just under the threshold may come back over it.
+        let losses = if codec.keeps_motion() { Vec::new() } else { codec.losses() };
         let slack = losses.iter().find(|l| l.attribute == "dynamic_scores").map_or(0.0, |l| SCORE_SLACK * l.relative_rms * deviation(&out.dynamic_scores));
         let moving = match self.moving {
             Moving::Scored { zeta } => Moving::Scored { zeta: zeta - slack as f32 },

@@ -4,11 +4,11 @@ use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, EvaluateDeformer, Gaussians, HostGaussians, Image8, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes, Result, Scene, SpatialInput,
-    Splats, Split, TrainingViews,
+    Camera, EvaluateDeformer, Gaussians, HostGaussians, Image8, Rasterizer, Registry, RenderModel, ParameterSpace, RenderSettings, RenderedPlanes, Result, Scene, Seed, SpatialInput,
+    SplatColors, Splats, Split, TrainingViews,
 };
 
-/// The training views of a scene.
+/// The views of one split of a scene.
 pub struct SceneViews<'a> {
     scene: &'a Scene,
     views: Vec<usize>,
@@ -17,7 +17,11 @@ pub struct SceneViews<'a> {
 impl<'a> SceneViews<'a> {
     /// The training views of `scene`, in its order.
     pub fn new(scene: &'a Scene) -> Self {
-        Self { scene, views: scene.split(Split::Train) }
+        Self::of(scene, Split::Train)
+    }
+    /// The views of `split`, in the order of `scene`.
+    pub fn of(scene: &'a Scene, split: Split) -> Self {
+        Self { scene, views: scene.split(split) }
     }
 }
 
@@ -77,4 +81,54 @@ impl RenderModel for ModelServices<'_> {
         let output = self.rasterizer.render(&Splats::from_gaussians(&moved, moved.sh_degree), camera, &self.settings)?;
         Ok(RenderedPlanes { width: camera.width, height: camera.height, planes: to_vec(output.planes, "rendered planes")? })
     }
+    fn background(&self) -> [f32; 3] {
+        self.model.background_on(None)
+    }
+    fn squared_derivatives(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32, seed: Seed) -> Result<Option<HostGaussians>> {
+        let tracked = self.device.clone().autodiff();
+        let leaf = |t: Tensor<2>| Tensor::<2>::from_inner(t).require_grad();
+        let moved = self.moved(gaussians, time_norm)?;
+        let [n, coefficients, _] = moved.sh_rest.dims();
+        let (means, log_scales, quaternions, sh_dc) = (leaf(moved.means), leaf(moved.log_scales), leaf(moved.quaternions), leaf(moved.sh_dc));
+        let opacity_logits = Tensor::<1>::from_inner(moved.opacity_logits).require_grad();
+        let sh_rest = Tensor::<3>::from_inner(moved.sh_rest).require_grad();
+        let splats = Splats {
+            means: means.clone(),
+            scales: log_scales.clone(),
+            quaternions: quaternions.clone(),
+            opacities: opacity_logits.clone(),
+            colors: SplatColors::Sh { dc: sh_dc.clone(), rest: sh_rest.clone(), degree: moved.sh_degree },
+            space: ParameterSpace::Raw,
+            screen_probe: None,
+            absolute_screen_probe: None,
+            camera_probe: None,
+        };
+        let background = self.settings.background.clone().map(Tensor::<1>::from_inner);
+        let planes = self.rasterizer.render(&splats, camera, &RenderSettings { background, ..self.settings.clone() })?.image();
+        let shape = planes.dims();
+        let signs = rand_signs(seed, shape.iter().product());
+        let gradients = (planes * Tensor::<3>::from_data(TensorData::new(signs, shape), &tracked)).sum().backward();
+        fn squared<const D: usize>(gradient: Option<Tensor<D>>, count: usize, name: &str) -> Result<Vec<f32>> {
+            // A tensor that no pixel depends on has no gradient.
+            let Some(gradient) = gradient else { return Ok(vec![0.0; count]) };
+            Ok(to_vec(gradient, name)?.into_iter().map(|v| if v.is_finite() { v * v } else { 0.0 }).collect())
+        }
+        Ok(Some(HostGaussians {
+            sh_degree: moved.sh_degree,
+            means: squared(means.grad(&gradients), 3 * n, "derivatives by centres")?,
+            log_scales: squared(log_scales.grad(&gradients), 3 * n, "derivatives by scales")?,
+            quaternions: squared(quaternions.grad(&gradients), 4 * n, "derivatives by rotations")?,
+            opacity_logits: squared(opacity_logits.grad(&gradients), n, "derivatives by opacities")?,
+            sh_dc: squared(sh_dc.grad(&gradients), 3 * n, "derivatives by colours")?,
+            sh_rest: squared(sh_rest.grad(&gradients), 3 * n * coefficients, "derivatives by colours")?,
+            dynamic_scores: vec![0.0; n],
+            extra: Default::default(),
+        }))
+    }
+}
+
+/// `count` numbers of 1 and -1.
+fn rand_signs(seed: Seed, count: usize) -> Vec<f32> {
+    let word = |k: usize| seed.index(k as u64).value();
+    (0..count.div_ceil(64)).flat_map(|k| (0..64).map(move |bit| if word(k) >> bit & 1 == 1 { 1.0 } else { -1.0 })).take(count).collect()
 }

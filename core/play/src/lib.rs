@@ -11,6 +11,7 @@ pub mod model;
 mod moving;
 mod orbit;
 pub mod player;
+pub mod prune;
 mod render;
 pub mod source;
 

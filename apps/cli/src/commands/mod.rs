@@ -8,6 +8,7 @@ mod doctor;
 mod eval;
 mod info;
 mod plugins;
+mod prune;
 mod render;
 mod storage;
 mod train;
@@ -58,6 +59,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Demo(args) => demo::run(&context, args),
         Command::Train(args) => train::run(&context, args),
         Command::Compress(args) => compress::run(&context, args),
+        Command::Prune(args) => prune::run(&context, args),
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),

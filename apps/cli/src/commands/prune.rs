@@ -1,0 +1,51 @@
+//! `cc4dgs prune`.
+
+use super::compress::compress;
+use super::{Context, create_parent};
+use crate::args::Prune;
+use crate::models::load_model;
+use cc4dgs::scenes::open_as_trained;
+use cc4dgs_core::Result;
+use cc4dgs_play::ArchiveOptions;
+use cc4dgs_play::prune::{PruneReport, prune};
+use serde::Serialize;
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// What pruning came to.
+#[derive(Serialize)]
+struct Report {
+    archive: PathBuf,
+    bytes: u64,
+    seconds: f64,
+    #[serde(flatten)]
+    prune: PruneReport,
+}
+
+pub fn run(context: &Context, args: &Prune) -> Result<()> {
+    let began = Instant::now();
+    let events = context.listeners(None)?;
+    create_parent(&args.out)?;
+    let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let scene = open_as_trained(&args.scene, &loaded.model, &[], &context.registry, &context.limits)?;
+    let found = prune(&mut loaded.model, &scene, args.max_drop, &context.registry, &loaded.device, &events)?;
+    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None };
+    let written = compress(context, &loaded.model, &options, &args.out, &events)?;
+    let report = Report { archive: args.out.clone(), bytes: written.bytes, seconds: began.elapsed().as_secs_f64(), prune: found };
+    context.output.result(&report, || text(&report))
+}
+
+fn text(report: &Report) -> String {
+    let p = &report.prune;
+    format!(
+        "{}: {} of {} Gaussians kept, PSNR {:.3} dB instead of {:.3} dB on {} {:?} views, {:.1} s",
+        report.archive.display(),
+        p.after,
+        p.before,
+        p.psnr_after_db,
+        p.psnr_before_db,
+        p.views,
+        p.judged_by,
+        report.seconds
+    )
+}

@@ -1,0 +1,90 @@
+#!/usr/bin/env python3
+"""Sizes, losses and times of codecs: a table of every codec on given models.
+
+    benches/codecs.py --cc4dgs target/release/cc4dgs --out benches/results/NAME [--codecs raw,quantize,...] MODEL=NAME[:SCENE]...
+
+With SCENE, PSNR and SSIM are those of `cc4dgs eval` on the test views, and codecs are given the scene. Without, a model is rendered from an orbit before and
+after by the example `compare`, which lies beside the program, and PSNR is between the two. Writes NAME.json and NAME.md, which hold numbers only.
+"""
+import argparse, json, pathlib, re, subprocess, sys, tempfile
+
+CODECS = "raw,quantize,sorted-image,spz,vq,cca:low,cca:mid,cca:default,compact"
+FRAMES = 12
+
+
+def run(program, *arguments):
+    done = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{' '.join(map(str, arguments))}: {done.stderr.strip()}")
+    return done.stdout, done.stderr
+
+
+def between(program, model, other):
+    return json.loads(run(pathlib.Path(program).parent / "examples/compare", model, other, FRAMES)[0])["psnr_db"]
+
+
+def measure(program, model, scene, codec, weights, settings, before, folder):
+    archive = pathlib.Path(folder) / f"{re.sub('[^a-z0-9]', '-', codec)}.cc4d"
+    chosen = [part for s in settings for part in ("--set", s)]
+    with_scene = ["--scene", scene] if scene else []
+    text, notes = run(program, "compress", model, "--codec", codec, "--field-weights", weights, "--out", archive, "--json", "-", *chosen, *with_scene)
+    report = json.loads(text)
+    row = {
+        "codec": " ".join([codec, *settings]),
+        "field_weights": weights,
+        "gaussians": report["gaussians"],
+        "total_mb": report["size_mb"]["total"],
+        "gaussians_mb": report["size_mb"]["point_cloud"],
+        "field_mb": report["size_mb"]["deform"],
+        "bytes_per_gaussian": round(1e6 * report["size_mb"]["point_cloud"] / report["gaussians"], 3),
+        "encode_s": round(report["seconds"], 2),
+        "streams": {s["name"]: round(s["stored_bytes"] / report["gaussians"], 3) for s in report["streams"] if s["kind"] == "canonical"},
+    }
+    if scene:
+        found = json.loads(run(program, "eval", archive, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet")[0])
+        row |= {"psnr_db": found["psnr_db"], "ssim": found["ssim"], "drop_db": before["psnr_db"] - found["psnr_db"], "ssim_drop": before["ssim"] - found["ssim"]}
+    else:
+        row["psnr_between_db"] = between(program, model, archive)
+    return row
+
+
+def table(rows, scene):
+    loss = ["drop dB", "SSIM drop"] if scene else ["PSNR between dB"]
+    lines = ["| codec | weights | " + " | ".join(loss) + " | bytes per Gaussian | Gaussians MB | total MB | encode s | bytes per Gaussian by stream |", "|" + " --- |" * (7 + len(loss))]
+    for r in rows:
+        numbers = [f"{r['drop_db']:.3f}", f"{r['ssim_drop']:.4f}"] if scene else [f"{r['psnr_between_db']:.2f}"]
+        streams = ", ".join(f"{k} {v:.2f}" for k, v in r["streams"].items() if v >= 0.005)
+        lines.append(f"| {r['codec']} | {r['field_weights']} | {' | '.join(numbers)} | {r['bytes_per_gaussian']:.2f} | {r['gaussians_mb']:.4f} | {r['total_mb']:.4f} | {r['encode_s']} | {streams} |")
+    return lines
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cc4dgs", default="target/release/cc4dgs")
+    parser.add_argument("--out", type=pathlib.Path, required=True)
+    parser.add_argument("--codecs", default=CODECS)
+    parser.add_argument("--weights", default="fp16")
+    parser.add_argument("--ablation", action="store_true", help="compact with each of its ideas switched off")
+    parser.add_argument("models", nargs="+", metavar="MODEL=NAME[:SCENE]")
+    args = parser.parse_args()
+    switches = ["adaptive=false", "measured=false", "transform=false", "canonical=false", "dead_zone=0.0"] if args.ablation else []
+    results, lines = [], []
+    for spec in args.models:
+        model, name = spec.split("=", 1)
+        name, _, scene = name.partition(":")
+        with tempfile.TemporaryDirectory() as folder:
+            before = None
+            if scene:
+                before = json.loads(run(args.cc4dgs, "eval", model, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet")[0])
+            todo = [(codec, []) for codec in args.codecs.split(",")] + [("compact", [s]) for s in switches]
+            rows = [measure(args.cc4dgs, model, scene, codec, args.weights, settings, before, folder) for codec, settings in todo]
+        about = f"{name}: {rows[0]['gaussians']} Gaussians" + (f", {before['psnr_db']:.3f} dB, SSIM {before['ssim']:.4f} on test views" if scene else ", no scene: PSNR between renders")
+        results.append({"model": name, "scene": bool(scene), "psnr_db": before["psnr_db"] if scene else None, "rows": rows})
+        lines += [f"## {about}", "", *table(rows, scene), ""]
+    args.out.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
+    args.out.with_suffix(".md").write_text("\n".join(lines))
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+//! Bytes per stream and seconds of codecs on a PLY file, repeated to a larger model: `codec_speed FILE.ply REPEAT CODEC[:PROFILE]...`, JSON lines.
+#![allow(clippy::print_stdout, reason = "its output is what it is for")]
+
+use cc4dgs_format::archive::{Archive, ArchiveWriter, Manifest, StreamKind};
+use cc4dgs_format::{CodecContext, CodecPlugin, Entries, Error, HostGaussians, Limits, Result, Seed, Silent, ply, toml};
+use std::time::Instant;
+
+fn main() -> Result<()> {
+    cc4dgs_codecs::link();
+    let arguments: Vec<String> = std::env::args().collect();
+    let [_, path, repeat, specs @ ..] = arguments.as_slice() else {
+        return Err(Error::parameter("codec_speed", "too few arguments", "Write codec_speed FILE.ply REPEAT CODEC[:PROFILE]..."));
+    };
+    let repeat = repeat.parse::<usize>().map_err(|e| Error::parameter("REPEAT", e.to_string(), "Write a number of copies"))?;
+    let limits = Limits::default();
+    let gaussians = repeated(&ply::read(std::path::Path::new(path), &limits)?, repeat);
+    let context = CodecContext { dynamic_threshold: Some(f32::INFINITY), ..CodecContext::new(Seed::root(0), limits, &Silent) };
+    let codecs = Entries::<CodecPlugin>::collect()?;
+    for spec in specs {
+        let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
+        let codec = (codecs.get(name)?.build)(profile, &toml::Table::new())?;
+        let began = Instant::now();
+        let streams = codec.encode(&gaussians, &context)?;
+        let encode = began.elapsed().as_secs_f64();
+        let manifest = Manifest { frame_count: 1, gaussian_count: gaussians.len() as u64, ..Default::default() };
+        let archive = Archive::from_bytes("memory", ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).to_bytes()?, &limits)?;
+        let mut decode = f64::INFINITY;
+        for _ in 0..3 {
+            let began = Instant::now();
+            let found = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
+            decode = decode.min(began.elapsed().as_secs_f64());
+            assert_eq!(found.len(), gaussians.len());
+        }
+        let per = |bytes: u64| (1000.0 * bytes as f64 / gaussians.len().max(1) as f64).round() / 1000.0;
+        let streams: Vec<String> = archive.stream_sizes().iter().map(|s| format!("\"{}\":{}", s.name, per(s.stored_bytes))).collect();
+        let bytes = archive.total_bytes()?;
+        println!(
+            "{{\"codec\":\"{spec}\",\"gaussians\":{},\"bytes\":{bytes},\"bytes_per_gaussian\":{},\"encode_s\":{encode:.3},\"decode_s\":{decode:.4},\"streams\":{{{}}}}}",
+            gaussians.len(),
+            per(bytes),
+            streams.join(",")
+        );
+    }
+    Ok(())
+}
+
+/// Copies of `gaussians` side by side, so that no two Gaussians are equal.
+fn repeated(gaussians: &HostGaussians, repeat: usize) -> HostGaussians {
+    let mut out = gaussians.select(&(0..gaussians.len() * repeat).map(|i| i % gaussians.len().max(1)).collect::<Vec<_>>());
+    let wide = gaussians.means.iter().fold(0.0f32, |a, v| a.max(v.abs()));
+    for (i, mean) in out.means.chunks_exact_mut(3).enumerate() {
+        let copy = i / gaussians.len().max(1);
+        mean[0] += 2.1 * wide * (copy % 3) as f32;
+        mean[2] += 2.1 * wide * (copy / 3) as f32;
+    }
+    out
+}

@@ -1,0 +1,229 @@
+//! From Gaussians to integers: classes, canonical rotations, steps, order, and rows that are stored exactly.
+
+use super::colors::{Choices, Degree};
+use super::geometry::{CODE_LIMIT, GRID_BITS, Geometry, companded};
+use super::importance::{Importance, median};
+use cc4dgs_format::HostGaussians;
+use rayon::prelude::*;
+
+/// The coarsest class.
+pub const CLASSES: u8 = 12;
+/// Share of the Gaussians with the largest weights that share class 0.
+const FINEST: f64 = 1e-3;
+/// Largest step of a centre, in middle scales.
+const LARGEST_STEP: f64 = 1.0;
+/// Norms of quaternions outside are stored exactly: an absolute step would be wrong for them.
+const NORMS: std::ops::Range<f64> = 0.2..5.0;
+/// Log-scales of larger magnitude are stored exactly.
+const LOG_SCALE_LIMIT: f32 = 60.0;
+/// Share of the centres at either end of an axis that may lie outside of the grid, if the grid is too coarse otherwise.
+const OUTSIDE: f64 = 5e-4;
+
+/// Everything that is stored, in the order of the Gaussians given.
+pub struct Integers {
+    pub geometry: Geometry,
+    pub degrees: Vec<Degree>,
+    pub classes: Vec<u8>,
+    pub scales: Vec<[i32; 3]>,
+    pub rotations: Vec<[i32; 4]>,
+    pub opacities: Vec<i32>,
+    pub keys: Vec<u64>,
+    /// `[N,dims]` per degree.
+    pub colors: Vec<Vec<i32>>,
+    /// Rows whose values are stored as float32, by column: means, log-scales, quaternions, opacity logits, then degrees.
+    pub exact: Vec<Vec<usize>>,
+}
+
+/// Whether a row's axes and the sign and norm of its quaternion are free to choose, because nothing is added to them.
+pub fn canonical(gaussians: &HostGaussians, free: &[bool]) -> HostGaussians {
+    let mut out = gaussians.clone();
+    let rows = out.quaternions.par_chunks_exact_mut(4).zip(out.log_scales.par_chunks_exact_mut(3)).zip(free);
+    rows.filter(|(_, free)| **free).for_each(|((q, s), _)| canonical_row(q, s));
+    out
+}
+
+/// Sorts the scales, largest first, and turns the quaternion to the one of its kind with the largest w.
+fn canonical_row(q: &mut [f32], s: &mut [f32]) {
+    let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
+    if !(norm > 1e-12 && norm.is_finite()) {
+        return;
+    }
+    let mut unit: [f64; 4] = std::array::from_fn(|k| f64::from(q[k]) / norm);
+    // Exchanging two axes is a quarter turn about the third, up to signs of axes, which do not matter.
+    for (a, b) in [(0, 1), (1, 2), (0, 1)] {
+        if s[a] < s[b] {
+            s.swap(a, b);
+            let mut quarter = [std::f64::consts::FRAC_1_SQRT_2, 0.0, 0.0, 0.0];
+            quarter[1 + (3 - a - b)] = std::f64::consts::FRAC_1_SQRT_2;
+            unit = product(unit, quarter);
+        }
+    }
+    // Half turns about the axes change nothing.
+    let halves = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+    let turned = halves.map(|half| product(unit, half));
+    let best = (0..4).max_by(|&a, &b| turned[a][0].abs().total_cmp(&turned[b][0].abs())).unwrap_or(0);
+    let sign = if turned[best][0] < 0.0 { -1.0 } else { 1.0 };
+    q.iter_mut().zip(turned[best]).for_each(|(q, v)| *q = (sign * v) as f32);
+}
+
+/// Hamilton's product of (w,x,y,z).
+fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+    [
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ]
+}
+
+/// Class of each Gaussian, and the weight of class 0.
+pub fn classify(weights: &[f64], adaptive: bool) -> (Vec<u8>, f64) {
+    let mut sorted: Vec<f64> = weights.iter().copied().filter(|w| *w > 0.0 && w.is_finite()).collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    if sorted.is_empty() {
+        return (vec![0; weights.len()], 1.0);
+    }
+    if !adaptive {
+        // One step for all that costs as much error as steps of their own would.
+        return (vec![0; weights.len()], (sorted.iter().map(|w| w * w).sum::<f64>() / sorted.len() as f64).sqrt());
+    }
+    let top = sorted[sorted.len() - 1 - (FINEST * sorted.len() as f64) as usize];
+    let class = |w: &f64| if *w > 0.0 { libm::log2(top / w).round().clamp(0.0, f64::from(CLASSES)) as u8 } else { CLASSES };
+    (weights.iter().map(class).collect(), top)
+}
+
+/// Factors of the steps of the columns means, log-scales, quaternions, opacity logits, degree 0 and higher degrees.
+pub type Factors = [f64; 6];
+
+/// Quantises canonical Gaussians with the step `quality` / weight for colours.
+pub fn quantise(
+    gaussians: &HostGaussians,
+    free: &[bool],
+    importance: &Importance,
+    (classes, top): (&[u8], f64),
+    quality: f64,
+    factors: &Factors,
+    choices: &Choices,
+) -> Integers {
+    let (base, steps, n) = (quality / top, importance.steps, gaussians.len());
+    let positive = |v: f64| (v as f32).clamp(1e-18, 1e18);
+    let finite: Vec<f64> = gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v)).collect();
+    let mut geometry = Geometry {
+        scale_origin: (finite.iter().sum::<f64>() / finite.len().max(1) as f64) as f32,
+        scale_step: positive((base * steps.log_scales * factors[1]).min(1.0)),
+        rotation_step: positive(base * steps.quaternions * factors[2]),
+        opacity_step: positive(base * steps.opacity_logits * factors[3]),
+        corner: [0.0; 3],
+        cell: 1.0,
+        size_floor: 0,
+        class_limit: 0,
+    };
+    let mut exact = vec![Vec::new(); 4];
+    let mut scales = vec![[0i32; 3]; n];
+    for (i, (codes, values)) in scales.iter_mut().zip(gaussians.log_scales.chunks_exact(3)).enumerate() {
+        let step = f64::from(geometry.scale_step) * f64::from(1u32 << classes[i]);
+        let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
+        match found {
+            [Some(a), Some(b), Some(c)] if values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
+            _ => exact[1].push(i),
+        }
+    }
+    grid(&mut geometry, gaussians, importance, base * steps.means * factors[0]);
+    let mut keys = vec![0u64; n];
+    for (i, (key, mean)) in keys.iter_mut().zip(gaussians.means.chunks_exact(3)).enumerate() {
+        match geometry.key(mean, geometry.position_shift(scales[i], classes[i])).filter(|_| factors[0] > 0.0) {
+            Some(found) => *key = found,
+            None => exact[0].push(i),
+        }
+    }
+    let mut rotations = vec![[0i32; 4]; n];
+    for (i, (codes, q)) in rotations.iter_mut().zip(gaussians.quaternions.chunks_exact(4)).enumerate() {
+        let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
+        let step = geometry.rotation(geometry.rotation_shift(scales[i], classes[i]));
+        let skip = usize::from(free[i]);
+        let found: Option<Vec<i32>> = q[skip..].iter().map(|&v| code(f64::from(v) / step)).collect();
+        match found.filter(|_| NORMS.contains(&norm)) {
+            Some(found) => codes[..found.len()].copy_from_slice(&found),
+            None => exact[2].push(i),
+        }
+    }
+    let mut opacities = vec![0i32; n];
+    for (i, (out, &logit)) in opacities.iter_mut().zip(&gaussians.opacity_logits).enumerate() {
+        match code(companded(logit) / (f64::from(geometry.opacity_step) * f64::from(1u32 << classes[i]))) {
+            Some(found) => *out = found,
+            None => exact[3].push(i),
+        }
+    }
+    let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
+    let (mut degrees, mut colors) = (Vec::new(), Vec::new());
+    for degree in 0..=gaussians.sh_degree {
+        let rows = coefficients(gaussians, degree);
+        let dims = 3 * (2 * degree + 1);
+        let (relative, factor) = if degree == 0 { (1.0, factors[4]) } else { (steps.sh_rest[degree - 1], factors[5]) };
+        let choices = Choices { dead_zone: if degree == 0 { 0.0 } else { choices.dead_zone }, ..*choices };
+        let plan = Degree::plan(&rows, dims, classes, &squared, positive(base * relative * factor), &choices);
+        let mut missing = Vec::new();
+        let mut codes = vec![0; n * dims];
+        for (i, (row, out)) in plan.quantise(&rows, classes, &choices).into_iter().zip(codes.chunks_exact_mut(dims)).enumerate() {
+            match row {
+                Some(row) => out.copy_from_slice(&row),
+                None => missing.push(i),
+            }
+        }
+        exact.push(missing);
+        degrees.push(plan);
+        colors.push(codes);
+    }
+    Integers { geometry, degrees, classes: classes.to_vec(), scales, rotations, opacities, keys, colors, exact }
+}
+
+fn code(steps: f64) -> Option<i32> {
+    let code = steps.round();
+    (code.abs() < CODE_LIMIT as f64).then_some(code as i32)
+}
+
+/// The coefficients of one degree `[N, 3 (2 degree + 1)]`.
+pub fn coefficients(gaussians: &HostGaussians, degree: usize) -> Vec<f32> {
+    if degree == 0 {
+        return gaussians.sh_dc.clone();
+    }
+    let width = 3 * cc4dgs_format::gaussians::sh_rest_len(gaussians.sh_degree);
+    let (from, to) = (3 * (degree * degree - 1), 3 * ((degree + 1) * (degree + 1) - 1));
+    gaussians.sh_rest.chunks_exact(width).flat_map(|row| &row[from..to]).copied().collect()
+}
+
+/// Chooses the grid of the centres: `relative` is the step of class 0 over the middle scale.
+fn grid(geometry: &mut Geometry, gaussians: &HostGaussians, importance: &Importance, relative: f64) {
+    let relative = relative.clamp(1e-9, 0.5);
+    let middle: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
+    // Below half a pixel all Gaussians look alike.
+    let pixel = if importance.pixels_per_unit > 0.0 { libm::log(0.5 / importance.pixels_per_unit) } else { -60.0 };
+    let floor = pixel.max(median(&middle) - 6.0).clamp(-60.0, 60.0);
+    geometry.size_floor = (floor / std::f64::consts::LN_2 * 65536.0) as i64;
+    let mut cell = relative * libm::exp(floor);
+    geometry.class_limit = libm::log2(LARGEST_STEP / relative).clamp(0.0, 15.0) as u8;
+    let cells = f64::from(1u32 << GRID_BITS);
+    let mut axes: Vec<Vec<f64>> = (0..3).map(|k| gaussians.means.iter().skip(k).step_by(3).map(|&v| f64::from(v)).collect()).collect();
+    axes.iter_mut().for_each(|axis| axis.sort_unstable_by(f64::total_cmp));
+    for cut in [0.0, OUTSIDE] {
+        let mut largest = 0.0f64;
+        for (axis, corner) in axes.iter().zip(&mut geometry.corner) {
+            let last = axis.len().saturating_sub(1);
+            let skip = (cut * axis.len() as f64).ceil() as usize;
+            let (low, high) = match axis.get(skip.min(last)).zip(axis.get(last.saturating_sub(skip))) {
+                Some((&low, &high)) if low <= high => (low, high),
+                _ => (0.0, 0.0),
+            };
+            let margin = if cut > 0.0 { 0.02 * (high - low) } else { 0.0 };
+            *corner = low - margin;
+            largest = largest.max(high - low + 2.0 * margin);
+        }
+        if largest / cell < cells - 2.0 {
+            break;
+        }
+        if cut > 0.0 {
+            cell = largest / (cells - 2.0);
+        }
+    }
+    geometry.cell = cell.max(1e-30);
+}

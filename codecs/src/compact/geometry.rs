@@ -1,0 +1,199 @@
+//! Scales, rotations, opacities and centres: their steps, and the coding of their integers.
+//!
+//! All steps double with each class. Rotations have finer steps where scales differ more, and centres where the Gaussian is smaller. Both are computed in
+//! integers from scales that are already decoded, so that every machine finds the same steps.
+
+use super::entropy::{Coder, Model, signed};
+use crate::morton::{gather, spread};
+use cc4dgs_format::archive::ByteReader;
+use cc4dgs_format::{Error, Result};
+
+/// Bits per axis of the grid of the centres.
+pub const GRID_BITS: u32 = 21;
+/// Codes are smaller in magnitude.
+pub const CODE_LIMIT: i64 = 1 << 24;
+/// Rotations of Gaussians whose scales are within a factor of sqrt(2), 2, 4, 8 and more: steps are halved so many times.
+const FINER: [i32; 4] = [-2, 1, 2, 3];
+/// Contexts of rotations start at this exponent of their step.
+const ROTATION_CONTEXTS: i32 = 4;
+
+/// Steps and origins.
+#[derive(Clone, Debug)]
+pub struct Geometry {
+    /// Mean log-scale.
+    pub scale_origin: f32,
+    /// Step of log-scales of class 0.
+    pub scale_step: f32,
+    /// Step of quaternion components of class 0 where scales are within a factor of 2.
+    pub rotation_step: f32,
+    /// Step of companded opacities of class 0.
+    pub opacity_step: f32,
+    /// Lower corner of the grid of the centres.
+    pub corner: [f64; 3],
+    /// Edge of a cell of the grid.
+    pub cell: f64,
+    /// Size of a Gaussian, in octaves times 2^16, at which a centre of class 0 has one cell; smaller ones have no finer steps.
+    pub size_floor: i64,
+    /// Centres of coarser classes have the steps of this one.
+    pub class_limit: u8,
+}
+
+impl Geometry {
+    /// Octaves per step of a log-scale of class 0, times 2^16.
+    fn octave(&self) -> i64 {
+        (f64::from(self.scale_step) / std::f64::consts::LN_2 * 65536.0) as i64
+    }
+    fn size_origin(&self) -> i64 {
+        (f64::from(self.scale_origin) / std::f64::consts::LN_2 * 65536.0) as i64
+    }
+    /// The middle scale (octaves times 2^16), and the octaves between largest and smallest.
+    fn size(&self, codes: [i32; 3], class: u8) -> (i64, usize) {
+        let [low, middle, high] = sorted(codes).map(|c| (i64::from(c) << class).clamp(-(1 << 36), 1 << 36));
+        let octaves = |steps: i64| steps.saturating_mul(self.octave().min(1 << 20));
+        (self.size_origin().saturating_add(octaves(middle)), ((octaves(high - low) + 32768) >> 16).clamp(0, 3) as usize)
+    }
+    /// How many times the step of a centre is doubled.
+    pub fn position_shift(&self, scales: [i32; 3], class: u8) -> u32 {
+        let larger = self.size(scales, class).0.saturating_sub(self.size_floor).max(0).saturating_add(32768);
+        (i64::from(class.min(self.class_limit)) + (larger >> 16)).min(i64::from(GRID_BITS)) as u32
+    }
+    /// How many times the step of a rotation is doubled, or halved if negative.
+    pub fn rotation_shift(&self, scales: [i32; 3], class: u8) -> i32 {
+        i32::from(class) - FINER[self.size(scales, class).1]
+    }
+    pub fn write(&self, meta: &mut Vec<u8>) {
+        [self.scale_origin, self.scale_step, self.rotation_step, self.opacity_step].iter().for_each(|v| meta.extend(v.to_le_bytes()));
+        self.corner.iter().chain([&self.cell]).for_each(|v| meta.extend(v.to_le_bytes()));
+        meta.extend(self.size_floor.to_le_bytes());
+        meta.push(self.class_limit);
+    }
+    pub fn read(meta: &mut ByteReader) -> Result<Self> {
+        let floats = meta.f32s(4)?;
+        let doubles = (0..4).map(|_| Ok(f64::from_bits(meta.u64()?))).collect::<Result<Vec<f64>>>()?;
+        let (size_floor, class_limit) = (meta.u64()? as i64, meta.u8()?);
+        if doubles.iter().any(|v| !v.is_finite()) || floats[1..].iter().any(|v| *v <= 0.0) || doubles[3] <= 0.0 || class_limit > 15 {
+            return Err(meta.error("a step or an origin is impossible"));
+        }
+        Ok(Self {
+            scale_origin: floats[0],
+            scale_step: floats[1],
+            rotation_step: floats[2],
+            opacity_step: floats[3],
+            corner: [doubles[0], doubles[1], doubles[2]],
+            cell: doubles[3],
+            size_floor,
+            class_limit,
+        })
+    }
+    pub fn scale(&self, code: i32, class: u8) -> f32 {
+        (f64::from(self.scale_origin) + f64::from(code) * f64::from(self.scale_step) * f64::from(1u32 << class)) as f32
+    }
+    pub fn opacity(&self, code: i32, class: u8) -> f32 {
+        let value = f64::from(code) * f64::from(self.opacity_step) * f64::from(1u32 << class);
+        (if value < 0.0 { value } else { libm::expm1(value) } as f32).clamp(f32::MIN, f32::MAX)
+    }
+    /// Step of a rotation.
+    pub fn rotation(&self, shift: i32) -> f64 {
+        f64::from(self.rotation_step) * if shift < 0 { 1.0 / f64::from(1u32 << -shift) } else { f64::from(1u32 << shift) }
+    }
+    /// The centre of a cell that was enlarged `shift` times.
+    pub fn centre(&self, key: u64, shift: u32) -> [f32; 3] {
+        let half = if shift == 0 { 0.5 } else { f64::from(1u32 << (shift - 1)) };
+        std::array::from_fn(|axis| ((self.corner[axis] + (gather(key >> axis) as f64 + half) * self.cell) as f32).clamp(f32::MIN, f32::MAX))
+    }
+    /// The key of a centre: its cell, interleaved bit by bit, without the bits below its step. `None` outside the grid.
+    pub fn key(&self, mean: &[f32], shift: u32) -> Option<u64> {
+        let mut key = 0;
+        for axis in 0..3 {
+            let cell = libm::floor((f64::from(mean[axis]) - self.corner[axis]) / self.cell);
+            if !(0.0..f64::from(1u32 << GRID_BITS)).contains(&cell) {
+                return None;
+            }
+            key |= spread(cell as u64 >> shift << shift) << axis;
+        }
+        Some(key)
+    }
+}
+
+fn sorted(mut codes: [i32; 3]) -> [i32; 3] {
+    codes.sort_unstable();
+    codes
+}
+
+/// The opacity logit on the scale on which it is quantised: errors of opaque Gaussians matter less.
+pub fn companded(logit: f32) -> f64 {
+    if logit < 0.0 { f64::from(logit) } else { libm::log1p(f64::from(logit)) }
+}
+
+/// Codes three log-scales per row: the first predicted by earlier rows, the others by the one before.
+pub fn code_scales<C: Coder>(coder: &mut C, scales: &mut [[i32; 3]], classes: &[u8]) -> Result<()> {
+    let mut models = vec![[Model::default(), Model::default()]; 3 * 16];
+    let mut recent = [0i64; 4];
+    for (i, (row, &class)) in scales.iter_mut().zip(classes).enumerate() {
+        let mut guess = (recent.iter().sum::<i64>() / 4) >> class;
+        for (axis, code) in row.iter_mut().enumerate() {
+            let [size, sign] = &mut models[axis * 16 + usize::from(class.min(15))];
+            guess += signed(coder, size, sign, i64::from(*code) - guess)?;
+            *code = checked(guess)?;
+        }
+        recent[i % 4] = i64::from(row[0]) << class;
+    }
+    Ok(())
+}
+
+/// Codes components of quaternions; `shifts` are the exponents of their steps, `width` the number of components of each row.
+pub fn code_rotations<C: Coder>(coder: &mut C, rows: &mut [[i32; 4]], shifts: impl Iterator<Item = (i32, usize)>) -> Result<()> {
+    let mut models = vec![[Model::default(), Model::default()]; 8 * 24];
+    for (row, (shift, width)) in rows.iter_mut().zip(shifts) {
+        let context = (shift + ROTATION_CONTEXTS).clamp(0, 23) as usize;
+        for (k, code) in row.iter_mut().take(width).enumerate() {
+            let [size, sign] = &mut models[(k + if width == 4 { 4 } else { 0 }) * 24 + context];
+            *code = checked(signed(coder, size, sign, i64::from(*code))?)?;
+        }
+    }
+    Ok(())
+}
+
+/// Codes opacities.
+pub fn code_opacities<C: Coder>(coder: &mut C, rows: &mut [i32], classes: &[u8]) -> Result<()> {
+    let mut models = vec![[Model::default(), Model::default()]; 16];
+    for (code, &class) in rows.iter_mut().zip(classes) {
+        let [size, sign] = &mut models[usize::from(class.min(15))];
+        *code = checked(signed(coder, size, sign, i64::from(*code))?)?;
+    }
+    Ok(())
+}
+
+/// Codes keys in ascending order: the difference to the one before, in the step of each row.
+pub fn code_keys<C: Coder>(coder: &mut C, keys: &mut [u64], shifts: impl Iterator<Item = u32>) -> Result<()> {
+    let mut lengths = vec![Model::default(); 16];
+    let mut quarters = vec![Model::default(); 64];
+    let mut top = vec![Model::default(); 64];
+    let mut last = 0u64;
+    let mut quarter = 0;
+    for (key, shift) in keys.iter_mut().zip(shifts) {
+        let start = last >> (3 * shift);
+        let step = (*key >> (3 * shift)).saturating_sub(start);
+        let wanted = u64::BITS - step.leading_zeros();
+        quarter = coder.symbol(&mut quarters[quarter], wanted as usize >> 2)?;
+        let length = (quarter << 2 | coder.symbol(&mut lengths[quarter], wanted as usize & 3)? & 3) as u32;
+        let mut found = u64::from(length > 0);
+        if length > 1 {
+            let high = (length - 1).min(3);
+            let shown = coder.symbol(&mut top[length as usize & 63], (step >> (length - 1 - high)) as usize & ((1 << high) - 1))? as u64 & ((1 << high) - 1);
+            found = found << high | shown;
+            let rest = length - 1 - high;
+            let upper = rest.saturating_sub(32);
+            found = found << upper | coder.bits(upper, step.checked_shr(32).unwrap_or(0))?;
+            found = found << (rest - upper) | coder.bits(rest - upper, step)?;
+        }
+        let next = start.checked_add(found).filter(|v| *v < 1 << (3 * GRID_BITS - 3 * shift));
+        *key = next.ok_or_else(|| Error::data("entropy-coded centres", "a cell is outside of the grid", "The file is damaged"))? << (3 * shift);
+        last = *key;
+    }
+    Ok(())
+}
+
+fn checked(code: i64) -> Result<i32> {
+    if code.abs() < CODE_LIMIT { Ok(code as i32) } else { Err(Error::data("entropy-coded integer", format!("{code} is out of range"), "The file is damaged")) }
+}

@@ -1,0 +1,172 @@
+//! How much errors of each Gaussian and attribute change rendered images: measured where the model can be rendered, estimated otherwise.
+//!
+//! Where errors of all parameters add the same to the squared error of images, a file of a given size has the smallest error. A parameter's step is
+//! therefore inversely proportional to its *weight*: the root of the sum, over pixels and channels of an image, of the squared derivatives.
+
+use cc4dgs_format::{CodecContext, HostGaussians, Result};
+
+/// Value of the spherical-harmonics basis function of degree 0.
+const SH0: f64 = 0.282_094_791_773_878_14;
+/// Views that are looked at.
+const VIEWS: usize = 24;
+/// Width and height of the images that are assumed without views.
+const IMAGE: (f64, f64) = (800.0, 600.0);
+/// Variance of the pixel blur of rasterizers.
+const BLUR: f64 = 0.3;
+/// Root of the mean squared transmittance in front of a Gaussian that is assumed without a renderer.
+const SEEN: f64 = 0.6;
+/// The contrast of a Gaussian with what is behind it, assumed without a renderer.
+const CONTRAST: f64 = 0.35;
+/// Gaussians of less than this share of the median weight are counted with it in ratios.
+const LEAST: f64 = 1e-2;
+
+/// Weights of Gaussians and attributes.
+pub struct Importance {
+    /// Weight of a degree-0 colour coefficient of each Gaussian, mean over images `[N]`.
+    pub weights: Vec<f64>,
+    /// Pixels of an image, times channels.
+    pub samples: f64,
+    /// Pixels per world unit, median over Gaussians.
+    pub pixels_per_unit: f64,
+    /// Steps relative to those of degree-0 colours.
+    pub steps: Steps,
+}
+
+/// Steps relative to the step of a degree-0 colour coefficient.
+#[derive(Clone, Copy, Debug)]
+pub struct Steps {
+    /// Of centres, relative to the middle scale.
+    pub means: f64,
+    /// Of log-scales.
+    pub log_scales: f64,
+    /// Of quaternion components where scales are within a factor of 2.
+    pub quaternions: f64,
+    /// Of companded opacities.
+    pub opacity_logits: f64,
+    /// Of colour coefficients of degree 1 to 4.
+    pub sh_rest: [f64; 4],
+}
+
+impl Default for Steps {
+    fn default() -> Self {
+        let relative = SH0 / CONTRAST;
+        Self { means: 1.4 * relative, log_scales: 1.15 * relative, quaternions: 1.4 * relative, opacity_logits: relative, sh_rest: [1.0; 4] }
+    }
+}
+
+/// Middle and largest standard deviation of a Gaussian, world units.
+fn sizes(log_scales: &[f32]) -> (f64, f64) {
+    let mut s = [f64::from(log_scales[0]), f64::from(log_scales[1]), f64::from(log_scales[2])];
+    s.sort_unstable_by(f64::total_cmp);
+    (libm::exp(s[1].clamp(-60.0, 60.0)), libm::exp(s[2].clamp(-60.0, 60.0)))
+}
+
+/// Weights from sizes and opacities alone, at the distance of the training cameras or of a camera that sees the whole model.
+pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance {
+    let (scale, samples) = pixel_scales(gaussians, context);
+    let weight = |i: usize| {
+        let (middle, largest) = sizes(&gaussians.log_scales[3 * i..3 * i + 3]);
+        let alpha = 1.0 / (1.0 + libm::exp(-f64::from(gaussians.opacity_logits[i]).clamp(-60.0, 60.0)));
+        let area = ((middle * scale[i]).powi(2) + BLUR).sqrt() * ((largest * scale[i]).powi(2) + BLUR).sqrt();
+        // A Gaussian that fills the image is not seen beyond it.
+        SH0 * SEEN * alpha * (std::f64::consts::PI * area).min(samples).sqrt()
+    };
+    Importance { weights: (0..gaussians.len()).map(weight).collect(), samples, pixels_per_unit: median(&scale), steps: Steps::default() }
+}
+
+/// Weights from derivatives of renders; `None` where the context cannot tell them.
+pub fn measure(gaussians: &HostGaussians, context: &CodecContext) -> Result<Option<Importance>> {
+    let (Some(views), Some(renderer)) = (context.views, context.renderer) else { return Ok(None) };
+    let chosen = views.len().min(VIEWS);
+    if chosen == 0 || gaussians.is_empty() {
+        return Ok(None);
+    }
+    let mut total: Option<HostGaussians> = None;
+    for k in 0..chosen {
+        let (camera, time_norm) = views.view(k * views.len() / chosen);
+        let Some(found) = renderer.squared_derivatives(gaussians, camera, time_norm, context.seed.child("importance").index(k as u64))? else {
+            return Ok(None);
+        };
+        match &mut total {
+            None => total = Some(found),
+            Some(total) => {
+                for ((_, _, sum), (_, _, found)) in total.columns_mut().into_iter().zip(found.columns()) {
+                    sum.iter_mut().zip(found).for_each(|(s, f)| *s += f);
+                }
+            }
+        }
+    }
+    let Some(total) = total else { return Ok(None) };
+    let row = |values: &[f32], width: usize, i: usize| values[i * width..(i + 1) * width].iter().map(|&v| f64::from(v)).sum::<f64>();
+    let n = gaussians.len();
+    let colours: Vec<f64> = (0..n).map(|i| row(&total.sh_dc, 3, i) / 3.0).collect();
+    let floor = LEAST * median(&colours).max(f64::MIN_POSITIVE);
+    // With the steps of each Gaussian in proportion to its colour's, the ratio of steps that is best is the inverse root of the mean ratio of weights.
+    let ratio = |weight: &dyn Fn(usize) -> f64| {
+        let mean = (0..n).map(|i| weight(i) / colours[i].max(floor)).sum::<f64>() / n as f64;
+        if mean > 0.0 && mean.is_finite() { (1.0 / mean).sqrt().clamp(1e-3, 1e3) } else { 1.0 }
+    };
+    let width = 3 * cc4dgs_format::gaussians::sh_rest_len(gaussians.sh_degree);
+    let degree = |d: usize| {
+        let (from, to) = (3 * (d * d - 1), 3 * ((d + 1) * (d + 1) - 1));
+        if d > gaussians.sh_degree { 1.0 } else { ratio(&|i| row(&total.sh_rest[i * width + from..i * width + to], to - from, 0) / (to - from) as f64) }
+    };
+    let steps = Steps {
+        means: ratio(&|i| row(&total.means, 3, i) / 3.0 * sizes(&gaussians.log_scales[3 * i..3 * i + 3]).0.powi(2)),
+        log_scales: ratio(&|i| row(&total.log_scales, 3, i) / 3.0),
+        quaternions: ratio(&|i| {
+            let q = &gaussians.quaternions[4 * i..4 * i + 4];
+            let norm: f64 = q.iter().map(|&v| f64::from(v).powi(2)).sum();
+            let s = &gaussians.log_scales[3 * i..3 * i + 3];
+            let octaves = f64::from(s.iter().copied().fold(f32::MIN, f32::max) - s.iter().copied().fold(f32::MAX, f32::min)) / std::f64::consts::LN_2;
+            let finer = [0.25, 2.0, 4.0, 8.0][(octaves + 0.5).clamp(0.0, 3.0) as usize];
+            row(&total.quaternions, 4, i) / 3.0 * norm / (finer * finer)
+        }),
+        opacity_logits: ratio(&|i| {
+            let x = f64::from(gaussians.opacity_logits[i]);
+            f64::from(total.opacity_logits[i]) * (1.0 + x.max(0.0)).powi(2)
+        }),
+        sh_rest: [degree(1), degree(2), degree(3), degree(4)],
+    };
+    let (scale, samples) = pixel_scales(gaussians, context);
+    let weights = colours.iter().map(|w| (w / chosen as f64).sqrt()).collect();
+    Ok(Some(Importance { weights, samples, pixels_per_unit: median(&scale), steps }))
+}
+
+/// Pixels per world unit at each Gaussian (root of the mean square over cameras that see it), and the samples of an image.
+fn pixel_scales(gaussians: &HostGaussians, context: &CodecContext) -> (Vec<f64>, f64) {
+    let Some(views) = context.views.filter(|v| !v.is_empty()) else { return (vec![whole(gaussians); gaussians.len()], 3.0 * IMAGE.0 * IMAGE.1) };
+    let chosen = views.len().min(VIEWS);
+    let cameras: Vec<_> = (0..chosen).map(|k| views.view(k * views.len() / chosen).0).collect();
+    let samples = cameras.iter().map(|c| 3.0 * f64::from(c.width) * f64::from(c.height)).sum::<f64>() / chosen as f64;
+    let scale = |mean: &[f32]| {
+        let (mut sum, mut count) = (0.0, 0.0);
+        for camera in &cameras {
+            let m = &camera.world_to_camera;
+            let at: [f64; 3] = std::array::from_fn(|r| (0..3).map(|c| m[r][c] * f64::from(mean[c])).sum::<f64>() + m[r][3]);
+            let (x, y) = (camera.fx * at[0] / at[2] + camera.cx, camera.fy * at[1] / at[2] + camera.cy);
+            if at[2] > 0.05 && (0.0..f64::from(camera.width)).contains(&x) && (0.0..f64::from(camera.height)).contains(&y) {
+                sum += (camera.fx / at[2]).powi(2);
+                count += 1.0;
+            }
+        }
+        if count > 0.0 { (sum / count).sqrt() } else { 0.0 }
+    };
+    (gaussians.means.chunks_exact(3).map(scale).collect(), samples)
+}
+
+/// Pixels per world unit of a camera that sees most of the model.
+fn whole(gaussians: &HostGaussians) -> f64 {
+    let middle: [f64; 3] = std::array::from_fn(|axis| median(&gaussians.means.iter().skip(axis).step_by(3).map(|&v| f64::from(v)).collect::<Vec<_>>()));
+    let mut distances: Vec<f64> =
+        gaussians.means.chunks_exact(3).map(|p| (0..3).map(|k| (f64::from(p[k]) - middle[k]).powi(2)).sum::<f64>().sqrt()).collect();
+    distances.sort_unstable_by(f64::total_cmp);
+    let radius = distances.get(distances.len() * 7 / 10).copied().unwrap_or(1.0);
+    if radius > 0.0 && radius.is_finite() { 0.5 * IMAGE.1 / (1.1 * radius) } else { IMAGE.1 }
+}
+
+pub fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
+}

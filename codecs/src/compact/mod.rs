@@ -1,0 +1,173 @@
+//! `compact`: quantised by what is seen, transformed, and entropy coded with adaptive integer models.
+//!
+//! The step of every value follows from how much its error changes rendered images. Gaussians fall into classes; the steps of one class are twice those of
+//! the class before. Weights come from derivatives of renders on the training views, or from sizes and opacities. Streams, in the order in which a player
+//! needs them: classes, scales, centres, rotations, opacities, degree-0 colours, then the higher degrees one by one.
+
+mod blocks;
+mod colors;
+mod encode;
+mod entropy;
+mod geometry;
+mod importance;
+mod search;
+mod settings;
+mod streams;
+mod transform;
+mod weights;
+
+pub(crate) use weights::build as build_weights;
+
+use cc4dgs_format::storage::relative_rms;
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
+use colors::Choices;
+use encode::Factors;
+use importance::Importance;
+use settings::Settings;
+use streams::Motion;
+
+/// Version of the stored form.
+const VERSION: u8 = 1;
+/// The degree whose coordinates are predicted by earlier rows.
+const PREDICTED: usize = 0;
+/// Largest losses: column and root-mean-square error over the standard deviation. Gaussians that are hardly seen may lose much.
+const LOSSES: [(&str, f64); 7] = [
+    ("means", 0.01),
+    ("log_scales", 0.5),
+    ("quaternions", 0.7),
+    ("opacity_logits", 0.7),
+    ("sh_dc", 0.5),
+    ("sh_rest", 1.0),
+    // One of two levels, each the mean of its scores.
+    ("dynamic_scores", 1.0),
+];
+/// Halvings of a column's step until its loss is allowed; then the whole column is stored exactly.
+const HALVINGS: usize = 12;
+/// Times at which the deformer is asked what it changes.
+const TIMES: [f32; 3] = [0.0, 0.37, 1.0];
+
+struct Compact {
+    settings: Settings,
+}
+
+/// What does not change from one attempt to the next.
+struct Job<'a> {
+    gaussians: &'a HostGaussians,
+    free: Vec<bool>,
+    importance: &'a Importance,
+    classes: Vec<u8>,
+    top: f64,
+    motion: Motion,
+    choices: Choices,
+    limits: &'a CodecContext<'a>,
+}
+
+/// Streams of a quality.
+struct Attempt {
+    quality: f64,
+    bytes: usize,
+    streams: Vec<Stream>,
+}
+
+impl Job<'_> {
+    fn attempt(&self, quality: f64) -> Result<Attempt> {
+        let mut factors: Factors = [1.0; 6];
+        for halvings in 0.. {
+            let of = encode::quantise(self.gaussians, &self.free, self.importance, (&self.classes, self.top), quality, &factors, &self.choices);
+            let mut order: Vec<usize> = (0..self.gaussians.len()).collect();
+            order.sort_by_key(|&i| (of.keys[i], i));
+            let streams = streams::write(self.gaussians, &of, &self.motion, &order)?;
+            let found = streams::read(&streams, &CodecContext::new(self.limits.seed, self.limits.limits, self.limits.events))?;
+            let expected = self.gaussians.select(&order);
+            let mut kept = true;
+            for (((name, _, before), (_, _, after)), factor) in expected.columns().into_iter().zip(found.columns()).zip(&mut factors) {
+                let allowed = LOSSES.iter().find(|l| l.0 == name).map_or(0.0, |l| l.1);
+                let lost = relative_rms(before, after);
+                // A small part of it is left for what rounding adds.
+                if lost.is_nan() || lost > 0.999 * allowed {
+                    *factor *= if halvings < HALVINGS { 0.5 } else { 0.0 };
+                    kept = false;
+                }
+            }
+            if kept || halvings > HALVINGS {
+                return Ok(Attempt { quality, bytes: streams.iter().map(|s| s.bytes.len()).sum(), streams });
+            }
+        }
+        Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
+    }
+}
+
+impl Compact {
+    fn motion(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<(Motion, Vec<bool>)> {
+        let n = gaussians.len();
+        let Some(threshold) = context.dynamic_threshold else { return Ok((Motion { free: 0, moving: None, levels: [0.0; 2] }, vec![false; n])) };
+        let moving: Vec<bool> = gaussians.dynamic_scores.iter().map(|&s| s > threshold).collect();
+        let mean = |moves: bool| {
+            let of: Vec<f64> = gaussians.dynamic_scores.iter().zip(&moving).filter(|(_, m)| **m == moves).map(|(&s, _)| f64::from(s)).collect();
+            (of.iter().sum::<f64>() / of.len().max(1) as f64) as f32
+        };
+        // Rounded to float32, a mean may be on the other side of the threshold.
+        let finite = threshold.clamp(f32::MIN, f32::MAX);
+        let levels = [if moving.contains(&false) { mean(false).min(finite) } else { 0.0 }, if moving.contains(&true) { mean(true).max(finite.next_up().min(f32::MAX)) } else { 0.0 }];
+        let free = match (self.settings.canonical, moving.contains(&true)) {
+            (false, _) => 0,
+            (true, false) => 1,
+            (true, true) => if keeps_shapes(gaussians, context)? { 1 } else { 2 },
+        };
+        let free_rows = moving.iter().map(|m| free == 1 || free == 2 && !m).collect();
+        Ok((Motion { free, moving: Some(moving), levels }, free_rows))
+    }
+}
+
+/// Whether the deformer leaves scales and rotations as they are.
+fn keeps_shapes(gaussians: &HostGaussians, context: &CodecContext) -> Result<bool> {
+    let Some(deformer) = context.deformer else { return Ok(false) };
+    for time in TIMES {
+        let moved = deformer.deform(gaussians, time)?;
+        if moved.log_scales != gaussians.log_scales || moved.quaternions != gaussians.quaternions {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+impl AttributeCodec for Compact {
+    fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        gaussians.validate("Gaussians to encode", &context.limits)?;
+        let measured = if self.settings.measured { importance::measure(gaussians, context)? } else { None };
+        let importance = measured.unwrap_or_else(|| importance::estimate(gaussians, context));
+        let (motion, free) = self.motion(gaussians, context)?;
+        let canonical = encode::canonical(gaussians, &free);
+        let (classes, top) = encode::classify(&importance.weights, self.settings.adaptive);
+        let choices = Choices { transform: self.settings.transform, dead_zone: self.settings.dead_zone };
+        let job = Job { gaussians: &canonical, free, importance: &importance, classes, top, motion, choices, limits: context };
+        Ok(search::search(&job, &self.settings, context)?.streams)
+    }
+    fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        streams::read(streams, context)
+    }
+    fn losses(&self) -> Vec<DeclaredLoss> {
+        LOSSES.map(|(attribute, relative_rms)| DeclaredLoss { attribute: attribute.into(), relative_rms }).into()
+    }
+    fn keeps_motion(&self) -> bool {
+        true
+    }
+}
+
+pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
+    Ok(Box::new(Compact { settings: Settings::parse(profile, settings)? }))
+}
+
+inventory::submit! {
+    CodecPlugin {
+        info: Plugin {
+            name: "compact",
+            version: "1",
+            summary: "steps by what is seen, transformed colours, adaptive entropy coding: the smallest files",
+            paper: "rate-distortion allocation; octave classes; Karhunen-Loève transform; range coding (constriction)",
+            schema: settings::SCHEMA,
+            capabilities: &["lossy", "reorders"],
+        },
+        build,
+    }
+}

@@ -1,0 +1,119 @@
+//! Settings, and the profiles that are short for them.
+
+use cc4dgs_format::{Error, Result, config, unknown_name};
+use serde::Deserialize;
+
+pub(super) const SCHEMA: &str = "\
+max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. 0: psnr_db
+max_size_mb = 0.0        # the best file of at most so many MB; `compact:max-size=5MB` for short. 0: no limit
+psnr_db = 50.0           # without --scene: estimated PSNR between images before and after; `compact:psnr=50dB` for short
+dead_zone = 0.15         # share of a step by which colour coefficients above degree 0 are rounded towards zero
+measured = true          # with --scene: weights from derivatives of renders; false: from sizes and opacities
+adaptive = true          # steps of their own for Gaussians that are seen more or less
+transform = true         # transform the colour coefficients of each degree
+canonical = true         # sort the axes of Gaussians whose shape does not change
+";
+
+/// Settings of the codec.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Largest loss of PSNR on training views in dB; 0 chooses by `psnr_db`.
+    pub max_drop_db: f64,
+    /// Largest size in MB; 0 is no limit.
+    pub max_size_mb: f64,
+    /// Estimated PSNR between images before and after, in dB.
+    pub psnr_db: f64,
+    /// Share of a step by which colour coefficients are rounded towards zero.
+    pub dead_zone: f64,
+    /// Measure weights where the context can render.
+    pub measured: bool,
+    /// Classes of steps.
+    pub adaptive: bool,
+    /// Transform colour coefficients.
+    pub transform: bool,
+    /// Sort axes.
+    pub canonical: bool,
+    /// Whether the user chose the loss of PSNR, which needs a scene.
+    #[serde(skip)]
+    pub drop_wanted: bool,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            max_drop_db: 0.05,
+            max_size_mb: 0.0,
+            psnr_db: 50.0,
+            dead_zone: 0.15,
+            measured: true,
+            adaptive: true,
+            transform: true,
+            canonical: true,
+            drop_wanted: false,
+        }
+    }
+}
+
+/// Name of a profile in front of `=`, the setting, its unit, and the settings that it switches off.
+const PROFILES: [(&str, &str, &str, &[&str]); 3] = [
+    ("max-drop", "max_drop_db", "dB", &["max_size_mb"]),
+    ("max-size", "max_size_mb", "MB", &[]),
+    ("psnr", "psnr_db", "dB", &["max_drop_db", "max_size_mb"]),
+];
+
+impl Settings {
+    /// The settings of a profile (`max-drop=0.05dB`), with `table` laid over them.
+    pub fn parse(profile: &str, table: &toml::Table) -> Result<Self> {
+        let mut section = toml::Table::new();
+        let drop_wanted = profile.starts_with("max-drop") || table.contains_key("max_drop_db");
+        if !matches!(profile, "" | "default") {
+            let (name, value) = profile.split_once('=').unwrap_or((profile, ""));
+            let Some((_, setting, unit, off)) = PROFILES.iter().find(|p| p.0 == name) else {
+                return Err(unknown_name("profile of codec compact", name, ["default"].into_iter().chain(PROFILES.iter().map(|p| p.0))));
+            };
+            let number = value.strip_suffix(unit).unwrap_or(value).trim().parse::<f64>().ok().filter(|v| *v > 0.0 && v.is_finite());
+            let Some(number) = number else {
+                let remedy = format!("Write a positive number of {unit}, such as compact:{name}={}{unit}", if *unit == "MB" { "5" } else { "0.05" });
+                return Err(Error::parameter(format!("profile of codec compact '{profile}'"), format!("'{value}' is no number of {unit}"), remedy));
+            };
+            section.insert((*setting).into(), number.into());
+            off.iter().for_each(|key| drop(section.insert((*key).into(), 0.0.into())));
+        }
+        config::merge(&mut section, table);
+        let settings = Self { drop_wanted, ..config::parse_section("codec compact", &section)? };
+        let bounds = [
+            ("max_drop_db", settings.max_drop_db, 0.0..=20.0),
+            ("max_size_mb", settings.max_size_mb, 0.0..=1e6),
+            ("psnr_db", settings.psnr_db, 15.0..=90.0),
+            ("dead_zone", settings.dead_zone, 0.0..=0.4),
+        ];
+        match bounds.into_iter().find(|(_, value, range)| !range.contains(value)) {
+            Some((name, value, range)) => {
+                Err(Error::parameter(format!("codec compact.{name}"), value.to_string(), format!("Choose {} to {}", range.start(), range.end())))
+            }
+            None => Ok(settings),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn profiles_are_short_for_settings() {
+        let parse = |profile: &str| Settings::parse(profile, &toml::Table::new());
+        assert_eq!(parse("max-drop=0.1dB").unwrap().max_drop_db, 0.1);
+        assert_eq!(parse("max-size=5MB").unwrap().max_size_mb, 5.0);
+        let psnr = parse("psnr=44").unwrap();
+        assert_eq!((psnr.psnr_db, psnr.max_drop_db), (44.0, 0.0));
+        for bad in ["max-drop", "max-drop=x", "max-size=-1MB", "max-size=nanMB", "psnr=1000dB", "lowest"] {
+            assert!(parse(bad).is_err(), "{bad}");
+        }
+        assert!(parse("max-dorp=1dB").unwrap_err().to_string().contains("max-drop"));
+        let schema: toml::Table = SCHEMA.parse().unwrap();
+        let (read, default) = (Settings::parse("", &schema).unwrap(), parse("").unwrap());
+        assert_eq!(format!("{:?}", Settings { drop_wanted: false, ..read }), format!("{default:?}"));
+    }
+}

@@ -1,0 +1,132 @@
+//! A Karhunen-Loève transform with an 8-bit basis.
+
+/// Steps of a basis vector's component.
+const UNIT: f64 = 127.0;
+
+/// Rows are basis vectors, by falling variance: [dims, dims], in steps of 1/127.
+pub type Basis = Vec<i8>;
+
+/// The basis of the weighted second moments of `rows` `[N,dims]`.
+pub fn basis(rows: &[f64], dims: usize, weights: &[f64]) -> Basis {
+    let mut moments = vec![0.0; dims * dims];
+    for (row, weight) in rows.chunks_exact(dims).zip(weights) {
+        for i in 0..dims {
+            let scaled = weight * row[i];
+            for j in i..dims {
+                moments[i * dims + j] += scaled * row[j];
+            }
+        }
+    }
+    for i in 0..dims {
+        for j in 0..i {
+            moments[i * dims + j] = moments[j * dims + i];
+        }
+    }
+    let vectors = eigenvectors(&mut moments, dims);
+    let mut order: Vec<usize> = (0..dims).collect();
+    order.sort_by(|&a, &b| moments[b * dims + b].total_cmp(&moments[a * dims + a]).then(a.cmp(&b)));
+    order.into_iter().flat_map(|v| (0..dims).map(move |i| (i, v))).map(|(i, v)| libm::round(UNIT * vectors[i * dims + v]) as i8).collect()
+}
+
+/// Coordinates `[dims,dims]` (row-major) that [`synthesise`] turns back into a vector: the inverse of the transposed basis.
+pub fn analysis(basis: &[i8], dims: usize) -> Option<Vec<f64>> {
+    let mut left: Vec<f64> = (0..dims * dims).map(|k| f64::from(basis[k % dims * dims + k / dims]) / UNIT).collect();
+    let mut right: Vec<f64> = (0..dims * dims).map(|k| f64::from(u8::from(k % dims == k / dims))).collect();
+    for column in 0..dims {
+        let pivot = (column..dims).max_by(|&a, &b| left[a * dims + column].abs().total_cmp(&left[b * dims + column].abs()))?;
+        if left[pivot * dims + column].abs() < 0.1 {
+            return None;
+        }
+        for k in 0..dims {
+            left.swap(pivot * dims + k, column * dims + k);
+            right.swap(pivot * dims + k, column * dims + k);
+        }
+        let scale = 1.0 / left[column * dims + column];
+        for k in 0..dims {
+            left[column * dims + k] *= scale;
+            right[column * dims + k] *= scale;
+        }
+        for row in (0..dims).filter(|&row| row != column) {
+            let factor = left[row * dims + column];
+            for k in 0..dims {
+                left[row * dims + k] -= factor * left[column * dims + k];
+                right[row * dims + k] -= factor * right[column * dims + k];
+            }
+        }
+    }
+    Some(right)
+}
+
+/// Adds the basis vector `component` times `coordinate` to `out` `[dims]`.
+#[inline]
+pub fn synthesise(basis: &[i8], component: usize, coordinate: f64, out: &mut [f64]) {
+    let scaled = coordinate * (1.0 / UNIT);
+    let vector = &basis[component * out.len()..(component + 1) * out.len()];
+    out.iter_mut().zip(vector).for_each(|(o, &b)| *o += scaled * f64::from(b));
+}
+
+/// The identity as a basis.
+pub fn identity(dims: usize) -> Basis {
+    (0..dims * dims).map(|k| if k % dims == k / dims { 127 } else { 0 }).collect()
+}
+
+/// Jacobi's method: `matrix` becomes diagonal; returns the eigenvectors as columns.
+fn eigenvectors(matrix: &mut [f64], n: usize) -> Vec<f64> {
+    const SWEEPS: usize = 30;
+    let mut vectors: Vec<f64> = (0..n * n).map(|k| f64::from(u8::from(k % n == k / n))).collect();
+    let total: f64 = matrix.iter().map(|v| v * v).sum();
+    for _ in 0..SWEEPS {
+        let off: f64 = (0..n * n).filter(|k| k % n != k / n).map(|k| matrix[k] * matrix[k]).sum();
+        // NaN ends the loop too.
+        if off.is_nan() || off <= 1e-24 * total {
+            break;
+        }
+        for p in 0..n {
+            for q in p + 1..n {
+                let apq = matrix[p * n + q];
+                if apq == 0.0 {
+                    continue;
+                }
+                let theta = (matrix[q * n + q] - matrix[p * n + p]) / (2.0 * apq);
+                let t = libm::copysign(1.0, theta) / (theta.abs() + (theta * theta + 1.0).sqrt());
+                let c = 1.0 / (t * t + 1.0).sqrt();
+                let s = t * c;
+                for k in 0..n {
+                    let (a, b) = (matrix[k * n + p], matrix[k * n + q]);
+                    (matrix[k * n + p], matrix[k * n + q]) = (c * a - s * b, s * a + c * b);
+                }
+                for k in 0..n {
+                    let (a, b) = (matrix[p * n + k], matrix[q * n + k]);
+                    (matrix[p * n + k], matrix[q * n + k]) = (c * a - s * b, s * a + c * b);
+                    let (a, b) = (vectors[k * n + p], vectors[k * n + q]);
+                    (vectors[k * n + p], vectors[k * n + q]) = (c * a - s * b, s * a + c * b);
+                }
+            }
+        }
+    }
+    vectors
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn vectors_come_back_and_energy_comes_first() {
+        let (dims, n) = (9, 500);
+        let rows: Vec<f64> = (0..n * dims).map(|k| ((k * k) as f64 * 0.37).sin() + 3.0 * ((k / dims) as f64).cos() * (k % dims) as f64).collect();
+        let basis = basis(&rows, dims, &vec![1.0; n]);
+        let analysis = analysis(&basis, dims).unwrap();
+        let mut energy = vec![0.0; dims];
+        for row in rows.chunks_exact(dims) {
+            let mut back = vec![0.0; dims];
+            for c in 0..dims {
+                let coordinate: f64 = (0..dims).map(|k| analysis[c * dims + k] * row[k]).sum();
+                energy[c] += coordinate * coordinate;
+                synthesise(&basis, c, coordinate, &mut back);
+            }
+            assert!(row.iter().zip(&back).all(|(a, b)| (a - b).abs() < 1e-9), "{row:?} became {back:?}");
+        }
+        assert!(energy[0] > 0.9 * energy.iter().sum::<f64>(), "{energy:?}");
+    }
+}

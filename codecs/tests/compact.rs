@@ -1,0 +1,133 @@
+//! `compact`: the conformance suite, a stored file that must stay readable, motion, and sizes.
+
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, Entries, HostGaussians, Limits, Seed, Silent, Stream, conformance, toml};
+
+fn plugin() -> &'static CodecPlugin {
+    cc4dgs_codecs::link();
+    Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap()
+}
+
+fn codec(profile: &str) -> Box<dyn AttributeCodec> {
+    (plugin().build)(profile, &toml::Table::new()).unwrap()
+}
+
+fn context(threshold: Option<f32>) -> CodecContext<'static> {
+    CodecContext { dynamic_threshold: threshold, ..CodecContext::new(Seed::root(3), Limits::default(), &Silent) }
+}
+
+/// Gaussians on a surface, of many sizes, with smooth colours and some noise. No function whose rounding depends on the machine is used.
+fn scene(count: usize, sh_degree: usize) -> HostGaussians {
+    let draw = |i: usize, k: usize| (Seed::root(31).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+    let mut g = HostGaussians { sh_degree, opacity_logits: vec![0.0; count], ..Default::default() };
+    g.opacity_logits = (0..count).map(|i| 2.0 + 3.0 * draw(i, 0)).collect();
+    for i in 0..count {
+        let (x, y) = (draw(i, 1), draw(i, 2));
+        g.means.extend([x, y, 0.3 * x * y + 0.01 * draw(i, 3)]);
+        let size = -4.0 + 1.5 * draw(i, 4) * draw(i, 5);
+        g.log_scales.extend([size, size - 0.5 * draw(i, 6), size - 1.0 + draw(i, 7)]);
+        g.quaternions.extend([1.0 + 0.3 * draw(i, 8), draw(i, 9), draw(i, 10), draw(i, 11)]);
+        g.sh_dc.extend([x + 0.2 * draw(i, 12), y + 0.2 * draw(i, 13), x * y + 0.2 * draw(i, 14)]);
+        g.sh_rest.extend((0..3 * cc4dgs_format::gaussians::sh_rest_len(sh_degree)).map(|k| 0.1 * draw(i, 20 + k) * draw(i, 80 + k) * if k % 3 == 0 { x } else { y }));
+        g.dynamic_scores.push(if x > 0.5 { 9.0 + draw(i, 15) } else { draw(i, 16) });
+    }
+    g
+}
+
+#[test]
+fn the_suite_passes() {
+    for profile in ["", "psnr=35dB", "psnr=70dB", "max-size=1MB"] {
+        let findings = conformance::codec(plugin(), profile, &toml::Table::new());
+        assert!(findings.is_empty(), "{}", findings.join("\n"));
+    }
+}
+
+#[test]
+fn motion_is_kept_and_scores_take_a_bit() {
+    let (g, codec) = (scene(4000, 1), codec(""));
+    for (threshold, width) in [(Some(5.0), 1.0), (Some(f32::NEG_INFINITY), 0.1), (Some(f32::INFINITY), 0.1)] {
+        let streams = codec.encode(&g, &context(threshold)).unwrap();
+        let found = codec.decode(&streams, &context(None)).unwrap();
+        let moves = |g: &HostGaussians| g.dynamic_scores.iter().filter(|s| **s > threshold.unwrap()).count();
+        assert_eq!(moves(&found), moves(&g));
+        let bytes = streams.iter().find(|s| s.name == "moving").unwrap().bytes.len();
+        assert!(8.0 * bytes as f64 <= 100.0 + width * 4000.0, "{bytes} bytes for a bit per Gaussian");
+    }
+}
+
+/// Covariances are what axes and rotations mean.
+fn covariance(g: &HostGaussians, i: usize) -> [f64; 6] {
+    let q: Vec<f64> = g.quaternions[4 * i..4 * i + 4].iter().map(|&v| f64::from(v)).collect();
+    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+    let [w, x, y, z] = [q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm];
+    let r = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ];
+    let s: Vec<f64> = g.log_scales[3 * i..3 * i + 3].iter().map(|&v| f64::from(v).exp().powi(2)).collect();
+    let entry = |a: usize, b: usize| (0..3).map(|k| r[a][k] * s[k] * r[b][k]).sum::<f64>();
+    [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
+}
+
+#[test]
+fn sorted_axes_are_the_same_ellipsoids() {
+    let g = scene(500, 0);
+    let codec = codec("psnr=90dB");
+    let streams = codec.encode(&g, &context(Some(f32::INFINITY))).unwrap();
+    let found = codec.decode(&streams, &context(None)).unwrap();
+    for i in 0..found.len() {
+        let (mean, wanted) = (&found.means[3 * i..3 * i + 3], covariance(&found, i));
+        let distance = |j: &usize| (0..3).map(|k| f64::from(g.means[3 * j + k] - mean[k]).powi(2)).sum::<f64>();
+        let nearest = (0..g.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap();
+        let (given, size) = (covariance(&g, nearest), wanted[0] + wanted[3] + wanted[5]);
+        assert!(given.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 0.02 * size), "{given:?} became {wanted:?}");
+        assert!(found.log_scales[3 * i..3 * i + 3].is_sorted_by(|a, b| a >= b));
+    }
+}
+
+#[test]
+fn a_larger_error_takes_fewer_bytes_and_sizes_are_kept_to() {
+    let g = scene(5000, 2);
+    let size = |streams: &[Stream]| streams.iter().map(|s| s.bytes.len()).sum::<usize>();
+    let sizes: Vec<usize> = ["psnr=60dB", "psnr=50dB", "psnr=40dB"].iter().map(|p| size(&codec(p).encode(&g, &context(None)).unwrap())).collect();
+    assert!(sizes.is_sorted_by(|a, b| 5 * a > 6 * b), "{sizes:?}");
+    let wanted = (sizes[0] + sizes[1]) / 2;
+    let found = size(&codec(&format!("max-size={}MB", wanted as f64 / 1e6)).encode(&g, &context(None)).unwrap());
+    assert!(found <= wanted && 10 * found > 9 * wanted, "{found} of {wanted}");
+    assert!(codec("max-size=0.0001MB").encode(&g, &context(None)).is_err());
+    assert!(codec("max-drop=0.1dB").encode(&g, &context(None)).unwrap_err().to_string().contains("--scene"));
+}
+
+/// Streams of version 1 and what they decode to, written by this test where the variable is set.
+#[test]
+fn stored_streams_decode_to_the_same_bits() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-1.bin");
+    let put = |out: &mut Vec<u8>, bytes: &[u8]| {
+        out.extend((bytes.len() as u32).to_le_bytes());
+        out.extend(bytes);
+    };
+    let values = |g: &HostGaussians| g.columns().iter().flat_map(|(_, _, v)| v.iter().flat_map(|v| v.to_le_bytes())).collect::<Vec<u8>>();
+    if std::env::var_os("CC4DGS_WRITE_FIXTURES").is_some() {
+        let streams = codec("").encode(&scene(60, 3), &context(Some(5.0))).unwrap();
+        let mut out = Vec::new();
+        put(&mut out, &values(&codec("").decode(&streams, &context(None)).unwrap()));
+        for stream in &streams {
+            put(&mut out, stream.name.as_bytes());
+            put(&mut out, &stream.bytes);
+        }
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, out).unwrap();
+    }
+    let stored = std::fs::read(&path).unwrap();
+    let mut reader = cc4dgs_format::archive::ByteReader::new("fixture", &stored);
+    let mut next = || {
+        let length = reader.u32().ok()? as usize;
+        Some(reader.take(length).unwrap().to_vec())
+    };
+    let expected = next().unwrap();
+    let mut streams = Vec::new();
+    while let Some(name) = next() {
+        streams.push(Stream { name: String::from_utf8(name).unwrap(), bytes: next().unwrap() });
+    }
+    assert_eq!(values(&codec("").decode(&streams, &context(None)).unwrap()), expected);
+}

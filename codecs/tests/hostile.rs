@@ -1,0 +1,184 @@
+//! Damaged streams of every codec and weight codec: an error or a sound result, never a panic, and no memory that the limits do not allow.
+//!
+//! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test; by default it is a second per codec.
+
+use cc4dgs_format::{
+    AttributeCodec, CodecContext, CodecPlugin, Entries, Error, ExtraAttribute, HostGaussians, Limits, Seed, Silent, Stream, WeightArray, WeightCodec,
+    WeightCodecPlugin, toml,
+};
+use proptest::prelude::*;
+use proptest::test_runner::{Config, TestRunner};
+use std::time::{Duration, Instant};
+
+/// Enough for what is encoded here, far below what damaged counts claim.
+const LIMITS: Limits = Limits { max_bytes: 64 << 20, max_gaussians: 100_000, max_pixels: 1 << 20, max_depth: 16 };
+
+fn context(threshold: Option<f32>) -> CodecContext<'static> {
+    CodecContext { dynamic_threshold: threshold, ..CodecContext::new(Seed::root(17), LIMITS, &Silent) }
+}
+
+/// A damage to one stream. Places are fractions of its length.
+#[derive(Clone, Debug)]
+enum Damage {
+    Flip(f64, u8),
+    Set(f64, Vec<u8>),
+    Cut(f64),
+    Insert(f64, Vec<u8>),
+    Remove(f64, usize),
+    /// Copies bytes from another stream.
+    Splice(f64, usize, usize),
+    Swap(usize),
+    Drop,
+}
+
+fn damage() -> impl Strategy<Value = Damage> {
+    // Numbers that are often special: zero, largest, sign bits, infinities.
+    let bytes = prop_oneof![
+        prop::collection::vec(any::<u8>(), 1..9),
+        prop::sample::select(vec![vec![0; 4], vec![255; 4], vec![0, 0, 128, 127], vec![255, 255, 255, 127], vec![0, 0, 0, 128], vec![255; 8]]),
+    ];
+    // Half of the damages hit the first bytes, where counts are.
+    let place = || prop_oneof![0.0..1.0f64, (0.0..1.0f64).prop_map(|v| 0.05 * v * v)];
+    prop_oneof![
+        4 => (place(), 0..8u8).prop_map(|(at, bit)| Damage::Flip(at, bit)),
+        4 => (place(), bytes.clone()).prop_map(|(at, bytes)| Damage::Set(at, bytes)),
+        1 => place().prop_map(Damage::Cut),
+        1 => (place(), bytes).prop_map(|(at, bytes)| Damage::Insert(at, bytes)),
+        1 => (place(), 1..64usize).prop_map(|(at, count)| Damage::Remove(at, count)),
+        1 => (place(), 0..16usize, 1..64usize).prop_map(|(at, other, count)| Damage::Splice(at, other, count)),
+        1 => (0..16usize).prop_map(Damage::Swap),
+        1 => Just(Damage::Drop),
+    ]
+}
+
+fn harm(streams: &mut Vec<Stream>, which: usize, damage: &Damage) {
+    if streams.is_empty() {
+        return;
+    }
+    let (which, count) = (which % streams.len(), streams.len());
+    let other = |k: usize| streams[k % count].bytes.clone();
+    let place = |at: &f64, len: usize| ((at * len as f64) as usize).min(len.saturating_sub(1));
+    match damage {
+        Damage::Splice(at, k, length) => {
+            let from = other(*k);
+            let bytes = &mut streams[which].bytes;
+            let at = place(at, bytes.len());
+            bytes.iter_mut().skip(at).take(*length).zip(from).for_each(|(to, from)| *to = from);
+        }
+        Damage::Swap(k) => {
+            let (a, b) = (streams[which].bytes.clone(), other(*k));
+            streams[which].bytes = b;
+            streams[k % count].bytes = a;
+        }
+        Damage::Drop => drop(streams.remove(which)),
+        _ => {
+            let bytes = &mut streams[which].bytes;
+            match damage {
+                Damage::Flip(at, bit) if !bytes.is_empty() => {
+                    let at = place(at, bytes.len());
+                    bytes[at] ^= 1 << bit;
+                }
+                Damage::Set(at, new) => {
+                    let at = place(at, bytes.len());
+                    bytes.iter_mut().skip(at).zip(new).for_each(|(to, from)| *to = *from);
+                }
+                Damage::Cut(at) => bytes.truncate(place(at, bytes.len())),
+                Damage::Insert(at, new) => {
+                    let at = place(at, bytes.len());
+                    bytes.splice(at..at, new.iter().copied());
+                }
+                Damage::Remove(at, length) => {
+                    let at = place(at, bytes.len());
+                    bytes.drain(at..(at + length).min(bytes.len()));
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+fn scene(count: usize, sh_degree: usize) -> HostGaussians {
+    let draw = |i: usize, k: usize| (Seed::root(23).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+    let mut g = HostGaussians { sh_degree, opacity_logits: vec![0.0; count], ..Default::default() };
+    for (column, (name, width, values)) in g.columns_mut().into_iter().enumerate() {
+        let (shift, scale) = if name == "log_scales" { (-4.0, 1.0) } else { (0.0, if name == "dynamic_scores" { 12.0 } else { 1.0 }) };
+        *values = (0..count * width).map(|i| shift + scale * draw(i, column)).collect();
+    }
+    g.extra.insert("exact".into(), ExtraAttribute::exact(2, (0..2 * count).map(|i| draw(i, 90)).collect()));
+    let needed = g.dynamic_scores.iter().map(|s| *s > 5.0).collect();
+    g.extra.insert("near".into(), ExtraAttribute::exact(1, (0..count).map(|i| draw(i, 91)).collect()).within(0.01).needed_in(needed, 0.0));
+    g
+}
+
+/// Seconds for each codec.
+fn seconds(of: usize) -> Duration {
+    let wanted = std::env::var("CC4DGS_HOSTILE_SECONDS").ok().and_then(|v| v.parse::<f64>().ok()).map_or(1.0, |total| total / of.max(1) as f64);
+    Duration::from_secs_f64(wanted)
+}
+
+/// Tries damages until time is up. `decode` says what is wrong with a result, if anything is.
+fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream]) -> Option<String>) -> u64 {
+    let began = Instant::now();
+    let mut runner = TestRunner::new_with_rng(Config { cases: 64, failure_persistence: None, ..Config::default() }, proptest::test_runner::TestRng::deterministic_rng(proptest::test_runner::RngAlgorithm::ChaCha));
+    let mut tried = 0;
+    while began.elapsed() < time {
+        let strategy = prop::collection::vec((any::<usize>(), damage()), 1..4);
+        let outcome = runner.run(&strategy, |damages| {
+            let mut streams = sound.to_vec();
+            damages.iter().for_each(|(which, damage)| harm(&mut streams, *which, damage));
+            match decode(&streams) {
+                None => Ok(()),
+                Some(problem) => Err(TestCaseError::fail(problem)),
+            }
+        });
+        if let Err(e) = outcome {
+            panic!("{name}: {e}");
+        }
+        tried += 64;
+    }
+    tried
+}
+
+#[test]
+fn damaged_gaussians_give_errors() {
+    cc4dgs_codecs::link();
+    let plugins: Vec<_> = Entries::<CodecPlugin>::collect().unwrap().iter().collect();
+    let time = seconds(plugins.len() * 2);
+    for plugin in plugins {
+        let quick = if plugin.info.schema.contains("sample_budget") { "sample_budget = 20000".parse().unwrap() } else { toml::Table::new() };
+        let codec: Box<dyn AttributeCodec> = (plugin.build)("", &quick).unwrap();
+        // The larger model is enough for forms that are chosen for large ones only.
+        for (count, degree, threshold) in [(40, 3, Some(5.0)), (3000, 1, None)] {
+            let sound = codec.encode(&scene(count, degree), &context(threshold)).unwrap();
+            let tried = attack(plugin.info.name, &sound, time, &|streams| match codec.decode(streams, &context(None)) {
+                Ok(found) => found.validate("decoded", &LIMITS).err().map(|e: Error| e.to_string()),
+                Err(_) => None,
+            });
+            println!("{}: {tried} damaged versions of {count} Gaussians", plugin.info.name);
+        }
+    }
+}
+
+#[test]
+fn damaged_weights_give_errors() {
+    cc4dgs_codecs::link();
+    let plugins: Vec<_> = Entries::<WeightCodecPlugin>::collect().unwrap().iter().collect();
+    let time = seconds(plugins.len());
+    let array = |name: &str, shape: &[usize]| {
+        let count = shape.iter().product::<usize>();
+        WeightArray { name: name.into(), shape: shape.into(), values: (0..count).map(|i| (i as f32 * 0.37).sin()).collect() }
+    };
+    let weights = [array("grid", &[40, 33]), array("bias", &[5]), array("scale", &[]), array("none", &[0, 4])];
+    for plugin in plugins {
+        let codec: Box<dyn WeightCodec> = (plugin.build)(&toml::Table::new()).unwrap();
+        let sound = codec.encode(&weights, &context(None)).unwrap();
+        let tried = attack(plugin.info.name, &sound, time, &|streams| match codec.decode(streams, &context(None)) {
+            Ok(found) => {
+                let wrong = found.iter().find(|a| a.shape.iter().product::<usize>() != a.values.len() || a.values.iter().any(|v| !v.is_finite()));
+                wrong.map(|a| format!("'{}' is not sound", a.name))
+            }
+            Err(_) => None,
+        });
+        println!("{}: {tried} damaged versions of weights", plugin.info.name);
+    }
+}

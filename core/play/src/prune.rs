@@ -1,0 +1,110 @@
+//! Removal of the Gaussians that contribute least to images, over all views and times, under a budget of PSNR.
+
+use crate::codec_services::{ModelServices, SceneViews};
+use crate::model::Model;
+use burn::tensor::Device;
+use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Registry, RenderModel, Result, Scene, Seed, Split, TrainingViews};
+use serde::Serialize;
+
+/// Training views from which contributions are taken.
+const VIEWS: usize = 64;
+/// Views on which PSNR is measured.
+const JUDGES: usize = 32;
+/// Bisection steps of the share that is removed.
+const STEPS: usize = 8;
+
+/// What was removed, and what it cost.
+#[derive(Clone, Debug, Serialize)]
+pub struct PruneReport {
+    /// Gaussians before.
+    pub before: usize,
+    /// Gaussians after.
+    pub after: usize,
+    /// PSNR in dB before, on the judged views.
+    pub psnr_before_db: f64,
+    /// PSNR in dB after.
+    pub psnr_after_db: f64,
+    /// Which views judged: validation views where the model was trained with some, else training views.
+    pub judged_by: Split,
+    /// Number of those views.
+    pub views: usize,
+}
+
+/// Contribution of each Gaussian: the mean over training views, at their times, of the sum over pixels of its squared blending weight (with what shines through it).
+pub fn contributions(model: &Model, scene: &Scene, registry: &Registry, device: &Device, events: &dyn EventSink) -> Result<Vec<f64>> {
+    let services = ModelServices::new(model, registry, device)?;
+    let views = SceneViews::new(scene);
+    let chosen = views.len().min(VIEWS);
+    let seed = Seed::root(model.provenance.seed).child("prune");
+    let mut sum = vec![0.0; model.gaussians.len()];
+    for k in 0..chosen {
+        let (camera, time_norm) = views.view(k * views.len() / chosen);
+        let Some(found) = services.squared_derivatives(&model.gaussians, camera, time_norm, seed.index(k as u64))? else { break };
+        for (sum, row) in sum.iter_mut().zip(found.sh_dc.chunks_exact(3)) {
+            *sum += row.iter().map(|&v| f64::from(v)).sum::<f64>() / chosen as f64;
+        }
+        events.emit(&Event::Progress { task: "contributions".into(), done: k as u64 + 1, total: chosen as u64 });
+    }
+    Ok(sum)
+}
+
+/// Removes as many Gaussians from `model` as lower the PSNR by at most `max_drop_db`, those of the least contribution first.
+///
+/// # Errors
+/// [`Error::Parameter`] for a scene without training views or a drop that is not positive, and what the scene and the rasterizer report.
+pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Registry, device: &Device, events: &dyn EventSink) -> Result<PruneReport> {
+    if !(max_drop_db > 0.0 && max_drop_db.is_finite()) {
+        return Err(Error::parameter("prune", format!("a drop of {max_drop_db} dB"), "Allow a positive number of dB, such as 0.1"));
+    }
+    let judged_by = if scene.split(Split::Validation).is_empty() { Split::Train } else { Split::Validation };
+    let judges = SceneViews::of(scene, judged_by);
+    if SceneViews::new(scene).is_empty() || judges.is_empty() {
+        return Err(Error::parameter("prune", format!("{} has no training views", scene.name), "Give the scene that the model was trained on"));
+    }
+    let contribution = contributions(model, scene, registry, device, events)?;
+    let mut order: Vec<usize> = (0..contribution.len()).collect();
+    order.sort_by(|&a, &b| contribution[b].total_cmp(&contribution[a]).then(a.cmp(&b)));
+    let kept = |count: usize| {
+        let mut rows = order[..count].to_vec();
+        rows.sort_unstable();
+        model.gaussians.select(&rows)
+    };
+    let n = order.len();
+    let services = ModelServices::new(model, registry, device)?;
+    let psnr_before_db = psnr(&model.gaussians, &judges, &services)?;
+    // The fewest that are known to suffice, and the most that are known not to.
+    let (mut enough, mut too_few, mut psnr_after_db) = (n, 0usize, psnr_before_db);
+    for step in 0..STEPS {
+        let count = (enough + too_few) / 2;
+        if count == enough || count == too_few {
+            break;
+        }
+        let found = psnr(&kept(count), &judges, &services)?;
+        if psnr_before_db - found <= max_drop_db {
+            (enough, psnr_after_db) = (count, found);
+        } else {
+            too_few = count;
+        }
+        events.emit(&Event::Progress { task: "share to remove".into(), done: step as u64 + 1, total: STEPS as u64 });
+    }
+    let rest = kept(enough);
+    drop(services);
+    model.gaussians = rest;
+    let views = judges.len().min(JUDGES);
+    Ok(PruneReport { before: n, after: enough, psnr_before_db, psnr_after_db, judged_by, views })
+}
+
+/// Mean PSNR over at most [`JUDGES`] of `views`; values are clamped to 0..1 and not rounded.
+fn psnr(gaussians: &HostGaussians, views: &SceneViews, services: &ModelServices) -> Result<f64> {
+    let chosen = views.len().min(JUDGES);
+    let mut sum = 0.0;
+    for k in 0..chosen {
+        let index = k * views.len() / chosen;
+        let (camera, time_norm) = views.view(index);
+        let drawn = services.render(gaussians, camera, time_norm)?;
+        let truth = views.image(index)?.to_planes(services.background());
+        let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum();
+        sum -= 10.0 * (error / truth.len().max(1) as f64).max(1e-12).log10();
+    }
+    Ok(sum / chosen.max(1) as f64)
+}
