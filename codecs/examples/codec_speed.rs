@@ -1,4 +1,5 @@
-//! Bytes per stream and seconds of codecs on a PLY file, repeated to a larger model: `codec_speed FILE.ply REPEAT CODEC[:PROFILE]...`, JSON lines.
+//! Bytes per stream and seconds of codecs on a PLY file, repeated to a larger model: `codec_speed FILE.ply REPEAT CODEC[:PROFILE]...`, JSON lines. Where the
+//! variable `DECODED` names a folder, what was decoded is written there as PLY files.
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
 use cc4dgs_format::archive::{Archive, ArchiveWriter, Manifest, StreamKind};
@@ -26,10 +27,14 @@ fn main() -> Result<()> {
         let archive = Archive::from_bytes("memory", ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).to_bytes()?, &limits)?;
         let mut decode = f64::INFINITY;
         for _ in 0..3 {
+            let streams = archive.read_kind(StreamKind::Canonical)?;
             let began = Instant::now();
-            let found = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
+            let found = codec.decode(&streams, &context)?;
             decode = decode.min(began.elapsed().as_secs_f64());
             assert_eq!(found.len(), gaussians.len());
+            if let Some(folder) = std::env::var_os("DECODED") {
+                ply::write(std::path::Path::new(&folder).join(format!("{}.ply", spec.replace([':', '='], "-"))), &found, false)?;
+            }
         }
         let per = |bytes: u64| (1000.0 * bytes as f64 / gaussians.len().max(1) as f64).round() / 1000.0;
         let streams: Vec<String> = archive.stream_sizes().iter().map(|s| format!("\"{}\":{}", s.name, per(s.stored_bytes))).collect();

@@ -12,6 +12,9 @@ pub const CLASSES: u8 = 12;
 const FINEST: f64 = 1e-3;
 /// Largest step of a centre, in middle scales.
 const LARGEST_STEP: f64 = 1.0;
+/// Largest steps of log-scales and companded opacities.
+const LARGEST_SCALE_STEP: f64 = 0.7;
+const LARGEST_OPACITY_STEP: f64 = 1.0;
 /// Norms of quaternions outside are stored exactly: an absolute step would be wrong for them.
 const NORMS: std::ops::Range<f64> = 0.2..5.0;
 /// Log-scales of larger magnitude are stored exactly.
@@ -110,18 +113,23 @@ pub fn quantise(
     let finite: Vec<f64> = gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v)).collect();
     let mut geometry = Geometry {
         scale_origin: (finite.iter().sum::<f64>() / finite.len().max(1) as f64) as f32,
-        scale_step: positive((base * steps.log_scales * factors[1]).min(1.0)),
+        scale_step: positive((base * steps.log_scales * factors[1]).min(LARGEST_SCALE_STEP)),
         rotation_step: positive(base * steps.quaternions * factors[2]),
-        opacity_step: positive(base * steps.opacity_logits * factors[3]),
+        opacity_step: positive((base * steps.opacity_logits * factors[3]).min(LARGEST_OPACITY_STEP)),
         corner: [0.0; 3],
         cell: 1.0,
         size_floor: 0,
         class_limit: 0,
+        scale_limit: 0,
+        opacity_limit: 0,
     };
+    let limit = |step: f32, largest: f64| libm::log2(largest / f64::from(step)).clamp(0.0, 15.0) as u8;
+    geometry.scale_limit = limit(geometry.scale_step, LARGEST_SCALE_STEP);
+    geometry.opacity_limit = limit(geometry.opacity_step, LARGEST_OPACITY_STEP);
     let mut exact = vec![Vec::new(); 4];
     let mut scales = vec![[0i32; 3]; n];
     for (i, (codes, values)) in scales.iter_mut().zip(gaussians.log_scales.chunks_exact(3)).enumerate() {
-        let step = f64::from(geometry.scale_step) * f64::from(1u32 << classes[i]);
+        let step = f64::from(geometry.scale_step) * f64::from(1u32 << classes[i].min(geometry.scale_limit));
         let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
         match found {
             [Some(a), Some(b), Some(c)] if values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
@@ -149,7 +157,7 @@ pub fn quantise(
     }
     let mut opacities = vec![0i32; n];
     for (i, (out, &logit)) in opacities.iter_mut().zip(&gaussians.opacity_logits).enumerate() {
-        match code(companded(logit) / (f64::from(geometry.opacity_step) * f64::from(1u32 << classes[i]))) {
+        match code(companded(logit) / (f64::from(geometry.opacity_step) * f64::from(1u32 << classes[i].min(geometry.opacity_limit)))) {
             Some(found) => *out = found,
             None => exact[3].push(i),
         }

@@ -18,8 +18,18 @@ pub const SYMBOLS: usize = 16;
 /// Bits of a probability.
 const PRECISION: usize = 15;
 const ONE: i32 = 1 << PRECISION;
-/// Adaptation slows down from the first shift to the last one: the n-th symbol has about the weight 1 / (n + 4), later ones 2^-7.
-const RATES: [(u8, u32); 6] = [(4, 2), (12, 3), (28, 4), (60, 5), (124, 6), (255, 7)];
+/// Shift of the adaptation by the number of symbols before: the n-th symbol has about the weight 1 / (n + 4), later ones 2^-7.
+const RATES: [u8; 125] = rates();
+
+const fn rates() -> [u8; 125] {
+    let mut out = [2; 125];
+    let mut n = 0;
+    while n < out.len() {
+        out[n] = (n as u32 + 4).ilog2() as u8;
+        n += 1;
+    }
+    out
+}
 
 /// An adaptive distribution of 16 symbols.
 #[derive(Clone)]
@@ -42,13 +52,14 @@ impl Model {
     /// Moves the distribution towards `symbol`.
     #[inline]
     fn update(&mut self, symbol: usize) {
-        let rate = RATES.iter().find(|(until, _)| self.seen < *until).map_or(7, |r| r.1);
-        for (i, below) in self.below.iter_mut().enumerate().skip(1) {
-            let target = if i <= symbol { i as i32 } else { ONE - SYMBOLS as i32 + i as i32 };
-            let value = i32::from(*below);
+        let rate = RATES[usize::from(self.seen)];
+        // The first entry stays 0: its target is 0 whatever the symbol. Probabilities are below 2^15, so that differences fit 16 bits.
+        for (i, below) in self.below.iter_mut().enumerate() {
+            let target = i as i16 + if i <= symbol { 0 } else { (ONE - SYMBOLS as i32) as i16 };
+            let value = *below as i16;
             *below = (value + ((target - value) >> rate)) as u16;
         }
-        self.seen = self.seen.saturating_add(1);
+        self.seen = (self.seen + 1).min(RATES.len() as u8 - 1);
     }
 }
 
@@ -68,7 +79,8 @@ impl EncoderModel<PRECISION> for Model {
 impl DecoderModel<PRECISION> for Model {
     #[inline]
     fn quantile_function(&self, quantile: u32) -> (usize, u32, NonZeroU32) {
-        let symbol = self.below.iter().skip(1).filter(|&&below| u32::from(below) <= quantile).count();
+        // The first entry is 0, so that there is at least one.
+        let symbol = self.below.iter().map(|&below| u16::from(below <= quantile as u16)).sum::<u16>() as usize - 1;
         let start = u32::from(self.below[symbol]);
         (symbol, start, NonZeroU32::new(self.end(symbol) - start).unwrap_or(NonZeroU32::MIN))
     }

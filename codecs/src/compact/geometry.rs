@@ -36,6 +36,10 @@ pub struct Geometry {
     pub size_floor: i64,
     /// Centres of coarser classes have the steps of this one.
     pub class_limit: u8,
+    /// Log-scales of coarser classes have the steps of this one: a Gaussian that is hardly seen must not become a large one.
+    pub scale_limit: u8,
+    /// Opacities of coarser classes have the steps of this one.
+    pub opacity_limit: u8,
 }
 
 impl Geometry {
@@ -48,7 +52,7 @@ impl Geometry {
     }
     /// The middle scale (octaves times 2^16), and the octaves between largest and smallest.
     fn size(&self, codes: [i32; 3], class: u8) -> (i64, usize) {
-        let [low, middle, high] = sorted(codes).map(|c| (i64::from(c) << class).clamp(-(1 << 36), 1 << 36));
+        let [low, middle, high] = sorted(codes).map(|c| (i64::from(c) << class.min(self.scale_limit)).clamp(-(1 << 36), 1 << 36));
         let octaves = |steps: i64| steps.saturating_mul(self.octave().min(1 << 20));
         (self.size_origin().saturating_add(octaves(middle)), ((octaves(high - low) + 32768) >> 16).clamp(0, 3) as usize)
     }
@@ -65,13 +69,13 @@ impl Geometry {
         [self.scale_origin, self.scale_step, self.rotation_step, self.opacity_step].iter().for_each(|v| meta.extend(v.to_le_bytes()));
         self.corner.iter().chain([&self.cell]).for_each(|v| meta.extend(v.to_le_bytes()));
         meta.extend(self.size_floor.to_le_bytes());
-        meta.push(self.class_limit);
+        meta.extend([self.class_limit, self.scale_limit, self.opacity_limit]);
     }
     pub fn read(meta: &mut ByteReader) -> Result<Self> {
         let floats = meta.f32s(4)?;
         let doubles = (0..4).map(|_| Ok(f64::from_bits(meta.u64()?))).collect::<Result<Vec<f64>>>()?;
-        let (size_floor, class_limit) = (meta.u64()? as i64, meta.u8()?);
-        if doubles.iter().any(|v| !v.is_finite()) || floats[1..].iter().any(|v| *v <= 0.0) || doubles[3] <= 0.0 || class_limit > 15 {
+        let (size_floor, class_limit, scale_limit, opacity_limit) = (meta.u64()? as i64, meta.u8()?, meta.u8()?, meta.u8()?);
+        if doubles.iter().any(|v| !v.is_finite()) || floats[1..].iter().any(|v| *v <= 0.0) || doubles[3] <= 0.0 || [class_limit, scale_limit, opacity_limit].iter().any(|l| *l > 15) {
             return Err(meta.error("a step or an origin is impossible"));
         }
         Ok(Self {
@@ -83,13 +87,15 @@ impl Geometry {
             cell: doubles[3],
             size_floor,
             class_limit,
+            scale_limit,
+            opacity_limit,
         })
     }
     pub fn scale(&self, code: i32, class: u8) -> f32 {
-        (f64::from(self.scale_origin) + f64::from(code) * f64::from(self.scale_step) * f64::from(1u32 << class)) as f32
+        (f64::from(self.scale_origin) + f64::from(code) * f64::from(self.scale_step) * f64::from(1u32 << class.min(self.scale_limit))) as f32
     }
     pub fn opacity(&self, code: i32, class: u8) -> f32 {
-        let value = f64::from(code) * f64::from(self.opacity_step) * f64::from(1u32 << class);
+        let value = f64::from(code) * f64::from(self.opacity_step) * f64::from(1u32 << class.min(self.opacity_limit));
         (if value < 0.0 { value } else { libm::expm1(value) } as f32).clamp(f32::MIN, f32::MAX)
     }
     /// Step of a rotation.
@@ -126,17 +132,18 @@ pub fn companded(logit: f32) -> f64 {
 }
 
 /// Codes three log-scales per row: the first predicted by earlier rows, the others by the one before.
-pub fn code_scales<C: Coder>(coder: &mut C, scales: &mut [[i32; 3]], classes: &[u8]) -> Result<()> {
+pub fn code_scales<C: Coder>(coder: &mut C, scales: &mut [[i32; 3]], classes: &[u8], limit: u8) -> Result<()> {
     let mut models = vec![[Model::default(), Model::default()]; 3 * 16];
     let mut recent = [0i64; 4];
     for (i, (row, &class)) in scales.iter_mut().zip(classes).enumerate() {
-        let mut guess = (recent.iter().sum::<i64>() / 4) >> class;
+        let shift = class.min(limit);
+        let mut guess = (recent.iter().sum::<i64>() / 4) >> shift;
         for (axis, code) in row.iter_mut().enumerate() {
             let [size, sign] = &mut models[axis * 16 + usize::from(class.min(15))];
             guess += signed(coder, size, sign, i64::from(*code) - guess)?;
             *code = checked(guess)?;
         }
-        recent[i % 4] = i64::from(row[0]) << class;
+        recent[i % 4] = i64::from(row[0]) << shift;
     }
     Ok(())
 }

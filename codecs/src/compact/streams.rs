@@ -7,7 +7,7 @@ use super::{PREDICTED, VERSION, blocks};
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::storage::column::{self, Form, Target};
-use cc4dgs_format::storage::{Attributes, META, Shape, StreamSet, extra_streams, open};
+use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams, open};
 use cc4dgs_format::{CodecContext, Error, HostGaussians, Result, Stream};
 use rayon::prelude::*;
 
@@ -71,7 +71,7 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
             Stream { name: SCORES.into(), bytes }
         }
     });
-    streams.push(blocks::encode(SCALES, n, |coder, range| code_scales(coder, &mut scales[range.clone()].to_vec(), &classes[range]))?);
+    streams.push(blocks::encode(SCALES, n, |coder, range| code_scales(coder, &mut scales[range.clone()].to_vec(), &classes[range], of.geometry.scale_limit))?);
     let keys: Vec<u64> = order.iter().map(|&i| of.keys[i]).collect();
     streams.push(blocks::encode(MEANS, n, |coder, range| {
         code_keys(coder, &mut keys[range.clone()].to_vec(), range.map(|i| of.geometry.position_shift(scales[i], classes[i])))
@@ -154,7 +154,7 @@ pub fn read(streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>
     let (name, stream) = coded(SCALES)?;
     let scales = blocks::decode(name, stream, n, |coder, range| {
         let mut codes = vec![[0; 3]; range.len()];
-        code_scales(coder, &mut codes, &classes[range])?;
+        code_scales(coder, &mut codes, &classes[range], geometry.scale_limit)?;
         Ok(codes)
     })?;
     let scales: Vec<[i32; 3]> = scales.concat();
