@@ -27,7 +27,9 @@ fn scene(count: usize, sh_degree: usize) -> HostGaussians {
         g.log_scales.extend([size, size - 0.5 * draw(i, 6), size - 1.0 + draw(i, 7)]);
         g.quaternions.extend([1.0 + 0.3 * draw(i, 8), draw(i, 9), draw(i, 10), draw(i, 11)]);
         g.sh_dc.extend([x + 0.2 * draw(i, 12), y + 0.2 * draw(i, 13), x * y + 0.2 * draw(i, 14)]);
-        g.sh_rest.extend((0..3 * cc4dgs_format::gaussians::sh_rest_len(sh_degree)).map(|k| 0.1 * draw(i, 20 + k) * draw(i, 80 + k) * if k % 3 == 0 { x } else { y }));
+        g.sh_rest.extend(
+            (0..3 * cc4dgs_format::gaussians::sh_rest_len(sh_degree)).map(|k| 0.1 * draw(i, 20 + k) * draw(i, 80 + k) * if k % 3 == 0 { x } else { y }),
+        );
         g.dynamic_scores.push(if x > 0.5 { 9.0 + draw(i, 15) } else { draw(i, 16) });
     }
     g

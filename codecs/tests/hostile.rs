@@ -119,7 +119,10 @@ fn seconds(of: usize) -> Duration {
 /// Tries damages until time is up. `decode` says what is wrong with a result, if anything is.
 fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream]) -> Option<String>) -> u64 {
     let began = Instant::now();
-    let mut runner = TestRunner::new_with_rng(Config { cases: 64, failure_persistence: None, ..Config::default() }, proptest::test_runner::TestRng::deterministic_rng(proptest::test_runner::RngAlgorithm::ChaCha));
+    let mut runner = TestRunner::new_with_rng(
+        Config { cases: 64, failure_persistence: None, ..Config::default() },
+        proptest::test_runner::TestRng::deterministic_rng(proptest::test_runner::RngAlgorithm::ChaCha),
+    );
     let mut tried = 0;
     while began.elapsed() < time {
         let strategy = prop::collection::vec((any::<usize>(), damage()), 1..4);

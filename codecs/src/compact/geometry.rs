@@ -75,7 +75,11 @@ impl Geometry {
         let floats = meta.f32s(4)?;
         let doubles = (0..4).map(|_| Ok(f64::from_bits(meta.u64()?))).collect::<Result<Vec<f64>>>()?;
         let (size_floor, class_limit, scale_limit, opacity_limit) = (meta.u64()? as i64, meta.u8()?, meta.u8()?, meta.u8()?);
-        if doubles.iter().any(|v| !v.is_finite()) || floats[1..].iter().any(|v| *v <= 0.0) || doubles[3] <= 0.0 || [class_limit, scale_limit, opacity_limit].iter().any(|l| *l > 15) {
+        if doubles.iter().any(|v| !v.is_finite())
+            || floats[1..].iter().any(|v| *v <= 0.0)
+            || doubles[3] <= 0.0
+            || [class_limit, scale_limit, opacity_limit].iter().any(|l| *l > 15)
+        {
             return Err(meta.error("a step or an origin is impossible"));
         }
         Ok(Self {

@@ -158,8 +158,7 @@ fn pixel_scales(gaussians: &HostGaussians, context: &CodecContext) -> (Vec<f64>,
 /// Pixels per world unit of a camera that sees most of the model.
 fn whole(gaussians: &HostGaussians) -> f64 {
     let middle: [f64; 3] = std::array::from_fn(|axis| median(&gaussians.means.iter().skip(axis).step_by(3).map(|&v| f64::from(v)).collect::<Vec<_>>()));
-    let mut distances: Vec<f64> =
-        gaussians.means.chunks_exact(3).map(|p| (0..3).map(|k| (f64::from(p[k]) - middle[k]).powi(2)).sum::<f64>().sqrt()).collect();
+    let mut distances: Vec<f64> = gaussians.means.chunks_exact(3).map(|p| (0..3).map(|k| (f64::from(p[k]) - middle[k]).powi(2)).sum::<f64>().sqrt()).collect();
     distances.sort_unstable_by(f64::total_cmp);
     let radius = distances.get(distances.len() * 7 / 10).copied().unwrap_or(1.0);
     if radius > 0.0 && radius.is_finite() { 0.5 * IMAGE.1 / (1.1 * radius) } else { IMAGE.1 }

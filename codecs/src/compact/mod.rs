@@ -108,11 +108,20 @@ impl Compact {
         };
         // Rounded to float32, a mean may be on the other side of the threshold.
         let finite = threshold.clamp(f32::MIN, f32::MAX);
-        let levels = [if moving.contains(&false) { mean(false).min(finite) } else { 0.0 }, if moving.contains(&true) { mean(true).max(finite.next_up().min(f32::MAX)) } else { 0.0 }];
+        let levels = [
+            if moving.contains(&false) { mean(false).min(finite) } else { 0.0 },
+            if moving.contains(&true) { mean(true).max(finite.next_up().min(f32::MAX)) } else { 0.0 },
+        ];
         let free = match (self.settings.canonical, moving.contains(&true)) {
             (false, _) => 0,
             (true, false) => 1,
-            (true, true) => if keeps_shapes(gaussians, context)? { 1 } else { 2 },
+            (true, true) => {
+                if keeps_shapes(gaussians, context)? {
+                    1
+                } else {
+                    2
+                }
+            }
         };
         let free_rows = moving.iter().map(|m| free == 1 || free == 2 && !m).collect();
         Ok((Motion { free, moving: Some(moving), levels }, free_rows))

@@ -26,12 +26,20 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
     let object = "codec compact";
     if settings.max_size_mb > 0.0 {
         let limit = settings.max_size_mb * 1e6;
-        let found = largest(job, start, |attempt| Ok(attempt.bytes as f64 <= limit), |attempt| attempt.bytes as f64 >= GOOD_SIZE * limit)?;
+        let found = bisect(job, start, -1.0, |attempt| Ok(attempt.bytes as f64 <= limit), |attempt| attempt.bytes as f64 >= GOOD_SIZE * limit)?;
         if found.bytes as f64 > limit {
             let remedy = "Allow more, or remove Gaussians with `cc4dgs prune`";
             return Err(Error::parameter(object, format!("{} bytes are the least that it reached", found.bytes), remedy));
         }
-        note(context, format!("{:.4} MB of Gaussians of {} MB allowed, steps {:.3} times the estimated ones", found.bytes as f64 / 1e6, settings.max_size_mb, found.quality / start));
+        note(
+            context,
+            format!(
+                "{:.4} MB of Gaussians of {} MB allowed, steps {:.3} times the estimated ones",
+                found.bytes as f64 / 1e6,
+                settings.max_size_mb,
+                found.quality / start
+            ),
+        );
         return Ok(found);
     }
     let (Some(views), Some(renderer)) = (context.views.filter(|v| !v.is_empty()), context.renderer) else {
@@ -45,7 +53,8 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
         return job.attempt(start);
     }
     let before = Losses::of(job.gaussians, views, renderer)?;
-    let drop_of = |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&streams::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
+    let drop_of =
+        |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&streams::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
     let best = std::cell::Cell::new((0.0, f64::NAN));
     let allowed = |attempt: &Attempt| {
         let drop = drop_of(attempt)?;
@@ -54,7 +63,7 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
         }
         Ok(drop <= settings.max_drop_db)
     };
-    let found = largest(job, start, allowed, |_| false)?;
+    let found = bisect(job, start, 1.0, allowed, |_| false)?;
     let (_, drop) = best.get();
     note(
         context,
@@ -78,9 +87,10 @@ fn note(context: &CodecContext, message: String) {
     context.events.emit(&Event::Note { object: "codec compact".into(), message });
 }
 
-/// The attempt with the largest steps that is `allowed`, by bisection of the logarithm; the one with the smallest steps if none is.
-fn largest(job: &Job, start: f64, allowed: impl Fn(&Attempt) -> Result<bool>, good: impl Fn(&Attempt) -> bool) -> Result<Attempt> {
-    let (mut low, mut high): (Option<Attempt>, Option<f64>) = (None, None);
+/// The attempt with the largest steps (`direction` 1) or the smallest (-1) that is `allowed`, by bisection of the logarithm; an attempt far on the other side
+/// if none is.
+fn bisect(job: &Job, start: f64, direction: f64, allowed: impl Fn(&Attempt) -> Result<bool>, good: impl Fn(&Attempt) -> bool) -> Result<Attempt> {
+    let (mut best, mut refused): (Option<Attempt>, Option<f64>) = (None, None);
     let mut quality = start;
     for _ in 0..ATTEMPTS {
         let attempt = job.attempt(quality)?;
@@ -88,17 +98,17 @@ fn largest(job: &Job, start: f64, allowed: impl Fn(&Attempt) -> Result<bool>, go
             if good(&attempt) {
                 return Ok(attempt);
             }
-            low = Some(attempt);
+            best = Some(attempt);
         } else {
-            high = Some(quality);
+            refused = Some(quality);
         }
-        quality = match (&low, high) {
-            (Some(low), Some(high)) => (low.quality * high).sqrt(),
-            (Some(low), None) => 2.0 * low.quality,
-            (None, _) => quality / 2.5,
+        quality = match (&best, refused) {
+            (Some(best), Some(refused)) => (best.quality * refused).sqrt(),
+            (Some(best), None) => best.quality * libm::pow(2.0, direction),
+            (None, _) => quality / libm::pow(2.5, direction),
         };
     }
-    match low {
+    match best {
         Some(attempt) => Ok(attempt),
         None => job.attempt(quality),
     }

@@ -56,11 +56,8 @@ impl Default for Settings {
 }
 
 /// Name of a profile in front of `=`, the setting, its unit, and the settings that it switches off.
-const PROFILES: [(&str, &str, &str, &[&str]); 3] = [
-    ("max-drop", "max_drop_db", "dB", &["max_size_mb"]),
-    ("max-size", "max_size_mb", "MB", &[]),
-    ("psnr", "psnr_db", "dB", &["max_drop_db", "max_size_mb"]),
-];
+const PROFILES: [(&str, &str, &str, &[&str]); 3] =
+    [("max-drop", "max_drop_db", "dB", &["max_size_mb"]), ("max-size", "max_size_mb", "MB", &[]), ("psnr", "psnr_db", "dB", &["max_drop_db", "max_size_mb"])];
 
 impl Settings {
     /// The settings of a profile (`max-drop=0.05dB`), with `table` laid over them.

@@ -254,4 +254,3 @@ fn read_exact(stream: &mut ByteReader, width: usize, values: &mut [f32]) -> Resu
     }
     Ok(())
 }
-

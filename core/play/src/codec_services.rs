@@ -4,8 +4,8 @@ use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, EvaluateDeformer, Gaussians, HostGaussians, Image8, Rasterizer, Registry, RenderModel, ParameterSpace, RenderSettings, RenderedPlanes, Result, Scene, Seed, SpatialInput,
-    SplatColors, Splats, Split, TrainingViews,
+    Camera, EvaluateDeformer, Gaussians, HostGaussians, Image8, ParameterSpace, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes, Result,
+    Scene, Seed, SpatialInput, SplatColors, Splats, Split, TrainingViews,
 };
 
 /// The views of one split of a scene.
