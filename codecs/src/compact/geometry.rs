@@ -114,8 +114,8 @@ impl Geometry {
     /// The key of a centre: its cell, interleaved bit by bit, without the bits below its step. `None` outside the grid.
     pub fn key(&self, mean: &[f32], shift: u32) -> Option<u64> {
         let mut key = 0;
-        for axis in 0..3 {
-            let cell = libm::floor((f64::from(mean[axis]) - self.corner[axis]) / self.cell);
+        for (axis, (&value, corner)) in mean.iter().zip(self.corner).enumerate() {
+            let cell = libm::floor((f64::from(value) - corner) / self.cell);
             if !(0.0..f64::from(1u32 << GRID_BITS)).contains(&cell) {
                 return None;
             }
