@@ -133,8 +133,10 @@ fn outliers_survive_without_spoiling_their_neighbours() {
         hold_to_losses(&name, codec.as_ref(), &g);
         let (original, decoded, _) = round_trip(&name, codec.as_ref(), &g);
         let worst = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| (x - y).abs() / (1.0 + x.abs())).fold(0.0, f32::max);
-        assert!(worst(&original.log_scales, &decoded.log_scales) < 0.05, "{name}");
-        assert!(worst(&original.opacity_logits, &decoded.opacity_logits) < 0.05, "{name}");
+        // `compact` has steps up to 0.7 and 1 for Gaussians that are hardly seen.
+        let (scale, opacity) = if name.starts_with("compact") { (0.36, 0.55) } else { (0.05, 0.05) };
+        assert!(worst(&original.log_scales, &decoded.log_scales) < scale, "{name}");
+        assert!(worst(&original.opacity_logits, &decoded.opacity_logits) < opacity, "{name}");
         assert!(worst(&original.dynamic_scores, &decoded.dynamic_scores) < 0.1, "{name}");
     }
 }
