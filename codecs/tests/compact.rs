@@ -1,4 +1,5 @@
 //! `compact`: the conformance suite, a stored file that must stay readable, motion, and sizes.
+#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
 use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, Entries, HostGaussians, Limits, Seed, Silent, Stream, conformance, toml};
 
