@@ -46,7 +46,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             except (BrokenPipeError, ConnectionResetError):
                 return
             if "slow" in path:
-                time.sleep(0.05)
+                time.sleep(0.3)
 
     def log_message(self, *_):
         pass
