@@ -24,7 +24,7 @@ impl Clock {
     }
     /// Moves on by `elapsed_s` seconds of the real clock; whether time changed.
     pub fn tick(&mut self, elapsed_s: f32) -> bool {
-        if !self.playing || self.frames < 2 || !(elapsed_s > 0.0) {
+        if !self.playing || self.frames < 2 || elapsed_s.is_nan() || elapsed_s <= 0.0 {
             return false;
         }
         let next = self.time + elapsed_s * self.speed / self.seconds;

@@ -188,7 +188,7 @@ def main():
 
         # Without ranges, and slowly: the base is there before the motion.
         for name in ("plain", "slow"):
-            page.evaluate("window.steps = []; cc4dgs.on('progress', e => steps.push([e.bytes, cc4dgs.facts?.frames ?? 0]))")
+            page.evaluate("window.steps = []; cc4dgs.on('progress', e => steps.push([e.bytes, cc4dgs.facts?.frames ?? 0])); 0")
             loaded = page.evaluate(f"cc4dgs.load('/{name}.cc4d')")
             assert loaded["frames"] == facts["frames"], loaded
         fetched = page.evaluate("cc4dgs.received")
