@@ -1,4 +1,5 @@
 //! Images of the player against those of the tile renderer, of a small model trained here and baked.
+#![allow(clippy::unwrap_used)]
 
 use cc4dgs::core::Limits;
 use cc4dgs::core::archive::Archive;

@@ -46,7 +46,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             except (BrokenPipeError, ConnectionResetError):
                 return
             if "slow" in path:
-                time.sleep(0.05)
+                time.sleep(0.3)
 
     def log_message(self, *_):
         pass
@@ -122,8 +122,9 @@ def main():
         page.evaluate("cc4dgs.seek(0); window.times = []; cc4dgs.on('time', e => times.push(e.time)); cc4dgs.play()")
         page.wait_for_function("times.length > 3", timeout=60000)
         page.evaluate("cc4dgs.pause()")
-        assert page.evaluate("times.every((t, i) => i === 0 || t > times[i - 1])")
-        rates = page.evaluate("""async () => { const g = cc4dgs.gpu; const n = 10, began = performance.now();
+        # A short sequence may have begun again.
+        assert page.evaluate("new Set(times).size === times.length")
+        rates = page.evaluate("""async () => { const g = cc4dgs.gpu; const n = 5, began = performance.now();
             for (let i = 0; i < n; i++) { cc4dgs.seek(i / n); cc4dgs.draw(); await g.countVisible(); } return (performance.now() - began) / n; }""")
         say(f"plays; {rates:.1f} ms per frame at {page.evaluate('cc4dgs.ui.canvas.width')}x{page.evaluate('cc4dgs.ui.canvas.height')} on SwiftShader")
         page.get_by_label("Time", exact=True).fill("0.5")
@@ -187,7 +188,7 @@ def main():
 
         # Without ranges, and slowly: the base is there before the motion.
         for name in ("plain", "slow"):
-            page.evaluate("window.steps = []; cc4dgs.on('progress', e => steps.push([e.bytes, cc4dgs.facts?.frames ?? 0]))")
+            page.evaluate("window.steps = []; cc4dgs.on('progress', e => steps.push([e.bytes, cc4dgs.facts?.frames ?? 0])); 0")
             loaded = page.evaluate(f"cc4dgs.load('/{name}.cc4d')")
             assert loaded["frames"] == facts["frames"], loaded
         fetched = page.evaluate("cc4dgs.received")

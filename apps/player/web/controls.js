@@ -29,7 +29,7 @@ export function build(container, player) {
     const gear = button("☰", "Settings", () => { panel.hidden = !panel.hidden; gear.setAttribute("aria-expanded", String(!panel.hidden)); });
     gear.setAttribute("aria-expanded", "false");
     const bar = element("div", { className: "bar", attributes: { role: "group", "aria-label": "Playback" } },
-        play, button("⏮", "One frame back", () => player.step(-1)), button("⏭", "One frame on", () => player.step(1)), time, clock, speed, loop);
+        play, button("‹", "One frame back", () => player.step(-1)), button("›", "One frame on", () => player.step(1)), time, clock, speed, loop);
 
     const slider = (label, name, min, max, step, text) => {
         const value = element("span");
@@ -72,7 +72,7 @@ export function build(container, player) {
     const open = source => player.load(source).catch(() => {});
     const say = (text, error) => {
         note.hidden = !text;
-        note.className = error ? "note error" : "note";
+        note.className = error ? "note error" : player.facts ? "note hint" : "note";
         note.setAttribute("role", error ? "alert" : "status");
         note.replaceChildren(element("p", { textContent: text ?? "" }), ...(text && player.facts ? [button("Close", "Close", () => { note.hidden = true; })] : []));
     };

@@ -10,9 +10,9 @@ const HOME: (u32, u32) = (960, 720);
 /// Iterations of the power method for the upward axis.
 const ITERATIONS: usize = 200;
 
-/// `value` with nine significant digits: cameras are stored as decimals, and these come back as they were.
+/// `value` with nine decimals: cameras are stored as decimals, and short ones come back as they were, while those of 1e-17 may not.
 fn rounded(value: f64) -> f64 {
-    format!("{value:.8e}").parse().unwrap_or(value)
+    format!("{value:.9}").parse().unwrap_or(value)
 }
 
 /// `camera` as it will be read back from an archive.
@@ -30,7 +30,7 @@ pub fn of_cameras(cameras: &[Camera], up: Option<[f64; 3]>) -> Presentation {
     let up = up.map_or_else(|| upward(cameras), DVec3::from);
     let step = cameras.len().div_ceil(MAX_CAMERAS).max(1);
     Presentation {
-        up: Some(up.as_vec3().to_array()),
+        up: Some(up.to_array().map(|v| rounded(v) as f32)),
         target: Some([0.0; 3]),
         home: cameras.first().map(storable),
         cameras: cameras.iter().step_by(step).map(storable).collect(),
@@ -53,7 +53,7 @@ pub fn of_gaussians(gaussians: &HostGaussians, up: [f64; 3]) -> Result<Presentat
     let target = eye + along * forward;
     Ok(Presentation {
         up: Some(up.map(|v| v as f32)),
-        target: Some(target.as_vec3().to_array()),
+        target: Some(target.to_array().map(|v| rounded(v) as f32)),
         home: cameras.first().map(storable),
         ..Presentation::default()
     })

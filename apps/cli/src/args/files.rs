@@ -1,6 +1,6 @@
 //! Arguments of `decompress`, `render` and `export`: models in the formats of other programs.
 
-use super::{SplitArg, UpArg};
+use super::{SplitArg, UpArg, parse_size};
 use clap::Args;
 use std::path::PathBuf;
 

@@ -26,7 +26,7 @@ const SAMPLED_ROWS: usize = 3072;
 /// Floats of offsets held at a time.
 const FLOATS: usize = 24 << 20;
 /// Samples per frame at most.
-const SAMPLES_PER_FRAME: usize = 4;
+const SAMPLES_PER_FRAME: usize = 8;
 /// The part of the tolerance that linear interpolation between samples may use up before the samples are doubled.
 const BETWEEN_SHARE: f32 = 0.5;
 
