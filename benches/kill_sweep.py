@@ -3,7 +3,7 @@
 
     python3 benches/kill_sweep.py OUT --bin BIN [--grid benches/grids/tiny.toml] [--kills 50] [--json FILE]
 
-The undisturbed sweep is OUT/whole, the other one OUT/killed. At each of the random moments, drawn over the time that the undisturbed sweep took, either the pool and
+The undisturbed sweep is OUT/whole, the other one OUT/killed. At random moments after each start either the pool and
 all of its processes are killed (SIGKILL), or the pool alone, or one of its processes, or the pool is asked to stop (SIGTERM). Once the disturbed sweep is complete, its
 folder is cleared and it begins again, until as many kills as asked for have hit a running sweep; every completed round is compared.
 """
@@ -77,6 +77,7 @@ def main():
     parser.add_argument("--grid", type=pathlib.Path, default=pathlib.Path(__file__).parent / "grids" / "tiny.toml")
     parser.add_argument("--iterations", type=int, help="size, in place of the grid's")
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--longest", type=float, default=0.25, help="longest time before a kill, as a share of the undisturbed time")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--json", type=pathlib.Path)
@@ -103,7 +104,7 @@ def main():
             process = subprocess.Popen(command(options, "run", killed, "--jobs", options.jobs), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             if sum(hits.values()) < options.kills:
                 # Short moments hit the beginning of trainings, long ones checkpoints, codecs and scores.
-                time.sleep(draw.uniform(0.05, 0.5 * undisturbed))
+                time.sleep(draw.uniform(0.05, options.longest * undisturbed))
                 way = draw.choice(WAYS)
                 workers = children(process.pid)
                 if way == "worker":

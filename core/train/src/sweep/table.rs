@@ -16,6 +16,9 @@ const SHOWN: [(&str, &str, usize); 6] = [
     ("flip", "FLIP", 4),
 ];
 
+/// A number of a result, where it has it.
+type Number = fn(&CellResult) -> Option<f64>;
+
 /// Mean and sample standard deviation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
@@ -139,7 +142,7 @@ pub fn csv(results: &[CellResult]) -> Result<String> {
         let key = name.clone();
         columns.push((name.clone(), Box::new(move |r: &CellResult| r.metrics.get(&key).map(|s| s.value))));
     }
-    let fixed: [(&str, Fixed); 14] = [
+    let fixed: [(&str, Number); 14] = [
         ("worst_block_psnr_db", |r| r.blocks.map(|b| b.worst_psnr_db)),
         ("lost_blocks", |r| r.blocks.map(|b| b.lost)),
         ("size_mb", |r| Some(r.size_mb())),

@@ -58,7 +58,7 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
     let events = context.listeners(None)?;
     let began = Instant::now();
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let jobs = jobs.unwrap_or(if threads == 0 { 1 } else { (cores / threads).max(1) });
+    let jobs = jobs.unwrap_or_else(|| cores.checked_div(threads).map_or(1, |jobs| jobs.max(1)));
     let queue = folder.open_trainings(plan).into();
     let (running, seconds, failed, not_before) = (Vec::new(), Vec::new(), Vec::new(), began);
     let mut pool = Pool { context, plan, folder, threads, events: &events, queue, running, seconds, failed, not_before };
