@@ -134,7 +134,6 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
 /// As [`markdown`].
 pub fn csv(results: &[CellResult]) -> Result<String> {
     type Value = dyn Fn(&CellResult) -> Option<f64>;
-    type Fixed = fn(&CellResult) -> Option<f64>;
     let rows = rows(results)?;
     let metrics: BTreeSet<&String> = results.iter().flat_map(|r| r.metrics.keys()).collect();
     let mut columns: Vec<(String, Box<Value>)> = Vec::new();
