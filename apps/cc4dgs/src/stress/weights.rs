@@ -44,7 +44,13 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
             let values = |device: &Device| -> Result<Vec<f32>> {
                 let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
                 let (kind, settings) = split_kind("deformer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
-                let deformer = (job.registry.deformer(&kind)?.build)(&settings, &context, device)?;
+                let mut deformer = (job.registry.deformer(&kind)?.build)(&settings, &context, device)?;
+                // Fresh deformers are the identity, whatever they are asked.
+                for (index, parameter) in deformer.parameters_mut().into_iter().enumerate() {
+                    let count = parameter.value.dims()[0];
+                    let noise: Vec<f32> = (0..count).map(|k| 0.1 * uniform(Seed::root(13).index(index as u64), k)).collect();
+                    parameter.value = parameter.value.clone() + Tensor::from_data(TensorData::new(noise, [count]), device);
+                }
                 let means: Vec<f32> = (0..POINTS).flat_map(place).collect();
                 let attributes = deformer.attributes().iter().map(|a| Tensor::<2>::full([POINTS, a.width], a.start, device)).collect();
                 let input = SpatialInput { means_world: Tensor::from_data(TensorData::new(means, [POINTS, 3]), device), attributes };

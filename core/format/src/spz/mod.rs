@@ -112,7 +112,7 @@ mod tests {
     fn sample(count: usize, sh_degree: usize) -> HostGaussians {
         let draw = |i: usize, k: usize| uniform(Seed::root(3).index(i as u64), k);
         let mut g = HostGaussians { sh_degree, ..Default::default() };
-        let mut fill = |width: usize, scale: f32, from: usize| -> Vec<f32> {
+        let fill = |width: usize, scale: f32, from: usize| -> Vec<f32> {
             (0..count).flat_map(|i| (0..width).map(move |k| (i, k))).map(|(i, k)| scale * draw(i, from + k)).collect()
         };
         g.means = fill(3, 20.0, 0);
