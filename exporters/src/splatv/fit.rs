@@ -274,7 +274,7 @@ mod tests {
         let times: Vec<f32> = (0..9).map(|i| i as f32 / 8.0).collect();
         let at = |i: usize| {
             let angle = 0.4 * times[i];
-            let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
+            let sign = if i.is_multiple_of(2) { 1.0 } else { -1.0 };
             let rotation = [sign * angle.cos(), 0.0, sign * angle.sin(), 0.0];
             Instant { mean: [times[i].powi(3), 0.0, 5.0], rotation, log_scales: [-1.0; 3], opacity: 0.5, color: [0.1; 3] }
         };
