@@ -71,7 +71,7 @@ impl StressReport {
         let mut limits: Vec<(&str, &str, Option<&str>)> = Vec::new();
         for case in &self.cases {
             let Some(error) = case.error else { continue };
-            let over = (!(error <= LIMIT)).then_some(case.level.as_str());
+            let over = (error.is_nan() || error > LIMIT).then_some(case.level.as_str());
             match limits.iter_mut().find(|(part, condition, _)| *part == case.part && *condition == case.condition) {
                 Some((_, _, limit)) => *limit = limit.or(over),
                 None => limits.push((&case.part, &case.condition, over)),

@@ -14,6 +14,9 @@ const POINTS: usize = 120;
 /// Values per optimizer run.
 const VALUES: usize = 64;
 
+/// A condition, and the centre with an index.
+type Place = (&'static str, fn(usize) -> [f32; 3]);
+
 pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     for (kind, plugin) in job.registry.plugins() {
         match kind {
@@ -32,7 +35,7 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
 /// Times at the ends and beyond, and centres on the faces of voxels, in the corners of the box, and outside.
 fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
     let part = format!("deformer {name}");
-    let places: [(&str, fn(usize) -> [f32; 3]); 4] = [
+    let places: [Place; 4] = [
         // Multiples of 1/64 lie on the faces of grids of any power of two.
         ("centres on the faces of voxels", |i| [i % 9, i / 9 % 9, i / 81].map(|k| k as f32 / 4.0 - 1.0)),
         ("centres at the box", |i| [i & 1, i >> 1 & 1, i >> 2 & 1].map(|k| if k == 0 { -1.0 } else { 1.0 })),
