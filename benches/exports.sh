@@ -41,11 +41,13 @@ for file in model.ply model.spz model-v3.spz model.sog "sequence/$(ls "$out/sequ
     "${transform[@]}" "$out/$file" "$out/read-$name.ply"
     head -c 300 "$out/read-$name.ply" | grep -a "element vertex"
     case $file in sequence/*) continue ;; esac
+    node "$here/exports_read.mjs" "$out/read-$name.ply"
     render "$out/read-$name.ply" "$out/frames/$name"
     ffmpeg -loglevel info -i "$out/frames/own/frame_%05d.png" -i "$out/frames/$name/frame_%05d.png" -lavfi psnr -f null - 2>&1 |
         sed -n 's/.*PSNR.*average:\([^ ]*\).*/   PSNR of what it read against our PLY: \1 dB/p'
 done
 
+"${transform[@]}" "$out/model.ply" "$out/splat-transform.glb"
 cp "$here/exports_read.mjs" "$tools/"
 absolute=$(cd "$out" && pwd)
 (cd "$tools" && node exports_read.mjs "$absolute")

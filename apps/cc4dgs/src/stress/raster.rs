@@ -7,6 +7,9 @@ use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Gaussians, Rasterizer, RenderSettings, Result, Seed, Splats, split_kind, toml};
 
+/// Gradients of an attribute that are smaller than this share of the largest of all count as zero.
+const NEGLIGIBLE: f32 = 1e-5;
+
 pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     let build = |name: &str| -> Result<Box<dyn Rasterizer>> {
         let (kind, settings) = split_kind("rasterizer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
@@ -46,15 +49,18 @@ fn gradients(rasterizer: &dyn Rasterizer, device: &Device, hard: &Hard) -> Resul
     let upstream: Vec<f32> = (0..5 * height * width).map(|k| if k < 4 * height * width { uniform(Seed::root(6), k) } else { 0.0 }).collect();
     let weights = Tensor::<3>::from_data(TensorData::new(upstream, [5, height, width]), &tracked);
     let found = (output.planes * weights).sum().backward();
-    let mut out = Vec::new();
+    let one = g.opacity_logits.grad(&found).map(|t| to_vec(t, "gradient"));
     let means = g.means.grad(&found).map(|t| to_vec(t, "gradient"));
     let others = [g.log_scales.grad(&found), g.quaternions.grad(&found), g.sh_dc.grad(&found)].map(|t| t.map(|t| to_vec(t, "gradient")));
-    let opacity = g.opacity_logits.grad(&found).map(|t| to_vec(t, "gradient"));
-    for gradient in [means, opacity].into_iter().chain(others).flatten() {
-        let gradient = gradient?;
-        let largest = gradient.iter().filter(|v| v.is_finite()).fold(0.0f32, |a, v| a.max(v.abs()));
-        let scale = if largest > 0.0 { largest } else { 1.0 };
-        out.extend(gradient.into_iter().map(|v| v / scale));
-    }
-    Ok(out)
+    let all = [means, one].into_iter().chain(others).flatten().collect::<Result<Vec<_>>>()?;
+    let largest = |gradient: &[f32]| gradient.iter().filter(|v| v.is_finite()).fold(0.0f32, |a, v| a.max(v.abs()));
+    // Gradients that are zero but for rounding stay small.
+    let least = NEGLIGIBLE * all.iter().map(|gradient| largest(gradient)).fold(f32::MIN_POSITIVE / NEGLIGIBLE, f32::max);
+    Ok(all
+        .into_iter()
+        .flat_map(|gradient| {
+            let scale = largest(&gradient).max(least);
+            gradient.into_iter().map(move |v| v / scale)
+        })
+        .collect())
 }

@@ -69,7 +69,10 @@ pub fn all() -> Vec<Hard> {
     }
     for decade in [-8, -6, -4, -2, 0, 1, 2, 3, 4] {
         let log = (10f32.powi(decade)).ln();
-        add("scales", format!("1e{decade}"), camera(0.0), &|g| g.log_scales.iter_mut().for_each(|v| *v = log));
+        // Not round: the gradients of a sphere's rotation are zero, and their noise says nothing.
+        add("scales", format!("1e{decade}"), camera(0.0), &|g| {
+            g.log_scales.as_chunks_mut::<3>().0.iter_mut().for_each(|scales| *scales = [log, log - 0.4, log + 0.3]);
+        });
     }
     for decade in 1..=6 {
         let aspect = 10f32.powi(decade).ln();

@@ -14,8 +14,8 @@ const POINTS: usize = 120;
 /// Values per optimizer run.
 const VALUES: usize = 64;
 
-/// The centre of a point by its index, in world units.
-type Place = fn(usize) -> [f32; 3];
+/// A condition, and the centre with an index.
+type Place = (&'static str, fn(usize) -> [f32; 3]);
 
 pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     for (kind, plugin) in job.registry.plugins() {
@@ -35,7 +35,7 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
 /// Times at the ends and beyond, and centres on the faces of voxels, in the corners of the box, and outside.
 fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
     let part = format!("deformer {name}");
-    let places: [(&str, Place); 4] = [
+    let places: [Place; 4] = [
         // Multiples of 1/64 lie on the faces of grids of any power of two.
         ("centres on the faces of voxels", |i| [i % 9, i / 9 % 9, i / 81].map(|k| k as f32 / 4.0 - 1.0)),
         ("centres at the box", |i| [i & 1, i >> 1 & 1, i >> 2 & 1].map(|k| if k == 0 { -1.0 } else { 1.0 })),
@@ -47,7 +47,13 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
             let values = |device: &Device| -> Result<Vec<f32>> {
                 let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
                 let (kind, settings) = split_kind("deformer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
-                let deformer = (job.registry.deformer(&kind)?.build)(&settings, &context, device)?;
+                let mut deformer = (job.registry.deformer(&kind)?.build)(&settings, &context, device)?;
+                // Fresh deformers are the identity, whatever they are asked.
+                for (index, parameter) in deformer.parameters_mut().into_iter().enumerate() {
+                    let count = parameter.value.dims()[0];
+                    let noise: Vec<f32> = (0..count).map(|k| 0.1 * uniform(Seed::root(13).index(index as u64), k)).collect();
+                    parameter.value = parameter.value.clone() + Tensor::from_data(TensorData::new(noise, [count]), device);
+                }
                 let means: Vec<f32> = (0..POINTS).flat_map(place).collect();
                 let attributes = deformer.attributes().iter().map(|a| Tensor::<2>::full([POINTS, a.width], a.start, device)).collect();
                 let input = SpatialInput { means_world: Tensor::from_data(TensorData::new(means, [POINTS, 3]), device), attributes };
