@@ -13,7 +13,7 @@ use crate::masks::blur;
 use crate::sample::spread;
 use blobs::blobs;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Event, Result, Schedule, Split, Stage};
+use cc4dgs_core::{Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage};
 use cc4dgs_play::model::ModelDeformer;
 use glam::DVec3;
 use std::collections::BTreeSet;
@@ -45,7 +45,13 @@ impl Context<'_> {
     /// Adds Gaussians for what the model does not draw, when the iteration is due and `train.recover` is on.
     pub(crate) fn recover(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let due = SHARES.iter().any(|share| schedule.iteration == (share * schedule.length as f64).round() as usize);
-        if !self.job.config.train.recover || schedule.stage != Stage::Main || !due || state.deformer.is_none() {
+        let Some(deformer) = state.deformer.as_ref().filter(|_| self.job.config.train.recover && schedule.stage == Stage::Main && due) else {
+            return Ok(());
+        };
+        let own = LIFE_ATTRIBUTES.iter().filter(|(name, _)| deformer.field.attributes().iter().any(|a| a.name == *name)).count();
+        if own > 0 && own < LIFE_ATTRIBUTES.len() {
+            let message = format!("{} has velocities of its own: nothing is looked for", deformer.name());
+            self.job.events.emit(&Event::Note { object: "recover".into(), message });
             return Ok(());
         }
         let lost = self.lost(state, schedule)?;
@@ -119,7 +125,7 @@ impl Context<'_> {
     fn give_lives(&self, state: &mut TrainState) -> Result<()> {
         let Some(old) = &state.deformer else { return Ok(()) };
         let has = |name: &str| old.field.attributes().iter().any(|a| a.name == name);
-        if cc4dgs_core::LIFE_ATTRIBUTES.iter().all(|(name, _)| has(name)) {
+        if LIFE_ATTRIBUTES.iter().all(|(name, _)| has(name)) {
             return Ok(());
         }
         let mut section = old.section.clone();
