@@ -178,11 +178,19 @@ impl WithLife {
         let lives = own.attributes.split_off(own.attributes.len() - LIFE_ATTRIBUTES.len());
         Ok((own, Tensor::cat(lives, 1)))
     }
-    /// The attributes of lives `[M,7]`, and the features of the inner deformer.
-    fn split(features: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
+    /// The attributes of lives `[M,7]`, and the features of the inner deformer, which a static one does not have.
+    fn split(features: Tensor<2>) -> (Tensor<2>, Option<Tensor<2>>) {
         let [m, width] = features.dims();
+        if width == WIDTH {
+            return (features, None);
+        }
+        if m == 0 {
+            let empty = |width| Tensor::zeros([0, width], &features.device());
+            return (empty(WIDTH), Some(empty(width - WIDTH)));
+        }
         let flat = features.reshape([m * width]);
-        (flat.clone().narrow(0, 0, m * WIDTH).reshape([m, WIDTH]), flat.narrow(0, m * WIDTH, m * (width - WIDTH)).reshape([m, width - WIDTH]))
+        let inner = flat.clone().narrow(0, m * WIDTH, m * (width - WIDTH)).reshape([m, width - WIDTH]);
+        (flat.narrow(0, 0, m * WIDTH).reshape([m, WIDTH]), Some(inner))
     }
 }
 
@@ -209,7 +217,7 @@ impl Deformer for WithLife {
             return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
         }
         let (lives, inner) = Self::split(features);
-        let mut offsets = if self.inner.is_static() { Offsets::default() } else { self.inner.deform(inner, time_norm)? };
+        let mut offsets = inner.map(|inner| self.inner.deform(inner, time_norm)).transpose()?.unwrap_or_default();
         let LifeAt { shift, log_factor, temporary } = self.life.at(lives, time_norm);
         // What is there at all times is moved by the inner deformer alone; its velocity and its life have no gradient.
         let shift = shift * temporary;
@@ -242,10 +250,8 @@ impl Deformer for WithLife {
         self.inner.set_progress(progress);
     }
     fn simplified(&self, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
-        if self.inner.is_static() {
-            return Ok(None);
-        }
-        let Some(mut simple) = self.inner.simplified(Self::split(features).1, times)? else { return Ok(None) };
+        let (_, Some(inner)) = Self::split(features) else { return Ok(None) };
+        let Some(mut simple) = self.inner.simplified(inner, times)? else { return Ok(None) };
         simple.field = Box::new(Self { inner: simple.field, life: Life { settings: self.life.settings.clone() } });
         let table = toml::Table::try_from(&self.life.settings);
         let table = table.map_err(|e| Error::backend("deformer.life", e.to_string(), "Report this as a defect"))?;
