@@ -27,6 +27,7 @@ where
     T: Into<OsString> + Clone,
 {
     quiet_drivers();
+    cc4dgs_train::code::built_from(env!("CC4DGS_COMMIT"));
     let cli = match args::Cli::try_parse_from(args) {
         Ok(cli) => cli,
         Err(error) => {

@@ -235,7 +235,7 @@ fn frame_count(state: &TrainState) -> usize {
 
 fn provenance(config: &RunConfig) -> Result<Provenance> {
     let table = config.to_toml()?.parse().unwrap_or_default();
-    Ok(Provenance { commit: env!("CC4DGS_COMMIT").into(), seed: config.seed, device: config.device.clone(), config: table })
+    Ok(Provenance { commit: crate::code::version().1.into(), seed: config.seed, device: config.device.clone(), config: table })
 }
 
 /// Reads only the configuration of a run's folder.

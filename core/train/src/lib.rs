@@ -5,6 +5,7 @@ pub mod auto;
 pub mod blocks;
 pub mod checkpoint;
 pub mod checks;
+pub mod code;
 pub mod config;
 pub mod data;
 pub mod eval;

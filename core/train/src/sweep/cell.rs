@@ -3,9 +3,10 @@
 use super::facts::{device_facts, locate};
 use super::folder::SweepFolder;
 use super::hash::name_of;
-use super::plan::{Plan, PlannedCell, PlannedTraining, code_version};
+use super::plan::{Plan, PlannedCell, PlannedTraining};
 use super::result::{Axes, Blocks, CellResult, Cost, FrameMs, ImageResult, KIND, ResultProvenance, SCHEMA, Score, Storage, StreamBytes};
 use super::training::{FinishedTraining, Worker, config_of};
+use crate::code;
 use crate::config::RunConfig;
 use crate::data;
 use crate::eval::{EvalReport, evaluate};
@@ -95,7 +96,7 @@ impl<'a> Trained<'a> {
             image.scores.retain(|name, _| metrics.contains_key(name));
         }
         let finished = &self.finished;
-        let (version, commit) = code_version();
+        let (version, commit) = code::version();
         let configuration = to_value(&self.config)?;
         let result = CellResult {
             kind: KIND.into(),

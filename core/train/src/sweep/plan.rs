@@ -4,6 +4,7 @@ use super::facts::{fingerprint, listing, locate};
 use super::grid::{Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
 use super::hash::name_of;
 use super::result::{CodecChoice, DataFingerprint};
+use crate::code;
 use crate::config::RunConfig;
 use crate::layers::Layers;
 use cc4dgs_core::archive::write_atomically;
@@ -98,18 +99,13 @@ pub struct Plan {
     pub cells: Vec<PlannedCell>,
 }
 
-/// Version and commit of this program.
-pub(super) fn code_version() -> (&'static str, &'static str) {
-    (env!("CARGO_PKG_VERSION"), env!("CC4DGS_COMMIT"))
-}
-
 impl Plan {
     /// Expands `grid`. Every configuration is read strictly; where it is known before the scene is looked at, `check` is asked about it too.
     ///
     /// # Errors
     /// [`Error::Parameter`] that names the place in the grid, the wrong key or value, and the remedy; [`Error::Io`] for unreadable datasets.
     pub fn expand(grid: &Grid, registry: &Registry, check: &dyn Fn(&RunConfig) -> Result<()>) -> Result<Self> {
-        let (version, commit) = code_version();
+        let (version, commit) = code::version();
         let codecs = codecs(grid, registry)?;
         let mut plan = Self {
             kind: KIND.into(),
@@ -203,7 +199,7 @@ impl Plan {
     /// # Errors
     /// [`Error::Parameter`] that names both versions.
     pub fn check_program(&self) -> Result<()> {
-        let (version, commit) = code_version();
+        let (version, commit) = code::version();
         if (self.version.as_str(), self.commit.as_str()) == (version, commit) {
             return Ok(());
         }
@@ -358,7 +354,7 @@ pub(super) mod tests {
 
     /// A plan of one training with two cells.
     pub(in crate::sweep) fn example() -> Plan {
-        let (version, commit) = code_version();
+        let (version, commit) = code::version();
         let choice = CodecChoice { codec: "raw".into(), field_weights: "fp32".into(), settings: toml::Table::new() };
         let cell = |id: &str, codec: &str| PlannedCell { id: id.into(), training: "00000000000000a0".into(), codec: codec.into(), choice: choice.clone() };
         Plan {

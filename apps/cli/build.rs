@@ -1,4 +1,4 @@
-//! Tells the crate which commit it was built from, for the provenance in checkpoints and archives.
+//! Finds the commit that the program is built from, for the provenance in checkpoints and archives.
 
 use std::path::Path;
 use std::process::Command;
