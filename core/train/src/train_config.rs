@@ -71,6 +71,8 @@ pub struct TrainConfig {
     pub mask_sigma: f32,
     /// At a third and at two thirds of the main stage, scored Gaussians that move by less than so many pixels in every training camera are made static; 0 is off.
     pub settle: f32,
+    /// Where several cameras see each frame: every so many frames is a key frame, at which what moves starts with points and lives of its own; 0 is off.
+    pub key_frames: usize,
     /// Twice during the main stage, look for compact things that are in training views and not drawn, and add Gaussians with lives along their tracks.
     pub recover: bool,
     /// Which Gaussians may move.
@@ -112,6 +114,7 @@ impl Default for TrainConfig {
             mask_threshold: 0.02,
             mask_sigma: PUBLISHED_SIGMA,
             settle: 0.0,
+            key_frames: 0,
             recover: false,
             dynamic: Dynamic::Auto,
             sparse_adam: true,

@@ -29,6 +29,13 @@ const EXPOSURE: f32 = 0.09;
 const STATIC: f32 = 2e-4;
 /// Width in pixels of the images that masks were published for (N3DV at half size).
 const PUBLISHED_WIDTH: f64 = 1352.0;
+/// Share of the time for matching key frames, seconds of one thread per matched pixel, and the most pixels of an image that are matched.
+const MATCHING_SHARE: f64 = 0.08;
+const SECONDS_PER_MATCHED_PIXEL: f64 = 4.3e-6;
+const MOST_MATCHED_PIXELS: f64 = 96_000.0;
+/// Least and most frames between key frames: in fewer hardly anything moves; in more, straight lines do not follow.
+const LEAST_KEY_INTERVAL: f64 = 5.0;
+const MOST_KEY_INTERVAL: usize = 16;
 /// Share of transparent pixels from which a scene is an object without surroundings.
 const OBJECT: f32 = 0.05;
 
@@ -95,9 +102,10 @@ pub(super) fn cache(facts: &Facts, all_views: usize, options: &SceneOptions, mac
     (wanted > options.cache_mb as f64).then(|| choice([("scene.cache_mb", integer(wanted))], format!("{all_views} images are kept decoded")))
 }
 
-/// Every other setting but the number of iterations.
-pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64) -> Vec<Choice> {
-    let mut choices = vec![field(facts, machine, minutes), stages(facts), counts(facts, machine, minutes)];
+/// Every other setting but the number of iterations. `free` says whether Gaussians may have lives: not where another deformer is stated.
+pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, free: bool) -> Vec<Choice> {
+    let every = free.then(|| key_frames(facts, machine, minutes)).flatten();
+    let mut choices = vec![field(facts, machine, minutes, every), stages(facts, every), counts(facts, machine, minutes)];
     choices.extend(background(facts));
     choices.extend(near(facts));
     choices.extend(noise(facts));
@@ -116,9 +124,25 @@ fn stands_alone(facts: &Facts) -> bool {
     facts.plain.is_some() || facts.transparent > OBJECT
 }
 
-fn field(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
+/// How many frames lie between key frames, where several cameras see each and there is time to match enough of them.
+fn key_frames(facts: &Facts, machine: Machine, minutes: f64) -> Option<usize> {
+    if stands_still(facts) || !facts.arrangement.has_several_cameras() {
+        return None;
+    }
+    let image = facts.pixels().min(MOST_MATCHED_PIXELS) * facts.cameras as f64;
+    let affordable = MATCHING_SHARE * 60.0 * minutes * machine.speed() / (SECONDS_PER_MATCHED_PIXEL * image.max(1.0));
+    let every = (facts.frames as f64 / affordable.max(1.0)).ceil().max(LEAST_KEY_INTERVAL) as usize;
+    (every <= MOST_KEY_INTERVAL && facts.frames >= 2 * every).then_some(every)
+}
+
+fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize>) -> Choice {
     if stands_still(facts) {
         return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
+    }
+    if let Some(every) = key_frames {
+        let reason =
+            format!("{} cameras see each frame: what moves starts with points of every {every}th frame, each with a velocity and a life", facts.cameras);
+        return choice([("deformer.kind", "free-time".into()), ("train.key_frames", integer(every as f64))], reason);
     }
     // Where poses have nothing to do with each other, higher bands would learn every training time by itself and the times between not at all.
     let bands = if facts.arrangement != Arrangement::OneCameraAnywhere && facts.frames > 100 { 6 } else { 4 };
@@ -133,7 +157,7 @@ fn field(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
     choice(settings, format!("{} frames; the most accurate field for its time", facts.frames))
 }
 
-fn stages(facts: &Facts) -> Choice {
+fn stages(facts: &Facts, key_frames: Option<usize>) -> Choice {
     let shares = |shares: [f64; 3]| Value::Array(shares.map(Value::Float).to_vec());
     let (mut settings, reason) = match facts.arrangement {
         _ if stands_still(facts) => (vec![("train.shares", shares([1.0, 0.0, 4.0])), ("train.coarse_frames", "all".into())], "a static scene".to_string()),
@@ -151,13 +175,17 @@ fn stages(facts: &Facts) -> Choice {
             format!("{}: all frames come at once, everything may move, and what crosses the scene is looked for", facts.arrangement.describe()),
         ),
         Arrangement::Photos | Arrangement::Dome | Arrangement::Rig => {
-            let smooth = if facts.frames < 12 { 0.0 } else { 0.05 };
+            // Lives need neither frames that come one after another nor a smooth function of space.
+            let (ramp, smooth) = match key_frames {
+                Some(_) => (0.0, 0.0),
+                None => (0.4, if facts.frames < 12 { 0.0 } else { 0.05 }),
+            };
             (
                 vec![
                     ("train.shares", shares([5.0, 3.0, 20.0])),
                     ("train.coarse_frames", "first".into()),
                     ("train.dynamic", "auto".into()),
-                    ("train.time_ramp", Value::Float(0.4)),
+                    ("train.time_ramp", Value::Float(ramp)),
                     ("train.lambda_r", Value::Float(smooth)),
                 ],
                 format!("{} training cameras, {}: the first frame, then what moves", facts.cameras, facts.arrangement.describe()),
@@ -269,16 +297,20 @@ mod tests {
 
     #[test]
     fn scenes_get_what_they_need_and_no_more() {
-        let dome = choose(&facts(Arrangement::Dome), MACHINE, 5.0);
-        assert_eq!(value(&dome, "deformer.kind"), Some("cdf-basis".into()));
+        let dome = choose(&facts(Arrangement::Dome), MACHINE, 5.0, true);
+        assert_eq!((value(&dome, "deformer.kind"), value(&dome, "train.key_frames")), (Some("free-time".into()), Some(5.into())));
+        let stated = choose(&facts(Arrangement::Dome), MACHINE, 5.0, false);
+        assert!(value(&stated, "deformer.kind") == Some("cdf-basis".into()) && value(&stated, "train.key_frames").is_none());
+        let long = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
+        assert_eq!(value(&long, "deformer.kind"), Some("cdf-basis".into()));
         assert_eq!(value(&dome, "train.coarse_frames"), Some("first".into()));
         assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none() && value(&dome, "render.background").is_none());
-        let photos = choose(&Facts { frames: 1, moving: None, noise: None, ..facts(Arrangement::Photos) }, MACHINE, 5.0);
+        let photos = choose(&Facts { frames: 1, moving: None, noise: None, ..facts(Arrangement::Photos) }, MACHINE, 5.0, true);
         assert_eq!(value(&photos, "deformer.kind"), Some("none".into()));
         let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
-        let odd = choose(&odd, MACHINE, 5.0);
+        let odd = choose(&odd, MACHINE, 5.0, true);
         assert_eq!((value(&odd, "train.dynamic"), value(&odd, "train.recover")), (Some("all".into()), Some(true.into())));
-        assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0), "train.dynamic"), Some("score".into()));
+        assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0, true), "train.dynamic"), Some("score".into()));
         assert!(value(&odd, "appearance.kind").is_some() && value(&odd, "train.mask_threshold").is_some() && value(&odd, "render.background").is_some());
     }
 

@@ -32,8 +32,8 @@ const LEAST_SHARE: f64 = 0.4;
 const ITERATIONS: [f64; 2] = [500.0, 200_000.0];
 /// Share of moving pixels that is expected where no camera stands still.
 const UNKNOWN_MOTION: f32 = 0.1;
-/// Views of an iteration take at least a half as long as the pass through the field that they share, but are not more than these.
-const FIELD_VIEWS: f64 = 2.0;
+/// Views of an iteration take about twice as long as the pass through the field that they share, but are not more than these.
+const FIELD_VIEWS: f64 = 0.5;
 const MOST_VIEWS: f64 = 8.0;
 /// Iterations below which a run is too short for its scene.
 const SHORT: f64 = 2000.0;
@@ -119,7 +119,9 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
         plan.add(choice)?;
         scene = read(&layers.over(&plan.table).config()?)?;
     }
-    for choice in choose::choose(&facts, machine, minutes) {
+    let kind = asked.deformer.get("kind").and_then(|k| k.as_str());
+    let free = !layers.state("deformer.kind") || kind == Some("free-time");
+    for choice in choose::choose(&facts, machine, minutes, free) {
         plan.add(for_density_of(layers, &asked, choice, registry)?)?;
     }
     if !layers.state("train.iterations") {

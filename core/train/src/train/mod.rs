@@ -3,6 +3,7 @@
 
 mod density;
 mod guard;
+mod key_frames;
 mod log;
 mod losses;
 mod parameters;
@@ -264,6 +265,7 @@ impl Context<'_> {
             state.begin_stage(&self.device);
             if stage == Stage::Main {
                 self.begin_main(state)?;
+                self.add_key_frames(state)?;
             }
         }
         events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });

@@ -33,6 +33,7 @@ pub(super) enum Arrangement {
 }
 
 /// The views to load: first the keys, which get depth maps, then those that are only matched with.
+#[derive(Clone)]
 pub(super) struct Choice {
     pub arrangement: Arrangement,
     /// Indices into the scene's views.

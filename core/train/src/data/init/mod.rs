@@ -9,12 +9,14 @@ mod choose;
 mod foreground;
 mod fuse;
 mod hull;
+mod key_frames;
 mod revealed;
 mod size;
 mod sweep;
 mod views;
 mod volume;
 
+pub(crate) use key_frames::{KeyFrames, KeyPoint};
 pub use size::{limit_opacities, limit_sizes};
 
 use crate::config::InitSource;

@@ -45,13 +45,7 @@ impl Context<'_> {
     /// Adds Gaussians for what the model does not draw, when the iteration is due and `train.recover` is on.
     pub(crate) fn recover(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let due = SHARES.iter().any(|share| schedule.iteration == (share * schedule.length as f64).round() as usize);
-        let Some(deformer) = state.deformer.as_ref().filter(|_| self.job.config.train.recover && schedule.stage == Stage::Main && due) else {
-            return Ok(());
-        };
-        let own = LIFE_ATTRIBUTES.iter().filter(|(name, _)| deformer.field.attributes().iter().any(|a| a.name == *name)).count();
-        if own > 0 && own < LIFE_ATTRIBUTES.len() {
-            let message = format!("{} has velocities of its own: nothing is looked for", deformer.name());
-            self.job.events.emit(&Event::Note { object: "recover".into(), message });
+        if !(self.job.config.train.recover && schedule.stage == Stage::Main && due && self.can_live(state)) {
             return Ok(());
         }
         let lost = self.lost(state, schedule)?;
@@ -121,13 +115,21 @@ impl Context<'_> {
         Ok(lost)
     }
 
+    /// Whether Gaussians have lives or can be given some: not those of a deformer with velocities of its own.
+    fn can_live(&self, state: &TrainState) -> bool {
+        let Some(deformer) = &state.deformer else { return false };
+        let own = own_lives(deformer);
+        let able = own == 0 || own == LIFE_ATTRIBUTES.len();
+        if !able {
+            let message = format!("{} has velocities of its own: nothing is added", deformer.name());
+            self.job.events.emit(&Event::Note { object: "lives".into(), message });
+        }
+        able
+    }
+
     /// Gives the Gaussians lives, unless the deformer has them: those that are there last for ever.
     fn give_lives(&self, state: &mut TrainState) -> Result<()> {
-        let Some(old) = &state.deformer else { return Ok(()) };
-        let has = |name: &str| old.field.attributes().iter().any(|a| a.name == name);
-        if LIFE_ATTRIBUTES.iter().all(|(name, _)| has(name)) {
-            return Ok(());
-        }
+        let Some(old) = state.deformer.as_ref().filter(|old| own_lives(old) == 0) else { return Ok(()) };
         let mut section = old.section.clone();
         section.insert("life".into(), true.into());
         let mut field = self.job.registry.build_deformer(&section, &old.context, &self.device)?;
@@ -139,4 +141,9 @@ impl Context<'_> {
         state.deformer = Some(ModelDeformer { field, section, context });
         Ok(())
     }
+}
+
+/// How many of the attributes of lives a deformer has itself.
+pub(super) fn own_lives(deformer: &ModelDeformer) -> usize {
+    LIFE_ATTRIBUTES.iter().filter(|(name, _)| deformer.field.attributes().iter().any(|a| a.name == *name)).count()
 }

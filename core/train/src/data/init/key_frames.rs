@@ -1,0 +1,330 @@
+//! Points of several key frames, each with a life and a velocity (FreeTimeGS starts so): what moves is found where it is at each of them, instead of being
+//! followed from the first frame.
+//!
+//! Where several cameras see each frame, the images of a key frame give points as those of the first frame do. How long a point is there is judged by its colour:
+//! it is alive at another key frame while most of the images that show it still have that colour there. The velocity is the one with which it is found
+//! again at the neighbouring key frames, searched at random and handed on between neighbours as in PatchMatch (Barnes et al. 2009).
+
+use super::choose::{Arrangement, Choice};
+use super::views::{WorkSet, WorkView};
+use super::{Candidate, fuse, sweep, thin};
+use cc4dgs_core::{Result, Scene, Seed};
+use glam::Vec3;
+use rand::Rng;
+use rayon::prelude::*;
+
+/// Mean difference of the channels, 0..1, up to which a pixel shows a point.
+const SIMILAR: f32 = 0.1;
+/// Images that must show a point at its own frame.
+const LEAST_IMAGES: usize = 2;
+/// Share of those images that must still show it at another.
+const ALIVE: f32 = 0.5;
+/// The farthest a point gets between two key frames, as a share of the width of the images.
+const FARTHEST: f32 = 0.12;
+/// Velocities tried at first, rounds in which neighbours hand theirs on, neighbours asked, and how much better another one must fit.
+const TRIES: usize = 12;
+const ROUNDS: usize = 4;
+const NEIGHBOURS: usize = 6;
+const BETTER: f32 = 0.02;
+
+/// What a point is and when it is there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct KeyPoint {
+    /// In the scene's units.
+    pub position: Vec3,
+    pub color: [f32; 3],
+    /// Index of the key frame at which it is at `position`.
+    pub key: usize,
+    /// The first and the last key frame at which it is there without moving.
+    pub alive: [usize; 2],
+    /// Scene units from one key frame to the next.
+    pub velocity: Vec3,
+}
+
+/// The images of all key frames.
+pub(crate) struct KeyFrames {
+    /// Frames, ascending, at equal distances; the first is 0.
+    pub frames: Vec<usize>,
+    sets: Vec<WorkSet>,
+}
+
+impl KeyFrames {
+    /// Every `every`-th frame of `scene`; `None` where cameras move, frames lack cameras, or there would be a single key frame.
+    ///
+    /// # Errors
+    /// Whatever decoding the images meets.
+    pub(crate) fn load(scene: &Scene, every: usize) -> Result<Option<Self>> {
+        let choice = Choice::new(scene);
+        if choice.arrangement != Arrangement::OneTime || every == 0 || scene.frame_count <= every {
+            return Ok(None);
+        }
+        let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
+        let (mut frames, mut sets): (Vec<usize>, Vec<WorkSet>) = Default::default();
+        for frame in (0..scene.frame_count).step_by(every) {
+            let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera);
+            let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else { return Ok(None) };
+            sets.push(WorkSet::load(scene, Choice { views, ..choice.clone() })?);
+            frames.push(frame);
+        }
+        Ok(Some(Self { frames, sets }))
+    }
+
+    /// Up to `count` points that are not there at all key frames, of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so.
+    pub(crate) fn points(&mut self, scene: &Scene, moves: impl Fn(usize, f32, f32) -> bool, count: usize, seed: Seed) -> Vec<KeyPoint> {
+        let choice = Choice::new(scene);
+        for set in &mut self.sets {
+            for (view, &index) in set.views.iter_mut().zip(&choice.views) {
+                let level = view.fine();
+                let (w, h) = (level.width, level.height);
+                let drawn = |p: usize| view.opaque.as_ref().is_none_or(|o| o[p]);
+                let share = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
+                let open = (0..w * h).map(|p| drawn(p) && moves(scene.views[index].camera, share(p % w, w), share(p / w, h))).collect();
+                view.opaque = Some(open);
+            }
+        }
+        let found: Vec<Vec<Candidate>> = (0..self.sets.len()).map(|key| self.candidates(key, seed.index(key as u64))).collect();
+        let each = count / self.sets.len();
+        let mut points = Vec::new();
+        for (key, candidates) in found.iter().enumerate() {
+            let judged = self.judge(candidates.iter().map(|c| (c.position, c.color)).collect(), key);
+            let new = |p: &KeyPoint| p.alive != [0, self.sets.len() - 1] && !points.iter().any(|other| self.same(other, p));
+            let mut own: Vec<KeyPoint> = judged.into_iter().flatten().filter(new).take(each).collect();
+            self.set_in_motion(&mut own, &found, seed.child("motion").index(key as u64));
+            points.extend(own);
+        }
+        points
+    }
+
+    /// When each of the given points (position, colour) of key frame `key` is there; `None` for those that hardly an image shows.
+    pub(crate) fn judge(&self, points: Vec<(Vec3, [f32; 3])>, key: usize) -> Vec<Option<KeyPoint>> {
+        points.into_par_iter().map(|(position, color)| self.judge_one(position, color, key)).collect()
+    }
+
+    fn judge_one(&self, position: Vec3, color: [f32; 3], key: usize) -> Option<KeyPoint> {
+        let images = self.images_of(position, color, key);
+        if images.len() < LEAST_IMAGES {
+            return None;
+        }
+        let there = |&other: &usize| self.share(&images, position, color, other) >= ALIVE;
+        let first = (0..key).rev().take_while(there).last().unwrap_or(key);
+        let last = (key + 1..self.sets.len()).take_while(there).last().unwrap_or(key);
+        Some(KeyPoint { position, color, key, alive: [first, last], velocity: Vec3::ZERO })
+    }
+
+    fn candidates(&self, key: usize, seed: Seed) -> Vec<Candidate> {
+        let set = &self.sets[key];
+        let mut fused = fuse::fuse(set, &sweep::depth_maps(set), seed.child("guess"));
+        fused.matched.append(&mut fused.between);
+        let far = set.rig.distance.unwrap_or(f64::INFINITY) as f32;
+        thin(fused.matched, set.cell_size(), far, seed.child("matched"))
+    }
+
+    /// Whether `a`, of an earlier key frame, is `b` as well.
+    fn same(&self, a: &KeyPoint, b: &KeyPoint) -> bool {
+        let near = a.position.distance(b.position) < self.sets[b.key].cell_size();
+        near && (a.alive[0]..=a.alive[1]).contains(&b.key) && difference(a.color, b.color) < SIMILAR
+    }
+
+    /// The images of `key` that show a point.
+    fn images_of(&self, position: Vec3, color: [f32; 3], key: usize) -> Vec<usize> {
+        let views = &self.sets[key].views;
+        (0..views.len()).filter(|&v| shown(&views[v], position, color).is_some_and(|d| d < SIMILAR)).collect()
+    }
+
+    /// The share of `images` that show a point at `key`.
+    fn share(&self, images: &[usize], position: Vec3, color: [f32; 3], key: usize) -> f32 {
+        let showing = images.iter().filter(|&&v| shown(&self.sets[key].views[v], position, color).is_some_and(|d| d < SIMILAR)).count();
+        showing as f32 / images.len().max(1) as f32
+    }
+
+    /// Finds the velocities of `points`, which are of one key frame, from those that are there at this one only.
+    fn set_in_motion(&self, points: &mut [KeyPoint], found: &[Vec<Candidate>], seed: Seed) {
+        let Some(key) = points.first().map(|p| p.key) else { return };
+        let around: Vec<usize> = [key.checked_sub(1), Some(key + 1)].into_iter().flatten().filter(|&k| k < self.sets.len()).collect();
+        let set = &self.sets[key];
+        let farthest = set.views.first().map_or(0.0, |v| FARTHEST * v.fine().width as f32) * 0.5 * set.cell_size();
+        let images: Vec<Vec<usize>> = points.par_iter().map(|p| self.images_of(p.position, p.color, key)).collect();
+        // The mean similarity over the images that show the point at its own frame.
+        let fit = |i: usize, point: &KeyPoint, velocity: Vec3| {
+            let at = |&other: &usize| {
+                let position = point.position + velocity * (other as f32 - key as f32);
+                let similar = |&v: &usize| shown(&self.sets[other].views[v], position, point.color).map_or(0.0, |d| (1.0 - d / (2.0 * SIMILAR)).max(0.0));
+                images[i].iter().map(similar).sum::<f32>() / images[i].len().max(1) as f32
+            };
+            around.iter().map(at).sum::<f32>() / around.len().max(1) as f32
+        };
+        let neighbours = nearest(points);
+        let moving = |p: &KeyPoint| p.alive == [key, key];
+        let mut best: Vec<(f32, Vec3)> = points.iter().enumerate().map(|(i, p)| (fit(i, p, Vec3::ZERO), Vec3::ZERO)).collect();
+        for round in 0..=ROUNDS {
+            let before = best.clone();
+            best = (0..points.len())
+                .into_par_iter()
+                .map(|i| {
+                    let (point, mut best) = (&points[i], before[i]);
+                    if !moving(point) {
+                        return best;
+                    }
+                    let mut random = seed.index(round as u64).index(i as u64).rng();
+                    let mut tries: Vec<Vec3> = neighbours[i].iter().map(|&j| before[j].1).collect();
+                    if round == 0 {
+                        tries = (0..TRIES).filter_map(|_| jump(point, &around, found, farthest, &mut random)).collect();
+                    }
+                    let reach = farthest * 0.5f32.powi(round as i32 + 2);
+                    tries.extend((0..4).map(|k| best.1 + reach * 0.5f32.powi(k) * (Vec3::from_array(random.random()) * 2.0 - 1.0)));
+                    for velocity in tries {
+                        let score = fit(i, point, velocity);
+                        if velocity.length() <= farthest && score > best.0 + BETTER {
+                            best = (score, velocity);
+                        }
+                    }
+                    best
+                })
+                .collect();
+        }
+        // A single point fits somewhere by chance: neighbours decide together.
+        for (i, point) in points.iter_mut().enumerate() {
+            let among: Vec<Vec3> = neighbours[i].iter().chain([&i]).map(|&j| best[j].1).collect();
+            point.velocity = if moving(point) { median(&among) } else { Vec3::ZERO };
+        }
+    }
+}
+
+/// The way from `point` to a candidate of a neighbouring key frame that looks like it, if one drawn at random does.
+fn jump(point: &KeyPoint, around: &[usize], found: &[Vec<Candidate>], farthest: f32, random: &mut impl Rng) -> Option<Vec3> {
+    for _ in 0..50 {
+        let other = around[random.random_range(0..around.len())];
+        let candidates = &found[other];
+        if candidates.is_empty() {
+            continue;
+        }
+        let there = &candidates[random.random_range(0..candidates.len())];
+        let way = (there.position - point.position) * if other > point.key { 1.0 } else { -1.0 };
+        if way.length() <= farthest && difference(there.color, point.color) < SIMILAR {
+            return Some(way);
+        }
+    }
+    None
+}
+
+/// The indices of the nearest other points of each.
+fn nearest(points: &[KeyPoint]) -> Vec<Vec<usize>> {
+    let of = |i: usize| {
+        let mut all: Vec<(f32, usize)> = (0..points.len()).filter(|&j| j != i).map(|j| (points[i].position.distance_squared(points[j].position), j)).collect();
+        let count = NEIGHBOURS.min(all.len());
+        if count < all.len() {
+            all.select_nth_unstable_by(count, |a, b| a.partial_cmp(b).unwrap_or(std::cmp::Ordering::Equal));
+        }
+        all.truncate(count);
+        all.into_iter().map(|(_, j)| j).collect()
+    };
+    (0..points.len()).into_par_iter().map(of).collect()
+}
+
+/// The median of each coordinate.
+fn median(values: &[Vec3]) -> Vec3 {
+    let of = |k: usize| {
+        let mut sorted: Vec<f32> = values.iter().map(|v| v[k]).collect();
+        sorted.sort_unstable_by(f32::total_cmp);
+        sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
+    };
+    Vec3::new(of(0), of(1), of(2))
+}
+
+/// How much a view differs from a point where it would show it; `None` outside the image.
+fn shown(view: &WorkView, position: Vec3, color: [f32; 3]) -> Option<f32> {
+    view.pixel_of(position).map(|p| difference(view.fine().rgb[p], color))
+}
+
+fn difference(a: [f32; 3], b: [f32; 3]) -> f32 {
+    (0..3).map(|k| (a[k] - b[k]).abs()).sum::<f32>() / 3.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::focus::Focus;
+    use super::super::views::{Foreground, Level};
+    use super::*;
+    use glam::{DMat3, DVec3};
+
+    const RED: [f32; 3] = [0.9, 0.1, 0.1];
+    const BLUE: [f32; 3] = [0.1, 0.2, 0.9];
+    const STEP: Vec3 = Vec3::new(0.3, 0.1, 0.0);
+
+    /// A view from `x` along z of a red disk at `ball` and a blue one that stands still, before grey.
+    fn view(x: f64, ball: Vec3) -> WorkView {
+        let (width, height) = (80usize, 60usize);
+        let k = DMat3::from_cols_array_2d(&[[60.0, 0.0, 0.0], [0.0, 60.0, 0.0], [40.0, 30.0, 1.0]]);
+        let level = Level { width, height, gray: vec![0.5; width * height], rgb: vec![[0.5; 3]; width * height], k };
+        let center = DVec3::new(x, 0.0, -4.0);
+        let mut view = WorkView {
+            levels: vec![level],
+            rotation: DMat3::IDENTITY,
+            translation: -center,
+            center,
+            partners: Vec::new(),
+            witnesses: Vec::new(),
+            depth_range: [1.0, 8.0],
+            mask: None,
+            opaque: None,
+        };
+        for (position, color) in [(still(), BLUE), (ball, RED)] {
+            let Some((u, v, _)) = view.project(view.fine(), position) else { continue };
+            for p in 0..width * height {
+                let (du, dv) = ((p % width) as f32 + 0.5 - u, (p / width) as f32 + 0.5 - v);
+                if du * du + dv * dv < 4.0 {
+                    view.levels[0].rgb[p] = color;
+                }
+            }
+        }
+        view
+    }
+
+    fn still() -> Vec3 {
+        Vec3::new(-1.0, -0.5, 0.3)
+    }
+
+    fn ball(key: usize) -> Vec3 {
+        Vec3::new(-0.2, 0.2, 0.0) + STEP * key as f32
+    }
+
+    fn key_frames() -> KeyFrames {
+        let set = |key: usize| WorkSet {
+            views: [-1.0, -0.4, 0.4, 1.0].map(|x| view(x, ball(key))).into(),
+            keys: 4,
+            arrangement: Arrangement::OneTime,
+            rig: Focus { point: DVec3::ZERO, distance: Some(4.0), half: 2.0 },
+            foreground: Foreground::Unknown,
+            box_low: Vec3::splat(-1.0),
+            box_high: Vec3::splat(1.0),
+        };
+        KeyFrames { frames: vec![0, 5, 10], sets: (0..3).map(set).collect() }
+    }
+
+    #[test]
+    fn what_stands_still_is_always_there_and_what_moves_at_its_own_frame() {
+        let frames = key_frames();
+        let judged = frames.judge(vec![(still(), BLUE), (ball(1), RED), (ball(1), [0.1, 0.9, 0.1])], 1);
+        assert_eq!(judged[0].map(|p| p.alive), Some([0, 2]));
+        assert_eq!(judged[1].map(|p| p.alive), Some([1, 1]));
+        assert!(judged[2].is_none(), "no image shows green");
+    }
+
+    #[test]
+    fn velocities_are_found_from_the_neighbouring_key_frames() {
+        let frames = key_frames();
+        let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
+        let found: Vec<Vec<Candidate>> = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
+        let mut points: Vec<KeyPoint> = frames.judge((0..9).map(|k| (ball(1) + offset(k), RED)).collect(), 1).into_iter().flatten().collect();
+        assert_eq!(points.len(), 9);
+        frames.set_in_motion(&mut points, &found, Seed::root(1));
+        for point in points {
+            assert!((point.velocity - STEP).length() < 0.1, "{point:?}");
+        }
+    }
+
+    /// Points within the disk.
+    fn offset(k: usize) -> Vec3 {
+        Vec3::new((k % 3) as f32 - 1.0, (k / 3) as f32 - 1.0, 0.0) * 0.04
+    }
+}

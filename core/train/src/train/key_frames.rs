@@ -1,0 +1,134 @@
+//! Gaussians of key frames: what moves starts with a life at each of them, so that nothing has to be followed from the first frame to the last.
+
+use super::recover::own_lives;
+use super::{Context, TrainState};
+use crate::data::init::{KeyFrames, KeyPoint};
+use crate::init::{SH_C0, from_points};
+use cc4dgs_core::{DensityPlan, Event, HostGaussians, LIFE_ATTRIBUTES, PointCloud, Result, Stage, gate_value};
+use cc4dgs_play::Moving;
+use cc4dgs_play::model::ModelDeformer;
+use glam::Vec3;
+
+/// Half-width and falloff of a life at one key frame, as shares of the distance of two.
+const HALF_WIDTH: f64 = 0.4;
+const FALLOFF: f64 = 0.25;
+/// Gates: of what is there for a while, and of what stays.
+const TEMPORARY: f32 = 0.01;
+const LASTING: f32 = 0.95;
+/// Points that may be added in any case, as a share of the Gaussians there are.
+const LEAST_SHARE: f64 = 0.25;
+/// Opacity of new Gaussians.
+const OPACITY: f32 = 0.6;
+
+impl Context<'_> {
+    /// Adds the Gaussians of key frames at the start of the main stage, where `train.key_frames` asks for them, and gives what moved at the first frame a life there.
+    pub(super) fn add_key_frames(&self, state: &mut TrainState) -> Result<()> {
+        let every = self.job.config.train.key_frames;
+        let Moving::Scored { zeta } = state.moving else { return Ok(()) };
+        let Some(zeta) = Some(zeta).filter(|_| every > 0 && !self.masks.is_empty()) else { return Ok(()) };
+        let name = state.deformer.as_ref().map_or("none", ModelDeformer::name).to_string();
+        if !state.deformer.as_ref().is_some_and(|deformer| own_lives(deformer) == LIFE_ATTRIBUTES.len()) {
+            let message = format!("the Gaussians of '{name}' have no lives, so key frames add none: set deformer.life = true, or train.key_frames = 0");
+            self.job.events.emit(&Event::Warning { object: "train.key_frames".into(), message });
+            return Ok(());
+        }
+        let Some(mut frames) = KeyFrames::load(&self.job.scene, every)? else {
+            let message = "no two key frames are seen by the same cameras: none is used".to_string();
+            self.job.events.emit(&Event::Note { object: "key frames".into(), message });
+            return Ok(());
+        };
+        let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(0, |most| most.max(0) as usize);
+        let count = most.saturating_sub(state.set.len()).max((LEAST_SHARE * state.set.len() as f64) as usize);
+        let points = frames.points(&self.job.scene, |camera, x, y| self.masked(camera, x, y), count, self.seed.child("key frames"));
+        let times = Times { interval: every as f64 / (self.job.scene.frame_count - 1) as f64, frames: frames.frames.len() };
+        let mut plan = DensityPlan::unchanged(state.set.len());
+        let host = state.set.host_gaussians()?;
+        let temporary = self.lives_of_first_frame(&mut plan, &host, state, &frames, &times)?;
+        let coefficients = state.set.get("sh_rest")?.dims()[1];
+        for key in 0..times.frames {
+            let own: Vec<&KeyPoint> = points.iter().filter(|p| p.key == key).collect();
+            let cloud = PointCloud { positions: own.iter().map(|p| p.position.to_array()).collect(), colors: own.iter().map(|p| p.color).collect() };
+            let start = from_points(&cloud, 0, OPACITY);
+            for (i, point) in own.into_iter().enumerate() {
+                let row = plan.copy(0);
+                plan.set(row, "means", &start.means[3 * i..3 * i + 3]);
+                plan.set(row, "log_scales", &start.log_scales[3 * i..3 * i + 3]);
+                plan.set(row, "quaternions", &[1.0, 0.0, 0.0, 0.0]);
+                plan.set(row, "opacity_logits", &start.opacity_logits[i..=i]);
+                plan.set(row, "sh_dc", &start.sh_dc[3 * i..3 * i + 3]);
+                if coefficients > 0 {
+                    plan.set(row, "sh_rest", &vec![0.0; coefficients]);
+                }
+                plan.set(row, "dynamic_scores", &[2.0 * zeta + 1.0]);
+                times.live(&mut plan, row, point);
+            }
+        }
+        plan.report.cloned = points.len();
+        let message = format!("{} points of {} key frames; {temporary} Gaussians of the first frame are there for a while", points.len(), times.frames);
+        self.job.events.emit(&Event::Note { object: "key frames".into(), message });
+        let schedule = self.lengths.schedule(Stage::Main, 0);
+        plan.check("key frames", &state.set.gaussians()?)?;
+        self.guard_plan(&mut plan, state, &schedule)?;
+        self.carry_out(&plan, state, &schedule)?;
+        state.density.executed(&plan, &self.device)?;
+        // The box of what moves is that of all key frames.
+        if let Some(ModelDeformer { section, .. }) = state.deformer.take() {
+            let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
+            let field = self.job.registry.build_deformer(&section, &context, &self.device)?;
+            state.deformer = Some(ModelDeformer { field, section, context });
+        }
+        Ok(())
+    }
+
+    /// Sets the lives of the Gaussians that may move: of those that vanish, one at the first frame. Returns how many vanish.
+    fn lives_of_first_frame(&self, plan: &mut DensityPlan, host: &HostGaussians, state: &TrainState, frames: &KeyFrames, times: &Times) -> Result<usize> {
+        let rows = state.moving.rows(&host.dynamic_scores).unwrap_or_default();
+        let mean = |row: usize| Vec3::from_slice(&host.means[3 * row..3 * row + 3]);
+        let color = |row: usize| [0, 1, 2].map(|k| 0.5 + SH_C0 * host.sh_dc[3 * row + k]);
+        let mut temporary = 0;
+        let judged = frames.judge(rows.iter().map(|&row| (mean(row), color(row))).collect(), 0);
+        for (row, judged) in rows.into_iter().zip(judged) {
+            match judged {
+                Some(point) if point.alive[1] + 1 < times.frames => {
+                    times.live(plan, row, &point);
+                    temporary += 1;
+                }
+                _ => times.last(plan, row),
+            }
+        }
+        Ok(temporary)
+    }
+
+    /// Whether the mask of what moves covers a pixel of a camera, whose coordinates are shares of the image.
+    fn masked(&self, camera: usize, x: f32, y: f32) -> bool {
+        let Some(mask) = self.masks.iter().find(|m| self.job.scene.views[m.view].camera == camera) else { return false };
+        let (w, h) = (self.job.scene.cameras[camera].width as usize, self.job.scene.cameras[camera].height as usize);
+        let at = |share: f32, n: usize| ((share * n as f32) as usize).min(n - 1);
+        mask.mask.get(at(y, h) * w + at(x, w)).is_some_and(|&v| v > 0.5)
+    }
+}
+
+/// When the key frames are.
+struct Times {
+    /// From one to the next, as a share of the sequence.
+    interval: f64,
+    frames: usize,
+}
+
+impl Times {
+    /// Gives a row the life and the velocity of a point.
+    fn live(&self, plan: &mut DensityPlan, row: usize, point: &KeyPoint) {
+        let [first, last] = point.alive.map(|key| key as f64 * self.interval);
+        let half_width = 0.5 * (last - first) + HALF_WIDTH * self.interval;
+        plan.set(row, "life_center", &[(0.5 * (first + last)) as f32]);
+        plan.set(row, "life_log_half_width", &[half_width.ln() as f32]);
+        plan.set(row, "life_log_falloff", &[(FALLOFF * self.interval).ln() as f32]);
+        plan.set(row, "life_gate", &[gate_value(TEMPORARY)]);
+        plan.set(row, "velocity", &(point.velocity / self.interval as f32).to_array());
+    }
+    /// Keeps a row at all times.
+    fn last(&self, plan: &mut DensityPlan, row: usize) {
+        plan.set(row, "life_gate", &[gate_value(LASTING)]);
+        plan.set(row, "velocity", &[0.0; 3]);
+    }
+}
