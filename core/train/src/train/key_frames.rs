@@ -32,14 +32,15 @@ impl Context<'_> {
             self.job.events.emit(&Event::Warning { object: "train.key_frames".into(), message });
             return Ok(());
         }
-        let Some(mut frames) = KeyFrames::load(&self.job.scene, every)? else {
+        let seed = self.seed.child("key frames");
+        let Some(frames) = KeyFrames::load(&self.job.scene, every, |camera, x, y| self.masked(camera, x, y), seed)? else {
             let message = "no two key frames are seen by the same cameras: none is used".to_string();
             self.job.events.emit(&Event::Note { object: "key frames".into(), message });
             return Ok(());
         };
         let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(0, |most| most.max(0) as usize);
         let count = most.saturating_sub(state.set.len()).max((LEAST_SHARE * state.set.len() as f64) as usize);
-        let points = frames.points(&self.job.scene, |camera, x, y| self.masked(camera, x, y), count, self.seed.child("key frames"));
+        let points = frames.points(count, seed.child("motion"));
         let times = Times { interval: every as f64 / (self.job.scene.frame_count - 1) as f64, frames: frames.frames.len() };
         let mut plan = DensityPlan::unchanged(state.set.len());
         let host = state.set.host_gaussians()?;

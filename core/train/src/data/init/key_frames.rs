@@ -41,55 +41,60 @@ pub(crate) struct KeyPoint {
     pub velocity: Vec3,
 }
 
-/// The images of all key frames.
+/// The images of all key frames, and the points that match in them.
 pub(crate) struct KeyFrames {
     /// Frames, ascending, at equal distances; the first is 0.
     pub frames: Vec<usize>,
     sets: Vec<WorkSet>,
+    found: Vec<Vec<Candidate>>,
 }
 
 impl KeyFrames {
-    /// Every `every`-th frame of `scene`; `None` where cameras move, frames lack cameras, or there would be a single key frame.
+    /// Every `every`-th frame of `scene`, with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so;
+    /// `None` where cameras move, frames lack cameras, or there would be a single key frame.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
-    pub(crate) fn load(scene: &Scene, every: usize) -> Result<Option<Self>> {
+    pub(crate) fn load(scene: &Scene, every: usize, moves: impl Fn(usize, f32, f32) -> bool, seed: Seed) -> Result<Option<Self>> {
         let choice = Choice::new(scene);
         if choice.arrangement != Arrangement::OneTime || every == 0 || scene.frame_count <= every {
             return Ok(None);
         }
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
-        let (mut frames, mut sets): (Vec<usize>, Vec<WorkSet>) = Default::default();
+        let mut loaded = Self { frames: Vec::new(), sets: Vec::new(), found: Vec::new() };
         for frame in (0..scene.frame_count).step_by(every) {
             let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera);
             let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else { return Ok(None) };
-            sets.push(WorkSet::load(scene, Choice { views, ..choice.clone() })?);
-            frames.push(frame);
-        }
-        Ok(Some(Self { frames, sets }))
-    }
-
-    /// Up to `count` points that are not there at all key frames, of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so.
-    pub(crate) fn points(&mut self, scene: &Scene, moves: impl Fn(usize, f32, f32) -> bool, count: usize, seed: Seed) -> Vec<KeyPoint> {
-        let choice = Choice::new(scene);
-        for set in &mut self.sets {
-            for (view, &index) in set.views.iter_mut().zip(&choice.views) {
+            let mut set = WorkSet::load(scene, Choice { views, ..choice.clone() })?;
+            for (view, &camera) in set.views.iter_mut().zip(&cameras) {
                 let level = view.fine();
                 let (w, h) = (level.width, level.height);
                 let drawn = |p: usize| view.opaque.as_ref().is_none_or(|o| o[p]);
                 let share = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
-                let open = (0..w * h).map(|p| drawn(p) && moves(scene.views[index].camera, share(p % w, w), share(p / w, h))).collect();
-                view.opaque = Some(open);
+                view.opaque = Some((0..w * h).map(|p| drawn(p) && moves(camera, share(p % w, w), share(p / w, h))).collect());
             }
+            loaded.found.push(candidates(&set, seed.index(frame as u64)));
+            // From here on nothing but colours is asked.
+            for view in &mut set.views {
+                view.levels.drain(..view.levels.len() - 1);
+                view.levels.iter_mut().for_each(|level| level.gray = Vec::new());
+                (view.mask, view.opaque) = (None, None);
+            }
+            loaded.sets.push(set);
+            loaded.frames.push(frame);
         }
-        let found: Vec<Vec<Candidate>> = (0..self.sets.len()).map(|key| self.candidates(key, seed.index(key as u64))).collect();
+        Ok(Some(loaded))
+    }
+
+    /// Up to `count` points that are not there at all key frames.
+    pub(crate) fn points(&self, count: usize, seed: Seed) -> Vec<KeyPoint> {
         let each = count / self.sets.len();
         let mut points = Vec::new();
-        for (key, candidates) in found.iter().enumerate() {
+        for (key, candidates) in self.found.iter().enumerate() {
             let judged = self.judge(candidates.iter().map(|c| (c.position, c.color)).collect(), key);
             let new = |p: &KeyPoint| p.alive != [0, self.sets.len() - 1] && !points.iter().any(|other| self.same(other, p));
             let mut own: Vec<KeyPoint> = judged.into_iter().flatten().filter(new).take(each).collect();
-            self.set_in_motion(&mut own, &found, seed.child("motion").index(key as u64));
+            self.set_in_motion(&mut own, seed.index(key as u64));
             points.extend(own);
         }
         points
@@ -111,14 +116,6 @@ impl KeyFrames {
         Some(KeyPoint { position, color, key, alive: [first, last], velocity: Vec3::ZERO })
     }
 
-    fn candidates(&self, key: usize, seed: Seed) -> Vec<Candidate> {
-        let set = &self.sets[key];
-        let mut fused = fuse::fuse(set, &sweep::depth_maps(set), seed.child("guess"));
-        fused.matched.append(&mut fused.between);
-        let far = set.rig.distance.unwrap_or(f64::INFINITY) as f32;
-        thin(fused.matched, set.cell_size(), far, seed.child("matched"))
-    }
-
     /// Whether `a`, of an earlier key frame, is `b` as well.
     fn same(&self, a: &KeyPoint, b: &KeyPoint) -> bool {
         let near = a.position.distance(b.position) < self.sets[b.key].cell_size();
@@ -138,7 +135,7 @@ impl KeyFrames {
     }
 
     /// Finds the velocities of `points`, which are of one key frame, from those that are there at this one only.
-    fn set_in_motion(&self, points: &mut [KeyPoint], found: &[Vec<Candidate>], seed: Seed) {
+    fn set_in_motion(&self, points: &mut [KeyPoint], seed: Seed) {
         let Some(key) = points.first().map(|p| p.key) else { return };
         let around: Vec<usize> = [key.checked_sub(1), Some(key + 1)].into_iter().flatten().filter(|&k| k < self.sets.len()).collect();
         let set = &self.sets[key];
@@ -168,7 +165,7 @@ impl KeyFrames {
                     let mut random = seed.index(round as u64).index(i as u64).rng();
                     let mut tries: Vec<Vec3> = neighbours[i].iter().map(|&j| before[j].1).collect();
                     if round == 0 {
-                        tries = (0..TRIES).filter_map(|_| jump(point, &around, found, farthest, &mut random)).collect();
+                        tries = (0..TRIES).filter_map(|_| jump(point, &around, &self.found, farthest, &mut random)).collect();
                     }
                     let reach = farthest * 0.5f32.powi(round as i32 + 2);
                     tries.extend((0..4).map(|k| best.1 + reach * 0.5f32.powi(k) * (Vec3::from_array(random.random()) * 2.0 - 1.0)));
@@ -188,6 +185,14 @@ impl KeyFrames {
             point.velocity = if moving(point) { median(&among) } else { Vec3::ZERO };
         }
     }
+}
+
+/// The points that match at one key frame.
+fn candidates(set: &WorkSet, seed: Seed) -> Vec<Candidate> {
+    let mut fused = fuse::fuse(set, &sweep::depth_maps(set), seed.child("guess"));
+    fused.matched.append(&mut fused.between);
+    let far = set.rig.distance.unwrap_or(f64::INFINITY) as f32;
+    thin(fused.matched, set.cell_size(), far, seed.child("matched"))
 }
 
 /// The way from `point` to a candidate of a neighbouring key frame that looks like it, if one drawn at random does.
@@ -298,7 +303,9 @@ mod tests {
             box_low: Vec3::splat(-1.0),
             box_high: Vec3::splat(1.0),
         };
-        KeyFrames { frames: vec![0, 5, 10], sets: (0..3).map(set).collect() }
+        let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
+        let found = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
+        KeyFrames { frames: vec![0, 5, 10], sets: (0..3).map(set).collect(), found }
     }
 
     #[test]
@@ -313,11 +320,9 @@ mod tests {
     #[test]
     fn velocities_are_found_from_the_neighbouring_key_frames() {
         let frames = key_frames();
-        let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
-        let found: Vec<Vec<Candidate>> = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
         let mut points: Vec<KeyPoint> = frames.judge((0..9).map(|k| (ball(1) + offset(k), RED)).collect(), 1).into_iter().flatten().collect();
         assert_eq!(points.len(), 9);
-        frames.set_in_motion(&mut points, &found, Seed::root(1));
+        frames.set_in_motion(&mut points, Seed::root(1));
         for point in points {
             assert!((point.velocity - STEP).length() < 0.1, "{point:?}");
         }
