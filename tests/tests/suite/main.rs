@@ -20,6 +20,7 @@ mod golden_training;
 mod image;
 mod lives;
 mod lookup;
+mod needles;
 mod planted;
 mod raster;
 mod raster_fixtures;
