@@ -27,4 +27,5 @@ mod raster_fixtures;
 mod raster_probes;
 mod readers;
 mod session;
+mod shortcuts;
 mod sort;
