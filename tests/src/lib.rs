@@ -1,6 +1,8 @@
 //! Helpers that the test suites share.
 #![allow(deprecated)] // burn deprecates NdArray in favour of Flex; it stays a tested choice here.
 
+pub mod golden;
+
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::parse_device;
 

@@ -12,7 +12,7 @@ use cc4dgs::core::gaussians::to_vec;
 use cc4dgs::core::{Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, parse_device};
 use cc4dgs::play::Model;
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs::train::eval::evaluate;
+use cc4dgs::train::eval::{Scored, evaluate};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
@@ -77,7 +77,8 @@ fn main() -> Result<()> {
     let load = || Model::open(model.as_ref(), &registry, &device, &limits, &Silent);
     let plain = load()?;
     let scene = open_as_trained(scene.as_ref(), &plain, &[], &registry, &limits)?;
-    let score = |model: &Model| evaluate(model, &scene, Split::Test, views, &registry, &device, &Silent, &mut |_, _, _, _| Ok(()));
+    let score =
+        |model: &Model| evaluate(model, &scene, Scored { max_views: views, ..Scored::all(Split::Test) }, &registry, &device, &Silent, &mut |_, _, _, _| Ok(()));
     let before = score(&plain)?;
     println!("{} moving Gaussians, field {} bytes as float32, {:.3} dB", before.dynamic_gaussians, plain.size.deform, before.psnr_db);
     for step in [0.02, 0.05, 0.1, 0.2, 0.5, 1.0] {

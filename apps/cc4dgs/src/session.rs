@@ -9,7 +9,7 @@ use cc4dgs_play::player::Player;
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::data;
-use cc4dgs_train::eval::{EvalReport, evaluate};
+use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
 use cc4dgs_train::layers::Layers;
 use cc4dgs_train::train::{CONFIG, TrainJob, train};
 use std::path::Path;
@@ -197,6 +197,6 @@ impl Session {
     /// # Errors
     /// As [`evaluate`].
     pub fn evaluate(&self, model: &Model, scene: &Scene, split: Split) -> Result<EvalReport> {
-        evaluate(model, scene, split, 0, self.registry(), self.device(), self.events(), &mut |_, _, _, _| Ok(()))
+        evaluate(model, scene, Scored::all(split), self.registry(), self.device(), self.events(), &mut |_, _, _, _| Ok(()))
     }
 }

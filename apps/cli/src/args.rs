@@ -6,7 +6,7 @@ mod play;
 mod prune;
 mod sweep;
 
-pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLoss, BenchPlay, BenchSort, BenchStep, BenchWhat};
+pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLoss, BenchPlay, BenchSkip, BenchSort, BenchStep, BenchWhat};
 pub use files::{Decompress, Export, Render, Shots};
 pub use play::Bake;
 #[cfg(feature = "view")]
@@ -174,6 +174,9 @@ pub struct Eval {
     /// Measure at most so many images, evenly spread; 0 measures all.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub max_views: usize,
+    /// Also measure LPIPS and FLIP, which take longer than drawing the images.
+    #[arg(long)]
+    pub perceptual: bool,
     /// The contact sheet: ground truth, render and error. Without it, it lies beside the JSON file or, for a run, in its folder.
     #[arg(long, value_name = "F.png")]
     pub sheet: Option<PathBuf>,

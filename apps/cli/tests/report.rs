@@ -50,7 +50,11 @@ fn evaluation_says_why_lpips_is_absent_and_measures_flip() {
     let train = ["train", "--scene", "procedural:tiny", "--preset", "demo", "--set", "train.iterations=60", "--device", "flex", "--out", text(&dir), "-q"];
     let output = run(&train);
     assert!(output.status.success(), "{}", said(&output));
-    let eval = ["eval", text(&dir), "--scene", "procedural:tiny", "--device", "flex", "--sheet-rows", "0", "-q"];
+    let plain = ["eval", text(&dir), "--scene", "procedural:tiny", "--device", "flex", "--sheet-rows", "0", "-q"];
+    let output = run(&[&plain[..], &["--json"]].concat());
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(report["flip"].is_null() && report["metrics"]["flip"].is_null() && report["lpips_absent"].as_str().unwrap().contains("--perceptual"), "{report}");
+    let eval = [&plain[..], &["--perceptual"]].concat();
     let output = run(&eval);
     assert!(said(&output).contains("LPIPS is not measured: /no/such/weights.safetensors"), "{}", said(&output));
     let output = run(&[&eval[..], &["--json"]].concat());

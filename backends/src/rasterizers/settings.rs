@@ -6,14 +6,6 @@ use cc4dgs_core::{Camera, Error, RenderSettings, Result, SplatColors, Splats};
 /// Pixels of the largest image drawn.
 const MAX_PIXELS: u64 = 1 << 28;
 
-/// Refuses `table` if it holds anything: neither rasterizer has settings of its own.
-pub fn no_settings(name: &str, table: &toml::Table) -> Result<()> {
-    match table.keys().next() {
-        None => Ok(()),
-        Some(key) => Err(Error::parameter(format!("rasterizer.{key}"), format!("rasterizer '{name}' has no such setting"), "Remove the key")),
-    }
-}
-
 /// Checks shapes, camera and degree, and gathers the numbers of a render.
 pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RasterSettings> {
     camera.validate()?;
@@ -80,5 +72,6 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
         max_weights: settings.max_weights,
         absolute_centers: splats.absolute_screen_probe.is_some(),
         pair_capacity: settings.pair_capacity,
+        shortcuts: Default::default(),
     })
 }

@@ -195,6 +195,22 @@ impl Offsets {
         }
         Ok(frame)
     }
+    /// The offsets of the first `count` Gaussians.
+    pub fn first(self, count: usize) -> Self {
+        let two = |head: Option<Tensor<2>>| head.map(|t| t.narrow(0, 0, count));
+        let one = |head: Option<Tensor<1>>| head.map(|t| t.narrow(0, 0, count));
+        Self {
+            means: two(self.means),
+            log_scales: two(self.log_scales),
+            scales: two(self.scales),
+            quaternions: two(self.quaternions),
+            rotation_vectors: two(self.rotation_vectors),
+            unit_quaternions: self.unit_quaternions,
+            opacity_logits: one(self.opacity_logits),
+            opacity_log_factor: one(self.opacity_log_factor),
+            sh: self.sh.map(|t| t.narrow(0, 0, count)),
+        }
+    }
     /// All heads concatenated as one matrix `[M, total width]`, for regularisers; `None` without heads.
     pub fn concatenated(&self) -> Option<Tensor<2>> {
         let mut parts: Vec<Tensor<2>> = Vec::new();

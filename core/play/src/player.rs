@@ -38,6 +38,21 @@ impl PairCapacity {
     }
 }
 
+/// What playback skips. Nothing of it changes a bit of an image; it is switched off only to measure what it saves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PlayShortcuts {
+    /// The deformer is asked about moving Gaussians only.
+    pub static_gating: bool,
+    /// The deformer's spatial features are computed once.
+    pub feature_cache: bool,
+}
+
+impl Default for PlayShortcuts {
+    fn default() -> Self {
+        Self { static_gating: true, feature_cache: true }
+    }
+}
+
 /// Plays one model on one device.
 pub struct Player<'a> {
     model: &'a Model,
@@ -53,6 +68,7 @@ pub struct Player<'a> {
     cache: Option<Tensor<2>>,
     settings: RenderSettings,
     pair_capacity: PairCapacity,
+    shortcuts: PlayShortcuts,
     /// Work of the field since the start.
     pub work: PlayWork,
 }
@@ -91,6 +107,13 @@ impl<'a> Player<'a> {
     /// # Errors
     /// What the rasterizer says of the model's `[rasterizer]` section.
     pub fn new(model: &'a Model, registry: &Registry, device: &Device) -> Result<Self> {
+        Self::with_shortcuts(model, registry, device, PlayShortcuts::default())
+    }
+    /// As [`Player::new`], with some of what is skipped switched off.
+    ///
+    /// # Errors
+    /// As [`Player::new`].
+    pub fn with_shortcuts(model: &'a Model, registry: &Registry, device: &Device, shortcuts: PlayShortcuts) -> Result<Self> {
         let n = model.gaussians.len();
         let moves = model.field.as_ref().is_some_and(|f| !f.field.is_static());
         let rows = if moves { model.moving.rows(&model.gaussians.dynamic_scores) } else { Some(Vec::new()) };
@@ -106,21 +129,24 @@ impl<'a> Player<'a> {
         let frame = Gaussians::from_host(host, device);
         let moving_gaussians =
             if (1..n).contains(&moving) { Gaussians::from_host(&host.select(&(0..moving).collect::<Vec<_>>()), device) } else { frame.clone() };
+        let asked = if shortcuts.static_gating { moving } else { n };
         let wanted = model.field.iter().filter(|_| moving > 0).flat_map(|f| f.field.attributes());
         let moving_attributes = wanted
             .filter_map(|spec| host.extra.get(&spec.name))
-            .map(|a| Tensor::<2>::from_data(TensorData::new(a.values[..moving * a.width].to_vec(), [moving, a.width]), device))
+            .map(|a| Tensor::<2>::from_data(TensorData::new(a.values[..asked * a.width].to_vec(), [asked, a.width]), device))
             .collect();
+        let means_world = if shortcuts.static_gating { moving_gaussians.means.clone() } else { frame.means.clone() };
         Ok(Self {
             device: device.clone(),
             rasterizer: registry.build_rasterizer(&model.rasterizer)?,
             frame,
-            spatial_input: SpatialInput { means_world: moving_gaussians.means.clone(), attributes: moving_attributes },
+            spatial_input: SpatialInput { means_world, attributes: moving_attributes },
             moving_gaussians,
             moving,
             cache: None,
             settings: model.render.settings(Some(colour(model.background_on(None), device))),
             pair_capacity: PairCapacity::default(),
+            shortcuts,
             work: PlayWork::default(),
             model,
         })
@@ -151,13 +177,14 @@ impl<'a> Player<'a> {
                 self.work.spatial.vertices_queried += spatial.work.vertices_queried;
                 self.work.spatial.vertices_decoded += spatial.work.vertices_decoded;
                 let features = field.field.packed(spatial.values);
-                if field.field.caches_spatial() {
+                if field.field.caches_spatial() && self.shortcuts.feature_cache {
                     self.cache = Some(features.clone());
                 }
                 features
             }
         };
         let offsets = field.field.deform(features, time_norm)?;
+        let offsets = if self.shortcuts.static_gating { offsets } else { offsets.first(self.moving) };
         // The frame is written in place. A caller who kept the last one keeps a copy of its own.
         let nothing = self.moving_gaussians.clone();
         let frame = std::mem::replace(&mut self.frame, nothing);

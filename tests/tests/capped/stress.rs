@@ -104,7 +104,7 @@ fn every_device_draws_the_edges_like_the_reference() {
     for (k, case) in cases().iter().enumerate() {
         let pixels = (case.size.0 * case.size.1) as usize;
         let upstream = noise(Seed::root(90).index(k as u64), 5 * pixels);
-        let (truth, _) = draw(&ReferenceRasterizer, case, &Device::flex(), &upstream);
+        let (truth, _) = draw(&ReferenceRasterizer::default(), case, &Device::flex(), &upstream);
         for (name, device) in &devices {
             poison(device);
             let (planes, _) = draw(&TileRasterizer, case, device, &upstream);
@@ -120,7 +120,7 @@ fn every_device_draws_the_edges_like_the_reference() {
                 }
             }
             assert!(flipped * 20 <= pixels, "{}, {name}: {flipped} of {pixels} pixels differ", case.name);
-            let (_, wanted) = draw(&ReferenceRasterizer, case, &Device::flex(), &masked);
+            let (_, wanted) = draw(&ReferenceRasterizer::default(), case, &Device::flex(), &masked);
             poison(device);
             let (again, found) = draw(&TileRasterizer, case, device, &masked);
             assert!(planes == again, "{}, {name}: two runs differ", case.name);
@@ -153,7 +153,7 @@ fn near_ties_of_depth_are_drawn_in_one_order() {
         let g = Gaussians::from_host(&gaussians, device);
         to_vec(rasterizer.render(&Splats::from_gaussians(&g, 3), &camera, &RenderSettings::default()).unwrap().image(), "image").unwrap()
     };
-    let truth = draw(&ReferenceRasterizer, &Device::flex());
+    let truth = draw(&ReferenceRasterizer::default(), &Device::flex());
     for (name, device) in devices() {
         let found = draw(&TileRasterizer, &device);
         let worst = found.iter().zip(&truth).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max);

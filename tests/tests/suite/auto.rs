@@ -6,7 +6,7 @@ use cc4dgs_core::{Event, Recorder, Registry, Scene, Silent, Split};
 use cc4dgs_play::Model;
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
-use cc4dgs_train::eval::evaluate;
+use cc4dgs_train::eval::{Scored, evaluate};
 use cc4dgs_train::layers::Layers;
 use cc4dgs_train::train::{TrainJob, train};
 use std::path::Path;
@@ -45,7 +45,10 @@ fn density_control_does_not_collapse() {
             });
             let (begun, ended) = (begun.unwrap(), model.gaussians.len());
             assert!(2 * ended >= begun && ended <= 20 * begun, "{capture}, {control}: {begun} Gaussians became {ended}");
-            let psnr = evaluate(&model, &scene, Split::Test, 6, &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db;
+            let psnr =
+                evaluate(&model, &scene, Scored { max_views: 6, ..Scored::all(Split::Test) }, &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(()))
+                    .unwrap()
+                    .psnr_db;
             println!("{capture}, {control}: {psnr:.2} dB, {begun} Gaussians became {ended}");
             assert!(psnr >= floor_db, "{capture}, {control}: {psnr:.2} dB, at least {floor_db} are expected");
         }

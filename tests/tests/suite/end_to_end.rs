@@ -8,7 +8,7 @@ use cc4dgs_play::player::Player;
 use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::agreement::agreement;
 use cc4dgs_train::config::RunConfig;
-use cc4dgs_train::eval::{EvalReport, evaluate};
+use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
 use cc4dgs_train::train::{TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -46,7 +46,7 @@ fn load(path: &Path) -> Model {
 
 fn score(model: &Model, config: &RunConfig) -> EvalReport {
     let registry = Registry::collect().unwrap();
-    evaluate(model, &open(config), Split::Test, 0, &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(())).unwrap()
+    evaluate(model, &open(config), Scored::all(Split::Test), &registry, &Device::flex(), &Silent, &mut |_, _, _, _| Ok(())).unwrap()
 }
 
 /// Sets the stop flag at the n-th iteration event.

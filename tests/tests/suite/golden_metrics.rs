@@ -1,13 +1,9 @@
 //! Metrics compared with the values of scikit-image, pytorch-msssim and Inria's code (`golden/metrics.json`), and with their definitions.
 
 use cc4dgs_core::metrics::{Metric, PSNR_CEILING_DB, Planes, Protocol, Rounding, SsimConvention, mean_absolute_error, mean_squared_error, ms_ssim, psnr, ssim};
+use cc4dgs_tests::golden::{folder, json};
 use serde_json::Value;
-use std::path::{Path, PathBuf};
-
-fn golden() -> PathBuf {
-    let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden");
-    std::env::var_os("CC4DGS_GOLDEN").map_or(committed, PathBuf::from)
-}
+use std::path::Path;
 
 fn image(path: &Path) -> Planes {
     let rgb = image::open(path).unwrap_or_else(|e| panic!("{}: {e}", path.display())).to_rgb8();
@@ -27,9 +23,7 @@ fn texture(width: usize, height: usize, shift: f64) -> Vec<f32> {
 
 #[test]
 fn golden_metrics() {
-    let folder = golden();
-    let text = std::fs::read_to_string(folder.join("metrics.json")).expect("metrics.json in the golden folder");
-    let file: Value = serde_json::from_str(&text).unwrap();
+    let (folder, file) = (folder(), json("metrics.json"));
     let pairs = file["pairs"].as_array().unwrap();
     assert!(!pairs.is_empty());
     let mut checked = 0;

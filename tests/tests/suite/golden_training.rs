@@ -6,34 +6,10 @@ use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
 use cc4dgs_backends::ops::field::MishShape;
 use cc4dgs_backends::ops::photometric::{bce_with_logits_loss, photometric_loss};
 use cc4dgs_tests::devices;
-use std::collections::HashMap;
-use std::path::PathBuf;
-
-/// Arrays of a float64 fixture by name, with shapes.
-type Fixture = HashMap<String, (Vec<usize>, Vec<f64>)>;
-
-fn golden(name: &str) -> Fixture {
-    let folder = std::env::var("CC4DGS_GOLDEN").map_or_else(|_| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden"), PathBuf::from);
-    let path = folder.join(format!("{name}.f64.safetensors"));
-    let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-    let file = safetensors::SafeTensors::deserialize(&bytes).expect("a safetensors file");
-    let array = |view: &safetensors::tensor::TensorView| view.data().chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().expect("8 bytes"))).collect();
-    file.tensors().iter().map(|(name, view)| (name.clone(), (view.shape().to_vec(), array(view)))).collect()
-}
-
-fn f32s(fixture: &Fixture, name: &str) -> Vec<f32> {
-    fixture[name].1.iter().map(|&v| v as f32).collect()
-}
-
-/// Relative L2 distance.
-fn distance(got: &[f32], want: &[f64]) -> f64 {
-    assert_eq!(got.len(), want.len());
-    let difference: f64 = got.iter().zip(want).map(|(g, w)| (f64::from(*g) - w).powi(2)).sum();
-    (difference / want.iter().map(|w| w * w).sum::<f64>().max(1e-300)).sqrt()
-}
+use cc4dgs_tests::golden::{Fixture, cases, narrow as to_f32, relative_l2, widen};
 
 fn check(what: &str, got: &[f32], want: &[f64], tolerance: f64) {
-    let d = distance(got, want);
+    let d = relative_l2(&widen(got), want);
     assert!(d < tolerance, "{what}: relative L2 distance {d:.3e}, allowed {tolerance:.1e}");
 }
 
@@ -43,22 +19,23 @@ fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
 
 /// `[H, W, C]` of a fixture to planes `[C, H, W]`.
 fn planes(fixture: &Fixture, name: &str) -> ([usize; 3], Vec<f64>) {
-    let (shape, data) = &fixture[name];
+    let (shape, data) = (fixture.shape(name), fixture.get(name));
     let (h, w, c) = (shape[0], shape[1], shape[2]);
     ([c, h, w], (0..c * h * w).map(|i| data[(i % (h * w)) * c + i / (h * w)]).collect())
 }
 
-fn to_f32(values: &[f64]) -> Vec<f32> {
-    values.iter().map(|&v| v as f32).collect()
-}
-
 #[test]
 fn golden_ssim_loss() {
-    let fixture = golden("ssim_loss");
-    let (shape, render) = planes(&fixture, "in.render");
-    let (_, target) = planes(&fixture, "in.target");
+    cases("ssim_loss").iter().for_each(ssim_loss);
+}
+
+fn ssim_loss(fixture: &Fixture) {
+    let one = |key: &str| fixture.get(key)[0];
+    let (shape, render) = planes(fixture, "in.render");
+    let (_, target) = planes(fixture, "in.target");
     for (name, device) in devices() {
-        for (lambda_c, loss_key, grad_key) in [(0.8, "out.loss", "grad.loss.render"), (0.0, "out.ssim", "grad.ssim.render")] {
+        for (lambda_c, loss_key, kind) in [(0.8, "out.loss", "loss"), (0.0, "out.ssim", "ssim")] {
+            let grad_key = &format!("grad.{kind}.render");
             // Two more planes, as in a rasterizer's output.
             let mut five = to_f32(&render);
             five.resize(5 * shape[1] * shape[2], 0.25);
@@ -70,14 +47,14 @@ fn golden_ssim_loss() {
             let grad = values(planes5.grad(&grads).expect("a gradient"));
             let loss = f64::from(values(out.loss)[0]);
             // With lambda_c = 0 the loss is 1 - SSIM, and its gradient is minus that of SSIM.
-            let (want, sign) = if lambda_c == 0.0 { (1.0 - fixture[loss_key].1[0], -1.0) } else { (fixture[loss_key].1[0], 1.0) };
+            let (want, sign) = if lambda_c == 0.0 { (1.0 - one(loss_key), -1.0) } else { (one(loss_key), 1.0) };
             assert!((loss - want).abs() < 1e-5, "{name}: loss {loss} instead of {want}");
-            assert!((f64::from(numbers.l1) - fixture["out.l1"].1[0]).abs() < 1e-6);
-            assert!((f64::from(numbers.ssim) - fixture["out.ssim"].1[0]).abs() < 2e-5);
-            let mse = render.iter().zip(&target_of(&fixture)).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / render.len() as f64;
+            assert!((f64::from(numbers.l1) - one("out.l1")).abs() < 1e-6);
+            assert!((f64::from(numbers.ssim) - one("out.ssim")).abs() < 2e-5);
+            let mse = render.iter().zip(&target_of(fixture)).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / render.len() as f64;
             assert!((f64::from(numbers.mse) / mse - 1.0).abs() < 1e-5, "{name}: mse {} instead of {mse}", numbers.mse);
-            let want: Vec<f64> = planes(&fixture, grad_key).1.iter().map(|g| sign * g).collect();
-            check(&format!("{name} {grad_key}"), &grad[..render.len()], &want, 2e-4);
+            let want: Vec<f64> = planes(fixture, grad_key).1.iter().map(|g| sign * g).collect();
+            check(&format!("{} {name} {grad_key}", fixture.name), &grad[..render.len()], &want, fixture.tolerance(&format!("grad_{kind}"), 2e-5));
             assert!(grad[render.len()..].iter().all(|g| *g == 0.0), "{name}: planes that are not read have a gradient");
         }
     }
@@ -89,27 +66,41 @@ fn target_of(fixture: &Fixture) -> Vec<f64> {
 
 #[test]
 fn golden_adam() {
-    let fixture = golden("adam");
+    cases("adam").iter().for_each(adam);
+}
+
+/// The variants of a fixture of Adam; one that is described by a sentence has a rate per step, in `in.lr_schedule`.
+fn adam(fixture: &Fixture) {
+    let shape = fixture.shape("in.grads");
+    let (steps, n) = (shape[0], shape[1]);
+    let variants: Vec<String> = fixture.facts["variants"].as_object().unwrap().keys().cloned().collect();
+    assert!(!variants.is_empty());
+    let [first, grads] = ["in.p0", "in.grads"].map(|key| fixture.narrow(key));
     for (name, device) in devices() {
-        for (variant, beta2, epsilon) in [("const", 0.999, 1e-15), ("sched", 0.999, 1e-15), ("eps8", 0.99, 1e-8)] {
-            let n = fixture["in.p0"].1.len();
-            let vector = |v: &[f64]| Tensor::<1>::from_data(TensorData::new(to_f32(v), [n]), &device);
-            let (mut p, mut m, mut v) = (vector(&fixture["in.p0"].1), Tensor::<1>::zeros([n], &device), Tensor::<1>::zeros([n], &device));
+        for variant in &variants {
+            let stated = &fixture.facts["variants"][variant];
+            // A variant that is a sentence follows the schedule with the constants of Adam's paper.
+            let scheduled = stated.is_string();
+            let number = |value: &serde_json::Value, usual: f64| if scheduled { usual } else { value.as_f64().unwrap() };
+            let (beta1, beta2) = (number(&stated["betas"][0], 0.9), number(&stated["betas"][1], 0.999));
+            let epsilon = number(&stated["eps"], 1e-15);
+            let rates = if scheduled { fixture.get("in.lr_schedule") } else { vec![stated["lr"].as_f64().unwrap(); steps] };
+            let vector = |v: &[f32]| Tensor::<1>::from_data(TensorData::new(v.to_vec(), [n]), &device);
+            let (mut p, mut m, mut v) = (vector(&first), Tensor::<1>::zeros([n], &device), Tensor::<1>::zeros([n], &device));
             let (mut all_p, mut all_m, mut all_v) = (Vec::new(), Vec::new(), Vec::new());
-            for step in 0..50 {
-                let lr = if variant == "sched" { fixture["in.lr_schedule"].1[step] } else { 0.009999999776482582 };
-                let grad = vector(&fixture["in.grads"].1[step * n..(step + 1) * n]);
-                let settings = AdamSettings { lr, beta1: 0.9, beta2, epsilon, step: step as u64 + 1, visible: None };
+            for step in 0..steps {
+                let grad = vector(&grads[step * n..(step + 1) * n]);
+                let settings = AdamSettings { lr: rates[step], beta1, beta2, epsilon, step: step as u64 + 1, visible: None };
                 let out = adam_step(p, m, v, grad, &settings).expect("a step");
                 (p, m, v) = (out.param, out.m, out.v);
                 all_p.extend(values(p.clone()));
                 all_m.extend(values(m.clone()));
                 all_v.extend(values(v.clone()));
             }
-            let worst = all_p.iter().zip(&fixture[&format!("{variant}.out.params")].1).map(|(g, w)| (f64::from(*g) - w).abs()).fold(0.0, f64::max);
-            assert!(worst < 5e-6, "{name} {variant}: parameters off by {worst:.2e}");
-            check(&format!("{name} {variant} m"), &all_m, &fixture[&format!("{variant}.out.exp_avg")].1, 1e-6);
-            check(&format!("{name} {variant} v"), &all_v, &fixture[&format!("{variant}.out.exp_avg_sq")].1, 4e-6);
+            for (array, short, got) in [("params", "params", &all_p), ("exp_avg", "m", &all_m), ("exp_avg_sq", "v", &all_v)] {
+                let want = fixture.get(&format!("{variant}.out.{array}"));
+                check(&format!("{} {name} {variant} {short}", fixture.name), got, &want, fixture.tolerance(&format!("{variant}.{array}"), 5e-7));
+            }
         }
     }
 }
@@ -151,59 +142,74 @@ fn adam_leaves_invisible_and_broken_rows_alone() {
 
 #[test]
 fn golden_nn_activations() {
-    let fixture = golden("nn");
-    let (x, w) = (f32s(&fixture, "mish.in.x"), &fixture["mish.in.weights"].1);
-    let out: Vec<f32> = x.iter().map(|&x| activation::mish(x)).collect();
-    check("mish", &out, &fixture["mish.out"].1, 1e-6);
-    let grad: Vec<f32> = x.iter().zip(w).map(|(&x, &w)| activation::mish_derivative(x) * w as f32).collect();
-    check("mish gradient", &grad, &fixture["mish.grad.x"].1, 1e-6);
+    cases("nn").iter().for_each(activations);
+}
 
-    let n = 16;
-    let mut normalized = f32s(&fixture, "layernorm.in.x");
-    let (gain, shift) = (f32s(&fixture, "layernorm.in.weight"), f32s(&fixture, "layernorm.in.bias"));
-    let (mut inverse, mut work) = (vec![0.0; 7], vec![0.0; n]);
+fn activations(fixture: &Fixture) {
+    // A float32 kernel rounds each of a few operations, whatever the reference's own noise.
+    let check = |key: &str, noise: &str, got: &[f32]| check(&format!("{} {key}", fixture.name), got, &fixture.get(key), fixture.tolerance(noise, 5e-7));
+    let (x, w) = (fixture.narrow("mish.in.x"), fixture.narrow("mish.in.weights"));
+    let out: Vec<f32> = x.iter().map(|&x| activation::mish(x)).collect();
+    check("mish.out", "mish.out", &out);
+    let grad: Vec<f32> = x.iter().zip(w).map(|(&x, w)| activation::mish_derivative(x) * w).collect();
+    check("mish.grad.x", "mish.grad.x", &grad);
+
+    let shape = fixture.shape("layernorm.in.x");
+    let (rows, n) = (shape[0], shape[1]);
+    let mut normalized = fixture.narrow("layernorm.in.x");
+    let (gain, shift) = (fixture.narrow("layernorm.in.weight"), fixture.narrow("layernorm.in.bias"));
+    let (mut inverse, mut work) = (vec![0.0; rows], vec![0.0; n]);
     activation::normalize_rows(&mut normalized, n, &mut inverse, &mut work);
     let out: Vec<f32> = normalized.iter().enumerate().map(|(i, v)| v * gain[i % n] + shift[i % n]).collect();
-    check("layernorm", &out, &fixture["layernorm.out"].1, 3e-5);
-    let mut grad = f32s(&fixture, "layernorm.in.weights_loss");
+    check("layernorm.out", "layernorm.out", &out);
+    let mut grad = fixture.narrow("layernorm.in.weights_loss");
     let (mut grad_gain, mut grad_shift) = (vec![0.0; n], vec![0.0; n]);
     activation::layer_norm_backward(&mut grad, &normalized, &inverse, &gain, (&mut grad_gain, &mut grad_shift), &mut work);
-    check("layernorm x", &grad, &fixture["layernorm.grad.x"].1, 2e-6);
-    check("layernorm gain", &grad_gain, &fixture["layernorm.grad.weight"].1, 5e-5);
-    check("layernorm shift", &grad_shift, &fixture["layernorm.grad.bias"].1, 2e-6);
+    for (key, got) in [("layernorm.grad.x", &grad), ("layernorm.grad.weight", &grad_gain), ("layernorm.grad.bias", &grad_shift)] {
+        check(key, key, got);
+    }
 }
 
 #[test]
 fn golden_nn_mlp() {
-    let fixture = golden("nn");
-    let shape = MishShape { input: 11, hidden: vec![16, 16], output: 5 };
-    // The fixture keeps W as [out, in]; the kernel as [in, out].
+    cases("nn").iter().for_each(mlp);
+}
+
+fn mlp(fixture: &Fixture) {
+    // Linear, LayerNorm and Mish as often as there are LayerNorms, then Linear. The fixture keeps W as [out, in]; the kernel as [in, out].
+    let hidden_layers = (0..).find(|l| !fixture.has(&format!("mlp.in.ln{l}.weight"))).unwrap();
+    let width = |l: usize| fixture.shape(&format!("mlp.in.lin{l}.weight"));
+    let shape = MishShape { input: width(0)[1], hidden: (0..hidden_layers).map(|l| width(l)[0]).collect(), output: width(hidden_layers)[0] };
     let transposed = |name: &str| {
-        let (shape, data) = &fixture[name];
+        let (shape, data) = (fixture.shape(name), fixture.get(name));
         let (out, input) = (shape[0], shape[1]);
         (0..out * input).map(|i| data[(i % out) * input + i / out]).collect::<Vec<f64>>()
     };
     let flat = |prefix: &str| -> Vec<f64> {
-        let plain = |name: String| fixture[&name].1.clone();
-        let hidden = |l: usize| {
-            let (weight, bias) = (transposed(&format!("{prefix}.lin{l}.weight")), plain(format!("{prefix}.lin{l}.bias")));
-            [weight, bias, plain(format!("{prefix}.ln{l}.weight")), plain(format!("{prefix}.ln{l}.bias"))].concat()
+        let layer = |l: usize| {
+            let (weight, bias) = (transposed(&format!("{prefix}.lin{l}.weight")), fixture.get(&format!("{prefix}.lin{l}.bias")));
+            let norm = |what: &str| if l < hidden_layers { fixture.get(&format!("{prefix}.ln{l}.{what}")) } else { Vec::new() };
+            [weight, bias, norm("weight"), norm("bias")].concat()
         };
-        [hidden(0), hidden(1), transposed(&format!("{prefix}.lin2.weight")), plain(format!("{prefix}.lin2.bias"))].concat()
+        (0..=hidden_layers).flat_map(layer).collect()
     };
     let weights = to_f32(&flat("mlp.in"));
     assert_eq!(weights.len(), shape.parameter_count());
-    let x = f32s(&fixture, "mlp.in.x");
-    let rows = |first: usize, out: &mut [f32]| out.copy_from_slice(&x[first * 11..][..out.len()]);
-    check("mlp", &mish::forward(&shape, &weights, 7, &rows), &fixture["mlp.out"].1, 2e-6);
-    let mut grad_x = vec![0.0; 77];
-    let grad = mish::backward(&shape, &weights, 7, &rows, &f32s(&fixture, "mlp.in.weights_loss"), Some(&mut grad_x));
-    check("mlp x", &grad_x, &fixture["mlp.grad.x"].1, 3e-6);
-    for (layer, name) in shape.layers().iter().zip(["lin0", "lin1", "lin2"]) {
-        check(name, &grad[layer.weight.clone()], &transposed(&format!("mlp.grad.{name}.weight")), 3e-6);
-        check(name, &grad[layer.bias.clone()], &fixture[&format!("mlp.grad.{name}.bias")].1, 3e-6);
+    let (x, batch) = (fixture.narrow("mlp.in.x"), fixture.shape("mlp.in.x")[0]);
+    let rows = |first: usize, out: &mut [f32]| out.copy_from_slice(&x[first * shape.input..][..out.len()]);
+    let what = |key: &str| format!("{} {key}", fixture.name);
+    let tolerance = |key: &str| fixture.tolerance(key, 1e-6);
+    check(&what("mlp.out"), &mish::forward(&shape, &weights, batch, &rows), &fixture.get("mlp.out"), tolerance("mlp.out"));
+    let mut grad_x = vec![0.0; x.len()];
+    let grad = mish::backward(&shape, &weights, batch, &rows, &fixture.narrow("mlp.in.weights_loss"), Some(&mut grad_x));
+    check(&what("x"), &grad_x, &fixture.get("mlp.grad.x"), tolerance("mlp.grad.x"));
+    for (l, layer) in shape.layers().iter().enumerate() {
+        let (weight, bias) = (format!("mlp.grad.lin{l}.weight"), format!("mlp.grad.lin{l}.bias"));
+        check(&what(&weight), &grad[layer.weight.clone()], &transposed(&weight), tolerance(&weight));
+        check(&what(&bias), &grad[layer.bias.clone()], &fixture.get(&bias), tolerance(&bias));
     }
-    check("whole", &grad, &flat("mlp.grad"), 3e-6);
+    let worst = fixture.facts["noise_f32"].as_object().unwrap().keys().filter(|key| key.starts_with("mlp.grad.")).map(|key| tolerance(key));
+    check(&what("all gradients"), &grad, &flat("mlp.grad"), worst.fold(0.0, f64::max));
 }
 
 /// The loss by its definition in float64, with two-dimensional windows.

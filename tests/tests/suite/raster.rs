@@ -50,6 +50,7 @@ fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> 
         max_weights: true,
         absolute_centers: false,
         pair_capacity: None,
+        shortcuts: Default::default(),
     }
 }
 
@@ -298,7 +299,7 @@ fn no_gaussians_show_the_background() {
     for (name, device) in cc4dgs_tests::devices() {
         // The reference computes in float64 on the host and refuses other devices.
         let on_host = name != "wgpu";
-        for rasterizer in [&TileRasterizer as &dyn Rasterizer, &ReferenceRasterizer].into_iter().take(if on_host { 2 } else { 1 }) {
+        for rasterizer in [&TileRasterizer as &dyn Rasterizer, &ReferenceRasterizer::default()].into_iter().take(if on_host { 2 } else { 1 }) {
             let background = Tensor::<1>::from_floats([0.25, 0.5, 1.0], &device);
             let render = RenderSettings { background: Some(background), max_weights: true, ..Default::default() };
             let out = rasterizer.render(&empty_splats(&device), &camera, &render).unwrap();
@@ -337,7 +338,7 @@ fn direct_colours_are_blended_as_they_are() {
     splats.colors = SplatColors::Direct(colors.clone());
     let mut images = Vec::new();
     let mut gradients = Vec::new();
-    for rasterizer in [&TileRasterizer as &dyn Rasterizer, &ReferenceRasterizer] {
+    for rasterizer in [&TileRasterizer as &dyn Rasterizer, &ReferenceRasterizer::default()] {
         let out = rasterizer.render(&splats, &camera, &RenderSettings::default()).unwrap();
         let grads = out.planes.clone().sum().backward();
         images.push(out.planes.into_data().try_to_vec::<f32>().unwrap());

@@ -29,7 +29,7 @@ fn screen_gradients(rasterizer: &dyn Rasterizer, device: &Device, host: &HostGau
 fn absolute_screen_gradients_agree_with_the_reference() {
     let camera = step_camera(&StepCase { width: 53, height: 37, gaussians: 120 });
     let host = scene(120, Seed::root(71));
-    let [signed, truth, _] = screen_gradients(&ReferenceRasterizer, &Device::flex(), &host, &camera, true);
+    let [signed, truth, _] = screen_gradients(&ReferenceRasterizer::default(), &Device::flex(), &host, &camera, true);
     let wide: Vec<f64> = truth.iter().map(|&v| f64::from(v)).collect();
     let total = |values: &[f32]| values.iter().map(|v| f64::from(v.abs())).sum::<f64>();
     assert!(total(&truth) > 2.0 * total(&signed), "the pixels of a Gaussian pull in different directions");
@@ -54,7 +54,7 @@ fn a_gaussian_of_one_pixel_has_equal_signed_and_absolute_gradients() {
     host.log_scales.fill(-1.5);
     host.opacity_logits.fill(-1.0);
     let all = cc4dgs_tests::devices().into_iter().map(|(name, device)| (name, device, &TileRasterizer as &dyn Rasterizer));
-    for (name, device, rasterizer) in all.chain([("reference", Device::flex(), &ReferenceRasterizer as &dyn Rasterizer)]) {
+    for (name, device, rasterizer) in all.chain([("reference", Device::flex(), &ReferenceRasterizer::default() as &dyn Rasterizer)]) {
         let [signed, absolute, _] = screen_gradients(rasterizer, &device, &host, &camera, true);
         assert!(absolute.iter().any(|a| *a > 1e-4), "{name}: nothing was drawn");
         for (s, a) in signed.iter().zip(&absolute) {

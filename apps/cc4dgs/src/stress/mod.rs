@@ -33,6 +33,8 @@ pub struct StressJob<'a> {
     pub optimizer: &'a str,
     /// Optimizer steps with vanishing gradients.
     pub steps: usize,
+    /// Levels of each condition of a deformer; fewer where every level costs much (kernels of a software adapter).
+    pub deformer_levels: usize,
 }
 
 /// A condition at one level.
@@ -44,6 +46,8 @@ pub struct StressCase {
     pub condition: String,
     /// Its level.
     pub level: String,
+    /// What it was compared with: `float64`, or `float32 on HOST` for parts without an oracle of their own; absent where nothing was.
+    pub oracle: Option<String>,
     /// 95th percentile of the error, relative to the oracle's largest value; absent without an oracle or without numbers.
     pub error: Option<f64>,
     /// Share of the values that differ by more than 1 % of the oracle's largest.
@@ -96,17 +100,29 @@ pub fn stress(job: &StressJob, progress: &mut dyn FnMut(&StressCase)) -> Result<
     Ok(report)
 }
 
-/// Values under test, and those of an oracle if there is one.
-type Compared = (Vec<f32>, Option<Vec<f32>>);
+/// Name of oracles that compute in float64.
+const FLOAT64: &str = "float64";
+
+/// Values under test, and those of an oracle if there is one, with its name.
+type Compared = (Vec<f32>, Option<(&'static str, Vec<f32>)>);
 
 /// Runs `work` and judges its values.
 fn case(part: &str, condition: &str, level: impl Into<String>, work: impl FnOnce() -> Result<Compared>) -> StressCase {
-    let empty =
-        StressCase { part: part.into(), condition: condition.into(), level: level.into(), error: None, outliers: None, behaves: true, outcome: String::new() };
+    let empty = StressCase {
+        part: part.into(),
+        condition: condition.into(),
+        level: level.into(),
+        oracle: None,
+        error: None,
+        outliers: None,
+        behaves: true,
+        outcome: String::new(),
+    };
     match catch_unwind(AssertUnwindSafe(work)) {
         Err(_) => StressCase { behaves: false, outcome: "it panics".into(), ..empty },
         Ok(Err(e)) => StressCase { outcome: format!("error: {e}"), ..empty },
-        Ok(Ok((found, oracle))) => judge(empty, &found, oracle.as_deref()),
+        Ok(Ok((found, None))) => judge(empty, &found, None),
+        Ok(Ok((found, Some((name, exact))))) => judge(StressCase { oracle: Some(name.into()), ..empty }, &found, Some(&exact)),
     }
 }
 
@@ -143,15 +159,15 @@ mod tests {
     #[test]
     fn results_are_judged() {
         let judged = |work: fn() -> Result<Compared>| case("p", "c", "l", work);
-        let good = judged(|| Ok((vec![1.0, 2.0, 4.04], Some(vec![1.0, 2.0, 4.0]))));
+        let good = judged(|| Ok((vec![1.0, 2.0, 4.04], Some((FLOAT64, vec![1.0, 2.0, 4.0])))));
         assert!(good.behaves && (good.error.unwrap() - 0.0).abs() < 1e-9, "{good:?}");
         assert!((good.outliers.unwrap() - 1.0 / 3.0).abs() < 1e-9 || good.outliers == Some(0.0), "{good:?}");
         assert!(!judged(|| Ok((vec![f32::NAN], None))).behaves);
-        assert!(!judged(|| Ok((vec![f32::INFINITY], Some(vec![1.0])))).behaves);
-        assert!(judged(|| Ok((vec![f32::INFINITY], Some(vec![f32::INFINITY])))).behaves);
+        assert!(!judged(|| Ok((vec![f32::INFINITY], Some((FLOAT64, vec![1.0]))))).behaves);
+        assert!(judged(|| Ok((vec![f32::INFINITY], Some((FLOAT64, vec![f32::INFINITY]))))).behaves);
         assert!(judged(|| Err(Error::data("x", "y", "z"))).behaves);
         assert!(!judged(|| panic!("on purpose")).behaves);
-        assert!(!judged(|| Ok((vec![1.0], Some(Vec::new())))).behaves);
+        assert!(!judged(|| Ok((vec![1.0], Some((FLOAT64, Vec::new()))))).behaves);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The rasterizer, forward and backward, against the one in float64.
 
 use super::scenes::{Hard, all};
-use super::{Compared, StressCase, StressJob, case};
+use super::{Compared, FLOAT64, StressCase, StressJob, case};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
@@ -19,7 +19,7 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     for hard in all() {
         let compare = |values: fn(&dyn Rasterizer, &Device, &Hard) -> Result<Vec<f32>>| -> Result<Compared> {
             let exact = values(oracle.as_ref(), job.host, &hard)?;
-            Ok((values(tested.as_ref(), job.device, &hard)?, Some(exact)))
+            Ok((values(tested.as_ref(), job.device, &hard)?, Some((FLOAT64, exact))))
         };
         note(case("rasterizer", hard.condition, &hard.level, || compare(planes)));
         note(case("gradients", hard.condition, &hard.level, || compare(gradients)));

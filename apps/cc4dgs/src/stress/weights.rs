@@ -1,6 +1,6 @@
 //! Deformers, the optimizer, weight codecs and loss terms.
 
-use super::{Compared, StressCase, StressJob, case};
+use super::{Compared, FLOAT64, StressCase, StressJob, case};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
@@ -43,7 +43,8 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
         ("centres far outside the box", |i| [0, 1, 2].map(|k| 1e30 * uniform(Seed::root(5).index(i as u64), k))),
     ];
     for (condition, place) in places {
-        for time in [0.0f32, 0.5, 1.0, 1.0f32.next_up(), -1.0, 2.0, 1e6, f32::NAN] {
+        // The ends and no number first: a device with fewer levels still tries them.
+        for time in [0.0f32, 1.0, f32::NAN, 2.0, 0.5, 1.0f32.next_up(), -1.0, 1e6].into_iter().take(job.deformer_levels) {
             let values = |device: &Device| -> Result<Vec<f32>> {
                 let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
                 let (kind, settings) = split_kind("deformer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
@@ -61,7 +62,7 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
                 offsets.concatenated().map_or(Ok(Vec::new()), |all| to_vec(all, "offsets"))
             };
             // The other device computes the same formulas in float32.
-            let both = || Ok((values(job.device)?, Some(values(job.host)?)));
+            let both = || Ok((values(job.device)?, Some(("float32 on the host", values(job.host)?))));
             note(case(&part, condition, format!("time {time}"), both));
         }
     }
@@ -90,7 +91,7 @@ fn optimizer(job: &StressJob, decay: f64) -> Result<Compared> {
         }
         value = optimizer.step("stress", value, tensor(gradient), &settings)?;
     }
-    Ok((to_vec(value, "values")?, Some(exact.into_iter().map(|x| x as f32).collect())))
+    Ok((to_vec(value, "values")?, Some((FLOAT64, exact.into_iter().map(|x| x as f32).collect()))))
 }
 
 /// Weights that half precision can hardly hold.
@@ -102,7 +103,8 @@ fn weight_codec(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
             let context = CodecContext::new(Seed::root(1), Limits::default(), &Silent);
             let streams = codec.encode(&[WeightArray { name: "w".into(), shape: vec![500], values: values.clone() }], &context)?;
             let found = codec.decode(&streams, &context)?.into_iter().flat_map(|array| array.values).collect();
-            Ok((found, Some(values)))
+            // The weights themselves: what is lost is lost by the codec.
+            Ok((found, Some(("the weights", values))))
         }));
     }
 }

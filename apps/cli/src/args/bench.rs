@@ -18,6 +18,8 @@ pub enum BenchWhat {
     Frame(BenchFrame),
     /// Playback of a trained model through the cameras of a dataset: field and rasterizer, frame by frame.
     Play(BenchPlay),
+    /// A trained model with each kind of skipped work switched off: time saved, and whether images stay the same.
+    Skip(BenchSkip),
     /// The same model on several devices: how far their images differ.
     Agree(BenchAgree),
     /// The computational field forwards and backwards, against the same field in burn's primitives.
@@ -91,6 +93,21 @@ pub struct BenchPlay {
     /// Frames measured, after warming up.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub frames: u32,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchSkip {
+    #[command(flatten)]
+    pub views: ModelViews,
+    /// Device to compute on.
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    pub device: String,
+    /// Frames measured per case, after warming up.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub frames: u32,
+    /// Also train for so many iterations per case, with the model's configuration; 0 measures frames alone.
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
+    pub iterations: u32,
 }
 
 #[derive(Debug, Args)]

@@ -11,6 +11,7 @@ use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Result, Split};
 use cc4dgs_play::ArchiveOptions;
+use cc4dgs_train::eval::Scored;
 use cc4dgs_train::train::TrainReport;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -56,10 +57,10 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
 
     let scene = open_as_trained(scene_path, &loaded.model, &[], &context.registry, &context.limits)?;
     let plain = Images::default();
-    let before = measure(context, &args.out, &loaded, &scene, Split::Test, 0, &plain, &events)?;
+    let before = measure(context, &args.out, &loaded, &scene, Scored::all(Split::Test), &plain, &events)?;
     let images = Images { sheet: Some(args.out.join("sheet.png")), sheet_rows: 6, renders: None };
     let unpacked = load_model(&archive, &config.device, &context.registry, &context.limits, &events)?;
-    let after = measure(context, &archive, &unpacked, &scene, Split::Test, 0, &images, &events)?;
+    let after = measure(context, &archive, &unpacked, &scene, Scored::all(Split::Test), &images, &events)?;
 
     let report = DemoReport {
         scene: scene_name,

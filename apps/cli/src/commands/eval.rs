@@ -7,7 +7,7 @@ use crate::models::{Loaded, load_model};
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::{Event, EventSink, Limits, Result, Scene, Split};
 use cc4dgs_train::data::procedural::{self, ProceduralScene};
-use cc4dgs_train::eval::{EvalReport, evaluate};
+use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
 use cc4dgs_train::images::{Comparison, SheetOptions, comparison_sheet, write_png};
 use cc4dgs_train::trajectory::{MotionScore, motion_scores};
 use serde::Serialize;
@@ -57,7 +57,8 @@ pub fn run(context: &Context, args: &Eval) -> Result<()> {
     let split = args.views.split.into();
     let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_file()));
     let images = Images { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };
-    let report = measure(context, &args.views.model, &loaded, &scene, split, args.max_views, &images, &events)?;
+    let report =
+        measure(context, &args.views.model, &loaded, &scene, Scored { split, max_views: args.max_views, perceptual: args.perceptual }, &images, &events)?;
     context.output.result(&report, || text(&report))
 }
 
@@ -81,8 +82,7 @@ pub fn measure(
     model_path: &Path,
     loaded: &Loaded,
     scene: &Scene,
-    split: Split,
-    max_views: usize,
+    scored: Scored,
     images: &Images,
     events: &dyn EventSink,
 ) -> Result<FullReport> {
@@ -93,13 +93,13 @@ pub fn measure(
     for message in &scene.warnings {
         events.emit(&Event::Warning { object: scene.name.clone(), message: message.clone() });
     }
-    let in_split = scene.split(split).len();
-    let measured = if max_views == 0 { in_split } else { max_views.min(in_split) };
+    let in_split = scene.split(scored.split).len();
+    let measured = if scored.max_views == 0 { in_split } else { scored.max_views.min(in_split) };
     let mut rows = if images.sheet.is_some() { evenly(measured, images.sheet_rows) } else { Vec::new() };
     rows.reverse();
     let mut comparisons = Vec::with_capacity(rows.len());
     let mut index = 0;
-    let report = evaluate(model, scene, split, max_views, &context.registry, &loaded.device, events, &mut |view, truth, render, score| {
+    let report = evaluate(model, scene, scored, &context.registry, &loaded.device, events, &mut |view, truth, render, score| {
         interrupt::check(stop, "evaluation; nothing was written but finished renders")?;
         if rows.last() == Some(&index) {
             rows.pop();
@@ -161,10 +161,10 @@ pub fn text(report: &FullReport) -> String {
     let mut lines = vec![
         format!("{} on {} ({} images)", report.model.display(), e.scene, e.images.len()),
         format!("  PSNR {:.3} dB   SSIM {:.4} (Inria) {:.4} (skimage)   MS-SSIM {ms_ssim}", e.psnr_db, e.ssim, e.ssim_skimage),
-        match &e.lpips_absent {
-            None => format!("  LPIPS {} (AlexNet)   FLIP {:.4}", e.lpips.map_or_else(|| "-".to_string(), |v| format!("{v:.4}")), e.flip),
-            Some(reason) => format!("  FLIP {:.4}   {reason}", e.flip),
-        },
+        e.flip.map_or_else(String::new, |flip| match &e.lpips_absent {
+            None => format!("  LPIPS {} (AlexNet)   FLIP {flip:.4}", e.lpips.map_or_else(|| "-".to_string(), |v| format!("{v:.4}"))),
+            Some(reason) => format!("  FLIP {flip:.4}   {reason}"),
+        }),
         e.psnr_dynamic_db
             .zip(e.ssim_dynamic)
             .map_or_else(String::new, |(psnr, ssim)| format!("  PSNR {psnr:.3} dB   SSIM {ssim:.4} (Inria) where something moves")),

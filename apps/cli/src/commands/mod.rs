@@ -100,6 +100,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
             BenchWhat::Step(args) => bench::step(&context, args),
             BenchWhat::Frame(args) => bench::frame(&context, args),
             BenchWhat::Play(args) => bench::play(&context, args),
+            BenchWhat::Skip(args) => bench::skip(&context, args),
             BenchWhat::Agree(args) => bench::agree(&context, args),
             BenchWhat::Field(args) => bench::field(&context, args),
             BenchWhat::Lookup(args) => bench::lookup(&context, args),

@@ -46,6 +46,7 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
     let weights = SharedMut::new(&mut buffers.pair_weights);
     let (list, starts, ranked, order) = (&buffers.list, &buffers.tile_start, &buffers.ranked, &buffers.tile_order);
     let evaluations = AtomicU64::new(0);
+    let ends_early = settings.shortcuts.transmittance;
     run_tasks(tiles, |position| {
         let tile = order[position] as usize;
         let origin = [tile % tiles_x * TILE, tile / tiles_x * TILE];
@@ -57,9 +58,9 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
         let (transmittance, stop_at) = unsafe { (transmittance.slice(tile * TILE_PIXELS, TILE_PIXELS), stop_at.slice(tile * TILE_PIXELS, TILE_PIXELS)) };
         let mut state = TileState::new(origin, settings, stop_at);
         if settings.max_weights {
-            dispatch(BlendTile::<true> { ranked, list, origin, rules, state: &mut state, weights });
+            dispatch(BlendTile::<true> { ranked, list, origin, rules, state: &mut state, weights, ends_early });
         } else {
-            dispatch(BlendTile::<false> { ranked, list, origin, rules, state: &mut state, weights });
+            dispatch(BlendTile::<false> { ranked, list, origin, rules, state: &mut state, weights, ends_early });
         }
         evaluations.fetch_add(state.evaluations, Ordering::Relaxed);
         // SAFETY: as above.
@@ -181,13 +182,15 @@ struct BlendTile<'k, 'a, const WEIGHTS: bool> {
     rules: &'k RuleConstants,
     state: &'k mut TileState<'a>,
     weights: &'k mut [f32],
+    /// Whether rows and the tile end when their pixels have stopped.
+    ends_early: bool,
 }
 
 impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
     type Output = ();
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { ranked, list, origin, rules, state, weights } = self;
+        let Self { ranked, list, origin, rules, state, weights, ends_early } = self;
         let like = |v: f32| Lanes::<S>::splat(simd, v);
         let columns = column_centers(origin[0]);
         let origin_y = origin[1] as f32 + 0.5;
@@ -198,7 +201,7 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
                 prefetch(ranked, ahead.rank as usize);
             }
             let splat = &ranked[entry.rank as usize];
-            let rows = entry.row_mask() & state.alive;
+            let rows = entry.row_mask() & if ends_early { state.alive } else { u32::MAX };
             state.evaluations += u64::from(rows.count_ones()) * TILE as u64;
             let [half_a, b, half_c] = splat.conic;
             let a = like(half_a);
@@ -241,7 +244,7 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
             if WEIGHTS {
                 weights[i] = largest.largest();
             }
-            if state.alive == 0 {
+            if ends_early && state.alive == 0 {
                 state.end = i as u32 + 1;
                 return;
             }

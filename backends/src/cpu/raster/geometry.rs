@@ -3,7 +3,7 @@
 //! With M = R S (rotation times scales) the projected covariance is U U^T + blur, U = J W M being 2x3. The unblurred determinant is then
 //! |U0 x U1|^2 and the blurred one a sum of positive terms, so neither cancels for needles.
 
-use super::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION};
+use super::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE};
 use crate::cpu::simd::{Lanes, Mask, each};
 use pulp::Simd;
 
@@ -74,7 +74,7 @@ pub struct Projection<S: Simd> {
     pub conic: Vec3<S>,
     /// sqrt(determinant before the blur / after), at least 0.005.
     pub compensation: Lanes<S>,
-    /// Squared norm of the raw quaternion.
+    /// Squared norm of the raw quaternion, rescaled where it is very short or very long.
     pub norm_squared: Lanes<S>,
     unit: [Lanes<S>; 4],
     inverse_norm: Lanes<S>,
@@ -83,7 +83,6 @@ pub struct Projection<S: Simd> {
     turned: [Vec3<S>; 3],
     scaled: [Vec3<S>; 3],
     rows: [Vec3<S>; 2],
-    raw_covariance: Vec3<S>,
     raw_determinant: Lanes<S>,
     inverse_depth: Lanes<S>,
     ratio: [Lanes<S>; 2],
@@ -108,13 +107,21 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
         |i| w[i][0].fma(mean[0], w[i][1].fma(mean[1], w[i][2].fma(mean[2], like(camera.translation[i])))),
     );
     let inverse_depth = like(1.0) / point[2];
-    let [q0, q1, q2, q3] = quaternion;
-    let norm_squared = q0.fma(q0, q1.fma(q1, q2.fma(q2, q3 * q3)));
-    let inverse_norm = like(1.0) / norm_squared.sqrt();
+    // Squares of very short and very long quaternions leave the range of float32: a power of two brings them back, and rounds nothing.
+    let squares = |[q0, q1, q2, q3]: [Lanes<S>; 4]| q0.fma(q0, q1.fma(q1, q2.fma(q2, q3 * q3)));
+    let first = squares(quaternion);
+    let factor = like(1.0 / QUATERNION_RANGE).gt(first).select(like(RESCALE), first.gt(like(QUATERNION_RANGE)).select(like(1.0 / RESCALE), like(1.0)));
+    let rescaled: [Lanes<S>; 4] = each(
+        #[inline(always)]
+        |k| quaternion[k] * factor,
+    );
+    let norm_squared = squares(rescaled);
+    let inverse = like(1.0) / norm_squared.sqrt();
     let unit: [Lanes<S>; 4] = each(
         #[inline(always)]
-        |k| quaternion[k] * inverse_norm,
+        |k| rescaled[k] * inverse,
     );
+    let inverse_norm = inverse * factor;
     let rotation = rotation(unit);
     let turned: [Vec3<S>; 3] = each(
         #[inline(always)]
@@ -187,7 +194,6 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
         turned,
         scaled,
         rows,
-        raw_covariance: [xx, xy, yy],
         raw_determinant,
         inverse_depth,
         ratio,
@@ -234,43 +240,90 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
             )
         },
     );
-    // The conic is the inverse of the covariance: d covariance = -K G K with G the symmetric gradient.
-    let [a, b, c] = p.conic;
-    let half = g.conic[1] * 0.5;
-    let left = [a.fma(g.conic[0], b * half), a.fma(half, b * g.conic[2]), b.fma(g.conic[0], c * half), b.fma(half, c * g.conic[2])];
-    let mut d_xx = -left[0].fma(a, left[1] * b);
-    // Half the gradient of the off-diagonal entry, which appears twice.
-    let d_xy = -left[0].fma(b, left[1] * c);
-    let mut d_yy = -left[2].fma(b, left[3] * c);
-    // Compensation^2 = raw determinant / determinant, where that is over its floor.
+    let scale: [Lanes<S>; 2] = each(
+        #[inline(always)]
+        |k| p.inverse_depth * camera.focal[k],
+    );
+    // Projected axes of unit length in the world: rows[k] = axes[k] times the scales.
+    let axes: [Vec3<S>; 2] = each(
+        #[inline(always)]
+        |k| {
+            each(
+                #[inline(always)]
+                |j| scale[k] * p.ratio[k].nfma(p.turned[2][j], p.turned[k][j]),
+            )
+        },
+    );
+    let squared: Vec3<S> = each(
+        #[inline(always)]
+        |j| p.scales[j] * p.scales[j],
+    );
+    let by_squares = |row: Vec3<S>| -> Vec3<S> {
+        each(
+            #[inline(always)]
+            |j| row[j] * squared[j],
+        )
+    };
+    // The adjugate of the unblurred covariance, times the axes. A needle's covariance nearly annihilates its own axis; written with cross products, nothing
+    // cancels. With the blur and over the determinant, that is the conic K times the axes.
+    let normal = cross(axes[0], axes[1]);
+    let adjugate = [cross(by_squares(axes[1]), normal), cross(normal, by_squares(axes[0]))];
     let inverse = like(1.0) / p.determinant;
+    let seen: [Vec3<S>; 2] = each(
+        #[inline(always)]
+        |k| {
+            each(
+                #[inline(always)]
+                |j| (axes[k][j] * EPS_2D + adjugate[k][j]) * inverse,
+            )
+        },
+    );
+    // d covariance = -K G K with G the symmetric gradient of the conic.
+    let half = g.conic[1] * 0.5;
+    let weighted: [Vec3<S>; 2] = [
+        each(
+            #[inline(always)]
+            |j| g.conic[0].fma(seen[0][j], half * seen[1][j]),
+        ),
+        each(
+            #[inline(always)]
+            |j| half.fma(seen[0][j], g.conic[2] * seen[1][j]),
+        ),
+    ];
+    // Compensation^2 = raw determinant / determinant, where that is over its floor.
     let share = p.raw_determinant * inverse;
     let alive = share.gt(like(MIN_COMPENSATION * MIN_COMPENSATION));
     let d_share = alive.keep(g.compensation * 0.5 / p.compensation) * inverse;
     let d_raw = d_share * (like(1.0) - share);
     let d_trace = -(d_share * share * EPS_2D);
-    d_xx += d_trace;
-    d_yy += d_trace;
-    let [xx, xy, yy] = p.raw_covariance;
-    // raw determinant = xx yy - xy^2.
-    let m = [d_raw.fma(yy, d_xx), d_raw.nfma(xy, d_xy), d_raw.fma(xx, d_yy)];
     let two = like(2.0);
-    let d_rows: [Vec3<S>; 2] = [
-        each(
-            #[inline(always)]
-            |j| two * m[0].fma(p.rows[0][j], m[1] * p.rows[1][j]),
-        ),
-        each(
-            #[inline(always)]
-            |j| two * m[1].fma(p.rows[0][j], m[2] * p.rows[1][j]),
-        ),
-    ];
-    // rows[k] = (f_k / z) (scaled[k] - ratio_k scaled[2]).
-    let scale: [Lanes<S>; 2] = each(
+    let d_scales: Vec3<S> = each(
         #[inline(always)]
-        |k| p.inverse_depth * camera.focal[k],
+        |j| {
+            let (k, l) = ((j + 1) % 3, (j + 2) % 3);
+            // The squares of the unblurred determinant's terms with this scale, and the trace's.
+            let raw = squared[k].fma(normal[l] * normal[l], squared[l] * normal[k] * normal[k]);
+            let trace = axes[0][j].fma(axes[0][j], axes[1][j] * axes[1][j]);
+            let conic = seen[0][j].fma(weighted[0][j], seen[1][j] * weighted[1][j]);
+            two * p.scales[j] * d_raw.fma(raw, d_trace.fma(trace, -conic))
+        },
     );
-    let mut d_point = [like(0.0), like(0.0), g.depth];
+    let [a, b, c] = p.conic;
+    let d_rows: [Vec3<S>; 2] = each(
+        #[inline(always)]
+        |k| {
+            let (first, second) = if k == 0 { (a, b) } else { (b, c) };
+            each(
+                #[inline(always)]
+                |j| {
+                    let conic = first.fma(weighted[0][j], second * weighted[1][j]);
+                    two * p.scales[j].fma(d_raw.fma(adjugate[k][j], -conic), d_trace * p.rows[k][j])
+                },
+            )
+        },
+    );
+    // rows[k] = (f_k / z) (scaled[k] - ratio_k scaled[2]); 1/z scales all of them, as a common factor of the scales would.
+    let mut d_point = [like(0.0), like(0.0), dot(d_scales, p.scales).nfma(p.inverse_depth, g.depth)];
     let mut d_scaled = [[like(0.0); 3]; 3];
     for k in 0..2 {
         d_scaled[k] = each(
@@ -282,8 +335,6 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
             d_scaled[2][j] = d_scaled[k][j].nfma(ratio, d_scaled[2][j]);
         }
         let d_ratio_row = -dot(d_scaled[k], p.scaled[2]);
-        // 1/z scales the whole row.
-        d_point[2] = (dot(d_rows[k], p.rows[k]) * p.inverse_depth).nfma(like(1.0), d_point[2]);
         // The clamped ratio passes no gradient; the projected centre always does.
         let d_ratio = g.center[k].fma(like(camera.focal[k]), p.inside[k].keep(d_ratio_row));
         let step = d_ratio * p.inverse_depth;
@@ -291,14 +342,15 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
         let raw_ratio = p.point[k] * p.inverse_depth;
         d_point[2] = step.nfma(raw_ratio, d_point[2]);
     }
-    let mut d_scales = [like(0.0); 3];
-    let mut d_turned = [[like(0.0); 3]; 3];
-    for j in 0..3 {
-        d_scales[j] = d_scaled[0][j].fma(p.turned[0][j], d_scaled[1][j].fma(p.turned[1][j], d_scaled[2][j] * p.turned[2][j]));
-        for i in 0..3 {
-            d_turned[i][j] = d_scaled[i][j] * p.scales[j];
-        }
-    }
+    let d_turned: [Vec3<S>; 3] = each(
+        #[inline(always)]
+        |i| {
+            each(
+                #[inline(always)]
+                |j| d_scaled[i][j] * p.scales[j],
+            )
+        },
+    );
     let d_rotation: [Vec3<S>; 3] = each(
         #[inline(always)]
         |i| {

@@ -15,6 +15,8 @@ pub const CHUNK: usize = 256;
 pub const WIDEST: usize = 16;
 /// Sigma by which footprints are enlarged, so that rounding never cuts off a pixel that blending would count.
 const CUTOFF_MARGIN: f32 = 0.005;
+/// Twice the sigma at which an opacity of 1 falls to 1/255, enlarged likewise: the reach of every footprint without the shortcut.
+const FULL_REACH: f32 = 11.1 + 2.0 * CUTOFF_MARGIN;
 /// Colours of this size and above count as infinite: their sums could overflow.
 const COLOR_LIMIT: f32 = 1e20;
 
@@ -148,7 +150,7 @@ impl WithSimd for Project<'_, '_> {
             let opacity = if k.settings.antialiased { opacity * p.compensation } else { opacity };
             let [xx, xy, yy] = p.covariance;
             // Twice the sigma at which alpha falls to 1/255.
-            let reach = ((opacity * 255.0).max(like(1e-30)).ln_rough() + CUTOFF_MARGIN) * 2.0;
+            let reach = if k.settings.shortcuts.opacity { ((opacity * 255.0).max(like(1e-30)).ln_rough() + CUTOFF_MARGIN) * 2.0 } else { like(FULL_REACH) };
             let (half_width, half_height) = ((reach * xx).sqrt(), (reach * yy).sqrt());
             let radius = if k.rules.square_tiles {
                 let (mid, half) = ((xx + yy) * 0.5, (xx - yy) * 0.5);

@@ -1,7 +1,7 @@
 //! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per thread.
 
 use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
-use crate::ops::rasterize::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, RuleConstants};
+use crate::ops::rasterize::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE, RuleConstants};
 use cubecl::prelude::*;
 
 /// Index of the translation in the camera buffer, which starts with the rotation by rows.
@@ -127,9 +127,14 @@ pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
     let w2 = load3(cam, 6);
     let point = add(v3(dot(w0, mean), dot(w1, mean), dot(w2, mean)), load3(cam, TRANSLATION));
     let inverse_depth = 1.0 / point.z;
-    let norm_squared = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z;
-    let inverse_norm = 1.0 / norm_squared.sqrt();
-    let unit = V4 { w: q.w * inverse_norm, x: q.x * inverse_norm, y: q.y * inverse_norm, z: q.z * inverse_norm };
+    // Squares of very short and very long quaternions leave the range of float32: a power of two brings them back, and rounds nothing.
+    let first = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z;
+    let factor = select(first < 1.0 / QUATERNION_RANGE, RESCALE, select(first > QUATERNION_RANGE, 1.0 / RESCALE, 1.0f32));
+    let r = V4 { w: q.w * factor, x: q.x * factor, y: q.y * factor, z: q.z * factor };
+    let norm_squared = r.w * r.w + r.x * r.x + r.y * r.y + r.z * r.z;
+    let inverse_length = 1.0 / norm_squared.sqrt();
+    let unit = V4 { w: r.w * inverse_length, x: r.x * inverse_length, y: r.y * inverse_length, z: r.z * inverse_length };
+    let inverse_norm = inverse_length * factor;
     let (w, x, y, z) = (unit.w, unit.x, unit.y, unit.z);
     let rotation0 = v3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y));
     let rotation1 = v3(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x));
@@ -207,42 +212,50 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     let w0 = load3(cam, 0);
     let w1 = load3(cam, 3);
     let w2 = load3(cam, 6);
-    // The conic is the inverse of the covariance: d covariance = -K G K with G the symmetric gradient.
-    let (a, b, c) = (p.conic.x, p.conic.y, p.conic.z);
-    let half = d_conic.y * 0.5;
-    let left0 = a * d_conic.x + b * half;
-    let left1 = a * half + b * d_conic.z;
-    let left2 = b * d_conic.x + c * half;
-    let left3 = b * half + c * d_conic.z;
-    // Compensation^2 = raw determinant / determinant, where that is over its floor.
+    let (fz_x, fz_y) = (p.inverse_depth * cam[FOCAL], p.inverse_depth * cam[FOCAL + 1]);
+    // Projected axes of unit length in the world: row0 and row1 are these times the scales.
+    let axes0 = scale(add(p.turned0, scale(p.turned2, -p.ratio_x)), fz_x);
+    let axes1 = scale(add(p.turned1, scale(p.turned2, -p.ratio_y)), fz_y);
+    let squared = times(s, s);
+    // The adjugate of the unblurred covariance, times the axes. A needle's covariance nearly annihilates its own axis; written with cross products, nothing
+    // cancels. With the blur and over the determinant, that is the conic K times the axes.
+    let normal = cross(axes0, axes1);
+    let adjugate0 = cross(times(axes1, squared), normal);
+    let adjugate1 = cross(normal, times(axes0, squared));
     let inverse = 1.0 / p.determinant;
+    let seen0 = scale(add(scale(axes0, EPS_2D), adjugate0), inverse);
+    let seen1 = scale(add(scale(axes1, EPS_2D), adjugate1), inverse);
+    // d covariance = -K G K with G the symmetric gradient of the conic.
+    let half = d_conic.y * 0.5;
+    let weighted0 = add(scale(seen0, d_conic.x), scale(seen1, half));
+    let weighted1 = add(scale(seen0, half), scale(seen1, d_conic.z));
+    // Compensation^2 = raw determinant / determinant, where that is over its floor.
     let share = p.raw_determinant * inverse;
     let d_share = select(share > MIN_COMPENSATION * MIN_COMPENSATION, d_compensation * 0.5 / p.compensation, 0.0f32) * inverse;
     let d_raw = d_share * (1.0 - share);
     let d_trace = -(d_share * share * EPS_2D);
-    let d_xx = -(left0 * a + left1 * b) + d_trace;
-    // Half the gradient of the off-diagonal entry, which appears twice.
-    let d_xy = -(left0 * b + left1 * c);
-    let d_yy = -(left2 * b + left3 * c) + d_trace;
-    // raw determinant = xx yy - xy^2, before the blur.
-    let m0 = d_raw * (p.yy - EPS_2D) + d_xx;
-    let m1 = d_xy - d_raw * p.xy;
-    let m2 = d_raw * (p.xx - EPS_2D) + d_yy;
-    let d_row0 = scale(add(scale(p.row0, m0), scale(p.row1, m1)), 2.0f32);
-    let d_row1 = scale(add(scale(p.row0, m1), scale(p.row1, m2)), 2.0f32);
+    let n = times(normal, normal);
+    let raw = v3(squared.y * n.z + squared.z * n.y, squared.z * n.x + squared.x * n.z, squared.x * n.y + squared.y * n.x);
+    let trace = add(times(axes0, axes0), times(axes1, axes1));
+    let through_conic = add(times(seen0, weighted0), times(seen1, weighted1));
+    let d_scales = scale(times(s, add(add(scale(raw, d_raw), scale(trace, d_trace)), scale(through_conic, -1.0f32))), 2.0f32);
+    let (a, b, c) = (p.conic.x, p.conic.y, p.conic.z);
+    let conic0 = add(scale(weighted0, a), scale(weighted1, b));
+    let conic1 = add(scale(weighted0, b), scale(weighted1, c));
+    let d_row0 = scale(add(times(s, add(scale(adjugate0, d_raw), scale(conic0, -1.0f32))), scale(p.row0, d_trace)), 2.0f32);
+    let d_row1 = scale(add(times(s, add(scale(adjugate1, d_raw), scale(conic1, -1.0f32))), scale(p.row1, d_trace)), 2.0f32);
     // rows[k] = (f_k / z) (scaled[k] - ratio_k scaled[2]).
-    let d_scaled0 = scale(d_row0, p.inverse_depth * cam[FOCAL]);
-    let d_scaled1 = scale(d_row1, p.inverse_depth * cam[FOCAL + 1]);
+    let d_scaled0 = scale(d_row0, fz_x);
+    let d_scaled1 = scale(d_row1, fz_y);
     let d_scaled2 = add(scale(d_scaled0, -p.ratio_x), scale(d_scaled1, -p.ratio_y));
-    // The clamped ratio passes no gradient; the projected centre always does. 1/z scales the whole row.
+    // The clamped ratio passes no gradient; the projected centre always does. 1/z scales both rows, as a common factor of the scales would.
     let step_x = (d_x * cam[FOCAL] - p.inside_x * dot(d_scaled0, p.scaled2)) * p.inverse_depth;
     let step_y = (d_y * cam[FOCAL + 1] - p.inside_y * dot(d_scaled1, p.scaled2)) * p.inverse_depth;
-    let d_z = d_depth - (dot(d_row0, p.row0) + dot(d_row1, p.row1)) * p.inverse_depth - (step_x * p.point.x + step_y * p.point.y) * p.inverse_depth;
+    let d_z = d_depth - dot(d_scales, s) * p.inverse_depth - (step_x * p.point.x + step_y * p.point.y) * p.inverse_depth;
     let d_point = v3(step_x, step_y, d_z);
     let d_turned0 = times(d_scaled0, s);
     let d_turned1 = times(d_scaled1, s);
     let d_turned2 = times(d_scaled2, s);
-    let d_scales = add(add(times(d_scaled0, p.turned0), times(d_scaled1, p.turned1)), times(d_scaled2, p.turned2));
     let r0 = combine(d_turned0, w0.x, d_turned1, w1.x, d_turned2, w2.x);
     let r1 = combine(d_turned0, w0.y, d_turned1, w1.y, d_turned2, w2.y);
     let r2 = combine(d_turned0, w0.z, d_turned1, w1.z, d_turned2, w2.z);

@@ -8,6 +8,10 @@ use glam::{DMat4, DVec3, DVec4};
 pub const EPS_2D: f32 = 0.3;
 /// Smallest opacity factor of the antialiasing compensation.
 pub const MIN_COMPENSATION: f32 = 0.005;
+/// Squared norms of quaternions beyond this, or below one over it, are rescaled before they are used.
+pub const QUATERNION_RANGE: f32 = 1e20;
+/// 2^80: short quaternions are multiplied by it, long ones divided.
+pub const RESCALE: f32 = 1_208_925_819_614_629_174_706_176.0;
 /// A pixel ignores a Gaussian below this alpha: the float32 value of 1/255.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 /// A pixel stops before its transmittance would fall to this value or below.

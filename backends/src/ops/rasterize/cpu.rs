@@ -4,7 +4,7 @@ use super::{GradientRequest, Method, Probes, RasterBackward, RasterGradients, Ra
 use crate::cpu::raster::{self, SplatArrays, Workspace};
 use crate::cpu::tensor::CpuBackend;
 use crate::rasterizers::reference::blend::Item;
-use crate::rasterizers::reference::{self, ReferenceInput};
+use crate::rasterizers::reference::{self, Precision, ReferenceInput};
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::Shape;
@@ -52,8 +52,8 @@ impl<B: CpuBackend> RasterOps for B {
     fn rasterize(splats: SplatTensors<Self>, _: Probes<Self>, settings: RasterSettings, method: Method) -> Rasterized<Self> {
         let borrowed = Borrowed::new(&splats);
         let splats = borrowed.arrays();
-        if method == Method::Reference {
-            return reference_forward::<B>(&splats, &settings);
+        if let Method::Reference(precision) = method {
+            return reference_forward::<B>(&splats, &settings, precision);
         }
         match raster::forward(&splats, &settings) {
             Ok(out) => {
@@ -85,8 +85,14 @@ fn narrow(values: Vec<f64>) -> Vec<f32> {
     values.into_iter().map(|v| v as f32).collect()
 }
 
-fn reference_forward<B: CpuBackend>(splats: &SplatArrays, settings: &RasterSettings) -> Rasterized<B> {
-    let out = reference::forward(&ReferenceInput::widen(splats), settings);
+/// What the reference's backward pass needs of its forward pass.
+struct Drawn {
+    precision: Precision,
+    items: Vec<Item>,
+}
+
+fn reference_forward<B: CpuBackend>(splats: &SplatArrays, settings: &RasterSettings, precision: Precision) -> Rasterized<B> {
+    let out = reference::forward_in(precision, &ReferenceInput::widen(splats), settings);
     let n = splats.len();
     let weights = if settings.max_weights { narrow(out.max_weights) } else { Vec::new() };
     let weights_len = weights.len();
@@ -97,13 +103,13 @@ fn reference_forward<B: CpuBackend>(splats: &SplatArrays, settings: &RasterSetti
         work: RenderWork { visible: out.items.len() as u64, tile_pairs: 0, pixel_pairs: out.pairs },
         pair_count: B::from_ints(vec![0], [1]),
         refused: None,
-        saved: Saved::new(out.items),
+        saved: Saved::new(Drawn { precision, items: out.items }),
     }
 }
 
-fn reference_backward(splats: &SplatArrays, settings: &RasterSettings, items: &[Item], upstream: &[f32]) -> raster::Gradients {
+fn reference_backward(splats: &SplatArrays, settings: &RasterSettings, drawn: &Drawn, upstream: &[f32]) -> raster::Gradients {
     let upstream: Vec<f64> = upstream.iter().map(|&v| f64::from(v)).collect();
-    let g = reference::backward(&ReferenceInput::widen(splats), settings, items, &upstream);
+    let g = reference::backward_in(drawn.precision, &ReferenceInput::widen(splats), settings, &drawn.items, &upstream);
     raster::Gradients {
         means: narrow(g.means),
         scales: narrow(g.scales),
@@ -129,8 +135,8 @@ impl<B: CpuBackend> RasterBackward for B {
         let borrowed = Borrowed::new(&splats);
         let arrays = borrowed.arrays();
         let upstream = B::floats(&upstream);
-        let g = if let Some(items) = saved.get::<Vec<Item>>() {
-            reference_backward(&arrays, settings, items, &upstream)
+        let g = if let Some(drawn) = saved.get::<Drawn>() {
+            reference_backward(&arrays, settings, drawn, &upstream)
         } else if let Some(workspace) = saved.get::<Mutex<Workspace>>() {
             // A panic in an earlier backward pass leaves old values behind at worst, and every buffer is written before it is read.
             let mut workspace = workspace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);

@@ -21,8 +21,8 @@ pub enum Method {
     /// Tiles.
     #[default]
     Tiles,
-    /// The float64 reference, on the host.
-    Reference,
+    /// The reference, on the host.
+    Reference(crate::rasterizers::reference::Precision),
 }
 
 /// What a device saves between the forward and the backward pass. Only the device that made it can read it.
@@ -212,7 +212,7 @@ fn check_device(device: &Device, method: Method) -> Result<()> {
         #[cfg(feature = "cube")]
         (DispatchDevice::Cube(_), Method::Tiles) => Ok(()),
         #[cfg(feature = "cube")]
-        (DispatchDevice::Cube(_), Method::Reference) => Err(Error::unsupported(
+        (DispatchDevice::Cube(_), Method::Reference(_)) => Err(Error::unsupported(
             format!("rasterizer reference on {device:?}"),
             "it computes in float64 on the processor",
             "Use --device flex, or the rasterizer tile",

@@ -61,6 +61,24 @@ pub struct RasterSettings {
     pub absolute_centers: bool,
     /// Capacity in (Gaussian, tile) pairs, where reading their number back would stall the device; `None` allocates for all.
     pub pair_capacity: Option<usize>,
+    /// What is skipped.
+    pub shortcuts: Shortcuts,
+}
+
+/// Shortcuts of the tile rasterizer on processors. They change no bit of images and of the Gaussians' gradients (the order in which the gradient of the camera's
+/// pose is summed may change); they are switched off only to measure what they save.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Shortcuts {
+    /// Footprints end where alpha falls below 1/255, rather than at 3.33 sigma.
+    pub opacity: bool,
+    /// Rows and tiles end when all of their pixels have stopped.
+    pub transmittance: bool,
+}
+
+impl Default for Shortcuts {
+    fn default() -> Self {
+        Self { opacity: true, transmittance: true }
+    }
 }
 
 /// Which gradients are wanted.

@@ -1,6 +1,8 @@
-//! Blending pixel by pixel over the whole depth-sorted list, forwards and backwards.
+//! Blending pixel by pixel over the whole depth-sorted list, forwards and backwards. Sums over pixels and planes are float64; everything that is summed is
+//! computed in the precision T.
 
 use super::gaussian::TileRange;
+use super::real::Real;
 use crate::ops::rasterize::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, RasterSettings};
 
@@ -16,39 +18,45 @@ pub struct Item {
 }
 
 /// One Gaussian at one pixel.
-struct Touch {
+struct Touch<T> {
     item: usize,
-    dx: f64,
-    dy: f64,
-    alpha: f64,
+    dx: T,
+    dy: T,
+    alpha: T,
     /// Alpha before the cap.
-    uncapped: f64,
+    uncapped: T,
     /// Transmittance in front of it.
-    before: f64,
+    before: T,
+}
+
+/// The numbers of an item in the precision T; they come from there, so nothing is rounded.
+fn numbers<T: Real>(item: &Item) -> [T; RECORD] {
+    item.numbers.map(T::constant)
 }
 
 /// The Gaussians that contribute at a pixel, front to back, and the transmittance left.
-fn touches(items: &[Item], settings: &RasterSettings, column: usize, row: usize) -> (Vec<Touch>, f64) {
+fn touches<T: Real>(items: &[Item], settings: &RasterSettings, column: usize, row: usize) -> (Vec<Touch<T>>, T) {
     let rules = RuleConstants::new(settings);
     let (cap, least, stop) = (f64::from(rules.alpha_max), f64::from(ALPHA_MIN), f64::from(TRANSMITTANCE_STOP));
+    let (one, half) = (T::constant(1.0), T::constant(0.5));
     let mut found = Vec::new();
-    let mut left = 1.0;
+    let mut left = one;
     for (k, item) in items.iter().enumerate() {
         if let Some([columns, rows]) = item.tiles
             && !((columns[0]..columns[1]).contains(&(column / 16)) && (rows[0]..rows[1]).contains(&(row / 16)))
         {
             continue;
         }
-        let [x, y, a, b, c, opacity, ..] = item.numbers;
-        let (dx, dy) = (column as f64 + 0.5 - x, row as f64 + 0.5 - y);
-        let sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy;
+        let [x, y, a, b, c, opacity, ..] = numbers::<T>(item);
+        let (dx, dy) = (T::constant(column as f64 + 0.5) - x, T::constant(row as f64 + 0.5) - y);
+        let sigma = half * (a * dx * dx + c * dy * dy) + b * dx * dy;
         let uncapped = opacity * (-sigma).exp();
-        let alpha = uncapped.min(cap);
-        if sigma < 0.0 || alpha < least || alpha.is_nan() {
+        let alpha = uncapped.smaller(T::constant(cap));
+        if sigma.value() < 0.0 || alpha.value() < least || alpha.value().is_nan() {
             continue;
         }
-        let after = left * (1.0 - alpha);
-        if after <= stop {
+        let after = left * (one - alpha);
+        if after.value() <= stop {
             break;
         }
         found.push(Touch { item: k, dx, dy, alpha, uncapped, before: left });
@@ -68,27 +76,27 @@ pub struct Blended {
 }
 
 /// Blends depth-sorted `items`.
-pub fn blend(items: &[Item], settings: &RasterSettings, background: [f64; 3]) -> Blended {
+pub fn blend<T: Real>(items: &[Item], settings: &RasterSettings, background: [f64; 3]) -> Blended {
     let plane = settings.width * settings.height;
     let mut image = Blended { planes: vec![0.0; 5 * plane], max_weights: vec![0.0; items.len()], pairs: 0 };
     for row in 0..settings.height {
         for column in 0..settings.width {
             let pixel = row * settings.width + column;
-            let (found, left) = touches(items, settings, column, row);
+            let (found, left) = touches::<T>(items, settings, column, row);
             image.pairs += found.len() as u64;
             for touch in &found {
                 let weight = touch.alpha * touch.before;
-                let numbers = &items[touch.item].numbers;
+                let numbers = numbers::<T>(&items[touch.item]);
                 for c in 0..3 {
-                    image.planes[c * plane + pixel] += weight * numbers[AT_COLOR + c];
+                    image.planes[c * plane + pixel] += (weight * numbers[AT_COLOR + c]).value();
                 }
-                image.planes[4 * plane + pixel] += weight * numbers[AT_DEPTH];
-                image.max_weights[touch.item] = image.max_weights[touch.item].max(weight);
+                image.planes[4 * plane + pixel] += (weight * numbers[AT_DEPTH]).value();
+                image.max_weights[touch.item] = image.max_weights[touch.item].max(weight.value());
             }
             for c in 0..3 {
-                image.planes[c * plane + pixel] += left * background[c];
+                image.planes[c * plane + pixel] += (left * T::constant(background[c])).value();
             }
-            image.planes[3 * plane + pixel] = 1.0 - left;
+            image.planes[3 * plane + pixel] = (T::constant(1.0) - left).value();
         }
     }
     image
@@ -105,49 +113,108 @@ pub struct BlendGradients {
 }
 
 /// Gradients for `upstream` `[5,H,W]`.
-pub fn blend_backward(items: &[Item], settings: &RasterSettings, background: [f64; 3], upstream: &[f64]) -> BlendGradients {
+pub fn blend_backward<T: Real>(items: &[Item], settings: &RasterSettings, background: [f64; 3], upstream: &[f64]) -> BlendGradients {
     let rules = RuleConstants::new(settings);
     let plane = settings.width * settings.height;
     let mut out = BlendGradients { items: vec![[0.0; RECORD]; items.len()], absolute_centers: vec![[0.0; 2]; items.len()], background: [0.0; 3] };
+    let (one, half, background) = (T::constant(1.0), T::constant(0.5), background.map(T::constant));
+    let colored = |g: &[T; 5], color: &[T]| g[0] * color[0] + g[1] * color[1] + g[2] * color[2];
     for row in 0..settings.height {
         for column in 0..settings.width {
             let pixel = row * settings.width + column;
-            let g: [f64; 5] = std::array::from_fn(|k| upstream[k * plane + pixel]);
-            let (found, left) = touches(items, settings, column, row);
+            let g: [T; 5] = std::array::from_fn(|k| T::constant(upstream[k * plane + pixel]));
+            let (found, left) = touches::<T>(items, settings, column, row);
             for c in 0..3 {
-                out.background[c] += left * g[c];
+                out.background[c] += (left * g[c]).value();
             }
             // d loss / d transmittance behind everything.
-            let mut d_left = (0..3).map(|c| g[c] * background[c]).sum::<f64>() - g[3];
+            let mut d_left = colored(&g, &background) - g[3];
             for touch in found.iter().rev() {
-                let numbers = &items[touch.item].numbers;
+                let numbers = numbers::<T>(&items[touch.item]);
                 let d = &mut out.items[touch.item];
-                let shown = (0..3).map(|c| g[c] * numbers[AT_COLOR + c]).sum::<f64>() + g[4] * numbers[AT_DEPTH];
+                let shown = colored(&g, &numbers[AT_COLOR..]) + g[4] * numbers[AT_DEPTH];
                 let weight = touch.alpha * touch.before;
                 for c in 0..3 {
-                    d[AT_COLOR + c] += weight * g[c];
+                    d[AT_COLOR + c] += (weight * g[c]).value();
                 }
-                d[AT_DEPTH] += weight * g[4];
+                d[AT_DEPTH] += (weight * g[4]).value();
                 let d_alpha = touch.before * (shown - d_left);
                 // The loss is linear in the transmittance in front of this Gaussian.
-                d_left = touch.alpha * shown + (1.0 - touch.alpha) * d_left;
-                if touch.uncapped > f64::from(rules.alpha_max) && !rules.pass_capped {
+                d_left = touch.alpha * shown + (one - touch.alpha) * d_left;
+                if touch.uncapped.value() > f64::from(rules.alpha_max) && !rules.pass_capped {
                     continue;
                 }
-                let [_, _, a, b, c, opacity, ..] = *numbers;
-                d[AT_OPACITY] += d_alpha * touch.uncapped / opacity;
-                let d_sigma = -d_alpha * touch.uncapped;
-                let d_center = [-d_sigma * (a * touch.dx + b * touch.dy), -d_sigma * (b * touch.dx + c * touch.dy)];
+                let [_, _, a, b, c, opacity, ..] = numbers;
+                let (dx, dy) = (touch.dx, touch.dy);
+                d[AT_OPACITY] += (d_alpha * touch.uncapped / opacity).value();
+                let d_sigma = -(d_alpha * touch.uncapped);
+                let d_center = [-(d_sigma * (a * dx + b * dy)), -(d_sigma * (b * dx + c * dy))].map(T::value);
                 d[AT_X] += d_center[0];
                 d[AT_Y] += d_center[1];
                 for (sum, value) in out.absolute_centers[touch.item].iter_mut().zip(d_center) {
                     *sum += value.abs();
                 }
-                d[AT_A] += d_sigma * 0.5 * touch.dx * touch.dx;
-                d[AT_B] += d_sigma * touch.dx * touch.dy;
-                d[AT_C] += d_sigma * 0.5 * touch.dy * touch.dy;
+                d[AT_A] += (d_sigma * half * dx * dx).value();
+                d[AT_B] += (d_sigma * dx * dy).value();
+                d[AT_C] += (d_sigma * half * dy * dy).value();
             }
         }
     }
     out
+}
+
+/// How near the decisions at a pixel are to falling the other way.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Margin {
+    /// The least relative distance of an alpha from 1/255 or from its cap, or of a transmittance from where a pixel stops.
+    pub relative: f64,
+    /// The least distance of such a decision in units of what rounding to float32 can change it by.
+    pub roundings: f64,
+}
+
+/// The margins of all pixels, in float64.
+///
+/// Rounding moves the exponent sigma by the rounding of its terms, which may be far larger than their sum, and by that of the centre: for a needle, several
+/// percent of alpha.
+pub fn margins(items: &[Item], settings: &RasterSettings) -> Vec<Margin> {
+    let rules = RuleConstants::new(settings);
+    let (cap, least, stop) = (f64::from(rules.alpha_max), f64::from(ALPHA_MIN), f64::from(TRANSMITTANCE_STOP));
+    let rounding = f64::from(f32::EPSILON);
+    let mut margins = Vec::with_capacity(settings.width * settings.height);
+    for row in 0..settings.height {
+        for column in 0..settings.width {
+            let mut margin = Margin { relative: f64::INFINITY, roundings: f64::INFINITY };
+            let mut note = |value: f64, threshold: f64, error: f64| {
+                let distance = (value / threshold - 1.0).abs();
+                margin.relative = margin.relative.min(distance);
+                margin.roundings = margin.roundings.min(distance / error);
+            };
+            let (mut left, mut error_left) = (1.0f64, 0.0f64);
+            for item in items {
+                let [x, y, a, b, c, opacity, ..] = item.numbers;
+                let (dx, dy) = (column as f64 + 0.5 - x, row as f64 + 0.5 - y);
+                let sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy;
+                let terms = 0.5 * (a * dx * dx + c * dy * dy) + (b * dx * dy).abs();
+                let slopes = ((a * dx).abs() + (b * dy).abs()) * x.abs().max(1.0) + ((c * dy).abs() + (b * dx).abs()) * y.abs().max(1.0);
+                // Relative error of alpha.
+                let error = rounding * (1.0 + terms + slopes);
+                let uncapped = opacity * (-sigma).exp();
+                note(uncapped, least, error);
+                if sigma < 0.0 || uncapped < least || uncapped.is_nan() {
+                    continue;
+                }
+                note(uncapped, cap, error);
+                let alpha = uncapped.min(cap);
+                error_left += alpha * error / (1.0 - alpha);
+                let after = left * (1.0 - alpha);
+                note(after, stop, error_left + rounding);
+                if after <= stop {
+                    break;
+                }
+                left = after;
+            }
+            margins.push(margin);
+        }
+    }
+    margins
 }

@@ -52,6 +52,21 @@ pub struct Projected<T> {
     pub depth: T,
 }
 
+impl<T: Real> Projected<T> {
+    /// The same numbers in float64.
+    pub fn widened(&self) -> Projected<f64> {
+        Projected {
+            center: self.center.map(T::value),
+            conic: self.conic.map(T::value),
+            covariance: self.covariance.map(T::value),
+            opacity: self.opacity.value(),
+            compensation: self.compensation.value(),
+            direction: self.direction.map(T::value),
+            depth: self.depth.value(),
+        }
+    }
+}
+
 fn dot<T: Real>(a: [T; 3], b: [T; 3]) -> T {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }

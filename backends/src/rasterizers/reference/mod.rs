@@ -1,5 +1,7 @@
 //! The rasterizer `reference`: slow, obvious, float64. It is the oracle of `tile` and shares no arithmetic with it: geometry is
 //! differentiated by carrying derivatives along ([`real::Dual`]), blending pixel by pixel over the whole list.
+//!
+//! The same formulas in float32 ([`Precision::Float32`]) show what rounding alone does to them: the noise that a float32 kernel is measured by.
 
 // Formulas with indices read as in the papers.
 #![allow(clippy::needless_range_loop)]
@@ -9,13 +11,24 @@ pub mod gaussian;
 pub mod harmonics;
 pub mod real;
 
-use super::settings::{no_settings, raster_settings};
+use super::settings::raster_settings;
 use super::tile::raster_inputs;
 use crate::ops::rasterize::{AT_COLOR, AT_DEPTH, Method, RECORD, RasterSettings, rasterize};
 use blend::Item;
-use cc4dgs_core::{Camera, Plugin, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, Splats, inventory};
+use cc4dgs_core::{Camera, Plugin, Rasterizer, RasterizerPlugin, RenderOutput, RenderSettings, Result, Splats, config, inventory};
 use gaussian::{Gaussian, Projected};
 use real::{Dual, Real};
+
+/// What the reference computes in.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// The oracle.
+    #[default]
+    Float64,
+    /// The same formulas, rounded.
+    Float32,
+}
 
 /// The arrays of N Gaussians in float64, row-major, as in [`crate::cpu::raster::SplatArrays`].
 #[derive(Clone, Debug, Default)]
@@ -133,14 +146,15 @@ impl ReferenceInput {
 const VARIABLES: usize = 27;
 
 /// The visible Gaussians front to back, and the screen radius of all, 0 where culled.
-pub fn visible(input: &ReferenceInput, settings: &RasterSettings) -> (Vec<Item>, Vec<i64>) {
+fn visible<T: Real>(input: &ReferenceInput, settings: &RasterSettings) -> (Vec<Item>, Vec<i64>) {
     let n = input.opacities.len();
     let mut radii = vec![0i64; n];
     let mut items = Vec::new();
     for i in 0..n {
-        let p: Projected<f64> = gaussian::project(&input.gaussian(i, settings, |v, _| v), settings);
+        let exact: Projected<T> = gaussian::project(&input.gaussian(i, settings, |v, _| T::constant(v)), settings);
+        let p = exact.widened();
         let Some((radius, tiles)) = gaussian::extent(&p, settings) else { continue };
-        let color = input.color(i, settings.sh_degree, p.direction);
+        let color = input.color(i, settings.sh_degree, exact.direction).map(T::value);
         if color.iter().any(|c| !c.is_finite()) {
             continue;
         }
@@ -154,10 +168,22 @@ pub fn visible(input: &ReferenceInput, settings: &RasterSettings) -> (Vec<Item>,
     (items, radii)
 }
 
-/// Renders.
+/// Renders in float64.
 pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOutput {
-    let (items, radii) = visible(input, settings);
-    let image = blend::blend(&items, settings, input.background);
+    forward_in(Precision::Float64, input, settings)
+}
+
+/// Renders.
+pub fn forward_in(precision: Precision, input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOutput {
+    match precision {
+        Precision::Float64 => forward_real::<f64>(input, settings),
+        Precision::Float32 => forward_real::<f32>(input, settings),
+    }
+}
+
+fn forward_real<T: Real>(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOutput {
+    let (items, radii) = visible::<T>(input, settings);
+    let image = blend::blend::<T>(&items, settings, input.background);
     let mut max_weights = vec![0.0; radii.len()];
     for (item, weight) in items.iter().zip(&image.max_weights) {
         max_weights[item.index] = *weight;
@@ -165,10 +191,22 @@ pub fn forward(input: &ReferenceInput, settings: &RasterSettings) -> ReferenceOu
     ReferenceOutput { planes: image.planes, radii, max_weights, items, pairs: image.pairs }
 }
 
-/// Gradients for `upstream` `[5,H,W]` at the visible `items` of the forward pass.
+/// Gradients in float64 for `upstream` `[5,H,W]` at the visible `items` of the forward pass.
 pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item], upstream: &[f64]) -> ReferenceGradients {
+    backward_in(Precision::Float64, input, settings, items, upstream)
+}
+
+/// Gradients for `upstream` `[5,H,W]` at the visible `items` of the forward pass in the same precision.
+pub fn backward_in(precision: Precision, input: &ReferenceInput, settings: &RasterSettings, items: &[Item], upstream: &[f64]) -> ReferenceGradients {
+    match precision {
+        Precision::Float64 => backward_real::<f64>(input, settings, items, upstream),
+        Precision::Float32 => backward_real::<f32>(input, settings, items, upstream),
+    }
+}
+
+fn backward_real<T: Real>(input: &ReferenceInput, settings: &RasterSettings, items: &[Item], upstream: &[f64]) -> ReferenceGradients {
     let n = input.opacities.len();
-    let blended = blend::blend_backward(items, settings, input.background, upstream);
+    let blended = blend::blend_backward::<T>(items, settings, input.background, upstream);
     let mut out = ReferenceGradients {
         means: vec![0.0; 3 * n],
         scales: vec![0.0; 3 * n],
@@ -184,18 +222,19 @@ pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item
     };
     for ((item, g), absolute) in items.iter().zip(&blended.items).zip(&blended.absolute_centers) {
         let i = item.index;
-        let p = gaussian::project(&input.gaussian(i, settings, Dual::<VARIABLES>::variable), settings);
+        let p = gaussian::project(&input.gaussian(i, settings, |v, k| Dual::<VARIABLES, T>::variable(T::constant(v), k)), settings);
         let color = input.color(i, settings.sh_degree, p.direction);
-        let mut d = [0.0; VARIABLES];
-        let mut add = |quantity: Dual<VARIABLES>, g: f64| (0..VARIABLES).for_each(|v| d[v] += g * quantity.slope[v]);
+        let mut d = [T::constant(0.0); VARIABLES];
+        let mut add = |quantity: Dual<VARIABLES, T>, g: f64| (0..VARIABLES).for_each(|v| d[v] = d[v] + T::constant(g) * quantity.slope[v]);
         for (quantity, g) in [p.center[0], p.center[1], p.conic[0], p.conic[1], p.conic[2], p.opacity].into_iter().zip(g) {
             add(quantity, *g);
         }
         add(p.depth, g[AT_DEPTH]);
-        let d_color: [f64; 3] = std::array::from_fn(|c| if settings.sh_degree.is_some() && color[c].value < 0.0 { 0.0 } else { g[AT_COLOR + c] });
+        let d_color: [f64; 3] = std::array::from_fn(|c| if settings.sh_degree.is_some() && color[c].value() < 0.0 { 0.0 } else { g[AT_COLOR + c] });
         for c in 0..3 {
             add(color[c], d_color[c]);
         }
+        let d = d.map(T::value);
         out.means[3 * i..3 * i + 3].copy_from_slice(&d[0..3]);
         out.scales[3 * i..3 * i + 3].copy_from_slice(&d[3..6]);
         out.quaternions[4 * i..4 * i + 4].copy_from_slice(&d[6..10]);
@@ -205,12 +244,12 @@ pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item
         }
         out.screen[2 * i..2 * i + 2].copy_from_slice(&g[0..2]);
         out.absolute_screen[2 * i..2 * i + 2].copy_from_slice(absolute);
-        let values = settings.sh_degree.map_or(vec![1.0], |degree| harmonics::basis(degree, p.direction.map(|v| v.value)));
+        let values = settings.sh_degree.map_or(vec![T::constant(1.0)], |degree| harmonics::basis(degree, p.direction.map(|v| v.value)));
         let width = input.sh_rest.len() / n;
         for (k, value) in values.into_iter().enumerate() {
             let to = if k == 0 { &mut out.colors[3 * i..3 * i + 3] } else { &mut out.sh_rest[i * width + 3 * (k - 1)..][..3] };
             for c in 0..3 {
-                to[c] = value * d_color[c];
+                to[c] = (value * T::constant(d_color[c])).value();
             }
         }
     }
@@ -218,14 +257,25 @@ pub fn backward(input: &ReferenceInput, settings: &RasterSettings, items: &[Item
     out
 }
 
-/// Draws with [`forward`] and [`backward`]; the time grows with pixels times Gaussians.
+/// Draws with [`forward_in`] and [`backward_in`]; the time grows with pixels times Gaussians.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct ReferenceRasterizer;
+pub struct ReferenceRasterizer {
+    /// What it computes in.
+    pub precision: Precision,
+}
 
 impl Rasterizer for ReferenceRasterizer {
     fn render(&self, splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RenderOutput> {
-        rasterize(raster_inputs(splats, settings), raster_settings(splats, camera, settings)?, Method::Reference)
+        rasterize(raster_inputs(splats, settings), raster_settings(splats, camera, settings)?, Method::Reference(self.precision))
     }
+}
+
+/// Settings of the plug-in.
+#[derive(serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Settings {
+    #[serde(default)]
+    precision: Precision,
 }
 
 inventory::submit! {
@@ -235,12 +285,12 @@ inventory::submit! {
             version: "1",
             summary: "Every pixel over every Gaussian in float64; slow, the oracle of the tests",
             paper: "Kerbl et al. 2023 (3DGS); Ye et al. 2024 (gsplat)",
-            schema: "",
+            schema: "# \"float64\", or \"float32\": the same formulas, rounded\nprecision = \"float64\"\n",
             capabilities: &["differentiable", "antialiased", "max-weights", "rules=gsplat099,gsplat0999,inria"],
         },
         build: |table| {
-            no_settings("reference", table)?;
-            Ok(Box::new(ReferenceRasterizer))
+            let Settings { precision } = config::parse_section("rasterizer reference", table)?;
+            Ok(Box::new(ReferenceRasterizer { precision }))
         },
     }
 }

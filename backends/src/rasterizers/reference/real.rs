@@ -43,75 +43,76 @@ macro_rules! plain {
 plain!(f32);
 plain!(f64);
 
-/// A number and its derivatives with respect to N variables (forward-mode differentiation).
+/// A number and its derivatives with respect to N variables (forward-mode differentiation), in the precision T.
 #[derive(Clone, Copy, Debug)]
-pub struct Dual<const N: usize> {
+pub struct Dual<const N: usize, T = f64> {
     /// The number.
-    pub value: f64,
+    pub value: T,
     /// Its derivatives.
-    pub slope: [f64; N],
+    pub slope: [T; N],
 }
 
-impl<const N: usize> Dual<N> {
+impl<const N: usize, T: Real> Dual<N, T> {
     /// Variable number `index`.
-    pub fn variable(value: f64, index: usize) -> Self {
-        let mut slope = [0.0; N];
-        slope[index] = 1.0;
+    pub fn variable(value: T, index: usize) -> Self {
+        let mut slope = [T::constant(0.0); N];
+        slope[index] = T::constant(1.0);
         Self { value, slope }
     }
     /// A function of `self` with this value and this derivative.
-    fn chain(self, value: f64, derivative: f64) -> Self {
+    fn chain(self, value: T, derivative: T) -> Self {
         Self { value, slope: self.slope.map(|d| d * derivative) }
     }
     /// a * self + b * other in the derivatives.
-    fn mix(self, other: Self, value: f64, a: f64, b: f64) -> Self {
+    fn mix(self, other: Self, value: T, a: T, b: T) -> Self {
         Self { value, slope: std::array::from_fn(|k| a * self.slope[k] + b * other.slope[k]) }
     }
 }
 
-impl<const N: usize> Add for Dual<N> {
+impl<const N: usize, T: Real> Add for Dual<N, T> {
     type Output = Self;
     fn add(self, other: Self) -> Self {
-        self.mix(other, self.value + other.value, 1.0, 1.0)
+        let one = T::constant(1.0);
+        self.mix(other, self.value + other.value, one, one)
     }
 }
-impl<const N: usize> Sub for Dual<N> {
+impl<const N: usize, T: Real> Sub for Dual<N, T> {
     type Output = Self;
     fn sub(self, other: Self) -> Self {
-        self.mix(other, self.value - other.value, 1.0, -1.0)
+        self.mix(other, self.value - other.value, T::constant(1.0), T::constant(-1.0))
     }
 }
-impl<const N: usize> Mul for Dual<N> {
+impl<const N: usize, T: Real> Mul for Dual<N, T> {
     type Output = Self;
     fn mul(self, other: Self) -> Self {
         self.mix(other, self.value * other.value, other.value, self.value)
     }
 }
-impl<const N: usize> Div for Dual<N> {
+impl<const N: usize, T: Real> Div for Dual<N, T> {
     type Output = Self;
     fn div(self, other: Self) -> Self {
         let value = self.value / other.value;
-        self.mix(other, value, 1.0 / other.value, -value / other.value)
+        self.mix(other, value, T::constant(1.0) / other.value, -(value / other.value))
     }
 }
-impl<const N: usize> Neg for Dual<N> {
+impl<const N: usize, T: Real> Neg for Dual<N, T> {
     type Output = Self;
     fn neg(self) -> Self {
-        self.chain(-self.value, -1.0)
+        self.chain(-self.value, T::constant(-1.0))
     }
 }
 
-impl<const N: usize> Real for Dual<N> {
+impl<const N: usize, T: Real> Real for Dual<N, T> {
     fn constant(value: f64) -> Self {
-        Self { value, slope: [0.0; N] }
+        Self { value: T::constant(value), slope: [T::constant(0.0); N] }
     }
     fn value(self) -> f64 {
-        self.value
+        self.value.value()
     }
     fn sqrt(self) -> Self {
         let root = self.value.sqrt();
         // Where the argument is constant, so is the root, even at zero.
-        if self.slope.iter().all(|&d| d == 0.0) { Self::constant(root) } else { self.chain(root, 0.5 / root) }
+        if self.slope.iter().all(|&d| d.value() == 0.0) { Self { value: root, slope: self.slope } } else { self.chain(root, T::constant(0.5) / root) }
     }
     fn exp(self) -> Self {
         let value = self.value.exp();

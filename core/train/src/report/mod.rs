@@ -11,10 +11,10 @@ mod rows;
 mod tables;
 mod text;
 
-pub use rows::{Better, QUANTITIES, Quantity, Row, Spread, rows};
+pub use rows::{Better, QUANTITIES, Quantity, Row, rows};
 pub use tables::{Cell, Table};
 
-use crate::sweep::{CellResult, RESULTS, check_comparable, read_results};
+use crate::sweep::{RESULTS, check_comparable, read_results, select};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
@@ -40,8 +40,7 @@ pub struct ReportOptions {
     pub images: ImageChoice,
     /// Views per scene.
     pub views: usize,
-    /// `KEY=VALUE` with the keys `scene`, `method`, `setting`, `codec`, `seed`, `device`, `split`: only results that have all of them; several values of a key
-    /// are alternatives.
+    /// `KEY=VALUE`, as [`select`] takes them.
     pub only: Vec<String>,
 }
 
@@ -89,7 +88,7 @@ pub struct ReportFiles {
 /// # Errors
 /// What reading reports; [`Error::Data`] for results that do not belong into one table, and for damaged images; [`Error::Parameter`] for options.
 pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
-    let results = chosen(read_results(path)?, &options.only)?;
+    let results = select(read_results(path)?, &options.only)?;
     check_comparable(&results)?;
     let scenes = rows(&results)?;
     let beside = path.is_file() || path.file_name().is_some_and(|name| name == RESULTS);
@@ -159,33 +158,6 @@ pub fn write_report(path: &Path, out: &Path, options: &ReportOptions) -> Result<
         cells: report.cells,
         html_bytes: report.html.len(),
     })
-}
-
-/// The results that `only` asks for.
-fn chosen(results: Vec<CellResult>, only: &[String]) -> Result<Vec<CellResult>> {
-    const KEYS: [&str; 7] = ["scene", "method", "setting", "codec", "seed", "device", "split"];
-    let mut wanted: std::collections::BTreeMap<&str, Vec<&str>> = std::collections::BTreeMap::new();
-    for text in only {
-        let pair = text.split_once('=').filter(|(key, _)| KEYS.contains(key));
-        let (key, value) =
-            pair.ok_or_else(|| Error::parameter("--where", text.clone(), format!("Write KEY=VALUE with one of the keys {}", KEYS.join(", "))))?;
-        wanted.entry(key).or_default().push(value);
-    }
-    let of = |r: &CellResult, key: &str| match key {
-        "scene" => r.axes.scene.clone(),
-        "method" => r.axes.method.clone(),
-        "setting" => r.axes.setting.clone(),
-        "codec" => r.axes.codec.clone(),
-        "seed" => r.axes.seed.to_string(),
-        "device" => r.provenance.device.name.clone(),
-        _ => format!("{:?}", r.split).to_lowercase(),
-    };
-    let total = results.len();
-    let kept: Vec<CellResult> = results.into_iter().filter(|r| wanted.iter().all(|(key, values)| values.contains(&of(r, key).as_str()))).collect();
-    if kept.is_empty() {
-        return Err(Error::parameter("--where", format!("none of {total} results has {}", only.join(" and ")), "Compare with the axes of the results"));
-    }
-    Ok(kept)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Results grouped into rows: one per scene, method, setting and codec, with the seeds as its spread.
 
-use crate::sweep::CellResult;
+use crate::sweep::{CellResult, Spread};
 use cc4dgs_core::{Error, Result};
 use std::collections::BTreeMap;
 
@@ -73,38 +73,6 @@ impl Quantity {
     }
 }
 
-/// A quantity over seeds.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Spread {
-    /// Mean.
-    pub mean: f64,
-    /// Sample standard deviation; absent for one seed.
-    pub deviation: Option<f64>,
-    /// The least value.
-    pub low: f64,
-    /// The largest value.
-    pub high: f64,
-}
-
-impl Spread {
-    /// Of at least one value.
-    pub fn of(values: &[f64]) -> Option<Self> {
-        let n = values.len() as f64;
-        let mean = values.iter().sum::<f64>() / n;
-        let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
-        let deviation = (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt());
-        let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
-        (!values.is_empty()).then_some(Self { mean, deviation, low, high })
-    }
-    /// `mean ± deviation` with `digits` decimals.
-    pub fn text(&self, digits: usize) -> String {
-        match self.deviation {
-            Some(deviation) => format!("{:.digits$} ± {deviation:.digits$}", self.mean),
-            None => format!("{:.digits$}", self.mean),
-        }
-    }
-}
-
 /// The results that differ in their seed alone.
 #[derive(Clone, Debug)]
 pub struct Row<'a> {
@@ -124,7 +92,7 @@ impl<'a> Row<'a> {
     /// The quantity over seeds; absent where a result lacks it, so that no mean hides a gap.
     pub fn spread(&self, quantity: &Quantity) -> Option<Spread> {
         let values: Option<Vec<f64>> = self.cells.iter().map(|cell| quantity.of(cell)).collect();
-        Spread::of(&values?)
+        Spread::of(values?)
     }
     /// Method, and setting where it is not the base.
     pub fn training(&self) -> String {

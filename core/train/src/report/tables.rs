@@ -2,6 +2,7 @@
 
 use super::rows::{Better, QUANTITIES, Quantity, Row};
 use super::text;
+use crate::sweep::csv_field;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -173,11 +174,11 @@ pub fn csv(scenes: &BTreeMap<&str, Vec<Row>>) -> String {
     let mut out = head.join(",") + "\n";
     for row in scenes.values().flatten() {
         let outcome = if row.hopeless() { "hopeless" } else { "done" };
-        let mut fields: Vec<String> = [row.scene, row.method, row.setting, row.codec, outcome].map(text::csv).to_vec();
+        let mut fields: Vec<String> = [row.scene, row.method, row.setting, row.codec, outcome].map(csv_field).to_vec();
         fields.push(row.cells.len().to_string());
         for quantity in QUANTITIES {
             let spread = row.spread(quantity);
-            let part = |f: &dyn Fn(&super::rows::Spread) -> Option<f64>| spread.as_ref().and_then(f).map_or_else(String::new, |v| v.to_string());
+            let part = |f: &dyn Fn(&crate::sweep::Spread) -> Option<f64>| spread.as_ref().and_then(f).map_or_else(String::new, |v| v.to_string());
             fields.extend([part(&|s| Some(s.mean)), part(&|s| s.deviation), part(&|s| Some(s.low)), part(&|s| Some(s.high))]);
         }
         out += &(fields.join(",") + "\n");

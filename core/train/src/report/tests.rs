@@ -1,4 +1,5 @@
 use super::*;
+use crate::sweep::{CellResult, Spread};
 use crate::sweep::{ImageResult, Outcome};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -189,10 +190,10 @@ fn what_does_not_belong_together_is_refused() {
 
 #[test]
 fn numbers_over_seeds() {
-    let spread = Spread::of(&[1.0, 2.0, 6.0]).unwrap();
+    let spread = Spread::of([1.0, 2.0, 6.0]).unwrap();
     assert_eq!((spread.mean, spread.low, spread.high), (3.0, 1.0, 6.0));
     assert!((spread.deviation.unwrap() - 7f64.sqrt()).abs() < 1e-12);
-    assert_eq!((Spread::of(&[]), Spread::of(&[4.0]).unwrap().text(1)), (None, "4.0".into()));
+    assert_eq!((Spread::of([]), Spread::of([4.0]).unwrap().text(1)), (None, "4.0".into()));
     // A mean over some of the seeds would hide a gap.
     let (a, mut b) = (cell("a", |_| ()), cell("b", |r| r.axes.seed = 1));
     b.metrics.remove("ssim");

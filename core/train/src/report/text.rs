@@ -65,13 +65,6 @@ pub fn latex(text: &str) -> String {
     out
 }
 
-/// A field of CSV. Text that a spreadsheet would compute (it begins with `=`, `+`, `-` or `@` and is no number) gets an apostrophe.
-pub fn csv(text: &str) -> String {
-    let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r']) && text.parse::<f64>().is_err();
-    let text = if formula { format!("'{text}") } else { text.to_string() };
-    if text.contains(['"', ',', '\n', '\r']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text }
-}
-
 /// A number with at most `digits` decimals and no trailing zeros, for ticks.
 pub fn short(value: f64, digits: usize) -> String {
     let text = format!("{value:.digits$}");
@@ -102,10 +95,6 @@ mod tests {
         assert_eq!(html(evil), "&lt;script&gt;alert(&#39;1&#39;)&lt;/script&gt; &amp; &quot;x&quot; \u{fffd}\u{fffd}");
         assert_eq!(markdown("a|b_c<d>\n"), "a\\|b\\_c&lt;d&gt;\u{fffd}");
         assert_eq!(latex("50% of $x_1$ \\input{y}^~é"), "50\\% of \\$x\\_1\\$ \\textbackslash{}input\\{y\\}\\textasciicircum{}\\textasciitilde{}?");
-        assert_eq!(
-            (csv("a,b"), csv("say \"x\""), csv("=1+1"), csv("-3.5"), csv("plain")),
-            ("\"a,b\"".into(), "\"say \"\"x\"\"\"".into(), "'=1+1".into(), "-3.5".into(), "plain".into())
-        );
     }
 
     #[test]

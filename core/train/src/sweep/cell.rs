@@ -9,7 +9,7 @@ use super::training::{FinishedTraining, Worker, config_of};
 use crate::code;
 use crate::config::RunConfig;
 use crate::data;
-use crate::eval::{EvalReport, evaluate};
+use crate::eval::{EvalReport, Scored, evaluate};
 use crate::images::write_png;
 use crate::sample::spread;
 use burn::tensor::Device;
@@ -58,38 +58,38 @@ impl<'a> Trained<'a> {
 
         let split = plan.split.into();
         let in_split = self.scene.split(split).len();
-        let scored = if plan.max_views == 0 { in_split } else { plan.max_views.min(in_split) };
-        let kept = spread(&(0..scored).collect::<Vec<_>>(), plan.images);
-        let (mut images, mut frame_ms_each) = (Vec::with_capacity(scored), Vec::with_capacity(scored));
+        let count = if plan.max_views == 0 { in_split } else { plan.max_views.min(in_split) };
+        let kept = spread(&(0..count).collect::<Vec<_>>(), plan.images);
+        let scored = Scored { split, max_views: plan.max_views, perceptual: true };
+        let (mut images, mut frame_ms_each) = (Vec::with_capacity(count), Vec::with_capacity(count));
         let began = Instant::now();
         let mut image_size = [0, 0];
-        let report =
-            evaluate(&decoded, &self.scene, split, plan.max_views, worker.registry, &self.device, worker.events, &mut |view, truth, render, score| {
-                if worker.stop.load(Ordering::Relaxed) {
-                    return Err(Error::Interrupted(format!("scoring of cell {}; the next run scores it again", cell.id)));
-                }
-                let index = images.len();
-                let keep = |owner: &str, image| {
-                    let name = format!("images/{owner}/{index:05}.png");
-                    write_png(folder.root().join(&name), image).map(|()| name)
-                };
-                let keeps = kept.contains(&index);
-                if index == 0 {
-                    image_size = [truth.width, truth.height];
-                }
-                frame_ms_each.push(score.field_ms + score.raster_ms);
-                images.push(ImageResult {
-                    camera: score.camera.clone(),
-                    frame: score.frame,
-                    time_norm: self.scene.views[view].time_norm,
-                    // All numbers for now; those without a protocol are left out below.
-                    scores: numbers(score)?,
-                    blocks: score.blocks.map(|b| (b.moving, b.lost, b.worst_psnr_db)),
-                    truth: if keeps { Some(keep(&format!("{}/truth", self.training.id), truth)?) } else { None },
-                    render: if keeps { Some(keep(&cell.id, render)?) } else { None },
-                });
-                Ok(())
-            })?;
+        let report = evaluate(&decoded, &self.scene, scored, worker.registry, &self.device, worker.events, &mut |view, truth, render, score| {
+            if worker.stop.load(Ordering::Relaxed) {
+                return Err(Error::Interrupted(format!("scoring of cell {}; the next run scores it again", cell.id)));
+            }
+            let index = images.len();
+            let keep = |owner: &str, image| {
+                let name = format!("images/{owner}/{index:05}.png");
+                write_png(folder.root().join(&name), image).map(|()| name)
+            };
+            let keeps = kept.contains(&index);
+            if index == 0 {
+                image_size = [truth.width, truth.height];
+            }
+            frame_ms_each.push(score.field_ms + score.raster_ms);
+            images.push(ImageResult {
+                camera: score.camera.clone(),
+                frame: score.frame,
+                time_norm: self.scene.views[view].time_norm,
+                // All numbers for now; those without a protocol are left out below.
+                scores: numbers(score)?,
+                blocks: score.blocks.map(|b| (b.moving, b.lost, b.worst_psnr_db)),
+                truth: if keeps { Some(keep(&format!("{}/truth", self.training.id), truth)?) } else { None },
+                render: if keeps { Some(keep(&cell.id, render)?) } else { None },
+            });
+            Ok(())
+        })?;
         let evaluation_seconds = began.elapsed().as_secs_f64();
         let (metrics, absent) = scores(&report)?;
         for image in &mut images {

@@ -120,33 +120,38 @@ pub fn write_tables(folder: &SweepFolder, results: &[CellResult]) -> Result<Tabl
     Ok(tables)
 }
 
-/// The results for which every `KEY=VALUE` of `conditions` holds. Keys: scene, method, setting, codec, seed, device.
+/// The keys that [`select`] knows.
+const KEYS: [&str; 7] = ["scene", "method", "setting", "codec", "seed", "device", "split"];
+
+/// The results that `conditions` ask for, each `KEY=VALUE` with one of the keys scene, method, setting, codec, seed, device and split. Several values of one key
+/// are alternatives; all keys must hold.
 ///
 /// # Errors
 /// [`Error::Parameter`] for other keys, and for conditions that no result meets.
 pub fn select(results: Vec<CellResult>, conditions: &[String]) -> Result<Vec<CellResult>> {
-    const KEYS: &str = "Keys are scene, method, setting, codec, seed and device";
-    let mut kept = results;
+    let mut wanted: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     for condition in conditions {
-        let object = format!("--where {condition}");
-        let Some((key, value)) = condition.split_once('=') else { return Err(Error::parameter(object, "no '=' found", "Write --where KEY=VALUE")) };
-        let of = |r: &CellResult| match key {
-            "scene" => Some(r.axes.scene.clone()),
-            "method" => Some(r.axes.method.clone()),
-            "setting" => Some(r.axes.setting.clone()),
-            "codec" => Some(r.axes.codec.clone()),
-            "seed" => Some(r.axes.seed.to_string()),
-            "device" => Some(r.provenance.device.name.clone()),
-            _ => None,
-        };
-        let present: BTreeSet<String> = kept.iter().filter_map(of).collect();
-        if present.is_empty() && !kept.is_empty() {
-            return Err(Error::parameter(object, format!("'{key}' is no key"), KEYS));
-        }
-        kept.retain(|r| of(r).as_deref() == Some(value));
+        let pair = condition.split_once('=').filter(|(key, _)| KEYS.contains(key));
+        let remedy = || format!("Write KEY=VALUE with one of the keys {}", KEYS.join(", "));
+        let (key, value) = pair.ok_or_else(|| Error::parameter("--where", format!("'{condition}' is no condition"), remedy()))?;
+        wanted.entry(key).or_default().push(value);
+    }
+    let of = |r: &CellResult, key: &str| match key {
+        "scene" => r.axes.scene.clone(),
+        "method" => r.axes.method.clone(),
+        "setting" => r.axes.setting.clone(),
+        "codec" => r.axes.codec.clone(),
+        "seed" => r.axes.seed.to_string(),
+        "device" => r.provenance.device.name.clone(),
+        _ => format!("{:?}", r.split).to_lowercase(),
+    };
+    let mut kept = results;
+    for (key, values) in wanted {
+        let present: BTreeSet<String> = kept.iter().map(|r| of(r, key)).collect();
+        kept.retain(|r| values.contains(&of(r, key).as_str()));
         if kept.is_empty() {
             let known = present.into_iter().collect::<Vec<_>>().join(", ");
-            return Err(Error::parameter(object, "no result meets it", format!("There are: {known}")));
+            return Err(Error::parameter("--where", format!("no result has {key}={}", values.join(" or ")), format!("There are: {known}")));
         }
     }
     Ok(kept)
@@ -196,8 +201,9 @@ mod tests {
         let of = |conditions: &[&str]| select(results(), &conditions.iter().map(ToString::to_string).collect::<Vec<_>>());
         assert_eq!(of(&[]).unwrap().len(), 2);
         assert_eq!(of(&["seed=7", "device=flex"]).unwrap()[0].id, "b");
+        assert_eq!(of(&["seed=7", "seed=0", "split=test"]).unwrap().len(), 2);
         assert!(of(&["seed=8"]).unwrap_err().to_string().contains("0, 7"));
-        assert!(of(&["sead=8"]).unwrap_err().to_string().contains("Keys are"));
+        assert!(of(&["sead=8"]).unwrap_err().to_string().contains("one of the keys"));
         assert!(of(&["seed"]).unwrap_err().to_string().contains("KEY=VALUE"));
     }
 }

@@ -7,9 +7,9 @@ use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
-/// Deepest folder of a dataset, and most files: a link that leads in a circle ends here.
+/// Deepest folder of a dataset, and most files and folders: a link that leads in a circle ends here.
 const MOST_DEPTH: usize = 32;
-const MOST_FILES: usize = 5_000_000;
+const MOST_ENTRIES: usize = 5_000_000;
 
 /// The path a grid's text stands for: an environment variable at its start is replaced, as in `$CC4DGS_DATA/mutant`.
 ///
@@ -31,9 +31,15 @@ struct DataFile {
     bytes: u64,
 }
 
-/// All files of `root` in the order of their names; hidden ones are left out.
+/// All files of `root` in the order of their names; hidden ones are left out. Folders that are nested too deeply are an error, as a part of a dataset has no
+/// fingerprint.
 fn list(root: &Path) -> Result<Vec<DataFile>> {
     let mut files = Vec::new();
+    let too_many = |what: &str, found: usize, most: usize| {
+        let object = format!("dataset {}: {what}", root.display());
+        Error::limit(object, found as u64, most as u64, "Name the folder of one dataset, and remove links that lead in a circle")
+    };
+    let mut entries = 0;
     let mut folders = vec![(root.to_path_buf(), String::new(), 0)];
     while let Some((folder, prefix, depth)) = folders.pop() {
         for entry in std::fs::read_dir(&folder).map_err(|e| Error::io(&folder, e))? {
@@ -41,18 +47,17 @@ fn list(root: &Path) -> Result<Vec<DataFile>> {
             let Some(name) = path.file_name().map(|name| name.to_string_lossy().into_owned()).filter(|name| !name.starts_with('.')) else { continue };
             let facts = std::fs::metadata(&path).map_err(|e| Error::io(&path, e))?;
             let name = format!("{prefix}{name}");
-            if facts.is_dir() && depth < MOST_DEPTH {
+            entries += 1;
+            if entries > MOST_ENTRIES {
+                return Err(too_many("files and folders", entries, MOST_ENTRIES));
+            }
+            if facts.is_dir() {
+                if depth == MOST_DEPTH {
+                    return Err(too_many("depth of folders", depth + 1, MOST_DEPTH));
+                }
                 folders.push((path, name + "/", depth + 1));
             } else if facts.is_file() {
                 files.push(DataFile { name, bytes: facts.len(), path });
-            }
-            if files.len() > MOST_FILES {
-                return Err(Error::limit(
-                    format!("dataset {}: files", root.display()),
-                    files.len() as u64,
-                    MOST_FILES as u64,
-                    "Name the folder of one dataset",
-                ));
             }
         }
     }
@@ -194,6 +199,17 @@ mod tests {
         std::fs::rename(at("train/a.png"), at("train/b.png")).unwrap();
         assert_ne!(of().hash, first.hash, "another name");
         assert_ne!(listing(folder.path()).unwrap(), first_listing);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_in_a_circle_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["a", "b"] {
+            std::os::unix::fs::symlink(folder.path(), folder.path().join(name)).unwrap();
+        }
+        let message = listing(folder.path()).unwrap_err().to_string();
+        assert!(message.contains("circle"), "{message}");
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use super::result::CodecChoice;
 use crate::auto::PRESET as AUTO;
 use cc4dgs_core::{Error, Result, Split, config};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
@@ -30,53 +31,80 @@ impl From<ScoredViews> for Split {
     }
 }
 
-/// A dataset.
+/// One value of an axis along which trainings differ: a name, settings, a factor of the grid's size, and the keys of its own kind.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SceneAxis {
+#[serde(try_from = "NamedTable", bound(deserialize = "T: DeserializeOwned"))]
+pub struct Axis<T> {
     /// Its name in tables.
     pub name: String,
+    /// Settings, `key=value`.
+    pub set: Vec<String>,
+    /// Multiplies the grid's size.
+    pub size: f64,
+    /// The keys of its kind.
+    #[serde(flatten)]
+    pub own: T,
+}
+
+/// A dataset.
+pub type SceneAxis = Axis<SceneKeys>;
+/// A way to train.
+pub type MethodAxis = Axis<MethodKeys>;
+/// Changes of a method.
+pub type SettingAxis = Axis<SettingKeys>;
+
+/// What a `[[scene]]` has beside the keys of every axis.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneKeys {
     /// A path, `procedural:NAME`, or a path that starts with an environment variable (`$CC4DGS_DATA/mutant`).
     pub path: String,
     /// The family of presets that methods starting with `+` are put on.
     #[serde(default = "auto")]
     pub family: String,
-    /// Settings for this scene, `key=value`.
-    #[serde(default)]
-    pub set: Vec<String>,
-    /// Multiplies the grid's size.
-    #[serde(default = "one")]
-    pub size: f64,
 }
 
-/// A way to train.
+/// What a `[[method]]` has beside the keys of every axis.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct MethodAxis {
-    /// Its name in tables.
-    pub name: String,
+pub struct MethodKeys {
     /// A preset, such as `auto+hexplane`; `+hexplane` is put on the scene's family, `+` alone is that family.
     pub preset: String,
-    /// Settings of this method, `key=value`.
-    #[serde(default)]
-    pub set: Vec<String>,
-    /// Multiplies the grid's size.
-    #[serde(default = "one")]
-    pub size: f64,
 }
 
-/// Changes of a method.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+/// A `[[setting]]` has nothing beside the keys of every axis.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct SettingAxis {
-    /// Its name in tables.
-    pub name: String,
-    /// The changes, `key=value`.
+pub struct SettingKeys {}
+
+/// The common keys of an axis, and all others.
+#[derive(Deserialize)]
+struct NamedTable {
+    name: String,
     #[serde(default)]
-    pub set: Vec<String>,
-    /// Multiplies the grid's size.
+    set: Vec<String>,
     #[serde(default = "one")]
-    pub size: f64,
+    size: f64,
+    #[serde(flatten)]
+    others: toml::Table,
+}
+
+// serde cannot refuse unknown keys of a flattened structure; the keys of a kind are therefore read by themselves.
+impl<T: DeserializeOwned> TryFrom<NamedTable> for Axis<T> {
+    type Error = toml::de::Error;
+    fn try_from(table: NamedTable) -> std::result::Result<Self, Self::Error> {
+        let NamedTable { name, set, size, others } = table;
+        Ok(Self { name, set, size, own: others.try_into()? })
+    }
+}
+
+impl<T> Axis<T> {
+    fn names(axis: &[Self]) -> Vec<&str> {
+        axis.iter().map(|value| value.name.as_str()).collect()
+    }
+    fn sizes(axis: &[Self]) -> impl Iterator<Item = f64> + '_ {
+        axis.iter().map(|value| value.size)
+    }
 }
 
 /// A way to store a model.
@@ -173,7 +201,7 @@ fn first_seed() -> Vec<u64> {
     vec![0]
 }
 fn base() -> Vec<SettingAxis> {
-    vec![SettingAxis { name: "base".into(), set: Vec::new(), size: 1.0 }]
+    vec![SettingAxis { name: "base".into(), set: Vec::new(), size: 1.0, own: SettingKeys {} }]
 }
 
 impl Grid {
@@ -209,9 +237,9 @@ impl Grid {
             return bad("validation", "no view is kept out of training, and validation views are to be scored".into(), "Give a positive number of views");
         }
         let axes: [(&str, Vec<&str>); 4] = [
-            ("scene", self.scene.iter().map(|a| a.name.as_str()).collect()),
-            ("method", self.method.iter().map(|a| a.name.as_str()).collect()),
-            ("setting", self.setting.iter().map(|a| a.name.as_str()).collect()),
+            ("scene", Axis::names(&self.scene)),
+            ("method", Axis::names(&self.method)),
+            ("setting", Axis::names(&self.setting)),
             ("codec", self.codec.iter().map(|a| a.name.as_str()).collect()),
         ];
         for (axis, names) in &axes {
@@ -231,8 +259,8 @@ impl Grid {
         if self.seeds.is_empty() || self.seeds.iter().collect::<BTreeSet<_>>().len() < self.seeds.len() {
             return bad("seeds", format!("{:?} is empty or has one twice", self.seeds), "Give different numbers, such as [0, 1, 2]");
         }
-        let sizes = self.scene.iter().map(|a| a.size).chain(self.method.iter().map(|a| a.size)).chain(self.setting.iter().map(|a| a.size));
-        if let Some(size) = sizes.into_iter().find(|size| !(*size > 0.0 && *size <= 1e6)) {
+        let mut sizes = Axis::sizes(&self.scene).chain(Axis::sizes(&self.method)).chain(Axis::sizes(&self.setting));
+        if let Some(size) = sizes.find(|size| !(*size > 0.0 && *size <= 1e6)) {
             return bad("size", format!("{size} is no factor"), "Give a positive number of at most 1e6; 1 is the grid's own size");
         }
         let cells = axes.iter().map(|(_, names)| names.len()).chain([self.seeds.len()]).try_fold(1usize, |n, k| n.checked_mul(k)).unwrap_or(usize::MAX);
@@ -259,7 +287,7 @@ mod tests {
     fn defaults_are_few() {
         let grid = Grid::parse("g.toml", SMALL).unwrap();
         assert_eq!((grid.split, grid.validation_views(), grid.seeds.as_slice(), grid.setting[0].name.as_str()), (ScoredViews::Test, 0, &[0][..], "base"));
-        assert_eq!((grid.scene[0].family.as_str(), grid.codec[0].field_weights.as_str()), ("auto", "fp32"));
+        assert_eq!((grid.scene[0].own.family.as_str(), grid.codec[0].field_weights.as_str()), ("auto", "fp32"));
         let validation = Grid::parse("g.toml", &format!("split = 'validation'\n{SMALL}")).unwrap();
         assert_eq!(validation.validation_views(), VALIDATION_VIEWS);
         let again: Grid = toml::from_str(&toml::to_string(&grid).unwrap()).unwrap();
@@ -279,6 +307,8 @@ mod tests {
             ("", "[[codec]]\nname = 'a/b'\ncodec = 'vq'\n", "'a/b' is no name"),
             ("", "[[setting]]\nname = 'x'\nsize = 0.0\n", "0 is no factor"),
             ("", "[[setting]]\nname = 'x'\nsets = []\n", "sets"),
+            ("", "[[method]]\nname = 'x'\npreset = '+'\npath = 'p'\n", "path"),
+            ("", "[[method]]\nname = 'x'\n", "preset"),
         ];
         for (before, after, expected) in cases {
             let message = Grid::parse("g.toml", &format!("{before}{SMALL}{after}")).unwrap_err().to_string();

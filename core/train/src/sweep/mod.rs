@@ -22,7 +22,7 @@ pub use collect::{Collection, Missing, Tables, collect, select, write_tables};
 pub use emit::{EmitOptions, INTERRUPTED, Scheduler, emit};
 pub use facts::{device_facts, fingerprint};
 pub use folder::{Failure, SweepFolder};
-pub use grid::{CodecAxis, Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
+pub use grid::{Axis, CodecAxis, Grid, MethodAxis, MethodKeys, SceneAxis, SceneKeys, ScoredViews, SettingAxis, SettingKeys};
 pub use lock::TrainingLock;
 pub use plan::{PLAN, Plan, PlannedCell, PlannedTraining};
 pub use read::{RESULTS, check_comparable, read_results};
@@ -31,5 +31,6 @@ pub use result::{
     Storage, StreamBytes,
 };
 pub use run::{Busy, TrainingState, run_training, summary};
+pub(crate) use table::csv_field;
 pub use table::{Spread, csv, markdown};
 pub use training::Worker;

@@ -122,8 +122,8 @@ impl Plan {
         };
         let mut labels: BTreeMap<String, String> = BTreeMap::new();
         for scene in &grid.scene {
-            let data = fingerprint(&scene.path, registry)?;
-            let listing = listing(&locate(&scene.path)?)?;
+            let data = fingerprint(&scene.own.path, registry)?;
+            let listing = listing(&locate(&scene.own.path)?)?;
             for (method, setting) in grid.method.iter().flat_map(|method| grid.setting.iter().map(move |setting| (method, setting))) {
                 for &seed in &grid.seeds {
                     let mut training = planned(grid, scene, method, setting, seed, data.clone(), listing.clone());
@@ -221,10 +221,10 @@ fn codecs(grid: &Grid, registry: &Registry) -> Result<Vec<(String, CodecChoice)>
 
 /// Everything about a training but its name.
 fn planned(grid: &Grid, scene: &SceneAxis, method: &MethodAxis, setting: &SettingAxis, seed: u64, data: DataFingerprint, listing: String) -> PlannedTraining {
-    let preset = match method.preset.strip_prefix('+') {
-        Some("") => scene.family.clone(),
-        Some(method) => format!("{}+{method}", scene.family),
-        None => method.preset.clone(),
+    let preset = match method.own.preset.strip_prefix('+') {
+        Some("") => scene.own.family.clone(),
+        Some(method) => format!("{}+{method}", scene.own.family),
+        None => method.own.preset.clone(),
     };
     let size = scene.size * method.size * setting.size;
     let mut sets = [grid.set.as_slice(), &scene.set, &method.set, &setting.set].concat();
@@ -292,7 +292,7 @@ pub(super) mod tests {
     /// The plan of trainings of a grid whose codecs are not built.
     fn trainings(text: &str) -> Result<Vec<(PlannedTraining, toml::Table)>> {
         let (grid, registry) = (grid(text), Registry::collect().unwrap());
-        let data = fingerprint(&grid.scene[0].path, &registry)?;
+        let data = fingerprint(&grid.scene[0].own.path, &registry)?;
         let mut all = Vec::new();
         for (method, setting) in grid.method.iter().flat_map(|m| grid.setting.iter().map(move |s| (m, s))) {
             for &seed in &grid.seeds {

@@ -19,15 +19,17 @@ const SHOWN: [(&str, &str, usize); 6] = [
 /// A number of a result, where it has it.
 type Number = fn(&CellResult) -> Option<f64>;
 
-/// Mean and sample standard deviation.
+/// Values over seeds: mean, sample standard deviation, least and largest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
     /// Mean.
     pub mean: f64,
     /// Sample standard deviation; `None` of one value.
     pub deviation: Option<f64>,
-    /// Number of values.
-    pub count: usize,
+    /// The least value.
+    pub low: f64,
+    /// The largest value.
+    pub high: f64,
 }
 
 impl Spread {
@@ -37,9 +39,11 @@ impl Spread {
         let n = values.len() as f64;
         let mean = values.iter().sum::<f64>() / n;
         let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
-        (!values.is_empty()).then(|| Self { mean, deviation: (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()), count: values.len() })
+        let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
+        (!values.is_empty()).then(|| Self { mean, deviation: (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()), low, high })
     }
-    fn text(&self, decimals: usize) -> String {
+    /// `mean ± deviation` with so many decimals.
+    pub fn text(&self, decimals: usize) -> String {
         match self.deviation {
             Some(deviation) => format!("{:.decimals$} ± {deviation:.decimals$}", self.mean),
             None => format!("{:.decimals$}", self.mean),
@@ -54,8 +58,9 @@ struct Row<'a> {
 }
 
 impl Row<'_> {
+    /// Absent where a result lacks the number: a mean over some seeds would stand beside means over all.
     fn spread(&self, value: impl Fn(&CellResult) -> Option<f64>) -> Option<Spread> {
-        Spread::of(self.results.iter().filter_map(|r| value(r)))
+        Spread::of(self.results.iter().map(|r| value(r)).collect::<Option<Vec<f64>>>()?)
     }
 }
 
@@ -166,9 +171,16 @@ pub fn csv(results: &[CellResult]) -> Result<String> {
             let spread = row.spread(value);
             format!("{},{}", number(spread.map(|s| s.mean)), number(spread.and_then(|s| s.deviation)))
         });
-        let _ = writeln!(text, "{},{},{}", row.axes.join(","), row.results.len(), values.collect::<Vec<_>>().join(","));
+        let _ = writeln!(text, "{},{},{}", row.axes.map(csv_field).join(","), row.results.len(), values.collect::<Vec<_>>().join(","));
     }
     Ok(text)
+}
+
+/// A field of a CSV table. Text that a spreadsheet would compute (it begins with `=`, `+`, `-` or `@` and is no number) gets an apostrophe.
+pub(crate) fn csv_field(text: &str) -> String {
+    let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r']) && text.parse::<f64>().is_err();
+    let text = if formula { format!("'{text}") } else { text.to_string() };
+    if text.contains(['"', ',', '\n', '\r']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text }
 }
 
 #[cfg(test)]
@@ -189,9 +201,9 @@ mod tests {
     #[test]
     fn spreads_are_sample_deviations() {
         assert_eq!(Spread::of([]), None);
-        assert_eq!(Spread::of([3.0]), Some(Spread { mean: 3.0, deviation: None, count: 1 }));
+        assert_eq!(Spread::of([3.0]), Some(Spread { mean: 3.0, deviation: None, low: 3.0, high: 3.0 }));
         let spread = Spread::of([1.0, 2.0, 3.0, 6.0]).unwrap();
-        assert_eq!((spread.mean, spread.count), (3.0, 4));
+        assert_eq!((spread.mean, spread.low, spread.high), (3.0, 1.0, 6.0));
         assert!((spread.deviation.unwrap() - (14.0f64 / 3.0).sqrt()).abs() < 1e-12);
     }
 
@@ -207,6 +219,18 @@ mod tests {
         assert!(lines.len() == 3 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");
         let psnr = lines[0].iter().position(|name| *name == "psnr_db").unwrap();
         assert_eq!((lines[1][4], lines[1][psnr], lines[2][psnr + 1]), ("2", "31", ""));
+        // One of two seeds lacks a metric: the mean of the other is not the row's.
+        let mut gap = results;
+        gap[1].metrics.remove("ssim");
+        assert!(markdown(&gap).unwrap().contains("| cdf | base | cca | 2 | 31.00 ± 1.41 | - |"));
+    }
+
+    #[test]
+    fn fields_of_csv_end_where_they_should() {
+        assert_eq!(
+            ["a,b", "say \"x\"", "=1+1", "-3.5", "plain"].map(csv_field),
+            ["\"a,b\"", "\"say \"\"x\"\"\"", "'=1+1", "-3.5", "plain"].map(str::to_string)
+        );
     }
 
     #[test]

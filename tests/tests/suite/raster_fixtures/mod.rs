@@ -2,76 +2,8 @@
 
 use cc4dgs_backends::ops::rasterize::RasterSettings;
 use cc4dgs_core::{ParameterSpace, Rules};
-use safetensors::{Dtype, SafeTensors};
-use std::path::{Path, PathBuf};
-
-/// The folder of fixtures: `CC4DGS_GOLDEN`, or the committed folder.
-pub fn folder() -> PathBuf {
-    let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden");
-    std::env::var_os("CC4DGS_GOLDEN").map_or(committed, PathBuf::from)
-}
-
-/// Arrays of one file.
-pub struct Fixture {
-    name: String,
-    bytes: Vec<u8>,
-}
-
-impl Fixture {
-    /// `name`.f64.safetensors in the folder.
-    pub fn open(name: &str) -> Self {
-        let path = folder().join(format!("{name}.f64.safetensors"));
-        let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-        Self { name: name.to_string(), bytes }
-    }
-    /// Shape of an array.
-    pub fn shape(&self, key: &str) -> Vec<usize> {
-        self.tensors().tensor(key).unwrap_or_else(|e| panic!("{} {key}: {e}", self.name)).shape().to_vec()
-    }
-    /// Values of an array of any type, as float64.
-    pub fn get(&self, key: &str) -> Vec<f64> {
-        let file = self.tensors();
-        let view = file.tensor(key).unwrap_or_else(|e| panic!("{} {key}: {e}", self.name));
-        let data = view.data();
-        match view.dtype() {
-            Dtype::F64 => data.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect(),
-            Dtype::I32 => data.chunks_exact(4).map(|b| f64::from(i32::from_le_bytes(b.try_into().unwrap()))).collect(),
-            Dtype::U8 => data.iter().map(|&b| f64::from(b)).collect(),
-            other => panic!("{} {key}: unexpected type {other:?}", self.name),
-        }
-    }
-    /// The same in float32.
-    pub fn narrow(&self, key: &str) -> Vec<f32> {
-        narrow(&self.get(key))
-    }
-    fn tensors(&self) -> SafeTensors<'_> {
-        SafeTensors::deserialize(&self.bytes).unwrap_or_else(|e| panic!("{}: {e}", self.name))
-    }
-}
-
-/// Float32 of float64 values.
-pub fn narrow(values: &[f64]) -> Vec<f32> {
-    values.iter().map(|&v| v as f32).collect()
-}
-
-/// Float64 of float32 values.
-pub fn widen(values: &[f32]) -> Vec<f64> {
-    values.iter().map(|&v| f64::from(v)).collect()
-}
-
-/// |a - b| / |b| in the Euclidean norm; |a| where b is zero.
-pub fn relative_l2(a: &[f64], b: &[f64]) -> f64 {
-    assert_eq!(a.len(), b.len());
-    let norm = b.iter().map(|v| v * v).sum::<f64>().sqrt();
-    let difference = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
-    if norm > 0.0 { difference / norm } else { difference }
-}
-
-/// The largest absolute difference.
-pub fn largest_difference(a: &[f64], b: &[f64]) -> f64 {
-    assert_eq!(a.len(), b.len());
-    a.iter().zip(b).map(|(a, b)| if a.is_nan() || b.is_nan() { f64::INFINITY } else { (a - b).abs() }).fold(0.0, f64::max)
-}
+use cc4dgs_tests::golden::folder;
+pub use cc4dgs_tests::golden::{Fixture, largest_difference, narrow, relative_l2, widen};
 
 /// A 4x4 from 16 row-major values.
 pub fn matrix(values: &[f64]) -> [[f64; 4]; 4] {
@@ -96,6 +28,7 @@ pub fn settings(width: usize, height: usize, k: &[f64], view: &[f64]) -> RasterS
         max_weights: false,
         absolute_centers: false,
         pair_capacity: None,
+        shortcuts: Default::default(),
     }
 }
 
@@ -129,12 +62,9 @@ impl Scene {
     pub fn open(name: &str) -> Self {
         let (scene, variant) = name.split_once('.').unwrap();
         let inputs = Fixture::open(&format!("{scene}.inputs"));
-        let facts = std::fs::read_to_string(folder().join(format!("{scene}.inputs.json"))).unwrap();
-        let facts: serde_json::Value = serde_json::from_str(&facts).unwrap();
-        let number = |key: &str| facts[key].as_u64().unwrap() as usize;
-        let mut settings = settings(number("W"), number("H"), &inputs.get("in.K"), &inputs.get("in.viewmat"));
-        settings.sh_degree = Some(number("sh_degree"));
-        settings.antialiased = facts["antialiased"].as_bool().unwrap();
+        let mut settings = settings(inputs.count("W"), inputs.count("H"), &inputs.get("in.K"), &inputs.get("in.viewmat"));
+        settings.sh_degree = Some(inputs.count("sh_degree"));
+        settings.antialiased = inputs.facts["antialiased"].as_bool().unwrap();
         settings.rules = match variant {
             "gsplat099" => Rules::Gsplat099,
             "gsplat0999" => Rules::Gsplat0999,

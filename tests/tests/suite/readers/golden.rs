@@ -2,12 +2,11 @@
 
 use super::common::*;
 use cc4dgs_core::{Distortion, Split};
-use std::path::{Path, PathBuf};
+use cc4dgs_tests::golden::json;
 
 #[test]
 fn golden_fox() {
-    let folder = std::env::var_os("CC4DGS_GOLDEN").map_or(Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden"), PathBuf::from);
-    let fox: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(folder.join("fox.json")).unwrap()).unwrap();
+    let fox = json("fox.json");
     let (frames, present) = (fox["frames_in_transforms_json"].as_u64().unwrap() as usize, fox["images_present"].as_u64().unwrap() as usize);
     let missing: Vec<&str> = fox["frames_without_image"].as_array().unwrap().iter().map(|v| v.as_str().unwrap()).collect();
     assert_eq!(frames - missing.len(), present);

@@ -5,7 +5,7 @@ use cc4dgs_core::{Camera, HostGaussians, Limits, Registry, Scene, Seed, Silent, 
 use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::data::procedural::ProceduralScene;
-use cc4dgs_train::eval::evaluate;
+use cc4dgs_train::eval::{Scored, evaluate};
 use cc4dgs_train::init::initialise;
 use cc4dgs_train::train::{TrainJob, train};
 use glam::{DMat3, DQuat, DVec3};
@@ -188,7 +188,7 @@ fn trained(scene: Scene, seed: u64) -> (Model, f64) {
     let (model, _) = train(&job).unwrap();
     assert_eq!(model.normalisation, scene.normalisation);
     let device = parse_device("flex").unwrap();
-    let psnr = evaluate(&model, &scene, Split::Test, 0, &registry, &device, &Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db;
+    let psnr = evaluate(&model, &scene, Scored::all(Split::Test), &registry, &device, &Silent, &mut |_, _, _, _| Ok(())).unwrap().psnr_db;
     (model, psnr)
 }
 

@@ -6,6 +6,7 @@ mod frame;
 mod lookup;
 mod parts;
 mod play;
+mod skip;
 mod step;
 
 pub use agree::agree;
@@ -14,6 +15,7 @@ pub use frame::frame;
 pub use lookup::lookup;
 pub use parts::{loss, sort};
 pub use play::play;
+pub use skip::skip;
 pub use step::step;
 
 use cc4dgs_backends::bench::{ROOM_CASES, RoomCase, shrunk};
