@@ -5,6 +5,7 @@ mod density;
 mod guard;
 mod log;
 mod losses;
+mod observe;
 mod parameters;
 mod probe;
 mod pyramid;
@@ -22,6 +23,7 @@ mod validate;
 mod watchdog;
 
 pub use guard::Guard;
+pub use observe::{Observer, Snapshot, Standing};
 pub use record::Record;
 pub(crate) use record::Score;
 pub use state::{Parts, TrainState};
@@ -72,6 +74,8 @@ pub struct TrainJob<'a> {
     pub events: &'a dyn EventSink,
     /// Set to stop after the current iteration, with a checkpoint.
     pub stop: &'a AtomicBool,
+    /// Looks at the model now and then.
+    pub observer: Option<&'a dyn Observer>,
 }
 
 /// What came of it.
@@ -313,6 +317,7 @@ impl Context<'_> {
             }
             watch.after_iteration(self, state, &schedule)?;
             self.validate(state, &schedule)?;
+            self.observe(state, &schedule)?;
             if saves {
                 state.record.log = log.record();
                 self.save(state)?;
