@@ -3,6 +3,7 @@
 use cc4dgs_format::{Error, Limits, Result};
 use cc4dgs_player::Content;
 use cc4dgs_player::window::{Shown, show};
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -10,7 +11,8 @@ fn main() -> ExitCode {
     match run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("error: {e}");
+            // Nobody is left to be told where standard error is closed.
+            writeln!(std::io::stderr(), "error: {e}").ok();
             ExitCode::from(e.exit_code())
         }
     }

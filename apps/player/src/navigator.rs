@@ -37,7 +37,8 @@ impl Navigator {
         let up = shown.up.map_or(DVec3::Z, of).try_normalize().unwrap_or(DVec3::Z);
         let side = up.any_orthonormal_vector();
         let target = shown.target.map_or(middle, of);
-        let mut out = Self { eye: target + 1.8 * radius * (side + 0.35 * up).normalize(), target, up, fov_y: FOV_X, aspect: ASPECT, roll: 0.0, home: shown.home.clone() };
+        let mut out =
+            Self { eye: target + 1.8 * radius * (side + 0.35 * up).normalize(), target, up, fov_y: FOV_X, aspect: ASPECT, roll: 0.0, home: shown.home.clone() };
         out.reset();
         out
     }

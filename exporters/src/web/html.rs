@@ -46,7 +46,7 @@ fn document(title: &str, head: &str, body: &str) -> String {
 
 /// The page of a folder: it loads `model`, or what its address asks for (`?src=`).
 pub(super) fn of_folder(title: &str, model: &str, autoplay: bool) -> String {
-    let options = script_json(&json!({ "src": model, "autoplay": autoplay }));
+    let options = script_json(&json!({ "autoplay": autoplay, "src": model }));
     let body = format!(
         r#"<script type="module">
 import {{ createPlayer }} from "./player.js";
@@ -86,7 +86,7 @@ pub(super) fn single(page: &Page, title: &str, archive: &[u8], autoplay: bool) -
     let data = |id: &str, kind: &str, content: &str| format!("<script type=\"{kind}\" id=\"{id}\">{content}</script>\n");
     let head = format!("<style>\n{style}</style>\n<script type=\"importmap\">{}</script>", script_json(&json!({ "imports": imports })));
     let body = [
-        data("settings", "application/json", &script_json(&json!({ "name": title, "autoplay": autoplay }))),
+        data("settings", "application/json", &script_json(&json!({ "autoplay": autoplay, "name": title }))),
         data("renderer", "text/plain", &STANDARD.encode(packed)),
         data("model", "text/plain", &STANDARD.encode(archive)),
         format!("<script type=\"module\">\n{START}\n</script>"),

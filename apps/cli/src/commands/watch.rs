@@ -65,7 +65,7 @@ fn content(snapshot: Snapshot) -> Result<Content> {
 
 /// Trains on a thread of its own while the window has this one, the main thread. The training goes on where the window is closed; the window stays open where the
 /// training ends.
-pub fn run(args: &Train, with_context: impl FnOnce(&mut dyn FnMut(&Context) -> Result<()>) -> Result<()> + Send) -> Result<()> {
+pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> Result<()> + Send)) -> Result<()> + Send) -> Result<()> {
     let stop = interrupt::stop_flag()?;
     let (live, now) = (Arc::new(Live::default()), Instant::now());
     let watcher = Watcher { live: live.clone(), times: Mutex::new((now, now)) };

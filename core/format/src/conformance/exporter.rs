@@ -84,7 +84,7 @@ impl ExportSource for MovingModel {
     }
     /// No real archive: exporters pass its bytes on and do not look into them.
     fn playable(&mut self, _: MaxError) -> Result<Vec<u8>> {
-        Ok(crate::ply::to_bytes(&self.canonical, true)?)
+        crate::ply::to_bytes(&self.canonical, true)
     }
     fn progress(&mut self, _: usize, _: usize) -> Result<()> {
         Ok(())
