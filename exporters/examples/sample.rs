@@ -12,9 +12,10 @@ const DEGREE: usize = 3;
 
 fn main() -> Result<()> {
     let folder = std::env::args().nth(1).ok_or_else(|| Error::parameter("sample", "no folder", "Name the folder to write to"))?;
-    for plugin in Entries::<ExporterPlugin>::collect()?.iter() {
+    // A page holds an archive, which the synthetic model is not.
+    for plugin in Entries::<ExporterPlugin>::collect()?.iter().filter(|p| !p.info.capabilities.contains(&"player")) {
         let name = match plugin.target {
-            ExportTarget::File(extension) => format!("sample.{extension}"),
+            ExportTarget::File(extension) | ExportTarget::FileOrFolder { file: extension, .. } => format!("sample.{extension}"),
             ExportTarget::Folder(_) => plugin.info.name.to_string(),
         };
         let exporter = (plugin.build)(&toml::Table::new())?;

@@ -1,19 +1,30 @@
 //! Every exporter of this crate with the conformance suite.
 
-use cc4dgs_exporters as _;
+use cc4dgs_exporters::web::PAGE_FILES;
 use cc4dgs_format::{Entries, ExporterPlugin, config, conformance};
 
 #[test]
 fn every_exporter_conforms() {
+    let folder = tempfile::tempdir().unwrap();
+    PAGE_FILES.iter().for_each(|name| std::fs::write(folder.path().join(name), format!("/* {name} */")).unwrap());
+    let page = toml::Table::from_iter([("page".to_string(), folder.path().to_str().unwrap().into())]);
     let exporters: Vec<_> = Entries::<ExporterPlugin>::collect().unwrap().iter().collect();
-    let findings: Vec<String> = exporters.iter().flat_map(|plugin| conformance::exporter(plugin, &toml::Table::new())).collect();
-    assert!(findings.is_empty() && exporters.len() == 6, "{} exporters\n{}", exporters.len(), findings.join("\n"));
+    let settings = |plugin: &ExporterPlugin| if plugin.info.capabilities.contains(&"player") { page.clone() } else { toml::Table::new() };
+    let findings: Vec<String> = exporters.iter().flat_map(|plugin| conformance::exporter(plugin, &settings(plugin))).collect();
+    assert!(findings.is_empty() && exporters.len() == 7, "{} exporters\n{}", exporters.len(), findings.join("\n"));
 }
 
 #[test]
 fn settings_out_of_range_are_refused_before_a_model_is_read() {
     let exporters = Entries::<ExporterPlugin>::collect().unwrap();
-    for (name, bad) in [("spz", "version = 2"), ("spz", "sh1_bits = 9"), ("sog", "palette = 3"), ("sog", "iterations = 1000"), ("splatv", "samples = 0")] {
+    for (name, bad) in [
+        ("spz", "version = 2"),
+        ("spz", "sh1_bits = 9"),
+        ("sog", "palette = 3"),
+        ("sog", "iterations = 1000"),
+        ("splatv", "samples = 0"),
+        ("web", "max_error = '-1px'"),
+    ] {
         let settings = config::parse_table("test", bad).unwrap();
         assert!((exporters.get(name).unwrap().build)(&settings).is_err(), "{name}: {bad}");
     }

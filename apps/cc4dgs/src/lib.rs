@@ -23,6 +23,7 @@
 pub mod export;
 mod model;
 
+pub mod playable;
 pub mod plugins;
 pub mod runs;
 pub mod scenes;

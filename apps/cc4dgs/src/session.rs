@@ -169,7 +169,7 @@ impl Session {
         plugins::check(config, self.registry())?;
         self.shared.stop.store(false, Ordering::Relaxed);
         let (registry, events, stop) = (self.registry(), self.events(), &self.shared.stop);
-        let (model, _) = train(&TrainJob { config, scene, out: out.map(Path::to_path_buf), resume, registry, events, stop })?;
+        let (model, _) = train(&TrainJob { config, scene, out: out.map(Path::to_path_buf), resume, registry, events, stop, observer: None })?;
         Ok(Model::new(model, self.clone()))
     }
     /// The configuration with this session's device and limits.

@@ -47,7 +47,7 @@ pub enum Command {
     Train(Train),
     /// Store a trained model as a .cc4d archive.
     Compress(Compress),
-    /// Write a model in the file format of other programs: PLY, SPZ, SOG, glTF, splatV, MP4.
+    /// Write a model as a page that plays it, or in the file format of other programs: PLY, SPZ, SOG, glTF, splatV, MP4.
     Export(Export),
     /// Remove the Gaussians that contribute least, under a budget of PSNR.
     Prune(Prune),
@@ -123,6 +123,10 @@ pub struct Train {
     /// Start anew where DIR holds a run already.
     #[arg(long, conflicts_with = "resume")]
     pub overwrite: bool,
+    /// Show the model in a window while it trains. The result is the same.
+    #[cfg(feature = "view")]
+    #[arg(long)]
+    pub view: bool,
 }
 
 #[derive(Debug, Args)]

@@ -4,8 +4,9 @@ use crate::args::Shots;
 use crate::commands::{Context, evenly};
 use cc4dgs::Orbit;
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs_core::{Camera, Error, Result};
+use cc4dgs_core::{Camera, Error, Result, Split};
 use cc4dgs_play::model::Model;
+use std::path::Path;
 
 /// Cameras and normalised times, and the background of the scene they are from.
 pub type Chosen = (Vec<(Camera, f32)>, Option<[f32; 3]>);
@@ -33,4 +34,13 @@ pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model) -
         (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[views[i]].time_norm)
     };
     Ok((evenly(views.len(), wanted).into_iter().map(shot).collect(), scene.background))
+}
+
+/// The cameras that recorded the dataset at `path`, as `model` was trained on them: those of the training views, each once.
+pub fn capture_cameras(context: &Context, path: &Path, model: &Model) -> Result<Vec<Camera>> {
+    let scene = open_as_trained(path, model, &[], &context.registry, &context.limits)?;
+    let mut indices: Vec<usize> = scene.split(Split::Train).into_iter().map(|view| scene.views[view].camera).collect();
+    indices.sort_unstable();
+    indices.dedup();
+    Ok(indices.into_iter().map(|i| scene.cameras[i].clone()).collect())
 }

@@ -1,46 +1,16 @@
 //! The command as its users meet it: a process, files, exit codes.
 #![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
+mod common;
+
+use common::{cc4dgs, fail, json_of, run, succeed, text};
 use serde_json::Value;
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
-
-fn cc4dgs() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_cc4dgs"));
-    command.stdin(Stdio::null());
-    command
-}
-
-fn run(args: &[&str]) -> Output {
-    cc4dgs().args(args).output().expect("the program starts")
-}
-
-fn succeed(args: &[&str]) -> Output {
-    let output = run(args);
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-    output
-}
-
-fn json_of(args: &[&str]) -> Value {
-    serde_json::from_slice(&succeed(args).stdout).expect("standard output is JSON")
-}
-
-/// Runs a command that must fail with `code`; returns what it said.
-fn fail(args: &[&str], code: i32) -> String {
-    let output = run(args);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(code), "{args:?}: {said}");
-    assert!(said.contains("error"), "{args:?}: {said}");
-    said
-}
 
 fn read_json(path: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
-}
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
 }
 
 /// The smallest scene and the shortest training that goes through every stage.

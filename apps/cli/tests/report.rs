@@ -1,22 +1,19 @@
 //! Reports, and the metrics that need weights, as users of the command meet them.
 #![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
+mod common;
+
+use common::{cc4dgs, text};
 use serde_json::Value;
-use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Output;
 
 fn run(args: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_cc4dgs"));
     // Weights of this machine must not decide what the test sees.
-    command.env("CC4DGS_LPIPS", "/no/such/weights.safetensors").args(args).output().expect("the program starts")
+    cc4dgs().env("CC4DGS_LPIPS", "/no/such/weights.safetensors").args(args).output().expect("the program starts")
 }
 
 fn said(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
-}
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
 }
 
 #[test]

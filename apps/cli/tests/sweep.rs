@@ -1,9 +1,11 @@
 //! `cc4dgs sweep` as its users meet it: a grid, a folder, processes, exit codes.
 #![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
+mod common;
+
+use common::{fail, json_of, run, text};
 use serde_json::Value;
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
 
 const GRID: &str = "name = 'small'
 iterations = 90
@@ -28,26 +30,9 @@ codec = 'quantize'
 field_weights = 'fp16'
 ";
 
-fn run(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_cc4dgs")).args(args).stdin(Stdio::null()).output().expect("the program starts")
-}
-
+/// The report of a command that succeeds.
 fn succeed(args: &[&str]) -> Value {
-    let output = run(&[args, &["-q", "--json"]].concat());
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-    serde_json::from_slice(&output.stdout).expect("standard output is JSON")
-}
-
-/// Runs a command that must fail with `code`; returns what it said.
-fn fail(args: &[&str], code: i32) -> String {
-    let output = run(args);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(code), "{args:?}: {said}");
-    said
-}
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
+    json_of(&[args, &["-q", "--json"]].concat())
 }
 
 /// The results of a sweep by file name, without what differs between equal runs.

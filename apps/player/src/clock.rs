@@ -38,6 +38,16 @@ impl Clock {
         }
         true
     }
+    /// Plays or pauses. Where time stands at the end, playing begins anew.
+    pub fn play(&mut self, on: bool) {
+        self.playing = on && self.frames > 1;
+        if self.playing && !self.looping {
+            let (start, end) = if self.speed < 0.0 { (1.0, 0.0) } else { (0.0, 1.0) };
+            if self.time == end {
+                self.time = start;
+            }
+        }
+    }
     /// Goes to a normalised time; what is no number is the start.
     pub fn seek(&mut self, time_norm: f32) {
         self.time = if time_norm.is_nan() { 0.0 } else { time_norm.clamp(0.0, 1.0) };
@@ -69,6 +79,9 @@ mod tests {
         (clock.looping, clock.speed) = (false, 10.0);
         clock.tick(1.0);
         assert_eq!((clock.time, clock.playing), (1.0, false));
+        clock.play(true);
+        assert_eq!((clock.time, clock.playing), (0.0, true));
+        clock.play(false);
         clock.seek(0.34);
         clock.step(-1);
         assert!((clock.time - 0.2).abs() < 1e-6);

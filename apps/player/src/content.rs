@@ -5,6 +5,8 @@ use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::playback::{Head, PlaybackLayer};
 use cc4dgs_format::{Error, HostGaussians, Limits, Result, Rules, Silent, StoredModel, ply, spz};
 
+/// Smallest near plane: depths are sorted by their logarithm.
+const LEAST_NEAR: f32 = 1e-6;
 /// Floats of a Gaussian in [`Scene::gaussians`].
 pub(crate) const GAUSSIAN_FLOATS: usize = 16;
 
@@ -32,6 +34,8 @@ pub struct Scene {
     pub sh_degree: usize,
     /// Lower and upper corner of the canonical centres.
     pub bounds: [[f32; 3]; 2],
+    /// Lower and upper corner of a box that holds all centres at all times.
+    pub(crate) reach: [[f32; 3]; 2],
     /// Background, RGB in 0..1.
     pub background: [f32; 3],
     /// Smallest depth drawn.
@@ -69,7 +73,7 @@ impl Content {
         }
         let gaussians = if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
             ply::from_bytes(object, &bytes, limits)?.0
-        } else if bytes.starts_with(&[0x1f, 0x8b]) {
+        } else if spz::begins_as_spz(&bytes) {
             spz::from_spz(object, &bytes, limits)?
         } else {
             let remedy = "Give a .cc4d archive, a PLY file of 3D Gaussian splatting or an SPZ file";
@@ -99,7 +103,7 @@ impl Content {
         scene.background = manifest.background;
         scene.antialiased = manifest.rasterizer.antialiased;
         scene.square = rules == Rules::Inria;
-        scene.near = manifest.rasterizer.near.unwrap_or(if scene.square { 0.2 } else { 0.01 });
+        scene.near = manifest.rasterizer.near.unwrap_or(if scene.square { 0.2 } else { 0.01 }).max(LEAST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
         let frame_count = if moves { manifest.frame_count } else { 1 };
         Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, bytes })
@@ -129,6 +133,7 @@ impl Scene {
             moving: rows.len(),
             sh_degree: gaussians.sh_degree,
             bounds: bounds(&gaussians.means),
+            reach: bounds(&gaussians.means),
             background: [0.0; 3],
             near: 0.01,
             alpha_max: 0.99,
@@ -155,6 +160,7 @@ impl Scene {
             out.harmonics.extend(gaussians.sh_rest[rest * i..rest * (i + 1)].chunks(2).map(pair_of_halves));
         }
         if let Some(layer) = layer {
+            out.reach = reach(&gaussians.means, out.reach, &layer);
             out.set_layer(layer)?;
         }
         Ok(out)
@@ -201,6 +207,28 @@ fn bounds(means: &[f32]) -> [[f32; 3]; 2] {
     [fold(f32::INFINITY, f32::min), fold(f32::NEG_INFINITY, f32::max)]
 }
 
+/// `still` widened to where `layer` can move the centres `means`: the sum of what each function can add, which no time exceeds.
+fn reach(means: &[f32], still: [[f32; 3]; 2], layer: &PlaybackLayer) -> [[f32; 3]; 2] {
+    let [mut lower, mut upper] = still;
+    for segment in &layer.segments {
+        let samples = segment.last - segment.first + 1;
+        for track in segment.tracks.iter().filter(|t| t.head == Head::Means) {
+            let range = |f: &[f32]| f.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(*v), b.max(*v)));
+            let ranges: Vec<(f32, f32)> = track.functions.chunks_exact(samples).map(range).collect();
+            for (row, &gaussian) in layer.rows.iter().enumerate() {
+                let coefficients = &track.coefficients[3 * track.starts[row] as usize..3 * track.starts[row + 1] as usize];
+                for k in 0..3 {
+                    let terms = coefficients.iter().skip(k).step_by(3).zip(&ranges);
+                    let (low, high) = terms.fold((0.0, 0.0), |(a, b), (c, r)| (a + (c * r.0).min(c * r.1), b + (c * r.0).max(c * r.1)));
+                    let mean = means[3 * gaussian as usize + k];
+                    (lower[k], upper[k]) = (lower[k].min(mean + low), upper[k].max(mean + high));
+                }
+            }
+        }
+    }
+    [lower, upper]
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -226,6 +254,8 @@ mod tests {
         assert_eq!((scene.gaussians[3], scene.gaussians[8], &scene.starts), (0.5, 1.0, &vec![0, 1, 3]));
         assert_eq!(scene.tracks[0][0], Some((0, 0)));
         assert_eq!(scene.bounds, [[0.0, 1.0, 2.0], [9.0, 10.0, 11.0]]);
+        // Two functions of 0 to 1 with coefficients of 1.
+        assert_eq!(scene.reach, [[0.0, 1.0, 2.0], [11.0, 12.0, 13.0]]);
     }
 
     #[test]

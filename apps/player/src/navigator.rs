@@ -6,6 +6,8 @@ use glam::{DMat3, DVec3};
 
 /// Full horizontal angle where no camera says another, in radians.
 const FOV_X: f64 = 0.9;
+/// Width over height where no camera says another.
+const ASPECT: f64 = 4.0 / 3.0;
 /// Nearest to a pole that orbiting comes, in radians.
 const POLE: f64 = 0.03;
 
@@ -18,8 +20,10 @@ pub struct Navigator {
     pub target: DVec3,
     /// Unit vector that points up.
     pub up: DVec3,
-    /// Full vertical angle in radians.
+    /// Full vertical angle in radians, of images at least as wide as `aspect` says; narrower ones show as much to the sides, and more above and below.
     pub fov_y: f64,
+    /// Width over height of the camera that was taken last.
+    aspect: f64,
     /// Rotation of the camera around its viewing direction that captured cameras may have, in radians; 0 after the user orbits.
     roll: f64,
     home: Option<Camera>,
@@ -33,7 +37,8 @@ impl Navigator {
         let up = shown.up.map_or(DVec3::Z, of).try_normalize().unwrap_or(DVec3::Z);
         let side = up.any_orthonormal_vector();
         let target = shown.target.map_or(middle, of);
-        let mut out = Self { eye: target + 1.8 * radius * (side + 0.35 * up).normalize(), target, up, fov_y: FOV_X, roll: 0.0, home: shown.home.clone() };
+        let mut out =
+            Self { eye: target + 1.8 * radius * (side + 0.35 * up).normalize(), target, up, fov_y: FOV_X, aspect: ASPECT, roll: 0.0, home: shown.home.clone() };
         out.reset();
         out
     }
@@ -52,6 +57,7 @@ impl Navigator {
         self.eye = eye;
         self.target = eye + distance * forward;
         self.fov_y = 2.0 * (0.5 * f64::from(camera.height) / camera.fy).atan();
+        self.aspect = f64::from(camera.width.max(1)) / f64::from(camera.height.max(1));
         let (right, down) = self.axes();
         let m = camera.world_to_camera;
         let row = DVec3::new(m[0][0], m[0][1], m[0][2]);
@@ -115,7 +121,7 @@ impl Navigator {
         let (s, c) = self.roll.sin_cos();
         let (right, down) = (c * flat_right + s * flat_down, c * flat_down - s * flat_right);
         let row = |a: DVec3| [a.x, a.y, a.z, -a.dot(self.eye)];
-        let focal = 0.5 * f64::from(height) / (0.5 * self.fov_y).tan();
+        let focal = 0.5 * f64::from(height).min(f64::from(width) / self.aspect) / (0.5 * self.fov_y).tan();
         Camera {
             name: "view".into(),
             width,
@@ -164,6 +170,9 @@ mod tests {
         assert!(((navigator.eye - navigator.target).length() - (DVec3::new(2.8, 0.9, 1.7)).length()).abs() < 1e-6);
         navigator.reset();
         assert!(close(&navigator.camera(640, 480), &home()) < 1e-9);
+        // A phone shows all of its width, and no less above and below.
+        let tall = navigator.camera(320, 960);
+        assert!((tall.fx - 0.5 * home().fx).abs() < 1e-9 && tall.cy == 480.0);
         // Rolled cameras keep their roll.
         let rolled = Camera::look_at("rolled", (640, 480), 0.8, [3.0, 1.0, 2.0], [0.2, 0.1, 0.3], [0.3, 0.1, 1.0]);
         navigator.go_to(&rolled);

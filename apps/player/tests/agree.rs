@@ -2,10 +2,9 @@
 #![allow(clippy::unwrap_used)]
 
 use cc4dgs::core::Limits;
-use cc4dgs::core::archive::Archive;
 use cc4dgs::core::metrics::{Metric, Rounding};
-use cc4dgs::play::bake::{Additions, BakeOptions, MaxError, bake, write_archive};
-use cc4dgs::play::presentation;
+use cc4dgs::play::bake::MaxError;
+use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings};
 use cc4dgs::{Camera, Orbit, Session};
 use cc4dgs_player::{Content, Mode, Renderer, View, request_device};
 use std::path::{Path, PathBuf};
@@ -40,17 +39,13 @@ fn baked(session: &Session, folder: &Path, overrides: &[&str]) -> (PathBuf, f32)
     let model = session.train(&config, scene, None).unwrap();
     let (plain, out) = (folder.join("plain.cc4d"), folder.join("baked.cc4d"));
     model.save(&plain, "quantize:high").unwrap();
-    let stored = session.open(&plain).unwrap();
-    let options = BakeOptions { max_error: MaxError::Pixels(0.1), cameras: &[] };
-    let baked = bake(&stored, &options, session.device(), session.events()).unwrap().unwrap();
-    let additions = Additions {
-        baked: Some(&baked),
-        presentation: presentation::of_gaussians(&stored.gaussians, [0.0, 0.0, 1.0]).unwrap(),
-        poster: None,
-        without_field: false,
-    };
-    write_archive(&Archive::open(&plain, &Limits::default()).unwrap(), additions, &out).unwrap();
-    (out, baked.report.at_samples)
+    let around = Surroundings { registry: session.registry(), device: session.device(), limits: session.limits(), events: session.events() };
+    let stored = Stored::open(&plain, Storage::default(), around).unwrap();
+    let presentation = stored.presentation(&[], None).unwrap();
+    let options = PlayableOptions { max_error: Some(MaxError::Pixels(0.1)), cameras: &[], presentation, poster: false, without_field: false };
+    let playable = stored.playable(options, around).unwrap();
+    std::fs::write(&out, playable.bytes).unwrap();
+    (out, playable.report.unwrap().at_samples)
 }
 
 fn agrees(deformer: &[&str]) {

@@ -1,6 +1,7 @@
-"""Drives the page in Chromium: browser.py PAGE ARCHIVE REFERENCE [--screenshots FOLDER].
+"""Drives the page in Chromium: browser.py PAGE ARCHIVE REFERENCE [--single FILE.html] [--screenshots FOLDER].
 
-PAGE is the folder of build-web, ARCHIVE a baked archive, REFERENCE the folder that the example `reference` wrote for it. Chromium renders with SwiftShader, so no
+PAGE is the folder of build-web, ARCHIVE a baked archive, REFERENCE the folder that the example `reference` wrote for it. --single is a file of
+`cc4dgs export web` of the same archive: it is opened from disk, without a network. Chromium renders with SwiftShader, so no
 graphics card is needed. Needs playwright, Pillow and numpy, and Chromium on the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, functools, http.server, io, json, os, pathlib, re, shutil, threading, time
@@ -64,7 +65,7 @@ def say(text):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("page"), parser.add_argument("archive"), parser.add_argument("reference")
-    parser.add_argument("--screenshots")
+    parser.add_argument("--single"), parser.add_argument("--screenshots")
     args = parser.parse_args()
     archive = pathlib.Path(args.archive).read_bytes()
     damaged = bytearray(archive)
@@ -222,6 +223,28 @@ def main():
         shot(phone, "phone")
         quiet("the phone")
         say("the file picker works, at phone width too")
+        if args.single:
+            path = pathlib.Path(args.single).resolve()
+            context = browser.new_context(viewport={"width": 1280, "height": 800}, offline=True)
+            for backend in ("", "?backend=webgl"):
+                file = context.new_page()
+                file.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
+                file.on("pageerror", lambda e: complaints.append(str(e)))
+                fetched = []
+                file.on("request", lambda r: fetched.append(r.url) if not r.url.startswith(("data:", "blob:")) else None)
+                began = time.time()
+                file.goto(path.as_uri() + backend)
+                file.wait_for_function("window.cc4dgs?.facts", timeout=120000)
+                assert file.evaluate("cc4dgs.facts.gaussians") == facts["gaussians"] and bool(backend) == file.evaluate("!!cc4dgs.gl")
+                say(f"{path.name}, {path.stat().st_size / 1e6:.2f} MB: opened from disk without a network in {time.time() - began:.1f} s, {file.title()!r}")
+                file.wait_for_function("cc4dgs.playing && cc4dgs.time > 0", timeout=60000)
+                file.evaluate("cc4dgs.pause()")
+                agree(file, "the single file" + (", WebGL2" if backend else ""))
+                assert len(fetched) == 1, f"it fetched {fetched}"
+                file.evaluate("cc4dgs.seek(0.5)")
+                shot(file, "single" + ("_webgl" if backend else ""))
+                file.close()
+            quiet("the single file")
         browser.close()
     say("all checks passed")
 

@@ -85,6 +85,7 @@ export function build(container, player) {
 
     const ui = {
         root, canvas,
+        replaceCanvas: () => { const fresh = ui.canvas.cloneNode(); ui.canvas.replaceWith(fresh); ui.canvas = fresh; },
         title: text => { title.textContent = text; document.title = `${text} – cc4dgs player`; },
         error: text => say(text, true),
         note: text => say(text, false),

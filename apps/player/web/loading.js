@@ -59,17 +59,21 @@ class Progress {
         return true;
     }
     finish() {
-        const done = this.shown.motion;
-        this.download.free();
-        if (!done) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
+        if (!this.shown.motion) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
     }
+}
+
+/// The last part of an address; what is not encoded as addresses are stays as it is.
+export function nameOf(path) {
+    const last = path.split(/[?#]/)[0].split("/").pop() || "model";
+    try { return decodeURIComponent(last); } catch { return last; }
 }
 
 function isArchive(bytes) { return MAGIC.every((b, i) => bytes[i] === b); }
 
 /// Loads `url`; `show` has poster(bytes), part(download, motion, first), whole(name, bytes), progress(share, bytes).
 export async function loadUrl(wasm, url, show, signal) {
-    const name = decodeURIComponent(new URL(url, location.href).pathname.split("/").pop() || "model");
+    const name = nameOf(url);
     const get = async headers => {
         let response;
         try { response = await fetch(url, { headers, signal }); } catch (e) {
@@ -89,17 +93,22 @@ export async function loadUrl(wasm, url, show, signal) {
         return loadBody(wasm, name, await get({}), show);
     }
     const progress = new Progress(wasm, name, total, show);
-    let more = progress.put(0, start);
-    while (more && progress.arrived < total) {
-        // The header first, then everything that is needed.
-        const end = progress.streams ? progress.needed : Math.max(progress.header, 24);
-        const part = await get({ Range: `bytes=${progress.arrived}-${Math.max(end, progress.arrived + 1) - 1}` });
-        if (part.status !== 206) { progress.download.free(); return loadBody(wasm, name, part, show); }
-        const before = progress.arrived;
-        await drain(part, before, (offset, bytes) => (more = progress.put(offset, bytes)));
-        if (progress.arrived === before) break;
-    }
-    progress.finish();
+    let whole = null;
+    try {
+        let more = progress.put(0, start);
+        while (more && progress.arrived < total) {
+            // The header first, then everything that is needed.
+            const end = progress.streams ? progress.needed : Math.max(progress.header, 24);
+            const part = await get({ Range: `bytes=${progress.arrived}-${Math.max(end, progress.arrived + 1) - 1}` });
+            if (part.status !== 206) { whole = part; break; }
+            const before = progress.arrived;
+            await drain(part, before, (offset, bytes) => (more = progress.put(offset, bytes)));
+            if (progress.arrived === before) break;
+        }
+        if (!whole) progress.finish();
+    } finally { progress.download.free(); }
+    // A server that stops answering with ranges sends the whole file.
+    if (whole) return loadBody(wasm, name, whole, show);
 }
 
 /// The whole file in one answer.
@@ -108,14 +117,16 @@ async function loadBody(wasm, name, response, show) {
     const encoded = response.headers.get("Content-Encoding");
     const pieces = [];
     let progress = null, size = 0;
-    await drain(response, 0, (offset, bytes) => {
-        size += bytes.length;
-        if (!progress && offset === 0 && total && !encoded && isArchive(bytes)) progress = new Progress(wasm, name, total, show);
-        if (progress) return progress.put(offset, bytes);
-        pieces.push(bytes);
-        show.progress(total ? size / total : 0.5, size);
-        return true;
-    });
-    if (progress) return progress.finish();
-    show.whole(name, await new Blob(pieces).arrayBuffer().then(b => new Uint8Array(b)));
+    try {
+        await drain(response, 0, (offset, bytes) => {
+            size += bytes.length;
+            if (!progress && offset === 0 && total && !encoded && isArchive(bytes)) progress = new Progress(wasm, name, total, show);
+            if (progress) return progress.put(offset, bytes);
+            pieces.push(bytes);
+            show.progress(total ? size / total : 0.5, size);
+            return true;
+        });
+        if (progress) return progress.finish();
+    } finally { progress?.download.free(); }
+    show.whole(name, new Uint8Array(await new Blob(pieces).arrayBuffer()));
 }

@@ -1,13 +1,13 @@
 // The player as a page and as a small library:
 //
-//     const player = await createPlayer(element, { src: "model.cc4d", autoplay: true });
+//     const player = await createPlayer(element, { src: "model.cc4d", autoplay: true });   // src: an address, a File, or bytes with { name }
 //     player.on("time", ({ time, frame }) => …);  player.seek(0.5);  player.play();  await player.load("other.cc4d");
 //
 // Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" { message }, "progress" { share, bytes }.
 // Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
 
 import init, * as wasm from "./cc4dgs_player.js";
-import { loadUrl } from "./loading.js";
+import { loadUrl, nameOf } from "./loading.js";
 import { addGestures, addKeys } from "./gestures.js";
 import { WebGl } from "./webgl.js";
 import { build } from "./controls.js";
@@ -22,7 +22,7 @@ export async function createPlayer(container, options = {}) {
         ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined);
         await ready;
         await player.start();
-        if (src) await player.load(src);
+        if (src) await player.load(src, options.name);
         player.followLink();
         if (autoplay && src) player.play();
     } catch (e) {
@@ -63,8 +63,15 @@ class Page {
     async startDevice() {
         const forced = this.backend === "webgl";
         if (!forced && await navigator.gpu?.requestAdapter()) {
-            this.gpu = await wasm.Player.create(this.ui.canvas);
-            return;
+            try {
+                this.gpu = await wasm.Player.create(this.ui.canvas);
+                return;
+            } catch (e) {
+                // An adapter without the device that is needed. The canvas is WebGPU's now, so WebGL2 takes a new one; later, gestures belong to the old one.
+                if (this.flyKeys) throw e;
+                console.warn(`WebGPU: ${e.message}`);
+                this.ui.replaceCanvas();
+            }
         }
         // A lost context stays that of its canvas until the browser restores it.
         if (this.gl?.lost) await new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
@@ -96,7 +103,7 @@ class Page {
         const { signal } = this.abort;
         const again = source === this.source && this.facts;
         const kept = again ? { pose: this.gpu.pose, time: this.gpu.time } : null;
-        this.source = source;
+        [this.source, this.name] = [source, name];
         this.ui.loading(true);
         const show = {
             poster: bytes => { if (bytes && !this.facts) this.ui.poster(bytes); },
@@ -107,7 +114,7 @@ class Page {
         try {
             if (!again) this.facts = null;
             if (typeof source === "string") {
-                this.ui.title(decodeURIComponent(source.split(/[?#]/)[0].split("/").pop()));
+                this.ui.title(name ?? nameOf(source));
                 await loadUrl(wasm, source, show, signal);
             } else {
                 const label = name ?? source.name ?? "model";
@@ -127,7 +134,8 @@ class Page {
             this.fail(e);
             throw e;
         } finally {
-            this.ui.loading(false);
+            // A later load has a bar of its own.
+            if (this.abort.signal === signal) this.ui.loading(false);
         }
     }
     loaded(facts) {
@@ -201,7 +209,7 @@ class Page {
     }
     // A lost device: a new one, and the same model at the same time and pose.
     async recover() {
-        const [old, source] = [this.gpu, this.source];
+        const [old, source, name] = [this.gpu, this.source, this.name];
         const kept = { pose: old.pose, time: old.time, playing: old.playing };
         this.gpu = null;
         try {
@@ -209,7 +217,7 @@ class Page {
             await this.start();
             if (source) {
                 this.facts = null;
-                await this.load(source);
+                await this.load(source, name);
                 this.gpu.pose = kept.pose;
                 this.seek(kept.time);
                 this.setPlaying(kept.playing);

@@ -35,26 +35,27 @@ pub struct ArchiveOptions<'a> {
 const FIELD_STREAMS: &str = "field.";
 
 impl Model {
-    /// Reads the archive at `path`.
-    pub(crate) fn from_archive(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
-        let archive = Archive::open(path, limits)?;
-        let object = path.display().to_string();
+    /// The model of an open archive; `object` names it in errors.
+    ///
+    /// # Errors
+    /// As [`Model::open`].
+    pub fn of_archive(object: &str, archive: &Archive, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
         let manifest = archive.manifest().clone();
-        let gaussians = read_gaussians(&object, &archive, limits, events)?;
+        let gaussians = read_gaussians(object, archive, limits, events)?;
         let field = match &manifest.deformer {
             None => None,
             Some(entry) => {
-                let known = linked(&object, "deformer", &entry.name, Some(&entry.version), registry)?;
-                check_version(&object, "deformer", &entry.name, &entry.version, known)?;
+                let known = linked(object, "deformer", &entry.name, Some(&entry.version), registry)?;
+                check_version(object, "deformer", &entry.name, &entry.version, known)?;
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
                 let mut field = registry.build_deformer(&section, &entry.context, device)?;
-                let weights = read_weights(&archive, &object, &entry.weights, registry, limits, events)?;
-                load_weights(&object, field.as_mut(), weights, device)?;
+                let weights = read_weights(archive, object, &entry.weights, registry, limits, events)?;
+                load_weights(object, field.as_mut(), weights, device)?;
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
             }
         };
-        let moving = Moving::of_manifest(&object, &manifest)?;
+        let moving = Moving::of_manifest(object, &manifest)?;
         let mut rasterizer = manifest.rasterizer.settings.clone();
         rasterizer.insert("kind".into(), manifest.rasterizer.name.clone().into());
         let of_kind = |kind| archive.stream_sizes().iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();
@@ -85,7 +86,20 @@ impl Model {
         })
     }
     /// Writes a `.cc4d` archive and returns its size in bytes.
+    ///
+    /// # Errors
+    /// As [`Model::to_archive`], and [`Error::Io`].
     pub fn save_archive(&self, path: &Path, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<u64> {
+        self.archive_writer(options, registry, limits, events)?.write_to(path)
+    }
+    /// The bytes of the model's `.cc4d` archive.
+    ///
+    /// # Errors
+    /// What codecs and the deformer report, and unknown names.
+    pub fn to_archive(&self, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<u8>> {
+        self.archive_writer(options, registry, limits, events)?.to_bytes()
+    }
+    fn archive_writer(&self, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<ArchiveWriter> {
         let ArchiveOptions { codec: spec, settings, field_weights, scene } = *options;
         let codec = registry.build_codec(spec, settings)?;
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
@@ -153,7 +167,7 @@ impl Model {
             let streams = codec.encode(&weights_of(f.field.as_ref())?, &context(weight_seed(self.provenance.seed)))?;
             writer = writer.add_all(StreamKind::Field, streams.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s }));
         }
-        writer.write_to(path)
+        Ok(writer)
     }
     /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
     fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {

@@ -4,7 +4,7 @@ use crate::checkpoint;
 use crate::source::{Source, SourceKind};
 use crate::{Moving, RenderConfig, default_rasterizer};
 use burn::tensor::Device;
-use cc4dgs_core::archive::Provenance;
+use cc4dgs_core::archive::{Archive, Provenance};
 use cc4dgs_core::{Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Similarity, ply, spz};
 use serde::Serialize;
 use std::path::Path;
@@ -88,7 +88,10 @@ impl Model {
         let Source { kind, file } = Source::expect(path)?;
         match kind {
             SourceKind::Checkpoint => checkpoint::read_model(&file, registry, device, limits),
-            SourceKind::Archive => Self::from_archive(&file, registry, device, limits, events),
+            SourceKind::Archive => {
+                let archive = Archive::open(&file, limits)?;
+                Self::of_archive(&file.display().to_string(), &archive, registry, device, limits, events)
+            }
             SourceKind::Ply => {
                 let (gaussians, remarks) = ply::read_reporting(&file, limits)?;
                 for message in remarks {

@@ -2,7 +2,7 @@
 
 use crate::checkpoint::CHECKPOINT;
 use cc4dgs_core::archive::MAGIC;
-use cc4dgs_core::spz::PLAIN_MAGIC;
+use cc4dgs_core::spz::begins_as_spz;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
 use std::io::Read;
@@ -10,8 +10,6 @@ use std::path::{Path, PathBuf};
 
 /// Bytes that tell all kinds apart.
 const HEAD_BYTES: u64 = 9;
-/// How SPZ files up to version 3 start: they are gzip streams.
-const GZIP: [u8; 2] = [0x1f, 0x8b];
 
 /// What a model is stored as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -36,7 +34,7 @@ impl SourceKind {
             Some(Self::Archive)
         } else if head.starts_with(b"ply\n") || head.starts_with(b"ply\r") {
             Some(Self::Ply)
-        } else if head.starts_with(&GZIP) || head.starts_with(&PLAIN_MAGIC) {
+        } else if begins_as_spz(head) {
             Some(Self::Spz)
         } else {
             safetensors.then_some(Self::Checkpoint)

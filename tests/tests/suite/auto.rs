@@ -22,7 +22,7 @@ fn planned(capture: &str, sets: &[&str], registry: &Registry) -> (RunConfig, Arc
 
 fn trained(config: &RunConfig, scene: &Arc<Scene>, registry: &Registry) -> (Model, Vec<Event>) {
     let (events, stop) = (Recorder::default(), AtomicBool::new(false));
-    let job = TrainJob { config, scene: scene.clone(), out: None, resume: false, registry, events: &events, stop: &stop };
+    let job = TrainJob { config, scene: scene.clone(), out: None, resume: false, registry, events: &events, stop: &stop, observer: None };
     let model = train(&job).unwrap().0;
     (model, events.events())
 }

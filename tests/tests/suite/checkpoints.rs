@@ -26,6 +26,7 @@ fn checkpoint(folder: &Path, registry: &Registry) -> Vec<u8> {
         registry,
         events: &cc4dgs_core::Silent,
         stop: &AtomicBool::new(false),
+        observer: None,
     };
     train(&job).unwrap();
     std::fs::read(folder.join(CHECKPOINT)).unwrap()

@@ -162,7 +162,7 @@ fn run(scene: &Arc<Scene>, sets: &[&str]) -> (Result<(Model, TrainReport)>, Vec<
     let sets: Vec<String> = base.iter().chain(sets).map(ToString::to_string).collect();
     let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
     let (registry, events, stop) = (Registry::collect().unwrap(), Recorder::default(), AtomicBool::new(false));
-    let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &events, stop: &stop };
+    let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &events, stop: &stop, observer: None };
     (train(&job), events.events())
 }
 

@@ -72,7 +72,9 @@ fn every_exporter_conforms() {
     if !drawn {
         eprintln!("ffmpeg is absent: videos are left out");
     }
-    let plugins: Vec<_> = registry.exporters().filter(|p| drawn || !p.info.capabilities.contains(&"images")).collect();
+    let plugins = registry.exporters().filter(|p| drawn || !p.info.capabilities.contains(&"images"));
+    // Pages need the built player; the crate of the exporters tests theirs with a stand-in.
+    let plugins: Vec<_> = plugins.filter(|p| !p.info.capabilities.contains(&"player")).collect();
     let findings: Vec<String> = plugins.iter().flat_map(|plugin| conformance::exporter(plugin, &toml::Table::new())).collect();
     assert!(findings.is_empty() && plugins.len() >= 6, "{} exporters\n{}", plugins.len(), findings.join("\n"));
 }

@@ -37,7 +37,8 @@ fn open(config: &RunConfig) -> Arc<Scene> {
 
 fn run(config: &RunConfig, out: &Path, resume: bool, events: &dyn EventSink, stop: &AtomicBool) -> cc4dgs_core::Result<TrainReport> {
     let registry = Registry::collect().unwrap();
-    train(&TrainJob { config, scene: open(config), out: Some(out.to_path_buf()), resume, registry: &registry, events, stop }).map(|(_, report)| report)
+    train(&TrainJob { config, scene: open(config), out: Some(out.to_path_buf()), resume, registry: &registry, events, stop, observer: None })
+        .map(|(_, report)| report)
 }
 
 fn load(path: &Path) -> Model {

@@ -5,10 +5,13 @@
 
 mod mp4;
 
+use crate::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use crate::{Model, Orbit};
 use burn::tensor::Device;
+use cc4dgs_core::archive::{Presentation, StreamKind};
 use cc4dgs_core::exporter::export;
-use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, HostGaussians, Image8, Registry, Result};
+use cc4dgs_core::playback::MaxError;
+use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, HostGaussians, Image8, Limits, Registry, Result};
 use cc4dgs_play::model::Model as PlayModel;
 use cc4dgs_play::player::Player;
 use serde::Serialize;
@@ -30,11 +33,13 @@ pub struct ExportRequest {
     pub shots: Vec<(Camera, f32)>,
     /// Background of rendered images where the model has none.
     pub background: Option<[f32; 3]>,
+    /// Cameras of the recording, in the model's frame, for formats with a player.
+    pub cameras: Vec<Camera>,
 }
 
 impl Default for ExportRequest {
     fn default() -> Self {
-        Self { time_norm: None, frames: None, frames_per_second: 30.0, up: [0.0, 0.0, 1.0], shots: Vec::new(), background: None }
+        Self { time_norm: None, frames: None, frames_per_second: 30.0, up: [0.0, 0.0, 1.0], shots: Vec::new(), background: None, cameras: Vec::new() }
     }
 }
 
@@ -42,6 +47,8 @@ impl Default for ExportRequest {
 pub struct ExportJob<'a> {
     /// The model.
     pub model: &'a PlayModel,
+    /// The archive that it was read from, if any: formats with a player take it as it is. Others store the model anew.
+    pub archive: Option<&'a Path>,
     /// Name of the exporter.
     pub format: &'a str,
     /// Its settings.
@@ -56,6 +63,8 @@ pub struct ExportJob<'a> {
     pub registry: &'a Registry,
     /// The device of deformer and rasterizer.
     pub device: &'a Device,
+    /// Limits on what is read back.
+    pub limits: &'a Limits,
     /// Receives progress, and that the file was saved.
     pub events: &'a dyn EventSink,
     /// Ends the export with [`Error::Interrupted`] once it is set.
@@ -169,6 +178,23 @@ impl ExportSource for ModelSource<'_> {
             None => Err(Error::parameter("image", format!("{index} of {}", self.facts.images), "Ask for an image that is there")),
         }
     }
+    fn playable(&mut self, max_error: MaxError) -> Result<Vec<u8>> {
+        let ExportJob { model, request, registry, device, limits, events, .. } = self.job;
+        let around = Surroundings { registry, device, limits, events: *events };
+        let stored = match self.job.archive {
+            Some(path) => Stored::open(path, Storage::default(), around)?,
+            None => Stored::of_model(model, Storage::default(), around)?,
+        };
+        let up = request.cameras.is_empty().then_some(request.up);
+        let before = stored.presentation(&request.cameras, up)?;
+        let shown = if request.cameras.is_empty() { before.clone() } else { presented(&stored.model, &request.cameras, None)? };
+        let presentation =
+            Presentation { frames_per_second: before.frames_per_second.or(Some(request.frames_per_second as f32)), seconds: before.seconds, ..shown };
+        // A layer that is there was made with a bound of its own.
+        let max_error = (stored.bytes_of(StreamKind::Playback) == 0).then_some(max_error);
+        let options = PlayableOptions { max_error, cameras: &request.cameras, presentation, poster: true, without_field: true };
+        Ok(stored.playable(options, around)?.bytes)
+    }
     fn progress(&mut self, done: usize, total: usize) -> Result<()> {
         if self.job.stop.load(Ordering::Relaxed) {
             return Err(Error::Interrupted(format!("after {done} of {total} parts of {}", self.job.out.display())));
@@ -188,6 +214,7 @@ impl Model {
         let session = self.session();
         ExportJob {
             model: self,
+            archive: None,
             format,
             settings: &toml::Table::new(),
             request: ExportRequest::default(),
@@ -195,6 +222,7 @@ impl Model {
             overwrite: false,
             registry: session.registry(),
             device: session.device(),
+            limits: session.limits(),
             events: session.events(),
             stop: &AtomicBool::new(false),
         }

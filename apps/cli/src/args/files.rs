@@ -72,13 +72,13 @@ pub struct Shots {
 
 #[derive(Debug, Args)]
 pub struct Export {
-    /// The format: ply, ply-sequence, spz, sog, gltf, splatv, mp4; `cc4dgs plugins` lists all, with their settings.
+    /// The format: web (a page that plays), ply, ply-sequence, spz, sog, gltf, splatv, mp4; `cc4dgs plugins` lists all, with their settings.
     #[arg(value_name = "FORMAT")]
     pub format: String,
     /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
-    /// The file to write; a folder for ply-sequence.
+    /// The file to write; a folder for ply-sequence, and for web where the name does not end in .html.
     #[arg(long, value_name = "PATH")]
     pub out: PathBuf,
     /// Replace PATH where it exists.

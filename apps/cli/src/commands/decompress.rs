@@ -19,6 +19,7 @@ pub fn run(context: &Context, args: &Decompress) -> Result<()> {
         context,
         &ExportJob {
             model: &loaded.model,
+            archive: None,
             format,
             settings: &settings,
             request: ExportRequest { time_norm: args.time, ..ExportRequest::default() },
@@ -26,6 +27,7 @@ pub fn run(context: &Context, args: &Decompress) -> Result<()> {
             overwrite: true,
             registry: &context.registry,
             device: &loaded.device,
+            limits: &context.limits,
             events: &events,
             stop: interrupt::stop_flag()?,
         },

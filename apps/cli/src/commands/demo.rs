@@ -47,7 +47,7 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let layers = layers(context, Some("demo"), None, &args.sets, args.device.as_deref())?;
     let scene_path = Path::new("procedural");
     let existing = if args.overwrite { Existing::Overwrite } else { Existing::Refuse };
-    let Trained { scene: scene_name, config, report: trained } = train_into(context, &layers, scene_path, &args.out, existing)?;
+    let Trained { scene: scene_name, config, report: trained } = train_into(context, &layers, scene_path, &args.out, existing, None)?;
 
     let events = context.listeners(Some((&args.out.join(EVENTS), true)))?;
     let archive = args.out.join("model.cc4d");

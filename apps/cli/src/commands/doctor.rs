@@ -2,6 +2,7 @@
 
 use super::Context;
 use burn::tensor::Device;
+use cc4dgs::exporters::web::{Page, page_places};
 use cc4dgs::video;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::metrics::{WeightsId, installed_lpips, lpips_places};
@@ -30,6 +31,7 @@ struct Report {
     auto_reason: String,
     ffmpeg: Option<String>,
     lpips: LpipsReport,
+    page: PageReport,
     self_check: Vec<Check>,
     healthy: bool,
 }
@@ -49,6 +51,22 @@ struct LpipsReport {
 fn lpips() -> LpipsReport {
     let found = installed_lpips();
     LpipsReport { source: found.map(|f| f.source.clone()).ok(), weights: found.map(|f| f.network.id()).ok(), absent: found.err(), places: lpips_places() }
+}
+
+/// The page of the player, which `export web` needs.
+#[derive(Serialize)]
+struct PageReport {
+    /// The folder in use, or `this program`.
+    source: Option<String>,
+    /// Why there is none.
+    absent: Option<String>,
+    /// The folders that are looked at, in order.
+    places: Vec<PathBuf>,
+}
+
+fn page() -> PageReport {
+    let found = Page::find();
+    PageReport { source: found.as_ref().map(|p| p.origin.clone()).ok(), absent: found.err().map(|e| e.to_string()), places: page_places() }
 }
 
 #[derive(Serialize)]
@@ -104,6 +122,7 @@ pub fn run(context: &Context) -> Result<()> {
         auto_reason,
         ffmpeg: video::ffmpeg_version().ok(),
         lpips: lpips(),
+        page: page(),
         self_check,
         healthy,
     };
@@ -123,6 +142,10 @@ fn text(r: &Report) -> String {
     lines.push(match (&r.lpips.source, r.lpips.weights) {
         (Some(source), Some(weights)) => format!("LPIPS: weights {source} ({} v{}, xxh3 {})", weights.network, weights.version, weights.xxh3),
         _ => r.lpips.absent.unwrap_or_default().to_string(),
+    });
+    lines.push(match (&r.page.source, &r.page.absent) {
+        (Some(source), _) => format!("page of the player: {source}"),
+        (None, absent) => absent.clone().unwrap_or_default(),
     });
     lines.extend(r.self_check.iter().map(|c| {
         let result = match (&c.problem, c.max_difference) {

@@ -6,6 +6,7 @@ use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::export::{ExportJob, ExportRequest};
 use cc4dgs_core::{Error, ExportTarget, Result, config};
+use cc4dgs_play::source::{Source, SourceKind};
 use std::path::Path;
 
 pub fn run(context: &Context, args: &Export) -> Result<()> {
@@ -23,6 +24,10 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
         Err(Error::Data { .. }) if args.shots.scene.is_none() => (Vec::new(), None),
         chosen => chosen?,
     };
+    let cameras = match &args.shots.scene {
+        Some(scene) if plugin.info.capabilities.contains(&"player") => shots::capture_cameras(context, scene, &loaded.model)?,
+        _ => Vec::new(),
+    };
     let request = ExportRequest {
         time_norm: args.time,
         frames: args.shots.frames.map(|n| n as usize),
@@ -30,11 +35,15 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
         up: args.shots.up.into(),
         shots,
         background,
+        cameras,
     };
+    let source = Source::expect(&args.model)?;
+    let archive = (source.kind == SourceKind::Archive).then_some(source.file);
     finish(
         context,
         &ExportJob {
             model: &loaded.model,
+            archive: archive.as_deref(),
             format: &args.format,
             settings: &settings,
             request,
@@ -42,6 +51,7 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
             overwrite: args.overwrite,
             registry: &context.registry,
             device: &loaded.device,
+            limits: &context.limits,
             events: &events,
             stop: interrupt::stop_flag()?,
         },
@@ -64,7 +74,7 @@ pub fn finish(context: &Context, job: &ExportJob) -> Result<()> {
 
 /// Other programs go by the ending of a file.
 fn check_name(out: &Path, target: ExportTarget, format: &str) -> Result<()> {
-    match target {
+    match target.at(out) {
         ExportTarget::File(extension) if out.extension().is_none_or(|e| !e.eq_ignore_ascii_case(extension)) => {
             let remedy = format!("Name it {}", out.with_extension(extension).display());
             Err(Error::parameter(format!("--out {}", out.display()), format!("{format} files end in .{extension}"), remedy))

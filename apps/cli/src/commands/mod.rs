@@ -19,6 +19,8 @@ mod sweep;
 mod train;
 #[cfg(feature = "view")]
 mod view;
+#[cfg(feature = "view")]
+mod watch;
 
 use crate::args::{BenchWhat, Cli, Command, SweepWhat};
 use crate::listeners::Progress;
@@ -64,6 +66,12 @@ pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
         let content = rayon::scope(|_| view::prepare(&context(cli, output)?, args))?;
         return view::show(args, content);
     }
+    #[cfg(feature = "view")]
+    if let Command::Train(args) = &cli.command
+        && args.view
+    {
+        return watch::run(args, |work| rayon::scope(|_| work(&context(cli, output)?)));
+    }
     rayon::scope(|_| run(cli, output))
 }
 
@@ -75,7 +83,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
     let context = context(cli, output)?;
     match &cli.command {
         Command::Demo(args) => demo::run(&context, args),
-        Command::Train(args) => train::run(&context, args),
+        Command::Train(args) => train::run(&context, args, None),
         Command::Compress(args) => compress::run(&context, args),
         Command::Export(args) => export::run(&context, args),
         Command::Prune(args) => prune::run(&context, args),

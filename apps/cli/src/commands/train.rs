@@ -9,7 +9,7 @@ use cc4dgs_core::{Error, Result};
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::layers::Layers;
-use cc4dgs_train::train::{CONFIG, TrainJob, TrainReport, train};
+use cc4dgs_train::train::{CONFIG, Observer, TrainJob, TrainReport, train};
 use serde::Serialize;
 use std::path::Path;
 
@@ -26,7 +26,7 @@ struct Report<'a> {
     train: &'a TrainReport,
 }
 
-pub fn run(context: &Context, args: &Train) -> Result<()> {
+pub fn run(context: &Context, args: &Train, observer: Option<&dyn Observer>) -> Result<()> {
     let own = args.out.join(CONFIG);
     // A resumed run goes on with its own settings unless told otherwise.
     let file = match &args.config {
@@ -50,7 +50,7 @@ pub fn run(context: &Context, args: &Train) -> Result<()> {
         (false, true) => Existing::Overwrite,
         (false, false) => Existing::Refuse,
     };
-    let trained = train_into(context, &layers, &args.scene, &args.out, existing)?;
+    let trained = train_into(context, &layers, &args.scene, &args.out, existing, observer)?;
     let Trained { scene, config, report } = &trained;
     let (preset, device) = (config.preset.clone(), config.device.clone());
     let shown = Report { scene: scene.clone(), preset, device, seed: config.seed, iterations: config.train.iterations, plan: &config.auto.plan, train: report };
@@ -75,8 +75,8 @@ pub struct Trained {
     pub report: TrainReport,
 }
 
-/// Trains the scene at `scene_path` into the folder `out`.
-pub fn train_into(context: &Context, layers: &Layers, scene_path: &Path, out: &Path, existing: Existing) -> Result<Trained> {
+/// Trains the scene at `scene_path` into the folder `out`; `observer` looks at it.
+pub fn train_into(context: &Context, layers: &Layers, scene_path: &Path, out: &Path, existing: Existing, observer: Option<&dyn Observer>) -> Result<Trained> {
     let stop = interrupt::stop_flag()?;
     check_folder(out, existing, "Go on with it (train --resume), start anew in its place (--overwrite), or choose another folder")?;
     if !layers.want_plan() {
@@ -87,7 +87,8 @@ pub fn train_into(context: &Context, layers: &Layers, scene_path: &Path, out: &P
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let resume = existing == Existing::Resume;
     let events = context.listeners(Some((&out.join(EVENTS), resume)))?;
-    let job = TrainJob { config: &config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop };
+    let job =
+        TrainJob { config: &config, scene: scene.clone(), out: Some(out.to_path_buf()), resume, registry: &context.registry, events: &events, stop, observer };
     let report = train(&job)?.1;
     Ok(Trained { scene: scene.name.clone(), config, report })
 }

@@ -10,6 +10,12 @@ pub async fn request_device(instance: &wgpu::Instance, surface: Option<&wgpu::Su
     let options = wgpu::RequestAdapterOptions { power_preference: wgpu::PowerPreference::HighPerformance, compatible_surface: surface, ..Default::default() };
     let none = |problem: String| Error::unsupported("graphics adapter", problem, "Install a Vulkan, Metal or Direct3D 12 driver, or use a browser with WebGPU");
     let adapter = instance.request_adapter(&options).await.map_err(|e| none(e.to_string()))?;
+    let (device, queue) = adapter.request_device(&descriptor(&adapter)).await.map_err(|e| none(e.to_string()))?;
+    Ok((adapter, device, queue))
+}
+
+/// A device of `adapter` with the largest buffers and textures it has.
+pub(crate) fn descriptor(adapter: &wgpu::Adapter) -> wgpu::DeviceDescriptor<'static> {
     let has = adapter.limits();
     let required_limits = wgpu::Limits {
         max_buffer_size: has.max_buffer_size,
@@ -17,7 +23,5 @@ pub async fn request_device(instance: &wgpu::Instance, surface: Option<&wgpu::Su
         max_texture_dimension_2d: has.max_texture_dimension_2d,
         ..wgpu::Limits::default()
     };
-    let descriptor = wgpu::DeviceDescriptor { label: Some("cc4dgs player"), required_limits, ..Default::default() };
-    let (device, queue) = adapter.request_device(&descriptor).await.map_err(|e| none(e.to_string()))?;
-    Ok((adapter, device, queue))
+    wgpu::DeviceDescriptor { label: Some("cc4dgs player"), required_limits, ..Default::default() }
 }

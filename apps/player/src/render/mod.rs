@@ -12,6 +12,8 @@ use pipelines::Pipelines;
 use target::Target;
 use uploaded::Uploaded;
 
+#[cfg(all(feature = "window", not(target_arch = "wasm32")))]
+pub(crate) use device::descriptor;
 pub use device::request_device;
 #[cfg(target_arch = "wasm32")]
 pub(crate) use uniforms::{Frame, functions};
@@ -97,8 +99,22 @@ impl Renderer {
     pub fn scene(&self) -> Option<&Scene> {
         self.uploaded.as_ref().map(|u| &u.scene)
     }
-    /// Encodes a frame into `out`, a texture view of the renderer's format and of any size; the image is scaled to it. Nothing is waited for.
+    /// Largest side of an image in pixels.
+    fn most_pixels(&self) -> u32 {
+        self.device.limits().max_texture_dimension_2d
+    }
+    /// Encodes a frame into `out`, a texture view of the renderer's format and of any size; the image is scaled to it. Cameras of more pixels than the device can
+    /// draw are drawn with as many as it can. Nothing is waited for.
     pub fn draw(&mut self, view: &View, out: &wgpu::TextureView) {
+        let most = self.most_pixels();
+        let fitted;
+        let view = if view.camera.width.max(view.camera.height) > most {
+            let camera = view.camera.resized(view.camera.width.min(most), view.camera.height.min(most));
+            fitted = View { camera, ..view.clone() };
+            &fitted
+        } else {
+            view
+        };
         let (width, height) = (view.camera.width.max(1), view.camera.height.max(1));
         if self.target.as_ref().is_none_or(|t| t.size != (width, height)) {
             if let Some(old) = self.target.take() {
@@ -123,6 +139,10 @@ impl Renderer {
     /// Draws a frame and starts to copy it to host memory; `done` receives the 8-bit RGB image. In a browser that happens later, elsewhere when the device is polled.
     pub fn capture(&mut self, view: &View, done: impl FnOnce(Result<Image8>) + wgpu::WasmNotSend + 'static) {
         let (width, height) = (view.camera.width.max(1), view.camera.height.max(1));
+        let most = self.most_pixels();
+        if width.max(height) > most {
+            return done(Err(Error::limit("side of an image in pixels", width.max(height).into(), most.into(), "Ask for a smaller image")));
+        }
         let format = self.pipelines.format;
         let size = wgpu::Extent3d { width, height, depth_or_array_layers: 1 };
         let usage = wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::COPY_SRC;

@@ -59,13 +59,13 @@ impl Frame {
     }
 }
 
-/// The nearest and farthest depth that `camera` can see of the scene's box.
+/// The nearest and farthest depth that `camera` can see of the box of all centres at all times.
 fn depth_range(scene: &Scene, camera: &Camera) -> (f32, f32) {
     let row = camera.world_to_camera[2];
-    let corner = |i: usize| (0..3).map(|k| row[k] * f64::from(scene.bounds[(i >> k) & 1][k])).sum::<f64>() + row[3];
+    let corner = |i: usize| (0..3).map(|k| row[k] * f64::from(scene.reach[(i >> k) & 1][k])).sum::<f64>() + row[3];
     let (low, high) = (0..8).map(corner).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), z| (a.min(z), b.max(z)));
-    let near = (low as f32).max(scene.near);
-    (near, (high as f32).max(near * LEAST_RANGE))
+    let near = (low as f32).clamp(scene.near, 0.5 * FAR);
+    (near, (high as f32).min(FAR).max(near * LEAST_RANGE))
 }
 
 /// φ of every head at `time`, one after the other, and per head: first start, first coefficient, first function, and its width (0: it does not change).

@@ -42,10 +42,16 @@ impl Uploaded {
         use wgpu::BufferUsages as Usage;
         let n = scene.count as u64;
         let most = device.limits().max_storage_buffer_binding_size.min(device.limits().max_buffer_size);
-        let largest = [4 * scene.gaussians.len() as u64, 4 * scene.harmonics.len() as u64, 4 * scene.coefficients.len() as u64, SPLAT_BYTES * n];
-        if let Some(&bytes) = largest.iter().find(|b| **b > most) {
+        let words = [scene.gaussians.len(), scene.harmonics.len(), scene.starts.len(), scene.coefficients.len()];
+        let largest = words.map(|w| 4 * w as u64).into_iter().chain([SPLAT_BYTES * n]);
+        if let Some(bytes) = largest.max().filter(|b| *b > most) {
             let fits = n * most / bytes.max(1);
             return Err(Error::limit("largest buffer of the model, in bytes", bytes, most, format!("This device holds about {fits} such Gaussians")));
+        }
+        let blocks = n.div_ceil(u64::from(BLOCK));
+        let most_blocks = u64::from(device.limits().max_compute_workgroups_per_dimension);
+        if blocks > most_blocks {
+            return Err(Error::limit("Gaussians", n, most_blocks * u64::from(BLOCK), "Remove Gaussians with `cc4dgs prune`"));
         }
         let mut buffers = Vec::new();
         let mut buffer = |bytes: u64, usage: Usage| {
@@ -55,7 +61,6 @@ impl Uploaded {
             buffers.push(made.clone());
             made
         };
-        let blocks = n.div_ceil(u64::from(BLOCK));
         let gaussians = buffer(4 * scene.gaussians.len() as u64, Usage::COPY_DST);
         let harmonics = buffer(4 * scene.harmonics.len() as u64, Usage::COPY_DST);
         let starts = buffer(4 * scene.starts.len() as u64, Usage::COPY_DST);

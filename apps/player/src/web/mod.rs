@@ -232,10 +232,7 @@ impl Player {
     /// Plays or pauses; at the end, playing starts again.
     #[wasm_bindgen(setter)]
     pub fn set_playing(&mut self, on: bool) {
-        self.clock.playing = on;
-        if on && !self.clock.looping && self.clock.time >= 1.0 {
-            self.clock.time = 0.0;
-        }
+        self.clock.play(on);
     }
     /// Multiple of the recorded speed.
     #[wasm_bindgen(setter)]

@@ -3,6 +3,7 @@
 use super::uniform;
 use crate::exporter::export;
 use crate::gaussians::sh_rest_len;
+use crate::playback::MaxError;
 use crate::{Error, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Result, Seed};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
@@ -81,6 +82,10 @@ impl ExportSource for MovingModel {
         let data = (0..3 * width * height).map(|i| (i as usize * 5 + index * 40) as u8).collect();
         Ok(Image8 { width, height, channels: 3, data })
     }
+    /// No real archive: exporters pass its bytes on and do not look into them.
+    fn playable(&mut self, _: MaxError) -> Result<Vec<u8>> {
+        crate::ply::to_bytes(&self.canonical, true)
+    }
     fn progress(&mut self, _: usize, _: usize) -> Result<()> {
         Ok(())
     }
@@ -107,6 +112,10 @@ impl ExportSource for Failing {
     fn image(&mut self, index: usize) -> Result<Image8> {
         self.count()?;
         self.0.image(index)
+    }
+    fn playable(&mut self, max_error: MaxError) -> Result<Vec<u8>> {
+        self.count()?;
+        self.0.playable(max_error)
     }
     fn progress(&mut self, _: usize, _: usize) -> Result<()> {
         self.count()
@@ -159,7 +168,7 @@ fn once(plugin: &ExporterPlugin, settings: &toml::Table, source: &mut dyn Export
     let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", e))?;
     let exporter = (plugin.build)(settings)?;
     let path = folder.path().join(match plugin.target {
-        crate::ExportTarget::File(extension) => format!("suite.{extension}"),
+        crate::ExportTarget::File(extension) | crate::ExportTarget::FileOrFolder { file: extension, .. } => format!("suite.{extension}"),
         crate::ExportTarget::Folder(_) => "suite".to_string(),
     });
     let outcome = export(exporter.as_ref(), plugin.target, source, &path, false);

@@ -8,6 +8,7 @@ mod place;
 #[cfg(not(target_arch = "wasm32"))]
 pub use place::export;
 
+use crate::playback::MaxError;
 use crate::plugin::Plugin;
 use crate::{Camera, HostGaussians, Image8, Result};
 use serde::Serialize;
@@ -19,8 +20,26 @@ use std::path::Path;
 pub enum ExportTarget {
     /// One file, whose name ends in this extension (without a dot).
     File(&'static str),
-    /// A folder of files, all with this extension (without a dot).
-    Folder(&'static str),
+    /// A folder of files, all with one of these extensions (without dots).
+    Folder(&'static [&'static str]),
+    /// One file where the name ends in the extension `file`, else a folder of files with one of the extensions `folder`.
+    FileOrFolder {
+        /// Extension of the file.
+        file: &'static str,
+        /// Extensions of the files in the folder.
+        folder: &'static [&'static str],
+    },
+}
+
+impl ExportTarget {
+    /// Whether `path` names a file or a folder: [`ExportTarget::File`] or [`ExportTarget::Folder`].
+    pub fn at(self, path: &Path) -> Self {
+        match self {
+            Self::FileOrFolder { file, .. } if path.extension().is_some_and(|e| e.eq_ignore_ascii_case(file)) => Self::File(file),
+            Self::FileOrFolder { folder, .. } => Self::Folder(folder),
+            other => other,
+        }
+    }
 }
 
 /// What an exporter may know before it asks for any Gaussians.
@@ -72,6 +91,11 @@ pub trait ExportSource {
     /// # Errors
     /// What the renderer reports; [`Error::Unsupported`](crate::Error::Unsupported) where there is none.
     fn image(&mut self, index: usize) -> Result<Image8>;
+    /// The model as the bytes of an archive with a playback layer, in the coordinates of the model. Points are off by at most `max_error`.
+    ///
+    /// # Errors
+    /// What baking reports; [`Error::Unsupported`](crate::Error::Unsupported) where the source cannot bake.
+    fn playable(&mut self, max_error: MaxError) -> Result<Vec<u8>>;
     /// Reports `done` of `total` pieces of work.
     ///
     /// # Errors

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 /// # Errors
 /// [`Error::Parameter`] for a `path` that may not be replaced, [`Error::Io`], and those of [`Exporter::write`].
 pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn ExportSource, path: &Path, overwrite: bool) -> Result<(Exported, u64)> {
+    let target = target.at(path);
     check(path, target, overwrite)?;
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let Some(name) = path.file_name() else {
@@ -55,14 +56,14 @@ fn check(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
     match target {
         ExportTarget::File(_) if found.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
         ExportTarget::Folder(_) if !found.is_dir() => refuse("it is a file, and this format is a folder of files", "Give the name of a folder"),
-        ExportTarget::Folder(extension) => match files(path)?.iter().find(|file| file.extension().is_none_or(|e| e != extension)) {
+        ExportTarget::Folder(extensions) => match files(path)?.iter().find(|file| !extensions.iter().any(|e| file.extension().is_some_and(|own| own == *e))) {
             Some(other) => {
-                let problem = format!("the folder also holds {}, which is no .{extension} file", other.display());
+                let problem = format!("the folder also holds {}, which is no .{} file", other.display(), extensions.join(", ."));
                 refuse(&problem, "Give another folder; only exports are replaced")
             }
             None => Ok(()),
         },
-        ExportTarget::File(_) => Ok(()),
+        ExportTarget::File(_) | ExportTarget::FileOrFolder { .. } => Ok(()),
     }
 }
 
@@ -80,6 +81,7 @@ fn files(path: &Path) -> Result<Vec<PathBuf>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::playback::MaxError;
     use crate::{ExportFacts, HostGaussians, Image8};
 
     struct Nothing(ExportFacts);
@@ -92,6 +94,9 @@ mod tests {
         }
         fn image(&mut self, _: usize) -> Result<Image8> {
             Err(Error::unsupported("image", "none", "None"))
+        }
+        fn playable(&mut self, _: MaxError) -> Result<Vec<u8>> {
+            Err(Error::unsupported("archive", "none", "None"))
         }
         fn progress(&mut self, _: usize, _: usize) -> Result<()> {
             Ok(())
@@ -116,7 +121,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut source = Nothing(crate::conformance::export_facts(0, 0));
         let mut run = |text, fails, target, name: &str, overwrite| export(&Text(text, fails), target, &mut source, &folder.path().join(name), overwrite);
-        let (file, dir) = (ExportTarget::File("txt"), ExportTarget::Folder("txt"));
+        let (file, dir) = (ExportTarget::File("txt"), ExportTarget::Folder(&["txt"]));
         for (target, name) in [(file, "deep/one.txt"), (dir, "deep/many")] {
             let copies = if target == file { 1 } else { 2 };
             assert!(run("first", true, target, name, false).is_err());
@@ -130,6 +135,9 @@ mod tests {
             assert_eq!(std::fs::read_to_string(folder.path().join(&first)).unwrap(), "third!");
         }
         assert_eq!(std::fs::read_dir(folder.path().join("deep")).unwrap().count(), 2, "no temporary names are left");
+        // The name says which of the two is wanted.
+        let either = ExportTarget::FileOrFolder { file: "txt", folder: &["txt"] };
+        assert_eq!((run("one", false, either, "x.txt", false).unwrap().1, run("two", false, either, "x", false).unwrap().1), (3, 6));
         // What was not exported is never replaced.
         std::fs::write(folder.path().join("deep/many/notes.md"), "mine").unwrap();
         assert!(run("x", false, dir, "deep/many", true).unwrap_err().to_string().contains("notes.md"));

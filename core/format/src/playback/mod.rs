@@ -9,7 +9,9 @@
 //! `cc4dgs bake` writes the layer into an archive, beside the Gaussians that it moves. [`PlaybackLayer::apply`] is the reference for players.
 
 mod layer;
+mod max_error;
 mod streams;
 
 pub use layer::{Head, MAX_FUNCTIONS, MAX_SAMPLES, MAX_SEGMENTS, PlaybackLayer, Segment, TimeWeights, Track};
+pub use max_error::MaxError;
 pub use streams::{CodedTrack, exponent_step};

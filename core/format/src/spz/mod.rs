@@ -19,6 +19,14 @@ pub use values::LARGEST;
 const MAGIC: u32 = 0x5053_474e;
 /// The first bytes of an SPZ file of version 4, which is not compressed as a whole.
 pub const PLAIN_MAGIC: [u8; 4] = MAGIC.to_le_bytes();
+/// How SPZ files up to version 3 start: they are gzip streams.
+const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
+
+/// Whether a file that begins with `head` may be an SPZ file of any version.
+pub fn begins_as_spz(head: &[u8]) -> bool {
+    head.starts_with(&GZIP_MAGIC) || head.starts_with(&PLAIN_MAGIC)
+}
+
 /// The flag of models trained with Mip-Splatting's 2D filter.
 const ANTIALIASED: u8 = 1;
 

@@ -3,15 +3,22 @@
 use super::Baked;
 use cc4dgs_core::archive::{Archive, ArchiveWriter, Presentation, StreamKind};
 use cc4dgs_core::{Error, Result, Stream};
-use std::path::Path;
 
 /// Key of the manifest's `extra` with the figures of the layer.
 pub const PLAYBACK: &str = "playback";
 
-/// What [`write_archive`] adds to an archive.
+/// The playback layer that [`with_additions`] writes.
+pub enum Motion<'a> {
+    /// The one that the archive has, if any.
+    Kept,
+    /// This one; `None` for models that do not move.
+    Replaced(Option<&'a Baked>),
+}
+
+/// What [`with_additions`] adds to an archive.
 pub struct Additions<'a> {
-    /// The layer; `None` for models that do not move.
-    pub baked: Option<&'a Baked>,
+    /// The layer.
+    pub motion: Motion<'a>,
     /// How a player shows it.
     pub presentation: Presentation,
     /// PNG or JPEG bytes.
@@ -20,27 +27,32 @@ pub struct Additions<'a> {
     pub without_field: bool,
 }
 
-/// Writes `archive` with `additions` to `path` and returns its size in bytes. A layer or poster that it has already is replaced. Streams come in the order in which a
-/// player needs them: poster, Gaussians, playback layer, field, all others.
+/// The bytes of `archive` with `additions`. A poster that it has already is replaced or dropped. Streams come in the order in which a player
+/// needs them: poster, Gaussians, playback layer, field, all others.
 ///
 /// # Errors
 /// What reading and writing report.
-pub fn write_archive(archive: &Archive, additions: Additions, path: &Path) -> Result<u64> {
+pub fn with_additions(archive: &Archive, additions: Additions) -> Result<Vec<u8>> {
     let mut manifest = archive.manifest().clone();
     manifest.presentation = additions.presentation;
-    manifest.extra.remove(PLAYBACK);
-    if let Some(baked) = additions.baked {
-        // By way of text, so that numbers have the digits of a float32 and come back as they were.
-        let report = serde_json::to_string(&baked.report).and_then(|text| serde_json::from_str(&text));
-        let report = report.map_err(|e| Error::backend("playback layer", e.to_string(), "Report this"))?;
-        manifest.extra.insert(PLAYBACK.into(), report);
-    }
+    let layer = match additions.motion {
+        Motion::Kept => archive.read_kind(StreamKind::Playback)?,
+        Motion::Replaced(baked) => {
+            manifest.extra.remove(PLAYBACK);
+            if let Some(baked) = baked {
+                // By way of text, so that numbers have the digits of a float32 and come back as they were.
+                let report = serde_json::to_string(&baked.report).and_then(|text| serde_json::from_str(&text));
+                let report = report.map_err(|e| Error::backend("playback layer", e.to_string(), "Report this"))?;
+                manifest.extra.insert(PLAYBACK.into(), report);
+            }
+            baked.map(|b| b.streams.clone()).unwrap_or_default()
+        }
+    };
     let mut writer = ArchiveWriter::new(manifest);
     if let Some(bytes) = additions.poster {
         writer = writer.add(StreamKind::Poster, Stream { name: "poster".into(), bytes });
     }
-    writer = writer.add_all(StreamKind::Canonical, archive.read_kind(StreamKind::Canonical)?);
-    writer = writer.add_all(StreamKind::Playback, additions.baked.iter().flat_map(|b| b.streams.iter().cloned()));
+    writer = writer.add_all(StreamKind::Canonical, archive.read_kind(StreamKind::Canonical)?).add_all(StreamKind::Playback, layer);
     let mut kinds = vec![StreamKind::Meta];
     if !additions.without_field {
         kinds.insert(0, StreamKind::Field);
@@ -55,5 +67,5 @@ pub fn write_archive(archive: &Archive, additions: Additions, path: &Path) -> Re
     for kind in kinds {
         writer = writer.add_all(kind, archive.read_kind(kind)?);
     }
-    writer.write_to(path)
+    writer.to_bytes()
 }

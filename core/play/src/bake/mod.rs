@@ -6,19 +6,21 @@
 
 mod archive;
 mod functions;
+mod keyframes;
 mod motion;
 mod rows;
 mod tolerance;
 
 use crate::{Model, Orbit};
-pub use archive::{Additions, PLAYBACK, write_archive};
+pub use archive::{Additions, Motion as AddedMotion, PLAYBACK, with_additions};
 use burn::tensor::Device;
+pub use cc4dgs_core::playback::MaxError;
 use cc4dgs_core::playback::{CodedTrack, Head, MAX_SAMPLES, PlaybackLayer};
-use cc4dgs_core::{Camera, Error, Event, EventSink, Result, Stream};
+use cc4dgs_core::{Camera, Event, EventSink, Result, Stream};
 use functions::{HeadFunctions, segment_ends};
+pub use keyframes::keyframes;
 use motion::Motion;
 use serde::Serialize;
-pub use tolerance::MaxError;
 use tolerance::Tolerances;
 
 /// Gaussians that the functions are found from.
@@ -83,7 +85,7 @@ pub struct HeadReport {
 /// The motion of `model` as a playback layer; `None` if nothing moves. `device` is that of the model's deformer.
 ///
 /// # Errors
-/// [`Error::Parameter`] for a bound that is not positive; what the deformer reports.
+/// [`cc4dgs_core::Error::Parameter`] for a bound that is not positive; what the deformer reports.
 pub fn bake(model: &Model, options: &BakeOptions, device: &Device, events: &dyn EventSink) -> Result<Option<Baked>> {
     options.max_error.check()?;
     let Some(motion) = Motion::of(model, device)? else { return Ok(None) };
@@ -145,36 +147,9 @@ fn choose_samples(motion: &Motion, tolerances: &Tolerances, probe: &[usize], fra
     loop {
         let finer = 2 * samples - 1;
         let error = motion.evaluate(&few, finer, tolerances)?.largest_bend();
-        if error <= BETWEEN_SHARE || finer > (SAMPLES_PER_FRAME * frames.max(2)).min(MAX_SAMPLES / 2) {
+        if error <= BETWEEN_SHARE || finer > SAMPLES_PER_FRAME.saturating_mul(frames.max(2)).min(MAX_SAMPLES / 2) {
             return Ok((samples, error));
         }
         samples = finer;
-    }
-}
-
-impl std::str::FromStr for MaxError {
-    type Err = Error;
-    /// `0.1px`, or a length in units of the model such as `0.002`.
-    fn from_str(text: &str) -> Result<Self> {
-        let (number, pixels) = text.strip_suffix("px").map_or((text, false), |number| (number, true));
-        let value = number.trim().parse::<f32>();
-        let value = value.map_err(|_| Error::parameter("--max-error", format!("'{text}' is no error bound"), "Write pixels, 0.1px, or a length, 0.002"))?;
-        let parsed = if pixels { Self::Pixels(value) } else { Self::Length(value) };
-        parsed.check()?;
-        Ok(parsed)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn bounds_are_read_strictly() {
-        assert_eq!("0.1px".parse::<MaxError>().unwrap(), MaxError::Pixels(0.1));
-        assert_eq!("0.002".parse::<MaxError>().unwrap(), MaxError::Length(0.002));
-        for bad in ["", "px", "-1px", "0", "nan", "inf", "1cm"] {
-            assert!(bad.parse::<MaxError>().is_err(), "{bad}");
-        }
     }
 }

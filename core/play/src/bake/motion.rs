@@ -148,7 +148,7 @@ impl<'a> Motion<'a> {
 }
 
 /// The offsets of one head of the Gaussian `i` of `host` at all samples `moved`.
-fn offsets_of(head: Head, host: &HostGaussians, moved: &[HostGaussians], i: usize) -> Vec<f32> {
+pub(super) fn offsets_of(head: Head, host: &HostGaussians, moved: &[HostGaussians], i: usize) -> Vec<f32> {
     let differences = |width: usize, of: fn(&HostGaussians) -> &Vec<f32>| -> Vec<f32> {
         let start = &of(host)[width * i..width * (i + 1)];
         moved.iter().flat_map(|g| of(g)[width * i..width * (i + 1)].iter().zip(start).map(|(a, b)| a - b)).collect()

@@ -1,32 +1,7 @@
 //! How far each Gaussian may be off.
 
-use cc4dgs_core::playback::Head;
-use cc4dgs_core::{Camera, Error, Result};
-use serde::Serialize;
-
-/// The bound on errors of a layer: how far any point within three standard deviations of a Gaussian may lie from where the deformer puts it.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum MaxError {
-    /// Pixels in the nearest camera that sees the Gaussian.
-    Pixels(f32),
-    /// A length in units of the model.
-    Length(f32),
-}
-
-impl MaxError {
-    /// Refuses bounds that are not positive and finite.
-    ///
-    /// # Errors
-    /// [`Error::Parameter`].
-    pub fn check(self) -> Result<()> {
-        let (Self::Pixels(value) | Self::Length(value)) = self;
-        if value.is_finite() && value > 0.0 {
-            return Ok(());
-        }
-        Err(Error::parameter("--max-error", format!("{value} is not a positive number"), "Give pixels, such as 0.1px, or a length, such as 0.002"))
-    }
-}
+use cc4dgs_core::Camera;
+use cc4dgs_core::playback::{Head, MaxError};
 
 /// Shares of the bound: errors of centre, scale and rotation add up.
 const SHARES: [f32; 3] = [0.5, 0.25, 0.25];

@@ -51,7 +51,8 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     let began = Instant::now();
     let recorder = Recorder::default();
     let stop = AtomicBool::new(false);
-    let (model, _) = train(&TrainJob { config: &trial, scene: scene.clone(), out: None, resume: false, registry, events: &recorder, stop: &stop })?;
+    let (model, _) =
+        train(&TrainJob { config: &trial, scene: scene.clone(), out: None, resume: false, registry, events: &recorder, stop: &stop, observer: None })?;
     let all_ms = 1000.0 * began.elapsed().as_secs_f64();
     let events = recorder.events();
     let iterations_ms: f64 =

@@ -89,7 +89,8 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
         }
         (config, scene)
     };
-    let job = TrainJob { config: &config, scene, out: Some(run.clone()), resume, registry: worker.registry, events: &events, stop: worker.stop };
+    let job =
+        TrainJob { config: &config, scene, out: Some(run.clone()), resume, registry: worker.registry, events: &events, stop: worker.stop, observer: None };
     let (outcome, message, verdict) = match train(&job) {
         Ok((_, report)) => (Outcome::Done, None, report.verdict),
         // The checkpoint is there, so the cells can be scored all the same.

@@ -6,6 +6,7 @@ mod guard;
 mod key_frames;
 mod log;
 mod losses;
+mod observe;
 mod parameters;
 mod probe;
 mod pyramid;
@@ -23,6 +24,7 @@ mod validate;
 mod watchdog;
 
 pub use guard::Guard;
+pub use observe::{Observer, Snapshot, Standing};
 pub use record::Record;
 pub(crate) use record::Score;
 pub use state::{Parts, TrainState};
@@ -73,6 +75,8 @@ pub struct TrainJob<'a> {
     pub events: &'a dyn EventSink,
     /// Set to stop after the current iteration, with a checkpoint.
     pub stop: &'a AtomicBool,
+    /// Looks at the model now and then.
+    pub observer: Option<&'a dyn Observer>,
 }
 
 /// What came of it.
@@ -315,6 +319,7 @@ impl Context<'_> {
             }
             watch.after_iteration(self, state, &schedule)?;
             self.validate(state, &schedule)?;
+            self.observe(state, &schedule)?;
             if saves {
                 state.record.log = log.record();
                 self.save(state)?;

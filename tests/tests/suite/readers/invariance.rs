@@ -184,7 +184,7 @@ fn trained(scene: Scene, seed: u64) -> (Model, f64) {
     let registry = Registry::collect().unwrap();
     let sets = ["init.source=random", "init.count=400", "train.iterations=120", "train.log_every=1000", &format!("seed={seed}")];
     let (config, scene, never) = (config(&sets), Arc::new(scene), AtomicBool::new(false));
-    let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &Silent, stop: &never };
+    let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &Silent, stop: &never, observer: None };
     let (model, _) = train(&job).unwrap();
     assert_eq!(model.normalisation, scene.normalisation);
     let device = parse_device("flex").unwrap();

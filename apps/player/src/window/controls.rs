@@ -1,0 +1,143 @@
+//! Controls of the window: time bar, settings, keys, gestures, messages.
+
+use super::Window;
+use crate::Mode;
+use eframe::egui;
+use std::sync::PoisonError;
+use std::sync::atomic::Ordering;
+
+/// Share of the distance to the target that is flown per second.
+const FLIGHT: f64 = 1.0;
+
+impl Window {
+    /// The state of a training, and what went wrong.
+    pub(super) fn messages(&mut self, ui: &mut egui::Ui) {
+        if let Some(live) = &self.live {
+            let (status, paused) = live.status();
+            egui::Panel::top("training").show(ui, |ui| {
+                ui.horizontal(|ui| {
+                    if ui.button(if paused { "Resume training" } else { "Pause training" }).clicked() {
+                        live.pause(!paused);
+                    }
+                    ui.label(if status.is_empty() { "Training has not begun yet." } else { status.as_str() });
+                });
+            });
+        }
+        let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(text) = trouble.clone() {
+            egui::Panel::top("trouble").show(ui, |ui| {
+                ui.horizontal_wrapped(|ui| {
+                    ui.colored_label(ui.visuals().error_fg_color, text);
+                    if ui.button("Close").clicked() {
+                        *trouble = None;
+                    }
+                });
+            });
+        }
+    }
+    pub(super) fn bar(&mut self, ui: &mut egui::Ui) {
+        ui.horizontal(|ui| {
+            let still = self.clock.frames < 2;
+            ui.add_enabled_ui(!still, |ui| {
+                if ui.button(if self.clock.playing { "⏸" } else { "▶" }).on_hover_text("Play (Space)").clicked() {
+                    self.clock.play(!self.clock.playing);
+                }
+                if ui.button("⏮").on_hover_text("One frame back (,)").clicked() {
+                    self.clock.step(-1);
+                }
+                if ui.button("⏭").on_hover_text("One frame on (.)").clicked() {
+                    self.clock.step(1);
+                }
+                let mut time = self.clock.time;
+                ui.spacing_mut().slider_width = (ui.available_width() - 330.0).max(80.0);
+                if ui.add(egui::Slider::new(&mut time, 0.0..=1.0).show_value(false)).changed() {
+                    self.clock.seek(time);
+                }
+                let seconds = self.clock.time * self.clock.seconds;
+                ui.monospace(if still { "still".into() } else { format!("{:>4} / {} · {seconds:6.2} s", self.clock.frame() + 1, self.clock.frames) });
+                ui.add(egui::DragValue::new(&mut self.clock.speed).range(-4.0..=4.0).speed(0.02).suffix("×")).on_hover_text("Speed");
+                ui.toggle_value(&mut self.clock.looping, "⟳").on_hover_text("Loop");
+            });
+            ui.toggle_value(&mut self.settings, "☰").on_hover_text("Settings");
+        });
+    }
+    pub(super) fn panel(&mut self, ui: &mut egui::Ui, adapter: &str) {
+        egui::ComboBox::from_label("Camera").selected_text("choose").show_ui(ui, |ui| {
+            if ui.button("Home").clicked() {
+                self.navigator.reset();
+            }
+            for camera in &self.cameras {
+                if ui.button(&camera.name).clicked() {
+                    self.navigator.go_to(camera);
+                }
+            }
+        });
+        ui.horizontal(|ui| {
+            if ui.button("Reset (R)").clicked() {
+                self.navigator.reset();
+            }
+            ui.toggle_value(&mut self.flying, "Fly (F)").on_hover_text("W A S D Q E, drag to look");
+        });
+        let degree = self.renderer.scene().map_or(0, |s| s.sh_degree);
+        self.look.sh_degree = self.look.sh_degree.min(degree);
+        ui.add(egui::Slider::new(&mut self.look.scale, 0.1..=2.0).text("Size"));
+        ui.add(egui::Slider::new(&mut self.look.sh_degree, 0..=degree).text("SH degree"));
+        ui.add(egui::Slider::new(&mut self.resolution, 0.25..=2.0).text("Resolution"));
+        ui.checkbox(&mut self.look.tint, "Tint what moves");
+        let mut depth = self.look.mode == Mode::Depth;
+        ui.checkbox(&mut depth, "Depth");
+        self.look.mode = if depth { Mode::Depth } else { Mode::Color };
+        ui.separator();
+        if let Some(scene) = self.renderer.scene() {
+            ui.small(format!("{:.0} frames/s", self.rate));
+            ui.small(format!("{} of {} Gaussians drawn, {} move", self.visible.load(Ordering::Relaxed), scene.count, scene.moving));
+            ui.small(adapter);
+        }
+        if self.lacks_motion {
+            ui.small("No playback layer: the model stands still.");
+        }
+    }
+    pub(super) fn keys(&mut self, ctx: &egui::Context, elapsed_s: f64) {
+        use egui::Key;
+        if ctx.egui_wants_keyboard_input() {
+            return;
+        }
+        let (pressed, held) = ctx.input(|i| {
+            let pressed = [Key::Space, Key::Comma, Key::Period, Key::R, Key::F, Key::T, Key::Home, Key::End].map(|k| i.key_pressed(k));
+            (pressed, [Key::D, Key::A, Key::E, Key::Q, Key::W, Key::S].map(|k| f64::from(u8::from(i.key_down(k)))))
+        });
+        let actions: [fn(&mut Self); 8] = [
+            |w| w.clock.play(!w.clock.playing),
+            |w| w.clock.step(-1),
+            |w| w.clock.step(1),
+            |w| w.navigator.reset(),
+            |w| w.flying = !w.flying,
+            |w| w.look.tint = !w.look.tint,
+            |w| w.clock.seek(0.0),
+            |w| w.clock.seek(1.0),
+        ];
+        pressed.iter().zip(actions).filter(|(pressed, _)| **pressed).for_each(|(_, act)| act(self));
+        let by = |k: usize| FLIGHT * elapsed_s * (held[k] - held[k + 1]);
+        if held.iter().any(|h| *h > 0.0) {
+            self.navigator.fly(by(0), by(2), by(4));
+            ctx.request_repaint();
+        }
+    }
+    pub(super) fn gestures(&mut self, ui: &egui::Ui, response: &egui::Response) {
+        let height = f64::from(response.rect.height().max(1.0));
+        let by = response.drag_delta();
+        let (dx, dy) = (f64::from(by.x) / height, f64::from(by.y) / height);
+        let pans = response.dragged_by(egui::PointerButton::Secondary) || response.dragged_by(egui::PointerButton::Middle) || ui.input(|i| i.modifiers.shift);
+        if response.dragged() {
+            match (pans, self.flying) {
+                (true, _) => self.navigator.pan(-dx, -dy),
+                (false, true) => self.navigator.look(-2.0 * dx, -2.0 * dy),
+                (false, false) => self.navigator.orbit(-4.0 * dx, 4.0 * dy),
+            }
+        }
+        if response.hovered() {
+            let (scroll, pinch) = ui.input(|i| (i.smooth_scroll_delta.y, i.zoom_delta()));
+            self.navigator.zoom(f64::from(pinch) * (f64::from(scroll) * 0.003).exp());
+        }
+    }
+}

@@ -1,0 +1,112 @@
+//! A model that changes while a window shows it: a training under way.
+
+use crate::Content;
+use eframe::egui;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Duration;
+
+/// How often a paused training looks whether it is to stop.
+const POLL: Duration = Duration::from_millis(100);
+
+/// What training and window tell each other. The training offers models and says where it stands; the window takes them and pauses it.
+#[derive(Default)]
+pub struct Live {
+    state: Mutex<State>,
+    changed: Condvar,
+    window: OnceLock<egui::Context>,
+}
+
+#[derive(Default)]
+struct State {
+    content: Option<Content>,
+    status: String,
+    paused: bool,
+    closed: bool,
+}
+
+impl Live {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // A panic elsewhere leaves nothing half written here.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+    fn repaint(&self) {
+        if let Some(window) = self.window.get() {
+            window.request_repaint();
+        }
+    }
+    /// Whether a model would be shown: the window is open and has taken the last one.
+    pub fn wants(&self) -> bool {
+        let state = self.lock();
+        state.content.is_none() && !state.closed && self.window.get().is_some()
+    }
+    /// Hands over a model.
+    pub fn offer(&self, content: Content) {
+        self.lock().content = Some(content);
+        self.repaint();
+    }
+    /// Says where the training stands, in a line.
+    pub fn say(&self, status: String) {
+        self.lock().status = status;
+        self.repaint();
+    }
+    /// Returns once the window lets the training go on, was closed, or `stop` is set.
+    pub fn wait_while_paused(&self, stop: &AtomicBool) {
+        let mut state = self.lock();
+        while state.paused && !state.closed && !stop.load(Ordering::Relaxed) {
+            state = self.changed.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+    /// The window is open.
+    pub(super) fn open(&self, window: egui::Context) {
+        // A second window of the same training repaints by itself.
+        self.window.set(window).ok();
+        self.lock().closed = false;
+    }
+    /// The window is closed: nothing is shown any more, and a paused training goes on.
+    pub(super) fn close(&self) {
+        self.lock().closed = true;
+        self.changed.notify_all();
+    }
+    /// The model that was offered last and not taken yet.
+    pub(super) fn take(&self) -> Option<Content> {
+        self.lock().content.take()
+    }
+    /// The line and whether the training is paused.
+    pub(super) fn status(&self) -> (String, bool) {
+        let state = self.lock();
+        (state.status.clone(), state.paused)
+    }
+    pub(super) fn pause(&self, on: bool) {
+        self.lock().paused = on;
+        self.changed.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Instant;
+
+    #[test]
+    fn a_paused_training_waits_until_the_window_closes_or_it_is_stopped() {
+        let (live, stop) = (Live::default(), AtomicBool::new(false));
+        live.wait_while_paused(&stop);
+        assert!(!live.wants(), "no window");
+        live.pause(true);
+        let began = Instant::now();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                std::thread::sleep(Duration::from_millis(50));
+                live.close();
+            });
+            live.wait_while_paused(&stop);
+        });
+        assert!(began.elapsed() >= Duration::from_millis(50));
+        live.lock().closed = false;
+        stop.store(true, Ordering::Relaxed);
+        live.wait_while_paused(&stop);
+        live.say("main 3 of 5".into());
+        assert_eq!(live.status(), ("main 3 of 5".to_string(), true));
+    }
+}

@@ -1,0 +1,214 @@
+//! The player in a desktop window (eframe), which shares the device with its controls.
+
+mod controls;
+mod live;
+
+use crate::render::descriptor;
+use crate::{Clock, Content, Navigator, Renderer, View};
+use cc4dgs_format::{Camera, Error, Result};
+use eframe::egui;
+use eframe::egui_wgpu::{WgpuConfiguration, WgpuSetup, WgpuSetupCreateNew};
+pub use live::Live;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Format of the texture that egui shows.
+const FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
+
+/// What a window shows.
+pub enum Shown {
+    /// A model.
+    Model(Content),
+    /// A training under way.
+    Training(Arc<Live>),
+}
+
+/// Opens a window until it is closed. Call it on the main thread: some systems allow windows there only.
+///
+/// # Errors
+/// [`Error::Limit`] for models that the device has no memory for, [`Error::Unsupported`] where no window can be opened.
+pub fn show(title: &str, shown: Shown) -> Result<()> {
+    let setup = WgpuSetupCreateNew { device_descriptor: Arc::new(descriptor), ..WgpuSetupCreateNew::without_display_handle() };
+    let options = eframe::NativeOptions {
+        viewport: egui::ViewportBuilder::default().with_title(format!("{title} – cc4dgs")).with_inner_size([1100.0, 760.0]),
+        wgpu_options: WgpuConfiguration { wgpu_setup: WgpuSetup::CreateNew(setup), ..Default::default() },
+        ..Default::default()
+    };
+    let failure = Arc::new(Mutex::new(None));
+    let told = failure.clone();
+    let created = move |cc: &eframe::CreationContext<'_>| -> std::result::Result<Box<dyn eframe::App>, Box<dyn std::error::Error + Send + Sync>> {
+        match Window::new(cc, shown) {
+            Ok(window) => Ok(Box::new(window)),
+            Err(e) => {
+                let text = e.to_string();
+                if let Ok(mut told) = told.lock() {
+                    *told = Some(e);
+                }
+                Err(text.into())
+            }
+        }
+    };
+    let result = eframe::run_native("cc4dgs", options, Box::new(created));
+    if let Some(error) = failure.lock().ok().and_then(|mut told| told.take()) {
+        return Err(error);
+    }
+    result.map_err(|e| Error::unsupported("window", e.to_string(), "Start it in a graphical session with a Vulkan, Metal or Direct3D 12 driver"))
+}
+
+/// The image in the window.
+struct Image {
+    view: wgpu::TextureView,
+    id: egui::TextureId,
+    size: (u32, u32),
+}
+
+struct Window {
+    renderer: Renderer,
+    navigator: Navigator,
+    clock: Clock,
+    cameras: Vec<Camera>,
+    live: Option<Arc<Live>>,
+    /// What the device or the training complained about last.
+    trouble: Arc<Mutex<Option<String>>>,
+    lacks_motion: bool,
+    /// Whether a model has been shown.
+    loaded: bool,
+    look: View,
+    resolution: f32,
+    flying: bool,
+    settings: bool,
+    image: Option<Image>,
+    visible: Arc<AtomicU32>,
+    counted: f64,
+    /// Frames per second, smoothed.
+    rate: f32,
+}
+
+impl Window {
+    fn new(cc: &eframe::CreationContext<'_>, shown: Shown) -> Result<Self> {
+        let none = || Error::unsupported("window", "it has no wgpu device", "Install a Vulkan, Metal or Direct3D 12 driver");
+        let state = cc.wgpu_render_state.as_ref().ok_or_else(none)?;
+        let trouble = Arc::new(Mutex::new(None));
+        let told = trouble.clone();
+        // Without a handler, wgpu ends the process.
+        state.device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| *told.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string())));
+        let navigator = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]);
+        let mut window = Self {
+            renderer: Renderer::new(state.device.clone(), state.queue.clone(), FORMAT),
+            look: View::new(navigator.camera(16, 16), 0.0),
+            navigator,
+            clock: Clock::new(1, 1.0),
+            cameras: Vec::new(),
+            live: None,
+            trouble,
+            lacks_motion: false,
+            loaded: false,
+            resolution: 1.0,
+            flying: false,
+            settings: false,
+            image: None,
+            visible: Arc::default(),
+            counted: 0.0,
+            rate: 0.0,
+        };
+        match shown {
+            Shown::Model(content) => {
+                window.load(content)?;
+                window.clock.play(true);
+            }
+            Shown::Training(live) => {
+                live.open(cc.egui_ctx.clone());
+                window.live = Some(live);
+            }
+        }
+        Ok(window)
+    }
+    /// Shows `content`; the first one sets camera and clock, later ones leave them.
+    fn load(&mut self, content: Content) -> Result<()> {
+        let Content { scene, presentation, frame_count, lacks_motion, .. } = content;
+        let ([lower, upper], seconds) = (scene.bounds, presentation.seconds_of(frame_count));
+        self.renderer.load(scene)?;
+        if !self.loaded {
+            self.navigator = Navigator::new(&presentation, lower, upper);
+            self.clock = Clock::new(frame_count, seconds);
+        }
+        (self.clock.frames, self.clock.seconds) = (frame_count.max(1), seconds.max(1e-3));
+        (self.cameras, self.lacks_motion, self.loaded) = (presentation.cameras, lacks_motion, true);
+        Ok(())
+    }
+    /// Takes what the training offered.
+    fn follow(&mut self) {
+        let Some(content) = self.live.as_ref().and_then(|live| live.take()) else { return };
+        if let Err(e) = self.load(content) {
+            *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string());
+        }
+    }
+    /// Draws the scene and shows it in what is left of the window.
+    fn scene(&mut self, ui: &mut egui::Ui, frame: &eframe::Frame) {
+        let Some(state) = frame.wgpu_render_state() else { return };
+        let scale = ui.ctx().pixels_per_point() * self.resolution;
+        let available = ui.available_size();
+        let most = self.renderer.device().limits().max_texture_dimension_2d;
+        let side = |points: f32| ((points * scale).round() as u32).clamp(1, most);
+        let size = (side(available.x), side(available.y));
+        if self.image.as_ref().is_none_or(|s| s.size != size) {
+            let texture = self.renderer.device().create_texture(&wgpu::TextureDescriptor {
+                label: Some("window"),
+                size: wgpu::Extent3d { width: size.0, height: size.1, depth_or_array_layers: 1 },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format: FORMAT,
+                usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::TEXTURE_BINDING,
+                view_formats: &[],
+            });
+            let view = texture.create_view(&Default::default());
+            let mut egui_renderer = state.renderer.write();
+            if let Some(old) = self.image.take() {
+                egui_renderer.free_texture(&old.id);
+            }
+            let id = egui_renderer.register_native_texture(self.renderer.device(), &view, wgpu::FilterMode::Linear);
+            self.image = Some(Image { view, id, size });
+        }
+        let Some(shown) = &self.image else { return };
+        let image = egui::Image::from_texture((shown.id, available)).sense(egui::Sense::click_and_drag());
+        let view = View { camera: self.navigator.camera(size.0, size.1), time: self.clock.time, ..self.look.clone() };
+        self.renderer.draw(&view, &shown.view);
+        let response = ui.add(image);
+        self.gestures(ui, &response);
+    }
+}
+
+impl Drop for Window {
+    fn drop(&mut self) {
+        if let Some(live) = &self.live {
+            live.close();
+        }
+    }
+}
+
+impl eframe::App for Window {
+    fn ui(&mut self, ui: &mut egui::Ui, frame: &mut eframe::Frame) {
+        let ctx = ui.ctx().clone();
+        let elapsed = ctx.input(|i| i.stable_dt).min(0.25);
+        self.rate += 0.1 * (1.0 / elapsed.max(1e-4) - self.rate);
+        if self.clock.tick(elapsed) {
+            ctx.request_repaint();
+        }
+        self.follow();
+        self.keys(&ctx, f64::from(elapsed));
+        self.messages(ui);
+        egui::Panel::bottom("time").show(ui, |ui| self.bar(ui));
+        if self.settings {
+            let adapter = frame.wgpu_render_state().map(|s| s.adapter.get_info().name).unwrap_or_default();
+            egui::Panel::right("settings").show(ui, |ui| self.panel(ui, &adapter));
+            let now = ctx.input(|i| i.time);
+            if now - self.counted > 1.0 {
+                self.counted = now;
+                let visible = self.visible.clone();
+                self.renderer.count_visible(move |count| visible.store(count, Ordering::Relaxed));
+            }
+        }
+        egui::CentralPanel::no_frame().show(ui, |ui| self.scene(ui, frame));
+    }
+}

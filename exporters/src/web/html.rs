@@ -1,0 +1,132 @@
+//! The HTML of an exported page.
+
+use super::page::Page;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use cc4dgs_format::{Error, Result};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use serde_json::{Map, Value, json};
+use std::io::Write;
+
+const TEMPLATE: &str = include_str!("page.html");
+/// Modules inside one file have no addresses; they import each other by names with this prefix, which an import map resolves.
+const PREFIX: &str = "cc4dgs/";
+/// Starts the player of a single file from what the other elements hold.
+const START: &str = r#"import { createPlayer } from "cc4dgs/player.js";
+const bytes = id => Uint8Array.from(atob(document.getElementById(id).textContent.trim()), c => c.charCodeAt(0));
+const unpacked = packed => new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+const { name, autoplay } = JSON.parse(document.getElementById("settings").textContent);
+const wasm = await unpacked(bytes("renderer"));
+window.cc4dgs = await createPlayer(document.getElementById("player"), { src: bytes("model"), name, wasm, autoplay });"#;
+
+/// `text` where HTML shows it.
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// JSON inside a script element: no text in it can end the element.
+fn script_json(value: &Value) -> String {
+    value.to_string().replace('<', "\\u003c")
+}
+
+fn document(title: &str, head: &str, body: &str) -> String {
+    // Parts of the template are replaced in one pass: what is put in may contain their names.
+    let mut out = String::with_capacity(TEMPLATE.len() + title.len() + head.len() + body.len());
+    let mut rest = TEMPLATE;
+    for (key, value) in [("{title}", escaped(title)), ("{head}", head.to_string()), ("{body}", body.to_string())] {
+        let (before, after) = rest.split_once(key).unwrap_or((rest, ""));
+        out.push_str(before);
+        out.push_str(&value);
+        rest = after;
+    }
+    out.push_str(rest);
+    out
+}
+
+/// The page of a folder: it loads `model`, or what its address asks for (`?src=`).
+pub(super) fn of_folder(title: &str, model: &str, autoplay: bool) -> String {
+    let options = script_json(&json!({ "autoplay": autoplay, "src": model }));
+    let body = format!(
+        r#"<script type="module">
+import {{ createPlayer }} from "./player.js";
+const options = {options};
+options.src = new URLSearchParams(location.search).get("src") ?? options.src;
+window.cc4dgs = await createPlayer(document.getElementById("player"), options);
+</script>"#
+    );
+    document(title, r#"<link rel="stylesheet" href="player.css">"#, &body)
+}
+
+/// Everything in one file: styles, modules, the renderer (gzip) and `archive`, which is compressed already.
+pub(super) fn single(page: &Page, title: &str, archive: &[u8], autoplay: bool) -> Result<String> {
+    let damaged = |name: &str, problem: &str| Error::data(format!("{}: {name}", page.origin), problem, "Build the page again with apps/player/build-web");
+    let text = |name: &str| std::str::from_utf8(page.file(name)).map_err(|_| damaged(name, "it is not UTF-8"));
+    let style = text("player.css")?;
+    if style.contains("</") {
+        return Err(damaged("player.css", "it contains '</', which would end the style element"));
+    }
+    let modules: Vec<&str> = page.files.iter().map(|(name, _)| *name).filter(|name| name.ends_with(".js")).collect();
+    let mut imports = Map::new();
+    for name in &modules {
+        let mut source = text(name)?.to_string();
+        for other in &modules {
+            for quote in ['"', '\''] {
+                source = source.replace(&format!("from {quote}./{other}{quote}"), &format!("from {quote}{PREFIX}{other}{quote}"));
+            }
+        }
+        if source.contains("from \"./") || source.contains("from './") {
+            return Err(damaged(name, "it imports a module that is not part of the page"));
+        }
+        imports.insert(format!("{PREFIX}{name}"), format!("data:text/javascript;base64,{}", STANDARD.encode(source)).into());
+    }
+    let mut packer = GzEncoder::new(Vec::new(), Compression::best());
+    let packed = packer.write_all(page.file("cc4dgs_player_bg.wasm")).and_then(|()| packer.finish());
+    let packed = packed.map_err(|e| Error::backend("gzip", e.to_string(), "Report this"))?;
+    let data = |id: &str, kind: &str, content: &str| format!("<script type=\"{kind}\" id=\"{id}\">{content}</script>\n");
+    let head = format!("<style>\n{style}</style>\n<script type=\"importmap\">{}</script>", script_json(&json!({ "imports": imports })));
+    let body = [
+        data("settings", "application/json", &script_json(&json!({ "autoplay": autoplay, "name": title }))),
+        data("renderer", "text/plain", &STANDARD.encode(packed)),
+        data("model", "text/plain", &STANDARD.encode(archive)),
+        format!("<script type=\"module\">\n{START}\n</script>"),
+    ];
+    Ok(document(title, &head, &body.concat()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::web::page::PAGE_FILES;
+
+    fn page() -> Page {
+        let content = |name: &str| if name == "player.js" { "import { a } from \"./controls.js\"; // {body}".to_string() } else { format!("/* {name} */") };
+        Page { files: PAGE_FILES.into_iter().map(|name| (name, content(name).into_bytes())).collect(), origin: "test".into() }
+    }
+
+    #[test]
+    fn modules_find_each_other_without_addresses() {
+        let html = single(&page(), "a <b> & {head}", b"archive", false).unwrap();
+        assert!(html.contains("<title>a &lt;b&gt; &amp; {head}</title>") && html.contains(r#"{"autoplay":false,"name":"a \u003cb> & {head}"}"#), "{html}");
+        assert!(html.contains(&STANDARD.encode("archive")) && html.contains("/* player.css */"));
+        let source = html.split("cc4dgs/player.js\":\"data:text/javascript;base64,").nth(1).unwrap().split('"').next().unwrap();
+        assert_eq!(STANDARD.decode(source).unwrap(), b"import { a } from \"cc4dgs/controls.js\"; // {body}");
+        assert!(!html.contains("src=\"") && !html.contains("href=\"player"), "nothing is fetched");
+    }
+
+    #[test]
+    fn a_page_that_would_not_load_is_refused() {
+        let mut other = page();
+        other.files[0].1 = b"import { a } from \"./unknown.js\";".to_vec();
+        assert!(single(&other, "t", b"", true).unwrap_err().to_string().contains("player.js"));
+        let mut other = page();
+        other.files[5].1 = b"a { } </style><script>".to_vec();
+        assert!(single(&other, "t", b"", true).unwrap_err().to_string().contains("player.css"));
+    }
+
+    #[test]
+    fn names_cannot_leave_their_script() {
+        let html = of_folder("</script><script>alert(1)</script>", "</script>x", true);
+        assert_eq!(html.matches("</script>").count(), 1, "{html}");
+    }
+}

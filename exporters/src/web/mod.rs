@@ -1,0 +1,94 @@
+//! `web`: the model with the player, as one HTML file that opens from disk without a network, or as a folder for any static server.
+//!
+//! The player's page is built apart from this program (`apps/player/build-web`); [`Page`] finds it. The archive is stored with a playback layer and without the
+//! deformer, which the page cannot evaluate.
+
+mod html;
+mod page;
+
+use crate::still;
+use cc4dgs_format::playback::MaxError;
+use cc4dgs_format::{Error, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, Plugin, Result, config, inventory};
+pub use page::{PAGE_FILES, PAGE_VARIABLE, Page, page_places};
+use serde::Deserialize;
+use std::path::Path;
+
+const SCHEMA: &str = "\
+max_error = \"0.1px\"      # how far a point may be off where motion has to be baked; as for `cc4dgs bake`
+autoplay = true          # play as soon as the model is there
+page = \"\"                # folder of the page that apps/player/build-web made; by default the one that `cc4dgs doctor` names
+";
+/// Name of the archive in a folder.
+const MODEL: &str = "model.cc4d";
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Settings {
+    max_error: String,
+    autoplay: bool,
+    page: String,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { max_error: "0.1px".into(), autoplay: true, page: String::new() }
+    }
+}
+
+struct Web {
+    max_error: MaxError,
+    autoplay: bool,
+    /// Folder of the page, or empty. It is read when a file is written, so that settings can be checked without one.
+    page: String,
+}
+
+impl Exporter for Web {
+    fn loses(&self, facts: &ExportFacts) -> String {
+        if facts.moving == 0 {
+            return "It holds the Gaussians and the player.".into();
+        }
+        let bound = self.max_error;
+        format!("It holds the Gaussians, their motion within {bound} (or as the archive has it baked) and the player, without the deformer.")
+    }
+    fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
+        let page = &if self.page.is_empty() { Page::find()? } else { Page::read(Path::new(&self.page))? };
+        let facts = source.facts().clone();
+        let archive = source.playable(self.max_error)?;
+        source.progress(1, 2)?;
+        let mut notes = vec![format!("The archive in it has {:.3} MB, the player is from {}", archive.len() as f64 / 1e6, page.origin)];
+        if path.is_dir() {
+            for (name, bytes) in &page.files {
+                still::write(&path.join(name), bytes)?;
+            }
+            still::write(&path.join(MODEL), &archive)?;
+            still::write(&path.join("index.html"), html::of_folder(&facts.name, MODEL, self.autoplay).as_bytes())?;
+            notes.push("A static server shows the folder: python3 -m http.server -d FOLDER".into());
+        } else {
+            still::write(path, html::single(page, &facts.name, &archive, self.autoplay)?.as_bytes())?;
+        }
+        source.progress(2, 2)?;
+        Ok(Exported { gaussians: facts.gaussians, sh_degree: facts.sh_degree, frames: facts.times_norm.len(), notes })
+    }
+}
+
+pub(crate) fn build(settings: &toml::Table) -> Result<Box<dyn Exporter>> {
+    let Settings { max_error, autoplay, page } = config::parse_section("exporter web", settings)?;
+    let max_error =
+        max_error.parse().map_err(|e: Error| Error::parameter("exporter web: max_error", e.to_string(), "Write pixels, 0.1px, or a length, 0.002"))?;
+    Ok(Box::new(Web { max_error, autoplay, page }))
+}
+
+inventory::submit! {
+    ExporterPlugin {
+        info: Plugin {
+            name: "web",
+            version: "1",
+            summary: "a page that plays the model: one HTML file, or a folder for a static server",
+            paper: "none: the player of this project",
+            schema: SCHEMA,
+            capabilities: &["motion", "player"],
+        },
+        target: ExportTarget::FileOrFolder { file: "html", folder: &["html", "css", "js", "wasm", "cc4d"] },
+        build,
+    }
+}

@@ -1,0 +1,112 @@
+//! Where the built page of the player is found.
+
+use cc4dgs_format::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// Names the folder of the page; nothing else is looked at then.
+pub const PAGE_VARIABLE: &str = "CC4DGS_PAGE";
+/// Name of the folder in the other places.
+const PAGE_FOLDER: &str = "page";
+/// Files of the page that `apps/player/build-web` makes; `index.html` is written anew.
+pub const PAGE_FILES: [&str; 8] =
+    ["player.js", "controls.js", "gestures.js", "loading.js", "webgl.js", "player.css", "cc4dgs_player.js", "cc4dgs_player_bg.wasm"];
+/// Largest file that is taken for one of them, in bytes.
+const MOST_BYTES: u64 = 64 << 20;
+
+/// The page: its files by name, in the order of [`PAGE_FILES`].
+#[derive(Clone, Debug)]
+pub struct Page {
+    /// Names and contents.
+    pub files: Vec<(&'static str, Vec<u8>)>,
+    /// The folder, or `this program`.
+    pub origin: String,
+}
+
+/// The folders that [`Page::find`] looks at, in order: the one that the variable `CC4DGS_PAGE` names, or else `page` in the user's data folder
+/// (`$XDG_DATA_HOME/cc4dgs` or `~/.local/share/cc4dgs`; `~/Library/Application Support/cc4dgs` on macOS, `%APPDATA%\cc4dgs` on Windows), `share/cc4dgs/page`
+/// beside the folder of the program, and `page` in it.
+pub fn page_places() -> Vec<PathBuf> {
+    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    if let Some(folder) = variable(PAGE_VARIABLE) {
+        return vec![folder];
+    }
+    let data = if cfg!(windows) {
+        variable("APPDATA")
+    } else if cfg!(target_os = "macos") {
+        variable("HOME").map(|home| home.join("Library/Application Support"))
+    } else {
+        variable("XDG_DATA_HOME").or_else(|| variable("HOME").map(|home| home.join(".local/share")))
+    };
+    let beside = std::env::current_exe().ok().and_then(|program| Some(program.parent()?.to_path_buf()));
+    let shared = beside.as_ref().and_then(|folder| Some(folder.parent()?.join("share/cc4dgs")));
+    [data.map(|folder| folder.join("cc4dgs")), shared, beside].into_iter().flatten().map(|folder| folder.join(PAGE_FOLDER)).collect()
+}
+
+impl Page {
+    /// The page of the first folder of [`page_places`] that exists, else the one that the feature `embed-page` built in.
+    ///
+    /// # Errors
+    /// [`Error::Unsupported`] where there is none, and as [`Page::read`].
+    pub fn find() -> Result<Self> {
+        let places = page_places();
+        let named = std::env::var_os(PAGE_VARIABLE).is_some_and(|v| !v.is_empty());
+        if let Some(folder) = places.iter().find(|folder| named || folder.is_dir()) {
+            return Self::read(folder);
+        }
+        if let Some(files) = embedded() {
+            return Ok(Self { files: PAGE_FILES.into_iter().zip(files).collect(), origin: "this program".into() });
+        }
+        let looked: Vec<String> = places.iter().map(|p| p.display().to_string()).collect();
+        let problem = format!("it is neither built in nor in {}", looked.join(" or "));
+        let remedy = format!("Build it with apps/player/build-web FOLDER, then name the folder: {PAGE_VARIABLE}=FOLDER or --set page=FOLDER");
+        Err(Error::unsupported("page of the player", problem, remedy))
+    }
+    /// The page in `folder`.
+    ///
+    /// # Errors
+    /// [`Error::Io`] for files that are missing, [`Error::Limit`] for files that are too large for it.
+    pub fn read(folder: &Path) -> Result<Self> {
+        let read = |name: &'static str| {
+            let path = folder.join(name);
+            let bytes = std::fs::metadata(&path).map_err(|e| Error::io(&path, e))?.len();
+            if bytes > MOST_BYTES {
+                return Err(Error::limit(path.display().to_string(), bytes, MOST_BYTES, "Name a folder that apps/player/build-web made"));
+            }
+            Ok((name, std::fs::read(&path).map_err(|e| Error::io(&path, e))?))
+        };
+        Ok(Self { files: PAGE_FILES.into_iter().map(read).collect::<Result<_>>()?, origin: folder.display().to_string() })
+    }
+    /// The file `name` of [`PAGE_FILES`].
+    pub(super) fn file(&self, name: &str) -> &[u8] {
+        self.files.iter().find(|(own, _)| *own == name).map_or(&[], |(_, bytes)| bytes)
+    }
+}
+
+#[cfg(feature = "embed-page")]
+fn embedded() -> Option<[Vec<u8>; PAGE_FILES.len()]> {
+    macro_rules! file {
+        ($name:literal) => {
+            include_bytes!(concat!(
+                env!("CC4DGS_PAGE", "the feature embed-page needs the variable CC4DGS_PAGE: the absolute path of the folder that apps/player/build-web made"),
+                "/",
+                $name
+            ))
+            .to_vec()
+        };
+    }
+    Some([
+        file!("player.js"),
+        file!("controls.js"),
+        file!("gestures.js"),
+        file!("loading.js"),
+        file!("webgl.js"),
+        file!("player.css"),
+        file!("cc4dgs_player.js"),
+        file!("cc4dgs_player_bg.wasm"),
+    ])
+}
+
+#[cfg(not(feature = "embed-page"))]
+fn embedded() -> Option<[Vec<u8>; PAGE_FILES.len()]> {
+    None
+}
