@@ -101,10 +101,10 @@ fn a_larger_error_takes_fewer_bytes_and_sizes_are_kept_to() {
     assert!(codec("max-drop=0.1dB").encode(&g, &context(None)).unwrap_err().to_string().contains("--scene"));
 }
 
-/// Streams of version 1 and what they decode to, written by this test where the variable is set.
+/// Streams of version 2 and what they decode to, written by this test where the variable is set.
 #[test]
 fn stored_streams_decode_to_the_same_bits() {
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-1.bin");
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-2.bin");
     let put = |out: &mut Vec<u8>, bytes: &[u8]| {
         out.extend((bytes.len() as u32).to_le_bytes());
         out.extend(bytes);

@@ -2,7 +2,7 @@
 
 use super::importance::Importance;
 use super::settings::Settings;
-use super::{Attempt, Job, streams};
+use super::{Attempt, Job, read};
 use cc4dgs_format::{CodecContext, Error, Event, HostGaussians, RenderModel, Result, TrainingViews};
 
 /// Views on which the loss is measured.
@@ -54,7 +54,7 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
     }
     let before = Losses::of(job.gaussians, views, renderer)?;
     let drop_of =
-        |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&streams::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
+        |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&read::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
     let best = std::cell::Cell::new((0.0, f64::NAN));
     let allowed = |attempt: &Attempt| {
         let drop = drop_of(attempt)?;
@@ -64,7 +64,17 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
         Ok(drop <= settings.max_drop_db)
     };
     let found = bisect(job, start, 1.0, allowed, |_| false)?;
-    let (_, drop) = best.get();
+    let (kept, mut drop) = best.get();
+    if kept == 0.0 {
+        drop = drop_of(&found)?;
+        if drop > settings.max_drop_db {
+            let problem = format!("the finest steps tried lose {drop:.3} dB on training views, {} dB are allowed", settings.max_drop_db);
+            if settings.drop_wanted {
+                return Err(Error::parameter(object, problem, "Allow more, or choose compact:psnr=70dB or the codec raw"));
+            }
+            context.events.emit(&Event::Warning { object: object.into(), message: problem });
+        }
+    }
     note(
         context,
         format!(
