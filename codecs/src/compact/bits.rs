@@ -45,7 +45,7 @@ impl<'a> BitReader<'a> {
         Self { bytes, at: 0, pending: 0, filled: 0 }
     }
     /// The next `count` (at most 56) bits; `None` if there are fewer.
-    #[inline]
+    #[inline(always)]
     pub fn take(&mut self, count: u32) -> Option<u64> {
         if self.filled < count {
             self.refill();

@@ -114,11 +114,13 @@ impl Degree {
     pub fn restore(&self, basis: &[f32], codes: &[i32], class: u8, out: &mut [f32]) {
         out.copy_from_slice(&self.mean);
         let step = self.step * (1u32 << class) as f32;
-        for (vector, &code) in basis.chunks_exact(self.dims).zip(codes).filter(|(_, code)| **code != 0) {
-            let coordinate = code as f32 * step;
-            out.iter_mut().zip(vector).for_each(|(o, b)| *o += coordinate * b);
+        match self.dims {
+            3 => add::<3>(basis, codes, step, out),
+            9 => add::<9>(basis, codes, step, out),
+            15 => add::<15>(basis, codes, step, out),
+            21 => add::<21>(basis, codes, step, out),
+            _ => add::<27>(basis, codes, step, out),
         }
-        out.iter_mut().for_each(|o| *o = o.clamp(f32::MIN, f32::MAX));
     }
     pub fn write(&self, meta: &mut Vec<u8>) {
         meta.extend(self.step.to_le_bytes());
@@ -168,6 +170,21 @@ impl Degree {
     }
 }
 
+/// Adds `codes` times `step` times the vectors of `basis` to `out`, all of `DIMS` components.
+#[inline]
+fn add<const DIMS: usize>(basis: &[f32], codes: &[i32], step: f32, out: &mut [f32]) {
+    let Some(out) = out.first_chunk_mut::<DIMS>() else { return };
+    for (vector, &code) in basis.as_chunks::<DIMS>().0.iter().zip(codes).filter(|(_, code)| **code != 0) {
+        let coordinate = code as f32 * step;
+        for (o, b) in out.iter_mut().zip(vector) {
+            *o += coordinate * b;
+        }
+    }
+    for o in out {
+        *o = o.clamp(f32::MIN, f32::MAX);
+    }
+}
+
 /// What a code adds to the activity of a row.
 #[inline]
 fn found_in(code: i32, class: u8) -> u64 {
@@ -194,7 +211,8 @@ fn level(quarters: i32, activity: &Activity, class: u8) -> usize {
 #[inline]
 fn octaves(value: u64) -> i32 {
     let octave = value.ilog2();
-    (4 * octave + if octave >= 2 { (value >> (octave - 2)) as u32 & 3 } else { ((value as u32) << 2 >> octave) & 3 }) as i32
+    // Below 2^53, as sums of codes are.
+    4 * octave as i32 + (value << 2 >> octave & 3) as i32
 }
 
 fn project(analysis: &[f64], row: &[f64]) -> f64 {

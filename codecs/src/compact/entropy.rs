@@ -26,16 +26,23 @@ const QUARTERS: [u64; 4] = [1024, 1218, 1448, 1722];
 /// Low bits of a difference of probabilities that are stored as they are.
 const RICE: u32 = 2;
 
+/// Edges of intervals, with entries that make every masked index valid.
+const EDGES: usize = 2 * SYMBOLS;
+/// Bits of a quantile that look up the first symbol that may have it.
+const FIRST_BITS: usize = 8;
+
 /// A distribution of 16 symbols.
 #[derive(Clone)]
 pub struct Table {
-    /// One less than the probability of all symbols below each, times 2^15. Signed, because vector units compare signed numbers.
-    edges: [i16; SYMBOLS + 1],
+    /// The probability of all symbols below each, times 2^15; all from the 16th are 2^15.
+    below: [u16; EDGES],
+    /// The symbol of the smallest quantile with these upper bits.
+    first: [u8; 1 << FIRST_BITS],
 }
 
 impl Default for Table {
     fn default() -> Self {
-        Self { edges: std::array::from_fn(|i| ((i as i32) * (ONE as i32 / SYMBOLS as i32) - 1) as i16) }
+        Self::from_shares([i64::from(ONE) / SYMBOLS as i64; SYMBOLS])
     }
 }
 
@@ -50,19 +57,27 @@ impl Table {
         let mut shares = levels.map(|l| if l == 0 { 0 } else { ((weight(l) << PRECISION) / total).max(1) as i64 });
         let largest = (0..SYMBOLS).max_by_key(|&s| (shares[s], std::cmp::Reverse(s)))?;
         shares[largest] += i64::from(ONE) - shares.iter().sum::<i64>();
-        let mut edges = [-1i16; SYMBOLS + 1];
+        Some(Self::from_shares(shares))
+    }
+    /// The distribution of shares that add up to 2^15.
+    fn from_shares(shares: [i64; SYMBOLS]) -> Self {
+        let mut out = Self { below: [ONE as u16; EDGES], first: [0; 1 << FIRST_BITS] };
         let mut below = 0;
-        for (edge, share) in edges.iter_mut().skip(1).zip(shares) {
+        for (edge, share) in out.below.iter_mut().zip(shares) {
+            *edge = below as u16;
             below += share;
-            *edge = (below - 1) as i16;
         }
-        Some(Self { edges })
+        for (upper, first) in out.first.iter_mut().enumerate() {
+            let quantile = upper << (PRECISION - FIRST_BITS);
+            *first = (0..SYMBOLS).filter(|&s| usize::from(out.below[s]) <= quantile).max().unwrap_or(0) as u8;
+        }
+        out
     }
     /// Start and width of a symbol's interval.
-    #[inline]
+    #[inline(always)]
     fn interval(&self, symbol: usize) -> (u32, u32) {
-        let (low, high) = (i32::from(self.edges[symbol]), i32::from(self.edges[symbol + 1]));
-        ((low + 1) as u32, (high - low) as u32)
+        let (low, high) = (self.below[symbol % EDGES], self.below[(symbol + 1) % EDGES]);
+        (u32::from(low), u32::from(high.wrapping_sub(low)))
     }
 }
 
@@ -79,15 +94,14 @@ impl EncoderModel<PRECISION> for Table {
 }
 
 impl DecoderModel<PRECISION> for Table {
-    #[inline]
+    #[inline(always)]
     fn quantile_function(&self, quantile: u32) -> (usize, u32, NonZeroU32) {
-        let quantile = quantile as i16;
-        // The first edge is -1, so that there is at least one.
-        let mut symbols = 0i16;
-        for edge in &self.edges[..SYMBOLS] {
-            symbols += i16::from(*edge < quantile);
+        let mut symbol = usize::from(self.first[(quantile >> (PRECISION - FIRST_BITS)) as usize % (1 << FIRST_BITS)]);
+        // Most often none or one symbol lies between; a branch would be mispredicted.
+        symbol += usize::from(u32::from(self.below[(symbol + 1) % EDGES]) <= quantile);
+        while u32::from(self.below[(symbol + 1) % EDGES]) <= quantile {
+            symbol += 1;
         }
-        let symbol = (symbols as usize).wrapping_sub(1) & (SYMBOLS - 1);
         let (start, width) = self.interval(symbol);
         (symbol, start, NonZeroU32::new(width).unwrap_or(NonZeroU32::MIN))
     }
@@ -250,12 +264,12 @@ impl<'a> Decoder<'a> {
 }
 
 impl Coder for Decoder<'_> {
-    #[inline]
+    #[inline(always)]
     fn symbol(&mut self, context: usize, _: usize) -> Result<usize> {
         let Some(table) = self.tables.0.get(context) else { return Err(self.damaged("a value has no distribution")) };
         self.coder.decode_symbol(table).map_err(|_| Error::backend("entropy coder", "its words cannot be read", "Report this"))
     }
-    #[inline]
+    #[inline(always)]
     fn bits(&mut self, count: u32, _: u64) -> Result<u64> {
         match self.bits.take(count) {
             Some(bits) => Ok(bits),
@@ -264,55 +278,65 @@ impl Coder for Decoder<'_> {
     }
 }
 
-/// The smallest integer that is stored behind the last symbol, with its length.
+/// The smallest magnitude that is stored behind the last symbol, with its length.
 const ESCAPED: u64 = 192;
+/// Bits of magnitudes above that, at most.
+const LONGEST: u32 = 41;
 
-/// Codes an integer from 0 to 2^41: symbols 0 to 3 are themselves, 4 to 14 an octave's half and its low bits, 15 the rest.
-#[inline]
-pub fn unsigned<C: Coder>(coder: &mut C, context: usize, value: u64) -> Result<u64> {
-    let symbol = coder.symbol(context, if value < 4 { value as usize } else { half_octave(value) })?;
-    match symbol as u64 {
-        small @ 0..4 => Ok(small),
-        15 => {
-            let rest = value.wrapping_sub(ESCAPED);
-            let length = coder.bits(6, u64::from(u64::BITS - rest.leading_zeros()))? as u32;
-            if length > 41 {
-                return Err(Error::data("entropy-coded integer", format!("it has {length} bits, at most 41 are allowed"), "The file is damaged"));
-            }
-            Ok(ESCAPED + if length == 0 { 0 } else { 1 << (length - 1) | coder.bits(length - 1, rest)? })
-        }
-        symbol => {
-            let octave = symbol as u32 / 2;
-            Ok((2 + (symbol & 1)) << (octave - 1) | coder.bits(octave - 1, value)?)
-        }
+/// Symbols of a magnitude: 0 to 3 are themselves, 4 to 14 an octave's half, 15 the rest.
+#[inline(always)]
+fn symbol_of(magnitude: u64) -> usize {
+    if magnitude < 4 {
+        return magnitude as usize;
     }
+    let octave = magnitude.ilog2();
+    ((2 * octave) as usize + (magnitude >> (octave - 1) & 1) as usize).min(SYMBOLS - 1)
 }
 
-/// Half octaves of an integer above 1, at most 15.
-#[inline]
-fn half_octave(value: u64) -> usize {
-    let octave = value.ilog2();
-    ((2 * octave) as usize + (value >> (octave - 1) & 1) as usize).min(15)
+/// The smallest magnitude of each symbol.
+const SMALLEST: [u64; SYMBOLS] = [0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, ESCAPED];
+/// Bits behind each symbol: the low ones of a magnitude, except of the last, whose bits follow.
+const LOW_BITS: [u32; SYMBOLS] = [0, 0, 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 0];
+
+/// Codes the magnitude above [`ESCAPED`].
+#[cold]
+fn escaped<C: Coder>(coder: &mut C, rest: u64) -> Result<u64> {
+    let length = coder.bits(6, u64::from(u64::BITS - rest.leading_zeros()))? as u32;
+    if length > LONGEST {
+        return Err(Error::data("entropy-coded integer", format!("it has {length} bits, at most {LONGEST} are allowed"), "The file is damaged"));
+    }
+    Ok(if length == 0 { 0 } else { 1 << (length - 1) | coder.bits(length - 1, rest)? })
 }
 
 /// Codes an integer with a magnitude up to 2^41; the sign has a context of its own.
 #[inline]
 pub fn signed<C: Coder>(coder: &mut C, size: usize, sign: usize, value: i64) -> Result<i64> {
-    let magnitude = unsigned(coder, size, value.unsigned_abs())? as i64;
-    if magnitude == 0 {
+    let magnitude = value.unsigned_abs();
+    let symbol = coder.symbol(size, symbol_of(magnitude))? % SYMBOLS;
+    let below = magnitude.wrapping_sub(SMALLEST[symbol]);
+    let mut found = SMALLEST[symbol] + coder.bits(LOW_BITS[symbol], below)?;
+    if symbol == SYMBOLS - 1 {
+        found += escaped(coder, below)?;
+    }
+    if found == 0 {
         return Ok(0);
     }
-    Ok(if coder.symbol(sign, usize::from(value < 0))? == 1 { -magnitude } else { magnitude })
+    Ok(if coder.symbol(sign, usize::from(value < 0))? == 1 { -(found as i64) } else { found as i64 })
 }
 
-/// The same with signs that are thought to be random.
-#[inline]
+/// The same with signs that are thought to be random. Without branches but for the last symbol.
+#[inline(always)]
 pub fn symmetric<C: Coder>(coder: &mut C, size: usize, value: i64) -> Result<i64> {
-    let magnitude = unsigned(coder, size, value.unsigned_abs())? as i64;
-    if magnitude == 0 {
-        return Ok(0);
+    let magnitude = value.unsigned_abs();
+    let symbol = coder.symbol(size, symbol_of(magnitude))? % SYMBOLS;
+    let below = magnitude.wrapping_sub(SMALLEST[symbol]);
+    let bits = coder.bits(LOW_BITS[symbol] + u32::from(symbol > 0), below << 1 | u64::from(value < 0))?;
+    let mut found = SMALLEST[symbol] + (bits >> 1);
+    if symbol == SYMBOLS - 1 {
+        found = ESCAPED + escaped(coder, below)?;
     }
-    Ok(if coder.bits(1, u64::from(value < 0))? == 1 { -magnitude } else { magnitude })
+    let sign = -((bits & 1) as i64);
+    Ok((found as i64 ^ sign) - sign)
 }
 
 #[cfg(test)]

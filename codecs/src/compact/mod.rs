@@ -4,6 +4,7 @@
 //! the class before. Weights come from derivatives of renders on the training views, or from sizes and opacities. Streams, in the order in which a player
 //! needs them: classes, scales, centres, rotations, opacities, degree-0 colours, then the higher degrees one by one.
 
+mod allocate;
 mod bits;
 mod blocks;
 mod colors;
@@ -59,6 +60,8 @@ struct Job<'a> {
     classes: Classes,
     motion: Motion,
     choices: Choices,
+    /// Of the columns, to start with.
+    factors: Factors,
     limits: &'a CodecContext<'a>,
 }
 
@@ -71,7 +74,10 @@ struct Attempt {
 
 impl Job<'_> {
     fn attempt(&self, quality: f64) -> Result<Attempt> {
-        let mut factors: Factors = [1.0; 6];
+        self.attempt_with(quality, &self.factors)
+    }
+    fn attempt_with(&self, quality: f64, factors: &Factors) -> Result<Attempt> {
+        let mut factors = *factors;
         for halvings in 0.. {
             let of = encode::quantise(self.gaussians, &self.free, self.importance, &self.classes, quality, &factors, &self.choices);
             let mut order: Vec<usize> = (0..self.gaussians.len()).collect();
@@ -149,8 +155,8 @@ impl AttributeCodec for Compact {
         let canonical = encode::canonical(gaussians, &free);
         let classes = encode::classify(&importance.weights, &importance.shapes, self.settings.adaptive);
         let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
-        let job = Job { gaussians: &canonical, free, importance: &importance, classes, motion, choices, limits: context };
-        Ok(search::search(&job, &self.settings, context)?.streams)
+        let mut job = Job { gaussians: &canonical, free, importance: &importance, classes, motion, choices, factors: [1.0; 6], limits: context };
+        Ok(search::search(&mut job, &self.settings, context)?.streams)
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
         read::read(streams, context)

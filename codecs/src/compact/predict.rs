@@ -1,6 +1,6 @@
 //! Integers of rows that are predicted by a linear function of earlier rows and of what is known about the row, with weights that the encoder fits.
 
-use super::entropy::{Coder, signed};
+use super::entropy::{Coder, symmetric};
 use super::geometry::checked;
 use cc4dgs_format::Result;
 use cc4dgs_format::archive::ByteReader;
@@ -18,7 +18,7 @@ const MEMORY: usize = 8;
 const POINT: u32 = 9;
 /// The input that is the same for all rows.
 const CONSTANT: i64 = 4096;
-/// Inputs and predictions are smaller in magnitude.
+/// Predictions are smaller in magnitude; inputs are, because codes are below 2^24 and shifts at most 15.
 const LIMIT: i64 = 1 << 40;
 /// Passes of the fit; each weighs rows by the inverse error of the one before, so that the sum of magnitudes falls.
 const PASSES: usize = 3;
@@ -67,14 +67,14 @@ impl History {
         out[2..2 + c].copy_from_slice(&row[..c]);
         out[2 + DIMS..2 + DIMS + GIVEN].copy_from_slice(&known.given);
         out[INPUTS - 1] = CONSTANT;
-        out.map(|v| v.clamp(-LIMIT, LIMIT))
+        out
     }
 }
 
 impl Linear {
     /// Contexts of rows of `dims` components.
     pub const fn contexts(dims: usize) -> usize {
-        dims * (LEVELS + 1)
+        dims * LEVELS
     }
     /// Fits the weights to the rows `codes` `[N,dims]`; blocks start where [`super::blocks`] starts them.
     pub fn fit(dims: usize, codes: &[i32], known: &[Known]) -> Self {
@@ -133,7 +133,7 @@ impl Linear {
                 let size = &mut sizes[c][usize::from(known.class & 15)];
                 let expected = if *size == 0 { recent[c] } else { (*size + recent[c]) / 2 };
                 let context = c * LEVELS + level(expected >> shift);
-                let difference = signed(coder, context, self.dims * LEVELS + c, i64::from(*code) - guess)?;
+                let difference = symmetric(coder, context, i64::from(*code) - guess)?;
                 *code = checked(guess + difference)?;
                 row[c] = i64::from(*code) << shift;
                 let magnitude = difference.unsigned_abs() << shift;

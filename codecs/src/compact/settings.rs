@@ -7,10 +7,11 @@ pub(super) const SCHEMA: &str = "\
 max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. 0: psnr_db
 max_size_mb = 0.0        # the best file of at most so many MB; `compact:max-size=5MB` for short. 0: no limit
 psnr_db = 50.0           # without --scene: estimated PSNR between images before and after; `compact:psnr=50dB` for short
-rate_weight = 1.0        # how much bits count when colour coefficients above degree 0 are rounded; 0 rounds to the nearest
+rate_weight = 0.0        # how much bits count when colour coefficients above degree 0 are rounded; 0 rounds to the nearest, which is best for images
 measured = true          # with --scene: weights from derivatives of renders; false: from sizes and opacities
 adaptive = true          # steps of their own for Gaussians that are seen more or less
 shapes = true            # with --scene: steps of shapes by the weights of shapes; false: by those of colours
+allocate = true          # with --scene: correct the steps of the columns by what a change of each costs and saves
 transform = true         # transform the colour coefficients of each degree
 canonical = true         # sort the axes of Gaussians whose shape does not change
 ";
@@ -33,6 +34,8 @@ pub struct Settings {
     pub adaptive: bool,
     /// Weights of their own for shapes.
     pub shapes: bool,
+    /// Measure what the steps of each column cost and save.
+    pub allocate: bool,
     /// Transform colour coefficients.
     pub transform: bool,
     /// Sort axes.
@@ -48,10 +51,11 @@ impl Default for Settings {
             max_drop_db: 0.05,
             max_size_mb: 0.0,
             psnr_db: 50.0,
-            rate_weight: 1.0,
+            rate_weight: 0.0,
             measured: true,
             adaptive: true,
             shapes: true,
+            allocate: true,
             transform: true,
             canonical: true,
             drop_wanted: false,

@@ -1,4 +1,4 @@
-//! The weight codec `compact`: integers of 8 bits or fewer with a scale per row, entropy coded.
+//! The weight codec `compact`: integers of few bits with a scale per row, entropy coded.
 
 use super::entropy::{Coder, Decoder, Encoder, Tables, signed, symmetric};
 use cc4dgs_format::archive::ByteReader;
@@ -8,8 +8,9 @@ use serde::Deserialize;
 
 /// Values per scale.
 const ROW: usize = 64;
-/// Bits of a code, at most.
-const BITS: u32 = 8;
+/// Bits of a code, and how many there may be.
+const BITS: u32 = 10;
+const RANGE: std::ops::RangeInclusive<u32> = 3..=12;
 /// Arrays with distributions of their own.
 const ARRAYS: usize = 1000;
 /// Largest exponent of a scale in magnitude: those of the smallest and the largest floats fit.
@@ -109,8 +110,8 @@ impl Default for Settings {
 /// Keeps the plug-in in the program; see [`crate::link`].
 pub(crate) fn build(settings: &toml::Table) -> Result<Box<dyn WeightCodec>> {
     let Settings { bits } = config::parse_section("weight-codec compact", settings)?;
-    if !(3..=BITS).contains(&bits) {
-        return Err(Error::parameter("weight-codec compact.bits", bits.to_string(), format!("Choose 3 to {BITS}")));
+    if !RANGE.contains(&bits) {
+        return Err(Error::parameter("weight-codec compact.bits", bits.to_string(), format!("Choose {} to {}", RANGE.start(), RANGE.end())));
     }
     Ok(Box::new(Weights { peak: f64::from((1u32 << (bits - 1)) - 1) }))
 }
@@ -120,9 +121,9 @@ inventory::submit! {
         info: Plugin {
             name: "compact",
             version: "1",
-            summary: "integers of 8 bits or fewer with a scale per 64 values, entropy coded",
+            summary: "integers of few bits with a scale per 64 values, entropy coded",
             paper: "row-wise symmetric quantisation; asymmetric numeral systems (constriction)",
-            schema: "bits = 8                 # of a weight, 3 to 8, before entropy coding; a lost one doubles the error of weights\n",
+            schema: "bits = 10                # of a weight, 3 to 12, before entropy coding; one less doubles the error of weights\n",
             capabilities: &["lossy"],
         },
         build,

@@ -10,7 +10,7 @@ use cc4dgs_core::{CodecContext, Error, Event, Registry, RenderModel, Result, Str
 const VIEWS: usize = 16;
 /// The setting that a search changes, and its values from the most accurate.
 const BITS: &str = "bits";
-const SEARCHED: [i64; 6] = [8, 7, 6, 5, 4, 3];
+const SEARCHED: [i64; 10] = [12, 11, 10, 9, 8, 7, 6, 5, 4, 3];
 
 /// A weight codec with its settings.
 #[derive(Clone, Debug, PartialEq)]
@@ -103,7 +103,7 @@ impl FieldWeights {
             gaussians: model.gaussians.clone(),
             field: Some(ModelDeformer { field, section: of.section.clone(), context: of.context.clone() }),
             moving: model.moving,
-            render: model.render,
+            render: model.render.clone(),
             background: model.background,
             rasterizer: model.rasterizer.clone(),
             frame_count: model.frame_count,
