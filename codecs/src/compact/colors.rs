@@ -197,7 +197,7 @@ const LIMIT: i64 = 1 << 24;
 /// The magnitude that a spread stands for.
 fn magnitude(spread: i32) -> u64 {
     let half_octaves = (spread - ONE_STEP + 2 * POINT as i32).clamp(0, 48) as u32;
-    (if half_octaves % 2 == 0 { 2 } else { 3 }) << (half_octaves / 2) >> 1
+    (if half_octaves.is_multiple_of(2) { 2 } else { 3 }) << (half_octaves / 2) >> 1
 }
 
 /// The level of a coordinate that is usually `quarters` quarter octaves large, in a row of this activity.

@@ -168,15 +168,14 @@ fn solve(mut matrix: [[f64; INPUTS]; INPUTS], mut vector: [f64; INPUTS]) -> [f64
         matrix[k][k] *= 1.0 + 1e-6;
     }
     for k in 0..INPUTS {
-        if skipped[k] || !(matrix[k][k] > 0.0) {
+        let pivot = matrix[k];
+        if skipped[k] || pivot[k].is_nan() || pivot[k] <= 0.0 {
             skipped[k] = true;
             continue;
         }
         for other in (0..INPUTS).filter(|&o| o != k) {
-            let factor = matrix[other][k] / matrix[k][k];
-            for j in 0..INPUTS {
-                matrix[other][j] -= factor * matrix[k][j];
-            }
+            let factor = matrix[other][k] / pivot[k];
+            matrix[other].iter_mut().zip(pivot).for_each(|(m, p)| *m -= factor * p);
             vector[other] -= factor * vector[k];
         }
     }

@@ -73,13 +73,13 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         }
         Ok(drop <= settings.max_drop_db)
     };
-    let mut found = bisect(job, (start, WIDE), (1.0, ATTEMPTS), &allowed, |_| false)?;
+    let mut found = bisect(job, (start, WIDE), (1.0, ATTEMPTS), allowed, |_| false)?;
     if allocation.is_some() {
         job.factors = allocate::allocate(job, found.quality, views, renderer, context)?;
         let factors = job.factors;
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {factors:.2?}"));
         let (first, drop) = (found, best.replace((0.0, f64::NAN)));
-        found = bisect(job, (first.quality, NARROW), (1.0, ATTEMPTS), &allowed, |_| false)?;
+        found = bisect(job, (first.quality, NARROW), (1.0, ATTEMPTS), allowed, |_| false)?;
         // Small models may gain nothing.
         if first.bytes <= found.bytes || best.get().0 == 0.0 {
             found = first;

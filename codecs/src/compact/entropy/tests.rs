@@ -28,7 +28,7 @@ fn plain(notes: &[(usize, usize)], levels: &[[u32; SYMBOLS]]) -> Vec<u32> {
 
 fn notes(count: usize) -> Vec<(usize, usize)> {
     let draw = |i: usize| cc4dgs_format::Seed::root(5).index(i as u64).value();
-    let symbol = |i: usize| if i % 3 == 0 { (draw(i) % 16) as usize } else { (draw(i).trailing_zeros() as usize).min(15) };
+    let symbol = |i: usize| if i.is_multiple_of(3) { (draw(i) % 16) as usize } else { (draw(i).trailing_zeros() as usize).min(15) };
     (0..count).map(|i| (i % 3, symbol(i))).collect()
 }
 
