@@ -101,10 +101,27 @@ fn a_larger_error_takes_fewer_bytes_and_sizes_are_kept_to() {
     assert!(codec("max-drop=0.1dB").encode(&g, &context(None)).unwrap_err().to_string().contains("--scene"));
 }
 
-/// Streams of version 1 and what they decode to, written by this test where the variable is set.
+#[test]
+fn what_is_far_out_is_exact_and_the_smallest_weights_are_stored() {
+    let mut g = scene(3000, 0);
+    (g.opacity_logits[7], g.log_scales[31]) = (1e6, -300.0);
+    let found = codec("").decode(&codec("").encode(&g, &context(None)).unwrap(), &context(None)).unwrap();
+    assert!(found.opacity_logits.contains(&1e6) && found.log_scales.contains(&-300.0));
+    let plugins = Entries::<cc4dgs_format::WeightCodecPlugin>::collect().unwrap();
+    let weights = [cc4dgs_format::WeightArray { name: "w".into(), shape: vec![3], values: vec![1e-45, -1e-42, f32::MAX] }];
+    for settings in ["", "bits = 3", "bits = 12"] {
+        let codec = (plugins.get("compact").unwrap().build)(&settings.parse().unwrap()).unwrap();
+        let found = codec.decode(&codec.encode(&weights[..], &context(None)).unwrap(), &context(None)).unwrap();
+        assert!(found[0].values[2] > 0.9 * f32::MAX && found[0].values[0].abs() < 1e38);
+        let small = [cc4dgs_format::WeightArray { values: vec![1e-45, -1e-42, 0.0], ..weights[0].clone() }];
+        codec.decode(&codec.encode(&small, &context(None)).unwrap(), &context(None)).unwrap();
+    }
+}
+
+/// Streams of version 2 and what they decode to, written by this test where the variable is set.
 #[test]
 fn stored_streams_decode_to_the_same_bits() {
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-1.bin");
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-2.bin");
     let put = |out: &mut Vec<u8>, bytes: &[u8]| {
         out.extend((bytes.len() as u32).to_le_bytes());
         out.extend(bytes);

@@ -140,8 +140,8 @@ pub struct Compress {
     /// Override a setting of the codec; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// Weight codec of the field, such as fp32, fp16, int8 or compact; see `cc4dgs plugins`.
-    #[arg(long, value_name = "NAME", default_value = "fp32")]
+    /// Weight codec of the field, such as fp32, fp16, int8, compact, compact:bits=6 or compact:max-drop=0.01dB; see `cc4dgs plugins`.
+    #[arg(long, value_name = "NAME[:SETTING]", default_value = "fp32")]
     pub field_weights: String,
     /// The dataset that the model was trained on, for codecs that make use of its training views.
     #[arg(long, value_name = "PATH")]

@@ -1,8 +1,9 @@
 //! From Gaussians to integers: classes, canonical rotations, steps, order, and rows that are stored exactly.
 
 use super::colors::{Choices, Degree};
-use super::geometry::{CODE_LIMIT, GRID_BITS, Geometry, companded};
+use super::geometry::{CODE_LIMIT, GRID_BITS, Geometry, Rotation, companded};
 use super::importance::{Importance, median};
+use super::write::APART;
 use cc4dgs_format::HostGaussians;
 use rayon::prelude::*;
 
@@ -17,8 +18,9 @@ const LARGEST_SCALE_STEP: f64 = 0.7;
 const LARGEST_OPACITY_STEP: f64 = 1.0;
 /// Norms of quaternions outside are stored exactly: an absolute step would be wrong for them.
 const NORMS: std::ops::Range<f64> = 0.2..5.0;
-/// Log-scales of larger magnitude are stored exactly.
+/// Log-scales and opacity logits of larger magnitude are stored exactly.
 const LOG_SCALE_LIMIT: f32 = 60.0;
+const LOGIT_LIMIT: f32 = 60.0;
 /// Share of the centres at either end of an axis that may lie outside of the grid, if the grid is too coarse otherwise.
 const OUTSIDE: f64 = 5e-4;
 
@@ -26,9 +28,9 @@ const OUTSIDE: f64 = 5e-4;
 pub struct Integers {
     pub geometry: Geometry,
     pub degrees: Vec<Degree>,
-    pub classes: Vec<u8>,
+    pub classes: Classes,
     pub scales: Vec<[i32; 3]>,
-    pub rotations: Vec<[i32; 4]>,
+    pub rotations: Vec<Rotation>,
     pub opacities: Vec<i32>,
     pub keys: Vec<u64>,
     /// `[N,dims]` per degree.
@@ -79,8 +81,27 @@ fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
     ]
 }
 
-/// Class of each Gaussian, and the weight of class 0.
-pub fn classify(weights: &[f64], adaptive: bool) -> (Vec<u8>, f64) {
+/// Classes of Gaussians.
+#[derive(Clone)]
+pub struct Classes {
+    /// Of colours.
+    pub colors: Vec<u8>,
+    /// Of everything else; at most [`APART`] from those of colours.
+    pub shapes: Vec<u8>,
+    /// The weight of class 0.
+    top: f64,
+}
+
+/// Classes by the weights of colours and of shapes.
+pub fn classify(colors: &[f64], shapes: &[f64], adaptive: bool) -> Classes {
+    let (colors, top) = octaves(colors, None, adaptive);
+    let apart = |(&shape, &color): (&u8, &u8)| shape.clamp(color.saturating_sub(APART), color + APART).min(CLASSES);
+    let shapes = octaves(shapes, Some(top), adaptive).0.iter().zip(&colors).map(apart).collect();
+    Classes { colors, shapes, top }
+}
+
+/// Octaves of each weight below the top one.
+fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) {
     let mut sorted: Vec<f64> = weights.iter().copied().filter(|w| *w > 0.0 && w.is_finite()).collect();
     sorted.sort_unstable_by(f64::total_cmp);
     if sorted.is_empty() {
@@ -90,7 +111,7 @@ pub fn classify(weights: &[f64], adaptive: bool) -> (Vec<u8>, f64) {
         // One step for all that costs as much error as steps of their own would.
         return (vec![0; weights.len()], (sorted.iter().map(|w| w * w).sum::<f64>() / sorted.len() as f64).sqrt());
     }
-    let top = sorted[sorted.len() - 1 - (FINEST * sorted.len() as f64) as usize];
+    let top = top.unwrap_or(sorted[sorted.len() - 1 - (FINEST * sorted.len() as f64) as usize]);
     let class = |w: &f64| if *w > 0.0 { libm::log2(top / w).round().clamp(0.0, f64::from(CLASSES)) as u8 } else { CLASSES };
     (weights.iter().map(class).collect(), top)
 }
@@ -103,12 +124,13 @@ pub fn quantise(
     gaussians: &HostGaussians,
     free: &[bool],
     importance: &Importance,
-    (classes, top): (&[u8], f64),
+    classes: &Classes,
     quality: f64,
     factors: &Factors,
     choices: &Choices,
 ) -> Integers {
-    let (base, steps, n) = (quality / top, importance.steps, gaussians.len());
+    let (base, steps, n) = (quality / classes.top, importance.steps, gaussians.len());
+    let shapes = &classes.shapes;
     let positive = |v: f64| (v as f32).clamp(1e-18, 1e18);
     let finite: Vec<f64> = gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v)).collect();
     let mut geometry = Geometry {
@@ -129,7 +151,7 @@ pub fn quantise(
     let mut exact = vec![Vec::new(); 4];
     let mut scales = vec![[0i32; 3]; n];
     for (i, (codes, values)) in scales.iter_mut().zip(gaussians.log_scales.chunks_exact(3)).enumerate() {
-        let step = f64::from(geometry.scale_step) * f64::from(1u32 << classes[i].min(geometry.scale_limit));
+        let step = f64::from(geometry.scale_step) * f64::from(1u32 << shapes[i].min(geometry.scale_limit));
         let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
         match found {
             [Some(a), Some(b), Some(c)] if values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
@@ -139,25 +161,24 @@ pub fn quantise(
     grid(&mut geometry, gaussians, importance, base * steps.means * factors[0]);
     let mut keys = vec![0u64; n];
     for (i, (key, mean)) in keys.iter_mut().zip(gaussians.means.chunks_exact(3)).enumerate() {
-        match geometry.key(mean, geometry.position_shift(scales[i], classes[i])).filter(|_| factors[0] > 0.0) {
+        match geometry.key(mean, geometry.position_shift(scales[i], shapes[i])).filter(|_| factors[0] > 0.0) {
             Some(found) => *key = found,
             None => exact[0].push(i),
         }
     }
-    let mut rotations = vec![[0i32; 4]; n];
+    let mut rotations = vec![Rotation::default(); n];
     for (i, (codes, q)) in rotations.iter_mut().zip(gaussians.quaternions.chunks_exact(4)).enumerate() {
         let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
-        let step = geometry.rotation(geometry.rotation_shift(scales[i], classes[i]));
-        let skip = usize::from(free[i]);
-        let found: Option<Vec<i32>> = q[skip..].iter().map(|&v| code(f64::from(v) / step)).collect();
-        match found.filter(|_| NORMS.contains(&norm)) {
-            Some(found) => codes[..found.len()].copy_from_slice(&found),
+        let step = geometry.rotation(geometry.rotation_shift(scales[i], shapes[i]));
+        match Some(norm).filter(|norm| NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i])) {
+            Some(found) => *codes = found,
             None => exact[2].push(i),
         }
     }
     let mut opacities = vec![0i32; n];
     for (i, (out, &logit)) in opacities.iter_mut().zip(&gaussians.opacity_logits).enumerate() {
-        match code(companded(logit) / (f64::from(geometry.opacity_step) * f64::from(1u32 << classes[i].min(geometry.opacity_limit)))) {
+        let step = f64::from(geometry.opacity_step) * f64::from(1u32 << shapes[i].min(geometry.opacity_limit));
+        match code(companded(logit) / step).filter(|_| logit.abs() < LOGIT_LIMIT) {
             Some(found) => *out = found,
             None => exact[3].push(i),
         }
@@ -168,11 +189,11 @@ pub fn quantise(
         let rows = coefficients(gaussians, degree);
         let dims = 3 * (2 * degree + 1);
         let (relative, factor) = if degree == 0 { (1.0, factors[4]) } else { (steps.sh_rest[degree - 1], factors[5]) };
-        let choices = Choices { dead_zone: if degree == 0 { 0.0 } else { choices.dead_zone }, ..*choices };
-        let plan = Degree::plan(&rows, dims, classes, &squared, positive(base * relative * factor), &choices);
+        let choices = Choices { rate_weight: if degree == 0 { 0.0 } else { choices.rate_weight }, ..*choices };
+        let plan = Degree::plan(&rows, dims, &classes.colors, &squared, positive(base * relative * factor), &choices);
         let mut missing = Vec::new();
         let mut codes = vec![0; n * dims];
-        for (i, (row, out)) in plan.quantise(&rows, classes, &choices).into_iter().zip(codes.chunks_exact_mut(dims)).enumerate() {
+        for (i, (row, out)) in plan.quantise(&rows, &classes.colors, &choices).into_iter().zip(codes.chunks_exact_mut(dims)).enumerate() {
             match row {
                 Some(row) => out.copy_from_slice(&row),
                 None => missing.push(i),
@@ -182,7 +203,7 @@ pub fn quantise(
         degrees.push(plan);
         colors.push(codes);
     }
-    Integers { geometry, degrees, classes: classes.to_vec(), scales, rotations, opacities, keys, colors, exact }
+    Integers { geometry, degrees, classes: classes.clone(), scales, rotations, opacities, keys, colors, exact }
 }
 
 fn code(steps: f64) -> Option<i32> {

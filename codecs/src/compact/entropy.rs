@@ -1,168 +1,262 @@
-//! Entropy coding of integers. Models are adaptive and use integers only, so that every machine writes and reads the same bytes; the range coder is
-//! constriction's.
+//! Entropy coding of integers: static distributions that are stored with the data, and asymmetric numeral systems (constriction's).
 //!
-//! Encoder and decoder share their modelling code through [`Coder`]: the encoder writes the value it is given, the decoder ignores it and returns the
-//! one it reads.
+//! Encoder and decoder share their modelling code through [`Coder`]: the encoder notes the value it is given, the decoder ignores it and returns the one it
+//! reads. Contexts and distributions are integers, so that every machine reads the same values.
 
+use super::bits::{BitReader, BitWriter};
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::{Error, Result};
-use constriction::backends::Cursor;
 use constriction::stream::model::{DecoderModel, EncoderModel, EntropyModel};
-use constriction::stream::queue::{RangeDecoder, RangeEncoder};
-use constriction::stream::{Decode, Encode};
+use constriction::stream::stack::AnsCoder;
+use constriction::stream::{Code, Decode, Encode};
 use std::borrow::Borrow;
 use std::num::NonZeroU32;
 
-/// Symbols of a model.
+/// Symbols of a distribution.
 pub const SYMBOLS: usize = 16;
+/// Contexts that a stream may have.
+pub const CONTEXTS: usize = 4096;
 /// Bits of a probability.
 const PRECISION: usize = 15;
-const ONE: i32 = 1 << PRECISION;
-/// Shift of the adaptation by the number of symbols before: the n-th symbol has about the weight 1 / (n + 4), later ones 2^-7.
-const RATES: [u8; 125] = rates();
+const ONE: u32 = 1 << PRECISION;
+/// Probabilities are stored as quarter octaves above 2^-15, from 1; 0 is impossible.
+const LOUDEST: u32 = 61;
+/// 2^10 times the quarter octaves of an octave.
+const QUARTERS: [u64; 4] = [1024, 1218, 1448, 1722];
+/// Low bits of a difference of probabilities that are stored as they are.
+const RICE: u32 = 2;
 
-const fn rates() -> [u8; 125] {
-    let mut out = [2; 125];
-    let mut n = 0;
-    while n < out.len() {
-        out[n] = (n as u32 + 4).ilog2() as u8;
-        n += 1;
-    }
-    out
-}
+/// Edges of intervals, with entries that make every masked index valid.
+const EDGES: usize = 2 * SYMBOLS;
+/// Bits of a quantile that look up the first symbol that may have it.
+const FIRST_BITS: usize = 8;
 
-/// An adaptive distribution of 16 symbols.
+/// A distribution of 16 symbols.
 #[derive(Clone)]
-pub struct Model {
-    /// Probability of all symbols below each, times 2^15. Strictly increasing, so that no symbol is impossible.
-    below: [u16; SYMBOLS],
-    seen: u8,
+pub struct Table {
+    /// The probability of all symbols below each, times 2^15; all from the 16th are 2^15.
+    below: [u16; EDGES],
+    /// The symbol of the smallest quantile with these upper bits.
+    first: [u8; 1 << FIRST_BITS],
 }
 
-impl Default for Model {
+impl Default for Table {
     fn default() -> Self {
-        Self { below: std::array::from_fn(|i| (i as u16) << (PRECISION - 4)), seen: 0 }
+        Self::from_shares([i64::from(ONE) / SYMBOLS as i64; SYMBOLS])
     }
 }
 
-impl Model {
-    fn end(&self, symbol: usize) -> u32 {
-        self.below.get(symbol + 1).map_or(ONE as u32, |&v| u32::from(v))
-    }
-    /// Moves the distribution towards `symbol`.
-    #[inline]
-    fn update(&mut self, symbol: usize) {
-        let rate = RATES[usize::from(self.seen)];
-        // The first entry stays 0: its target is 0 whatever the symbol. Probabilities are below 2^15, so that differences fit 16 bits.
-        for (i, below) in self.below.iter_mut().enumerate() {
-            let target = i as i16 + if i <= symbol { 0 } else { (ONE - SYMBOLS as i32) as i16 };
-            let value = *below as i16;
-            *below = (value + ((target - value) >> rate)) as u16;
+impl Table {
+    /// The distribution of stored probabilities; `None` if no symbol is possible.
+    fn from_levels(levels: &[u32; SYMBOLS]) -> Option<Self> {
+        let weight = |level: u32| if level == 0 { 0 } else { QUARTERS[(level as usize - 1) % 4] << ((level - 1) / 4) };
+        let total: u64 = levels.iter().map(|&l| weight(l)).sum();
+        if total == 0 {
+            return None;
         }
-        self.seen = (self.seen + 1).min(RATES.len() as u8 - 1);
+        let mut shares = levels.map(|l| if l == 0 { 0 } else { ((weight(l) << PRECISION) / total).max(1) as i64 });
+        let largest = (0..SYMBOLS).max_by_key(|&s| (shares[s], std::cmp::Reverse(s)))?;
+        shares[largest] += i64::from(ONE) - shares.iter().sum::<i64>();
+        Some(Self::from_shares(shares))
+    }
+    /// The distribution of shares that add up to 2^15.
+    fn from_shares(shares: [i64; SYMBOLS]) -> Self {
+        let mut out = Self { below: [ONE as u16; EDGES], first: [0; 1 << FIRST_BITS] };
+        let mut below = 0;
+        for (edge, share) in out.below.iter_mut().zip(shares) {
+            *edge = below as u16;
+            below += share;
+        }
+        for (upper, first) in out.first.iter_mut().enumerate() {
+            let quantile = upper << (PRECISION - FIRST_BITS);
+            *first = (0..SYMBOLS).filter(|&s| usize::from(out.below[s]) <= quantile).max().unwrap_or(0) as u8;
+        }
+        out
+    }
+    /// Start and width of a symbol's interval.
+    #[inline(always)]
+    fn interval(&self, symbol: usize) -> (u32, u32) {
+        let (low, high) = (self.below[symbol % EDGES], self.below[(symbol + 1) % EDGES]);
+        (u32::from(low), u32::from(high.wrapping_sub(low)))
     }
 }
 
-impl EntropyModel<PRECISION> for Model {
+impl EntropyModel<PRECISION> for Table {
     type Symbol = usize;
     type Probability = u32;
 }
 
-impl EncoderModel<PRECISION> for Model {
+impl EncoderModel<PRECISION> for Table {
     fn left_cumulative_and_probability(&self, symbol: impl Borrow<usize>) -> Option<(u32, NonZeroU32)> {
-        let symbol = *symbol.borrow();
-        let start = u32::from(*self.below.get(symbol)?);
-        Some((start, NonZeroU32::new(self.end(symbol) - start)?))
+        let (start, width) = self.interval((*symbol.borrow()).min(SYMBOLS - 1));
+        Some((start, NonZeroU32::new(width)?))
     }
 }
 
-impl DecoderModel<PRECISION> for Model {
-    #[inline]
+impl DecoderModel<PRECISION> for Table {
+    #[inline(always)]
     fn quantile_function(&self, quantile: u32) -> (usize, u32, NonZeroU32) {
-        // The first entry is 0, so that there is at least one.
-        let symbol = self.below.iter().map(|&below| u16::from(below <= quantile as u16)).sum::<u16>() as usize - 1;
-        let start = u32::from(self.below[symbol]);
-        (symbol, start, NonZeroU32::new(self.end(symbol) - start).unwrap_or(NonZeroU32::MIN))
+        let mut symbol = usize::from(self.first[(quantile >> (PRECISION - FIRST_BITS)) as usize % (1 << FIRST_BITS)]);
+        // Most often none or one symbol lies between; a branch would be mispredicted.
+        symbol += usize::from(u32::from(self.below[(symbol + 1) % EDGES]) <= quantile);
+        while u32::from(self.below[(symbol + 1) % EDGES]) <= quantile {
+            symbol += 1;
+        }
+        let (start, width) = self.interval(symbol);
+        (symbol, start, NonZeroU32::new(width).unwrap_or(NonZeroU32::MIN))
     }
+}
+
+/// Distributions of all contexts of a stream, stored with quarter octaves of probability: exact ones would save 0.002 bits per symbol.
+pub struct Tables(Vec<Table>);
+
+impl Tables {
+    /// The distributions of what the encoders hold, and their bytes.
+    pub fn fit(contexts: usize, encoders: &[Encoder]) -> (Self, Vec<u8>) {
+        let mut counts = vec![[0u32; SYMBOLS]; contexts];
+        for &note in encoders.iter().flat_map(|e| &e.symbols) {
+            if let Some(counts) = counts.get_mut(usize::from(note) / SYMBOLS) {
+                counts[usize::from(note) % SYMBOLS] += 1;
+            }
+        }
+        let (mut bits, mut tables) = (BitWriter::default(), Vec::with_capacity(contexts));
+        for counts in counts {
+            let total: u32 = counts.iter().sum();
+            let level = |count: u32| {
+                let octaves = libm::log2(f64::from(count) / f64::from(total)) + PRECISION as f64;
+                if count == 0 { 0 } else { (4.0 * octaves + 1.0).round().clamp(1.0, f64::from(LOUDEST)) as u32 }
+            };
+            let levels = counts.map(level);
+            let found = Table::from_levels(&levels);
+            bits.put(1, u64::from(found.is_some()));
+            if found.is_some() {
+                write_levels(&mut bits, &levels);
+            }
+            tables.push(found.unwrap_or_default());
+        }
+        (Self(tables), bits.finish())
+    }
+    /// Reads the bytes of [`Tables::fit`].
+    pub fn read(object: &str, contexts: usize, bytes: &[u8]) -> Result<Self> {
+        let damaged = || Error::data(object, "its distributions are impossible", "The file is damaged; fetch or write it again");
+        let mut bits = BitReader::new(bytes);
+        let mut tables = Vec::with_capacity(contexts);
+        for _ in 0..contexts {
+            let table = match bits.take(1).ok_or_else(damaged)? {
+                0 => Table::default(),
+                _ => read_levels(&mut bits).and_then(|levels| Table::from_levels(&levels)).ok_or_else(damaged)?,
+            };
+            tables.push(table);
+        }
+        if bits.is_done() { Ok(Self(tables)) } else { Err(damaged()) }
+    }
+}
+
+fn write_levels(bits: &mut BitWriter, levels: &[u32; SYMBOLS]) {
+    let count = levels.iter().rposition(|&l| l > 0).map_or(1, |last| last + 1);
+    bits.put(4, count as u64 - 1);
+    let mut last = LOUDEST;
+    for &level in &levels[..count] {
+        let difference = i64::from(level) - i64::from(last);
+        let folded = if difference < 0 { -2 * difference - 1 } else { 2 * difference } as u64;
+        bits.put((folded >> RICE) as u32 + 1, 1 << (folded >> RICE));
+        bits.put(RICE, folded);
+        last = level;
+    }
+}
+
+fn read_levels(bits: &mut BitReader) -> Option<[u32; SYMBOLS]> {
+    let count = bits.take(4)? as usize + 1;
+    let (mut levels, mut last) = ([0; SYMBOLS], i64::from(LOUDEST));
+    for level in &mut levels[..count] {
+        let mut folded = 0i64;
+        while bits.take(1)? == 0 {
+            folded += 1 << RICE;
+            if folded > 4 * i64::from(LOUDEST) {
+                return None;
+            }
+        }
+        folded += bits.take(RICE)? as i64;
+        last += if folded & 1 == 1 { -(folded + 1) / 2 } else { folded / 2 };
+        *level = u32::try_from(last).ok().filter(|l| *l <= LOUDEST)?;
+    }
+    Some(levels)
 }
 
 /// An encoder or a decoder.
 pub trait Coder {
-    /// Codes `symbol` (0 to 15) and adapts the model.
-    fn symbol(&mut self, model: &mut Model, symbol: usize) -> Result<usize>;
-    /// Codes the low `count` (at most 57) bits of `value`, which are thought to be random.
+    /// Codes `symbol` (0 to 15) in a context.
+    fn symbol(&mut self, context: usize, symbol: usize) -> Result<usize>;
+    /// Codes the low `count` (at most 56) bits of `value`, which are thought to be random.
     fn bits(&mut self, count: u32, value: u64) -> Result<u64>;
 }
 
-/// Writes symbols and bits.
+/// Notes symbols and bits, which are coded once the distributions are known.
 #[derive(Default)]
 pub struct Encoder {
-    coder: RangeEncoder<u32, u64>,
-    bits: Vec<u8>,
-    pending: u64,
-    filled: u32,
+    /// Contexts times 16, plus symbols.
+    symbols: Vec<u16>,
+    bits: BitWriter,
 }
 
 impl Encoder {
-    /// The bytes: u32 words of the range coder, the words, then the bits.
-    pub fn finish(mut self) -> Vec<u8> {
-        if self.filled > 0 {
-            self.bits.extend(&self.pending.to_le_bytes()[..self.filled.div_ceil(8) as usize]);
+    /// The bytes: u32 words of the coder, the words, then the bits.
+    pub fn finish(self, tables: &Tables) -> Result<Vec<u8>> {
+        let failed = || Error::backend("entropy coder", "a symbol has no probability", "Report this");
+        let mut coder = AnsCoder::<u32, u64>::new();
+        for &note in self.symbols.iter().rev() {
+            let table = tables.0.get(usize::from(note) / SYMBOLS).ok_or_else(failed)?;
+            coder.encode_symbol(usize::from(note) % SYMBOLS, table).map_err(|_| failed())?;
         }
-        let Ok(words) = self.coder.into_compressed();
-        let mut out = Vec::with_capacity(4 + 4 * words.len() + self.bits.len());
+        let words: Vec<u32> = coder.into_compressed().map_err(|_| failed())?;
+        let bits = self.bits.finish();
+        let mut out = Vec::with_capacity(4 + 4 * words.len() + bits.len());
         out.extend((words.len() as u32).to_le_bytes());
         out.extend(words.iter().flat_map(|w| w.to_le_bytes()));
-        out.extend(self.bits);
-        out
+        out.extend(bits);
+        Ok(out)
     }
 }
 
 impl Coder for Encoder {
-    fn symbol(&mut self, model: &mut Model, symbol: usize) -> Result<usize> {
-        let failed = |_| Error::backend("entropy coder", format!("symbol {symbol} is over 15"), "Report this");
-        self.coder.encode_symbol(symbol, &*model).map_err(failed)?;
-        model.update(symbol);
+    #[inline]
+    fn symbol(&mut self, context: usize, symbol: usize) -> Result<usize> {
+        if context >= CONTEXTS || symbol >= SYMBOLS {
+            return Err(Error::backend("entropy coder", format!("symbol {symbol} of context {context}"), "Report this"));
+        }
+        self.symbols.push((context * SYMBOLS + symbol) as u16);
         Ok(symbol)
     }
+    #[inline]
     fn bits(&mut self, count: u32, value: u64) -> Result<u64> {
-        let value = value & ((1 << count) - 1);
-        self.pending |= value << self.filled;
-        self.filled += count;
-        while self.filled >= 8 {
-            self.bits.push(self.pending as u8);
-            self.pending >>= 8;
-            self.filled -= 8;
-        }
-        Ok(value)
+        Ok(self.bits.put(count, value))
     }
 }
 
 /// Reads what [`Encoder`] wrote.
 pub struct Decoder<'a> {
-    coder: RangeDecoder<u32, u64, Cursor<u32, Vec<u32>>>,
-    bits: &'a [u8],
-    at: usize,
-    pending: u64,
-    filled: u32,
+    coder: AnsCoder<u32, u64>,
+    tables: &'a Tables,
+    bits: BitReader<'a>,
     object: &'a str,
 }
 
 impl<'a> Decoder<'a> {
     /// A decoder of `bytes`; `object` names them in errors.
-    pub fn new(object: &'a str, bytes: &'a [u8]) -> Result<Self> {
+    pub fn new(object: &'a str, tables: &'a Tables, bytes: &'a [u8]) -> Result<Self> {
         let mut reader = ByteReader::new(object, bytes);
         let count = reader.u32()? as usize;
         let words = reader.take(count.saturating_mul(4))?.as_chunks::<4>().0.iter().map(|w| u32::from_le_bytes(*w)).collect::<Vec<u32>>();
-        let Ok(coder) = RangeDecoder::from_compressed(words);
-        Ok(Self { coder, bits: reader.rest(), at: 0, pending: 0, filled: 0, object })
+        let coder = AnsCoder::from_compressed(words).map_err(|_| reader.error("its last word is zero"))?;
+        Ok(Self { coder, tables, bits: BitReader::new(reader.rest()), object })
     }
+    #[cold]
     fn damaged(&self, problem: &str) -> Error {
         Error::data(self.object, problem, "The file is damaged; fetch or write it again")
     }
     /// Refuses data that was not read.
     pub fn finish(self) -> Result<()> {
-        if self.at != self.bits.len() || self.pending != 0 || !self.coder.maybe_exhausted() {
+        if !self.bits.is_done() || !self.coder.decoder_maybe_exhausted::<PRECISION>() {
             return Err(self.damaged("data follow the last value"));
         }
         Ok(())
@@ -170,74 +264,79 @@ impl<'a> Decoder<'a> {
 }
 
 impl Coder for Decoder<'_> {
-    #[inline]
-    fn symbol(&mut self, model: &mut Model, _: usize) -> Result<usize> {
-        let symbol = self.coder.decode_symbol(&*model).map_err(|_| self.damaged("no sequence of symbols has this code"))?;
-        model.update(symbol);
-        Ok(symbol)
+    #[inline(always)]
+    fn symbol(&mut self, context: usize, _: usize) -> Result<usize> {
+        let Some(table) = self.tables.0.get(context) else { return Err(self.damaged("a value has no distribution")) };
+        self.coder.decode_symbol(table).map_err(|_| Error::backend("entropy coder", "its words cannot be read", "Report this"))
     }
-    #[inline]
+    #[inline(always)]
     fn bits(&mut self, count: u32, _: u64) -> Result<u64> {
-        while self.filled < count {
-            let Some(&byte) = self.bits.get(self.at) else { return Err(self.damaged("it ends within a value")) };
-            self.pending |= u64::from(byte) << self.filled;
-            self.at += 1;
-            self.filled += 8;
+        match self.bits.take(count) {
+            Some(bits) => Ok(bits),
+            None => Err(self.damaged("it ends within a value")),
         }
-        let value = self.pending & ((1 << count) - 1);
-        self.pending >>= count;
-        self.filled -= count;
-        Ok(value)
     }
 }
 
-/// The smallest integer that is stored behind the last symbol, with its length.
+/// The smallest magnitude that is stored behind the last symbol, with its length.
 const ESCAPED: u64 = 192;
+/// Bits of magnitudes above that, at most.
+const LONGEST: u32 = 41;
 
-/// Codes an integer from 0 to 2^41: symbols 0 to 3 are themselves, 4 to 14 an octave's half and its low bits, 15 the rest.
-#[inline]
-pub fn unsigned<C: Coder>(coder: &mut C, model: &mut Model, value: u64) -> Result<u64> {
-    let symbol = coder.symbol(model, if value < 4 { value as usize } else { half_octave(value) })?;
-    match symbol as u64 {
-        small @ 0..4 => Ok(small),
-        15 => {
-            let rest = value.wrapping_sub(ESCAPED);
-            let length = coder.bits(6, u64::from(u64::BITS - rest.leading_zeros()))? as u32;
-            if length > 41 {
-                return Err(Error::data("entropy-coded integer", format!("it has {length} bits, at most 41 are allowed"), "The file is damaged"));
-            }
-            Ok(ESCAPED + if length == 0 { 0 } else { 1 << (length - 1) | coder.bits(length - 1, rest)? })
-        }
-        symbol => {
-            let octave = symbol as u32 / 2;
-            Ok((2 + (symbol & 1)) << (octave - 1) | coder.bits(octave - 1, value)?)
-        }
+/// Symbols of a magnitude: 0 to 3 are themselves, 4 to 14 an octave's half, 15 the rest.
+#[inline(always)]
+fn symbol_of(magnitude: u64) -> usize {
+    if magnitude < 4 {
+        return magnitude as usize;
     }
+    let octave = magnitude.ilog2();
+    ((2 * octave) as usize + (magnitude >> (octave - 1) & 1) as usize).min(SYMBOLS - 1)
 }
 
-fn half_octave(value: u64) -> usize {
-    let octave = value.ilog2();
-    ((2 * octave) as usize + (value >> (octave - 1) & 1) as usize).min(15)
+/// The smallest magnitude of each symbol.
+const SMALLEST: [u64; SYMBOLS] = [0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, ESCAPED];
+/// Bits behind each symbol: the low ones of a magnitude, except of the last, whose bits follow.
+const LOW_BITS: [u32; SYMBOLS] = [0, 0, 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 0];
+
+/// Codes the magnitude above [`ESCAPED`].
+#[cold]
+fn escaped<C: Coder>(coder: &mut C, rest: u64) -> Result<u64> {
+    let length = coder.bits(6, u64::from(u64::BITS - rest.leading_zeros()))? as u32;
+    if length > LONGEST {
+        return Err(Error::data("entropy-coded integer", format!("it has {length} bits, at most {LONGEST} are allowed"), "The file is damaged"));
+    }
+    Ok(if length == 0 { 0 } else { 1 << (length - 1) | coder.bits(length - 1, rest)? })
 }
 
-/// Codes an integer with a magnitude up to 2^41; the sign has a model of its own.
+/// Codes an integer with a magnitude up to 2^41; the sign has a context of its own.
 #[inline]
-pub fn signed<C: Coder>(coder: &mut C, size: &mut Model, sign: &mut Model, value: i64) -> Result<i64> {
-    let magnitude = unsigned(coder, size, value.unsigned_abs())? as i64;
-    if magnitude == 0 {
+pub fn signed<C: Coder>(coder: &mut C, size: usize, sign: usize, value: i64) -> Result<i64> {
+    let magnitude = value.unsigned_abs();
+    let symbol = coder.symbol(size, symbol_of(magnitude))? % SYMBOLS;
+    let below = magnitude.wrapping_sub(SMALLEST[symbol]);
+    let mut found = SMALLEST[symbol] + coder.bits(LOW_BITS[symbol], below)?;
+    if symbol == SYMBOLS - 1 {
+        found += escaped(coder, below)?;
+    }
+    if found == 0 {
         return Ok(0);
     }
-    Ok(if coder.symbol(sign, usize::from(value < 0))? == 1 { -magnitude } else { magnitude })
+    Ok(if coder.symbol(sign, usize::from(value < 0))? == 1 { -(found as i64) } else { found as i64 })
 }
 
-/// The same with signs that are thought to be random.
-#[inline]
-pub fn symmetric<C: Coder>(coder: &mut C, size: &mut Model, value: i64) -> Result<i64> {
-    let magnitude = unsigned(coder, size, value.unsigned_abs())? as i64;
-    if magnitude == 0 {
-        return Ok(0);
+/// The same with signs that are thought to be random. Without branches but for the last symbol.
+#[inline(always)]
+pub fn symmetric<C: Coder>(coder: &mut C, size: usize, value: i64) -> Result<i64> {
+    let magnitude = value.unsigned_abs();
+    let symbol = coder.symbol(size, symbol_of(magnitude))? % SYMBOLS;
+    let below = magnitude.wrapping_sub(SMALLEST[symbol]);
+    let bits = coder.bits(LOW_BITS[symbol] + u32::from(symbol > 0), below << 1 | u64::from(value < 0))?;
+    let mut found = SMALLEST[symbol] + (bits >> 1);
+    if symbol == SYMBOLS - 1 {
+        found = ESCAPED + escaped(coder, below)?;
     }
-    Ok(if coder.bits(1, u64::from(value < 0))? == 1 { -magnitude } else { magnitude })
+    let sign = -((bits & 1) as i64);
+    Ok((found as i64 ^ sign) - sign)
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 //! All steps double with each class. Rotations have finer steps where scales differ more, and centres where the Gaussian is smaller. Both are computed in
 //! integers from scales that are already decoded, so that every machine finds the same steps.
 
-use super::entropy::{Coder, Model, signed};
+use super::entropy::{Coder, signed, symmetric};
 use crate::morton::{gather, spread};
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::{Error, Result};
@@ -14,8 +14,13 @@ pub const GRID_BITS: u32 = 21;
 pub const CODE_LIMIT: i64 = 1 << 24;
 /// Rotations of Gaussians whose scales are within a factor of sqrt(2), 2, 4, 8 and more: steps are halved so many times.
 const FINER: [i32; 4] = [-2, 1, 2, 3];
-/// Contexts of rotations start at this exponent of their step.
-const ROTATION_CONTEXTS: i32 = 4;
+/// Steps of rotations that have contexts of their own, and minus the exponent of the finest.
+const ROTATION_STEPS: usize = 20;
+const ROTATION_FINEST: i32 = 4;
+/// Step of the logarithm of a quaternion's norm. Only offsets of deformers depend on it.
+const NORM_STEP: f64 = 1.0 / 16.0;
+/// Largest magnitude of its code.
+const NORM_LIMIT: i64 = 256;
 
 /// Steps and origins.
 #[derive(Clone, Debug)]
@@ -135,63 +140,82 @@ pub fn companded(logit: f32) -> f64 {
     if logit < 0.0 { f64::from(logit) } else { libm::log1p(f64::from(logit)) }
 }
 
-/// Codes three log-scales per row: the first predicted by earlier rows, the others by the one before.
-pub fn code_scales<C: Coder>(coder: &mut C, scales: &mut [[i32; 3]], classes: &[u8], limit: u8) -> Result<()> {
-    let mut models = vec![[Model::default(), Model::default()]; 3 * 16];
-    let mut recent = [0i64; 4];
-    for (i, (row, &class)) in scales.iter_mut().zip(classes).enumerate() {
-        let shift = class.min(limit);
-        let mut guess = (recent.iter().sum::<i64>() / 4) >> shift;
-        for (axis, code) in row.iter_mut().enumerate() {
-            let [size, sign] = &mut models[axis * 16 + usize::from(class.min(15))];
-            guess += signed(coder, size, sign, i64::from(*code) - guess)?;
-            *code = checked(guess)?;
+/// A rotation: the three components of the unit quaternion beside the largest, the index of the largest times two plus its sign, and the norm.
+#[derive(Clone, Copy, Default)]
+pub struct Rotation {
+    pub codes: [i32; 3],
+    pub form: u8,
+    pub norm: i32,
+}
+
+impl Rotation {
+    /// The codes of a quaternion (w,x,y,z) for a step; those of one that is `free` have a positive w, the largest component, and the norm 1.
+    pub fn of(q: &[f32], norm: f64, step: f64, free: bool) -> Option<Self> {
+        let unit: [f64; 4] = std::array::from_fn(|k| f64::from(q[k]) / norm);
+        let index = if free { 0 } else { (0..4).max_by(|&a, &b| unit[a].abs().total_cmp(&unit[b].abs())).unwrap_or(0) };
+        let mut out = Self { form: 2 * index as u8 + u8::from(unit[index] < 0.0), norm: libm::round(libm::log(norm) / NORM_STEP) as i32, ..Default::default() };
+        for (code, k) in out.codes.iter_mut().zip((0..4).filter(|k| *k != index)) {
+            let found = (unit[k] / step).round();
+            *code = (found.abs() < CODE_LIMIT as f64).then_some(found as i32)?;
         }
-        recent[i % 4] = i64::from(row[0]) << shift;
+        Some(out)
+    }
+    /// The quaternion.
+    #[inline]
+    pub fn quaternion(&self, step: f64) -> [f32; 4] {
+        let v = self.codes.map(|code| f64::from(code) * step);
+        let squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+        // Rounded outwards, nothing may be left for the largest.
+        let scale = if squared > 0.999 { (0.999 / squared).sqrt() } else { 1.0 };
+        let largest = (1.0 - squared * scale * scale).max(0.0).sqrt();
+        let norm = if self.norm == 0 { 1.0 } else { libm::exp(f64::from(self.norm) * NORM_STEP) };
+        let (index, sign) = (usize::from(self.form / 2) & 3, if self.form & 1 == 1 { -1.0 } else { 1.0 });
+        let mut rest = v.into_iter().map(|v| scale * v);
+        std::array::from_fn(|k| (norm * if k == index { sign * largest } else { rest.next().unwrap_or(0.0) }) as f32)
+    }
+}
+
+/// Contexts of [`code_rotations`]: three components of each step, the form, the norm and its sign.
+pub const ROTATION_CONTEXTS: usize = 3 * ROTATION_STEPS + 3;
+
+/// Codes rotations; `shifts` are the exponents of their steps, and whether each is free.
+pub fn code_rotations<C: Coder>(coder: &mut C, rows: &mut [Rotation], shifts: impl Iterator<Item = (i32, bool)>) -> Result<()> {
+    const FORM: usize = 3 * ROTATION_STEPS;
+    for (row, (shift, free)) in rows.iter_mut().zip(shifts) {
+        if !free {
+            row.form = coder.symbol(FORM, usize::from(row.form))? as u8 & 7;
+            row.norm = i32::try_from(signed(coder, FORM + 1, FORM + 2, i64::from(row.norm))?.clamp(-NORM_LIMIT, NORM_LIMIT)).unwrap_or(0);
+        }
+        let context = (shift + ROTATION_FINEST).clamp(0, ROTATION_STEPS as i32 - 1) as usize;
+        for (k, code) in row.codes.iter_mut().enumerate() {
+            *code = checked(symmetric(coder, k * ROTATION_STEPS + context, i64::from(*code))?)?;
+        }
     }
     Ok(())
 }
 
-/// Codes components of quaternions; `shifts` are the exponents of their steps, `width` the number of components of each row.
-pub fn code_rotations<C: Coder>(coder: &mut C, rows: &mut [[i32; 4]], shifts: impl Iterator<Item = (i32, usize)>) -> Result<()> {
-    let mut models = vec![[Model::default(), Model::default()]; 8 * 24];
-    for (row, (shift, width)) in rows.iter_mut().zip(shifts) {
-        let context = (shift + ROTATION_CONTEXTS).clamp(0, 23) as usize;
-        for (k, code) in row.iter_mut().take(width).enumerate() {
-            let [size, sign] = &mut models[(k + if width == 4 { 4 } else { 0 }) * 24 + context];
-            *code = checked(signed(coder, size, sign, i64::from(*code))?)?;
-        }
-    }
-    Ok(())
-}
-
-/// Codes opacities.
-pub fn code_opacities<C: Coder>(coder: &mut C, rows: &mut [i32], classes: &[u8]) -> Result<()> {
-    let mut models = vec![[Model::default(), Model::default()]; 16];
-    for (code, &class) in rows.iter_mut().zip(classes) {
-        let [size, sign] = &mut models[usize::from(class.min(15))];
-        *code = checked(signed(coder, size, sign, i64::from(*code))?)?;
-    }
-    Ok(())
-}
+/// Contexts of [`code_keys`].
+pub const KEY_CONTEXTS: usize = 32 + 48 + 64;
 
 /// Codes keys in ascending order: the difference to the one before, in the step of each row.
 pub fn code_keys<C: Coder>(coder: &mut C, keys: &mut [u64], shifts: impl Iterator<Item = u32>) -> Result<()> {
-    let mut lengths = vec![Model::default(); 16];
-    let mut quarters = vec![Model::default(); 64];
-    let mut top = vec![Model::default(); 64];
+    const LENGTHS: usize = 32;
+    const TOP: usize = LENGTHS + 48;
     let mut last = 0u64;
-    let mut quarter = 0;
+    let mut before = [0u32; 2];
     for (key, shift) in keys.iter_mut().zip(shifts) {
         let start = last >> (3 * shift);
         let step = (*key >> (3 * shift)).saturating_sub(start);
         let wanted = u64::BITS - step.leading_zeros();
-        quarter = coder.symbol(&mut quarters[quarter], wanted as usize >> 2)?;
-        let length = (quarter << 2 | coder.symbol(&mut lengths[quarter], wanted as usize & 3)? & 3) as u32;
+        // Steps that are likely now, from the cells of those before.
+        let expected = ((before[0] + before[1]) / 2).saturating_sub(3 * shift);
+        let quarter = coder.symbol((expected / 2) as usize & 31, wanted as usize >> 2)?;
+        let trend = (expected as usize >> 2).cmp(&quarter) as i8 + 1;
+        let length = (quarter << 2 | coder.symbol(LENGTHS + quarter * 3 + trend as usize, wanted as usize & 3)? & 3) as u32;
         let mut found = u64::from(length > 0);
         if length > 1 {
             let high = (length - 1).min(3);
-            let shown = coder.symbol(&mut top[length as usize & 63], (step >> (length - 1 - high)) as usize & ((1 << high) - 1))? as u64 & ((1 << high) - 1);
+            let shown = coder.symbol(TOP + (length as usize & 63), (step >> (length - 1 - high)) as usize & ((1 << high) - 1))? as u64 & ((1 << high) - 1);
             found = found << high | shown;
             let rest = length - 1 - high;
             let upper = rest.saturating_sub(32);
@@ -201,10 +225,13 @@ pub fn code_keys<C: Coder>(coder: &mut C, keys: &mut [u64], shifts: impl Iterato
         let next = start.checked_add(found).filter(|v| *v < 1 << (3 * GRID_BITS - 3 * shift));
         *key = next.ok_or_else(|| Error::data("entropy-coded centres", "a cell is outside of the grid", "The file is damaged"))? << (3 * shift);
         last = *key;
+        before = [length + 3 * shift, before[0]];
     }
     Ok(())
 }
 
-fn checked(code: i64) -> Result<i32> {
+/// `code`, unless it is out of range.
+#[inline]
+pub fn checked(code: i64) -> Result<i32> {
     if code.abs() < CODE_LIMIT { Ok(code as i32) } else { Err(Error::data("entropy-coded integer", format!("{code} is out of range"), "The file is damaged")) }
 }

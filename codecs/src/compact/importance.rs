@@ -24,6 +24,8 @@ const LEAST: f64 = 1e-2;
 pub struct Importance {
     /// Weight of a degree-0 colour coefficient of each Gaussian, mean over images `[N]`.
     pub weights: Vec<f64>,
+    /// The same for centres, scales, rotations and opacities, which matter more where a Gaussian differs from what is behind it `[N]`.
+    pub shapes: Vec<f64>,
     /// Pixels of an image, times channels.
     pub samples: f64,
     /// Pixels per world unit, median over Gaussians.
@@ -71,11 +73,12 @@ pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance
         // A Gaussian that fills the image is not seen beyond it.
         SH0 * SEEN * alpha * (std::f64::consts::PI * area).min(samples).sqrt()
     };
-    Importance { weights: (0..gaussians.len()).map(weight).collect(), samples, pixels_per_unit: median(&scale), steps: Steps::default() }
+    let weights: Vec<f64> = (0..gaussians.len()).map(weight).collect();
+    Importance { shapes: weights.clone(), weights, samples, pixels_per_unit: median(&scale), steps: Steps::default() }
 }
 
-/// Weights from derivatives of renders; `None` where the context cannot tell them.
-pub fn measure(gaussians: &HostGaussians, context: &CodecContext) -> Result<Option<Importance>> {
+/// Weights from derivatives of renders; `None` where the context cannot tell them. `apart` says whether shapes have weights of their own.
+pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool) -> Result<Option<Importance>> {
     let (Some(views), Some(renderer)) = (context.views, context.renderer) else { return Ok(None) };
     let chosen = views.len().min(VIEWS);
     if chosen == 0 || gaussians.is_empty() {
@@ -101,36 +104,57 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext) -> Result<Opti
     let n = gaussians.len();
     let colours: Vec<f64> = (0..n).map(|i| row(&total.sh_dc, 3, i) / 3.0).collect();
     let floor = LEAST * median(&colours).max(f64::MIN_POSITIVE);
-    // With the steps of each Gaussian in proportion to its colour's, the ratio of steps that is best is the inverse root of the mean ratio of weights.
-    let ratio = |weight: &dyn Fn(usize) -> f64| {
-        let mean = (0..n).map(|i| weight(i) / colours[i].max(floor)).sum::<f64>() / n as f64;
+    // With the steps of each Gaussian in proportion to the inverse of `of`, the ratio of steps that is best is the inverse root of the mean ratio of weights.
+    let mean = |weight: &dyn Fn(usize) -> f64, of: &[f64]| (0..n).map(|i| weight(i) / of[i].max(floor)).sum::<f64>() / n as f64;
+    let ratio = |weight: &dyn Fn(usize) -> f64, of: &[f64]| {
+        let mean = mean(weight, of);
         if mean > 0.0 && mean.is_finite() { (1.0 / mean).sqrt().clamp(1e-3, 1e3) } else { 1.0 }
     };
     let width = 3 * cc4dgs_format::gaussians::sh_rest_len(gaussians.sh_degree);
     let degree = |d: usize| {
         let (from, to) = (3 * (d * d - 1), 3 * ((d + 1) * (d + 1) - 1));
-        if d > gaussians.sh_degree { 1.0 } else { ratio(&|i| row(&total.sh_rest[i * width + from..i * width + to], to - from, 0) / (to - from) as f64) }
+        if d > gaussians.sh_degree {
+            1.0
+        } else {
+            ratio(&|i| row(&total.sh_rest[i * width + from..i * width + to], to - from, 0) / (to - from) as f64, &colours)
+        }
     };
+    let means = |i: usize| row(&total.means, 3, i) / 3.0 * sizes(&gaussians.log_scales[3 * i..3 * i + 3]).0.powi(2);
+    let log_scales = |i: usize| row(&total.log_scales, 3, i) / 3.0;
+    let quaternions = |i: usize| {
+        let q = &gaussians.quaternions[4 * i..4 * i + 4];
+        let norm: f64 = q.iter().map(|&v| f64::from(v).powi(2)).sum();
+        let s = &gaussians.log_scales[3 * i..3 * i + 3];
+        let octaves = f64::from(s.iter().copied().fold(f32::MIN, f32::max) - s.iter().copied().fold(f32::MAX, f32::min)) / std::f64::consts::LN_2;
+        let finer = [0.25, 2.0, 4.0, 8.0][(octaves + 0.5).clamp(0.0, 3.0) as usize];
+        row(&total.quaternions, 4, i) / 3.0 * norm / (finer * finer)
+    };
+    let opacity_logits = |i: usize| f64::from(total.opacity_logits[i]) * (1.0 + f64::from(gaussians.opacity_logits[i]).max(0.0)).powi(2);
+    // Weights of shapes are the mean of those of their attributes, each with the same mean ratio to those of colours.
+    let mut shapes = vec![0.0; if apart { n } else { 0 }];
+    for weight in [&means as &dyn Fn(usize) -> f64, &log_scales, &quaternions, &opacity_logits] {
+        let mean = mean(weight, &colours);
+        if mean > 0.0 && mean.is_finite() {
+            shapes.iter_mut().enumerate().for_each(|(i, shape)| *shape += weight(i) / mean);
+        }
+    }
+    if shapes.is_empty() {
+        shapes.clone_from(&colours);
+    }
+    // The median ratio to the weights of colours is 1, so that most classes agree.
+    let middle = median(&shapes.iter().zip(&colours).map(|(s, c)| s / c.max(floor)).collect::<Vec<_>>());
+    let middle = if middle > 0.0 && middle.is_finite() { middle } else { 1.0 };
+    shapes.iter_mut().for_each(|s| *s /= middle);
     let steps = Steps {
-        means: ratio(&|i| row(&total.means, 3, i) / 3.0 * sizes(&gaussians.log_scales[3 * i..3 * i + 3]).0.powi(2)),
-        log_scales: ratio(&|i| row(&total.log_scales, 3, i) / 3.0),
-        quaternions: ratio(&|i| {
-            let q = &gaussians.quaternions[4 * i..4 * i + 4];
-            let norm: f64 = q.iter().map(|&v| f64::from(v).powi(2)).sum();
-            let s = &gaussians.log_scales[3 * i..3 * i + 3];
-            let octaves = f64::from(s.iter().copied().fold(f32::MIN, f32::max) - s.iter().copied().fold(f32::MAX, f32::min)) / std::f64::consts::LN_2;
-            let finer = [0.25, 2.0, 4.0, 8.0][(octaves + 0.5).clamp(0.0, 3.0) as usize];
-            row(&total.quaternions, 4, i) / 3.0 * norm / (finer * finer)
-        }),
-        opacity_logits: ratio(&|i| {
-            let x = f64::from(gaussians.opacity_logits[i]);
-            f64::from(total.opacity_logits[i]) * (1.0 + x.max(0.0)).powi(2)
-        }),
+        means: ratio(&means, &shapes),
+        log_scales: ratio(&log_scales, &shapes),
+        quaternions: ratio(&quaternions, &shapes),
+        opacity_logits: ratio(&opacity_logits, &shapes),
         sh_rest: [degree(1), degree(2), degree(3), degree(4)],
     };
     let (scale, samples) = pixel_scales(gaussians, context);
-    let weights = colours.iter().map(|w| (w / chosen as f64).sqrt()).collect();
-    Ok(Some(Importance { weights, samples, pixels_per_unit: median(&scale), steps }))
+    let root = |squares: Vec<f64>| squares.into_iter().map(|w| (w / chosen as f64).sqrt()).collect();
+    Ok(Some(Importance { weights: root(colours), shapes: root(shapes), samples, pixels_per_unit: median(&scale), steps }))
 }
 
 /// Pixels per world unit at each Gaussian (root of the mean square over cameras that see it), and the samples of an image.

@@ -1,35 +1,37 @@
-//! `compact`: quantised by what is seen, transformed, and entropy coded with adaptive integer models.
+//! `compact`: quantised by what is seen, transformed, predicted, and entropy coded.
 //!
 //! The step of every value follows from how much its error changes rendered images. Gaussians fall into classes; the steps of one class are twice those of
 //! the class before. Weights come from derivatives of renders on the training views, or from sizes and opacities. Streams, in the order in which a player
 //! needs them: classes, scales, centres, rotations, opacities, degree-0 colours, then the higher degrees one by one.
 
+mod allocate;
+mod bits;
 mod blocks;
 mod colors;
 mod encode;
 mod entropy;
 mod geometry;
 mod importance;
+mod predict;
+mod read;
 mod search;
 mod settings;
-mod streams;
 mod transform;
 mod weights;
+mod write;
 
 pub(crate) use weights::build as build_weights;
 
 use cc4dgs_format::storage::relative_rms;
 use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
 use colors::Choices;
-use encode::Factors;
+use encode::{Classes, Factors};
 use importance::Importance;
 use settings::Settings;
-use streams::Motion;
+use write::Motion;
 
 /// Version of the stored form.
-const VERSION: u8 = 1;
-/// The degree whose coordinates are predicted by earlier rows.
-const PREDICTED: usize = 0;
+const VERSION: u8 = 2;
 /// Largest losses: column and root-mean-square error over the standard deviation. Gaussians that are hardly seen may lose much.
 const LOSSES: [(&str, f64); 7] = [
     ("means", 0.01),
@@ -55,10 +57,11 @@ struct Job<'a> {
     gaussians: &'a HostGaussians,
     free: Vec<bool>,
     importance: &'a Importance,
-    classes: Vec<u8>,
-    top: f64,
+    classes: Classes,
     motion: Motion,
     choices: Choices,
+    /// Of the columns, to start with.
+    factors: Factors,
     limits: &'a CodecContext<'a>,
 }
 
@@ -71,13 +74,16 @@ struct Attempt {
 
 impl Job<'_> {
     fn attempt(&self, quality: f64) -> Result<Attempt> {
-        let mut factors: Factors = [1.0; 6];
+        self.attempt_with(quality, &self.factors)
+    }
+    fn attempt_with(&self, quality: f64, factors: &Factors) -> Result<Attempt> {
+        let mut factors = *factors;
         for halvings in 0.. {
-            let of = encode::quantise(self.gaussians, &self.free, self.importance, (&self.classes, self.top), quality, &factors, &self.choices);
+            let of = encode::quantise(self.gaussians, &self.free, self.importance, &self.classes, quality, &factors, &self.choices);
             let mut order: Vec<usize> = (0..self.gaussians.len()).collect();
             order.sort_by_key(|&i| (of.keys[i], i));
-            let streams = streams::write(self.gaussians, &of, &self.motion, &order)?;
-            let found = streams::read(&streams, &CodecContext::new(self.limits.seed, self.limits.limits, self.limits.events))?;
+            let streams = write::write(self.gaussians, &of, &self.motion, &order)?;
+            let found = read::read(&streams, &CodecContext::new(self.limits.seed, self.limits.limits, self.limits.events))?;
             let expected = self.gaussians.select(&order);
             let mut kept = true;
             for (((name, _, before), (_, _, after)), factor) in expected.columns().into_iter().zip(found.columns()).zip(&mut factors) {
@@ -143,17 +149,17 @@ fn keeps_shapes(gaussians: &HostGaussians, context: &CodecContext) -> Result<boo
 impl AttributeCodec for Compact {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
         gaussians.validate("Gaussians to encode", &context.limits)?;
-        let measured = if self.settings.measured { importance::measure(gaussians, context)? } else { None };
+        let measured = if self.settings.measured { importance::measure(gaussians, context, self.settings.adaptive && self.settings.shapes)? } else { None };
         let importance = measured.unwrap_or_else(|| importance::estimate(gaussians, context));
         let (motion, free) = self.motion(gaussians, context)?;
         let canonical = encode::canonical(gaussians, &free);
-        let (classes, top) = encode::classify(&importance.weights, self.settings.adaptive);
-        let choices = Choices { transform: self.settings.transform, dead_zone: self.settings.dead_zone };
-        let job = Job { gaussians: &canonical, free, importance: &importance, classes, top, motion, choices, limits: context };
-        Ok(search::search(&job, &self.settings, context)?.streams)
+        let classes = encode::classify(&importance.weights, &importance.shapes, self.settings.adaptive);
+        let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
+        let mut job = Job { gaussians: &canonical, free, importance: &importance, classes, motion, choices, factors: [1.0; 6], limits: context };
+        Ok(search::search(&mut job, &self.settings, context)?.streams)
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        streams::read(streams, context)
+        read::read(streams, context)
     }
     fn losses(&self) -> Vec<DeclaredLoss> {
         LOSSES.map(|(attribute, relative_rms)| DeclaredLoss { attribute: attribute.into(), relative_rms }).into()
@@ -172,8 +178,8 @@ inventory::submit! {
         info: Plugin {
             name: "compact",
             version: "1",
-            summary: "steps by what is seen, transformed colours, adaptive entropy coding: the smallest files",
-            paper: "rate-distortion allocation; octave classes; Karhunen-Loève transform; range coding (constriction)",
+            summary: "steps by what is seen, transformed colours, entropy coding: the smallest files",
+            paper: "rate-distortion allocation; octave classes; Karhunen-Loève transform; asymmetric numeral systems (constriction)",
             schema: settings::SCHEMA,
             capabilities: &["lossy", "reorders"],
         },

@@ -2,13 +2,16 @@
 
 use super::importance::Importance;
 use super::settings::Settings;
-use super::{Attempt, Job, streams};
+use super::{Attempt, Job, allocate, read};
 use cc4dgs_format::{CodecContext, Error, Event, HostGaussians, RenderModel, Result, TrainingViews};
 
 /// Views on which the loss is measured.
 const VIEWS: usize = 16;
 /// Attempts of a search.
 const ATTEMPTS: usize = 7;
+/// Factors by which steps grow in search of a limit: at first, and near to it.
+const WIDE: f64 = 2.0;
+const NARROW: f64 = 1.2;
 /// Parameters of a Gaussian that are not rounded to zero, for the estimate of the error.
 const PARAMETERS: f64 = 20.0;
 /// A file of this share of the limit is good enough.
@@ -21,12 +24,19 @@ pub fn estimate(psnr_db: f64, importance: &Importance) -> f64 {
 }
 
 /// The streams that the settings ask for.
-pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<Attempt> {
+pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Result<Attempt> {
     let start = estimate(settings.psnr_db, job.importance);
     let object = "codec compact";
+    let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer);
+    let allocation = services.filter(|_| settings.allocate && !job.gaussians.is_empty());
     if settings.max_size_mb > 0.0 {
+        if let Some((views, renderer)) = allocation {
+            job.factors = allocate::allocate(job, start, views, renderer, context)?;
+        }
+        let job = &*job;
         let limit = settings.max_size_mb * 1e6;
-        let found = bisect(job, start, -1.0, |attempt| Ok(attempt.bytes as f64 <= limit), |attempt| attempt.bytes as f64 >= GOOD_SIZE * limit)?;
+        let found =
+            bisect(job, (start, WIDE), (-1.0, ATTEMPTS), |attempt| Ok(attempt.bytes as f64 <= limit), |attempt| attempt.bytes as f64 >= GOOD_SIZE * limit)?;
         if found.bytes as f64 > limit {
             let remedy = "Allow more, or remove Gaussians with `cc4dgs prune`";
             return Err(Error::parameter(object, format!("{} bytes are the least that it reached", found.bytes), remedy));
@@ -42,7 +52,7 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
         );
         return Ok(found);
     }
-    let (Some(views), Some(renderer)) = (context.views.filter(|v| !v.is_empty()), context.renderer) else {
+    let Some((views, renderer)) = services else {
         if settings.drop_wanted {
             let problem = "a loss of PSNR is measured on training views, and there are none";
             return Err(Error::parameter(object, problem, "Give the dataset with --scene, or choose compact:psnr=50dB or compact:max-size=5MB"));
@@ -54,7 +64,7 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
     }
     let before = Losses::of(job.gaussians, views, renderer)?;
     let drop_of =
-        |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&streams::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
+        |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&read::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
     let best = std::cell::Cell::new((0.0, f64::NAN));
     let allowed = |attempt: &Attempt| {
         let drop = drop_of(attempt)?;
@@ -63,8 +73,30 @@ pub fn search(job: &Job, settings: &Settings, context: &CodecContext) -> Result<
         }
         Ok(drop <= settings.max_drop_db)
     };
-    let found = bisect(job, start, 1.0, allowed, |_| false)?;
-    let (_, drop) = best.get();
+    let mut found = bisect(job, (start, WIDE), (1.0, ATTEMPTS), allowed, |_| false)?;
+    if allocation.is_some() {
+        job.factors = allocate::allocate(job, found.quality, views, renderer, context)?;
+        let factors = job.factors;
+        note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {factors:.2?}"));
+        let (first, drop) = (found, best.replace((0.0, f64::NAN)));
+        found = bisect(job, (first.quality, NARROW), (1.0, ATTEMPTS), allowed, |_| false)?;
+        // Small models may gain nothing.
+        if first.bytes <= found.bytes || best.get().0 == 0.0 {
+            found = first;
+            best.set(drop);
+        }
+    }
+    let (kept, mut drop) = best.get();
+    if kept == 0.0 {
+        drop = drop_of(&found)?;
+        if drop > settings.max_drop_db {
+            let problem = format!("the finest steps tried lose {drop:.3} dB on training views, {} dB are allowed", settings.max_drop_db);
+            if settings.drop_wanted {
+                return Err(Error::parameter(object, problem, "Allow more, or choose compact:psnr=70dB or the codec raw"));
+            }
+            context.events.emit(&Event::Warning { object: object.into(), message: problem });
+        }
+    }
     note(
         context,
         format!(
@@ -89,23 +121,30 @@ fn note(context: &CodecContext, message: String) {
 
 /// The attempt with the largest steps (`direction` 1) or the smallest (-1) that is `allowed`, by bisection of the logarithm; an attempt far on the other side
 /// if none is.
-fn bisect(job: &Job, start: f64, direction: f64, allowed: impl Fn(&Attempt) -> Result<bool>, good: impl Fn(&Attempt) -> bool) -> Result<Attempt> {
+fn bisect(
+    job: &Job,
+    (start, growth): (f64, f64),
+    (direction, attempts): (f64, usize),
+    allowed: impl Fn(&Attempt) -> Result<bool>,
+    good: impl Fn(&Attempt) -> bool,
+) -> Result<Attempt> {
     let (mut best, mut refused): (Option<Attempt>, Option<f64>) = (None, None);
     let mut quality = start;
-    for _ in 0..ATTEMPTS {
-        let attempt = job.attempt(quality)?;
-        if allowed(&attempt)? {
-            if good(&attempt) {
-                return Ok(attempt);
+    for attempt in 0..attempts {
+        let found = job.attempt(quality)?;
+        if allowed(&found)? {
+            if good(&found) {
+                return Ok(found);
             }
-            best = Some(attempt);
+            best = Some(found);
         } else {
             refused = Some(quality);
         }
+        // Where nothing was allowed yet, later attempts go farther.
         quality = match (&best, refused) {
             (Some(best), Some(refused)) => (best.quality * refused).sqrt(),
-            (Some(best), None) => best.quality * libm::pow(2.0, direction),
-            (None, _) => quality / libm::pow(2.5, direction),
+            (Some(best), None) => best.quality * libm::pow(growth, direction),
+            (None, _) => quality / libm::pow(growth * (1.0 + 0.25 * attempt as f64), direction),
         };
     }
     match best {

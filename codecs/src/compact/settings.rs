@@ -7,9 +7,11 @@ pub(super) const SCHEMA: &str = "\
 max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. 0: psnr_db
 max_size_mb = 0.0        # the best file of at most so many MB; `compact:max-size=5MB` for short. 0: no limit
 psnr_db = 50.0           # without --scene: estimated PSNR between images before and after; `compact:psnr=50dB` for short
-dead_zone = 0.15         # share of a step by which colour coefficients above degree 0 are rounded towards zero
+rate_weight = 0.0        # how much bits count when colour coefficients above degree 0 are rounded; 0 rounds to the nearest, which is best for images
 measured = true          # with --scene: weights from derivatives of renders; false: from sizes and opacities
 adaptive = true          # steps of their own for Gaussians that are seen more or less
+shapes = true            # with --scene: steps of shapes by the weights of shapes; false: by those of colours
+allocate = true          # with --scene: correct the steps of the columns by what a change of each costs and saves
 transform = true         # transform the colour coefficients of each degree
 canonical = true         # sort the axes of Gaussians whose shape does not change
 ";
@@ -24,12 +26,16 @@ pub struct Settings {
     pub max_size_mb: f64,
     /// Estimated PSNR between images before and after, in dB.
     pub psnr_db: f64,
-    /// Share of a step by which colour coefficients are rounded towards zero.
-    pub dead_zone: f64,
+    /// How much bits count when colour coefficients are rounded.
+    pub rate_weight: f64,
     /// Measure weights where the context can render.
     pub measured: bool,
     /// Classes of steps.
     pub adaptive: bool,
+    /// Weights of their own for shapes.
+    pub shapes: bool,
+    /// Measure what the steps of each column cost and save.
+    pub allocate: bool,
     /// Transform colour coefficients.
     pub transform: bool,
     /// Sort axes.
@@ -45,9 +51,11 @@ impl Default for Settings {
             max_drop_db: 0.05,
             max_size_mb: 0.0,
             psnr_db: 50.0,
-            dead_zone: 0.15,
+            rate_weight: 0.0,
             measured: true,
             adaptive: true,
+            shapes: true,
+            allocate: true,
             transform: true,
             canonical: true,
             drop_wanted: false,
@@ -83,7 +91,7 @@ impl Settings {
             ("max_drop_db", settings.max_drop_db, 0.0..=20.0),
             ("max_size_mb", settings.max_size_mb, 0.0..=1e6),
             ("psnr_db", settings.psnr_db, 15.0..=90.0),
-            ("dead_zone", settings.dead_zone, 0.0..=0.4),
+            ("rate_weight", settings.rate_weight, 0.0..=4.0),
         ];
         match bounds.into_iter().find(|(_, value, range)| !range.contains(value)) {
             Some((name, value, range)) => {

@@ -1,6 +1,7 @@
 //! A model as a `.cc4d` archive.
 
 use crate::codec_services::{ModelServices, SceneViews};
+use crate::field_weights::FieldWeights;
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -24,7 +25,7 @@ pub struct ArchiveOptions<'a> {
     pub codec: &'a str,
     /// Settings of that codec.
     pub settings: &'a toml::Table,
-    /// Name of the weight codec of the field.
+    /// Weight codec of the field: see [`FieldWeights::parse`].
     pub field_weights: &'a str,
     /// The scene that the model was trained on and the device that its field is on, for codecs that make use of the training views, of renders and of the
     /// field. Every codec works without.
@@ -121,13 +122,18 @@ impl Model {
         // A field that moves nothing is not stored.
         let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
         let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
+        let mut field_streams = Vec::new();
         let deformer = match field {
             None => None,
             Some(f) => {
                 let (name, settings) = split_kind("deformer", &f.section)?;
                 let version = registry.deformer(&name)?.info.version.to_string();
-                let weight_version = registry.weight_codec(field_weights)?.info.version.to_string();
-                let weights = CodecEntry { name: field_weights.into(), version: weight_version, ..Default::default() };
+                let chosen = FieldWeights::parse(field_weights, registry)?;
+                let weight_version = registry.weight_codec(&chosen.name)?.info.version.to_string();
+                let (seed, device) = (weight_seed(self.provenance.seed), scene.map(|(_, device)| device));
+                let (streams, weight_settings) = chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context(seed), registry)?;
+                field_streams.extend(streams.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s }));
+                let weights = CodecEntry { name: chosen.name, version: weight_version, settings: weight_settings, ..Default::default() };
                 Some(DeformerEntry { name, version, settings, context: f.context.clone(), weights })
             }
         };
@@ -161,13 +167,7 @@ impl Model {
             extra,
             ..Default::default()
         };
-        let mut writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams);
-        if let Some(f) = field {
-            let codec = registry.build_weight_codec(field_weights, &toml::Table::new())?;
-            let streams = codec.encode(&weights_of(f.field.as_ref())?, &context(weight_seed(self.provenance.seed)))?;
-            writer = writer.add_all(StreamKind::Field, streams.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s }));
-        }
-        Ok(writer)
+        Ok(ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams))
     }
     /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
     fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {
@@ -259,7 +259,8 @@ fn weights_of(field: &dyn Deformer) -> Result<Vec<WeightArray>> {
         .collect()
 }
 
-fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
+/// Replaces the weights of `field`, which must have arrays of the same names and shapes.
+pub(crate) fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
     let wanted: Vec<(String, Vec<usize>)> = field.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect();
     let found: Vec<(String, Vec<usize>)> = weights.iter().map(|w| (w.name.clone(), w.shape.clone())).collect();
     if wanted != found {

@@ -8,6 +8,7 @@ mod archive;
 pub mod bake;
 pub mod checkpoint;
 pub mod codec_services;
+pub mod field_weights;
 pub mod model;
 mod moving;
 mod orbit;

@@ -104,6 +104,30 @@ fn a_codec_gets_views_renderer_and_field_only_with_a_scene() {
 }
 
 #[test]
+fn weights_take_the_fewest_bits_that_keep_the_psnr() {
+    let registry = Registry::collect().unwrap();
+    let (model, scene, device) = (model(&registry), scene(), Device::flex());
+    let folder = tempfile::tempdir().unwrap();
+    let (settings, path) = (toml::Table::new(), folder.path().join("m.cc4d"));
+    let bits = |field_weights: &str| {
+        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights, scene: Some((&scene, &device)) };
+        model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap();
+        let entry = Archive::open(&path, &Limits::default()).unwrap().manifest().deformer.clone().unwrap().weights;
+        Model::open(&path, &registry, &device, &Limits::default(), &Silent).unwrap();
+        entry.settings["bits"].as_integer().unwrap()
+    };
+    assert_eq!((bits("compact:bits=5"), bits("compact:max-drop=20dB")), (5, 3));
+    assert!(bits("compact:max-drop=0.000001dB") > 3);
+    for bad in ["compact:max-drop=x", "fp16:max-drop=0.1dB", "compact:bits=13", "compact:bits", "nothing"] {
+        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: bad, scene: Some((&scene, &device)) };
+        assert!(model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).is_err(), "{bad}");
+    }
+    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=0.1dB", scene: None };
+    let refused = model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap_err();
+    assert!(refused.to_string().contains("--scene"), "{refused}");
+}
+
+#[test]
 fn services_move_and_draw_as_playback_does() {
     let registry = Registry::collect().unwrap();
     let (model, scene, device) = (model(&registry), scene(), Device::flex());

@@ -6,6 +6,7 @@ use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
 use cc4dgs_core::{Event, EventSink, Result, config};
+use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::eval::SizeMb;
@@ -57,7 +58,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let mut settings = toml::Table::new();
     config::set_all(&mut settings, &args.sets)?;
     // An unknown name is refused before the scene is read.
-    context.registry.weight_codec(&args.field_weights)?;
+    FieldWeights::parse(&args.field_weights, &context.registry)?;
     let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?;
     let options = ArchiveOptions {
         codec: &args.codec,

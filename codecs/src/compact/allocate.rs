@@ -1,0 +1,50 @@
+//! Steps of the columns relative to each other, from what a change of each costs and saves: at the best ratio all columns give the same bytes for the same
+//! error of images. Derivatives give the steps to start with; this corrects for what they leave out, such as large steps and prediction.
+
+use super::Job;
+use super::encode::Factors;
+use super::read;
+use cc4dgs_format::{CodecContext, RenderModel, Result, TrainingViews};
+
+/// Views on which the error is measured.
+const VIEWS: usize = 8;
+/// The change of a step that is tried.
+const CHANGE: f64 = 2.0;
+/// Largest factor, and the inverse of the smallest.
+const LARGEST: f64 = 2.0;
+
+/// The factors of the columns at about the step factor `quality`.
+pub fn allocate(job: &Job, quality: f64, views: &dyn TrainingViews, renderer: &dyn RenderModel, context: &CodecContext) -> Result<Factors> {
+    let chosen = views.len().min(VIEWS);
+    let view = |k: usize| views.view(k * views.len() / chosen);
+    let originals = (0..chosen).map(|k| Ok(renderer.render(job.gaussians, view(k).0, view(k).1)?.planes)).collect::<Result<Vec<Vec<f32>>>>()?;
+    let measure = |factors: &Factors| -> Result<(f64, f64)> {
+        let attempt = job.attempt_with(quality, factors)?;
+        let found = read::read(&attempt.streams, &CodecContext::new(context.seed, context.limits, context.events))?;
+        let mut error = 0.0;
+        for (k, original) in originals.iter().enumerate() {
+            let drawn = renderer.render(&found, view(k).0, view(k).1)?;
+            let colours = 3 * drawn.width as usize * drawn.height as usize;
+            error += original.iter().zip(&drawn.planes).take(colours).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
+        }
+        Ok((error, attempt.bytes as f64))
+    };
+    let mut factors: Factors = [1.0; 6];
+    let (error, bytes) = measure(&factors)?;
+    // With a factor f, the error of a column is a f² and its size b - c log2 f.
+    let (mut errors, mut slopes) = ([0.0; 6], [0.0; 6]);
+    for column in 0..factors.len() {
+        let mut changed = factors;
+        changed[column] = CHANGE;
+        let (more, less) = measure(&changed)?;
+        errors[column] = (more - error) / (CHANGE * CHANGE - 1.0);
+        slopes[column] = (bytes - less) / libm::log2(CHANGE);
+    }
+    let sound: Vec<usize> = (0..6).filter(|&c| errors[c] > 0.0 && slopes[c] > 0.0).collect();
+    let (total, slope) = (sound.iter().map(|&c| errors[c]).sum::<f64>(), sound.iter().map(|&c| slopes[c]).sum::<f64>());
+    for column in sound {
+        // The same error in all: the share of the error of each is its share of the slopes.
+        factors[column] = (total * slopes[column] / (slope * errors[column])).sqrt().clamp(1.0 / LARGEST, LARGEST);
+    }
+    Ok(factors)
+}

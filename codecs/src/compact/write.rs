@@ -1,0 +1,163 @@
+//! The streams of quantised Gaussians.
+
+use super::colors::{self, Activity, SMALL_CONTEXTS, code_small};
+use super::encode::{Classes, Integers, coefficients};
+use super::geometry::{KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
+use super::predict::{GIVEN, Known, Linear};
+use super::{VERSION, blocks};
+use cc4dgs_format::storage::column::{self, Target};
+use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams};
+use cc4dgs_format::{HostGaussians, Result, Stream};
+
+pub(super) const CLASSES: &str = "classes";
+pub(super) const SHAPES: &str = "shapes";
+pub(super) const SCALES: &str = "log_scales";
+pub(super) const MEANS: &str = "means";
+pub(super) const ROTATIONS: &str = "quaternions";
+pub(super) const OPACITIES: &str = "opacity_logits";
+pub(super) const MOVING: &str = "moving";
+pub(super) const SCORES: &str = "dynamic_scores";
+pub(super) const EXACT: &str = "exact";
+/// Largest distance of the two classes of a Gaussian.
+pub const APART: u8 = 7;
+/// Without a threshold, scores are stored as numbers.
+const SCORE: Target = Target { bits: 10, mu_law: true, loss: 0.05, tail: 1e-3 };
+/// What an octave of a class counts in predictions.
+const OCTAVE: i64 = 512;
+
+/// Which rows have rotations of three components, and how scores are stored.
+pub struct Motion {
+    /// 0: none, 1: all, 2: those that do not move.
+    pub free: u8,
+    /// Whether each Gaussian moves; `None` if the threshold is unknown.
+    pub moving: Option<Vec<bool>>,
+    /// Scores of Gaussians that stay and that move.
+    pub levels: [f32; 2],
+}
+
+impl Motion {
+    /// Whether the rotation of a row is free; `moving` is 0 or 1 per row, or empty.
+    pub fn is_free(&self, row: usize, moving: &[u8]) -> bool {
+        match self.free {
+            0 => false,
+            1 => true,
+            _ => moving.get(row) == Some(&0),
+        }
+    }
+}
+
+/// What predicts scales and colours of a row.
+pub fn known_classes(color: u8, shape: u8, for_color: bool, limit: u8) -> Known {
+    let class = if for_color { color } else { shape };
+    Known { class, shift: class.min(limit), given: [i64::from(color) * OCTAVE, i64::from(shape) * OCTAVE, 0, 0, 0] }
+}
+
+/// What predicts the opacity of a row: its classes and its scales, in the steps of class 0.
+pub fn known_scales(color: u8, shape: u8, scales: &[i32; 3], scale_limit: u8, limit: u8) -> Known {
+    let mut out = known_classes(color, shape, false, limit);
+    for (given, &code) in out.given[GIVEN - 3..].iter_mut().zip(scales) {
+        *given = i64::from(code) << shape.min(scale_limit);
+    }
+    out
+}
+
+/// All streams; `order` sorts the rows by their keys.
+pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &[usize]) -> Result<Vec<Stream>> {
+    let n = order.len();
+    let sorted = gaussians.select(order);
+    let pick = |values: &[u8]| order.iter().map(|&i| values[i]).collect::<Vec<u8>>();
+    let Classes { colors: classes, shapes, .. } = &of.classes;
+    let (classes, shapes) = (pick(classes), pick(shapes));
+    let scales: Vec<[i32; 3]> = order.iter().map(|&i| of.scales[i]).collect();
+    let moving: Vec<u8> = order.iter().map(|&i| motion.moving.as_ref().map_or(0, |m| u8::from(m[i]))).collect();
+    let opacities: Vec<i32> = order.iter().map(|&i| of.opacities[i]).collect();
+    let colors: Vec<Vec<i32>> =
+        of.degrees.iter().zip(&of.colors).map(|(d, codes)| order.iter().flat_map(|&i| &codes[i * d.dims..(i + 1) * d.dims]).copied().collect()).collect();
+    let geometry = &of.geometry;
+    let rows = || classes.iter().zip(&shapes);
+    let for_scales: Vec<Known> = rows().map(|(&c, &s)| known_classes(c, s, false, geometry.scale_limit)).collect();
+    let for_opacities: Vec<Known> =
+        rows().zip(&scales).map(|((&c, &s), scales)| known_scales(c, s, scales, geometry.scale_limit, geometry.opacity_limit)).collect();
+    let for_colors: Vec<Known> = rows().map(|(&c, &s)| known_classes(c, s, true, 15)).collect();
+    let (scale_plan, opacity_plan) = (Linear::fit(3, scales.as_flattened(), &for_scales), Linear::fit(1, &opacities, &for_opacities));
+    let color_plan = Linear::fit(3, &colors[0], &for_colors);
+
+    let mut meta = vec![VERSION];
+    Shape::of(&sorted).write(&mut meta)?;
+    geometry.write(&mut meta);
+    meta.extend([motion.free, u8::from(motion.moving.is_some())]);
+    motion.levels.iter().for_each(|v| meta.extend(v.to_le_bytes()));
+    [&scale_plan, &opacity_plan, &color_plan].iter().for_each(|plan| plan.write(&mut meta));
+    of.degrees.iter().for_each(|d| d.write(&mut meta));
+
+    let small = |name: &str, values: &[u8]| blocks::encode(name, SMALL_CONTEXTS, n, |coder, range| code_small(coder, &mut values[range].to_vec()));
+    let predicted = |name: &str, dims: usize, plan: &Linear, codes: &[i32], known: &[Known]| {
+        blocks::encode(name, Linear::contexts(dims), n, |coder, range| {
+            plan.code(coder, &mut codes[range.start * dims..range.end * dims].to_vec(), &known[range])
+        })
+    };
+    let apart: Vec<u8> = rows().map(|(&c, &s)| s + APART - c).collect();
+    let mut streams = vec![Stream { name: META.into(), bytes: meta }, Stream { name: EXACT.into(), bytes: write_exact(&sorted, of, order) }];
+    streams.extend([small(CLASSES, &classes)?, small(SHAPES, &apart)?]);
+    streams.push(match motion.moving {
+        Some(_) => small(MOVING, &moving)?,
+        None => {
+            let column = column::encode(&sorted.dynamic_scores, SCORE);
+            let mut bytes = Vec::new();
+            column.form.write(&mut bytes);
+            column::write_escapes(&column.escapes, &mut bytes);
+            bytes.extend(column.codes);
+            Stream { name: SCORES.into(), bytes }
+        }
+    });
+    streams.push(predicted(SCALES, 3, &scale_plan, scales.as_flattened(), &for_scales)?);
+    let keys: Vec<u64> = order.iter().map(|&i| of.keys[i]).collect();
+    streams.push(blocks::encode(MEANS, KEY_CONTEXTS, n, |coder, range| {
+        code_keys(coder, &mut keys[range.clone()].to_vec(), range.map(|i| geometry.position_shift(scales[i], shapes[i])))
+    })?);
+    let rotations: Vec<Rotation> = order.iter().map(|&i| of.rotations[i]).collect();
+    streams.push(blocks::encode(ROTATIONS, ROTATION_CONTEXTS, n, |coder, range| {
+        let shifts = range.clone().map(|i| (geometry.rotation_shift(scales[i], shapes[i]), motion.is_free(i, &moving)));
+        code_rotations(coder, &mut rotations[range].to_vec(), shifts)
+    })?);
+    streams.push(predicted(OPACITIES, 1, &opacity_plan, &opacities, &for_opacities)?);
+    streams.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
+    let mut activity = vec![Activity::default(); n];
+    for (degree, (plan, codes)) in of.degrees.iter().zip(&colors).enumerate().skip(1) {
+        streams.push(blocks::encode(color_name(degree), colors::CONTEXTS, n, |coder, range| {
+            let mut values = codes[range.start * plan.dims..range.end * plan.dims].to_vec();
+            plan.code(coder, &mut values, &classes[range.clone()], &mut activity[range].to_vec())
+        })?);
+        activity.iter_mut().zip(codes.chunks_exact(plan.dims)).zip(&classes).for_each(|((a, codes), &class)| plan.note(codes, class, a));
+    }
+    streams.extend(extra_streams(&sorted, Attributes::AsAllowed));
+    Ok(streams)
+}
+
+/// The stream of a degree's coefficients.
+pub fn color_name(degree: usize) -> String {
+    format!("sh.{degree}")
+}
+
+/// Columns of `gaussians` in the order of [`Integers::exact`].
+fn exact_columns(gaussians: &HostGaussians) -> Vec<(usize, Vec<f32>)> {
+    let plain = [&gaussians.means, &gaussians.log_scales, &gaussians.quaternions, &gaussians.opacity_logits];
+    let degrees = (0..=gaussians.sh_degree).map(|d| (3 * (2 * d + 1), coefficients(gaussians, d)));
+    plain.into_iter().zip([3, 3, 4, 1]).map(|(values, width)| (width, values.clone())).chain(degrees).collect()
+}
+
+fn write_exact(sorted: &HostGaussians, of: &Integers, order: &[usize]) -> Vec<u8> {
+    let mut out = Vec::new();
+    let mut place = vec![0u32; order.len()];
+    order.iter().enumerate().for_each(|(at, &i)| place[i] = at as u32);
+    for (rows, (width, values)) in of.exact.iter().zip(exact_columns(sorted)) {
+        let mut rows: Vec<u32> = rows.iter().map(|&i| place[i]).collect();
+        rows.sort_unstable();
+        out.extend((rows.len() as u32).to_le_bytes());
+        if rows.len() < order.len() {
+            rows.iter().for_each(|row| out.extend(row.to_le_bytes()));
+        }
+        rows.iter().flat_map(|&row| &values[row as usize * width..(row as usize + 1) * width]).for_each(|v| out.extend(v.to_le_bytes()));
+    }
+    out
+}

@@ -1,0 +1,127 @@
+//! `compact` with views and a renderer: the loss is kept, and measured steps are never worse than estimated ones.
+#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
+
+use cc4dgs_format::{
+    Camera, CodecContext, CodecPlugin, Entries, Event, EventSink, HostGaussians, Image8, Limits, RenderModel, RenderedPlanes, Result, Seed, Silent, Stream,
+    TrainingViews, toml,
+};
+use std::sync::Mutex;
+
+const SIZE: usize = 24;
+
+/// Draws every Gaussian as a blot, without order, so that images depend smoothly on all values.
+struct Blots;
+
+impl RenderModel for Blots {
+    fn render(&self, g: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<RenderedPlanes> {
+        let mut planes = vec![0.0; 5 * SIZE * SIZE];
+        let width = g.sh_rest.len() / g.len().max(1);
+        for i in 0..g.len() {
+            let (x, y) = (g.means[3 * i] + 0.1 * time_norm, g.means[3 * i + 1]);
+            let s = &g.log_scales[3 * i..3 * i + 3];
+            let q = &g.quaternions[4 * i..4 * i + 4];
+            let turn = q[1] * q[2] / q.iter().map(|v| v * v).sum::<f32>();
+            let radius = (s[0] * (1.0 + turn)).exp() + s[1].exp() + s[2].exp() + 0.03;
+            let alpha = 0.3 / (1.0 + (-g.opacity_logits[i]).exp());
+            for p in 0..SIZE * SIZE {
+                let at = |k: usize| (k as f32 + 0.5) / SIZE as f32 * 2.0 - 1.0;
+                let d = ((at(p % SIZE) - x).powi(2) + (at(p / SIZE) - y).powi(2)) / (radius * radius);
+                if d < 9.0 {
+                    for c in 0..3 {
+                        let rest: f32 = g.sh_rest[i * width..(i + 1) * width].iter().skip(c).step_by(3).sum();
+                        planes[c * SIZE * SIZE + p] += alpha * (-0.5 * d).exp() * (0.5 + 0.28 * g.sh_dc[3 * i + c] + 0.1 * camera.cx as f32 * rest);
+                    }
+                }
+            }
+        }
+        Ok(RenderedPlanes { width: SIZE as u32, height: SIZE as u32, planes })
+    }
+    fn background(&self) -> [f32; 3] {
+        [0.0; 3]
+    }
+}
+
+struct Views(Vec<(Camera, f32, Image8)>);
+
+impl TrainingViews for Views {
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+    fn view(&self, index: usize) -> (&Camera, f32) {
+        (&self.0[index].0, self.0[index].1)
+    }
+    fn image(&self, index: usize) -> Result<Image8> {
+        Ok(self.0[index].2.clone())
+    }
+}
+
+#[derive(Default)]
+struct Notes(Mutex<Vec<String>>);
+
+impl EventSink for Notes {
+    fn emit(&self, event: &Event) {
+        if let Event::Note { message, .. } = event {
+            self.0.lock().unwrap().push(message.clone());
+        }
+    }
+}
+
+fn draw(i: usize, k: usize) -> f32 {
+    (Seed::root(77).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+}
+
+fn scene(count: usize) -> HostGaussians {
+    let mut g = HostGaussians { sh_degree: 1, ..Default::default() };
+    for (column, (name, width, values)) in g.columns_mut().into_iter().enumerate() {
+        let (shift, scale) = if name == "log_scales" { (-3.0, 0.7) } else { (0.0, if name == "sh_rest" { 0.2 } else { 0.9 }) };
+        *values = (0..count * width).map(|i| shift + scale * draw(i, column)).collect();
+    }
+    g
+}
+
+fn psnr(g: &HostGaussians, views: &Views) -> f64 {
+    let of = |(camera, time, image): &(Camera, f32, Image8)| {
+        let (drawn, truth) = (Blots.render(g, camera, *time).unwrap(), image.to_planes([0.0; 3]));
+        let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum::<f64>() / truth.len() as f64;
+        -10.0 * error.log10()
+    };
+    views.0.iter().map(of).sum::<f64>() / views.0.len() as f64
+}
+
+#[test]
+fn the_loss_is_kept_and_measured_steps_save_bytes() {
+    cc4dgs_codecs::link();
+    let g = scene(600);
+    // What is recorded differs from what is drawn, as for a trained model.
+    let views = (0..4).map(|k| {
+        let camera = Camera { cx: f64::from(k), ..Camera::look_at("view", (SIZE as u32, SIZE as u32), 0.8, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]) };
+        let mut drawn = Blots.render(&g, &camera, 0.3 * k as f32).unwrap();
+        drawn.planes.iter_mut().enumerate().for_each(|(p, v)| *v += 0.02 * draw(p, 50 + k as usize));
+        (camera, 0.3 * k as f32, drawn.to_image())
+    });
+    let views = Views(views.collect());
+    let notes = Notes::default();
+    let context = CodecContext {
+        views: Some(&views),
+        renderer: Some(&Blots),
+        // All may move, so that no axes are exchanged: blots are no ellipsoids.
+        dynamic_threshold: Some(f32::NEG_INFINITY),
+        ..CodecContext::new(Seed::root(1), Limits::default(), &notes)
+    };
+    let plugin = Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap();
+    let encode = |profile: &str, settings: &str| {
+        let codec = (plugin.build)(profile, &settings.parse::<toml::Table>().unwrap()).unwrap();
+        let streams = codec.encode(&g, &context).unwrap();
+        let found = codec.decode(&streams, &CodecContext::new(Seed::root(1), Limits::default(), &Silent)).unwrap();
+        (streams.iter().map(|s: &Stream| s.bytes.len()).sum::<usize>(), psnr(&g, &views) - psnr(&found, &views))
+    };
+    let (loose, loose_drop) = encode("max-drop=0.5dB", "");
+    let (tight, tight_drop) = encode("max-drop=0.02dB", "");
+    assert!(loose_drop <= 0.5 && tight_drop <= 0.02, "{loose_drop}, {tight_drop}");
+    assert!(loose < tight, "{loose} bytes for 0.5 dB, {tight} for 0.02 dB");
+    assert!(notes.0.lock().unwrap().iter().any(|n| n.contains("dB allowed")));
+    let (plain, plain_drop) = encode("max-drop=0.5dB", "allocate = false");
+    assert!(plain_drop <= 0.5 && loose <= plain, "{loose} bytes with measured steps, {plain} without");
+    let (sized, _) = encode(&format!("max-size={}MB", loose as f64 / 1e6), "");
+    assert!(sized <= loose);
+}
