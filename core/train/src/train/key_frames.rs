@@ -27,7 +27,7 @@ impl Context<'_> {
         let Moving::Scored { zeta } = state.moving else { return Ok(()) };
         let Some(zeta) = Some(zeta).filter(|_| every > 0 && !self.masks.is_empty()) else { return Ok(()) };
         let name = state.deformer.as_ref().map_or("none", ModelDeformer::name).to_string();
-        if !state.deformer.as_ref().is_some_and(|deformer| own_lives(deformer) == LIFE_ATTRIBUTES.len()) {
+        if state.deformer.as_ref().is_none_or(|deformer| own_lives(deformer) != LIFE_ATTRIBUTES.len()) {
             let message = format!("the Gaussians of '{name}' have no lives, so key frames add none: set deformer.life = true, or train.key_frames = 0");
             self.job.events.emit(&Event::Warning { object: "train.key_frames".into(), message });
             return Ok(());

@@ -212,7 +212,8 @@ fn trainings(context: &Context, model: &Model, device: &Device, scene: &Scene, i
         let common = [format!("train.iterations={iterations}"), "train.checks=false".into(), "train.validation=0".into()];
         config::set_all(&mut table, &[&common[..], &set].concat())?;
         let config: RunConfig = config::parse_section("configuration of the model", &table)?;
-        let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &context.registry, events: &Silent, stop };
+        let job =
+            TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &context.registry, events: &Silent, observer: None, stop };
         let (trained, report) = train(&job)?;
         let scored = Scored { max_views: SCORED, ..Scored::all(Split::Test) };
         let psnr_db = evaluate(&trained, &scene, scored, &context.registry, device, &Silent, &mut |_, _, _, _| Ok(()))?.psnr_db;
