@@ -33,7 +33,7 @@ impl Observer for Looker {
 /// Trains into `out` and returns the checkpoint's bytes.
 fn run(out: &Path, observer: Option<&dyn Observer>) -> Vec<u8> {
     let session = Session::builder().device("flex").build().unwrap();
-    let sets = ["train.iterations=120", "train.checks=false", "train.log_every=5", "deformer.kind=cdf-basis"].map(String::from);
+    let sets = ["train.iterations=120", "train.checks=false", "train.log_every=5", "deformer.kind=cdf-basis", "deformer.unused=0.0"].map(String::from);
     let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
     let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
     let (registry, events, stop) = (session.registry(), session.events(), &AtomicBool::new(false));

@@ -1,6 +1,6 @@
 //! The context of a codec when a model is stored together with its scene, and the loss of a deformer's attributes.
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use cc4dgs_core::SceneOptions;
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{
@@ -106,7 +106,18 @@ fn a_codec_gets_views_renderer_and_field_only_with_a_scene() {
 #[test]
 fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     let registry = Registry::collect().unwrap();
-    let (model, scene, device) = (model(&registry), scene(), Device::flex());
+    let (mut model, scene, device) = (model(&registry), scene(), Device::flex());
+    // A deformer whose weights move everything.
+    let section: toml::Table = "kind = \"cdf-basis\"\ncapacity = \"small\"\nresolutions = [8]\nhashes = 16\ntime_bands = 2".parse().unwrap();
+    let context = model.field.as_ref().unwrap().context.clone();
+    let mut field = registry.build_deformer(&section, &context, &device).unwrap();
+    for parameter in field.parameters_mut() {
+        let [n] = parameter.value.dims();
+        let noise: Vec<f32> = (0..n).map(|k| ((k as f32 + 1.0) * 0.618).sin() * 0.1).collect();
+        parameter.value = parameter.value.clone() + Tensor::<1>::from_floats(noise.as_slice(), &device);
+    }
+    (model.field, model.moving) = (Some(ModelDeformer { field, section, context }), Moving::Everything);
+    model.gaussians.extra.clear();
     let folder = tempfile::tempdir().unwrap();
     let (settings, path) = (toml::Table::new(), folder.path().join("m.cc4d"));
     let bits = |field_weights: &str| {

@@ -132,15 +132,18 @@ fn outliers_survive_without_spoiling_their_neighbours() {
         g.dynamic_scores[9] = 3e5;
         hold_to_losses(&name, codec.as_ref(), &g);
         let (original, decoded, _) = round_trip(&name, codec.as_ref(), &g);
-        let worst = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| (x - y).abs() / (1.0 + x.abs())).fold(0.0, f32::max);
+        let worst = |a: &[f32], b: &[f32], least: f32| {
+            let outliers = a.iter().zip(b).filter(|(x, _)| x.abs() > least);
+            outliers.map(|(x, y)| (x - y).abs() / (1.0 + x.abs())).fold(0.0, f32::max)
+        };
         let scales = |i: usize| original.log_scales[3 * i..3 * i + 3].iter().any(|v| v.abs() > 30.0);
         let (far, near): (Vec<usize>, Vec<usize>) =
             (0..original.len()).partition(|&i| scales(i) || original.opacity_logits[i] > 1e5 || original.dynamic_scores[i] > 1e5);
         assert_eq!(far.len(), 4, "{name}");
         let (before, after) = (original.select(&far), decoded.select(&far));
-        assert!(worst(&before.log_scales, &after.log_scales) < 0.05, "{name}");
-        assert!(worst(&before.opacity_logits, &after.opacity_logits) < 0.05, "{name}");
-        assert!(worst(&before.dynamic_scores, &after.dynamic_scores) < 0.1, "{name}");
+        assert!(worst(&before.log_scales, &after.log_scales, 30.0) < 0.05, "{name}");
+        assert!(worst(&before.opacity_logits, &after.opacity_logits, 1e5) < 0.05, "{name}");
+        assert!(worst(&before.dynamic_scores, &after.dynamic_scores, 1e5) < 0.1, "{name}");
         // The others keep the declared losses, measured against their own deviation.
         let (before, after) = (original.select(&near), decoded.select(&near));
         for loss in codec.losses() {
