@@ -5,11 +5,10 @@ PAGE is the folder of apps/player/build-web, ARCHIVE an archive that was baked w
 last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the device `flex` (`cc4dgs bench play`), the medians of
 alternating rounds. Needs playwright, and Chromium on the path.
 """
-import argparse, functools, gzip, http.server, json, pathlib, shutil, statistics, subprocess, threading
+import argparse, gzip, json, pathlib, statistics, subprocess
+from chromium import launch, serve
 from playwright.sync_api import sync_playwright
 
-FLAGS = ("--enable-unsafe-webgpu --enable-features=Vulkan --use-vulkan=swiftshader --use-angle=swiftshader "
-         "--enable-unsafe-swiftshader --ignore-gpu-blocklist --no-sandbox").split()
 ROUNDS = 3
 FRAMES = 4
 LOAD = """async () => {
@@ -30,38 +29,23 @@ FRAME = """async frames => {
 }"""
 
 
-class Handler(http.server.SimpleHTTPRequestHandler):
-    def do_GET(self):
-        if self.path != "/model.cc4d":
-            return super().do_GET()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(self.archive)))
-        self.end_headers()
-        self.wfile.write(self.archive)
-
-    def log_message(self, *_):
-        pass
-
-
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("page"), parser.add_argument("archive")
     parser.add_argument("--scene", required=True), parser.add_argument("--program", default="cc4dgs"), parser.add_argument("--size", default="1352x1014"), parser.add_argument("--out")
     args = parser.parse_args()
     width, height = map(int, args.size.split("x"))
-    Handler.archive = pathlib.Path(args.archive).read_bytes()
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=args.page))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address, archive_bytes = serve(args.page, args.archive, "model.cc4d")
     files = [f for f in pathlib.Path(args.page).iterdir() if f.suffix in (".wasm", ".js", ".css", ".html")]
-    out = {"size": args.size, "archive_bytes": len(Handler.archive), "bundle_gzip_bytes": sum(len(gzip.compress(f.read_bytes(), 9)) for f in files)}
+    out = {"size": args.size, "archive_bytes": archive_bytes, "bundle_gzip_bytes": sum(len(gzip.compress(f.read_bytes(), 9)) for f in files)}
     times = {"webgpu": [], "webgl2": [], "tile": []}
     with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS, headless=True)
+        browser = launch(play)
         pages = {}
         for name, query in (("webgpu", ""), ("webgl2", "?backend=webgl")):
             page = browser.new_page(viewport={"width": width, "height": height})
             page.set_default_timeout(600000)
-            page.goto(f"http://127.0.0.1:{server.server_port}/index.html{query}")
+            page.goto(f"{address}/index.html{query}")
             page.wait_for_function("window.cc4dgs !== undefined")
             out[f"{name}_first_frame_ms"] = round(page.evaluate(LOAD), 1)
             facts = page.evaluate("cc4dgs.facts")

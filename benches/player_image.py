@@ -1,41 +1,25 @@
 #!/usr/bin/env python3
 """Makes the moving image of the player in the README: player_image.py PAGE ARCHIVE OUT.webp. Drives the page in Chromium (SwiftShader) through one sequence, there and
 back, while it orbits, and writes the screenshots as an animated WebP. Needs playwright and Pillow, and Chromium on the path."""
-import functools, http.server, io, math, pathlib, shutil, sys, threading
+import io, math, pathlib, sys
+from chromium import launch, serve
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-FLAGS = ("--enable-unsafe-webgpu --enable-features=Vulkan --use-vulkan=swiftshader --use-angle=swiftshader "
-         "--enable-unsafe-swiftshader --ignore-gpu-blocklist --no-sandbox").split()
 SIZE = (640, 420)
 FRAMES = 24
 QUALITY = 60
 
 
-class Handler(http.server.SimpleHTTPRequestHandler):
-    def do_GET(self):
-        if self.path != "/scene.cc4d":
-            return super().do_GET()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(self.archive)))
-        self.end_headers()
-        self.wfile.write(self.archive)
-
-    def log_message(self, *_):
-        pass
-
-
 def main():
     page_folder, archive, out = sys.argv[1:4]
-    Handler.archive = pathlib.Path(archive).read_bytes()
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=page_folder))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address, _ = serve(page_folder, archive, "scene.cc4d")
     frames = []
     with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS, headless=True)
+        browser = launch(play)
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
         page.set_default_timeout(300000)
-        page.goto(f"http://127.0.0.1:{server.server_port}/index.html?src=scene.cc4d")
+        page.goto(f"{address}/index.html?src=scene.cc4d")
         page.wait_for_function("window.cc4dgs?.facts?.frames > 1")
         for k in range(FRAMES):
             phase = 2 * math.pi * k / FRAMES

@@ -47,7 +47,7 @@ inventory::submit! {
             schema: SCHEMA,
             capabilities: &["motion"],
         },
-        target: ExportTarget::Folder(&["ply"]),
+        target: ExportTarget::Folder(&["*.ply"]),
         build,
     }
 }

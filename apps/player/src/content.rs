@@ -7,6 +7,8 @@ use cc4dgs_format::{Error, HostGaussians, Limits, Result, Rules, Silent, StoredM
 
 /// Smallest near plane: depths are sorted by their logarithm.
 const LEAST_NEAR: f32 = 1e-6;
+/// Greatest.
+const MOST_NEAR: f32 = 1e6;
 /// Floats of a Gaussian in [`Scene::gaussians`].
 pub(crate) const GAUSSIAN_FLOATS: usize = 16;
 
@@ -103,7 +105,7 @@ impl Content {
         scene.background = manifest.background;
         scene.antialiased = manifest.rasterizer.antialiased;
         scene.square = rules == Rules::Inria;
-        scene.near = manifest.rasterizer.near.unwrap_or(if scene.square { 0.2 } else { 0.01 }).max(LEAST_NEAR);
+        scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(if scene.square { 0.2 } else { 0.01 }).clamp(LEAST_NEAR, MOST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
         let frame_count = if moves { manifest.frame_count } else { 1 };
         Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, bytes })

@@ -16,6 +16,7 @@ mod events;
 pub mod exporter;
 pub mod gaussians;
 mod image;
+pub mod installed;
 mod limits;
 mod moving;
 pub mod playback;

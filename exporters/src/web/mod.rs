@@ -20,6 +20,19 @@ page = \"\"                # folder of the page that apps/player/build-web made;
 ";
 /// Name of the archive in a folder.
 const MODEL: &str = "model.cc4d";
+/// Name of the page in a folder.
+const INDEX: &str = "index.html";
+/// All files of a folder.
+const FOLDER: [&str; PAGE_FILES.len() + 2] = {
+    let mut names = [INDEX; PAGE_FILES.len() + 2];
+    names[1] = MODEL;
+    let mut i = 0;
+    while i < PAGE_FILES.len() {
+        names[i + 2] = PAGE_FILES[i];
+        i += 1;
+    }
+    names
+};
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -61,7 +74,7 @@ impl Exporter for Web {
                 still::write(&path.join(name), bytes)?;
             }
             still::write(&path.join(MODEL), &archive)?;
-            still::write(&path.join("index.html"), html::of_folder(&facts.name, MODEL, self.autoplay).as_bytes())?;
+            still::write(&path.join(INDEX), html::of_folder(&facts.name, MODEL, self.autoplay).as_bytes())?;
             notes.push("A static server shows the folder: python3 -m http.server -d FOLDER".into());
         } else {
             still::write(path, html::single(page, &facts.name, &archive, self.autoplay)?.as_bytes())?;
@@ -88,7 +101,7 @@ inventory::submit! {
             schema: SCHEMA,
             capabilities: &["motion", "player"],
         },
-        target: ExportTarget::FileOrFolder { file: "html", folder: &["html", "css", "js", "wasm", "cc4d"] },
+        target: ExportTarget::FileOrFolder { file: "html", folder: &FOLDER },
         build,
     }
 }

@@ -1,5 +1,6 @@
 //! Where the built page of the player is found.
 
+use cc4dgs_format::installed::{program_folder, user_data_folder, variable_path};
 use cc4dgs_format::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -22,24 +23,15 @@ pub struct Page {
     pub origin: String,
 }
 
-/// The folders that [`Page::find`] looks at, in order: the one that the variable `CC4DGS_PAGE` names, or else `page` in the user's data folder
-/// (`$XDG_DATA_HOME/cc4dgs` or `~/.local/share/cc4dgs`; `~/Library/Application Support/cc4dgs` on macOS, `%APPDATA%\cc4dgs` on Windows), `share/cc4dgs/page`
+/// The folders that [`Page::find`] looks at, in order: the one that the variable `CC4DGS_PAGE` names, or else `page` in [`user_data_folder`], `share/cc4dgs/page`
 /// beside the folder of the program, and `page` in it.
 pub fn page_places() -> Vec<PathBuf> {
-    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
-    if let Some(folder) = variable(PAGE_VARIABLE) {
+    if let Some(folder) = variable_path(PAGE_VARIABLE) {
         return vec![folder];
     }
-    let data = if cfg!(windows) {
-        variable("APPDATA")
-    } else if cfg!(target_os = "macos") {
-        variable("HOME").map(|home| home.join("Library/Application Support"))
-    } else {
-        variable("XDG_DATA_HOME").or_else(|| variable("HOME").map(|home| home.join(".local/share")))
-    };
-    let beside = std::env::current_exe().ok().and_then(|program| Some(program.parent()?.to_path_buf()));
+    let beside = program_folder();
     let shared = beside.as_ref().and_then(|folder| Some(folder.parent()?.join("share/cc4dgs")));
-    [data.map(|folder| folder.join("cc4dgs")), shared, beside].into_iter().flatten().map(|folder| folder.join(PAGE_FOLDER)).collect()
+    [user_data_folder(), shared, beside].into_iter().flatten().map(|folder| folder.join(PAGE_FOLDER)).collect()
 }
 
 impl Page {
@@ -49,7 +41,7 @@ impl Page {
     /// [`Error::Unsupported`] where there is none, and as [`Page::read`].
     pub fn find() -> Result<Self> {
         let places = page_places();
-        let named = std::env::var_os(PAGE_VARIABLE).is_some_and(|v| !v.is_empty());
+        let named = variable_path(PAGE_VARIABLE).is_some();
         if let Some(folder) = places.iter().find(|folder| named || folder.is_dir()) {
             return Self::read(folder);
         }

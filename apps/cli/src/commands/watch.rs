@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 /// Instants of the sequence that a snapshot has; between them, motion is a straight line.
 const KEYFRAMES: usize = 12;
-/// Least time between two snapshots, and how many times longer than a snapshot takes: looking costs the training at most a twentieth of its time.
+/// Least time between two snapshots, and how many times longer than a snapshot takes: taking them costs the training at most a twentieth of its time.
 const LEAST_PAUSE: Duration = Duration::from_millis(500);
 const PAUSE: u32 = 19;
 
@@ -33,7 +33,8 @@ impl Observer for Watcher {
         self.live.wait_while_paused(stop);
         let mut times = self.times.lock().unwrap_or_else(PoisonError::into_inner);
         let now = Instant::now();
-        if !self.live.wants() || (now < times.1 && standing.iteration < standing.of) {
+        let last = standing.iteration == standing.of;
+        if !self.live.is_open() || (!last && (now < times.1 || !self.live.wants())) {
             return 0;
         }
         times.0 = now;
@@ -42,7 +43,7 @@ impl Observer for Watcher {
     fn receive(&self, snapshot: Snapshot) {
         match content(snapshot) {
             Ok(content) => self.live.offer(content),
-            Err(e) => self.live.say(e.to_string()),
+            Err(e) => self.live.fail(e.to_string()),
         }
         let mut times = self.times.lock().unwrap_or_else(PoisonError::into_inner);
         times.1 = Instant::now() + (times.0.elapsed() * PAUSE).max(LEAST_PAUSE);
@@ -73,10 +74,10 @@ pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> 
     std::thread::scope(|scope| {
         let training = scope.spawn(|| {
             let result = with_context(&mut |context| train::run(context, args, Some(&watcher)));
-            watcher.live.say(match &result {
-                Ok(()) => "The training is done.".to_string(),
-                Err(e) => e.to_string(),
-            });
+            match &result {
+                Ok(()) => watcher.live.say("The training is done.".to_string()),
+                Err(e) => watcher.live.fail(e.to_string()),
+            }
             result
         });
         let shown = show(&title, Shown::Training(live));

@@ -8,6 +8,8 @@ use std::time::Duration;
 
 /// How often a paused training looks whether it is to stop.
 const POLL: Duration = Duration::from_millis(100);
+/// How soon a new line is shown.
+const SOON: Duration = Duration::from_millis(200);
 
 /// What training and window tell each other. The training offers models and says where it stands; the window takes them and pauses it.
 #[derive(Default)]
@@ -21,6 +23,7 @@ pub struct Live {
 struct State {
     content: Option<Content>,
     status: String,
+    failure: String,
     paused: bool,
     closed: bool,
 }
@@ -35,10 +38,13 @@ impl Live {
             window.request_repaint();
         }
     }
-    /// Whether a model would be shown: the window is open and has taken the last one.
+    /// Whether the window is open.
+    pub fn is_open(&self) -> bool {
+        !self.lock().closed && self.window.get().is_some()
+    }
+    /// Whether a model would be shown at once: the window is open and has taken the last one.
     pub fn wants(&self) -> bool {
-        let state = self.lock();
-        state.content.is_none() && !state.closed && self.window.get().is_some()
+        self.is_open() && self.lock().content.is_none()
     }
     /// Hands over a model.
     pub fn offer(&self, content: Content) {
@@ -48,6 +54,13 @@ impl Live {
     /// Says where the training stands, in a line.
     pub fn say(&self, status: String) {
         self.lock().status = status;
+        if let Some(window) = self.window.get() {
+            window.request_repaint_after(SOON);
+        }
+    }
+    /// Says what failed; it stays beside the line.
+    pub fn fail(&self, failure: String) {
+        self.lock().failure = failure;
         self.repaint();
     }
     /// Returns once the window lets the training go on, was closed, or `stop` is set.
@@ -72,10 +85,11 @@ impl Live {
     pub(super) fn take(&self) -> Option<Content> {
         self.lock().content.take()
     }
-    /// The line and whether the training is paused.
+    /// The line, with what failed, and whether the training is paused.
     pub(super) fn status(&self) -> (String, bool) {
         let state = self.lock();
-        (state.status.clone(), state.paused)
+        let line = [&state.status, &state.failure].into_iter().filter(|text| !text.is_empty()).cloned().collect::<Vec<_>>().join(" · ");
+        (line, state.paused)
     }
     pub(super) fn pause(&self, on: bool) {
         self.lock().paused = on;
@@ -86,7 +100,6 @@ impl Live {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::time::Instant;
 
     #[test]
     fn a_paused_training_waits_until_the_window_closes_or_it_is_stopped() {
@@ -94,19 +107,23 @@ mod tests {
         live.wait_while_paused(&stop);
         assert!(!live.wants(), "no window");
         live.pause(true);
-        let began = Instant::now();
+        let closed = AtomicBool::new(false);
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 std::thread::sleep(Duration::from_millis(50));
+                closed.store(true, Ordering::Relaxed);
                 live.close();
             });
             live.wait_while_paused(&stop);
+            assert!(closed.load(Ordering::Relaxed), "it waited for the window");
         });
-        assert!(began.elapsed() >= Duration::from_millis(50));
         live.lock().closed = false;
         stop.store(true, Ordering::Relaxed);
         live.wait_while_paused(&stop);
         live.say("main 3 of 5".into());
         assert_eq!(live.status(), ("main 3 of 5".to_string(), true));
+        live.fail("no model".into());
+        live.say("main 4 of 5".into());
+        assert_eq!(live.status().0, "main 4 of 5 · no model", "a failure stays");
     }
 }

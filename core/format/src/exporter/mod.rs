@@ -20,13 +20,13 @@ use std::path::Path;
 pub enum ExportTarget {
     /// One file, whose name ends in this extension (without a dot).
     File(&'static str),
-    /// A folder of files, all with one of these extensions (without dots).
+    /// A folder of files, each with one of these names; `*.ply` stands for every name that ends so.
     Folder(&'static [&'static str]),
-    /// One file where the name ends in the extension `file`, else a folder of files with one of the extensions `folder`.
+    /// One file where the name ends in the extension `file`, else a folder of files, as [`ExportTarget::Folder`] names them.
     FileOrFolder {
         /// Extension of the file.
         file: &'static str,
-        /// Extensions of the files in the folder.
+        /// Names of the files in the folder.
         folder: &'static [&'static str],
     },
 }

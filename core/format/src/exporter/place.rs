@@ -6,7 +6,7 @@ use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Runs `exporter` on a temporary name beside `path`, and renames. Returns what it reported and the bytes on disk. An existing `path` is replaced only if
-/// `overwrite` is set, and a folder only if all it holds are files with the exporter's extension.
+/// `overwrite` is set, and a folder only if all it holds has names that the exporter writes.
 ///
 /// # Errors
 /// [`Error::Parameter`] for a `path` that may not be replaced, [`Error::Io`], and those of [`Exporter::write`].
@@ -56,14 +56,22 @@ fn check(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
     match target {
         ExportTarget::File(_) if found.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
         ExportTarget::Folder(_) if !found.is_dir() => refuse("it is a file, and this format is a folder of files", "Give the name of a folder"),
-        ExportTarget::Folder(extensions) => match files(path)?.iter().find(|file| !extensions.iter().any(|e| file.extension().is_some_and(|own| own == *e))) {
+        ExportTarget::Folder(names) => match files(path)?.iter().find(|file| !names.iter().any(|name| is_named(file, name))) {
             Some(other) => {
-                let problem = format!("the folder also holds {}, which is no .{} file", other.display(), extensions.join(", ."));
+                let problem = format!("the folder also holds {}, which is not of this format ({})", other.display(), names.join(", "));
                 refuse(&problem, "Give another folder; only exports are replaced")
             }
             None => Ok(()),
         },
         ExportTarget::File(_) | ExportTarget::FileOrFolder { .. } => Ok(()),
+    }
+}
+
+/// Whether a file has the name; `*.ply` stands for every name that ends so.
+fn is_named(file: &Path, name: &str) -> bool {
+    match name.strip_prefix("*.") {
+        Some(extension) => file.is_file() && file.extension().is_some_and(|own| own == extension),
+        None => file.is_file() && file.file_name().is_some_and(|own| own == name),
     }
 }
 
@@ -121,7 +129,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut source = Nothing(crate::conformance::export_facts(0, 0));
         let mut run = |text, fails, target, name: &str, overwrite| export(&Text(text, fails), target, &mut source, &folder.path().join(name), overwrite);
-        let (file, dir) = (ExportTarget::File("txt"), ExportTarget::Folder(&["txt"]));
+        let (file, dir) = (ExportTarget::File("txt"), ExportTarget::Folder(&["a.txt", "*.txt"]));
         for (target, name) in [(file, "deep/one.txt"), (dir, "deep/many")] {
             let copies = if target == file { 1 } else { 2 };
             assert!(run("first", true, target, name, false).is_err());
@@ -136,9 +144,12 @@ mod tests {
         }
         assert_eq!(std::fs::read_dir(folder.path().join("deep")).unwrap().count(), 2, "no temporary names are left");
         // The name says which of the two is wanted.
-        let either = ExportTarget::FileOrFolder { file: "txt", folder: &["txt"] };
+        let either = ExportTarget::FileOrFolder { file: "txt", folder: &["a.txt", "b.txt"] };
         assert_eq!((run("one", false, either, "x.txt", false).unwrap().1, run("two", false, either, "x", false).unwrap().1), (3, 6));
         // What was not exported is never replaced.
+        std::fs::create_dir(folder.path().join("models")).unwrap();
+        std::fs::write(folder.path().join("models/c.txt"), "mine").unwrap();
+        assert!(run("x", false, either, "models", true).unwrap_err().to_string().contains("c.txt"));
         std::fs::write(folder.path().join("deep/many/notes.md"), "mine").unwrap();
         assert!(run("x", false, dir, "deep/many", true).unwrap_err().to_string().contains("notes.md"));
         assert!(run("x", false, file, "deep/many", true).is_err());

@@ -4,7 +4,8 @@ use super::recover::own_lives;
 use super::{Context, TrainState};
 use crate::data::init::{KeyFrames, KeyPoint};
 use crate::init::{SH_C0, from_points};
-use cc4dgs_core::{DensityPlan, Event, HostGaussians, LIFE_ATTRIBUTES, PointCloud, Result, Stage, gate_value};
+use crate::masks::DynamicMask;
+use cc4dgs_core::{Camera, DensityPlan, Event, HostGaussians, LIFE_ATTRIBUTES, PointCloud, Result, Stage, gate_value};
 use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use glam::Vec3;
@@ -17,6 +18,8 @@ const TEMPORARY: f32 = 0.01;
 const LASTING: f32 = 0.95;
 /// Points that may be added in any case, as a share of the Gaussians there are.
 const LEAST_SHARE: f64 = 0.25;
+/// Least time between two key frames: frames may claim to be simultaneous.
+const LEAST_INTERVAL: f64 = 1e-4;
 /// Opacity of new Gaussians.
 const OPACITY: f32 = 0.6;
 
@@ -25,15 +28,21 @@ impl Context<'_> {
     pub(super) fn add_key_frames(&self, state: &mut TrainState) -> Result<()> {
         let every = self.job.config.train.key_frames;
         let Moving::Scored { zeta } = state.moving else { return Ok(()) };
-        let Some(zeta) = Some(zeta).filter(|_| every > 0 && !self.masks.is_empty()) else { return Ok(()) };
-        let name = state.deformer.as_ref().map_or("none", ModelDeformer::name).to_string();
+        if every == 0 || self.masks.is_empty() {
+            return Ok(());
+        }
         if state.deformer.as_ref().is_none_or(|deformer| own_lives(deformer) != LIFE_ATTRIBUTES.len()) {
+            let name = state.deformer.as_ref().map_or("none", ModelDeformer::name);
             let message = format!("the Gaussians of '{name}' have no lives, so key frames add none: set deformer.life = true, or train.key_frames = 0");
             self.job.events.emit(&Event::Warning { object: "train.key_frames".into(), message });
             return Ok(());
         }
         let seed = self.seed.child("key frames");
-        let Some(frames) = KeyFrames::load(&self.job.scene, every, |camera, x, y| self.masked(camera, x, y), seed)? else {
+        let scene = &self.job.scene;
+        let mask_of = |camera: usize| self.masks.iter().find(|mask| scene.views[mask.view].camera == camera);
+        let masks: Vec<Option<&DynamicMask>> = (0..scene.cameras.len()).map(mask_of).collect();
+        let moves = |camera: usize, x: f32, y: f32| masks[camera].is_some_and(|mask| covers(mask, &scene.cameras[camera], x, y));
+        let Some(frames) = KeyFrames::load(scene, every, moves, seed)? else {
             let message = "no two key frames are seen by the same cameras: none is used".to_string();
             self.job.events.emit(&Event::Note { object: "key frames".into(), message });
             return Ok(());
@@ -41,12 +50,12 @@ impl Context<'_> {
         let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(0, |most| most.max(0) as usize);
         let count = most.saturating_sub(state.set.len()).max((LEAST_SHARE * state.set.len() as f64) as usize);
         let points = frames.points(count, seed.child("motion"));
-        let times = Times { interval: every as f64 / (self.job.scene.frame_count - 1) as f64, frames: frames.frames.len() };
+        let times = Times::new(&frames.times);
         let mut plan = DensityPlan::unchanged(state.set.len());
         let host = state.set.host_gaussians()?;
         let temporary = self.lives_of_first_frame(&mut plan, &host, state, &frames, &times)?;
         let coefficients = state.set.get("sh_rest")?.dims()[1];
-        for key in 0..times.frames {
+        for key in 0..times.keys.len() {
             let own: Vec<&KeyPoint> = points.iter().filter(|p| p.key == key).collect();
             let cloud = PointCloud { positions: own.iter().map(|p| p.position.to_array()).collect(), colors: own.iter().map(|p| p.color).collect() };
             let start = from_points(&cloud, 0, OPACITY);
@@ -65,7 +74,7 @@ impl Context<'_> {
             }
         }
         plan.report.cloned = points.len();
-        let message = format!("{} points of {} key frames; {temporary} Gaussians of the first frame are there for a while", points.len(), times.frames);
+        let message = format!("{} points of {} key frames; {temporary} Gaussians of the first frame are there for a while", points.len(), times.keys.len());
         self.job.events.emit(&Event::Note { object: "key frames".into(), message });
         let schedule = self.lengths.schedule(Stage::Main, 0);
         plan.check("key frames", &state.set.gaussians()?)?;
@@ -82,7 +91,7 @@ impl Context<'_> {
     }
 
     /// Sets the lives of the Gaussians that may move: of those that vanish, one at the first frame. Returns how many vanish.
-    fn lives_of_first_frame(&self, plan: &mut DensityPlan, host: &HostGaussians, state: &TrainState, frames: &KeyFrames, times: &Times) -> Result<usize> {
+    fn lives_of_first_frame(&self, plan: &mut DensityPlan, host: &HostGaussians, state: &TrainState, frames: &KeyFrames, times: &Times<'_>) -> Result<usize> {
         let rows = state.moving.rows(&host.dynamic_scores).unwrap_or_default();
         let mean = |row: usize| Vec3::from_slice(&host.means[3 * row..3 * row + 3]);
         let color = |row: usize| [0, 1, 2].map(|k| 0.5 + SH_C0 * host.sh_dc[3 * row + k]);
@@ -90,7 +99,7 @@ impl Context<'_> {
         let judged = frames.judge(rows.iter().map(|&row| (mean(row), color(row))).collect(), 0);
         for (row, judged) in rows.into_iter().zip(judged) {
             match judged {
-                Some(point) if point.alive[1] + 1 < times.frames => {
+                Some(point) if point.alive[1] + 1 < times.keys.len() => {
                     times.live(plan, row, &point);
                     temporary += 1;
                 }
@@ -99,27 +108,31 @@ impl Context<'_> {
         }
         Ok(temporary)
     }
+}
 
-    /// Whether the mask of what moves covers a pixel of a camera, whose coordinates are shares of the image.
-    fn masked(&self, camera: usize, x: f32, y: f32) -> bool {
-        let Some(mask) = self.masks.iter().find(|m| self.job.scene.views[m.view].camera == camera) else { return false };
-        let (w, h) = (self.job.scene.cameras[camera].width as usize, self.job.scene.cameras[camera].height as usize);
-        let at = |share: f32, n: usize| ((share * n as f32) as usize).min(n - 1);
-        mask.mask.get(at(y, h) * w + at(x, w)).is_some_and(|&v| v > 0.5)
-    }
+/// Whether a mask of what moves covers a pixel of its camera, whose coordinates are shares of the image.
+fn covers(mask: &DynamicMask, camera: &Camera, x: f32, y: f32) -> bool {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let at = |share: f32, n: usize| ((share * n as f32) as usize).min(n - 1);
+    mask.mask.get(at(y, h) * w + at(x, w)).is_some_and(|&v| v > 0.5)
 }
 
 /// When the key frames are.
-struct Times {
-    /// From one to the next, as a share of the sequence.
+struct Times<'a> {
+    /// The time of each, 0..1.
+    keys: &'a [f64],
+    /// From one to the next in the mean.
     interval: f64,
-    frames: usize,
 }
 
-impl Times {
+impl<'a> Times<'a> {
+    fn new(keys: &'a [f64]) -> Self {
+        let whole = keys.last().copied().unwrap_or(1.0) - keys.first().copied().unwrap_or(0.0);
+        Self { keys, interval: (whole / keys.len().saturating_sub(1).max(1) as f64).max(LEAST_INTERVAL) }
+    }
     /// Gives a row the life and the velocity of a point.
     fn live(&self, plan: &mut DensityPlan, row: usize, point: &KeyPoint) {
-        let [first, last] = point.alive.map(|key| key as f64 * self.interval);
+        let [first, last] = point.alive.map(|key| self.keys[key]);
         let half_width = 0.5 * (last - first) + HALF_WIDTH * self.interval;
         plan.set(row, "life_center", &[(0.5 * (first + last)) as f32]);
         plan.set(row, "life_log_half_width", &[half_width.ln() as f32]);
@@ -131,5 +144,25 @@ impl Times {
     fn last(&self, plan: &mut DensityPlan, row: usize) {
         plan.set(row, "life_gate", &[gate_value(LASTING)]);
         plan.set(row, "velocity", &[0.0; 3]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lives_are_at_the_times_that_views_state() {
+        // Five of six frames at k / 6: the last key frame is not at 1.
+        let keys = [0.0, 1.0 / 3.0, 2.0 / 3.0];
+        let times = Times::new(&keys);
+        let point = KeyPoint { position: Vec3::ZERO, color: [0.5; 3], key: 2, alive: [1, 2], velocity: Vec3::X };
+        let mut plan = DensityPlan::unchanged(1);
+        times.live(&mut plan, 0, &point);
+        let value = |name: &str| plan.values().iter().find(|v| v.attribute == name).map(|v| v.values[0]).unwrap();
+        assert!((value("life_center") - 0.5).abs() < 1e-6, "between the second and the third");
+        assert!((value("velocity") - 3.0).abs() < 1e-5, "a unit from one key frame to the next");
+        assert!((value("life_log_half_width").exp() - (1.0 / 6.0 + 0.4 / 3.0)).abs() < 1e-6);
+        assert!(Times::new(&[0.0, 0.0]).interval > 0.0);
     }
 }

@@ -58,14 +58,14 @@ impl Context<'_> {
             return Ok(());
         }
         let config = self.job.config;
-        let (rows, moved) = self.moved(state, times)?;
-        let cameras = super::training_cameras(scene).into_keys().map(|index| scene.cameras[index].clone()).collect();
         let gaussians = state.set.host_gaussians()?;
+        let (rows, moved) = self.moved(state, &gaussians.dynamic_scores, times)?;
+        let cameras = super::training_cameras(scene).into_keys().map(|index| scene.cameras[index].clone()).collect();
         observer.receive(Snapshot { standing, gaussians, rows, moved, background: config.background()?, render: config.render.clone(), cameras });
         Ok(())
     }
-    /// The moving Gaussians and what they are at `count` even times.
-    fn moved(&self, state: &mut TrainState, count: usize) -> Result<(Vec<u32>, Vec<HostGaussians>)> {
+    /// The Gaussians that move by their scores, and what they are at `count` even times.
+    fn moved(&self, state: &mut TrainState, scores: &[f32], count: usize) -> Result<(Vec<u32>, Vec<HostGaussians>)> {
         let moving = state.moving_rows(&self.device)?;
         let Some(deformer) = state.deformer.as_ref().filter(|d| !d.field.is_static() && moving.count() > 0) else {
             return Ok(Default::default());
@@ -78,8 +78,7 @@ impl Context<'_> {
             deformer.field.deform(features.clone(), time)?.apply(deformer.name(), &canonical, None)?.to_host()
         };
         let moved = (0..count).map(at).collect::<Result<_>>()?;
-        let scores = state.set.host_gaussians()?.dynamic_scores;
-        let rows = state.moving.rows(&scores).map_or_else(|| (0..scores.len() as u32).collect(), |rows| rows.into_iter().map(|r| r as u32).collect());
+        let rows = state.moving.rows(scores).map_or_else(|| (0..scores.len() as u32).collect(), |rows| rows.into_iter().map(|r| r as u32).collect());
         Ok((rows, moved))
     }
 }

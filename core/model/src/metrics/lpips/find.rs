@@ -1,6 +1,7 @@
 //! Where the weights of LPIPS are looked for.
 
 use super::Lpips;
+use cc4dgs_format::installed::{program_folder, user_data_folder, variable_path};
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 
@@ -19,22 +20,12 @@ pub struct InstalledLpips {
 }
 
 /// The files that [`installed_lpips`] looks at, in order: the one that the variable `CC4DGS_LPIPS` names, or else `lpips-alexnet.safetensors` in the
-/// user's data folder (`$XDG_DATA_HOME/cc4dgs` or `~/.local/share/cc4dgs`; `~/Library/Application Support/cc4dgs` on macOS, `%APPDATA%\cc4dgs` on Windows)
-/// and in the folder of the program.
+/// user's data folder ([`user_data_folder`]) and in the folder of the program.
 pub fn lpips_places() -> Vec<PathBuf> {
-    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
-    if let Some(file) = variable(LPIPS_VARIABLE) {
+    if let Some(file) = variable_path(LPIPS_VARIABLE) {
         return vec![file];
     }
-    let data = if cfg!(windows) {
-        variable("APPDATA")
-    } else if cfg!(target_os = "macos") {
-        variable("HOME").map(|home| home.join("Library/Application Support"))
-    } else {
-        variable("XDG_DATA_HOME").or_else(|| variable("HOME").map(|home| home.join(".local/share")))
-    };
-    let beside = std::env::current_exe().ok().and_then(|program| Some(program.parent()?.to_path_buf()));
-    data.map(|folder| folder.join("cc4dgs")).into_iter().chain(beside).map(|folder| folder.join(LPIPS_FILE)).collect()
+    [user_data_folder(), program_folder()].into_iter().flatten().map(|folder| folder.join(LPIPS_FILE)).collect()
 }
 
 /// The weights that this process uses, read once: of the first file of [`lpips_places`] that exists, else those that the feature `embed-lpips` built in.
@@ -48,7 +39,7 @@ pub fn installed_lpips() -> Result<&'static InstalledLpips, &'static str> {
 
 fn find() -> Result<InstalledLpips, String> {
     let places = lpips_places();
-    let named = std::env::var_os(LPIPS_VARIABLE).is_some_and(|v| !v.is_empty());
+    let named = variable_path(LPIPS_VARIABLE).is_some();
     if let Some(file) = places.iter().find(|file| named || file.is_file()) {
         let network = Lpips::read(file).map_err(|e| format!("LPIPS is not measured: {e}"))?;
         return Ok(InstalledLpips { network: Arc::new(network), source: file.display().to_string() });

@@ -43,8 +43,8 @@ pub(crate) struct KeyPoint {
 
 /// The images of all key frames, and the points that match in them.
 pub(crate) struct KeyFrames {
-    /// Frames, ascending, at equal distances; the first is 0.
-    pub frames: Vec<usize>,
+    /// The time of each key frame, 0..1, as its views state it; the first is that of frame 0.
+    pub times: Vec<f64>,
     sets: Vec<WorkSet>,
     found: Vec<Vec<Candidate>>,
 }
@@ -61,10 +61,11 @@ impl KeyFrames {
             return Ok(None);
         }
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
-        let mut loaded = Self { frames: Vec::new(), sets: Vec::new(), found: Vec::new() };
+        let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new() };
         for frame in (0..scene.frame_count).step_by(every) {
             let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera);
             let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else { return Ok(None) };
+            let Some(time) = views.first().map(|&v| f64::from(scene.views[v].time_norm)) else { return Ok(None) };
             let mut set = WorkSet::load(scene, Choice { views, ..choice.clone() })?;
             for (view, &camera) in set.views.iter_mut().zip(&cameras) {
                 let level = view.fine();
@@ -81,7 +82,7 @@ impl KeyFrames {
                 (view.mask, view.opaque) = (None, None);
             }
             loaded.sets.push(set);
-            loaded.frames.push(frame);
+            loaded.times.push(time);
         }
         Ok(Some(loaded))
     }
@@ -305,7 +306,7 @@ mod tests {
         };
         let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
         let found = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
-        KeyFrames { frames: vec![0, 5, 10], sets: (0..3).map(set).collect(), found }
+        KeyFrames { times: vec![0.0, 0.5, 1.0], sets: (0..3).map(set).collect(), found }
     }
 
     #[test]
