@@ -20,13 +20,16 @@ pub mod ops {
     pub mod networks;
     pub mod photometric;
     pub mod rasterize;
+    mod shared;
     pub mod sort;
+    pub mod split;
 }
 
 /// Plain-slice kernels (rayon and SIMD) that serve every CPU backend.
 pub mod cpu {
     pub mod adam;
     pub mod basis;
+    pub mod cross_entropy;
     pub mod heads;
     pub mod lookup;
     pub mod mlp;

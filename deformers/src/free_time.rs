@@ -81,9 +81,12 @@ impl Deformer for FreeTime {
         Ok(SpatialFeatures { values: Tensor::cat(input.attributes.clone(), 1), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
-        check_time(time_norm)?;
-        let LifeAt { shift, log_factor, .. } = self.life.at(features, time_norm);
-        Ok(Offsets { means: Some(shift), opacity_log_factor: Some(log_factor), ..Offsets::default() })
+        Ok(self.deform_all(features, &[time_norm])?.pop().unwrap_or_default())
+    }
+    fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
+        times_norm.iter().try_for_each(|&time_norm| check_time(time_norm))?;
+        let at = |LifeAt { shift, log_factor, .. }| Offsets { means: Some(shift), opacity_log_factor: Some(log_factor), ..Offsets::default() };
+        Ok(self.life.at(features, times_norm).into_iter().map(at).collect())
     }
     fn regularizer(&self, input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         input.check("free-time", &self.attributes())?;

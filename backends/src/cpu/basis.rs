@@ -118,23 +118,26 @@ fn by_columns(out: &mut [f32], head: &Head, values: &[f32], (first, rows): (usiz
     }
 }
 
-/// The gradient of the coefficients, head after head: every output's, times the functions.
-pub fn coefficient_gradient(shape: &BasisShape, functions: &[f32], grad: &[f32]) -> Vec<f32> {
-    let rows = grad.len() / shape.outputs();
+/// The gradient of the coefficients, head after head: the gradient of every output times the functions, summed over `parts` (functions, gradient of outputs).
+pub fn coefficient_gradient<'a>(shape: &BasisShape, rows: usize, parts: &[(&'a [f32], &'a [f32])]) -> Vec<f32> {
     let mut out = vec![0.0f32; rows * shape.coefficients()];
     let (mut rest, mut at) = (out.as_mut_slice(), 0);
     for head in heads(shape) {
         let (own, later) = rest.split_at_mut(rows * head.width());
         rest = later;
-        let grad = &grad[at..at + rows * head.outputs];
-        at += grad.len();
-        let functions = &functions[head.function..][..head.count];
-        own.par_chunks_mut(ROWS * head.width()).zip(grad.par_chunks(ROWS * head.outputs)).for_each(|(out, grad)| {
+        let own_part = |(functions, grad): &(&'a [f32], &'a [f32])| (&functions[head.function..][..head.count], &grad[at..at + rows * head.outputs]);
+        let parts: Vec<(&[f32], &[f32])> = parts.iter().map(own_part).collect();
+        at += rows * head.outputs;
+        own.par_chunks_mut(ROWS * head.width()).enumerate().for_each(|(block, out)| {
+            let first = block * ROWS * head.outputs;
             vectorized(
                 #[inline(always)]
                 || {
-                    for (own, d) in out.chunks_exact_mut(functions.len()).zip(grad) {
-                        own.iter_mut().zip(functions).for_each(|(c, f)| *c = d * f);
+                    for (k, own) in out.chunks_exact_mut(head.count).enumerate() {
+                        for (functions, grad) in &parts {
+                            let d = grad[first + k];
+                            own.iter_mut().zip(*functions).for_each(|(c, f)| *c += d * f);
+                        }
                     }
                 },
             );

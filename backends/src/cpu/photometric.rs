@@ -4,11 +4,15 @@
 //! Three sweeps over rows, each parallel: a horizontal blur of four fields; a vertical blur, the SSIM map and its three derivative
 //! fields, blurred horizontally while still in cache; a vertical blur of those and the gradient. The window is symmetric, so the
 //! adjoint of the blur is the blur.
+//!
+//! Where image and target are equal the similarity is 1 and the gradient 0, so only the box of the pixels that differ is swept, with the margin that the windows
+//! reach: on a plain background most of the image is skipped.
 
 use crate::cpu::scratch::scratch;
 use crate::cpu::simd::{Lanes, dispatch};
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
+use std::ops::Range;
 
 const RADIUS: usize = 5;
 const C1: f32 = 1e-4;
@@ -94,12 +98,13 @@ pub fn photometric(
     let count = (channels * pixels) as f64;
     let scale = (1.0 / count) as f32;
     let scales = (lambda_c * scale, -(1.0 - lambda_c) * scale);
-    let mut total = [0.0f64; 3];
+    let sweep = Sweep::of(image, target, (channels, height, width));
+    let mut total = [0.0, (channels * (pixels - sweep.similar_pixels())) as f64, 0.0];
     // Channel by channel, so that the fields of one stay in cache between the sweeps.
     for channel in 0..channels {
         let plane = channel * pixels..(channel + 1) * pixels;
         let gradient = gradient.as_deref_mut().map(|gradient| &mut gradient[plane.clone()]);
-        for terms in one_channel(&image[plane.clone()], &target[plane], width, scales, gradient) {
+        for terms in one_channel(&image[plane.clone()], &target[plane], &sweep, scales, gradient) {
             for (total, term) in total.iter_mut().zip(terms) {
                 *total += term;
             }
@@ -108,9 +113,65 @@ pub fn photometric(
     PhotometricTerms { l1: total[0] / count, ssim: total[1] / count, mse: total[2] / count }
 }
 
+/// The part of an image that is looked at.
+struct Sweep {
+    /// Columns of the image.
+    width: usize,
+    /// Rows and columns whose gradient may differ from 0.
+    rows: Range<usize>,
+    columns: Range<usize>,
+    /// Those of them whose similarity may differ from 1, counted from the first of them.
+    similar_rows: Range<usize>,
+    similar_columns: Range<usize>,
+}
+
+impl Sweep {
+    /// The box of the pixels that differ in any plane, with its margins; empty where none does.
+    fn of(image: &[f32], target: &[f32], (channels, height, width): (usize, usize, usize)) -> Self {
+        // A NaN differs from everything.
+        let differs = |(x, y): (&f32, &f32)| x != y;
+        let span = |(x, y): (&[f32], &[f32])| {
+            let first = x.iter().zip(y).position(differs)?;
+            Some((first, x.iter().zip(y).rposition(differs)? + 1))
+        };
+        let join = |a: Option<(usize, usize)>, b: Option<(usize, usize)>| match (a, b) {
+            (Some(a), Some(b)) => Some((a.0.min(b.0), a.1.max(b.1))),
+            (a, b) => a.or(b),
+        };
+        let of_row = |row: usize| {
+            let own = |channel: usize| (channel * height + row) * width..(channel * height + row + 1) * width;
+            (0..channels).map(|channel| span((&image[own(channel)], &target[own(channel)]))).fold(None, join)
+        };
+        let spans: Vec<Option<(usize, usize)>> = (0..height).into_par_iter().with_min_len(ROWS).map(of_row).collect();
+        let rows = spans.iter().position(Option::is_some).unwrap_or(0)..spans.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
+        let columns = spans.iter().copied().fold(None, join).map_or(0..0, |(first, end)| first..end);
+        let wider =
+            |range: &Range<usize>, by: usize, end: usize| if range.is_empty() { 0..0 } else { range.start.saturating_sub(by)..(range.end + by).min(end) };
+        let within = |inner: Range<usize>, outer: &Range<usize>| inner.start - outer.start..inner.end - outer.start;
+        let (all_rows, all_columns) = (wider(&rows, 2 * RADIUS, height), wider(&columns, 2 * RADIUS, width));
+        let similar_rows = within(wider(&rows, RADIUS, height), &all_rows);
+        let similar_columns = within(wider(&columns, RADIUS, width), &all_columns);
+        Self { width, rows: all_rows, columns: all_columns, similar_rows, similar_columns }
+    }
+    /// How many pixels of a plane have a similarity that is computed.
+    fn similar_pixels(&self) -> usize {
+        self.similar_rows.len() * self.similar_columns.len()
+    }
+    /// A row of a plane, counted from the first one, inside the columns.
+    fn row<'a>(&self, plane: &'a [f32], row: usize) -> &'a [f32] {
+        &plane[(self.rows.start + row) * self.width..][self.columns.clone()]
+    }
+}
+
 /// Row sums of |x - y|, SSIM and (x - y)^2 of one plane, and its gradient.
-fn one_channel(image: &[f32], target: &[f32], width: usize, (l1_scale, ssim_scale): (f32, f32), gradient: Option<&mut [f32]>) -> Vec<[f64; 3]> {
-    let rows = image.len() / width;
+fn one_channel(image: &[f32], target: &[f32], sweep: &Sweep, (l1_scale, ssim_scale): (f32, f32), mut gradient: Option<&mut [f32]>) -> Vec<[f64; 3]> {
+    let (rows, width) = (sweep.rows.len(), sweep.columns.len());
+    if let Some(gradient) = gradient.as_deref_mut() {
+        gradient.fill(0.0);
+    }
+    if rows == 0 {
+        return Vec::new();
+    }
     let g = half_window();
     let stride = width.next_multiple_of(PADDING);
     let mut blurred = scratch(rows * 4 * stride);
@@ -118,8 +179,8 @@ fn one_channel(image: &[f32], target: &[f32], width: usize, (l1_scale, ssim_scal
     blurred.par_chunks_mut(ROWS * 4 * stride).zip(row_terms.par_chunks_mut(ROWS)).enumerate().for_each(|(task, (fields, terms))| {
         let mut padded = scratch(4 * (stride + 2 * RADIUS));
         for (i, (fields, terms)) in fields.chunks_exact_mut(4 * stride).zip(terms).enumerate() {
-            let at = (task * ROWS + i) * width;
-            dispatch(FirstRow { x: &image[at..at + width], y: &target[at..at + width], fields, terms, padded: &mut padded, g: &g });
+            let row = task * ROWS + i;
+            dispatch(FirstRow { x: sweep.row(image, row), y: sweep.row(target, row), fields, terms, padded: &mut padded, g: &g });
         }
     });
 
@@ -131,18 +192,24 @@ fn one_channel(image: &[f32], target: &[f32], width: usize, (l1_scale, ssim_scal
     derivatives.par_chunks_mut(ROWS * width_out).zip(row_terms.par_chunks_mut(ROWS)).enumerate().for_each(|(task, (out, terms))| {
         let mut work = scratch(4 * stride + stride + 3 * (stride + 2 * RADIUS));
         for (i, (out, terms)) in out.chunks_exact_mut(width_out).zip(terms).enumerate() {
-            let taps = neighbours(task * ROWS + i, &blurred, 4 * stride, &zeros);
-            dispatch(SecondRow { taps, width, out: with_gradient.then_some(out), terms, work: &mut work, g: &g });
+            let row = task * ROWS + i;
+            if !sweep.similar_rows.contains(&row) {
+                out.fill(0.0);
+                continue;
+            }
+            let taps = neighbours(row, &blurred, 4 * stride, &zeros);
+            dispatch(SecondRow { taps, columns: sweep.similar_columns.clone(), out: with_gradient.then_some(out), terms, work: &mut work, g: &g });
         }
     });
 
     if let Some(gradient) = gradient {
-        gradient.par_chunks_mut(ROWS * width).enumerate().for_each(|(task, out)| {
+        let gradient = &mut gradient[sweep.rows.start * sweep.width..sweep.rows.end * sweep.width];
+        gradient.par_chunks_mut(ROWS * sweep.width).enumerate().for_each(|(task, out)| {
             let mut work = scratch(6 * stride);
-            for (i, out) in out.chunks_exact_mut(width).enumerate() {
+            for (i, out) in out.chunks_exact_mut(sweep.width).enumerate() {
                 let row = task * ROWS + i;
                 let taps = neighbours(row, &derivatives, 3 * stride, &zeros);
-                let (x, y) = (&image[row * width..][..width], &target[row * width..][..width]);
+                let (x, y, out) = (sweep.row(image, row), sweep.row(target, row), &mut out[sweep.columns.clone()]);
                 dispatch(ThirdRow { taps, x, y, out, work: &mut work, l1_scale, ssim_scale, g: &g });
             }
         });
@@ -150,7 +217,7 @@ fn one_channel(image: &[f32], target: &[f32], width: usize, (l1_scale, ssim_scal
     row_terms
 }
 
-/// The rows `row - 5 ..= row + 5`; zeros beyond the image.
+/// The rows `row - 5 ..= row + 5`; zeros beyond the fields.
 fn neighbours<'a>(row: usize, fields: &'a [f32], row_len: usize, zeros: &'a [f32]) -> [&'a [f32]; 11] {
     let rows = fields.len() / row_len;
     std::array::from_fn(|k| {
@@ -213,7 +280,8 @@ impl WithSimd for FirstRow<'_> {
 /// `E[x]`, `E[x^2]` and `E[xy]`.
 struct SecondRow<'a> {
     taps: [&'a [f32]; 11],
-    width: usize,
+    /// Those whose similarity is wanted; the derivatives of the others are 0.
+    columns: Range<usize>,
     /// Three rows of blurred derivatives.
     out: Option<&'a mut [f32]>,
     terms: &'a mut [f64; 3],
@@ -242,8 +310,9 @@ impl WithSimd for SecondRow<'_> {
             b.store(&mut d_square[RADIUS + at..]);
             c.store(&mut d_product[RADIUS + at..]);
         }
-        // The blur runs over into the padding, where there is no image.
-        map[self.width..].fill(0.0);
+        // The blur runs over into the margin and into the padding.
+        map[..self.columns.start].fill(0.0);
+        map[self.columns.end..].fill(0.0);
         let mut total = Lanes::splat(simd, 0.0);
         for at in (0..stride).step_by(Lanes::<S>::COUNT) {
             total += Lanes::load(simd, &map[at..]);
@@ -251,8 +320,8 @@ impl WithSimd for SecondRow<'_> {
         self.terms[1] = f64::from(total.sum());
         let Some(out) = self.out else { return };
         for row in [&mut *d_mu, d_square, d_product] {
-            row[..RADIUS].fill(0.0);
-            row[RADIUS + self.width..].fill(0.0);
+            row[..RADIUS + self.columns.start].fill(0.0);
+            row[RADIUS + self.columns.end..].fill(0.0);
         }
         let (out_mu, rest) = out.split_at_mut(stride);
         let (out_square, out_product) = rest.split_at_mut(stride);
@@ -314,29 +383,4 @@ impl WithSimd for ThirdRow<'_> {
         }
         self.out.copy_from_slice(&gradient[..self.out.len()]);
     }
-}
-
-/// Mean binary cross-entropy of logits against targets in 0..1, stable for logits of any size: max(x,0) - x z + ln(1 + e^-|x|).
-/// With `gradient`, writes (sigmoid(x) - z) / n there.
-pub fn bce_with_logits(logits: &[f32], targets: &[f32], gradient: Option<&mut [f32]>) -> f64 {
-    const CHUNK: usize = 4096;
-    if logits.is_empty() {
-        return 0.0;
-    }
-    let n = logits.len() as f64;
-    let loss = |x: f32, z: f32| x.max(0.0) - x * z + (-x.abs()).exp().ln_1p();
-    let partial: Vec<f64> =
-        logits.par_chunks(CHUNK).zip(targets.par_chunks(CHUNK)).map(|(x, z)| x.iter().zip(z).map(|(&x, &z)| f64::from(loss(x, z))).sum()).collect();
-    if let Some(gradient) = gradient {
-        let scale = (1.0 / n) as f32;
-        gradient.par_chunks_mut(CHUNK).zip(logits.par_chunks(CHUNK)).zip(targets.par_chunks(CHUNK)).for_each(|((out, x), z)| {
-            for ((out, &x), &z) in out.iter_mut().zip(x).zip(z) {
-                // exp(-|x|) never overflows; both branches of the sigmoid are exact in it.
-                let e = (-x.abs()).exp();
-                let sigmoid = if x >= 0.0 { 1.0 / (1.0 + e) } else { e / (1.0 + e) };
-                *out = scale * (sigmoid - z);
-            }
-        });
-    }
-    partial.iter().sum::<f64>() / n
 }

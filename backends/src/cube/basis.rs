@@ -2,9 +2,10 @@
 
 use super::field::add_segments;
 use super::tensor::{THREADS, floats, upload, workgroups_for};
-use crate::ops::basis::{BasisBackward, BasisOps, BasisShape};
+use crate::ops::basis::{BasisBackward, BasisOps, BasisShape, Combinations};
+use burn::backend::ops::FloatTensorOps;
 use burn::backend::tensor::FloatTensor;
-use burn::tensor::DType;
+use burn::tensor::{DType, FloatDType};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
 use cubecl::prelude::*;
@@ -117,14 +118,18 @@ fn function_parts(coefficients: &[f32], grad: &[f32], plan: &[u32], partial: &mu
 }
 
 impl BasisOps for CubeBackend {
-    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
+    fn coefficients(coefficients: FloatTensor<Self>, _: Arc<Combinations>) -> FloatTensor<Self> {
+        coefficients
+    }
+    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, combinations: Arc<Combinations>, _: usize) -> FloatTensor<Self> {
+        let shape = combinations.shape();
         let functions = into_contiguous(functions);
         let rows = coefficients.meta.shape()[0];
         let by_columns = coefficients.meta.strides()[..] == [1, rows] && shape.coefficients() > 1;
         let coefficients = if by_columns { coefficients } else { into_contiguous(coefficients) };
         let out = floats(&coefficients, [rows * shape.outputs()]);
         let client = coefficients.client.clone();
-        let plan = upload(&coefficients, &plan(&shape), DType::U32);
+        let plan = upload(&coefficients, &plan(shape), DType::U32);
         let (count, dim) = (workgroups_for(rows * shape.outputs()), CubeDim::new_1d(THREADS));
         let (c, f, p, o) = (coefficients.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
         combine_outputs::launch(&client, count, dim, c, f, p, o, rows as u32, shape.outputs() as u32, by_columns);
@@ -132,46 +137,37 @@ impl BasisOps for CubeBackend {
     }
 }
 
+/// The gradient of the coefficients of one combination.
+fn coefficient_gradient(functions: FloatTensor<CubeBackend>, grad: FloatTensor<CubeBackend>, rows: usize, shape: &BasisShape) -> FloatTensor<CubeBackend> {
+    let (functions, grad) = (into_contiguous(functions), into_contiguous(grad));
+    let client = grad.client.clone();
+    let plan = upload(&grad, &plan(shape), DType::U32);
+    let out = floats(&grad, [rows, shape.coefficients()]);
+    let (count, dim) = (workgroups_for(rows * shape.outputs()), CubeDim::new_1d(THREADS));
+    let (g, f, p, o) = (grad.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
+    spread_gradient::launch(&client, count, dim, g, f, p, o, rows as u32, shape.outputs() as u32);
+    out
+}
+
 impl BasisBackward for CubeBackend {
-    fn combine_backward(
-        coefficients: FloatTensor<Self>,
-        functions: FloatTensor<Self>,
-        shape: &BasisShape,
-        grad: FloatTensor<Self>,
-        wanted: [bool; 2],
-    ) -> [Option<FloatTensor<Self>>; 2] {
-        let (coefficients, functions, grad) = (into_contiguous(coefficients), into_contiguous(functions), into_contiguous(grad));
-        let (rows, count) = (coefficients.meta.shape()[0], functions.meta.shape()[0]);
+    fn coefficient_gradient(parts: Vec<(FloatTensor<Self>, FloatTensor<Self>)>, rows: usize, shape: &BasisShape) -> FloatTensor<Self> {
+        let gradients = parts.into_iter().map(|(functions, grad)| coefficient_gradient(functions, grad, rows, shape));
+        let zeros = || Self::float_zeros([rows, shape.coefficients()].into(), &Default::default(), FloatDType::F32);
+        gradients.reduce(Self::float_add).unwrap_or_else(zeros)
+    }
+    fn function_gradient(coefficients: FloatTensor<Self>, shape: &BasisShape, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        let (coefficients, grad) = (into_contiguous(coefficients), into_contiguous(grad));
+        let (rows, count) = (coefficients.meta.shape()[0], shape.functions());
         let client = coefficients.client.clone();
         let dim = CubeDim::new_1d(THREADS);
         let plan = upload(&coefficients, &plan(shape), DType::U32);
-        let width = shape.outputs() as u32;
-        let of_coefficients = wanted[0].then(|| {
-            let out = floats(&grad, [rows, shape.coefficients()]);
-            let (g, f) = (grad.clone().into_buffer_arg(), functions.clone().into_buffer_arg());
-            let (p, o) = (plan.clone().into_buffer_arg(), out.clone().into_buffer_arg());
-            spread_gradient::launch(&client, workgroups_for(rows * shape.outputs()), dim, g, f, p, o, rows as u32, width);
-            out
-        });
-        let of_functions = wanted[1].then(|| {
-            let segments = rows.div_ceil(SEGMENT);
-            let (partial, out) = (floats(&grad, [segments, count]), floats(&grad, [count]));
-            let (c, g) = (coefficients.clone().into_buffer_arg(), grad.clone().into_buffer_arg());
-            let (p, parts) = (plan.clone().into_buffer_arg(), partial.clone().into_buffer_arg());
-            function_parts::launch(&client, workgroups_for(segments * count), dim, c, g, p, parts, rows as u32, width, count as u32);
-            add_segments::launch(
-                &client,
-                workgroups_for(count),
-                dim,
-                partial.into_buffer_arg(),
-                out.clone().into_buffer_arg(),
-                count as u32,
-                segments as u32,
-                0,
-                false,
-            );
-            out
-        });
-        [of_coefficients, of_functions]
+        let segments = rows.div_ceil(SEGMENT);
+        let (partial, out) = (floats(&grad, [segments, count]), floats(&grad, [count]));
+        let (c, g) = (coefficients.into_buffer_arg(), grad.into_buffer_arg());
+        let (p, parts) = (plan.into_buffer_arg(), partial.clone().into_buffer_arg());
+        function_parts::launch(&client, workgroups_for(segments * count), dim, c, g, p, parts, rows as u32, shape.outputs() as u32, count as u32);
+        let (parts, sums) = (partial.into_buffer_arg(), out.clone().into_buffer_arg());
+        add_segments::launch(&client, workgroups_for(count), dim, parts, sums, count as u32, segments as u32, 0, false);
+        out
     }
 }

@@ -1,6 +1,7 @@
 //! Offsets as combinations of shared functions of time: out = C φ, a dot product per number and Gaussian.
 
 use super::field::split_heads;
+use super::shared::{Shared, Token, share};
 use crate::cpu::basis::{self as kernel, Coefficients};
 use crate::cpu::tensor::CpuBackend;
 use crate::ops::autodiff::{differentiate, record};
@@ -8,7 +9,7 @@ use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::Checkpoi
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::FloatTensor;
-use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
+use burn::backend::{Autodiff, Backend, Dispatch, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
@@ -40,47 +41,58 @@ impl BasisShape {
     }
 }
 
-/// The derivative per device.
-pub trait BasisBackward: Backend {
-    /// The gradients of coefficients and functions, as far as `wanted`.
-    fn combine_backward(
-        coefficients: FloatTensor<Self>,
-        functions: FloatTensor<Self>,
-        shape: &BasisShape,
-        grad: FloatTensor<Self>,
-        wanted: [bool; 2],
-    ) -> [Option<FloatTensor<Self>>; 2];
+/// What the combinations of the same coefficients leave for their gradient.
+#[derive(Debug)]
+pub struct Combinations {
+    shape: Arc<BasisShape>,
+    rows: usize,
+    gradients: Shared,
 }
 
-/// The operation per device.
+impl Combinations {
+    /// The layout of the coefficients.
+    pub fn shape(&self) -> &BasisShape {
+        &self.shape
+    }
+}
+
+/// The derivatives per device.
+pub trait BasisBackward: Token {
+    /// The gradient of the coefficients `[rows, C]`: the sum over all (functions, gradient of their outputs).
+    fn coefficient_gradient(parts: Vec<(FloatTensor<Self>, FloatTensor<Self>)>, rows: usize, shape: &BasisShape) -> FloatTensor<Self>;
+    /// The gradient of the functions.
+    fn function_gradient(coefficients: FloatTensor<Self>, shape: &BasisShape, grad: FloatTensor<Self>) -> FloatTensor<Self>;
+}
+
+/// The operations per device.
 #[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"), Autodiff)]
 pub trait BasisOps: Backend {
-    /// Flat outputs, head after head, each `[M, outputs]`, of coefficients `[M, C]` and functions `[F]`; differentiable in both.
-    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self>;
+    /// Coefficients `[M, C]` as they are; their gradient is computed once all combinations have theirs.
+    fn coefficients(coefficients: FloatTensor<Self>, combinations: Arc<Combinations>) -> FloatTensor<Self>;
+    /// Flat outputs, head after head, each `[M, outputs]`, of coefficients that [`BasisOps::coefficients`] returned and functions `[F]`; differentiable in both.
+    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, combinations: Arc<Combinations>, index: usize) -> FloatTensor<Self>;
 }
 
 impl<B: CpuBackend> BasisBackward for B {
-    fn combine_backward(
-        coefficients: FloatTensor<Self>,
-        functions: FloatTensor<Self>,
-        shape: &BasisShape,
-        grad: FloatTensor<Self>,
-        wanted: [bool; 2],
-    ) -> [Option<FloatTensor<Self>>; 2] {
-        let (grad, rows) = (B::floats(&grad), coefficients.shape()[0]);
-        [
-            wanted[0].then(|| B::from_floats(kernel::coefficient_gradient(shape, &B::floats(&functions), &grad), [rows, shape.coefficients()])),
-            wanted[1].then(|| B::from_floats(kernel::function_gradient(shape, &B::floats(&coefficients), &grad), [shape.functions()])),
-        ]
+    fn coefficient_gradient(parts: Vec<(FloatTensor<Self>, FloatTensor<Self>)>, rows: usize, shape: &BasisShape) -> FloatTensor<Self> {
+        let values: Vec<_> = parts.iter().map(|(functions, grad)| (B::floats(functions), B::floats(grad))).collect();
+        let slices: Vec<(&[f32], &[f32])> = values.iter().map(|(functions, grad)| (&**functions, &**grad)).collect();
+        B::from_floats(kernel::coefficient_gradient(shape, rows, &slices), [rows, shape.coefficients()])
+    }
+    fn function_gradient(coefficients: FloatTensor<Self>, shape: &BasisShape, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        B::from_floats(kernel::function_gradient(shape, &B::floats(&coefficients), &B::floats(&grad)), [shape.functions()])
     }
 }
 
 impl<B: CpuBackend> BasisOps for B {
-    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
-        let (rows, functions) = (coefficients.shape()[0], Self::floats(&functions));
+    fn coefficients(coefficients: FloatTensor<Self>, _: Arc<Combinations>) -> FloatTensor<Self> {
+        coefficients
+    }
+    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, combinations: Arc<Combinations>, _: usize) -> FloatTensor<Self> {
+        let (rows, functions, shape) = (combinations.rows, Self::floats(&functions), &combinations.shape);
         let out = match Self::columns(&coefficients) {
-            Some(columns) => kernel::combine(&shape, rows, &Coefficients::Columns(columns), &functions),
-            None => kernel::combine(&shape, rows, &Coefficients::Heads(&Self::floats(&coefficients)), &functions),
+            Some(columns) => kernel::combine(shape, rows, &Coefficients::Columns(columns), &functions),
+            None => kernel::combine(shape, rows, &Coefficients::Heads(&Self::floats(&coefficients)), &functions),
         };
         let len = out.len();
         Self::from_floats(out, [len])
@@ -91,20 +103,30 @@ impl<B: CpuBackend> BasisOps for B {
 struct Combine;
 
 impl<B: BasisBackward> Backward<B, 2> for Combine {
-    type State = (FloatTensor<B>, FloatTensor<B>, Arc<BasisShape>);
+    type State = (FloatTensor<B>, FloatTensor<B>, Arc<Combinations>, usize);
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
-        differentiate::<B, _, 2>(ops, grads, |(coefficients, functions, shape), upstream, wanted| {
-            B::combine_backward(coefficients, functions, &shape, upstream, wanted)
+        differentiate::<B, _, 2>(ops, grads, |(coefficients, functions, combinations, index), upstream, wanted| {
+            let of_functions = wanted[1].then(|| B::function_gradient(coefficients, &combinations.shape, upstream.clone()));
+            let token = wanted[0].then(|| B::token(&upstream));
+            combinations.gradients.leave(index, (functions, upstream));
+            [token, of_functions]
         });
     }
 }
 
 impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B, C> {
-    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, shape: Arc<BasisShape>) -> FloatTensor<Self> {
+    fn coefficients(coefficients: FloatTensor<Self>, combinations: Arc<Combinations>) -> FloatTensor<Self> {
+        share::<B, C, _>(coefficients, combinations, |combinations| {
+            let parts = combinations.gradients.take().into_iter().flatten().collect();
+            B::coefficient_gradient(parts, combinations.rows, &combinations.shape)
+        })
+    }
+    fn combine(coefficients: FloatTensor<Self>, functions: FloatTensor<Self>, combinations: Arc<Combinations>, index: usize) -> FloatTensor<Self> {
         let ((coefficients, first), (functions, second)) = (coefficients.into_parts(), functions.into_parts());
         record::<B, C, _, 2>(Combine, [first, second], |_| {
-            (B::combine(coefficients.clone(), functions.clone(), shape.clone()), (coefficients, functions, shape))
+            let out = B::combine(coefficients.clone(), functions.clone(), combinations.clone(), index);
+            (out, (coefficients, functions, combinations, index))
         })
     }
 }
@@ -114,13 +136,26 @@ impl<B: BasisBackward + BasisOps, C: CheckpointStrategy> BasisOps for Autodiff<B
 /// In memory, coefficients are stored group after group, each `[M, width x functions]`, as [`super::field::mlp_relu_flat`] returns them. Stored
 /// [`by_columns`] they are read faster, but have no gradient.
 pub fn combine(coefficients: Tensor<2>, functions: Tensor<1>, shape: &Arc<BasisShape>) -> Result<Vec<Tensor<2>>> {
-    let ([m, width], [count]) = (coefficients.dims(), functions.dims());
-    if m == 0 || width != shape.coefficients() || count != shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
-        let problem = format!("coefficients have shape [{m},{width}], there are {count} functions, {shape:?} is expected");
-        return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients and functions as the shape says"));
+    Ok(combine_all(coefficients, vec![functions], shape)?.into_iter().flatten().collect())
+}
+
+/// The outputs of [`combine`] at several moments, in the order of `functions`. The gradient of the coefficients is computed once for all of them.
+pub fn combine_all(coefficients: Tensor<2>, functions: Vec<Tensor<1>>, shape: &Arc<BasisShape>) -> Result<Vec<Vec<Tensor<2>>>> {
+    let [rows, width] = coefficients.dims();
+    for moment in &functions {
+        let [count] = moment.dims();
+        if rows == 0 || width != shape.coefficients() || count != shape.functions() || shape.groups.iter().any(|g| g.0 == 0 || g.1 == 0) {
+            let problem = format!("coefficients have shape [{rows},{width}], there are {count} functions, {shape:?} is expected");
+            return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients and functions as the shape says"));
+        }
     }
-    let flat = Tensor::from_dispatch(<Dispatch as BasisOps>::combine(coefficients.into_dispatch(), functions.into_dispatch(), shape.clone()));
-    Ok(split_heads(&flat, m, &shape.widths()))
+    let combinations = Arc::new(Combinations { shape: shape.clone(), rows, gradients: Shared::new(functions.len()) });
+    let coefficients = <Dispatch as BasisOps>::coefficients(coefficients.into_dispatch(), combinations.clone());
+    let at = |(index, moment): (usize, Tensor<1>)| {
+        let flat = <Dispatch as BasisOps>::combine(coefficients.clone(), moment.into_dispatch(), combinations.clone(), index);
+        split_heads(&Tensor::from_dispatch(flat), rows, &shape.widths())
+    };
+    Ok(functions.into_iter().enumerate().map(at).collect())
 }
 
 /// The same coefficients `[M, C]` column by column in memory, for playback.

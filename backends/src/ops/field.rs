@@ -4,6 +4,7 @@ use crate::cpu::mlp::{mish, relu};
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::interpolate;
 use crate::ops::autodiff::{differentiate, record};
+use crate::ops::split::split;
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops};
@@ -228,12 +229,8 @@ pub(super) fn split_heads(flat: &Tensor<1>, rows: usize, widths: &[usize]) -> Ve
     if let [only] = widths {
         return vec![flat.clone().reshape([rows, *only])];
     }
-    let mut at = 0;
-    let head = |&width: &usize| {
-        at += rows * width;
-        flat.clone().narrow(0, at - rows * width, rows * width).reshape([rows, width])
-    };
-    widths.iter().map(head).collect()
+    let heads = split(flat.clone(), widths.iter().map(|width| rows * width).collect());
+    heads.into_iter().zip(widths).map(|(head, &width)| head.reshape([rows, width])).collect()
 }
 
 fn check_weights(object: &str, got: usize, want: usize) -> Result<()> {

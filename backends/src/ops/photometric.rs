@@ -1,5 +1,6 @@
 //! The photometric loss and the cross-entropy of the score stage, with their gradients.
 
+use crate::cpu::cross_entropy::bce_with_logits;
 use crate::cpu::photometric as kernel;
 use crate::cpu::tensor::CpuBackend;
 use crate::ops::autodiff::{differentiate, record, record_beside};
@@ -56,7 +57,7 @@ impl<B: CpuBackend> PhotometricKernels for B {
         let pixels = shape[1] * shape[2];
         let mut grads = vec![0.0f32; if gradient { shape.num_elements() } else { 0 }];
         let wanted = gradient.then_some(&mut grads[..if gradient { pixels } else { 0 }]);
-        let loss = kernel::bce_with_logits(&B::floats(&planes)[..pixels], &B::floats(&mask), wanted);
+        let loss = bce_with_logits(&B::floats(&planes)[..pixels], &B::floats(&mask), wanted);
         let grads = if gradient { B::from_floats(grads, shape) } else { B::from_floats(grads, [0]) };
         (B::from_floats(vec![loss as f32], [1]), grads)
     }

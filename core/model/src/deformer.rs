@@ -200,6 +200,10 @@ pub trait Deformer: Send {
     }
     /// Offsets at `time_norm` in 0..1 for the M Gaussians of `features` `[M,F]`; the same heads at every time.
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets>;
+    /// The offsets of [`Deformer::deform`] at each of `times_norm`. Training asks for all views of an iteration at once, so that work and gradients can be shared.
+    fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
+        times_norm.iter().map(|&time_norm| self.deform(features.clone(), time_norm)).collect()
+    }
     /// The same features in the layout that [`Deformer::deform`] reads fastest. Playback calls this once per spatial pass.
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
         features

@@ -119,20 +119,25 @@ impl Life {
             |(((name, width), (start, spread)), lr)| AttributeSpec { spread, times_extent: name == "velocity", ..AttributeSpec::new(name, width, start, lr) };
         LIFE_ATTRIBUTES.into_iter().zip(starts).zip(rates).map(spec).collect()
     }
-    /// The change at `time_norm`, for attributes side by side `[M,7]`.
-    pub fn at(&self, attributes: Tensor<2>, time_norm: f32) -> LifeAt {
+    /// The changes at `times_norm`, for attributes side by side `[M,7]`.
+    pub fn at(&self, attributes: Tensor<2>, times_norm: &[f32]) -> Vec<LifeAt> {
         let [m, _] = attributes.dims();
         let column = |at: usize| attributes.clone().narrow(1, at, 1);
-        let since = column(0).neg().add_scalar(time_norm);
-        let outside = (since.clone().abs() - column(1).exp()).clamp_min(0.0);
-        let in_falloffs = outside / column(2).exp().clamp_min(LEAST_FALLOFF);
-        let life = in_falloffs.powi_scalar(2).clamp_max(-HIDDEN).neg().exp();
+        let (center, half_width, velocity) = (column(0), column(1).exp(), attributes.clone().narrow(1, 4, 3));
+        let falloff = column(2).exp().clamp_min(LEAST_FALLOFF);
         let gate = sigmoid(column(3).mul_scalar(GATE_STEEPNESS));
         let temporary = gate.clone().neg().add_scalar(1.0);
-        let factor = (gate + temporary.clone() * life).clamp(HIDDEN.exp(), 1.0);
-        let hidden = factor.clone().lower_elem(self.settings.hidden_below).reshape([m]);
-        let log_factor = factor.log().reshape([m]).mask_fill(hidden, HIDDEN);
-        LifeAt { shift: attributes.narrow(1, 4, 3) * since, log_factor, temporary }
+        let at = |&time_norm: &f32| {
+            let since = center.clone().neg().add_scalar(time_norm);
+            let outside = (since.clone().abs() - half_width.clone()).clamp_min(0.0);
+            let in_falloffs = outside / falloff.clone();
+            let life = (in_falloffs.clone() * in_falloffs).clamp_max(-HIDDEN).neg().exp();
+            let factor = (gate.clone() + temporary.clone() * life).clamp(HIDDEN.exp(), 1.0);
+            let hidden = factor.clone().lower_elem(self.settings.hidden_below).reshape([m]);
+            let log_factor = factor.log().reshape([m]).mask_fill(hidden, HIDDEN);
+            LifeAt { shift: velocity.clone() * since, log_factor, temporary: temporary.clone() }
+        };
+        times_norm.iter().map(at).collect()
     }
     /// The mean of 1 - gate with its weight, from the values of `life_gate` `[M,1]`.
     pub fn regularizer(&self, gates: Tensor<2>) -> Option<Tensor<1>> {
@@ -213,17 +218,25 @@ impl Deformer for WithLife {
         self.inner.attributes().into_iter().chain(self.life.attributes()).collect()
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
-        if !time_norm.is_finite() {
+        Ok(self.deform_all(features, &[time_norm])?.pop().unwrap_or_default())
+    }
+    fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
+        if let Some(time_norm) = times_norm.iter().find(|time_norm| !time_norm.is_finite()) {
             return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
         }
         let (lives, inner) = Self::split(features);
-        let mut offsets = inner.map(|inner| self.inner.deform(inner, time_norm)).transpose()?.unwrap_or_default();
-        let LifeAt { shift, log_factor, temporary } = self.life.at(lives, time_norm);
-        // What is there at all times is moved by the inner deformer alone; its velocity and its life have no gradient.
-        let shift = shift * temporary;
-        offsets.means = Some(offsets.means.map_or(shift.clone(), |means| means + shift));
-        offsets.opacity_log_factor = Some(offsets.opacity_log_factor.map_or(log_factor.clone(), |own| own + log_factor));
-        Ok(offsets)
+        let inner = match inner {
+            Some(inner) => self.inner.deform_all(inner, times_norm)?,
+            None => times_norm.iter().map(|_| Offsets::default()).collect(),
+        };
+        let with_life = |(mut offsets, LifeAt { shift, log_factor, temporary }): (Offsets, LifeAt)| {
+            // What is there at all times is moved by the inner deformer alone; its velocity and its life have no gradient.
+            let shift = shift * temporary;
+            offsets.means = Some(offsets.means.map_or(shift.clone(), |means| means + shift));
+            offsets.opacity_log_factor = Some(offsets.opacity_log_factor.map_or(log_factor.clone(), |own| own + log_factor));
+            offsets
+        };
+        Ok(inner.into_iter().zip(self.life.at(lives, times_norm)).map(with_life).collect())
     }
     fn parameters(&self) -> Vec<&Parameter> {
         self.inner.parameters()
@@ -277,7 +290,7 @@ mod tests {
         let (r, s) = (0.1f32.ln(), 0.1f32.ln());
         let attributes = Tensor::<2>::from_floats([[0.5, r, s, -1.0, 2.0, 0.0, 0.0], [0.5, r, s, 1.0, 2.0, 0.0, 0.0]], &device);
         let at = |time: f32| {
-            let LifeAt { shift, log_factor, .. } = life.at(attributes.clone(), time);
+            let LifeAt { shift, log_factor, .. } = life.at(attributes.clone(), &[time]).remove(0);
             (to_vec(log_factor, "f").unwrap(), to_vec(shift, "m").unwrap())
         };
         let (inside, means) = at(0.55);

@@ -13,13 +13,14 @@ mod functions;
 mod simplify;
 mod sparsity;
 
+use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
 use crate::parts::settings::{Rates, take, within};
 use crate::parts::time::bands_for;
 use crate::parts::voxels::{VoxelSettings, Voxels, parameter};
 use crate::parts::weights;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
+use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine_all};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu_flat};
 use cc4dgs_core::{
     Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
@@ -208,12 +209,13 @@ impl CdfBasis {
         let weights = self.functions.network.as_ref().map(|_| self.parameters[self.voxels.levels()].value.clone());
         self.functions.at(times_norm, weights, like)
     }
-    /// φ(t) for each head (its own functions only), concatenated head after head.
-    fn functions_by_head(&self, time_norm: f32, like: &Device) -> Result<Tensor<1>> {
-        let all: Tensor<1> = self.functions_at(&[time_norm], like)?.flatten(0, 1);
+    /// φ(t) at each of `times_norm` for each head (its own functions only), concatenated head after head.
+    fn functions_by_head(&self, times_norm: &[f32], like: &Device) -> Result<Vec<Tensor<1>>> {
+        let all = self.functions_at(times_norm, like)?;
         let indices: Vec<i64> = self.kept.iter().flatten().map(|&f| f as i64).collect();
         let count = indices.len();
-        Ok(all.select(0, Tensor::<1, Int>::from_data(TensorData::new(indices, [count]), like)))
+        let indices = Tensor::<1, Int>::from_data(TensorData::new(indices, [count]), like);
+        Ok((0..times_norm.len()).map(|k| all.clone().narrow(0, k, 1).flatten::<1>(0, 1).select(0, indices.clone())).collect())
     }
 }
 
@@ -231,21 +233,25 @@ impl Deformer for CdfBasis {
         Ok(SpatialFeatures { values: flat.reshape([m, self.shape.coefficients()]), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
-        if !time_norm.is_finite() {
-            return Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"));
-        }
-        let [m, _] = features.dims();
+        Ok(self.deform_all(features, &[time_norm])?.pop().unwrap_or_default())
+    }
+    fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
+        times_norm.iter().try_for_each(|&time_norm| check_time(time_norm))?;
+        let ([m, _], device) = (features.dims(), features.device());
         let outputs = if m == 0 {
-            self.shape.widths().into_iter().map(|width| Tensor::zeros([0, width], &features.device())).collect()
+            let empty = || self.shape.widths().into_iter().map(|width| Tensor::zeros([0, width], &device)).collect();
+            times_norm.iter().map(|_| empty()).collect()
         } else {
-            let functions = self.functions_by_head(time_norm, &features.device())?;
-            combine(features, functions, &self.shape)?
+            combine_all(features, self.functions_by_head(times_norm, &device)?, &self.shape)?
         };
-        let mut offsets = heads::offsets(&self.settings.heads, outputs, self.context.sh_degree);
-        if self.settings.rotation == Rotation::Exponential {
-            offsets.rotation_vectors = offsets.quaternions.take();
-        }
-        Ok(offsets)
+        let at = |outputs| {
+            let mut offsets = heads::offsets(&self.settings.heads, outputs, self.context.sh_degree);
+            if self.settings.rotation == Rotation::Exponential {
+                offsets.rotation_vectors = offsets.quaternions.take();
+            }
+            offsets
+        };
+        Ok(outputs.into_iter().map(at).collect())
     }
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
         by_columns(features, &self.shape)

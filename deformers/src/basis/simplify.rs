@@ -33,8 +33,8 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
     let device = features.device();
     let values = to_vec(features.inner(), "coefficients")?;
     let mut functions = Vec::with_capacity(times.len());
-    for &time in times {
-        functions.push(to_vec(field.functions_by_head(time, &device)?.inner(), "functions")?);
+    for at_time in field.functions_by_head(times, &device)? {
+        functions.push(to_vec(at_time.inner(), "functions")?);
     }
     let count = field.shape.functions();
     let flat: Vec<f32> = functions.concat();

@@ -275,6 +275,36 @@ fn photometric_loss_matches_its_definition_at_awkward_sizes() {
 }
 
 #[test]
+fn photometric_loss_is_right_where_most_of_an_image_is_equal() {
+    // Equal but for a box: in the middle, at a corner, one pixel. Kernels may skip what is equal.
+    let (h, w) = (30, 41);
+    for (rows, columns) in [(12..16, 16..25), (0..3, 36..41), (29..30, 0..1)] {
+        let n = 3 * h * w;
+        let y: Vec<f64> = (0..n).map(|i| f64::from((0.5 + 0.4 * (i as f64 * 0.31 + 1.0).cos()) as f32)).collect();
+        let differs = |i: usize| rows.contains(&(i / w % h)) && columns.contains(&(i % w));
+        let x: Vec<f64> = y.iter().enumerate().map(|(i, y)| if differs(i) { f64::from((y + 0.3 * (i as f64).sin()) as f32) } else { *y }).collect();
+        let slope = |at: usize| {
+            let moved = |by: f64| x.iter().enumerate().map(|(i, x)| if i == at { x + by } else { *x }).collect::<Vec<f64>>();
+            (plain_loss(&moved(1e-5), &y, (3, h, w), 0.2) - plain_loss(&moved(-1e-5), &y, (3, h, w), 0.2)) / 2e-5
+        };
+        let pixels = (0..h).step_by(5).chain([h - 1]).flat_map(|row| (0..w).step_by(6).map(move |column| (h + row) * w + column));
+        let slopes: Vec<(usize, f64)> = pixels.map(|at| (at, slope(at))).collect();
+        let want = plain_loss(&x, &y, (3, h, w), 0.2);
+        for (name, device) in devices() {
+            let planes = Tensor::<3>::from_data(TensorData::new(to_f32(&x), [3, h, w]), &device.clone().autodiff()).require_grad();
+            let out = photometric_loss(planes.clone(), Tensor::<3>::from_data(TensorData::new(to_f32(&y), [3, h, w]), &device), 0.2).expect("a loss");
+            let grad = values(planes.grad(&out.loss.clone().backward()).expect("a gradient"));
+            let loss = f64::from(values(out.loss)[0]);
+            assert!((loss - want).abs() < 2e-7, "{name} {rows:?} {columns:?}: {loss} instead of {want}");
+            for &(at, slope) in &slopes {
+                let error = (f64::from(grad[at]) - slope).abs();
+                assert!(error < 2e-3 * slope.abs() + 1e-7, "{name} {rows:?} {columns:?} value {at}: {} instead of {slope}", grad[at]);
+            }
+        }
+    }
+}
+
+#[test]
 fn cross_entropy_is_stable_and_its_gradient_right() {
     for (name, device) in devices() {
         let logits = [-200.0f32, -3.0, -0.5, 0.0, 0.5, 4.0, 200.0, 7.0];

@@ -64,11 +64,20 @@ impl Context<'_> {
         let mut rendered = Vec::with_capacity(batch.len());
         let mut seen: Option<Tensor<1, Int>> = None;
         let read = log.due(schedule.iteration);
+        let mut offsets = Vec::new();
+        if let (Some(spatial), Some(deformer)) = (&spatial, &state.deformer) {
+            let times: Vec<f32> = batch.iter().map(|&view| self.noisy_time(scene.views[view].time_norm, schedule, view)).collect();
+            offsets = deformer.field.deform_all(spatial.features.clone(), &times)?;
+            if offsets.len() != times.len() {
+                let problem = format!("deform_all gave offsets at {} times for {}", offsets.len(), times.len());
+                return Err(Error::parameter(format!("deformer {}", deformer.name()), problem, "Return the offsets at every time, in order"));
+            }
+        }
+        let mut offsets = offsets.into_iter();
         for &view in batch {
             let (camera, time_norm) = (scene.camera(view), scene.views[view].time_norm);
-            let drawn = match (&spatial, &state.deformer) {
-                (Some(spatial), Some(deformer)) => {
-                    let offsets = deformer.field.deform(spatial.features.clone(), self.noisy_time(time_norm, schedule, view))?;
+            let drawn = match (offsets.next(), &state.deformer) {
+                (Some(offsets), Some(deformer)) => {
                     offsets.check(deformer.name(), rows.count())?;
                     if read || check {
                         // The check names the head; the way out is the watchdog's.
