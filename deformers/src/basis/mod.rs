@@ -236,6 +236,9 @@ impl Deformer for CdfBasis {
         Ok(self.deform_all(features, &[time_norm])?.pop().unwrap_or_default())
     }
     fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
+        if times_norm.is_empty() {
+            return Ok(Vec::new());
+        }
         times_norm.iter().try_for_each(|&time_norm| check_time(time_norm))?;
         let ([m, _], device) = (features.dims(), features.device());
         let outputs = if m == 0 {

@@ -73,7 +73,7 @@ fn plans_fit_the_capture() {
     assert_eq!(kind(&plan("dome").appearance), "none");
     let turntable = plan("turntable");
     assert!(turntable.render.background.unwrap().iter().all(|c| *c > 0.97), "{:?}", turntable.render.background);
-    assert!(handheld.render.background.is_none());
+    assert!(handheld.render.background.is_some_and(|c| c.iter().all(|c| *c < 0.9)), "the mean colour of the images");
     // The plan is part of the configuration; planning again from it changes nothing.
     let text = handheld.to_toml().unwrap();
     let folder = tempfile::tempdir().unwrap();

@@ -1,7 +1,7 @@
 //! Basis combinations compared with sums in float64, forward and backward, on every device.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine};
+use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine, combine_all};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Deformer, DeformerContext, Gaussians, HostGaussians, Offsets, Registry, Seed, SpatialInput, config};
 use cc4dgs_deformers as _;
@@ -59,6 +59,44 @@ fn values_and_gradients_are_those_of_the_sums() {
                 close("coefficients", to_vec(c.grad(&gradients).unwrap(), "gradient").unwrap(), &of_coefficients);
                 close("functions", to_vec(f.grad(&gradients).unwrap(), "gradient").unwrap(), &of_functions);
             }
+        }
+    }
+}
+
+#[test]
+fn gradients_of_several_moments_are_the_sums_of_each() {
+    let shape = Arc::new(BasisShape { groups: vec![(3, 9), (3, 2), (4, 9)] });
+    let (columns, count, width) = (shape.coefficients(), shape.functions(), shape.outputs());
+    let rows = 290;
+    for (name, device) in devices() {
+        poison(&device);
+        let device = device.autodiff();
+        let upload = |seed: u64, len: usize| Tensor::<1>::from_data(TensorData::new(noise(seed, len), [len]), &device);
+        let moments: Vec<Tensor<1>> = (0..3).map(|k| upload(40 + k, count).require_grad()).collect();
+        // The loss does not depend on the second moment, nor on one head of the third.
+        let loss = |outputs: &[Vec<Tensor<2>>]| {
+            let weighted = |k: usize, heads: &[usize]| {
+                let all: Vec<Tensor<1>> = heads.iter().map(|&h| outputs[k][h].clone().flatten(0, 1)).collect();
+                let flat = Tensor::cat(all, 0);
+                let len = flat.dims()[0];
+                (flat * upload(60 + k as u64, len)).sum()
+            };
+            weighted(0, &[0, 1, 2]) + weighted(2, &[0, 2])
+        };
+        let coefficients = || upload(70, rows * columns).reshape([rows, columns]).inner();
+        let tracked = [0, 1].map(|_| Tensor::<2>::from_inner(coefficients()).require_grad());
+        let together = combine_all(tracked[0].clone(), moments.clone(), &shape).unwrap();
+        let apart: Vec<Vec<Tensor<2>>> = moments.iter().map(|m| combine(tracked[1].clone(), m.clone(), &shape).unwrap()).collect();
+        assert!(together.iter().flatten().map(|t| t.dims()[1]).sum::<usize>() == 3 * width);
+        let list = |t: Tensor<2>| to_vec(t, "gradient").unwrap();
+        let (a, b) = (loss(&together).backward(), loss(&apart).backward());
+        let (found, wanted) = (list(tracked[0].grad(&a).unwrap()), list(tracked[1].grad(&b).unwrap()));
+        let worst = found.iter().zip(&wanted).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+        assert!(found.len() == rows * columns && worst < 1e-5 && wanted.iter().any(|v| v.abs() > 0.1), "{name}: {worst}");
+        for (k, moment) in moments.iter().enumerate() {
+            let (x, y) = (moment.grad(&a).map(|t| to_vec(t, "f").unwrap()), moment.grad(&b).map(|t| to_vec(t, "f").unwrap()));
+            let worst = x.iter().flatten().zip(y.iter().flatten()).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+            assert!(x.is_some() == (k != 1) && y.is_some() == (k != 1) && worst < 1e-3, "{name}, moment {k}: {worst}");
         }
     }
 }

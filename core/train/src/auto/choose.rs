@@ -34,7 +34,7 @@ const MATCHING_SHARE: f64 = 0.08;
 const SECONDS_PER_MATCHED_PIXEL: f64 = 4.3e-6;
 const MOST_MATCHED_PIXELS: f64 = 96_000.0;
 /// Least and most frames between key frames: in fewer hardly anything moves; in more, straight lines do not follow.
-const LEAST_KEY_INTERVAL: f64 = 5.0;
+const LEAST_KEY_INTERVAL: f64 = 3.0;
 const MOST_KEY_INTERVAL: usize = 16;
 /// Share of transparent pixels from which a scene is an object without surroundings.
 const OBJECT: f32 = 0.05;
@@ -140,8 +140,10 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
         return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
     }
     if let Some(every) = key_frames {
-        let reason =
-            format!("{} cameras see each frame: what moves starts with points of every {every}th frame, each with a velocity and a life", facts.cameras);
+        let reason = format!(
+            "{} cameras see each frame: what moves starts with points of key frames, {every} frames apart, each with a velocity and a life",
+            facts.cameras
+        );
         return choice([("deformer.kind", "free-time".into()), ("train.key_frames", integer(every as f64))], reason);
     }
     // Where poses have nothing to do with each other, higher bands would learn every training time by itself and the times between not at all.
@@ -219,7 +221,7 @@ fn background(facts: &Facts) -> Option<Choice> {
     let (colour, reason) = match facts.plain {
         Some(colour) => (colour, "the images have a plain background of this colour"),
         None if stands_alone(facts) => ([1.0; 3], "the images are transparent"),
-        None => return None,
+        None => (facts.mean?, "where nothing is known of the surroundings, held-out views get the mean colour of the images"),
     };
     Some(choice([("render.background", Value::Array(colour.map(|c| float(f64::from(c))).to_vec()))], reason))
 }
@@ -261,8 +263,7 @@ fn exposure(facts: &Facts) -> Option<Choice> {
 fn colour(facts: &Facts) -> Option<Choice> {
     let degree = match facts.cameras {
         0..=4 => 0,
-        5..=8 => 1,
-        9..=24 => 2,
+        5..=40 => 1,
         _ => return None,
     };
     Some(choice([("train.sh_degree", Value::Integer(degree))], format!("{} cameras say little of how colours change with the direction", facts.cameras)))
@@ -284,6 +285,7 @@ mod tests {
             points: 0,
             transparent: 0.0,
             plain: None,
+            mean: Some([0.4, 0.5, 0.6]),
             detail: 0.4,
             moving: Some(0.1),
             noise: Some(0.001),
@@ -298,13 +300,14 @@ mod tests {
     #[test]
     fn scenes_get_what_they_need_and_no_more() {
         let dome = choose(&facts(Arrangement::Dome), MACHINE, 5.0, true);
-        assert_eq!((value(&dome, "deformer.kind"), value(&dome, "train.key_frames")), (Some("free-time".into()), Some(5.into())));
+        assert_eq!((value(&dome, "deformer.kind"), value(&dome, "train.key_frames")), (Some("free-time".into()), Some(3.into())));
         let stated = choose(&facts(Arrangement::Dome), MACHINE, 5.0, false);
         assert!(value(&stated, "deformer.kind") == Some("cdf-basis".into()) && value(&stated, "train.key_frames").is_none());
         let long = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
         assert_eq!(value(&long, "deformer.kind"), Some("cdf-basis".into()));
         assert_eq!(value(&dome, "train.coarse_frames"), Some("first".into()));
-        assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none() && value(&dome, "render.background").is_none());
+        assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none());
+        assert_eq!(value(&dome, "render.background"), Some(vec![0.4, 0.5, 0.6].into()));
         let photos = choose(&Facts { frames: 1, moving: None, noise: None, ..facts(Arrangement::Photos) }, MACHINE, 5.0, true);
         assert_eq!(value(&photos, "deformer.kind"), Some("none".into()));
         let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };

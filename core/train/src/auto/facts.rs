@@ -74,6 +74,8 @@ pub struct Facts {
     pub transparent: f32,
     /// Colour behind everything, where images have a plain background, RGB in 0..1.
     pub plain: Option<[f32; 3]>,
+    /// Mean colour of the images, RGB in 0..1, unless the dataset states a background.
+    pub mean: Option<[f32; 3]>,
     /// Share of pixels with local contrast.
     pub detail: f32,
     /// Share of pixels that see something move, where a camera has several frames.
@@ -108,6 +110,7 @@ impl Facts {
             points: scene.points.as_ref().map_or(0, |p| p.positions.len()),
             transparent,
             plain: plain_background(&images),
+            mean: scene.background.is_none().then(|| mean_colour(&images)),
             detail: mean(images.iter().map(detail)).unwrap_or(0.0),
             moving: motion.as_ref().map(|m| m.moving),
             noise: motion.as_ref().map(|m| m.noise),
@@ -187,6 +190,19 @@ fn plain_background(images: &[Image8]) -> Option<[f32; 3]> {
     let colour = [median(0), median(1), median(2)];
     let like = all.iter().filter(|c| (0..3).map(|k| (c[k] - colour[k]).abs()).sum::<f32>() < 3.0 * PLAIN).count();
     (like as f32 >= PLAIN_SHARE * all.len() as f32).then_some(colour)
+}
+
+/// Mean colour of all pixels; transparent ones count with the colour that is stored.
+fn mean_colour(images: &[Image8]) -> [f32; 3] {
+    let (mut sums, mut count) = ([0.0f64; 3], 0usize);
+    for image in images {
+        for pixel in image.data.chunks_exact(image.channels.max(3) as usize) {
+            (0..3).for_each(|k| sums[k] += f64::from(pixel[k]));
+            count += 1;
+        }
+    }
+    // Three digits: the plan is read by people.
+    sums.map(|sum| ((sum / 0.255 / count.max(1) as f64).round() / 1e3) as f32)
 }
 
 /// Share of pixels whose 3x3 surroundings have contrast.

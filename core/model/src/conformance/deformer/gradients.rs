@@ -10,8 +10,10 @@ use burn::tensor::{Device, Tensor, TensorData};
 const SLOPE_TOLERANCE: f64 = 0.05;
 /// Step along the gradient's direction: short enough to cross few ReLU kinks, long enough to be above the rounding error.
 const STEP: f64 = 5e-4;
-/// Time at which gradients are taken.
+/// Time at which gradients of regularizers are taken.
 const TIME: f32 = 0.43;
+/// Times of the offsets whose gradients are taken together.
+const TIMES: [f32; 2] = [TIME, 0.87];
 
 /// A scalar function of a deformer and its input.
 type Scalar<'a> = dyn Fn(&dyn Deformer, &SpatialInput) -> Result<Option<Tensor<1>>> + 'a;
@@ -22,7 +24,12 @@ impl Suite<'_> {
             return Ok(None);
         }
         let weighted = |built: &dyn Deformer, input: &SpatialInput| {
-            let offsets = self.offsets(built, input, TIME)?.concatenated().ok_or_else(no_heads)?;
+            let all = built.deform_all(built.spatial(input)?.values, &TIMES)?.into_iter();
+            let all: Vec<Tensor<2>> = all.map(|offsets| offsets.concatenated().ok_or_else(no_heads)).collect::<Result<_>>()?;
+            if all.is_empty() {
+                return Err(no_heads());
+            }
+            let offsets = Tensor::cat(all, 1);
             let [n, width] = offsets.dims();
             let weights: Vec<f32> = (0..n * width).map(|k| 1.0 + 0.5 * uniform(Seed::root(8), k)).collect();
             let weights = Tensor::<2>::from_inner(Tensor::from_data(TensorData::new(weights, [n, width]), self.device));

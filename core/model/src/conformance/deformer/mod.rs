@@ -7,7 +7,7 @@ use crate::gaussians::to_vec;
 use crate::{Deformer, DeformerContext, DeformerPlugin, Error, Offsets, Result, Seed, SpatialInput, check_attributes, config};
 use burn::tensor::{Device, Tensor, TensorData};
 
-/// Largest difference of offsets from packed features, as a share of the largest offset: sums may run in another order.
+/// Largest difference of offsets from packed features or at several times at once, as a share of the largest offset: sums may run in another order.
 const PACKED_TOLERANCE: f32 = 1e-5;
 /// Largest root-mean-square difference of a simplified deformer's offsets, over the root-mean-square of the offsets.
 const SIMPLIFIED_TOLERANCE: f64 = 0.5;
@@ -22,7 +22,7 @@ const CENTRES: usize = 48;
 /// - every head has its shape; offsets have the same heads at every time and at every progress of training, are finite, and repeat bit for bit;
 /// - a deformer that declares `starts-as-identity` moves nothing initially, a static one never does;
 /// - gradients of all weights and of all attributes agree with finite differences, through the offsets and through the regularizer;
-/// - packed features give the same offsets; weights can be copied to a new deformer, bit for bit;
+/// - several times at once give the offsets of each; packed features give the same offsets; weights can be copied to a new deformer, bit for bit;
 /// - what `simplified` returns can be built again from its settings, and moves Gaussians in nearly the same way;
 /// - no centres, one centre and centres that are not finite give offsets or errors; missing attributes and times that are not numbers are refused.
 ///
@@ -42,6 +42,7 @@ pub fn deformer(plugin: &DeformerPlugin, settings: &toml::Table, device: &Device
             ("regularizer", Box::new(|| suite.regularizer_is_sound())),
             ("progress", Box::new(|| suite.progress_is_followed())),
             ("weights", Box::new(|| suite.weights_carry_everything())),
+            ("several times", Box::new(|| suite.several_times_are_each())),
             ("packed", Box::new(|| suite.packing_changes_nothing())),
             ("simplified", Box::new(|| suite.simplified_does_the_same())),
             ("odd inputs", Box::new(|| suite.odd_inputs_are_answered())),
@@ -194,6 +195,24 @@ impl Suite<'_> {
         built.set_progress(1.0);
         let found = self.values(built.as_ref(), CENTRES, 0.37, self.device)?;
         Ok((found != trained).then(|| "at progress 1 it gives other offsets than before any progress was set".into()))
+    }
+    fn several_times_are_each(&self) -> Result<Option<String>> {
+        let built = self.shaken(self.device)?;
+        let features = built.spatial(&self.input(built.as_ref(), CENTRES, self.device))?.values;
+        let times = [0.37, 0.0, 0.92];
+        let together = built.deform_all(features.clone(), &times)?;
+        if together.len() != times.len() || !built.deform_all(features.clone(), &[])?.is_empty() {
+            return Ok(Some(format!("deform_all gives offsets at {} times for {}, or some for none", together.len(), times.len())));
+        }
+        for (time_norm, offsets) in times.into_iter().zip(together) {
+            let (found, wanted) = (flat(offsets)?, flat(built.deform(features.clone(), time_norm)?)?);
+            let size = wanted.iter().fold(0.0f32, |most, v| most.max(v.abs()));
+            let worst = found.iter().zip(&wanted).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            if found.len() != wanted.len() || worst > PACKED_TOLERANCE * size {
+                return Ok(Some(format!("at time {time_norm}, deform_all and deform differ by {worst}, for offsets of up to {size}")));
+            }
+        }
+        Ok(None)
     }
     fn packing_changes_nothing(&self) -> Result<Option<String>> {
         let built = self.shaken(self.device)?;
