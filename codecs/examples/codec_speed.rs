@@ -1,5 +1,5 @@
 //! Bytes per stream and seconds of codecs on a PLY file, repeated to a larger model: `codec_speed FILE.ply REPEAT CODEC[:PROFILE]...`, JSON lines. Where the
-//! variable `DECODED` names a folder, what was decoded is written there as PLY files.
+//! variable `DECODED` names a folder, what was decoded is written there as PLY files. `DECODES` is how often it decodes, the fastest counts; 3 by default.
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
 use cc4dgs_format::archive::{Archive, ArchiveWriter, Manifest, StreamKind};
@@ -17,6 +17,7 @@ fn main() -> Result<()> {
     let gaussians = repeated(&ply::read(std::path::Path::new(path), &limits)?, repeat);
     let context = CodecContext { dynamic_threshold: Some(f32::INFINITY), ..CodecContext::new(Seed::root(0), limits, &Silent) };
     let codecs = Entries::<CodecPlugin>::collect()?;
+    let decodes = std::env::var("DECODES").ok().and_then(|v| v.parse().ok()).unwrap_or(3);
     for spec in specs {
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
         let codec = (codecs.get(name)?.build)(profile, &toml::Table::new())?;
@@ -26,7 +27,7 @@ fn main() -> Result<()> {
         let manifest = Manifest { frame_count: 1, gaussian_count: gaussians.len() as u64, ..Default::default() };
         let archive = Archive::from_bytes("memory", ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).to_bytes()?, &limits)?;
         let (mut decode, mut decode_cpu) = (f64::INFINITY, f64::INFINITY);
-        for _ in 0..3 {
+        for _ in 0..decodes {
             let streams = archive.read_kind(StreamKind::Canonical)?;
             let (began, cpu) = (Instant::now(), cpu_seconds());
             let found = codec.decode(&streams, &context)?;

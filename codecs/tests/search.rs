@@ -121,7 +121,8 @@ fn the_loss_is_kept_and_measured_steps_save_bytes() {
     assert!(loose < tight, "{loose} bytes for 0.5 dB, {tight} for 0.02 dB");
     assert!(notes.0.lock().unwrap().iter().any(|n| n.contains("dB allowed")));
     let (plain, plain_drop) = encode("max-drop=0.5dB", "allocate = false");
-    assert!(plain_drop <= 0.5 && loose <= plain, "{loose} bytes with measured steps, {plain} without");
+    println!("{loose} bytes with measured steps, {plain} without");
+    assert!(plain_drop <= 0.5 && 100 * loose < 98 * plain, "{loose} bytes with measured steps, {plain} without");
     let (sized, _) = encode(&format!("max-size={}MB", loose as f64 / 1e6), "");
     assert!(sized <= loose);
 }

@@ -3,27 +3,28 @@
 
 use super::Job;
 use super::encode::Factors;
-use super::read;
-use cc4dgs_format::{CodecContext, RenderModel, Result, TrainingViews};
+use super::importance::budget;
+use cc4dgs_format::{RenderModel, Result, TrainingViews};
+use std::ops::RangeInclusive;
 
-/// Views on which the error is measured.
-const VIEWS: usize = 8;
+/// Views on which the error is measured, by [`budget`].
+const VIEWS: RangeInclusive<usize> = 4..=8;
+const WORK: usize = 1_000_000;
 /// The change of a step that is tried.
 const CHANGE: f64 = 2.0;
 /// Largest factor, and the inverse of the smallest.
 const LARGEST: f64 = 2.0;
 
 /// The factors of the columns at about the step factor `quality`.
-pub fn allocate(job: &Job, quality: f64, views: &dyn TrainingViews, renderer: &dyn RenderModel, context: &CodecContext) -> Result<Factors> {
-    let chosen = views.len().min(VIEWS);
+pub fn allocate(job: &Job, quality: f64, views: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<Factors> {
+    let chosen = views.len().min(budget(WORK, job.gaussians.len(), VIEWS));
     let view = |k: usize| views.view(k * views.len() / chosen);
     let originals = (0..chosen).map(|k| Ok(renderer.render(job.gaussians, view(k).0, view(k).1)?.planes)).collect::<Result<Vec<Vec<f32>>>>()?;
     let measure = |factors: &Factors| -> Result<(f64, f64)> {
         let attempt = job.attempt_with(quality, factors)?;
-        let found = read::read(&attempt.streams, &CodecContext::new(context.seed, context.limits, context.events))?;
         let mut error = 0.0;
         for (k, original) in originals.iter().enumerate() {
-            let drawn = renderer.render(&found, view(k).0, view(k).1)?;
+            let drawn = renderer.render(&attempt.decoded, view(k).0, view(k).1)?;
             let colours = 3 * drawn.width as usize * drawn.height as usize;
             error += original.iter().zip(&drawn.planes).take(colours).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
         }

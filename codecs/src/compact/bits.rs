@@ -34,49 +34,37 @@ impl BitWriter {
 /// Reads what [`BitWriter`] wrote.
 pub struct BitReader<'a> {
     bytes: &'a [u8],
+    /// Bits that were taken.
     at: usize,
-    /// Bits that were read from `bytes` and not taken; above `filled` there may be some that follow.
-    pending: u64,
-    filled: u32,
 }
 
 impl<'a> BitReader<'a> {
     pub fn new(bytes: &'a [u8]) -> Self {
-        Self { bytes, at: 0, pending: 0, filled: 0 }
+        Self { bytes, at: 0 }
     }
     /// The next `count` (at most 56) bits; `None` if there are fewer.
     #[inline(always)]
     pub fn take(&mut self, count: u32) -> Option<u64> {
-        if self.filled < count {
-            self.refill();
-            if self.filled < count {
-                return None;
-            }
-        }
-        let value = self.pending & ((1 << count) - 1);
-        self.pending >>= count;
-        self.filled -= count;
+        let (first, end) = (self.at / 8, self.at + count as usize);
+        let word = match self.bytes.get(first..).and_then(|rest| rest.first_chunk::<8>()) {
+            Some(word) => u64::from_le_bytes(*word),
+            None => self.last_word(first, end)?,
+        };
+        let value = word >> (self.at % 8) & ((1 << count) - 1);
+        self.at = end;
         Some(value)
     }
-    #[inline]
-    fn refill(&mut self) {
-        if let Some(word) = self.bytes.get(self.at..).and_then(|rest| rest.first_chunk::<8>()) {
-            self.pending |= u64::from_le_bytes(*word) << self.filled;
-            let taken = (63 - self.filled) / 8;
-            self.at += taken as usize;
-            self.filled += 8 * taken;
-            return;
-        }
-        while let Some(&byte) = self.bytes.get(self.at).filter(|_| self.filled <= 56) {
-            self.pending |= u64::from(byte) << self.filled;
-            self.at += 1;
-            self.filled += 8;
-        }
+    /// The last bytes, from `first`; `None` if bits before `end` are missing.
+    #[cold]
+    fn last_word(&self, first: usize, end: usize) -> Option<u64> {
+        let mut word = [0; 8];
+        word.iter_mut().zip(self.bytes.get(first..)?).for_each(|(to, from)| *to = *from);
+        (end <= 8 * self.bytes.len()).then_some(u64::from_le_bytes(word))
     }
     /// Whether nothing but the zeros that fill the last byte is left.
     pub fn is_done(&self) -> bool {
-        let rest = self.bytes.get(self.at..).unwrap_or_default();
-        self.filled < 8 && rest.is_empty() && self.pending & ((1 << self.filled) - 1) == 0
+        let left = (8 * self.bytes.len()).saturating_sub(self.at);
+        left < 8 && self.bytes.last().is_none_or(|last| u32::from(*last) >> (8 - left) == 0)
     }
 }
 

@@ -1,35 +1,29 @@
 //! Colour coefficients: per spherical-harmonics degree a transform, and coordinates in steps that grow with the class.
 
-use super::entropy::{Coder, symmetric};
+use super::entropy::{Coder, LANES, Lanes, behind, symbol_of};
 use super::transform::{Basis, analysis, basis, identity, scaled};
 use cc4dgs_format::Result;
 use cc4dgs_format::archive::ByteReader;
 
-/// Contexts by expected size, in half octaves.
-const LEVELS: i32 = 40;
-/// Half octaves below a step at which the contexts start.
-const LOWEST: i32 = 16;
-/// Contexts of [`Degree::code`]: whether a row has anything, and sizes after a zero and after something else.
-pub const CONTEXTS: usize = 3 * LEVELS as usize;
+/// Contexts of the size of a row: four per octave of the size expected.
+const SIZES: usize = 32;
+/// Contexts of a coordinate: octaves below the coordinate with the largest spread, the size of the row, whether the size was reached before, and whether the
+/// coordinate before is zero.
+const LEVELS: usize = 12;
+const ROW_SIZES: usize = 10;
+const STATES: usize = 4;
+/// Contexts of [`Degree::code`].
+pub const CONTEXTS: usize = SIZES + LEVELS * ROW_SIZES * STATES;
+/// The size of a row of zeros, in half octaves: one less than that of a row with a 1.
+const NOTHING: i32 = -1;
 /// The value of a spread that stands for one step.
 const ONE_STEP: i32 = 128;
-/// Bits behind the point of expected magnitudes.
-const POINT: u32 = 4;
-/// Earlier rows count as much as one such share of a row.
-const EARLIER: u32 = 4;
 /// Mean magnitude of a coordinate over its root mean square.
 const MEAN: f64 = 0.7;
 /// What a bit costs, in squared steps, at the rate where less of either is worth the same: (ln 2)/6.
 const BIT: f64 = 0.1155;
 /// Largest share of a step by which a coordinate is rounded towards zero.
 const FARTHEST: f64 = 0.4;
-
-/// How large the coordinates of a row were so far, and how large they were expected to be; in the steps of class 0.
-#[derive(Clone, Copy, Default)]
-pub struct Activity {
-    found: u64,
-    expected: u64,
-}
 
 /// The coefficients of one degree, all channels.
 pub struct Degree {
@@ -113,6 +107,9 @@ impl Degree {
     #[inline]
     pub fn restore(&self, basis: &[f32], codes: &[i32], class: u8, out: &mut [f32]) {
         out.copy_from_slice(&self.mean);
+        if codes.iter().all(|code| *code == 0) {
+            return;
+        }
         let step = self.step * (1u32 << class) as f32;
         match self.dims {
             3 => add::<3>(basis, codes, step, out),
@@ -133,39 +130,91 @@ impl Degree {
         let spread = meta.take(dims)?.to_vec();
         Ok(Self { dims, mean, step, spread, basis: meta.take(dims * dims)?.iter().map(|&b| b as i8).collect() })
     }
-    /// Adds a row of this degree to the activity, as [`Degree::code`] does.
-    pub fn note(&self, codes: &[i32], class: u8, activity: &mut Activity) {
-        activity.found += codes.iter().map(|&code| found_in(code, class)).sum::<u64>();
-        activity.expected += self.spread.iter().map(|&s| magnitude(i32::from(s))).sum::<u64>();
-    }
-    /// Codes the coordinates `[N,dims]` of a block. Many are zero, and often all of a row. What a row has in earlier degrees is in `activity`.
-    pub fn code<C: Coder>(&self, coder: &mut C, codes: &mut [i32], classes: &[u8], activity: &mut [Activity]) -> Result<()> {
-        let expected: Vec<u64> = self.spread.iter().map(|&s| magnitude(i32::from(s))).collect();
-        let whole = expected.iter().sum::<u64>();
-        let levels: Vec<i32> = self.spread.iter().map(|&s| 2 * (i32::from(s) - ONE_STEP + LOWEST)).collect();
-        let mut earlier = Activity::default();
-        for ((row, &class), activity) in codes.chunks_exact_mut(self.dims).zip(classes).zip(activity) {
-            let class = class.min(15);
-            let mut now = Activity { found: activity.found + (earlier.found >> EARLIER) + 1, expected: activity.expected + (earlier.expected >> EARLIER) + 1 };
-            let any = coder.symbol(level(levels[0], &now, class), usize::from(row.iter().any(|&v| v != 0)))?;
-            if any == 0 {
-                row.fill(0);
-            } else {
-                let mut after = LEVELS as usize;
-                for (c, code) in row.iter_mut().enumerate() {
-                    let context = after + level(levels[c], &now, class);
-                    *code = symmetric(coder, context, i64::from(*code))?.clamp(-LIMIT, LIMIT) as i32;
-                    now.found += found_in(*code, class);
-                    now.expected += expected[c];
-                    after = LEVELS as usize * (1 + usize::from(*code != 0));
-                }
-            }
-            let sum: u64 = row.iter().map(|&code| found_in(code, class)).sum();
-            activity.found += sum;
-            activity.expected += whole;
-            earlier.found = earlier.found - (earlier.found >> 3) + sum;
-            earlier.expected = earlier.expected - (earlier.expected >> 3) + whole;
+    /// The sizes of the rows `[N,dims]`, as [`Degree::code`] leaves them.
+    pub fn note(&self, codes: &[i32], classes: &[u8], sizes: &mut [i32]) {
+        for ((codes, &class), size) in codes.chunks_exact(self.dims).zip(classes).zip(sizes) {
+            *size = size_of(largest_symbol(codes), class);
         }
+    }
+    /// Codes the coordinates `[N,dims]` of a block. `sizes` are the sizes of the rows in the degree before, 0 if this is the first, and become those in this one:
+    /// the symbol of the largest magnitude plus twice the class, in half octaves. Sizes of all rows come first; then rows of zeros are known.
+    pub fn code<C: Coder>(&self, coder: &mut C, codes: &mut [i32], classes: &[u8], sizes: &mut [i32], first: bool) -> Result<()> {
+        let (dims, rows) = (self.dims, classes.len().min(sizes.len()).min(codes.len() / self.dims.max(1)));
+        let (codes, classes, sizes) = (&mut codes[..rows * dims], &classes[..rows], &mut sizes[..rows]);
+        // Running means of sizes, times 8.
+        let mut means = [0i32; LANES];
+        let mut filled = Vec::with_capacity(rows);
+        for (lane, row) in Lanes::of(rows).turns() {
+            let class = i32::from(classes[row].min(15));
+            // Twice the degree before and once the rows before, or these alone, times 2.
+            let expected = if first { means[lane] / 4 } else { (16 * sizes[row] + means[lane]) / 12 };
+            let context = (expected - 4 * class + 4).clamp(0, SIZES as i32 - 1);
+            let wanted = if C::WRITES { largest_symbol(&codes[row * dims..(row + 1) * dims]) } else { 0 };
+            let symbol = coder.symbol(lane, context as usize, wanted)?;
+            sizes[row] = size_of(symbol, classes[row]);
+            means[lane] += sizes[row] - means[lane] / 8;
+            if symbol == 0 {
+                codes[row * dims..(row + 1) * dims].fill(0);
+            } else {
+                filled.push((row as u32, symbol as u8));
+            }
+        }
+        let largest = self.spread.iter().copied().max().unwrap_or(0);
+        let levels: Vec<usize> = self.spread.iter().map(|&s| usize::from((largest - s) / 2).min(LEVELS - 1)).collect();
+        // Symbols first: contexts depend on them alone, so that they need not wait for the bits behind them.
+        let mut symbols = vec![0u8; filled.len() * dims];
+        if C::WRITES {
+            for (symbols, &(row, _)) in symbols.chunks_exact_mut(dims).zip(&filled) {
+                symbols.iter_mut().zip(&codes[row as usize * dims..]).for_each(|(symbol, code)| *symbol = symbol_of(u64::from(code.unsigned_abs())) as u8);
+            }
+        }
+        let lanes = Lanes::of(filled.len());
+        for step in 0..lanes.steps() {
+            // Short lanes have no last row.
+            let mut rows: [Row; LANES] = std::array::from_fn(|lane| match lanes.row(lane, step) {
+                Some(k) => {
+                    let size = usize::from(filled[k].1);
+                    Row { context: SIZES + (size.min(ROW_SIZES) - 1) * STATES, first: k * dims, size, state: 0 }
+                }
+                None => Row { context: SIZES, first: symbols.len(), size: 1, state: 0 },
+            });
+            let [a, b, c, d] = &mut rows;
+            for (k, level) in levels.iter().enumerate() {
+                // Written out, so that the lanes' coders stay in registers.
+                a.code(coder, 0, level * ROW_SIZES * STATES, k, &mut symbols)?;
+                b.code(coder, 1, level * ROW_SIZES * STATES, k, &mut symbols)?;
+                c.code(coder, 2, level * ROW_SIZES * STATES, k, &mut symbols)?;
+                d.code(coder, 3, level * ROW_SIZES * STATES, k, &mut symbols)?;
+            }
+        }
+        for (&(row, _), symbols) in filled.iter().zip(symbols.chunks_exact(dims)) {
+            for (code, &symbol) in codes[row as usize * dims..][..dims].iter_mut().zip(symbols) {
+                *code = behind(coder, usize::from(symbol), i64::from(*code))? as i32;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The row of a lane whose symbols are being coded.
+struct Row {
+    /// Its context without level and state.
+    context: usize,
+    /// Index of its first symbol.
+    first: usize,
+    size: usize,
+    /// 1 if the coordinate before is not zero, plus 2 if one had the size of the row.
+    state: usize,
+}
+
+impl Row {
+    /// Codes its symbol `k`, whose level starts `level` contexts after the first.
+    #[inline(always)]
+    fn code<C: Coder>(&mut self, coder: &mut C, lane: usize, level: usize, k: usize, symbols: &mut [u8]) -> Result<()> {
+        let Some(symbol) = symbols.get_mut(self.first + k) else { return Ok(()) };
+        let found = coder.symbol(lane, self.context + level + self.state, usize::from(*symbol))?;
+        *symbol = found as u8;
+        self.state = (self.state & 2) | usize::from(found >= self.size) << 1 | usize::from(found > 0);
         Ok(())
     }
 }
@@ -174,45 +223,24 @@ impl Degree {
 #[inline]
 fn add<const DIMS: usize>(basis: &[f32], codes: &[i32], step: f32, out: &mut [f32]) {
     let Some(out) = out.first_chunk_mut::<DIMS>() else { return };
-    for (vector, &code) in basis.as_chunks::<DIMS>().0.iter().zip(codes).filter(|(_, code)| **code != 0) {
+    let mut sums = *out;
+    for (vector, &code) in basis.as_chunks::<DIMS>().0.iter().zip(codes) {
         let coordinate = code as f32 * step;
-        for (o, b) in out.iter_mut().zip(vector) {
+        for (o, b) in sums.iter_mut().zip(vector) {
             *o += coordinate * b;
         }
     }
-    for o in out {
-        *o = o.clamp(f32::MIN, f32::MAX);
-    }
+    *out = sums.map(|o| o.clamp(f32::MIN, f32::MAX));
 }
 
-/// What a code adds to the activity of a row.
-#[inline]
-fn found_in(code: i32, class: u8) -> u64 {
-    u64::from(code.unsigned_abs()) << (u32::from(class.min(15)) + POINT)
+/// The symbol of the largest magnitude.
+fn largest_symbol(codes: &[i32]) -> usize {
+    symbol_of(u64::from(codes.iter().map(|v| v.unsigned_abs()).max().unwrap_or(0)))
 }
 
-/// Codes are smaller or equal in magnitude.
-const LIMIT: i64 = 1 << 24;
-
-/// The magnitude that a spread stands for.
-fn magnitude(spread: i32) -> u64 {
-    let half_octaves = (spread - ONE_STEP + 2 * POINT as i32).clamp(0, 48) as u32;
-    (if half_octaves.is_multiple_of(2) { 2 } else { 3 }) << (half_octaves / 2) >> 1
-}
-
-/// The level of a coordinate that is usually `quarters` quarter octaves large, in a row of this activity.
-#[inline]
-fn level(quarters: i32, activity: &Activity, class: u8) -> usize {
-    let ratio = octaves(activity.found) - octaves(activity.expected);
-    ((quarters + ratio - 4 * i32::from(class)) >> 1).clamp(0, LEVELS - 1) as usize
-}
-
-/// Quarter octaves of a number above 0.
-#[inline]
-fn octaves(value: u64) -> i32 {
-    let octave = value.ilog2();
-    // Below 2^53, as sums of codes are.
-    4 * octave as i32 + (value << 2 >> octave & 3) as i32
+/// The size of a row whose largest magnitude has this symbol.
+fn size_of(symbol: usize, class: u8) -> i32 {
+    2 * i32::from(class.min(15)) + if symbol == 0 { NOTHING } else { symbol as i32 }
 }
 
 fn project(analysis: &[f64], row: &[f64]) -> f64 {
@@ -222,13 +250,14 @@ fn project(analysis: &[f64], row: &[f64]) -> f64 {
 /// Contexts of [`code_small`].
 pub const SMALL_CONTEXTS: usize = 16 * 3;
 
-/// Codes numbers below 16 that resemble those before.
+/// Codes the numbers below 16 of a block, which resemble those before.
 pub fn code_small<C: Coder>(coder: &mut C, values: &mut [u8]) -> Result<()> {
-    let (mut last, mut before) = (0u8, 0u8);
-    for value in values {
+    let mut states = [(0u8, 0u8); LANES];
+    for (lane, row) in Lanes::of(values.len()).turns() {
+        let (last, before) = states[lane];
         let trend = usize::from(last > before) + 2 * usize::from(last < before);
-        let found = coder.symbol(usize::from(last & 15) * 3 + trend, usize::from(*value))? as u8;
-        (before, last, *value) = (last, found, found);
+        values[row] = coder.symbol(lane, usize::from(last & 15) * 3 + trend, usize::from(values[row]))? as u8;
+        states[lane] = (values[row], last);
     }
     Ok(())
 }

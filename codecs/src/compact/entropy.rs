@@ -2,6 +2,9 @@
 //!
 //! Encoder and decoder share their modelling code through [`Coder`]: the encoder notes the value it is given, the decoder ignores it and returns the one it
 //! reads. Contexts and distributions are integers, so that every machine reads the same values.
+//!
+//! A value depends on the one before, in its context and in the state of the coder, so a processor waits for most of the time. Rows are therefore coded in
+//! [`LANES`] that take turns, each with a coder of its own.
 
 use super::bits::{BitReader, BitWriter};
 use cc4dgs_format::archive::ByteReader;
@@ -20,24 +23,18 @@ pub const CONTEXTS: usize = 4096;
 const PRECISION: usize = 15;
 const ONE: u32 = 1 << PRECISION;
 /// Probabilities are stored as quarter octaves above 2^-15, from 1; 0 is impossible.
-const LOUDEST: u32 = 61;
+const MOST_LIKELY: u32 = 61;
 /// 2^10 times the quarter octaves of an octave.
 const QUARTERS: [u64; 4] = [1024, 1218, 1448, 1722];
 /// Low bits of a difference of probabilities that are stored as they are.
 const RICE: u32 = 2;
 
-/// Edges of intervals, with entries that make every masked index valid.
-const EDGES: usize = 2 * SYMBOLS;
-/// Bits of a quantile that look up the first symbol that may have it.
-const FIRST_BITS: usize = 8;
-
-/// A distribution of 16 symbols.
+/// A distribution of 16 symbols: where the interval of each ends, and where it starts.
 #[derive(Clone)]
+#[repr(align(64))]
 pub struct Table {
-    /// The probability of all symbols below each, times 2^15; all from the 16th are 2^15.
-    below: [u16; EDGES],
-    /// The symbol of the smallest quantile with these upper bits.
-    first: [u8; 1 << FIRST_BITS],
+    ends: [u16; SYMBOLS],
+    starts: [u16; SYMBOLS],
 }
 
 impl Default for Table {
@@ -61,23 +58,20 @@ impl Table {
     }
     /// The distribution of shares that add up to 2^15.
     fn from_shares(shares: [i64; SYMBOLS]) -> Self {
-        let mut out = Self { below: [ONE as u16; EDGES], first: [0; 1 << FIRST_BITS] };
+        let mut out = Self { ends: [0; SYMBOLS], starts: [0; SYMBOLS] };
         let mut below = 0;
-        for (edge, share) in out.below.iter_mut().zip(shares) {
-            *edge = below as u16;
+        for (symbol, share) in shares.into_iter().enumerate() {
+            out.starts[symbol] = below as u16;
             below += share;
-        }
-        for (upper, first) in out.first.iter_mut().enumerate() {
-            let quantile = upper << (PRECISION - FIRST_BITS);
-            *first = (0..SYMBOLS).filter(|&s| usize::from(out.below[s]) <= quantile).max().unwrap_or(0) as u8;
+            out.ends[symbol] = below as u16;
         }
         out
     }
     /// Start and width of a symbol's interval.
     #[inline(always)]
     fn interval(&self, symbol: usize) -> (u32, u32) {
-        let (low, high) = (self.below[symbol % EDGES], self.below[(symbol + 1) % EDGES]);
-        (u32::from(low), u32::from(high.wrapping_sub(low)))
+        let (start, end) = (self.starts[symbol % SYMBOLS], self.ends[symbol % SYMBOLS]);
+        (u32::from(start), u32::from(end.wrapping_sub(start)))
     }
 }
 
@@ -96,12 +90,12 @@ impl EncoderModel<PRECISION> for Table {
 impl DecoderModel<PRECISION> for Table {
     #[inline(always)]
     fn quantile_function(&self, quantile: u32) -> (usize, u32, NonZeroU32) {
-        let mut symbol = usize::from(self.first[(quantile >> (PRECISION - FIRST_BITS)) as usize % (1 << FIRST_BITS)]);
-        // Most often none or one symbol lies between; a branch would be mispredicted.
-        symbol += usize::from(u32::from(self.below[(symbol + 1) % EDGES]) <= quantile);
-        while u32::from(self.below[(symbol + 1) % EDGES]) <= quantile {
-            symbol += 1;
-        }
+        // Bisection without branches: four of them in a row cost less than one that is mispredicted.
+        let (quantile_16, ends) = (quantile as u16, &self.ends);
+        let mut symbol = 8 * usize::from(ends[7] <= quantile_16);
+        symbol += 4 * usize::from(ends[(symbol + 3) % SYMBOLS] <= quantile_16);
+        symbol += 2 * usize::from(ends[(symbol + 1) % SYMBOLS] <= quantile_16);
+        symbol += usize::from(ends[symbol % SYMBOLS] <= quantile_16);
         let (start, width) = self.interval(symbol);
         (symbol, start, NonZeroU32::new(width).unwrap_or(NonZeroU32::MIN))
     }
@@ -114,7 +108,7 @@ impl Tables {
     /// The distributions of what the encoders hold, and their bytes.
     pub fn fit(contexts: usize, encoders: &[Encoder]) -> (Self, Vec<u8>) {
         let mut counts = vec![[0u32; SYMBOLS]; contexts];
-        for &note in encoders.iter().flat_map(|e| &e.symbols) {
+        for &note in encoders.iter().flat_map(|e| e.symbols.iter().flatten()) {
             if let Some(counts) = counts.get_mut(usize::from(note) / SYMBOLS) {
                 counts[usize::from(note) % SYMBOLS] += 1;
             }
@@ -124,7 +118,7 @@ impl Tables {
             let total: u32 = counts.iter().sum();
             let level = |count: u32| {
                 let octaves = libm::log2(f64::from(count) / f64::from(total)) + PRECISION as f64;
-                if count == 0 { 0 } else { (4.0 * octaves + 1.0).round().clamp(1.0, f64::from(LOUDEST)) as u32 }
+                if count == 0 { 0 } else { (4.0 * octaves + 1.0).round().clamp(1.0, f64::from(MOST_LIKELY)) as u32 }
             };
             let levels = counts.map(level);
             let found = Table::from_levels(&levels);
@@ -155,7 +149,7 @@ impl Tables {
 fn write_levels(bits: &mut BitWriter, levels: &[u32; SYMBOLS]) {
     let count = levels.iter().rposition(|&l| l > 0).map_or(1, |last| last + 1);
     bits.put(4, count as u64 - 1);
-    let mut last = LOUDEST;
+    let mut last = MOST_LIKELY;
     for &level in &levels[..count] {
         let difference = i64::from(level) - i64::from(last);
         let folded = if difference < 0 { -2 * difference - 1 } else { 2 * difference } as u64;
@@ -167,26 +161,59 @@ fn write_levels(bits: &mut BitWriter, levels: &[u32; SYMBOLS]) {
 
 fn read_levels(bits: &mut BitReader) -> Option<[u32; SYMBOLS]> {
     let count = bits.take(4)? as usize + 1;
-    let (mut levels, mut last) = ([0; SYMBOLS], i64::from(LOUDEST));
+    let (mut levels, mut last) = ([0; SYMBOLS], i64::from(MOST_LIKELY));
     for level in &mut levels[..count] {
         let mut folded = 0i64;
         while bits.take(1)? == 0 {
             folded += 1 << RICE;
-            if folded > 4 * i64::from(LOUDEST) {
+            if folded > 4 * i64::from(MOST_LIKELY) {
                 return None;
             }
         }
         folded += bits.take(RICE)? as i64;
         last += if folded & 1 == 1 { -(folded + 1) / 2 } else { folded / 2 };
-        *level = u32::try_from(last).ok().filter(|l| *l <= LOUDEST)?;
+        *level = u32::try_from(last).ok().filter(|l| *l <= MOST_LIKELY)?;
     }
     Some(levels)
 }
 
+/// Independent coders that take turns.
+pub const LANES: usize = 4;
+
+/// The rows of a block by lane: each has one run of rows.
+#[derive(Clone, Copy)]
+pub struct Lanes {
+    count: usize,
+    each: usize,
+}
+
+impl Lanes {
+    /// The lanes of `count` rows.
+    pub fn of(count: usize) -> Self {
+        Self { count, each: count.div_ceil(LANES) }
+    }
+    /// Rows of the longest lane.
+    pub fn steps(&self) -> usize {
+        self.each
+    }
+    /// All rows in the order in which they are coded, each with its lane.
+    pub fn turns(self) -> impl Iterator<Item = (usize, usize)> {
+        (0..self.each).flat_map(move |step| (0..LANES).filter_map(move |lane| Some((lane, self.row(lane, step)?))))
+    }
+    /// The row of a lane at a step; `None` where the lane is at its end.
+    #[inline(always)]
+    pub fn row(&self, lane: usize, step: usize) -> Option<usize> {
+        let row = lane * self.each + step;
+        (row < self.count).then_some(row)
+    }
+}
+
 /// An encoder or a decoder.
 pub trait Coder {
-    /// Codes `symbol` (0 to 15) in a context.
-    fn symbol(&mut self, context: usize, symbol: usize) -> Result<usize>;
+    /// Whether it is given values to write.
+    const WRITES: bool;
+    /// Codes `symbol` (0 to 15) in a context with the coder of a lane.
+    fn symbol(&mut self, lane: usize, context: usize, symbol: usize) -> Result<usize>;
     /// Codes the low `count` (at most 56) bits of `value`, which are thought to be random.
     fn bits(&mut self, count: u32, value: u64) -> Result<u64>;
 }
@@ -194,37 +221,45 @@ pub trait Coder {
 /// Notes symbols and bits, which are coded once the distributions are known.
 #[derive(Default)]
 pub struct Encoder {
-    /// Contexts times 16, plus symbols.
-    symbols: Vec<u16>,
+    /// Contexts times 16, plus symbols, of each lane.
+    symbols: [Vec<u16>; LANES],
     bits: BitWriter,
 }
 
 impl Encoder {
-    /// The bytes: u32 words of the coder, the words, then the bits.
+    /// The bytes: the number of words of each lane (seven bits per byte, the lowest first; the upper bit says that more follow), their words, then the bits.
     pub fn finish(self, tables: &Tables) -> Result<Vec<u8>> {
         let failed = || Error::backend("entropy coder", "a symbol has no probability", "Report this");
-        let mut coder = AnsCoder::<u32, u64>::new();
-        for &note in self.symbols.iter().rev() {
-            let table = tables.0.get(usize::from(note) / SYMBOLS).ok_or_else(failed)?;
-            coder.encode_symbol(usize::from(note) % SYMBOLS, table).map_err(|_| failed())?;
+        let (mut out, mut bytes) = (Vec::new(), Vec::new());
+        for notes in &self.symbols {
+            let mut coder = AnsCoder::<u32, u64>::new();
+            for &note in notes.iter().rev() {
+                let table = tables.0.get(usize::from(note) / SYMBOLS).ok_or_else(failed)?;
+                coder.encode_symbol(usize::from(note) % SYMBOLS, table).map_err(|_| failed())?;
+            }
+            let words: Vec<u32> = coder.into_compressed().map_err(|_| failed())?;
+            let mut count = words.len();
+            while count > 0x7f {
+                out.push(count as u8 | 0x80);
+                count >>= 7;
+            }
+            out.push(count as u8);
+            bytes.extend(words.iter().flat_map(|w| w.to_le_bytes()));
         }
-        let words: Vec<u32> = coder.into_compressed().map_err(|_| failed())?;
-        let bits = self.bits.finish();
-        let mut out = Vec::with_capacity(4 + 4 * words.len() + bits.len());
-        out.extend((words.len() as u32).to_le_bytes());
-        out.extend(words.iter().flat_map(|w| w.to_le_bytes()));
-        out.extend(bits);
+        out.extend(bytes);
+        out.extend(self.bits.finish());
         Ok(out)
     }
 }
 
 impl Coder for Encoder {
+    const WRITES: bool = true;
     #[inline]
-    fn symbol(&mut self, context: usize, symbol: usize) -> Result<usize> {
+    fn symbol(&mut self, lane: usize, context: usize, symbol: usize) -> Result<usize> {
         if context >= CONTEXTS || symbol >= SYMBOLS {
             return Err(Error::backend("entropy coder", format!("symbol {symbol} of context {context}"), "Report this"));
         }
-        self.symbols.push((context * SYMBOLS + symbol) as u16);
+        self.symbols[lane % LANES].push((context * SYMBOLS + symbol) as u16);
         Ok(symbol)
     }
     #[inline]
@@ -235,7 +270,7 @@ impl Coder for Encoder {
 
 /// Reads what [`Encoder`] wrote.
 pub struct Decoder<'a> {
-    coder: AnsCoder<u32, u64>,
+    coders: [AnsCoder<u32, u64>; LANES],
     tables: &'a Tables,
     bits: BitReader<'a>,
     object: &'a str,
@@ -245,10 +280,25 @@ impl<'a> Decoder<'a> {
     /// A decoder of `bytes`; `object` names them in errors.
     pub fn new(object: &'a str, tables: &'a Tables, bytes: &'a [u8]) -> Result<Self> {
         let mut reader = ByteReader::new(object, bytes);
-        let count = reader.u32()? as usize;
-        let words = reader.take(count.saturating_mul(4))?.as_chunks::<4>().0.iter().map(|w| u32::from_le_bytes(*w)).collect::<Vec<u32>>();
-        let coder = AnsCoder::from_compressed(words).map_err(|_| reader.error("its last word is zero"))?;
-        Ok(Self { coder, tables, bits: BitReader::new(reader.rest()), object })
+        let mut counts = [0usize; LANES];
+        for count in &mut counts {
+            for shift in (0..).step_by(7) {
+                let byte = reader.u8()?;
+                if shift > 28 {
+                    return Err(reader.error("a number of words is too long"));
+                }
+                *count |= usize::from(byte & 0x7f) << shift;
+                if byte < 0x80 {
+                    break;
+                }
+            }
+        }
+        let mut coders: [AnsCoder<u32, u64>; LANES] = std::array::from_fn(|_| AnsCoder::new());
+        for (coder, count) in coders.iter_mut().zip(counts) {
+            let words = reader.take(count.saturating_mul(4))?.as_chunks::<4>().0.iter().map(|w| u32::from_le_bytes(*w)).collect::<Vec<u32>>();
+            *coder = AnsCoder::from_compressed(words).map_err(|_| reader.error("the last word of a lane is zero"))?;
+        }
+        Ok(Self { coders, tables, bits: BitReader::new(reader.rest()), object })
     }
     #[cold]
     fn damaged(&self, problem: &str) -> Error {
@@ -256,7 +306,7 @@ impl<'a> Decoder<'a> {
     }
     /// Refuses data that was not read.
     pub fn finish(self) -> Result<()> {
-        if !self.bits.is_done() || !self.coder.decoder_maybe_exhausted::<PRECISION>() {
+        if !self.bits.is_done() || !self.coders.iter().all(|c| c.decoder_maybe_exhausted::<PRECISION>()) {
             return Err(self.damaged("data follow the last value"));
         }
         Ok(())
@@ -264,10 +314,11 @@ impl<'a> Decoder<'a> {
 }
 
 impl Coder for Decoder<'_> {
+    const WRITES: bool = false;
     #[inline(always)]
-    fn symbol(&mut self, context: usize, _: usize) -> Result<usize> {
+    fn symbol(&mut self, lane: usize, context: usize, _: usize) -> Result<usize> {
         let Some(table) = self.tables.0.get(context) else { return Err(self.damaged("a value has no distribution")) };
-        self.coder.decode_symbol(table).map_err(|_| Error::backend("entropy coder", "its words cannot be read", "Report this"))
+        self.coders[lane % LANES].decode_symbol(table).map_err(|_| Error::backend("entropy coder", "its words cannot be read", "Report this"))
     }
     #[inline(always)]
     fn bits(&mut self, count: u32, _: u64) -> Result<u64> {
@@ -285,7 +336,7 @@ const LONGEST: u32 = 41;
 
 /// Symbols of a magnitude: 0 to 3 are themselves, 4 to 14 an octave's half, 15 the rest.
 #[inline(always)]
-fn symbol_of(magnitude: u64) -> usize {
+pub fn symbol_of(magnitude: u64) -> usize {
     if magnitude < 4 {
         return magnitude as usize;
     }
@@ -310,9 +361,9 @@ fn escaped<C: Coder>(coder: &mut C, rest: u64) -> Result<u64> {
 
 /// Codes an integer with a magnitude up to 2^41; the sign has a context of its own.
 #[inline]
-pub fn signed<C: Coder>(coder: &mut C, size: usize, sign: usize, value: i64) -> Result<i64> {
+pub fn signed<C: Coder>(coder: &mut C, lane: usize, size: usize, sign: usize, value: i64) -> Result<i64> {
     let magnitude = value.unsigned_abs();
-    let symbol = coder.symbol(size, symbol_of(magnitude))? % SYMBOLS;
+    let symbol = coder.symbol(lane, size, symbol_of(magnitude))? % SYMBOLS;
     let below = magnitude.wrapping_sub(SMALLEST[symbol]);
     let mut found = SMALLEST[symbol] + coder.bits(LOW_BITS[symbol], below)?;
     if symbol == SYMBOLS - 1 {
@@ -321,15 +372,21 @@ pub fn signed<C: Coder>(coder: &mut C, size: usize, sign: usize, value: i64) -> 
     if found == 0 {
         return Ok(0);
     }
-    Ok(if coder.symbol(sign, usize::from(value < 0))? == 1 { -(found as i64) } else { found as i64 })
+    Ok(if coder.symbol(lane, sign, usize::from(value < 0))? == 1 { -(found as i64) } else { found as i64 })
 }
 
 /// The same with signs that are thought to be random. Without branches but for the last symbol.
 #[inline(always)]
-pub fn symmetric<C: Coder>(coder: &mut C, size: usize, value: i64) -> Result<i64> {
-    let magnitude = value.unsigned_abs();
-    let symbol = coder.symbol(size, symbol_of(magnitude))? % SYMBOLS;
-    let below = magnitude.wrapping_sub(SMALLEST[symbol]);
+pub fn symmetric<C: Coder>(coder: &mut C, lane: usize, size: usize, value: i64) -> Result<i64> {
+    let symbol = coder.symbol(lane, size, symbol_of(value.unsigned_abs()))?;
+    behind(coder, symbol, value)
+}
+
+/// Codes what is behind the symbol of a magnitude: its low bits and the sign.
+#[inline(always)]
+pub fn behind<C: Coder>(coder: &mut C, symbol: usize, value: i64) -> Result<i64> {
+    let symbol = symbol % SYMBOLS;
+    let below = value.unsigned_abs().wrapping_sub(SMALLEST[symbol]);
     let bits = coder.bits(LOW_BITS[symbol] + u32::from(symbol > 0), below << 1 | u64::from(value < 0))?;
     let mut found = SMALLEST[symbol] + (bits >> 1);
     if symbol == SYMBOLS - 1 {

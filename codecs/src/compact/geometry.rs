@@ -3,7 +3,7 @@
 //! All steps double with each class. Rotations have finer steps where scales differ more, and centres where the Gaussian is smaller. Both are computed in
 //! integers from scales that are already decoded, so that every machine finds the same steps.
 
-use super::entropy::{Coder, signed, symmetric};
+use super::entropy::{Coder, LANES, Lanes, signed, symmetric};
 use crate::morton::{gather, spread};
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::{Error, Result};
@@ -19,7 +19,9 @@ const ROTATION_STEPS: usize = 20;
 const ROTATION_FINEST: i32 = 4;
 /// Step of the logarithm of a quaternion's norm. Only offsets of deformers depend on it.
 const NORM_STEP: f64 = 1.0 / 16.0;
-/// Largest magnitude of its code.
+/// Forms of a rotation: which component is the largest, and its sign.
+const FORMS: u8 = 8;
+/// Largest magnitude of the code of a norm.
 const NORM_LIMIT: i64 = 256;
 
 /// Steps and origins.
@@ -178,17 +180,24 @@ impl Rotation {
 /// Contexts of [`code_rotations`]: three components of each step, the form, the norm and its sign.
 pub const ROTATION_CONTEXTS: usize = 3 * ROTATION_STEPS + 3;
 
-/// Codes rotations; `shifts` are the exponents of their steps, and whether each is free.
-pub fn code_rotations<C: Coder>(coder: &mut C, rows: &mut [Rotation], shifts: impl Iterator<Item = (i32, bool)>) -> Result<()> {
+/// Codes the rotations of a block; `shifts` are the exponents of their steps, and whether each is free.
+pub fn code_rotations<C: Coder>(coder: &mut C, rows: &mut [Rotation], shifts: &[(i32, bool)]) -> Result<()> {
     const FORM: usize = 3 * ROTATION_STEPS;
-    for (row, (shift, free)) in rows.iter_mut().zip(shifts) {
+    let lanes = Lanes::of(rows.len().min(shifts.len()));
+    for (lane, index) in lanes.turns() {
+        let (row, (shift, free)) = (&mut rows[index], shifts[index]);
         if !free {
-            row.form = coder.symbol(FORM, usize::from(row.form))? as u8 & 7;
-            row.norm = i32::try_from(signed(coder, FORM + 1, FORM + 2, i64::from(row.norm))?.clamp(-NORM_LIMIT, NORM_LIMIT)).unwrap_or(0);
+            row.form = coder.symbol(lane, FORM, usize::from(row.form))? as u8;
+            let norm = signed(coder, lane, FORM + 1, FORM + 2, i64::from(row.norm))?;
+            if row.form >= FORMS || norm.abs() > NORM_LIMIT {
+                let problem = format!("form {} (below {FORMS}) with the norm code {norm} (at most {NORM_LIMIT} in magnitude)", row.form);
+                return Err(Error::data("entropy-coded rotation", problem, "The file is damaged; fetch or write it again"));
+            }
+            row.norm = norm as i32;
         }
         let context = (shift + ROTATION_FINEST).clamp(0, ROTATION_STEPS as i32 - 1) as usize;
         for (k, code) in row.codes.iter_mut().enumerate() {
-            *code = checked(symmetric(coder, k * ROTATION_STEPS + context, i64::from(*code))?)?;
+            *code = checked(symmetric(coder, lane, k * ROTATION_STEPS + context, i64::from(*code))?)?;
         }
     }
     Ok(())
@@ -197,25 +206,28 @@ pub fn code_rotations<C: Coder>(coder: &mut C, rows: &mut [Rotation], shifts: im
 /// Contexts of [`code_keys`].
 pub const KEY_CONTEXTS: usize = 32 + 48 + 64;
 
-/// Codes keys in ascending order: the difference to the one before, in the step of each row.
-pub fn code_keys<C: Coder>(coder: &mut C, keys: &mut [u64], shifts: impl Iterator<Item = u32>) -> Result<()> {
+/// Codes the keys of a block, which ascend: the difference to the one before in the lane, in the step of each row.
+pub fn code_keys<C: Coder>(coder: &mut C, keys: &mut [u64], shifts: &[u32]) -> Result<()> {
     const LENGTHS: usize = 32;
     const TOP: usize = LENGTHS + 48;
-    let mut last = 0u64;
-    let mut before = [0u32; 2];
-    for (key, shift) in keys.iter_mut().zip(shifts) {
-        let start = last >> (3 * shift);
+    let lanes = Lanes::of(keys.len().min(shifts.len()));
+    let mut states = [(0u64, [0u32; 2]); LANES];
+    for (lane, row) in lanes.turns() {
+        let (key, shift) = (&mut keys[row], shifts[row]);
+        let (last, before) = &mut states[lane];
+        let start = *last >> (3 * shift);
         let step = (*key >> (3 * shift)).saturating_sub(start);
         let wanted = u64::BITS - step.leading_zeros();
         // Steps that are likely now, from the cells of those before.
         let expected = ((before[0] + before[1]) / 2).saturating_sub(3 * shift);
-        let quarter = coder.symbol((expected / 2) as usize & 31, wanted as usize >> 2)?;
+        let quarter = coder.symbol(lane, (expected / 2) as usize & 31, wanted as usize >> 2)?;
         let trend = (expected as usize >> 2).cmp(&quarter) as i8 + 1;
-        let length = (quarter << 2 | coder.symbol(LENGTHS + quarter * 3 + trend as usize, wanted as usize & 3)? & 3) as u32;
+        let length = (quarter << 2 | coder.symbol(lane, LENGTHS + quarter * 3 + trend as usize, wanted as usize & 3)? & 3) as u32;
         let mut found = u64::from(length > 0);
         if length > 1 {
             let high = (length - 1).min(3);
-            let shown = coder.symbol(TOP + (length as usize & 63), (step >> (length - 1 - high)) as usize & ((1 << high) - 1))? as u64 & ((1 << high) - 1);
+            let shown =
+                coder.symbol(lane, TOP + (length as usize & 63), (step >> (length - 1 - high)) as usize & ((1 << high) - 1))? as u64 & ((1 << high) - 1);
             found = found << high | shown;
             let rest = length - 1 - high;
             let upper = rest.saturating_sub(32);
@@ -224,8 +236,8 @@ pub fn code_keys<C: Coder>(coder: &mut C, keys: &mut [u64], shifts: impl Iterato
         }
         let next = start.checked_add(found).filter(|v| *v < 1 << (3 * GRID_BITS - 3 * shift));
         *key = next.ok_or_else(|| Error::data("entropy-coded centres", "a cell is outside of the grid", "The file is damaged"))? << (3 * shift);
-        last = *key;
-        before = [length + 3 * shift, before[0]];
+        *last = *key;
+        *before = [length + 3 * shift, before[0]];
     }
     Ok(())
 }

@@ -4,11 +4,15 @@
 //! therefore inversely proportional to its *weight*: the root of the sum, over pixels and channels of an image, of the squared derivatives.
 
 use cc4dgs_format::{CodecContext, HostGaussians, Result};
+use std::ops::RangeInclusive;
 
 /// Value of the spherical-harmonics basis function of degree 0.
 const SH0: f64 = 0.282_094_791_773_878_14;
-/// Views that are looked at.
-const VIEWS: usize = 24;
+/// Views whose derivatives are averaged, by [`budget`]. An average over 150 views gives 7 % smaller files than one over 24, and that 8 % smaller ones than 12.
+const VIEWS: RangeInclusive<usize> = 12..=160;
+const WORK: usize = 2_000_000;
+/// Views whose cameras count for sizes in pixels.
+const CAMERAS: usize = 24;
 /// Width and height of the images that are assumed without views.
 const IMAGE: (f64, f64) = (800.0, 600.0);
 /// Variance of the pixel blur of rasterizers.
@@ -19,6 +23,11 @@ const SEEN: f64 = 0.6;
 const CONTRAST: f64 = 0.35;
 /// Gaussians of less than this share of the median weight are counted with it in ratios.
 const LEAST: f64 = 1e-2;
+
+/// The number of views for which `work` Gaussians are drawn in all, within `range`: small models can afford more.
+pub fn budget(work: usize, gaussians: usize, range: RangeInclusive<usize>) -> usize {
+    (work / gaussians.max(1)).clamp(*range.start(), *range.end())
+}
 
 /// Weights of Gaussians and attributes.
 pub struct Importance {
@@ -80,7 +89,7 @@ pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance
 /// Weights from derivatives of renders; `None` where the context cannot tell them. `apart` says whether shapes have weights of their own.
 pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool) -> Result<Option<Importance>> {
     let (Some(views), Some(renderer)) = (context.views, context.renderer) else { return Ok(None) };
-    let chosen = views.len().min(VIEWS);
+    let chosen = views.len().min(budget(WORK, gaussians.len(), VIEWS));
     if chosen == 0 || gaussians.is_empty() {
         return Ok(None);
     }
@@ -160,7 +169,7 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool) -
 /// Pixels per world unit at each Gaussian (root of the mean square over cameras that see it), and the samples of an image.
 fn pixel_scales(gaussians: &HostGaussians, context: &CodecContext) -> (Vec<f64>, f64) {
     let Some(views) = context.views.filter(|v| !v.is_empty()) else { return (vec![whole(gaussians); gaussians.len()], 3.0 * IMAGE.0 * IMAGE.1) };
-    let chosen = views.len().min(VIEWS);
+    let chosen = views.len().min(CAMERAS);
     let cameras: Vec<_> = (0..chosen).map(|k| views.view(k * views.len() / chosen).0).collect();
     let samples = cameras.iter().map(|c| 3.0 * f64::from(c.width) * f64::from(c.height)).sum::<f64>() / chosen as f64;
     let scale = |mean: &[f32]| {

@@ -31,7 +31,7 @@ use settings::Settings;
 use write::Motion;
 
 /// Version of the stored form.
-const VERSION: u8 = 2;
+const VERSION: u8 = 3;
 /// Largest losses: column and root-mean-square error over the standard deviation. Gaussians that are hardly seen may lose much.
 const LOSSES: [(&str, f64); 7] = [
     ("means", 0.01),
@@ -70,6 +70,8 @@ struct Attempt {
     quality: f64,
     bytes: usize,
     streams: Vec<Stream>,
+    /// What they decode to.
+    decoded: HostGaussians,
 }
 
 impl Job<'_> {
@@ -96,7 +98,7 @@ impl Job<'_> {
                 }
             }
             if kept || halvings > HALVINGS {
-                return Ok(Attempt { quality, bytes: streams.iter().map(|s| s.bytes.len()).sum(), streams });
+                return Ok(Attempt { quality, bytes: streams.iter().map(|s| s.bytes.len()).sum(), streams, decoded: found });
             }
         }
         Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
@@ -177,12 +179,31 @@ inventory::submit! {
     CodecPlugin {
         info: Plugin {
             name: "compact",
-            version: "1",
+            version: "3",
             summary: "steps by what is seen, transformed colours, entropy coding: the smallest files",
             paper: "rate-distortion allocation; octave classes; Karhunen-Loève transform; asymmetric numeral systems (constriction)",
             schema: settings::SCHEMA,
             capabilities: &["lossy", "reorders"],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_stored_version_is_that_of_the_plug_in() {
+        let plugin = cc4dgs_format::Entries::<CodecPlugin>::collect().and_then(|all| all.get("compact")).map(|p| p.info.version);
+        assert_eq!(plugin.ok(), Some(VERSION.to_string().as_str()));
+    }
+
+    #[test]
+    fn other_versions_are_refused_by_number() {
+        let streams = [Stream { name: "meta".into(), bytes: vec![2; 40] }];
+        let context = CodecContext::new(cc4dgs_format::Seed::root(1), Default::default(), &cc4dgs_format::Silent);
+        let message = read::read(&streams, &context).map(|_| ()).expect_err("version 2").to_string();
+        assert!(message.contains("version 2 is not 3"), "{message}");
     }
 }

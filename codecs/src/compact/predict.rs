@@ -1,6 +1,6 @@
 //! Integers of rows that are predicted by a linear function of earlier rows and of what is known about the row, with weights that the encoder fits.
 
-use super::entropy::{Coder, symmetric};
+use super::entropy::{Coder, LANES, Lanes, behind, symbol_of};
 use super::geometry::checked;
 use cc4dgs_format::Result;
 use cc4dgs_format::archive::ByteReader;
@@ -9,9 +9,11 @@ use cc4dgs_format::archive::ByteReader;
 const LEVELS: usize = 32;
 /// Components of a row, at most.
 const DIMS: usize = 3;
-/// Known numbers of a row, at most.
-pub const GIVEN: usize = 5;
-const INPUTS: usize = 2 + DIMS + GIVEN + 1;
+/// Known numbers of a row, beside its classes.
+pub const GIVEN: usize = 3;
+const INPUTS: usize = 2 + DIMS + 2 + GIVEN + 1;
+/// What an octave of a class counts in predictions.
+const OCTAVE: i64 = 512;
 /// Rows that are remembered.
 const MEMORY: usize = 8;
 /// Bits behind the point of weights.
@@ -23,12 +25,24 @@ const LIMIT: i64 = 1 << 40;
 /// Passes of the fit; each weighs rows by the inverse error of the one before, so that the sum of magnitudes falls.
 const PASSES: usize = 3;
 
-/// What is known about a row: numbers in the steps of class 0, and the shift of its steps.
+/// What is known about a row.
 #[derive(Clone, Copy, Default)]
 pub struct Known {
+    /// The classes of its colours and of the rest.
+    pub classes: [u8; 2],
+    /// The class of what is coded, which is one of the two.
     pub class: u8,
+    /// The shift of the steps of what is coded.
     pub shift: u8,
+    /// Numbers in the steps of class 0; [`Linear::code`] reads them in rows of one component.
     pub given: [i64; GIVEN],
+}
+
+impl Known {
+    /// What its classes count as inputs.
+    fn octaves(&self) -> [i64; 2] {
+        self.classes.map(|class| i64::from(class) * OCTAVE)
+    }
 }
 
 /// The weights `[dims, inputs]` of the components.
@@ -36,6 +50,26 @@ pub struct Known {
 pub struct Linear {
     dims: usize,
     weights: Vec<i16>,
+}
+
+/// What a lane knows.
+struct State {
+    history: History,
+    /// Components of the row that is being coded.
+    row: [i64; DIMS],
+    /// Magnitudes of differences: per component and class over the last rows of the class, and per component over the very last rows.
+    sizes: [[u64; 16]; DIMS],
+    recent: [u64; DIMS],
+    /// Prediction, context and symbol of the component that is being coded.
+    guess: i64,
+    context: usize,
+    symbol: usize,
+}
+
+impl State {
+    fn new() -> Self {
+        Self { history: History::new(), row: [0; DIMS], sizes: [[0; 16]; DIMS], recent: [0; DIMS], guess: 0, context: 0, symbol: 0 }
+    }
 }
 
 /// Rows before.
@@ -57,15 +91,22 @@ impl History {
         *slot = row;
         self.count += 1;
     }
+    /// Means of the component `c` over the last two rows, and over all that are remembered.
+    #[inline(always)]
+    fn means(&self, c: usize) -> [i64; 2] {
+        let last = |k: usize| self.rows[(self.count + MEMORY - k) % MEMORY][c];
+        // A division by a constant is fast, and the usual one.
+        let all = if self.count < MEMORY { self.sums[c] / self.count.max(1) as i64 } else { self.sums[c] / MEMORY as i64 };
+        [(last(1) + last(2)) / 2, all]
+    }
     /// Inputs of the component `c` of a row whose components before are `row`.
     #[inline]
     fn inputs(&self, c: usize, row: &[i64; DIMS], known: &Known) -> [i64; INPUTS] {
         let mut out = [0; INPUTS];
-        let last = |k: usize| self.rows[(self.count + MEMORY - k) % MEMORY][c];
-        out[0] = (last(1) + last(2)) / 2;
-        out[1] = self.sums[c] / self.count.clamp(1, MEMORY) as i64;
+        [out[0], out[1]] = self.means(c);
         out[2..2 + c].copy_from_slice(&row[..c]);
-        out[2 + DIMS..2 + DIMS + GIVEN].copy_from_slice(&known.given);
+        out[2 + DIMS..4 + DIMS].copy_from_slice(&known.octaves());
+        out[4 + DIMS..4 + DIMS + GIVEN].copy_from_slice(&known.given);
         out[INPUTS - 1] = CONSTANT;
         out
     }
@@ -76,7 +117,7 @@ impl Linear {
     pub const fn contexts(dims: usize) -> usize {
         dims * LEVELS
     }
-    /// Fits the weights to the rows `codes` `[N,dims]`; blocks start where [`super::blocks`] starts them.
+    /// Fits the weights to the rows `codes` `[N,dims]`. Blocks start where [`super::blocks`] starts them; that lanes start anew matters little.
     pub fn fit(dims: usize, codes: &[i32], known: &[Known]) -> Self {
         let mut fitted = vec![[0.0; INPUTS]; dims];
         let mut spread = [0.0; DIMS];
@@ -120,27 +161,64 @@ impl Linear {
     }
     /// Codes the rows `codes` `[N,dims]` of a block.
     pub fn code<C: Coder>(&self, coder: &mut C, codes: &mut [i32], known: &[Known]) -> Result<()> {
-        let mut history = History::new();
-        let mut sizes = [[0u64; 16]; DIMS];
-        let mut recent = [0u64; DIMS];
-        for (codes, known) in codes.chunks_exact_mut(self.dims).zip(known) {
-            let mut row = [0; DIMS];
-            for (c, code) in codes.iter_mut().enumerate() {
-                let inputs = history.inputs(c, &row, known);
-                let sum: i64 = self.weights[c * INPUTS..(c + 1) * INPUTS].iter().zip(inputs).map(|(&w, x)| i64::from(w) * x).sum();
-                let shift = u32::from(known.shift.min(15));
-                let guess = rounded((sum >> POINT).clamp(-LIMIT, LIMIT), shift);
-                let size = &mut sizes[c][usize::from(known.class & 15)];
-                let expected = if *size == 0 { recent[c] } else { (*size + recent[c]) / 2 };
-                let context = c * LEVELS + level(expected >> shift);
-                let difference = symmetric(coder, context, i64::from(*code) - guess)?;
-                *code = checked(guess + difference)?;
-                row[c] = i64::from(*code) << shift;
-                let magnitude = difference.unsigned_abs() << shift;
-                *size = if *size == 0 { 16 * magnitude } else { *size - *size / 16 + magnitude };
-                recent[c] = recent[c] - recent[c] / 4 + 4 * magnitude;
+        match self.dims {
+            1 => self.code_dims::<C, 1>(coder, codes, known),
+            _ => self.code_dims::<C, DIMS>(coder, codes, known),
+        }
+    }
+    fn code_dims<C: Coder, const D: usize>(&self, coder: &mut C, codes: &mut [i32], known: &[Known]) -> Result<()> {
+        let codes = codes.as_chunks_mut::<D>().0;
+        let lanes = Lanes::of(codes.len().min(known.len()));
+        let weights: [[i64; INPUTS]; D] = std::array::from_fn(|c| std::array::from_fn(|k| i64::from(self.weights[c * INPUTS + k])));
+        let mut states: [State; LANES] = std::array::from_fn(|_| State::new());
+        // What each pair of classes adds, with the constant.
+        let of_classes = |weights: &[i64; INPUTS], k: usize| {
+            let known = Known { classes: [(k / 16) as u8, (k % 16) as u8], ..Default::default() };
+            weights[2 + DIMS..].iter().zip(known.octaves()).map(|(w, x)| w * x).sum::<i64>() + weights[INPUTS - 1] * CONSTANT
+        };
+        let of_classes: [[i64; 256]; D] = std::array::from_fn(|c| std::array::from_fn(|k| of_classes(&weights[c], k)));
+        for step in 0..lanes.steps() {
+            for c in 0..D {
+                // In three passes, so that the lanes' symbols follow each other closely.
+                for (lane, state) in states.iter_mut().enumerate() {
+                    let Some(row) = lanes.row(lane, step) else { continue };
+                    let (known, weights) = (&known[row], &weights[c]);
+                    let [short, long] = state.history.means(c);
+                    let mut sum =
+                        of_classes[c][usize::from(known.classes[0] & 15) * 16 + usize::from(known.classes[1] & 15)] + weights[0] * short + weights[1] * long;
+                    sum += weights[2..2 + c].iter().zip(&state.row).map(|(w, x)| w * x).sum::<i64>();
+                    if D == 1 {
+                        sum += weights[4 + DIMS..].iter().zip(known.given).map(|(w, x)| w * x).sum::<i64>();
+                    }
+                    let shift = u32::from(known.shift.min(15));
+                    state.guess = rounded((sum >> POINT).clamp(-LIMIT, LIMIT), shift);
+                    let (size, recent) = (state.sizes[c][usize::from(known.class & 15)], state.recent[c]);
+                    let expected = if size == 0 { recent } else { (size + recent) / 2 };
+                    state.context = c * LEVELS + level(expected >> shift);
+                }
+                for (lane, state) in states.iter_mut().enumerate() {
+                    let Some(row) = lanes.row(lane, step) else { continue };
+                    let wanted = if C::WRITES { symbol_of((i64::from(codes[row][c]) - state.guess).unsigned_abs()) } else { 0 };
+                    state.symbol = coder.symbol(lane, state.context, wanted)?;
+                }
+                for (lane, state) in states.iter_mut().enumerate() {
+                    let Some(row) = lanes.row(lane, step) else { continue };
+                    let (code, known) = (&mut codes[row][c], &known[row]);
+                    let shift = u32::from(known.shift.min(15));
+                    let difference = behind(coder, state.symbol, i64::from(*code) - state.guess)?;
+                    *code = checked(state.guess + difference)?;
+                    state.row[c] = i64::from(*code) << shift;
+                    let magnitude = difference.unsigned_abs() << shift;
+                    let (size, recent) = (&mut state.sizes[c][usize::from(known.class & 15)], &mut state.recent[c]);
+                    *size = if *size == 0 { 16 * magnitude } else { *size - *size / 16 + magnitude };
+                    *recent = *recent - *recent / 4 + 4 * magnitude;
+                }
             }
-            history.push(row);
+            for state in &mut states {
+                // A lane at its end has no more rows to predict.
+                state.history.push(state.row);
+                state.row = [0; DIMS];
+            }
         }
         Ok(())
     }
@@ -188,14 +266,14 @@ mod tests {
 
     #[test]
     fn what_follows_from_the_rest_has_no_error() {
-        let known: Vec<Known> = (0..3000i64).map(|i| Known { class: 0, shift: 0, given: [i * i % 977, i % 13, 0, 0, 0] }).collect();
-        let codes: Vec<i32> = known.iter().flat_map(|k| [(3 * k.given[0] - 7 * k.given[1]) as i32, (k.given[0] / 2) as i32]).collect();
-        let linear = Linear::fit(2, &codes, &known);
+        let known: Vec<Known> = (0..3000i64).map(|i| Known { classes: [(i % 7) as u8, 0], given: [i * i % 977, i % 13, 0], ..Default::default() }).collect();
+        let codes: Vec<i32> = known.iter().map(|k| (3 * k.given[0] - 7 * k.given[1]) as i32 + 5 * i32::from(k.classes[0])).collect();
+        let linear = Linear::fit(1, &codes, &known);
         let mut encoder = super::super::entropy::Encoder::default();
         linear.code(&mut encoder, &mut codes.clone(), &known).unwrap();
-        let (tables, stored) = super::super::entropy::Tables::fit(Linear::contexts(2), std::slice::from_ref(&encoder));
+        let (tables, stored) = super::super::entropy::Tables::fit(Linear::contexts(1), std::slice::from_ref(&encoder));
         let bytes = encoder.finish(&tables).unwrap();
-        assert!(stored.len() + bytes.len() < 1500, "{} bytes for 6000 values", bytes.len());
+        assert!(stored.len() + bytes.len() < 750, "{} bytes for 3000 values", bytes.len());
         let mut decoder = super::super::entropy::Decoder::new("test", &tables, &bytes).unwrap();
         let mut found = vec![0; codes.len()];
         linear.code(&mut decoder, &mut found, &known).unwrap();

@@ -2,7 +2,7 @@
 
 use super::VERSION;
 use super::blocks::{Blocks, ROWS};
-use super::colors::{self, Activity, Degree, SMALL_CONTEXTS, code_small};
+use super::colors::{self, Degree, SMALL_CONTEXTS, code_small};
 use super::geometry::{Geometry, KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
 use super::predict::{Known, Linear};
 use super::write::{APART, CLASSES, EXACT, MEANS, MOVING, Motion, OPACITIES, ROTATIONS, SCALES, SCORES, SHAPES, color_name, known_classes, known_scales};
@@ -51,8 +51,7 @@ pub fn read(streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>
         *shape = (color + *shape).checked_sub(APART).filter(|s| *s < 16).ok_or_else(|| impossible(SHAPES, "a class is below 0 or above 15"))?;
     }
     let moving = if scored == 1 { small(&set, MOVING, n, 1)? } else { Vec::new() };
-    let scales = vec![[0; 3]; n];
-    let mut rows = Rows { geometry, motion: Motion { free, moving: None, levels }, classes, shapes, moving, scales };
+    let mut rows = Rows { geometry, motion: Motion { free, moving: None, levels }, classes, shapes, moving, scales: Vec::new() };
     rows.scales = rows.read_scales(&coded(SCALES, Linear::contexts(3))?, &scale_plan)?;
     let rows = &rows;
 
@@ -114,7 +113,7 @@ impl Rows {
         blocks.decode_into(&mut out, 3, |coder, range, out| {
             let mut keys = vec![0; range.len()];
             let shifts: Vec<u32> = range.map(|i| self.geometry.position_shift(self.scales[i], self.shapes[i])).collect();
-            code_keys(coder, &mut keys, shifts.iter().copied())?;
+            code_keys(coder, &mut keys, &shifts)?;
             let rows = out.as_chunks_mut::<3>().0.iter_mut().zip(keys).zip(shifts);
             rows.for_each(|((out, key), shift)| *out = self.geometry.centre(key, shift));
             Ok(())
@@ -127,7 +126,7 @@ impl Rows {
             let mut codes = vec![Rotation::default(); range.len()];
             let shifts: Vec<(i32, bool)> =
                 range.map(|i| (self.geometry.rotation_shift(self.scales[i], self.shapes[i]), self.motion.is_free(i, &self.moving))).collect();
-            code_rotations(coder, &mut codes, shifts.iter().copied())?;
+            code_rotations(coder, &mut codes, &shifts)?;
             let rows = out.as_chunks_mut::<4>().0.iter_mut().zip(codes).zip(shifts);
             rows.for_each(|((out, codes), (shift, _))| *out = codes.quaternion(self.geometry.rotation(shift)));
             Ok(())
@@ -170,11 +169,11 @@ impl Rows {
         let bases: Vec<Vec<f32>> = degrees.iter().map(|d| d.0.scaled_basis()).collect();
         out.par_chunks_mut(ROWS * width).enumerate().try_for_each(|(index, out)| {
             let range: Range<usize> = index * ROWS..index * ROWS + out.len() / width;
-            let mut activity = vec![Activity::default(); range.len()];
+            let mut sizes = vec![0; range.len()];
             let mut at = 0;
-            for ((degree, blocks), basis) in degrees.iter().zip(&bases) {
+            for (index_of_degree, ((degree, blocks), basis)) in degrees.iter().zip(&bases).enumerate() {
                 let mut codes = vec![0; range.len() * degree.dims];
-                blocks.decode(index, |coder| degree.code(coder, &mut codes, &self.classes[range.clone()], &mut activity))?;
+                blocks.decode(index, |coder| degree.code(coder, &mut codes, &self.classes[range.clone()], &mut sizes, index_of_degree == 0))?;
                 let rows = out.chunks_exact_mut(width).zip(codes.chunks_exact(degree.dims)).zip(&self.classes[range.clone()]);
                 rows.for_each(|((out, codes), &class)| degree.restore(basis, codes, class, &mut out[at..at + degree.dims]));
                 at += degree.dims;

@@ -1,21 +1,28 @@
-//! The search for the quality: the largest step factor whose loss or size is allowed.
+//! The search for the quality: the step factor that uses up an allowed loss or size.
 
-use super::importance::Importance;
+use super::importance::{Importance, budget};
 use super::settings::Settings;
-use super::{Attempt, Job, allocate, read};
-use cc4dgs_format::{CodecContext, Error, Event, HostGaussians, RenderModel, Result, TrainingViews};
+use super::{Attempt, Job, allocate};
+use cc4dgs_format::{CodecContext, Error, Event, RenderModel, Result, TrainingViews, psnr_on_views};
+use std::ops::RangeInclusive;
 
-/// Views on which the loss is measured.
-const VIEWS: usize = 16;
-/// Attempts of a search.
-const ATTEMPTS: usize = 7;
-/// Factors by which steps grow in search of a limit: at first, and near to it.
-const WIDE: f64 = 2.0;
-const NARROW: f64 = 1.2;
+/// Views on which the loss is measured, by [`budget`].
+const VIEWS: RangeInclusive<usize> = 8..=16;
+const WORK: usize = 3_000_000;
+/// Attempts of a search, at most.
+const ATTEMPTS: usize = 8;
 /// Parameters of a Gaussian that are not rounded to zero, for the estimate of the error.
 const PARAMETERS: f64 = 20.0;
-/// A file of this share of the limit is good enough.
-const GOOD_SIZE: f64 = 0.985;
+/// Shares of an allowance that are good enough: before the steps of the columns are corrected, and at the end.
+const ROUGH: f64 = 0.8;
+const GOOD: f64 = 0.97;
+/// The share that attempts aim at.
+const AIM: f64 = 0.985;
+/// Octaves of the step factor by which attempts differ, at most, and the share of a known interval that they stay away from its ends.
+const FARTHEST: f64 = 2.0;
+const MARGIN: f64 = 0.08;
+/// Least share from which a loss is extrapolated: smaller ones are noise.
+const LEAST: f64 = 0.05;
 
 /// The root-mean-square error of a value's contribution to images that gives the estimated `psnr_db`.
 pub fn estimate(psnr_db: f64, importance: &Importance) -> f64 {
@@ -23,154 +30,155 @@ pub fn estimate(psnr_db: f64, importance: &Importance) -> f64 {
     (12.0 * error / (PARAMETERS * importance.weights.len().max(1) as f64)).sqrt()
 }
 
+/// What attempts use up.
+enum Allowance<'a> {
+    /// Bytes of all streams. Larger steps use fewer.
+    Bytes(f64),
+    /// PSNR on the views, in dB below `before`. Larger steps lose more.
+    Drop { before: f64, limit: f64, views: &'a dyn TrainingViews, renderer: &'a dyn RenderModel, chosen: usize },
+}
+
+impl Allowance<'_> {
+    /// What an attempt uses, as a share of what is allowed.
+    fn share(&self, attempt: &Attempt) -> Result<f64> {
+        match self {
+            Self::Bytes(limit) => Ok(attempt.bytes as f64 / limit),
+            Self::Drop { before, limit, views, renderer, chosen } => Ok((before - psnr_on_views(&attempt.decoded, *views, *renderer, *chosen)?) / limit),
+        }
+    }
+    /// Octaves from the step factor of an attempt to the one that is expected to use [`AIM`].
+    fn octaves(&self, attempt: &Attempt, share: f64) -> f64 {
+        match self {
+            // An octave of all steps is a bit of every value that is not zero.
+            Self::Bytes(limit) => (share - AIM) * limit / (PARAMETERS / 8.0 * attempt.decoded.len().max(1) as f64),
+            // Squared errors of images, small beside what a model leaves, add to the loss in proportion.
+            Self::Drop { .. } => 0.5 * libm::log2(AIM / share.max(LEAST)),
+        }
+    }
+    /// 1 where larger steps use more, else -1.
+    fn direction(&self) -> f64 {
+        if matches!(self, Self::Bytes(_)) { -1.0 } else { 1.0 }
+    }
+}
+
+/// An attempt and the share of the allowance that it uses.
+struct Tried {
+    attempt: Attempt,
+    share: f64,
+}
+
+impl Tried {
+    fn allowed(&self) -> bool {
+        self.share <= 1.0
+    }
+}
+
+/// The attempt that uses most of what is allowed, from the step factor `start`; one that uses more if none is allowed. A share of `good` ends the search.
+fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried> {
+    let direction = allowance.direction();
+    // Octaves over `start` in the direction in which more is used.
+    let (mut at, mut refused) = (0.0, f64::INFINITY);
+    let mut best: Option<(f64, Tried)> = None;
+    let mut last = None;
+    for _ in 0..ATTEMPTS {
+        let attempt = job.attempt(start * libm::exp2(direction * at))?;
+        let share = allowance.share(&attempt)?;
+        let step = direction * allowance.octaves(&attempt, share);
+        let tried = Tried { attempt, share };
+        if tried.allowed() {
+            if share >= good {
+                return Ok(tried);
+            }
+            if best.as_ref().is_none_or(|(known, _)| at > *known) {
+                best = Some((at, tried));
+            }
+        } else {
+            refused = refused.min(at);
+            last = Some(tried);
+        }
+        let next = at + step.clamp(-FARTHEST, FARTHEST);
+        at = match &best {
+            Some((known, _)) if refused > *known && refused.is_finite() => {
+                let margin = MARGIN * (refused - known);
+                next.clamp(known + margin, refused - margin)
+            }
+            Some((known, _)) => next.max(known + MARGIN),
+            None => next.min(refused - MARGIN),
+        };
+    }
+    match best.map(|(_, tried)| tried).or(last) {
+        Some(tried) => Ok(tried),
+        None => Err(Error::backend("codec compact", "no step factor was tried", "Report this")),
+    }
+}
+
 /// The streams that the settings ask for.
 pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Result<Attempt> {
     let start = estimate(settings.psnr_db, job.importance);
     let object = "codec compact";
-    let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer);
-    let allocation = services.filter(|_| settings.allocate && !job.gaussians.is_empty());
-    if settings.max_size_mb > 0.0 {
-        if let Some((views, renderer)) = allocation {
-            job.factors = allocate::allocate(job, start, views, renderer, context)?;
-        }
-        let job = &*job;
-        let limit = settings.max_size_mb * 1e6;
-        let found =
-            bisect(job, (start, WIDE), (-1.0, ATTEMPTS), |attempt| Ok(attempt.bytes as f64 <= limit), |attempt| attempt.bytes as f64 >= GOOD_SIZE * limit)?;
-        if found.bytes as f64 > limit {
-            let remedy = "Allow more, or remove Gaussians with `cc4dgs prune`";
-            return Err(Error::parameter(object, format!("{} bytes are the least that it reached", found.bytes), remedy));
-        }
-        note(
-            context,
-            format!(
-                "{:.4} MB of Gaussians of {} MB allowed, steps {:.3} times the estimated ones",
-                found.bytes as f64 / 1e6,
-                settings.max_size_mb,
-                found.quality / start
-            ),
-        );
-        return Ok(found);
-    }
-    let Some((views, renderer)) = services else {
-        if settings.drop_wanted {
+    let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !job.gaussians.is_empty());
+    let allowance = match services {
+        _ if settings.max_size_mb > 0.0 => Allowance::Bytes(1e6 * settings.max_size_mb),
+        None if settings.drop_wanted && !job.gaussians.is_empty() => {
             let problem = "a loss of PSNR is measured on training views, and there are none";
             return Err(Error::parameter(object, problem, "Give the dataset with --scene, or choose compact:psnr=50dB or compact:max-size=5MB"));
         }
-        return job.attempt(start);
-    };
-    if settings.max_drop_db == 0.0 || job.gaussians.is_empty() {
-        return job.attempt(start);
-    }
-    let before = Losses::of(job.gaussians, views, renderer)?;
-    let drop_of =
-        |attempt: &Attempt| Ok::<_, Error>(before.mean - Losses::of(&read::read(&attempt.streams, &context_without(context))?, views, renderer)?.mean);
-    let best = std::cell::Cell::new((0.0, f64::NAN));
-    let allowed = |attempt: &Attempt| {
-        let drop = drop_of(attempt)?;
-        if drop <= settings.max_drop_db && attempt.quality > best.get().0 {
-            best.set((attempt.quality, drop));
+        Some((views, renderer)) if settings.max_drop_db > 0.0 => {
+            let chosen = views.len().min(budget(WORK, job.gaussians.len(), VIEWS));
+            let before = psnr_on_views(job.gaussians, views, renderer, chosen)?;
+            Allowance::Drop { before, limit: settings.max_drop_db, views, renderer, chosen }
         }
-        Ok(drop <= settings.max_drop_db)
+        _ => return job.attempt(start),
     };
-    let mut found = bisect(job, (start, WIDE), (1.0, ATTEMPTS), allowed, |_| false)?;
-    if allocation.is_some() {
-        job.factors = allocate::allocate(job, found.quality, views, renderer, context)?;
-        let factors = job.factors;
-        note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {factors:.2?}"));
-        let (first, drop) = (found, best.replace((0.0, f64::NAN)));
-        found = bisect(job, (first.quality, NARROW), (1.0, ATTEMPTS), allowed, |_| false)?;
-        // Small models may gain nothing.
-        if first.bytes <= found.bytes || best.get().0 == 0.0 {
+    let corrected = services.filter(|_| settings.allocate);
+    let mut found = seek(job, start, &allowance, if corrected.is_some() { ROUGH } else { GOOD })?;
+    if let Some((views, renderer)) = corrected {
+        job.factors = allocate::allocate(job, found.attempt.quality, views, renderer)?;
+        note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
+        let second = seek(job, found.attempt.quality, &allowance, GOOD)?;
+        let first = std::mem::replace(&mut found, second);
+        // The corrections may be worth nothing in small models.
+        let worse = matches!(allowance, Allowance::Drop { .. }) && found.attempt.bytes >= first.attempt.bytes;
+        if first.allowed() && (worse || !found.allowed()) {
             found = first;
-            best.set(drop);
         }
     }
-    let (kept, mut drop) = best.get();
-    if kept == 0.0 {
-        drop = drop_of(&found)?;
-        if drop > settings.max_drop_db {
-            let problem = format!("the finest steps tried lose {drop:.3} dB on training views, {} dB are allowed", settings.max_drop_db);
-            if settings.drop_wanted {
-                return Err(Error::parameter(object, problem, "Allow more, or choose compact:psnr=70dB or the codec raw"));
-            }
-            context.events.emit(&Event::Warning { object: object.into(), message: problem });
-        }
-    }
-    note(
-        context,
-        format!(
-            "{:.4} MB of Gaussians, PSNR {:.3} dB lower on {} training views ({} dB allowed), steps {:.3} times the estimated ones",
-            found.bytes as f64 / 1e6,
-            drop,
-            views.len().min(VIEWS),
-            settings.max_drop_db,
-            found.quality / start
-        ),
-    );
-    Ok(found)
+    report(&found, &allowance, start, settings, context)?;
+    Ok(found.attempt)
 }
 
-fn context_without<'a>(context: &CodecContext<'a>) -> CodecContext<'a> {
-    CodecContext::new(context.seed, context.limits, context.events)
+/// Says what was chosen; a loss or size over what the user allowed is an error.
+fn report(found: &Tried, allowance: &Allowance, start: f64, settings: &Settings, context: &CodecContext) -> Result<()> {
+    let object = "codec compact";
+    let (megabytes, steps) = (found.attempt.bytes as f64 / 1e6, found.attempt.quality / start);
+    match allowance {
+        Allowance::Bytes(_) if !found.allowed() => {
+            let problem = format!("{} bytes are the least that it reached", found.attempt.bytes);
+            return Err(Error::parameter(object, problem, "Allow more, or remove Gaussians with `cc4dgs prune`"));
+        }
+        Allowance::Bytes(_) => {
+            note(context, format!("{megabytes:.4} MB of Gaussians of {} MB allowed, steps {steps:.3} times the estimated ones", settings.max_size_mb));
+        }
+        Allowance::Drop { limit, chosen, .. } => {
+            let drop = found.share * limit;
+            if !found.allowed() {
+                let problem = format!("the finest steps tried lose {drop:.3} dB on training views, {limit} dB are allowed");
+                if settings.drop_wanted {
+                    return Err(Error::parameter(object, problem, "Allow more, or choose compact:psnr=70dB or the codec raw"));
+                }
+                context.events.emit(&Event::Warning { object: object.into(), message: problem });
+            }
+            note(
+                context,
+                format!(
+                    "{megabytes:.4} MB of Gaussians, PSNR {drop:.3} dB lower on {chosen} training views ({limit} dB allowed), steps {steps:.3} times the estimated ones"
+                ),
+            );
+        }
+    }
+    Ok(())
 }
 
 fn note(context: &CodecContext, message: String) {
     context.events.emit(&Event::Note { object: "codec compact".into(), message });
-}
-
-/// The attempt with the largest steps (`direction` 1) or the smallest (-1) that is `allowed`, by bisection of the logarithm; an attempt far on the other side
-/// if none is.
-fn bisect(
-    job: &Job,
-    (start, growth): (f64, f64),
-    (direction, attempts): (f64, usize),
-    allowed: impl Fn(&Attempt) -> Result<bool>,
-    good: impl Fn(&Attempt) -> bool,
-) -> Result<Attempt> {
-    let (mut best, mut refused): (Option<Attempt>, Option<f64>) = (None, None);
-    let mut quality = start;
-    for attempt in 0..attempts {
-        let found = job.attempt(quality)?;
-        if allowed(&found)? {
-            if good(&found) {
-                return Ok(found);
-            }
-            best = Some(found);
-        } else {
-            refused = Some(quality);
-        }
-        // Where nothing was allowed yet, later attempts go farther.
-        quality = match (&best, refused) {
-            (Some(best), Some(refused)) => (best.quality * refused).sqrt(),
-            (Some(best), None) => best.quality * libm::pow(growth, direction),
-            (None, _) => quality / libm::pow(growth * (1.0 + 0.25 * attempt as f64), direction),
-        };
-    }
-    match best {
-        Some(attempt) => Ok(attempt),
-        None => job.attempt(quality),
-    }
-}
-
-/// PSNR of renders against the recorded images.
-struct Losses {
-    mean: f64,
-}
-
-impl Losses {
-    fn of(gaussians: &HostGaussians, views: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<Self> {
-        let chosen = views.len().min(VIEWS);
-        let mut sum = 0.0;
-        for k in 0..chosen {
-            let index = k * views.len() / chosen;
-            let (camera, time_norm) = views.view(index);
-            let drawn = renderer.render(gaussians, camera, time_norm)?;
-            let image = views.image(index)?;
-            let truth = image.to_planes(renderer.background());
-            let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum::<f64>() / truth.len().max(1) as f64;
-            sum += -10.0 * libm::log10(error.max(1e-12));
-        }
-        Ok(Self { mean: sum / chosen.max(1) as f64 })
-    }
 }

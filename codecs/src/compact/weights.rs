@@ -1,69 +1,116 @@
-//! The weight codec `compact`: integers of few bits with a scale per row, entropy coded.
+//! The weight codec `compact`: integers of few bits with a step per array, entropy coded.
 
-use super::entropy::{Coder, Decoder, Encoder, Tables, signed, symmetric};
+use super::entropy::{Coder, Decoder, Encoder, LANES, Lanes, Tables, symbol_of, symmetric};
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::storage::{StreamSet, read_shapes, value_count, write_shapes};
 use cc4dgs_format::{CodecContext, Error, Plugin, Result, Stream, WeightArray, WeightCodec, WeightCodecPlugin, config, inventory};
 use serde::Deserialize;
 
-/// Values per scale.
-const ROW: usize = 64;
+/// Values of a row, which has a size.
+const ROW: usize = 16;
 /// Bits of a code, and how many there may be.
-const BITS: u32 = 10;
-const RANGE: std::ops::RangeInclusive<u32> = 3..=12;
+const BITS: f64 = 12.0;
+const RANGE: std::ops::RangeInclusive<f64> = 3.0..=16.0;
+/// Bits are stored in quarters.
+const QUARTERS: f64 = 4.0;
 /// Arrays with distributions of their own.
-const ARRAYS: usize = 1000;
-/// Largest exponent of a scale in magnitude: those of the smallest and the largest floats fit.
-const EXPONENT_LIMIT: i64 = 1300;
-/// Scales are powers of 2^(1/8).
-const PER_OCTAVE: f64 = 8.0;
-/// Exponent of rows of zeros, below that of every other row.
-const ZERO: i64 = -10_000;
+const ARRAYS: usize = 64;
+/// Contexts of sizes of rows, by the size before.
+const SIZES: usize = 16;
+/// Codes are shifted until they are below this; what is shifted out is stored as it is.
+const SYMBOL_LIMIT: f64 = 192.0;
 const SHAPES: &str = "shapes";
 const VALUES: &str = "values";
 /// Values per byte of the stream that a decoder believes.
 const PER_BYTE: usize = 4096;
 
 struct Weights {
+    bits: f64,
+    /// Bits of the arrays in turn, in place of `bits` where there are any.
+    array_bits: Vec<f64>,
+}
+
+/// How the codes of an array are made.
+#[derive(Clone, Copy)]
+struct Form {
+    quarter_bits: u8,
+    /// Largest magnitude of a value.
+    largest: f32,
+}
+
+impl Form {
     /// Largest code.
-    peak: f64,
+    fn peak(self) -> f64 {
+        libm::exp2(f64::from(self.quarter_bits) / QUARTERS - 1.0) - 1.0
+    }
+    fn step(self) -> f64 {
+        f64::from(self.largest) / self.peak()
+    }
+    /// Low bits that are stored as they are.
+    fn low_bits(self) -> u32 {
+        libm::log2((self.peak() + 1.0) / SYMBOL_LIMIT).ceil().max(0.0) as u32
+    }
+    fn write(self, out: &mut Vec<u8>) {
+        out.push(self.quarter_bits);
+        out.extend(self.largest.to_le_bytes());
+    }
+    fn read(reader: &mut ByteReader) -> Result<Self> {
+        let (quarter_bits, largest) = (reader.u8()?, reader.f32()?);
+        if !RANGE.contains(&(f64::from(quarter_bits) / QUARTERS)) || largest < 0.0 {
+            return Err(reader.error(format!("an array of {} bits with values up to {largest} is impossible", f64::from(quarter_bits) / QUARTERS)));
+        }
+        Ok(Self { quarter_bits, largest })
+    }
 }
 
 fn contexts(arrays: usize) -> usize {
-    3 * arrays.min(ARRAYS)
+    2 * SIZES * arrays.min(ARRAYS)
 }
 
-/// Codes the array `index`, whose largest code is `peak`; each has distributions of its own, because their values differ.
-fn code<C: Coder>(coder: &mut C, index: usize, peak: f64, values: &mut [f32]) -> Result<()> {
-    let size = 3 * index.min(ARRAYS - 1);
-    let (exponents, sign) = (size + 1, size + 2);
-    let mut last = 0;
-    for row in values.chunks_mut(ROW) {
-        let largest = row.iter().fold(0.0f32, |m, v| m.max(v.abs()));
-        let wanted = if largest > 0.0 { libm::ceil(PER_OCTAVE * libm::log2(f64::from(largest) / peak)) as i64 } else { ZERO };
-        let exponent = last + signed(coder, exponents, sign, wanted - last)?;
-        if exponent == ZERO {
-            row.fill(0.0);
-            continue;
+/// Codes the array `index`. Rows have sizes: the symbol of the largest code.
+fn code<C: Coder>(coder: &mut C, index: usize, form: Form, values: &mut [f32]) -> Result<()> {
+    if form.largest == 0.0 {
+        values.fill(0.0);
+        return Ok(());
+    }
+    let first = 2 * SIZES * index.min(ARRAYS - 1);
+    let (step, low_bits) = (form.step(), form.low_bits());
+    let mut sizes = [0; LANES];
+    for (lane, row) in Lanes::of(values.len().div_ceil(ROW)).turns() {
+        let end = values.len().min((row + 1) * ROW);
+        let row = &mut values[row * ROW..end];
+        let mut codes = [0i64; ROW];
+        if C::WRITES {
+            codes.iter_mut().zip(row.iter()).for_each(|(code, value)| *code = libm::round(f64::from(*value) / step) as i64);
         }
-        last = exponent;
-        if exponent.abs() > EXPONENT_LIMIT {
-            return Err(Error::data("compact weights", format!("a row has the exponent {exponent}"), "The file is damaged; fetch or write it again"));
-        }
-        let scale = libm::exp2(exponent as f64 / PER_OCTAVE);
-        for value in row {
-            let found = symmetric(coder, size, (f64::from(*value) / scale).round() as i64)?;
-            *value = ((found as f64 * scale) as f32).clamp(f32::MIN, f32::MAX);
+        let largest = codes.iter().map(|code| (code >> low_bits).unsigned_abs()).max().unwrap_or(0);
+        let size = coder.symbol(lane, first + sizes[lane], symbol_of(largest))?;
+        sizes[lane] = size % SIZES;
+        for (value, code) in row.iter_mut().zip(codes) {
+            let high = symmetric(coder, lane, first + SIZES + sizes[lane], code >> low_bits)?;
+            let found = high << low_bits | coder.bits(low_bits, code as u64)? as i64;
+            *value = ((found as f64 * step) as f32).clamp(f32::MIN, f32::MAX);
         }
     }
     Ok(())
+}
+
+impl Weights {
+    /// Bits of the array `index`, in quarters.
+    fn quarter_bits(&self, index: usize) -> u8 {
+        (QUARTERS * self.array_bits.get(index).copied().unwrap_or(self.bits)).round() as u8
+    }
 }
 
 impl WeightCodec for Weights {
     fn encode(&self, weights: &[WeightArray], _: &CodecContext) -> Result<Vec<Stream>> {
         let (mut shapes, mut coder) = (Vec::new(), Encoder::default());
         write_shapes(weights, &mut shapes)?;
-        weights.iter().enumerate().try_for_each(|(k, array)| code(&mut coder, k, self.peak, &mut array.values.clone()))?;
+        for (index, array) in weights.iter().enumerate() {
+            let form = Form { quarter_bits: self.quarter_bits(index), largest: array.values.iter().fold(0.0f32, |m, v| m.max(v.abs())) };
+            form.write(&mut shapes);
+            code(&mut coder, index, form, &mut array.values.clone())?;
+        }
         let (tables, mut values) = Tables::fit(contexts(weights.len()), std::slice::from_ref(&coder));
         let mut bytes = (values.len() as u32).to_le_bytes().to_vec();
         bytes.append(&mut values);
@@ -74,6 +121,7 @@ impl WeightCodec for Weights {
         let set = StreamSet::new("compact", streams);
         let (mut shapes, mut values): (ByteReader, ByteReader) = (set.reader(SHAPES)?, set.reader(VALUES)?);
         let mut arrays = read_shapes(&mut shapes)?;
+        let forms = arrays.iter().map(|_| Form::read(&mut shapes)).collect::<Result<Vec<Form>>>()?;
         let most = values.remaining().saturating_mul(PER_BYTE);
         let total = arrays.iter().try_fold(0usize, |sum, a| sum.checked_add(value_count(&a.shape)?)).filter(|total| *total <= most);
         let Some(total) = total else { return Err(shapes.error(format!("the arrays do not fit the {} bytes of values", values.remaining()))) };
@@ -82,49 +130,53 @@ impl WeightCodec for Weights {
         let (object, length) = ("compact stream 'values'", values.u32()? as usize);
         let tables = Tables::read(object, contexts(arrays.len()), values.take(length)?)?;
         let mut coder = Decoder::new(object, &tables, values.rest())?;
-        for (k, array) in arrays.iter_mut().enumerate() {
+        for (index, (array, form)) in arrays.iter_mut().zip(forms).enumerate() {
             array.values = vec![0.0; value_count(&array.shape).unwrap_or(0)];
-            code(&mut coder, k, self.peak, &mut array.values)?;
+            code(&mut coder, index, form, &mut array.values)?;
         }
         coder.finish()?;
         Ok(arrays)
     }
     fn loss(&self) -> f64 {
-        // Half a step of a scale that is up to an eighth of an octave too large.
-        0.5 * 1.0906 / self.peak + 1e-5
+        let least = (0..self.array_bits.len().max(1)).map(|index| self.quarter_bits(index)).min().unwrap_or(0);
+        0.5 / Form { quarter_bits: least, largest: 1.0 }.peak() + 1e-6
     }
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Settings {
-    bits: u32,
+    bits: f64,
+    array_bits: Vec<f64>,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { bits: BITS }
+        Self { bits: BITS, array_bits: Vec::new() }
     }
 }
 
 /// Keeps the plug-in in the program; see [`crate::link`].
 pub(crate) fn build(settings: &toml::Table) -> Result<Box<dyn WeightCodec>> {
-    let Settings { bits } = config::parse_section("weight-codec compact", settings)?;
-    if !RANGE.contains(&bits) {
-        return Err(Error::parameter("weight-codec compact.bits", bits.to_string(), format!("Choose {} to {}", RANGE.start(), RANGE.end())));
+    let Settings { bits, array_bits } = config::parse_section("weight-codec compact", settings)?;
+    if let Some(odd) = array_bits.iter().chain([&bits]).find(|bits| !RANGE.contains(bits)) {
+        return Err(Error::parameter("weight-codec compact.bits", odd.to_string(), format!("Choose {} to {}", RANGE.start(), RANGE.end())));
     }
-    Ok(Box::new(Weights { peak: f64::from((1u32 << (bits - 1)) - 1) }))
+    Ok(Box::new(Weights { bits, array_bits }))
 }
 
 inventory::submit! {
     WeightCodecPlugin {
         info: Plugin {
             name: "compact",
-            version: "1",
-            summary: "integers of few bits with a scale per 64 values, entropy coded",
-            paper: "row-wise symmetric quantisation; asymmetric numeral systems (constriction)",
-            schema: "bits = 10                # of a weight, 3 to 12, before entropy coding; one less doubles the error of weights\n",
-            capabilities: &["lossy"],
+            version: "2",
+            summary: "integers of few bits with a step per array, entropy coded",
+            paper: "uniform symmetric quantisation; asymmetric numeral systems (constriction)",
+            schema: "\
+bits = 12.0              # of the largest weight of an array, 3 to 16 in quarters, before entropy coding; one less doubles the error of weights
+array_bits = []          # of each array in turn, in place of bits; max-drop chooses them
+",
+            capabilities: &["lossy", "bits=3..16"],
         },
         build,
     }

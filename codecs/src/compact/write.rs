@@ -1,9 +1,9 @@
 //! The streams of quantised Gaussians.
 
-use super::colors::{self, Activity, SMALL_CONTEXTS, code_small};
+use super::colors::{self, SMALL_CONTEXTS, code_small};
 use super::encode::{Classes, Integers, coefficients};
 use super::geometry::{KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
-use super::predict::{GIVEN, Known, Linear};
+use super::predict::{Known, Linear};
 use super::{VERSION, blocks};
 use cc4dgs_format::storage::column::{self, Target};
 use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams};
@@ -22,8 +22,6 @@ pub(super) const EXACT: &str = "exact";
 pub const APART: u8 = 7;
 /// Without a threshold, scores are stored as numbers.
 const SCORE: Target = Target { bits: 10, mu_law: true, loss: 0.05, tail: 1e-3 };
-/// What an octave of a class counts in predictions.
-const OCTAVE: i64 = 512;
 
 /// Which rows have rotations of three components, and how scores are stored.
 pub struct Motion {
@@ -49,13 +47,13 @@ impl Motion {
 /// What predicts scales and colours of a row.
 pub fn known_classes(color: u8, shape: u8, for_color: bool, limit: u8) -> Known {
     let class = if for_color { color } else { shape };
-    Known { class, shift: class.min(limit), given: [i64::from(color) * OCTAVE, i64::from(shape) * OCTAVE, 0, 0, 0] }
+    Known { classes: [color, shape], class, shift: class.min(limit), ..Default::default() }
 }
 
 /// What predicts the opacity of a row: its classes and its scales, in the steps of class 0.
 pub fn known_scales(color: u8, shape: u8, scales: &[i32; 3], scale_limit: u8, limit: u8) -> Known {
     let mut out = known_classes(color, shape, false, limit);
-    for (given, &code) in out.given[GIVEN - 3..].iter_mut().zip(scales) {
+    for (given, &code) in out.given.iter_mut().zip(scales) {
         *given = i64::from(code) << shape.min(scale_limit);
     }
     out
@@ -113,22 +111,23 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
     streams.push(predicted(SCALES, 3, &scale_plan, scales.as_flattened(), &for_scales)?);
     let keys: Vec<u64> = order.iter().map(|&i| of.keys[i]).collect();
     streams.push(blocks::encode(MEANS, KEY_CONTEXTS, n, |coder, range| {
-        code_keys(coder, &mut keys[range.clone()].to_vec(), range.map(|i| geometry.position_shift(scales[i], shapes[i])))
+        let shifts: Vec<u32> = range.clone().map(|i| geometry.position_shift(scales[i], shapes[i])).collect();
+        code_keys(coder, &mut keys[range].to_vec(), &shifts)
     })?);
     let rotations: Vec<Rotation> = order.iter().map(|&i| of.rotations[i]).collect();
     streams.push(blocks::encode(ROTATIONS, ROTATION_CONTEXTS, n, |coder, range| {
-        let shifts = range.clone().map(|i| (geometry.rotation_shift(scales[i], shapes[i]), motion.is_free(i, &moving)));
-        code_rotations(coder, &mut rotations[range].to_vec(), shifts)
+        let shifts: Vec<(i32, bool)> = range.clone().map(|i| (geometry.rotation_shift(scales[i], shapes[i]), motion.is_free(i, &moving))).collect();
+        code_rotations(coder, &mut rotations[range].to_vec(), &shifts)
     })?);
     streams.push(predicted(OPACITIES, 1, &opacity_plan, &opacities, &for_opacities)?);
     streams.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
-    let mut activity = vec![Activity::default(); n];
+    let mut sizes = vec![0; n];
     for (degree, (plan, codes)) in of.degrees.iter().zip(&colors).enumerate().skip(1) {
         streams.push(blocks::encode(color_name(degree), colors::CONTEXTS, n, |coder, range| {
             let mut values = codes[range.start * plan.dims..range.end * plan.dims].to_vec();
-            plan.code(coder, &mut values, &classes[range.clone()], &mut activity[range].to_vec())
+            plan.code(coder, &mut values, &classes[range.clone()], &mut sizes[range].to_vec(), degree == 1)
         })?);
-        activity.iter_mut().zip(codes.chunks_exact(plan.dims)).zip(&classes).for_each(|((a, codes), &class)| plan.note(codes, class, a));
+        plan.note(codes, &classes, &mut sizes);
     }
     streams.extend(extra_streams(&sorted, Attributes::AsAllowed));
     Ok(streams)

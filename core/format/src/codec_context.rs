@@ -57,6 +57,25 @@ pub trait RenderModel {
     }
 }
 
+/// Mean PSNR in dB of `gaussians`, rendered, against the recorded images of at most `most` views, which are evenly spaced. Rendered values are clamped to 0..1
+/// and not rounded. 0 without views.
+///
+/// # Errors
+/// What the renderer and the images report.
+pub fn psnr_on_views(gaussians: &HostGaussians, views: &dyn TrainingViews, renderer: &dyn RenderModel, most: usize) -> Result<f64> {
+    let chosen = views.len().min(most);
+    let mut sum = 0.0;
+    for k in 0..chosen {
+        let index = k * views.len() / chosen;
+        let (camera, time_norm) = views.view(index);
+        let drawn = renderer.render(gaussians, camera, time_norm)?;
+        let truth = views.image(index)?.to_planes(renderer.background());
+        let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum();
+        sum -= 10.0 * libm::log10((error / truth.len().max(1) as f64).max(1e-12));
+    }
+    Ok(sum / chosen.max(1) as f64)
+}
+
 /// A deformer as a function from canonical Gaussians to deformed ones.
 pub trait EvaluateDeformer {
     /// `gaussians` deformed to `time_norm` (0..1), in the same order. Those whose score is not above the dynamic threshold stay unchanged.

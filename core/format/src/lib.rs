@@ -32,7 +32,7 @@ mod weight_codec;
 
 pub use camera::Camera;
 pub use codec::{AttributeCodec, CodecPlugin, DeclaredLoss, Stream};
-pub use codec_context::{CodecContext, EvaluateDeformer, RenderModel, RenderedPlanes, TrainingViews};
+pub use codec_context::{CodecContext, EvaluateDeformer, RenderModel, RenderedPlanes, TrainingViews, psnr_on_views};
 pub use deformer_context::DeformerContext;
 pub use error::{Error, Result};
 pub use events::{Event, EventSink, Fanout, Recorder, Silent};

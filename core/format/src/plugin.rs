@@ -17,7 +17,8 @@ pub struct Plugin {
     pub paper: &'static str,
     /// Settings with defaults, as TOML text with comments.
     pub schema: &'static str,
-    /// Capabilities, such as `differentiable`, `static-only`, `profiles=…`.
+    /// Capabilities, such as `differentiable`, `static-only`, `profiles=…`, or `bits=3..16`: the range of the bits in the setting
+    /// `array_bits` of a weight codec, a list with a number for each array.
     pub capabilities: &'static [&'static str],
 }
 

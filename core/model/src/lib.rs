@@ -32,7 +32,8 @@ pub use cc4dgs_format::{
     AttributeCodec, Camera, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Entries, Error, EvaluateDeformer, Event, EventSink, ExportFacts,
     ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, ExtraAttribute, Fanout, HostGaussians, Image8, Limits, MOVING, Moving, NeededRows, Plugin,
     PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rules, Seed, Silent, Similarity, StoredModel, Stream, TrainingViews, WeightArray, WeightCodec,
-    WeightCodecPlugin, archive, config, exporter, inventory, playback, plugin_kind, ply, read_gaussians, serde, split_kind, spz, storage, toml, unknown_name,
+    WeightCodecPlugin, archive, config, exporter, inventory, playback, plugin_kind, ply, psnr_on_views, read_gaussians, serde, split_kind, spz, storage, toml,
+    unknown_name,
 };
 pub use deformer::{
     AttributeSpec, Deformer, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures, SpatialInput, check_attributes,

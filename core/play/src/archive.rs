@@ -2,11 +2,13 @@
 
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::field_weights::FieldWeights;
+use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, RasterizerEntry, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
     AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
     WeightArray, read_gaussians, split_kind,
@@ -36,15 +38,27 @@ pub struct ArchiveOptions<'a> {
 const FIELD_STREAMS: &str = "field.";
 
 impl Model {
-    /// The model of an open archive; `object` names it in errors.
+    /// The model of an open archive; `object` names it in errors. Where the weights of its deformer were left out, its playback layer moves the Gaussians.
     ///
     /// # Errors
     /// As [`Model::open`].
     pub fn of_archive(object: &str, archive: &Archive, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
         let manifest = archive.manifest().clone();
-        let gaussians = read_gaussians(object, archive, limits, events)?;
+        let mut gaussians = read_gaussians(object, archive, limits, events)?;
+        let moving = Moving::of_manifest(object, &manifest)?;
+        let has = |kind| archive.stream_sizes().iter().any(|s| s.kind == kind);
         let field = match &manifest.deformer {
             None => None,
+            // The deformer was left out of an archive that plays.
+            Some(entry) if !has(StreamKind::Field) && has(StreamKind::Playback) => {
+                let layer = PlaybackLayer::decode(&archive.read_kind(StreamKind::Playback)?, gaussians.len(), gaussians.sh_degree, limits)?;
+                let rows = moving.rows(&gaussians.dynamic_scores).unwrap_or_else(|| (0..gaussians.len()).collect());
+                Some(of_layer(object, layer, &mut gaussians, &rows, &entry.context, device)?)
+            }
+            Some(entry) if !has(StreamKind::Field) => {
+                let problem = format!("it has neither the weights of its deformer '{}' nor a playback layer, so its motion is lost", entry.name);
+                return Err(Error::data(object, problem, "Fetch it again, or compress the run that it was made of"));
+            }
             Some(entry) => {
                 let known = linked(object, "deformer", &entry.name, Some(&entry.version), registry)?;
                 check_version(object, "deformer", &entry.name, &entry.version, known)?;
@@ -56,7 +70,6 @@ impl Model {
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
             }
         };
-        let moving = Moving::of_manifest(object, &manifest)?;
         let mut rasterizer = manifest.rasterizer.settings.clone();
         rasterizer.insert("kind".into(), manifest.rasterizer.name.clone().into());
         let of_kind = |kind| archive.stream_sizes().iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum::<u64>();
@@ -127,6 +140,10 @@ impl Model {
             None => None,
             Some(f) => {
                 let (name, settings) = split_kind("deformer", &f.section)?;
+                if name == PLAYBACK_LAYER {
+                    let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
+                    return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
+                }
                 let version = registry.deformer(&name)?.info.version.to_string();
                 let chosen = FieldWeights::parse(field_weights, registry)?;
                 let weight_version = registry.weight_codec(&chosen.name)?.info.version.to_string();

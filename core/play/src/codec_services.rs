@@ -4,8 +4,8 @@ use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, EvaluateDeformer, Gaussians, HostGaussians, Image8, ParameterSpace, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes, Result,
-    Scene, Seed, SpatialInput, SplatColors, Splats, Split, TrainingViews,
+    Camera, Deformer, EvaluateDeformer, Gaussians, HostGaussians, Image8, ParameterSpace, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes,
+    Result, Scene, Seed, SpatialInput, SplatColors, Splats, Split, TrainingViews,
 };
 
 /// The views of one split of a scene.
@@ -41,6 +41,7 @@ impl TrainingViews for SceneViews<'_> {
 /// Moves and draws Gaussians as a model does.
 pub struct ModelServices<'a> {
     model: &'a Model,
+    deformer: Option<&'a dyn Deformer>,
     device: Device,
     rasterizer: Box<dyn Rasterizer>,
     settings: RenderSettings,
@@ -51,21 +52,27 @@ impl<'a> ModelServices<'a> {
     pub fn new(model: &'a Model, registry: &Registry, device: &Device) -> Result<Self> {
         let background = Tensor::<1>::from_data(TensorData::new(model.background_on(None).to_vec(), [3]), device);
         let rasterizer = registry.build_rasterizer(&model.rasterizer)?;
-        Ok(Self { model, device: device.clone(), rasterizer, settings: model.render.settings(Some(background)) })
+        let deformer = model.field.as_ref().map(|f| f.field.as_ref());
+        Ok(Self { model, deformer, device: device.clone(), rasterizer, settings: model.render.settings(Some(background)) })
+    }
+    /// The same services with `deformer` in place of the model's, which must be of the same kind.
+    pub fn with_deformer(mut self, deformer: &'a dyn Deformer) -> Self {
+        self.deformer = Some(deformer);
+        self
     }
     fn moved(&self, host: &HostGaussians, time_norm: f32) -> Result<Gaussians> {
         let canonical = Gaussians::from_host(host, &self.device);
         let rows = self.model.moving.rows(&host.dynamic_scores);
         let nothing_moves = host.is_empty() || rows.as_ref().is_some_and(Vec::is_empty);
-        let Some(field) = self.model.field.as_ref().filter(|f| !nothing_moves && !f.field.is_static()) else { return Ok(canonical) };
+        let Some(deformer) = self.deformer.filter(|d| !nothing_moves && !d.is_static()) else { return Ok(canonical) };
         let rows = rows.map(|rows| {
             let indices: Vec<i64> = rows.iter().map(|&row| row as i64).collect();
             Tensor::<1, Int>::from_data(TensorData::new(indices, [rows.len()]), &self.device)
         });
         let select = |values: &Tensor<2>| rows.as_ref().map_or_else(|| values.clone(), |rows| values.clone().select(0, rows.clone()));
-        let attributes: Vec<Tensor<2>> = field.field.attributes().iter().filter_map(|spec| canonical.extra.get(&spec.name)).map(select).collect();
-        let features = field.field.spatial(&SpatialInput { means_world: select(&canonical.means), attributes })?.values;
-        field.field.deform(features, time_norm)?.apply(field.name(), &canonical, rows.as_ref())
+        let attributes: Vec<Tensor<2>> = deformer.attributes().iter().filter_map(|spec| canonical.extra.get(&spec.name)).map(select).collect();
+        let features = deformer.spatial(&SpatialInput { means_world: select(&canonical.means), attributes })?.values;
+        deformer.deform(features, time_norm)?.apply(self.model.field.as_ref().map_or("", |f| f.name()), &canonical, rows.as_ref())
     }
 }
 

@@ -1,16 +1,21 @@
-//! How the weights of a field are stored: `name`, `name:setting=value`, or `name:max-drop=0.01dB`, which searches the fewest bits that keep the PSNR.
+//! How the weights of a field are stored: `name`, `name:setting=value`, or `name:max-drop=0.01dB`, which searches the fewest bits of each array that keep the PSNR.
 
 use crate::archive::load_weights;
 use crate::codec_services::ModelServices;
-use crate::model::{Model, ModelDeformer, ModelSize};
+use crate::model::Model;
 use burn::tensor::Device;
-use cc4dgs_core::{CodecContext, Error, Event, Registry, RenderModel, Result, Stream, TrainingViews, WeightArray, WeightCodec, config};
+use cc4dgs_core::{CodecContext, Error, Event, Plugin, Registry, Result, Stream, WeightArray, config, psnr_on_views};
+use std::ops::RangeInclusive;
 
 /// Views on which the loss is measured.
 const VIEWS: usize = 16;
-/// The setting that a search changes, and its values from the most accurate.
-const BITS: &str = "bits";
-const SEARCHED: [i64; 10] = [12, 11, 10, 9, 8, 7, 6, 5, 4, 3];
+/// The setting that a search changes: the bits of each array in turn. The capability `bits=3..16` states their range.
+const ARRAY_BITS: &str = "array_bits";
+/// Attempts after every array was probed, at most.
+const ATTEMPTS: usize = 6;
+/// Where in the range an array is probed, and the least loss in dB that it counts with.
+const PROBED: f64 = 0.3;
+const SMALLEST: f64 = 1e-4;
 
 /// A weight codec with its settings.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,7 +36,7 @@ impl FieldWeights {
     pub fn parse(spec: &str, registry: &Registry) -> Result<Self> {
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
         let mut out = Self { name: name.into(), settings: toml::Table::new(), max_drop_db: None };
-        let searchable = registry.weight_codec(name)?.info.schema.contains(BITS);
+        let searchable = searched_bits(&registry.weight_codec(name)?.info).is_some();
         let Some(limit) = profile.strip_prefix("max-drop=") else {
             if !profile.is_empty() {
                 config::set_all(&mut out.settings, &[profile.to_string()])?;
@@ -63,69 +68,115 @@ impl FieldWeights {
             let problem = "a loss of PSNR is measured on training views, and there are none";
             return Err(Error::parameter("weight codec", problem, "Give the dataset with --scene, or a number of bits such as compact:bits=6"));
         };
-        let before = psnr(&ModelServices::new(model, registry, device)?, model, views)?;
-        let mut best = None;
-        for bits in SEARCHED {
+        let Some(of) = &model.field else { return Err(Error::backend("weight codec", "the model has no deformer", "Report this")) };
+        let Some(range) = searched_bits(&registry.weight_codec(&self.name)?.info) else {
+            return Err(Error::backend("weight codec", format!("{} has no bits to search", self.name), "Report this"));
+        };
+        let mut decoded = registry.build_deformer(&of.section, &of.context, device)?;
+        let before = psnr_on_views(&model.gaussians, views, &ModelServices::new(model, registry, device)?, VIEWS)?;
+        let mut attempt = |bits: &[f64]| {
             let mut settings = self.settings.clone();
-            settings.insert(BITS.into(), bits.into());
+            settings.insert(ARRAY_BITS.into(), bits.to_vec().into());
             let codec = registry.build_weight_codec(&self.name, &settings)?;
             let streams = codec.encode(weights, context)?;
-            let drop = before - self.decoded(model, codec.as_ref(), &streams, device, context, views, registry)?;
-            // The most accurate form is taken even if it loses more; the note says how much.
-            if best.is_some() && drop > limit {
-                break;
-            }
-            best = Some((streams, settings, bits, drop));
-        }
-        let Some((streams, settings, bits, drop)) = best else { return Err(Error::backend("weight codec", "no number of bits was tried", "Report this")) };
-        let object = format!("weight codec {}", self.name);
-        let message = format!("{bits} bits, PSNR {drop:.4} dB lower on {} training views ({limit} dB allowed)", views.len().min(VIEWS));
-        context.events.emit(&if drop > limit { Event::Warning { object, message } } else { Event::Note { object, message } });
-        Ok((streams, settings))
-    }
-    /// PSNR of the model with decoded weights.
-    #[expect(clippy::too_many_arguments, reason = "all of one attempt")]
-    fn decoded(
-        &self,
-        model: &Model,
-        codec: &dyn WeightCodec,
-        streams: &[Stream],
-        device: &Device,
-        context: &CodecContext,
-        views: &dyn TrainingViews,
-        registry: &Registry,
-    ) -> Result<f64> {
-        let Some(of) = &model.field else { return Ok(0.0) };
-        let found = codec.decode(streams, &CodecContext::new(context.seed.child("search"), context.limits, context.events))?;
-        let mut field = registry.build_deformer(&of.section, &of.context, device)?;
-        load_weights("encoded weights", field.as_mut(), found, device)?;
-        let other = Model {
-            gaussians: model.gaussians.clone(),
-            field: Some(ModelDeformer { field, section: of.section.clone(), context: of.context.clone() }),
-            moving: model.moving,
-            render: model.render.clone(),
-            background: model.background,
-            rasterizer: model.rasterizer.clone(),
-            frame_count: model.frame_count,
-            normalisation: model.normalisation,
-            provenance: model.provenance.clone(),
-            size: ModelSize::default(),
+            let found = codec.decode(&streams, &CodecContext::new(context.seed.child("search"), context.limits, context.events))?;
+            load_weights("encoded weights", decoded.as_mut(), found, device)?;
+            let services = ModelServices::new(model, registry, device)?.with_deformer(decoded.as_ref());
+            let drop = before - psnr_on_views(&model.gaussians, views, &services, VIEWS)?;
+            Ok::<_, Error>(Attempt { streams, settings, drop })
         };
-        psnr(&ModelServices::new(&other, registry, device)?, &other, views)
+        let counts: Vec<usize> = weights.iter().map(|w| w.values.len()).collect();
+        let (bits, found) = search_bits(&counts, range, limit, &mut attempt)?;
+        let object = format!("weight codec {}", self.name);
+        let text: Vec<String> = bits.iter().map(f64::to_string).collect();
+        let message = format!("{} bits, PSNR {:.4} dB lower on {} training views ({limit} dB allowed)", text.join(", "), found.drop, views.len().min(VIEWS));
+        context.events.emit(&if found.drop > limit { Event::Warning { object, message } } else { Event::Note { object, message } });
+        Ok((found.streams, found.settings))
     }
 }
 
-/// Mean PSNR of renders against the recorded images.
-fn psnr(services: &ModelServices, model: &Model, views: &dyn TrainingViews) -> Result<f64> {
-    let chosen = views.len().min(VIEWS);
-    let mut sum = 0.0;
-    for k in 0..chosen {
-        let index = k * views.len() / chosen;
-        let (camera, time_norm) = views.view(index);
-        let drawn = services.render(&model.gaussians, camera, time_norm)?;
-        let truth = views.image(index)?.to_planes(services.background());
-        let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum::<f64>() / truth.len().max(1) as f64;
-        sum += -10.0 * error.max(1e-12).log10();
+/// Encoded weights, the settings that made them, and the PSNR that they cost in dB.
+struct Attempt {
+    streams: Vec<Stream>,
+    settings: toml::Table,
+    drop: f64,
+}
+
+/// The fewest bits per array, in quarters, that lose at most `limit` dB; arrays have `counts` values. A bit less doubles errors and quadruples the loss. Where
+/// the sum of bits is smallest, the loss of each array is in proportion to its values. The most bits are taken even if they lose more.
+fn search_bits(counts: &[usize], range: RangeInclusive<i64>, limit: f64, attempt: &mut dyn FnMut(&[f64]) -> Result<Attempt>) -> Result<(Vec<f64>, Attempt)> {
+    let (least, most) = (*range.start() as f64, *range.end() as f64);
+    let finest = vec![most; counts.len()];
+    let first = attempt(&finest)?;
+    if first.drop > limit || counts.is_empty() {
+        return Ok((finest, first));
     }
-    Ok(sum / chosen.max(1) as f64)
+    let probe = (least + PROBED * (most - least)).round();
+    let mut losses = Vec::with_capacity(counts.len());
+    for array in 0..counts.len() {
+        let mut bits = finest.clone();
+        bits[array] = probe;
+        losses.push((attempt(&bits)?.drop - first.drop).max(SMALLEST));
+    }
+    let total = counts.iter().sum::<usize>().max(1) as f64;
+    let even = 0.5 * (total / limit).log2();
+    let bits_at = |more: f64| -> Vec<f64> {
+        let of = |(&loss, &count): (&f64, &usize)| probe + even + 0.5 * (loss / count.max(1) as f64).log2() + more;
+        losses.iter().zip(counts).map(|array| (4.0 * of(array)).round().clamp(4.0 * least, 4.0 * most) / 4.0).collect()
+    };
+    let (mut best, mut quarters) = ((finest, first), 0i32);
+    for _ in 0..ATTEMPTS {
+        let bits = bits_at(0.25 * f64::from(quarters));
+        let found = attempt(&bits)?;
+        let allowed = found.drop <= limit;
+        if allowed && bits.iter().sum::<f64>() < best.0.iter().sum::<f64>() {
+            best = (bits, found);
+        } else if allowed {
+            break;
+        }
+        // Once both sides of the limit are known, the search is over.
+        if quarters != 0 && allowed == (quarters > 0) {
+            break;
+        }
+        quarters += if allowed { -1 } else { 1 };
+    }
+    Ok(best)
+}
+
+/// The numbers of bits that a weight codec can be asked for, from its capability `bits=3..12`.
+fn searched_bits(info: &Plugin) -> Option<RangeInclusive<i64>> {
+    let (least, most) = info.capabilities.iter().find_map(|c| c.strip_prefix("bits="))?.split_once("..")?;
+    Some(least.parse().ok()?..=most.parse().ok()?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_go_where_they_count() {
+        // Array 1 matters 64 times as much per value as array 0: three bits.
+        let (counts, matter) = ([1000, 500], [64.0, 2048.0]);
+        let tried = std::cell::Cell::new(0);
+        let mut attempt = |bits: &[f64]| {
+            tried.set(tried.get() + 1);
+            let drop = bits.iter().zip(matter).map(|(b, m)| m * 0.25f64.powf(*b)).sum();
+            Ok(Attempt { streams: Vec::new(), settings: toml::Table::new(), drop })
+        };
+        let (bits, found) = search_bits(&counts, 3..=16, 0.064, &mut attempt).unwrap();
+        assert!(found.drop <= 0.064 && found.drop > 0.032, "{bits:?} lose {}", found.drop);
+        assert_eq!(bits[1] - bits[0], 3.0, "{bits:?}");
+        assert!(tried.get() < 10, "{} attempts", tried.get());
+        // Nothing is accurate enough: the most bits.
+        let (bits, _) = search_bits(&counts, 3..=16, 1e-12, &mut attempt).unwrap();
+        assert_eq!(bits, [16.0; 2]);
+    }
+
+    #[test]
+    fn only_codecs_that_state_their_bits_are_searched() {
+        let info = |capabilities: &'static [&'static str]| Plugin { name: "w", version: "1", summary: "", paper: "", schema: "bits = 8\n", capabilities };
+        assert_eq!(searched_bits(&info(&["lossy", "bits=3..12"])), Some(3..=12));
+        assert_eq!(searched_bits(&info(&["lossy"])), None);
+        assert_eq!(searched_bits(&info(&["bits=few"])), None);
+    }
 }

@@ -9,6 +9,7 @@ pub mod bake;
 pub mod checkpoint;
 pub mod codec_services;
 pub mod field_weights;
+mod layer_deformer;
 pub mod model;
 mod moving;
 mod orbit;

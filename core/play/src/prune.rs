@@ -3,7 +3,7 @@
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::model::Model;
 use burn::tensor::Device;
-use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Registry, RenderModel, Result, Scene, Seed, Split, TrainingViews};
+use cc4dgs_core::{Error, Event, EventSink, Registry, RenderModel, Result, Scene, Seed, Split, TrainingViews, psnr_on_views};
 use serde::Serialize;
 
 /// Training views from which contributions are taken.
@@ -71,7 +71,7 @@ pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Regi
     };
     let n = order.len();
     let services = ModelServices::new(model, registry, device)?;
-    let psnr_before_db = psnr(&model.gaussians, &judges, &services)?;
+    let psnr_before_db = psnr_on_views(&model.gaussians, &judges, &services, JUDGES)?;
     // The fewest that are known to suffice, and the most that are known not to.
     let (mut enough, mut too_few, mut psnr_after_db) = (n, 0usize, psnr_before_db);
     for step in 0..STEPS {
@@ -79,7 +79,7 @@ pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Regi
         if count == enough || count == too_few {
             break;
         }
-        let found = psnr(&kept(count), &judges, &services)?;
+        let found = psnr_on_views(&kept(count), &judges, &services, JUDGES)?;
         if psnr_before_db - found <= max_drop_db {
             (enough, psnr_after_db) = (count, found);
         } else {
@@ -92,19 +92,4 @@ pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Regi
     model.gaussians = rest;
     let views = judges.len().min(JUDGES);
     Ok(PruneReport { before: n, after: enough, psnr_before_db, psnr_after_db, judged_by, views })
-}
-
-/// Mean PSNR over at most [`JUDGES`] of `views`; values are clamped to 0..1 and not rounded.
-fn psnr(gaussians: &HostGaussians, views: &SceneViews, services: &ModelServices) -> Result<f64> {
-    let chosen = views.len().min(JUDGES);
-    let mut sum = 0.0;
-    for k in 0..chosen {
-        let index = k * views.len() / chosen;
-        let (camera, time_norm) = views.view(index);
-        let drawn = services.render(gaussians, camera, time_norm)?;
-        let truth = views.image(index)?.to_planes(services.background());
-        let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum();
-        sum -= 10.0 * (error / truth.len().max(1) as f64).max(1e-12).log10();
-    }
-    Ok(sum / chosen.max(1) as f64)
 }

@@ -146,6 +146,11 @@ fn outliers_survive_without_spoiling_their_neighbours() {
         assert!(worst(&before.dynamic_scores, &after.dynamic_scores, 1e5) < 0.1, "{name}");
         // The others keep the declared losses, measured against their own deviation.
         let (before, after) = (original.select(&near), decoded.select(&near));
+        // `compact` has steps of scales up to 0.7, and of opacities up to 1 on its scale, for Gaussians that are hardly seen.
+        let (scale, opacity) = if name.starts_with("compact") { (0.36, 0.66) } else { (0.05, 0.05) };
+        assert!(worst(&before.log_scales, &after.log_scales, -1.0) < scale, "{name}");
+        assert!(worst(&before.opacity_logits, &after.opacity_logits, -1.0) < opacity, "{name}");
+        assert!(worst(&before.dynamic_scores, &after.dynamic_scores, -1.0) < 0.1, "{name}");
         for loss in codec.losses() {
             let find = |g: &HostGaussians| g.columns().into_iter().find(|(column, _, _)| *column == loss.attribute).map(|(_, _, values)| values.clone());
             let lost = find(&before).zip(find(&after)).map_or(0.0, |(a, b)| relative_rms(&a, &b));

@@ -24,7 +24,7 @@ pub struct Bake {
     /// Weight codec of the field, where MODEL is no archive yet.
     #[arg(long, value_name = "NAME", default_value = "fp16")]
     pub field_weights: String,
-    /// Leave the deformer's weights out: smaller, for players that read the layer only.
+    /// Leave the deformer's weights out. The archive is smaller and moves by its layer; it cannot be compressed again.
     #[arg(long)]
     pub without_field: bool,
     /// Frames per second of the recording; 30 where nobody says.

@@ -193,3 +193,23 @@ fn pages_hold_a_baked_archive() {
     let layer = |path: &Path| cc4dgs_core::StoredModel::open(path, &cc4dgs::Limits::default(), &events).unwrap().playback;
     assert!(layer(&again.join("model.cc4d")) == layer(&baked) && layer(&baked) != model.playback);
 }
+
+#[test]
+fn archives_without_their_deformer_move_by_their_layer() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    train(&at("run"), "cdf-basis", 1);
+    let (dir, bare) = (at("run"), at("bare.cc4d"));
+    succeed(&["bake", text(&dir), "--out", text(&bare), "--max-error", "0.05px", "--without-field", "-q"]);
+    let judge = Judge::new(&dir);
+    let export = |name: &str, more: &[&str]| {
+        let out = at(name);
+        succeed(&[&["export", "ply", text(&bare), "--out", text(&out), "--device", "flex", "-q"], more].concat());
+        read::any(&out)
+    };
+    let (still, moved) = (export("still.ply", &[]), export("half.ply", &["--time", "0.5"]));
+    let (moves, stays, half) = (judge.psnr(still.clone(), Some(0.5)), judge.psnr(still, None), judge.psnr(moved, Some(0.5)));
+    assert!(stays > 40.0 && half > 40.0 && moves < half - 3.0, "{stays} dB canonical, {half} dB at half time, {moves} dB without motion");
+    let message = fail(&["compress", text(&bare), "--codec", "raw", "--out", text(&at("again.cc4d")), "-q"], 2);
+    assert!(message.contains("--without-field"), "{message}");
+}

@@ -23,7 +23,7 @@ pub struct Additions<'a> {
     pub presentation: Presentation,
     /// PNG or JPEG bytes.
     pub poster: Option<Vec<u8>>,
-    /// Whether the deformer's weights are left out. The archive then plays where its layer is read, and stands still for programs that need the deformer.
+    /// Whether the deformer's weights are left out. The archive then moves by its layer alone.
     pub without_field: bool,
 }
 

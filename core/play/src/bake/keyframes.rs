@@ -8,7 +8,8 @@ use cc4dgs_core::{Error, HostGaussians, Result};
 /// are one hat per keyframe, so its size grows with their number; [`bake`](super::bake) makes small layers.
 ///
 /// # Errors
-/// [`Error::Parameter`] for fewer than 2 or more than [`MAX_FUNCTIONS`] keyframes, and for keyframes of another number of Gaussians.
+/// [`Error::Parameter`] for fewer than 2 or more than [`MAX_FUNCTIONS`] keyframes, for keyframes of another number of Gaussians, and for rows that are not
+/// ascending indices of `canonical`.
 pub fn keyframes(canonical: &HostGaussians, rows: &[u32], moved: &[HostGaussians]) -> Result<PlaybackLayer> {
     let n = moved.len();
     if !(2..=MAX_FUNCTIONS).contains(&n) {
@@ -21,6 +22,9 @@ pub fn keyframes(canonical: &HostGaussians, rows: &[u32], moved: &[HostGaussians
     let indices: Vec<usize> = rows.iter().map(|&row| row as usize).collect();
     if let Some(row) = indices.iter().find(|row| **row >= canonical.len()) {
         return Err(Error::parameter("keyframes", format!("row {row} of {} Gaussians", canonical.len()), "Give indices of Gaussians that are there"));
+    }
+    if let Some(pair) = indices.windows(2).find(|pair| pair[0] >= pair[1]) {
+        return Err(Error::parameter("keyframes", format!("row {} before row {}", pair[0], pair[1]), "Give each moving Gaussian once, in ascending order"));
     }
     let host = canonical.select(&indices);
     let functions: Vec<f32> = (0..n * n).map(|i| f32::from(u8::from(i / n == i % n))).collect();
@@ -73,6 +77,11 @@ mod tests {
             keyframes(&canonical, &[1], &moved[..1]).is_err()
                 && keyframes(&canonical, &[2], &moved).is_err()
                 && keyframes(&canonical, &[0, 1], &moved).is_err()
+        );
+        let both: Vec<HostGaussians> = moved.iter().map(|g| two(g, g)).collect();
+        assert!(
+            keyframes(&canonical, &[0, 1], &both).is_ok() && keyframes(&canonical, &[1, 0], &both).is_err() && keyframes(&canonical, &[1, 1], &both).is_err(),
+            "rows ascend"
         );
     }
 }
