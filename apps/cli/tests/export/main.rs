@@ -135,7 +135,7 @@ fn exports_are_refused_before_work_and_never_replace_unasked() {
     let output = common::cc4dgs().args(export("web", &page, &[])).env("CC4DGS_PAGE", at("nowhere")).output().unwrap();
     assert!(!output.status.success() && common::said(&output).contains("nowhere") && !page.exists(), "{}", common::said(&output));
     // A folder that holds a run is not an export.
-    assert!(refused(export("ply-sequence", &dir, &["--overwrite"])).contains("no .ply file"));
+    assert!(refused(export("ply-sequence", &dir, &["--overwrite"])).contains("which is not of this format"));
     assert!(dir.join("checkpoint").is_file());
     // The alias writes the same bytes, and replaces as ever.
     let alias = at("b.ply");
