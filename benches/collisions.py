@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Collisions of the hash functions of computational deformation fields, ((a v + b) mod (2^31 - 1)) mod m over the vertices v of a grid.
 
-    python3 benches/collisions.py [--json FILE]
+    python3 benches/collisions.py [--seeds 1,2,3,4,5] [--json FILE]
 
-For k functions and modulus m: how many vertices share all k values with another vertex (`duplicates`), and how many single values coincide with one of another
-vertex (`collisions`, the mean share over functions). Constants come from SplitMix64, as in backends/src/ops/hash.rs. k values of a vertex are compared by a
+For k functions and modulus m: how many vertices share all k values with another vertex (`duplicates`, the least and the most over the seeds), and how many single
+values coincide with one of another vertex (`collisions`, the mean share over functions). Constants come from SplitMix64, as in backends/src/ops/hash.rs. k values of a vertex are compared by a
 64-bit fingerprint; the chance that two different ones of 16.8 million have the same is below 1e-5.
 """
 import argparse
@@ -38,11 +38,11 @@ def shared(values):
     return int(np.count_nonzero(np.concatenate([same, [False]]) | np.concatenate([[False], same])))
 
 
-def study(resolution, modulus, seed):
+def duplicates(grid, modulus, seed):
+    """Vertices that share all of k values with another one, per k of FUNCTIONS, and the share of single values that coincide."""
     random = split_mix(seed)
-    grid = vertices(resolution)
     fingerprint = np.zeros(len(grid[0]), dtype=np.uint64)
-    rows, single = [], []
+    found, single = [], []
     for k in range(1, max(FUNCTIONS) + 1):
         a = [1 + next(random) % (PRIME - 1) for _ in range(3)]
         b = next(random) % PRIME
@@ -52,29 +52,42 @@ def study(resolution, modulus, seed):
         fingerprint = (fingerprint ^ value) * np.uint64(0x9E3779B97F4A7C15)
         fingerprint ^= fingerprint >> np.uint64(29)
         if k in FUNCTIONS:
-            rows.append({"k": k, "duplicates": shared(fingerprint)})
-            if rows[-1]["duplicates"] == 0:
+            found.append(shared(fingerprint))
+            if found[-1] == 0:
                 # More functions cannot make two vertices equal again.
-                rows += [{"k": more, "duplicates": 0} for more in FUNCTIONS if more > k]
                 break
-    return {"resolution": resolution, "modulus": modulus, "vertices": len(grid[0]), "collisions": float(np.mean(single)), "functions": rows}
+    return found + [0] * (len(FUNCTIONS) - len(found)), float(np.mean(single))
+
+
+def study(resolution, modulus, seeds):
+    grid = vertices(resolution)
+    found = [duplicates(grid, modulus, seed) for seed in seeds]
+    functions = [{"k": k, "duplicates": [counts[i] for counts, _ in found]} for i, k in enumerate(FUNCTIONS)]
+    return {"resolution": resolution, "modulus": modulus, "vertices": len(grid[0]), "collisions": [single for _, single in found], "functions": functions}
+
+
+def span(counts):
+    low, high = min(counts), max(counts)
+    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json")
     parser.add_argument("--resolutions", default="32,64,128,255")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seeds", default="1,2,3,4,5")
     options = parser.parse_args()
-    cases = [study(int(r), m, options.seed) for r in options.resolutions.split(",") for m in MODULI]
+    seeds = [int(seed) for seed in options.seeds.split(",")]
+    cases = [study(int(r), m, seeds) for r in options.resolutions.split(",") for m in MODULI]
     print("| vertices | m | single values that collide | " + " | ".join(f"k = {k}" for k in FUNCTIONS) + " |")
     print("|" + " ---: |" * (3 + len(FUNCTIONS)))
     for case in cases:
-        cells = " | ".join(f"{row['duplicates']:,}" for row in case["functions"])
-        print(f"| {case['vertices']:,} | {case['modulus']:,} | {100 * case['collisions']:.2f} % | {cells} |")
+        cells = " | ".join(span(row["duplicates"]) for row in case["functions"])
+        print(f"| {case['vertices']:,} | {case['modulus']:,} | {100 * np.mean(case['collisions']):.2f} % | {cells} |")
     if options.json:
         with open(options.json, "w") as file:
-            json.dump({"what": "vertices that share all k hash values with another one", "seed": options.seed, "cases": cases}, file, indent=1)
+            json.dump({"what": "vertices that share all k hash values with another one, per seed", "seeds": seeds, "cases": cases}, file)
+            file.write("\n")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Times the page of the player in Chromium with SwiftShader, and the tile renderer beside it: player.py PAGE ARCHIVE --scene SCENE [--program cc4dgs] [--size 1352x1014] [--out FILE].
+"""Times the page of the player in Chromium with SwiftShader, and the tile renderer beside it: player.py PAGE [--program cc4dgs] [--case n3dv] [--out FILE].
 
-PAGE is the folder of apps/player/build-web, ARCHIVE an archive that was baked with its deformer and --scene SCENE, a built-in scene. Prints JSON: bytes of the bundle (gzipped) and of what a player fetches, milliseconds from the
-last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the device `flex` (`cc4dgs bench play`), the medians of
-alternating rounds. Needs playwright, and Chromium on the path.
+PAGE is the folder of apps/player/build-web. The model is a room of `cc4dgs bench frame`, as large as published scenes: 335,000 Gaussians at 1352x1014, of which
+12 % move. It is stored with a playback layer (`--archive`), and page and tile renderer look from the same camera. Prints JSON: bytes of the bundle (gzipped) and of
+the archive, milliseconds from the last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the device `flex`,
+deformer included; the medians of alternating rounds. Needs playwright, and Chromium on the path.
 """
-import argparse, gzip, json, pathlib, statistics, subprocess
+import argparse, gzip, json, pathlib, statistics, subprocess, tempfile
 from chromium import launch, serve
 from playwright.sync_api import sync_playwright
 
@@ -15,6 +16,8 @@ LOAD = """async () => {
     const bytes = new Uint8Array(await (await fetch("/model.cc4d")).arrayBuffer());
     const began = performance.now();
     await cc4dgs.load(bytes, "model.cc4d");
+    cc4dgs.goTo(0);
+    cc4dgs.draw();
     if (cc4dgs.gl) { const g = cc4dgs.gl.gl; g.readPixels(0, 0, 1, 1, g.RGBA, g.UNSIGNED_BYTE, new Uint8Array(4)); } else await cc4dgs.gpu.countVisible();
     return performance.now() - began;
 }"""
@@ -29,18 +32,32 @@ FRAME = """async frames => {
 }"""
 
 
+def room(args, frames, *more):
+    """What `cc4dgs bench frame` says of the case."""
+    command = [args.program, "--quiet", "bench", "frame", "--case", args.case, "--scale", args.scale, "--motion", "0.05", "--device", "flex"]
+    ran = subprocess.run([*command, "--set", f"deformer.kind={args.deformer}", "--frames", str(frames), *more, "--json"], capture_output=True, text=True)
+    if ran.returncode:
+        raise SystemExit(ran.stderr)
+    return json.loads(ran.stdout)["cases"][0]
+
+
 def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("page"), parser.add_argument("archive")
-    parser.add_argument("--scene", required=True), parser.add_argument("--program", default="cc4dgs"), parser.add_argument("--size", default="1352x1014"), parser.add_argument("--out")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page"), parser.add_argument("--program", default="cc4dgs"), parser.add_argument("--case", default="n3dv")
+    parser.add_argument("--scale", default="1"), parser.add_argument("--deformer", default="cdf-basis"), parser.add_argument("--out")
     args = parser.parse_args()
-    width, height = map(int, args.size.split("x"))
-    address, archive_bytes = serve(args.page, args.archive, "model.cc4d")
+    folder = tempfile.TemporaryDirectory()
+    archive = pathlib.Path(folder.name) / "room.cc4d"
+    case = room(args, 1, "--archive", str(archive))
+    width, height = case["width"], case["height"]
+    address, archive_bytes = serve(args.page, archive, "model.cc4d")
     files = [f for f in pathlib.Path(args.page).iterdir() if f.suffix in (".wasm", ".js", ".css", ".html")]
-    out = {"size": args.size, "archive_bytes": archive_bytes, "bundle_gzip_bytes": sum(len(gzip.compress(f.read_bytes(), 9)) for f in files)}
+    out = {"size": f"{width}x{height}", "case": args.case, "deformer": args.deformer, "archive_bytes": archive_bytes}
+    out["bundle_gzip_bytes"] = sum(len(gzip.compress(f.read_bytes(), 9)) for f in files)
     times = {"webgpu": [], "webgl2": [], "tile": []}
     with sync_playwright() as play:
         browser = launch(play)
+        out["browser"] = browser.version
         pages = {}
         for name, query in (("webgpu", ""), ("webgl2", "?backend=webgl")):
             page = browser.new_page(viewport={"width": width, "height": height})
@@ -54,14 +71,10 @@ def main():
         out["canvas"] = pages["webgpu"].evaluate("`${cc4dgs.ui.canvas.width}x${cc4dgs.ui.canvas.height}`")
         for _ in range(ROUNDS):
             for name, page in pages.items():
+                page.bring_to_front()
                 times[name].append(page.evaluate(FRAME, FRAMES))
-            sets = [word for each in (f"scene.width={width}", f"scene.height={height}") for word in ("--set", each)]
-            command = [args.program, "--quiet", "bench", "play", args.archive, "--scene", args.scene, *sets, "--frames", str(FRAMES), "--device", "flex", "--json"]
-            ran = subprocess.run(command, capture_output=True, text=True)
-            if ran.returncode:
-                raise SystemExit(ran.stderr)
-            report = json.loads(ran.stdout)
-            times["tile"].append(report["field"]["median_ms"] + report["raster"]["median_ms"])
+            case = room(args, FRAMES)
+            times["tile"].append(case["field"]["median_ms"] + case["raster"]["median_ms"])
         browser.close()
     medians = {name: statistics.median(values) for name, values in times.items()}
     out |= {"frame_ms": {name: round(value, 1) for name, value in medians.items()}, "rounds": times}

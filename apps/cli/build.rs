@@ -3,23 +3,32 @@
 use std::path::Path;
 use std::process::Command;
 
+/// What the program is made of, seen from this folder. A change there that is not committed marks the commit as dirty.
+const SOURCES: [&str; 9] =
+    ["../../apps", "../../backends", "../../codecs", "../../core", "../../deformers", "../../exporters", "../../parts", "../../Cargo.toml", "../../Cargo.lock"];
+
+fn git(args: &[&str]) -> Option<String> {
+    let output = Command::new("git").args(args).output().ok().filter(|o| o.status.success())?;
+    Some(String::from_utf8_lossy(&output.stdout).trim().to_string())
+}
+
+/// The commit of the repository, with a mark where sources differ from it.
+fn described() -> Option<String> {
+    let commit = git(&["describe", "--always", "--abbrev=12", "--exclude=*"])?;
+    let changes = git(&[&["status", "--porcelain", "--untracked-files=no", "--"], &SOURCES[..]].concat())?;
+    Some(if changes.is_empty() { commit } else { format!("{commit}-dirty") })
+}
+
 fn main() {
-    let git = |args: &[&str]| {
-        let output = Command::new("git").args(args).output().ok().filter(|o| o.status.success())?;
-        Some(String::from_utf8_lossy(&output.stdout).trim().to_string())
-    };
     println!("cargo::rerun-if-env-changed=CC4DGS_COMMIT");
-    println!("cargo::rerun-if-changed=src");
+    println!("cargo::rerun-if-changed=build.rs");
     // The log of HEAD grows with every commit, checkout and rebase.
-    if let Some(folder) = git(&["rev-parse", "--git-dir"]) {
-        for name in ["HEAD", "logs/HEAD"] {
-            let path = Path::new(&folder).join(name);
-            if path.exists() {
-                println!("cargo::rerun-if-changed={}", path.display());
-            }
-        }
+    let git_files = git(&["rev-parse", "--git-dir"]).into_iter().flat_map(|folder| ["HEAD", "logs/HEAD"].map(|name| Path::new(&folder).join(name)));
+    // Cargo would run this script at every build if it named a path that does not exist.
+    for path in SOURCES.iter().map(|source| Path::new(source).to_path_buf()).chain(git_files).filter(|path| path.exists()) {
+        println!("cargo::rerun-if-changed={}", path.display());
     }
     // Packagers build without a repository and may say what they build.
-    let commit = std::env::var("CC4DGS_COMMIT").ok().or_else(|| git(&["describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]));
+    let commit = std::env::var("CC4DGS_COMMIT").ok().or_else(described);
     println!("cargo::rustc-env=CC4DGS_COMMIT={}", commit.unwrap_or_default());
 }

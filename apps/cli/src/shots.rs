@@ -36,9 +36,9 @@ pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model) -
     Ok((evenly(views.len(), wanted).into_iter().map(shot).collect(), scene.background))
 }
 
-/// The cameras that recorded the dataset at `path`, as `model` was trained on them: those of the training views, each once.
-pub fn capture_cameras(context: &Context, path: &Path, model: &Model) -> Result<Vec<Camera>> {
-    let scene = open_as_trained(path, model, &[], &context.registry, &context.limits)?;
+/// The cameras that recorded the dataset at `path`, as `model` was trained on them with scene options `sets` laid over: those of the training views, each once.
+pub fn capture_cameras(context: &Context, path: &Path, sets: &[String], model: &Model) -> Result<Vec<Camera>> {
+    let scene = open_as_trained(path, model, sets, &context.registry, &context.limits)?;
     let mut indices: Vec<usize> = scene.split(Split::Train).into_iter().map(|view| scene.views[view].camera).collect();
     indices.sort_unstable();
     indices.dedup();

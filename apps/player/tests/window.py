@@ -1,17 +1,20 @@
 """Opens the window of `cc4dgs view` and of `cc4dgs train --view` on a virtual screen: window.py PROGRAM ARCHIVE [--screenshots FOLDER] [--iterations N].
 
-PROGRAM is a cc4dgs with the feature `view`, ARCHIVE a baked archive that moves. Needs Xvfb, xdotool, ffmpeg, Pillow and numpy; Mesa's lavapipe is enough to draw.
-Moves the time slider with the mouse, orbits, pauses and resumes a training, and compares the checkpoint of the watched training with that of an unwatched one.
-Ends with a sentence per check; fails at the first that does not hold.
+PROGRAM is a cc4dgs with the feature `view`, ARCHIVE a baked archive that moves. Needs Xvfb, xdotool, ffmpeg, Pillow, numpy and python-xlib; Mesa's lavapipe is enough to draw.
+Moves the time slider with the mouse, orbits, presses keys, drops a damaged and a good file, pauses and resumes a training, and compares the checkpoint of the
+watched training with that of an unwatched one. Prints a sentence per check; fails at the first that does not hold.
 """
 import argparse, io, os, pathlib, subprocess, sys, tempfile, time
 import numpy
 from PIL import Image
+from xclient import close, drop
 
 SIZE = (1280, 800)
 # Pixels of the window that the scene fills, whatever the panels: left, upper, right, lower.
 SCENE = (300, 150, 800, 600)
 PATIENCE = 240
+# Width of the settings at the right.
+PANEL = 120
 
 
 def say(text):
@@ -38,38 +41,45 @@ class Screen:
         """The window whose title contains `title`, in the corner of the screen and as large as it."""
         began = time.time()
         while time.time() - began < PATIENCE:
-            found = self.tool("search", "--name", title).split()
+            # A window that is not mapped yet cannot have the focus; without a window manager, nobody else gives it.
+            found = self.tool("search", "--onlyvisible", "--name", title).split()
             if found:
-                self.tool("windowmove", found[0], 0, 0), self.tool("windowsize", found[0], *SIZE), self.tool("windowfocus", found[0])
-                time.sleep(2)
+                self.tool("windowmove", found[0], 0, 0), self.tool("windowsize", found[0], *SIZE)
+                time.sleep(1)
+                self.tool("windowfocus", "--sync", found[0])
+                time.sleep(1)
                 return found[0]
             assert process.poll() is None, f"the program ended with {process.returncode} before it had a window"
             time.sleep(0.5)
         raise AssertionError("no window appeared")
 
     def image(self):
-        grab = ["ffmpeg", "-v", "error", "-f", "x11grab", "-video_size", f"{SIZE[0]}x{SIZE[1]}", "-i", self.display, "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "-"]
+        grab = ["ffmpeg", "-v", "error", "-f", "x11grab", "-draw_mouse", "0", "-video_size", f"{SIZE[0]}x{SIZE[1]}", "-i", self.display, "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "-"]
         return Image.open(io.BytesIO(subprocess.run(grab, env=self.environment, capture_output=True, check=True).stdout)).convert("RGB")
 
     def scene(self):
         return numpy.asarray(self.image().crop(SCENE)).astype(int)
 
-    def wait(self, holds, what):
-        """Waits until `holds(scene)`."""
+    def wait(self, holds, what, patience=30):
+        """Waits until `holds(scene)`: drawing in software takes its time."""
         began = time.time()
-        while time.time() - began < PATIENCE:
+        while time.time() - began < patience:
             if holds(self.scene()):
                 return
             time.sleep(0.5)
         raise AssertionError(what)
 
     def drag(self, start, end):
-        self.tool("mousemove", *start), self.tool("mousedown", 1)
+        # Slowly: what happens within one frame is no drag, and a frame may take half a second.
+        self.tool("mousemove", *start)
+        time.sleep(0.6)
+        self.tool("mousedown", 1)
         for k in range(1, 9):
+            time.sleep(0.2)
             self.tool("mousemove", *[round(a + (b - a) * k / 8) for a, b in zip(start, end)])
-            time.sleep(0.05)
+        time.sleep(0.8)
         self.tool("mouseup", 1)
-        time.sleep(1.5)
+        time.sleep(1)
 
 
 def different(a, b):
@@ -97,11 +107,11 @@ def main():
         processes.append(viewer)
         began = time.time()
         window = screen.window(archive.name, viewer)
-        screen.wait(lambda scene: scene.std() > 4, "the scene is empty")
+        screen.wait(lambda scene: scene.std() > 4, "the scene is empty", PATIENCE)
         say(f"{archive.name} is in a window after {time.time() - began:.1f} s")
         shot("view")
         # It plays; the space bar stops it.
-        screen.tool("mousemove", 640, 400), screen.tool("key", "--window", window, "space")
+        screen.tool("mousemove", 640, 400), screen.tool("key", "space")
         time.sleep(1.5)
         stopped = screen.scene()
         time.sleep(1.5)
@@ -109,32 +119,61 @@ def main():
         say("the space bar stops it")
         # The slider lies in the bar at the bottom, right of three buttons.
         bar = SIZE[1] - 16
-        screen.tool("key", "--window", window, "Home")
+        screen.tool("key", "Home")
         time.sleep(1.5)
         start = screen.scene()
         screen.drag((140, bar), (520, bar))
-        moved = screen.scene()
-        assert different(start, moved) > 0.05, "the slider does not change the image"
+        screen.wait(lambda scene: different(start, scene) > 0.05, "the slider does not change the image")
         shot("view_slider")
-        screen.tool("key", "--window", window, "Home")
-        time.sleep(1.5)
-        assert different(start, screen.scene()) < 0.05, "the first frame is another one now"
+        screen.tool("key", "Home")
+        screen.wait(lambda scene: different(start, scene) < 0.05, "the first frame is another one now")
         say("the slider moves time, Home returns to the first frame")
         screen.drag((640, 400), (760, 440))
-        assert different(start, screen.scene()) > 0.5, "dragging does not orbit"
-        screen.tool("key", "--window", window, "r")
+        screen.wait(lambda scene: different(start, scene) > 0.5, "dragging does not orbit")
+        screen.tool("key", "r")
+        screen.wait(lambda scene: different(start, scene) < 0.05, "R does not reset the camera")
+        screen.tool("key", "t")
+        screen.wait(lambda scene: different(start, scene) > 0.05, "T does not tint what moves")
+        say("dragging orbits, R resets, T tints")
+        for key in ("t", "End"):
+            screen.tool("key", key)
         time.sleep(1.5)
-        assert different(start, screen.scene()) < 0.05, "R does not reset the camera"
-        screen.tool("key", "--window", window, "t")
-        time.sleep(1.5)
-        assert different(start, screen.scene()) > 0.05, "T does not tint what moves"
+        last = screen.scene()
+        screen.tool("key", "comma")
+        screen.wait(lambda scene: different(last, scene) > 0.05, "the comma does not go a frame back")
+        screen.tool("key", "period")
+        screen.wait(lambda scene: different(last, scene) < 0.05, "the full stop does not go a frame on")
+        screen.tool("keydown", "w"), time.sleep(0.7), screen.tool("keyup", "w")
+        screen.wait(lambda scene: different(last, scene) > 0.5, "W does not fly on")
+        screen.tool("key", "r")
+        say("comma and full stop step, W flies")
         # The button of the settings is the last one of the bar.
+        whole = numpy.asarray(screen.image()).astype(int)
         screen.tool("mousemove", SIZE[0] - 18, bar), screen.tool("click", 1)
         time.sleep(3)
+        panel = different(whole[:, SIZE[0] - PANEL :], numpy.asarray(screen.image()).astype(int)[:, SIZE[0] - PANEL :])
+        assert panel > 10, "the settings do not open"
         shot("view_settings")
-        say("dragging orbits, R resets, T tints")
-        screen.tool("windowclose", window)
-        assert viewer.wait(60) is not None
+        say("the settings open, with statistics")
+        damaged = pathlib.Path(folder.name) / "damaged.cc4d"
+        content = bytearray(archive.read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        damaged.write_bytes(content)
+        before = screen.scene()
+        assert drop(screen.display, window, damaged), "the window does not take a file"
+        time.sleep(2)
+        shot("view_damaged")
+        # The message takes the top of the window.
+        assert different(whole[:16], numpy.asarray(screen.image()).astype(int)[:16]) > 10, "nothing is said of a damaged file"
+        assert drop(screen.display, window, archive)
+        screen.wait(lambda scene: different(before, scene) > 0.05, "a dropped archive does not play")
+        assert screen.tool("search", "--name", archive.name).split() == [window], "the title does not name the file"
+        say("a damaged file that is dropped is refused with a message, a good one plays")
+        close(screen.display, window)
+        assert viewer.wait(60) == 0, f"the window ends with {viewer.returncode}"
+        said = subprocess.run([args.program, "--quiet", "view", damaged], env=screen.environment, capture_output=True, text=True)
+        assert said.returncode == 3 and "damaged.cc4d" in said.stderr, f"a damaged file ends with {said.returncode}: {said.stderr}"
+        say("view of a damaged file ends with exit code 3 and a message")
 
         def train(name, *more):
             out = pathlib.Path(folder.name) / name
@@ -148,7 +187,7 @@ def main():
         training = screen.start(*watched)
         processes.append(training)
         window = screen.window("watched", training)
-        screen.wait(lambda scene: scene.std() > 4, "no model of the training appears")
+        screen.wait(lambda scene: scene.std() > 4, "no model of the training appears", PATIENCE)
         shot("train_early")
         # The button that pauses is the first one of the bar at the top.
         screen.tool("mousemove", 60, 14), screen.tool("click", 1)
@@ -168,10 +207,10 @@ def main():
         bar = SIZE[1] - 16
         start = screen.scene()
         screen.drag((140, bar), (520, bar))
-        assert different(start, screen.scene()) > 0.02, "the slider does not move the trained model"
+        screen.wait(lambda scene: different(start, scene) > 0.02, "the slider does not move the trained model")
         shot("train_scrubbed")
-        screen.tool("windowclose", window)
-        training.wait(60)
+        close(screen.display, window)
+        assert training.wait(60) == 0, f"the watched training ends with {training.returncode}"
         assert checkpoint.read_bytes() == plain.read_bytes(), "the watched training ended in other bytes"
         say(f"the training of {args.iterations} iterations ends in the bytes of one without a window, and can be scrubbed")
         say("all checks passed")

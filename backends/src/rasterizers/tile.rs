@@ -82,8 +82,8 @@ inventory::submit! {
             version: "1",
             summary: "EWA splatting in 16x16 tiles, depth-ordered blending, hand-written gradients; SIMD on the CPU",
             paper: "Kerbl et al. 2023 (3DGS); Ye et al. 2024 (gsplat)",
-            schema: "# exact on processors, and switched off only to measure what they save\nopacity_shortcut = true         # footprints end where alpha falls below 1/255\ntransmittance_shortcut = true   # rows and tiles end when their pixels have stopped\n",
-            capabilities: &["differentiable", "antialiased", "max-weights", "rules=gsplat099,gsplat0999,inria"],
+            schema: "# the same images without them; processors can do without, to measure what they save\nopacity_shortcut = true         # footprints end where alpha falls below 1/255\ntransmittance_shortcut = true   # rows and tiles end when their pixels have stopped\n",
+            capabilities: &["differentiable", "antialiased", "max-weights", "shortcuts", "rules=gsplat099,gsplat0999,inria"],
         },
         build: |table| {
             let settings: Settings = config::parse_section("rasterizer tile", table)?;

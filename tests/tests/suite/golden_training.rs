@@ -6,7 +6,7 @@ use cc4dgs_backends::ops::adam::{AdamSettings, adam_step};
 use cc4dgs_backends::ops::field::MishShape;
 use cc4dgs_backends::ops::photometric::{bce_with_logits_loss, photometric_loss};
 use cc4dgs_tests::devices;
-use cc4dgs_tests::golden::{Fixture, cases, narrow as to_f32, relative_l2, widen};
+use cc4dgs_tests::golden::{Fixture, cases, largest_difference, narrow as to_f32, relative_l2, widen};
 
 fn check(what: &str, got: &[f32], want: &[f64], tolerance: f64) {
     let d = relative_l2(&widen(got), want);
@@ -54,7 +54,7 @@ fn ssim_loss(fixture: &Fixture) {
             let mse = render.iter().zip(&target_of(fixture)).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / render.len() as f64;
             assert!((f64::from(numbers.mse) / mse - 1.0).abs() < 1e-5, "{name}: mse {} instead of {mse}", numbers.mse);
             let want: Vec<f64> = planes(fixture, grad_key).1.iter().map(|g| sign * g).collect();
-            check(&format!("{} {name} {grad_key}", fixture.name), &grad[..render.len()], &want, fixture.tolerance(&format!("grad_{kind}"), 2e-5));
+            check(&format!("{} {name} {grad_key}", fixture.name), &grad[..render.len()], &want, fixture.tolerance(&format!("grad_{kind}"), 2e-5).min(2e-4));
             assert!(grad[render.len()..].iter().all(|g| *g == 0.0), "{name}: planes that are not read have a gradient");
         }
     }
@@ -101,6 +101,10 @@ fn adam(fixture: &Fixture) {
                 let want = fixture.get(&format!("{variant}.out.{array}"));
                 check(&format!("{} {name} {variant} {short}", fixture.name), got, &want, fixture.tolerance(&format!("{variant}.{array}"), 5e-7));
             }
+            // A norm hides one wrong parameter among many.
+            let worst = largest_difference(&widen(&all_p), &fixture.get(&format!("{variant}.out.params")));
+            let allowed = (10.0 * fixture.number(&["noise_f32", &format!("{variant}.params"), "max_abs"])).min(5e-6);
+            assert!(worst <= allowed, "{} {name} {variant}: a parameter is off by {worst:.1e}, allowed {allowed:.1e}", fixture.name);
         }
     }
 }

@@ -4,6 +4,8 @@
 use crate::raster_fixtures::{narrow, scenes};
 use cc4dgs_backends::cpu::raster::{self, SplatArrays};
 use cc4dgs_backends::ops::rasterize::{GradientRequest, RasterSettings, Shortcuts};
+use cc4dgs_core::{Camera, Entries, Error, Gaussians, HostGaussians, RasterizerPlugin, RenderSettings, Splats};
+use cc4dgs_tests::devices;
 
 #[test]
 fn images_and_gradients_are_the_same_bits_without_shortcuts() {
@@ -36,6 +38,32 @@ fn images_and_gradients_are_the_same_bits_without_shortcuts() {
             for (k, (a, b)) in all.iter().zip(&other).enumerate() {
                 let different = a.iter().zip(b).filter(|(a, b)| a != b).count();
                 assert!(different == 0, "{}, opacity {opacity}, transmittance {transmittance}, array {k}: {different} of {} differ", scene.name, a.len());
+            }
+        }
+    }
+}
+
+#[test]
+fn gpus_refuse_to_do_without_shortcuts() {
+    let rasterizers = Entries::<RasterizerPlugin>::collect().unwrap();
+    let one = HostGaussians {
+        means: vec![0.0; 3],
+        log_scales: vec![-1.0; 3],
+        quaternions: vec![1.0, 0.0, 0.0, 0.0],
+        opacity_logits: vec![1.0],
+        sh_dc: vec![1.0; 3],
+        dynamic_scores: vec![0.0],
+        ..Default::default()
+    };
+    let camera = Camera::look_at("front", (16, 16), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
+    for (name, device) in devices() {
+        let splats = Splats::from_gaussians(&Gaussians::from_host(&one, &device), 0);
+        for set in ["", "opacity_shortcut = false", "transmittance_shortcut = false"] {
+            let rasterizer = (rasterizers.get("tile").unwrap().build)(&set.parse().unwrap()).unwrap();
+            match rasterizer.render(&splats, &camera, &RenderSettings::default()) {
+                Ok(_) => assert!(name != "wgpu" || set.is_empty(), "{name} ignores {set}"),
+                Err(Error::Unsupported { .. }) => assert!(name == "wgpu" && !set.is_empty(), "{name} refuses {set}"),
+                Err(e) => panic!("{name}, {set}: {e}"),
             }
         }
     }

@@ -11,7 +11,7 @@ use burn::tensor::Device;
 use cc4dgs_core::archive::{Presentation, StreamKind};
 use cc4dgs_core::exporter::export;
 use cc4dgs_core::playback::MaxError;
-use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, HostGaussians, Image8, Limits, Registry, Result};
+use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Limits, Registry, Result};
 use cc4dgs_play::model::Model as PlayModel;
 use cc4dgs_play::player::Player;
 use serde::Serialize;
@@ -21,7 +21,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// What to export of a model.
 #[derive(Clone, Debug)]
 pub struct ExportRequest {
-    /// The instant (0..1) that formats without motion hold; `None` is the canonical model.
+    /// The instant (0..1) that formats without motion hold; `None` is the canonical model. Formats with motion refuse one.
     pub time_norm: Option<f32>,
     /// Frames of formats that hold several; as many as the model was trained with where absent. Frame k of n is at time k / n.
     pub frames: Option<usize>,
@@ -100,15 +100,12 @@ impl ExportJob<'_> {
     /// Writes the file or folder; it appears complete or not at all.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for unknown formats, settings and times, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
+    /// [`Error::Parameter`] for unknown formats, settings and times, for a time where the format holds all of them, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
     /// cannot hold; what device and disk report.
     pub fn run(&self) -> Result<ExportReport> {
         let plugin = self.registry.exporter(self.format)?;
         let exporter = (plugin.build)(self.settings)?;
-        if let Some(time) = self.request.time_norm.filter(|t| !(0.0..=1.0).contains(t)) {
-            let remedy = "Give the normalised time, 0 for the first frame and 1 for the last";
-            return Err(Error::parameter("time", format!("{time} is not in 0..1"), remedy));
-        }
+        check_time(self.registry, plugin, self.request.time_norm)?;
         let mut source = ModelSource::new(self)?;
         let lost = exporter.loses(source.facts());
         let (exported, bytes) = export(exporter.as_ref(), plugin.target, &mut source, self.out, self.overwrite)?;
@@ -126,6 +123,25 @@ impl ExportJob<'_> {
             notes: exported.notes,
         })
     }
+}
+
+/// Refuses an instant that is no time, or that a format which holds all times has no use for.
+///
+/// # Errors
+/// [`Error::Parameter`].
+pub fn check_time(registry: &Registry, plugin: &ExporterPlugin, time_norm: Option<f32>) -> Result<()> {
+    let Some(time) = time_norm else { return Ok(()) };
+    let refuse = |problem: String, remedy: &str| Err(Error::parameter(format!("time {time}"), problem, remedy));
+    if !(0.0..=1.0).contains(&time) {
+        return refuse("it is not in 0..1".into(), "Give the normalised time, 0 for the first frame and 1 for the last");
+    }
+    let has = |capability| plugin.info.capabilities.contains(&capability);
+    let held = if has("motion") { "the whole motion" } else { "images of all times" };
+    if has("motion") || has("images") {
+        let still: Vec<&str> = registry.exporters().filter(|p| p.info.capabilities.contains(&"still")).map(|p| p.info.name).collect();
+        return refuse(format!("{} holds {held}", plugin.info.name), &format!("Leave it out, or choose a format of one instant: {}", still.join(", ")));
+    }
+    Ok(())
 }
 
 /// A model as exporters see it.

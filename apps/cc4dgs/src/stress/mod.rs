@@ -31,7 +31,7 @@ pub struct StressJob<'a> {
     pub oracle: &'a str,
     /// Name of the optimizer.
     pub optimizer: &'a str,
-    /// Optimizer steps with vanishing gradients.
+    /// Steps of each run of the optimizer: under constant, vanishing and tiny gradients.
     pub steps: usize,
     /// Levels of each condition of a deformer; fewer where every level costs much (kernels of a software adapter).
     pub deformer_levels: usize,

@@ -18,7 +18,7 @@ pub enum BenchWhat {
     Frame(BenchFrame),
     /// Playback of a trained model through the cameras of a dataset: field and rasterizer, frame by frame.
     Play(BenchPlay),
-    /// A trained model with each kind of skipped work switched off: time saved, and whether images stay the same.
+    /// A trained model with each kind of skipped work switched off: time saved, and whether the bits stay the same.
     Skip(BenchSkip),
     /// The same model on several devices: how far their images differ.
     Agree(BenchAgree),
@@ -105,6 +105,9 @@ pub struct BenchSkip {
     /// Frames measured per case, after warming up.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub frames: u32,
+    /// Times that all cases take turns, so that a machine that slows down slows all of them down; every round trains every case.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    pub rounds: u32,
     /// Also train for so many iterations per case, with the model's configuration; 0 measures frames alone.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
     pub iterations: u32,
@@ -139,6 +142,12 @@ pub struct BenchFrame {
     /// Share of the pixels and Gaussians to keep, for machines that are slow.
     #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = positive)]
     pub scale: f64,
+    /// Let the deformer move things, by about so many units at most; fresh deformers are the identity.
+    #[arg(long, value_name = "UNITS", default_value_t = 0.0, value_parser = not_negative)]
+    pub motion: f32,
+    /// Also store the model of the case with a playback layer and its camera, for players; there must be one case.
+    #[arg(long, value_name = "F.cc4d")]
+    pub archive: Option<PathBuf>,
     /// Settings of the deformer or rasterizer, such as deformer.kind=none; may be given several times.
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
@@ -151,6 +160,13 @@ fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(v) if v.is_finite() && v > 0.0 && v <= 100.0 => Ok(v),
         _ => Err(format!("'{text}' is not a number above 0 and up to 100")),
+    }
+}
+
+fn not_negative(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(v) if (0.0..=100.0).contains(&v) => Ok(v),
+        _ => Err(format!("'{text}' is not a number from 0 to 100")),
     }
 }
 

@@ -84,7 +84,7 @@ pub struct Export {
     /// Replace PATH where it exists.
     #[arg(long)]
     pub overwrite: bool,
-    /// The instant (0 to 1) that formats without motion hold; without it, the canonical Gaussians.
+    /// The instant (0 to 1) that formats without motion hold; without it, the canonical Gaussians. Formats with motion refuse it.
     #[arg(long, value_name = "T")]
     pub time: Option<f32>,
     /// Override a setting of the exporter (palette=8192), or with --scene a scene option (scene.width=800); may be given several times.

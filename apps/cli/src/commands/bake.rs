@@ -33,7 +33,7 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
     let around = Surroundings { registry: &context.registry, device: &device, limits: &context.limits, events: &events };
     let stored = Stored::open(&args.model, Storage { codec: &args.codec, field_weights: &args.field_weights }, around)?;
     let cameras = match &args.scene {
-        Some(scene) => capture_cameras(context, scene, &stored.model)?,
+        Some(scene) => capture_cameras(context, scene, &[], &stored.model)?,
         None => stored.archive.manifest().presentation.cameras.clone(),
     };
     let presentation = shown(args, &stored, &cameras)?;

@@ -4,7 +4,7 @@ use super::Context;
 use crate::args::Export;
 use crate::models::load_model;
 use crate::{interrupt, shots};
-use cc4dgs::export::{ExportJob, ExportRequest};
+use cc4dgs::export::{ExportJob, ExportRequest, check_time};
 use cc4dgs_core::{Error, ExportTarget, Result, config};
 use cc4dgs_play::source::{Source, SourceKind};
 use std::path::Path;
@@ -17,6 +17,7 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
     // Mistakes are found before anything long begins.
     context.registry.build_exporter(&args.format, &settings)?;
     check_name(&args.out, plugin.target, &args.format)?;
+    check_time(&context.registry, plugin, args.time)?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let (shots, background) = match shots::choose(context, &args.shots, &scene_sets, &loaded.model) {
@@ -25,7 +26,7 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
         chosen => chosen?,
     };
     let cameras = match &args.shots.scene {
-        Some(scene) if plugin.info.capabilities.contains(&"player") => shots::capture_cameras(context, scene, &loaded.model)?,
+        Some(scene) if plugin.info.capabilities.contains(&"player") => shots::capture_cameras(context, scene, &scene_sets, &loaded.model)?,
         _ => Vec::new(),
     };
     let request = ExportRequest {

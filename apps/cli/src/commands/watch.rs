@@ -16,7 +16,8 @@ use std::time::{Duration, Instant};
 
 /// Instants of the sequence that a snapshot has; between them, motion is a straight line.
 const KEYFRAMES: usize = 12;
-/// Least time between two snapshots, and how many times longer than a snapshot takes: taking them costs the training at most a twentieth of its time.
+/// Least time between two snapshots, and how many times longer than a snapshot takes: taking them costs the training at most a twentieth of its time. What the
+/// window draws comes on top; on a machine without a graphics card that is work of the same processor.
 const LEAST_PAUSE: Duration = Duration::from_millis(500);
 const PAUSE: u32 = 19;
 
@@ -75,8 +76,8 @@ pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> 
         let training = scope.spawn(|| {
             let result = with_context(&mut |context| train::run(context, args, Some(&watcher)));
             match &result {
-                Ok(()) => watcher.live.say("The training is done.".to_string()),
-                Err(e) => watcher.live.fail(e.to_string()),
+                Ok(()) => watcher.live.end("The training is done.".to_string()),
+                Err(e) => watcher.live.end(format!("The training has failed: {e}")),
             }
             result
         });

@@ -121,6 +121,8 @@ fn exports_are_refused_before_work_and_never_replace_unasked() {
     assert!(refused(export("spz", &at("a.spz"), &["--set", "version=9"])).contains("version"));
     assert!(refused(export("ply", &out, &["--set", "dynamics=false"])).contains("dynamics"));
     assert!(refused(export("ply", &out, &["--time", "1.5"])).contains("0..1"));
+    let still = refused(export("splatv", &at("a.splatv"), &["--time", "0.5"]));
+    assert!(still.contains("whole motion") && still.contains("ply, sog, spz"), "{still}");
     assert!(!out.exists());
     std::fs::write(&out, "mine").unwrap();
     assert!(refused(export("ply", &out, &[])).contains("--overwrite"));
@@ -133,7 +135,7 @@ fn exports_are_refused_before_work_and_never_replace_unasked() {
     let output = common::cc4dgs().args(export("web", &page, &[])).env("CC4DGS_PAGE", at("nowhere")).output().unwrap();
     assert!(!output.status.success() && common::said(&output).contains("nowhere") && !page.exists(), "{}", common::said(&output));
     // A folder that holds a run is not an export.
-    assert!(refused(export("ply-sequence", &dir, &["--overwrite"])).contains("not of this format"));
+    assert!(refused(export("ply-sequence", &dir, &["--overwrite"])).contains("which is not of this format"));
     assert!(dir.join("checkpoint").is_file());
     // The alias writes the same bytes, and replaces as ever.
     let alias = at("b.ply");
@@ -179,7 +181,11 @@ fn pages_hold_a_baked_archive() {
     PAGE_FILES.iter().for_each(|name| std::fs::write(at("page").join(name), "/* stand-in */").unwrap());
     let (dir, site, baked, again) = (at("run"), at("site"), at("baked.cc4d"), at("again"));
     let page = format!("page={}", text(&at("page")));
-    let export = |model: &Path, out: &Path| json_of(&["export", "web", text(model), "--out", text(out), "--set", &page, "--device", "flex", "-q", "--json"]);
+    let export_with = |model: &Path, out: &Path, more: &[&str]| {
+        let args = ["export", "web", text(model), "--out", text(out), "--set", &page, "--device", "flex", "-q", "--json"];
+        json_of(&[&args, more].concat())
+    };
+    let export = |model: &Path, out: &Path| export_with(model, out, &[]);
     assert!(export(&dir, &at("one.html"))["bytes"].as_u64().unwrap() > 1000);
     assert!(std::fs::read_to_string(at("one.html")).unwrap().starts_with("<!doctype html>"));
     export(&dir, &site);
@@ -192,6 +198,11 @@ fn pages_hold_a_baked_archive() {
     export(&baked, &again);
     let layer = |path: &Path| cc4dgs_core::StoredModel::open(path, &cc4dgs::Limits::default(), &events).unwrap().playback;
     assert!(layer(&again.join("model.cc4d")) == layer(&baked) && layer(&baked) != model.playback);
+    // Scene options count for the cameras of the page.
+    export_with(&dir, &at("small"), &["--scene", "procedural:tiny", "--set", "scene.width=20"]);
+    let small = cc4dgs_core::StoredModel::open(at("small/model.cc4d"), &cc4dgs::Limits::default(), &events).unwrap();
+    let widths: Vec<u32> = small.manifest.presentation.cameras.iter().map(|camera| camera.width).collect();
+    assert_eq!(widths, [20; 6]);
 }
 
 #[test]

@@ -13,10 +13,10 @@ impl Window {
     /// The state of a training, and what went wrong.
     pub(super) fn messages(&mut self, ui: &mut egui::Ui) {
         if let Some(live) = &self.live {
-            let (status, paused) = live.status();
+            let (status, paused, ended) = live.status();
             egui::Panel::top("training").show(ui, |ui| {
                 ui.horizontal(|ui| {
-                    if ui.button(if paused { "Resume training" } else { "Pause training" }).clicked() {
+                    if !ended && ui.button(if paused { "Resume training" } else { "Pause training" }).clicked() {
                         live.pause(!paused);
                     }
                     ui.label(if status.is_empty() { "Training has not begun yet." } else { status.as_str() });
@@ -36,29 +36,36 @@ impl Window {
         }
     }
     pub(super) fn bar(&mut self, ui: &mut egui::Ui) {
+        // The proportional font of egui has none of these signs.
+        let sign = |text: &str| egui::RichText::new(text).monospace();
+        let moves = self.clock.frames > 1;
         ui.horizontal(|ui| {
-            let still = self.clock.frames < 2;
-            ui.add_enabled_ui(!still, |ui| {
-                if ui.button(if self.clock.playing { "⏸" } else { "▶" }).on_hover_text("Play (Space)").clicked() {
+            ui.add_enabled_ui(moves, |ui| {
+                if ui.button(sign(if self.clock.playing { "‖" } else { "▶" })).on_hover_text("Play (Space)").clicked() {
                     self.clock.play(!self.clock.playing);
                 }
-                if ui.button("⏮").on_hover_text("One frame back (,)").clicked() {
+                if ui.button(sign("‹")).on_hover_text("One frame back (,)").clicked() {
                     self.clock.step(-1);
                 }
-                if ui.button("⏭").on_hover_text("One frame on (.)").clicked() {
+                if ui.button(sign("›")).on_hover_text("One frame on (.)").clicked() {
                     self.clock.step(1);
                 }
-                let mut time = self.clock.time;
-                ui.spacing_mut().slider_width = (ui.available_width() - 330.0).max(80.0);
-                if ui.add(egui::Slider::new(&mut time, 0.0..=1.0).show_value(false)).changed() {
-                    self.clock.seek(time);
-                }
-                let seconds = self.clock.time * self.clock.seconds;
-                ui.monospace(if still { "still".into() } else { format!("{:>4} / {} · {seconds:6.2} s", self.clock.frame() + 1, self.clock.frames) });
-                ui.add(egui::DragValue::new(&mut self.clock.speed).range(-4.0..=4.0).speed(0.02).suffix("×")).on_hover_text("Speed");
-                ui.toggle_value(&mut self.clock.looping, "⟳").on_hover_text("Loop");
             });
-            ui.toggle_value(&mut self.settings, "☰").on_hover_text("Settings");
+            // From the right end, so that the slider takes what is left.
+            ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| {
+                ui.toggle_value(&mut self.settings, sign("≡")).on_hover_text("Settings");
+                ui.add_enabled_ui(moves, |ui| {
+                    ui.toggle_value(&mut self.clock.looping, sign("↻")).on_hover_text("Loop");
+                    ui.add(egui::DragValue::new(&mut self.clock.speed).range(-4.0..=4.0).speed(0.02).suffix("×")).on_hover_text("Speed");
+                    let seconds = self.clock.time * self.clock.seconds;
+                    ui.monospace(if moves { format!("{:>4} / {} · {seconds:.2} s", self.clock.frame() + 1, self.clock.frames) } else { "still".into() });
+                    let mut time = self.clock.time;
+                    ui.spacing_mut().slider_width = (ui.available_width() - ui.spacing().item_spacing.x).max(80.0);
+                    if ui.add(egui::Slider::new(&mut time, 0.0..=1.0).show_value(false)).changed() {
+                        self.clock.seek(time);
+                    }
+                });
+            });
         });
     }
     pub(super) fn panel(&mut self, ui: &mut egui::Ui, adapter: &str) {
@@ -91,6 +98,9 @@ impl Window {
         if let Some(scene) = self.renderer.scene() {
             ui.small(format!("{:.0} frames/s", self.rate));
             ui.small(format!("{} of {} Gaussians drawn, {} move", self.visible.load(Ordering::Relaxed), scene.count, scene.moving));
+            if self.bytes > 0 {
+                ui.small(format!("{:.3} MB", self.bytes as f64 / 1e6));
+            }
             ui.small(adapter);
         }
         if self.lacks_motion {

@@ -24,6 +24,7 @@ struct State {
     content: Option<Content>,
     status: String,
     failure: String,
+    ended: bool,
     paused: bool,
     closed: bool,
 }
@@ -58,6 +59,14 @@ impl Live {
             window.request_repaint_after(SOON);
         }
     }
+    /// Says how the training ended; there is nothing left to pause.
+    pub fn end(&self, status: String) {
+        {
+            let mut state = self.lock();
+            (state.status, state.ended) = (status, true);
+        }
+        self.repaint();
+    }
     /// Says what failed; it stays beside the line.
     pub fn fail(&self, failure: String) {
         self.lock().failure = failure;
@@ -85,11 +94,11 @@ impl Live {
     pub(super) fn take(&self) -> Option<Content> {
         self.lock().content.take()
     }
-    /// The line, with what failed, and whether the training is paused.
-    pub(super) fn status(&self) -> (String, bool) {
+    /// The line, with what failed; whether the training is paused, and whether it has ended.
+    pub(super) fn status(&self) -> (String, bool, bool) {
         let state = self.lock();
         let line = [&state.status, &state.failure].into_iter().filter(|text| !text.is_empty()).cloned().collect::<Vec<_>>().join(" · ");
-        (line, state.paused)
+        (line, state.paused, state.ended)
     }
     pub(super) fn pause(&self, on: bool) {
         self.lock().paused = on;
@@ -121,9 +130,11 @@ mod tests {
         stop.store(true, Ordering::Relaxed);
         live.wait_while_paused(&stop);
         live.say("main 3 of 5".into());
-        assert_eq!(live.status(), ("main 3 of 5".to_string(), true));
+        assert_eq!(live.status(), ("main 3 of 5".to_string(), true, false));
         live.fail("no model".into());
         live.say("main 4 of 5".into());
         assert_eq!(live.status().0, "main 4 of 5 · no model", "a failure stays");
+        live.end("done".into());
+        assert_eq!(live.status(), ("done · no model".to_string(), true, true));
     }
 }

@@ -5,10 +5,11 @@ mod live;
 
 use crate::render::descriptor;
 use crate::{Clock, Content, Navigator, Renderer, View};
-use cc4dgs_format::{Camera, Error, Result};
+use cc4dgs_format::{Camera, Error, Limits, Result};
 use eframe::egui;
 use eframe::egui_wgpu::{WgpuConfiguration, WgpuSetup, WgpuSetupCreateNew};
 pub use live::Live;
+use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -30,7 +31,7 @@ pub enum Shown {
 pub fn show(title: &str, shown: Shown) -> Result<()> {
     let setup = WgpuSetupCreateNew { device_descriptor: Arc::new(descriptor), ..WgpuSetupCreateNew::without_display_handle() };
     let options = eframe::NativeOptions {
-        viewport: egui::ViewportBuilder::default().with_title(format!("{title} – cc4dgs")).with_inner_size([1100.0, 760.0]),
+        viewport: egui::ViewportBuilder::default().with_title(titled(title)).with_inner_size([1100.0, 760.0]),
         wgpu_options: WgpuConfiguration { wgpu_setup: WgpuSetup::CreateNew(setup), ..Default::default() },
         ..Default::default()
     };
@@ -55,6 +56,11 @@ pub fn show(title: &str, shown: Shown) -> Result<()> {
     result.map_err(|e| Error::unsupported("window", e.to_string(), "Start it in a graphical session with a Vulkan, Metal or Direct3D 12 driver"))
 }
 
+/// Title of a window that shows `name`.
+fn titled(name: &str) -> String {
+    format!("{name} – cc4dgs")
+}
+
 /// The image in the window.
 struct Image {
     view: wgpu::TextureView,
@@ -71,6 +77,8 @@ struct Window {
     /// What the device or the training complained about last.
     trouble: Arc<Mutex<Option<String>>>,
     lacks_motion: bool,
+    /// Size of the file; 0 where there is none.
+    bytes: u64,
     /// Whether a model has been shown.
     loaded: bool,
     look: View,
@@ -102,6 +110,7 @@ impl Window {
             live: None,
             trouble,
             lacks_motion: false,
+            bytes: 0,
             loaded: false,
             resolution: 1.0,
             flying: false,
@@ -125,7 +134,7 @@ impl Window {
     }
     /// Shows `content`; the first one sets camera and clock, later ones leave them.
     fn load(&mut self, content: Content) -> Result<()> {
-        let Content { scene, presentation, frame_count, lacks_motion, .. } = content;
+        let Content { scene, presentation, frame_count, lacks_motion, bytes } = content;
         let ([lower, upper], seconds) = (scene.bounds, presentation.seconds_of(frame_count));
         self.renderer.load(scene)?;
         if !self.loaded {
@@ -133,7 +142,7 @@ impl Window {
             self.clock = Clock::new(frame_count, seconds);
         }
         (self.clock.frames, self.clock.seconds) = (frame_count.max(1), seconds.max(1e-3));
-        (self.cameras, self.lacks_motion, self.loaded) = (presentation.cameras, lacks_motion, true);
+        (self.cameras, self.lacks_motion, self.bytes, self.loaded) = (presentation.cameras, lacks_motion, bytes, true);
         Ok(())
     }
     /// Takes what the training offered.
@@ -142,6 +151,33 @@ impl Window {
         if let Err(e) = self.load(content) {
             *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string());
         }
+    }
+    /// Opens files that were dropped on the window; what is wrong with one is said, and the model before it stays.
+    fn dropped(&mut self, ctx: &egui::Context) {
+        // A training has a model of its own to show.
+        if self.live.is_some() {
+            return;
+        }
+        for path in ctx.input(|i| i.raw.dropped_files.iter().map(|file| file.path().to_path_buf()).collect::<Vec<_>>()) {
+            let opened = self.open(&path);
+            let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+            match opened {
+                Ok(()) => {
+                    *trouble = None;
+                    ctx.send_viewport_cmd(egui::ViewportCommand::Title(titled(&path.file_name().unwrap_or_default().to_string_lossy())));
+                }
+                Err(e) => *trouble = Some(e.to_string()),
+            }
+            ctx.request_repaint();
+        }
+    }
+    fn open(&mut self, path: &Path) -> Result<()> {
+        let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
+        let content = Content::read(&path.display().to_string(), bytes, &Limits::default())?;
+        self.loaded = false;
+        self.load(content)?;
+        self.clock.play(true);
+        Ok(())
     }
     /// Draws the scene and shows it in what is left of the window.
     fn scene(&mut self, ui: &mut egui::Ui, frame: &eframe::Frame) {
@@ -196,6 +232,7 @@ impl eframe::App for Window {
             ctx.request_repaint();
         }
         self.follow();
+        self.dropped(&ctx);
         self.keys(&ctx, f64::from(elapsed));
         self.messages(ui);
         egui::Panel::bottom("time").show(ui, |ui| self.bar(ui));

@@ -1,6 +1,6 @@
 //! From Gaussians to the visible ones on the screen: activation, projection, culling, colour.
 
-use super::camera::{ALPHA_MIN, CameraConstants, FAR, RuleConstants};
+use super::camera::{ALPHA_MIN, CameraConstants, FAR, RuleConstants, SHORTEST_QUATERNION};
 use super::geometry::{Vec3, project};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Footprint, Workspace, set_len};
@@ -166,7 +166,7 @@ impl WithSimd for Project<'_, '_> {
             let visible = finite.equal(zero)
                 & p.point[2].gt(like(k.rules.near))
                 & p.point[2].lt(like(FAR))
-                & p.norm_squared.gt(like(1e-30))
+                & p.norm_squared.gt(like(SHORTEST_QUATERNION))
                 & opacity.ge(like(ALPHA_MIN))
                 & (p.center[0] + half_width).ge(like(0.5))
                 & (p.center[0] - half_width).le(like(width - 0.5))

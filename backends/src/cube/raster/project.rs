@@ -4,7 +4,7 @@ use super::geometry::{CENTER, NEAR, Projected, SIZE, project, sorting_depth};
 use super::harmonics::basis;
 use super::vector::{V3, V4, add, dot, load3, scale, store3, v3};
 use crate::cube::tensor::is_finite;
-use crate::ops::rasterize::camera::{ALPHA_MIN, FAR};
+use crate::ops::rasterize::camera::{ALPHA_MIN, FAR, SHORTEST_QUATERNION};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, TILE};
 use cubecl::prelude::*;
 
@@ -147,7 +147,7 @@ pub fn project_gaussians(
             && is_finite(half_height)
             && p.point.z > cam[NEAR]
             && p.point.z < FAR
-            && p.norm_squared > 1e-30
+            && p.norm_squared > SHORTEST_QUATERNION
             && opacity >= ALPHA_MIN
             && reach > 0.0
             && p.center_x + half_width >= 0.5

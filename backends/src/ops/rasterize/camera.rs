@@ -12,6 +12,9 @@ pub const MIN_COMPENSATION: f32 = 0.005;
 pub const QUATERNION_RANGE: f32 = 1e20;
 /// 2^80: short quaternions are multiplied by it, long ones divided.
 pub const RESCALE: f32 = 1_208_925_819_614_629_174_706_176.0;
+/// Quaternions whose rescaled squared norm is not above this are not drawn. Their length is at most 8.3e-39, so all components are subnormal: some
+/// devices take those for zeros, others keep few of their digits. Whatever has a normal component (1.2e-38 and more) is drawn.
+pub const SHORTEST_QUATERNION: f32 = 1e-28;
 /// A pixel ignores a Gaussian below this alpha: the float32 value of 1/255.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 /// A pixel stops before its transmittance would fall to this value or below.

@@ -203,14 +203,20 @@ pub struct RasterInputs {
     pub background: Option<Tensor<1>>,
 }
 
-/// An error for a device without the operation.
-fn check_device(device: &Device, method: Method) -> Result<()> {
+/// An error for a device without the operation, or without what its settings ask for.
+fn check_device(device: &Device, method: Method, shortcuts: Shortcuts) -> Result<()> {
     match (device.clone().without_autodiff().as_dispatch(), method) {
         (DispatchDevice::Flex(_), _) => Ok(()),
         #[cfg(feature = "ndarray")]
         (DispatchDevice::NdArray(_), _) => Ok(()),
         #[cfg(feature = "cube")]
-        (DispatchDevice::Cube(_), Method::Tiles) => Ok(()),
+        (DispatchDevice::Cube(_), Method::Tiles) if shortcuts == Shortcuts::default() => Ok(()),
+        #[cfg(feature = "cube")]
+        (DispatchDevice::Cube(_), Method::Tiles) => Err(Error::unsupported(
+            format!("rasterizer tile with opacity_shortcut = {}, transmittance_shortcut = {} on {device:?}", shortcuts.opacity, shortcuts.transmittance),
+            "its kernels for GPUs always take both shortcuts",
+            "Leave both settings at true, or use --device flex or ndarray",
+        )),
         #[cfg(feature = "cube")]
         (DispatchDevice::Cube(_), Method::Reference(_)) => Err(Error::unsupported(
             format!("rasterizer reference on {device:?}"),
@@ -224,7 +230,7 @@ fn check_device(device: &Device, method: Method) -> Result<()> {
 /// Renders; shapes must agree with `settings` (the rasterizer plug-ins check them).
 pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method) -> Result<RenderOutput> {
     let device = inputs.means.device();
-    check_device(&device, method)?;
+    check_device(&device, method, settings.shortcuts)?;
     // What is absent still needs a tensor: probes are never read, and no background is black.
     let absent = || Tensor::<1>::empty([3], &device).into_dispatch();
     let black = || Tensor::<1>::zeros([3], &device).into_dispatch();

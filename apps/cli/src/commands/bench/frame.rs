@@ -2,25 +2,32 @@
 
 use super::{Playback, Spread, WARM_UP, rooms, time_playback};
 use crate::args::BenchFrame;
-use crate::commands::Context;
+use crate::commands::{Context, create_parent};
 use crate::interrupt;
 use crate::models::resolved_device;
-use burn::tensor::{Tensor, TensorData};
-use cc4dgs_backends::bench::{RoomCase, growth, room, shrunk};
-use cc4dgs_core::archive::Provenance;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
+use cc4dgs_backends::bench::{RoomCase, Workload, growth, room, shrunk};
+use cc4dgs_core::archive::{Provenance, write_atomically};
+use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{DeformerContext, Event, EventSink, Result, Seed, Similarity, SpatialInput, config, parse_device};
+use cc4dgs_core::{Camera, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Result, Seed, Similarity, SpatialInput, config, parse_device};
 use cc4dgs_play::Moving;
 use cc4dgs_play::RenderConfig;
 use cc4dgs_play::model::{Model, ModelDeformer, ModelSize};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::config::RunConfig;
 use serde::Serialize;
+use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 /// Frames of the sequence the rooms stand for.
 const SEQUENCE: usize = 300;
+/// Where the size of a motion is measured.
+const MOTION_TIMES: [f32; 4] = [0.1, 0.35, 0.6, 0.85];
+/// Weights that motion is tried with first; the second try has the size that is asked for.
+const FIRST_MOTION: f32 = 0.1;
 
 #[derive(Serialize)]
 struct FrameReport<'a> {
@@ -55,14 +62,22 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     config::set_all(&mut table, &args.set)?;
     let config: RunConfig = config::parse_section("configuration", &table)?;
     let mut cases = Vec::new();
-    let wanted = if args.growth { growth().iter().map(|case| shrunk(case, args.scale)).collect() } else { rooms(&args.case, args.scale)? };
+    let wanted: Vec<RoomCase> = if args.growth { growth().iter().map(|case| shrunk(case, args.scale)).collect() } else { rooms(&args.case, args.scale)? };
+    if let (Some(archive), true) = (&args.archive, wanted.len() != 1) {
+        let object = format!("--archive {}", archive.display());
+        return Err(Error::parameter(object, format!("there are {} cases, and a file holds one", wanted.len()), "Choose one with --case NAME"));
+    }
     let stop = interrupt::stop_flag()?;
     for (done, case) in wanted.iter().enumerate() {
         // What was measured so far is worth keeping.
         if done > 0 && stop.load(Ordering::Relaxed) {
             break;
         }
-        cases.push(time_case(context, case, &config, &device, args)?);
+        let (mut model, camera) = room_model(context, case, &config, &device, args)?;
+        if let Some(path) = &args.archive {
+            write_playable(context, &model, &camera, &device, &events, path)?;
+        }
+        cases.push(time_case(context, case.name.to_string(), &mut model, &camera, &device, args)?);
         events.emit(&Event::Progress { task: "bench".into(), done: done as u64 + 1, total: wanted.len() as u64 });
     }
     let deformer = config.deformer.get("kind").and_then(|k| k.as_str()).unwrap_or_default().to_string();
@@ -78,28 +93,27 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     context.output.result(&report, || text(&report))
 }
 
-fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &burn::tensor::Device, args: &BenchFrame) -> Result<FrameCase> {
+/// The model of a case, and the camera that looks at it.
+fn room_model(context: &Context, case: &RoomCase, config: &RunConfig, device: &Device, args: &BenchFrame) -> Result<(Model, Camera)> {
     let seed = Seed::root(args.seed).child("bench").child(&case.name);
-    let workload = room(case, seed);
+    let Workload { gaussians, camera, .. } = room(case, seed);
     let moving = Moving::Scored { zeta: 0.0 };
-    let rows = moving.rows(&workload.gaussians.dynamic_scores).unwrap_or_default();
-    let axis = |k: usize, from: f32, pick: fn(f32, f32) -> f32| rows.iter().map(|&i| workload.gaussians.means[3 * i + k]).fold(from, pick);
-    let field_context = DeformerContext {
+    let rows = moving.rows(&gaussians.dynamic_scores).unwrap_or_default();
+    let axis = |k: usize, from: f32, pick: fn(f32, f32) -> f32| rows.iter().map(|&i| gaussians.means[3 * i + k]).fold(from, pick);
+    let deformer = DeformerContext {
         box_min: std::array::from_fn(|k| if rows.is_empty() { 0.0 } else { axis(k, f32::INFINITY, f32::min) }),
         box_max: std::array::from_fn(|k| if rows.is_empty() { 1.0 } else { axis(k, f32::NEG_INFINITY, f32::max) }),
         frame_count: SEQUENCE,
-        sh_degree: workload.gaussians.sh_degree,
+        sh_degree: gaussians.sh_degree,
         seed: seed.child("field"),
     };
-    let mut field = context.registry.build_deformer(&config.deformer, &field_context, device)?;
-    let means: Vec<f32> = rows.iter().flat_map(|&i| workload.gaussians.means[3 * i..3 * i + 3].to_vec()).collect();
-    let means = Tensor::<2>::from_data(TensorData::new(means, [rows.len(), 3]), device);
-    let (field_spatial, field_forward_backward) = time_field(field.as_mut(), means, args.frames.min(10))?;
-
-    let (n, camera) = (workload.gaussians.len(), workload.camera);
+    let mut field = context.registry.build_deformer(&config.deformer, &deformer, device)?;
+    if args.motion > 0.0 && !rows.is_empty() {
+        set_in_motion(field.as_mut(), moving_means(&gaussians, &rows, device), args.motion, seed.child("motion"))?;
+    }
     let model = Model {
-        gaussians: workload.gaussians,
-        field: Some(ModelDeformer { field, section: config.deformer.clone(), context: field_context }),
+        gaussians,
+        field: Some(ModelDeformer { field, section: config.deformer.clone(), context: deformer }),
         moving,
         render: RenderConfig::default(),
         background: Some([0.0; 3]),
@@ -109,13 +123,66 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
         provenance: Provenance::default(),
         size: ModelSize::default(),
     };
-    let mut player = Player::new(&model, &context.registry, device)?;
-    let playback = time_playback(&mut player, args.frames as usize, |frame| (&camera, frame as f32 / SEQUENCE as f32))?;
+    Ok((model, camera))
+}
+
+/// Centres of the rows, `[M,3]`.
+fn moving_means(gaussians: &HostGaussians, rows: &[usize], device: &Device) -> Tensor<2> {
+    let means: Vec<f32> = rows.iter().flat_map(|&i| gaussians.means[3 * i..3 * i + 3].to_vec()).collect();
+    Tensor::from_data(TensorData::new(means, [rows.len(), 3]), device)
+}
+
+/// Gives weights that are zero random values, so that the largest offset becomes about `motion`: what makes a fresh deformer the identity is zero.
+fn set_in_motion(field: &mut dyn Deformer, means_world: Tensor<2>, motion: f32, seed: Seed) -> Result<()> {
+    let device = means_world.device();
+    let mut scale = FIRST_MOTION;
+    let fresh: Vec<Vec<f32>> = field.parameters().iter().map(|p| to_vec(p.value.clone(), "weights")).collect::<Result<_>>()?;
+    for _ in 0..2 {
+        for (index, (parameter, values)) in field.parameters_mut().into_iter().zip(&fresh).enumerate() {
+            let seed = seed.index(index as u64);
+            let moved: Vec<f32> = values.iter().enumerate().map(|(k, v)| if *v == 0.0 { scale * uniform(seed, k) } else { *v }).collect();
+            parameter.value = Tensor::from_data(TensorData::new(moved, [values.len()]), &device);
+        }
+        let features = field.spatial(&SpatialInput::new(means_world.clone()))?.values;
+        let mut largest = 0.0f32;
+        for time in MOTION_TIMES {
+            if let Some(offsets) = field.deform(features.clone(), time)?.concatenated() {
+                largest = largest.max(offsets.abs().max().into_scalar::<f32>());
+            }
+        }
+        scale *= motion / largest.max(f32::MIN_POSITIVE);
+    }
+    Ok(())
+}
+
+/// Stores the model with a playback layer; players start from `camera`.
+fn write_playable(context: &Context, model: &Model, camera: &Camera, device: &Device, events: &dyn EventSink, path: &Path) -> Result<()> {
+    let around = Surroundings { registry: &context.registry, device, limits: &context.limits, events };
+    let stored = Stored::of_model(model, Storage::default(), around)?;
+    let cameras = std::slice::from_ref(camera);
+    let presentation = presented(&stored.model, cameras, None)?;
+    let options = PlayableOptions { max_error: None, cameras, presentation, poster: false, without_field: true };
+    create_parent(path)?;
+    let bytes = stored.playable(options, around)?.bytes;
+    write_atomically(path, &bytes)?;
+    events.emit(&Event::Saved { path: path.display().to_string(), bytes: bytes.len() as u64 });
+    Ok(())
+}
+
+fn time_case(context: &Context, name: String, model: &mut Model, camera: &Camera, device: &Device, args: &BenchFrame) -> Result<FrameCase> {
+    let rows = model.moving.rows(&model.gaussians.dynamic_scores).unwrap_or_default();
+    let means = moving_means(&model.gaussians, &rows, device);
+    let (field_spatial, field_forward_backward) = match &mut model.field {
+        Some(deformer) => time_field(deformer.field.as_mut(), means, args.frames.min(10))?,
+        None => (Spread::of(Vec::new()), Spread::of(Vec::new())),
+    };
+    let mut player = Player::new(model, &context.registry, device)?;
+    let playback = time_playback(&mut player, args.frames as usize, |frame| (camera, frame as f32 / SEQUENCE as f32))?;
     Ok(FrameCase {
-        name: case.name.to_string(),
+        name,
         width: camera.width,
         height: camera.height,
-        gaussians: n,
+        gaussians: model.gaussians.len(),
         dynamic_gaussians: player.moving(),
         playback,
         field_spatial,
@@ -124,7 +191,7 @@ fn time_case(context: &Context, case: &RoomCase, config: &RunConfig, device: &bu
 }
 
 /// The spatial pass alone, and a pass forwards and backwards through the whole field.
-fn time_field(field: &mut dyn cc4dgs_core::Deformer, means_world: Tensor<2>, repeats: u32) -> Result<(Spread, Spread)> {
+fn time_field(field: &mut dyn Deformer, means_world: Tensor<2>, repeats: u32) -> Result<(Spread, Spread)> {
     if field.is_static() || means_world.dims()[0] == 0 {
         return Ok((Spread::of(Vec::new()), Spread::of(Vec::new())));
     }
