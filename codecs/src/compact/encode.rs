@@ -119,7 +119,7 @@ fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) 
 /// Factors of the steps of the columns means, log-scales, quaternions, opacity logits, degree 0 and higher degrees.
 pub type Factors = [f64; 6];
 
-/// Quantises canonical Gaussians with the step `quality` / weight for colours.
+/// Quantises canonical Gaussians with the step `quality` / weight for colours. A column whose factor is 0 is stored exactly.
 pub fn quantise(
     gaussians: &HostGaussians,
     free: &[bool],
@@ -154,7 +154,7 @@ pub fn quantise(
         let step = f64::from(geometry.scale_step) * f64::from(1u32 << shapes[i].min(geometry.scale_limit));
         let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
         match found {
-            [Some(a), Some(b), Some(c)] if values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
+            [Some(a), Some(b), Some(c)] if factors[1] > 0.0 && values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
             _ => exact[1].push(i),
         }
     }
@@ -170,7 +170,7 @@ pub fn quantise(
     for (i, (codes, q)) in rotations.iter_mut().zip(gaussians.quaternions.chunks_exact(4)).enumerate() {
         let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
         let step = geometry.rotation(geometry.rotation_shift(scales[i], shapes[i]));
-        match Some(norm).filter(|norm| NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i])) {
+        match Some(norm).filter(|norm| factors[2] > 0.0 && NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i])) {
             Some(found) => *codes = found,
             None => exact[2].push(i),
         }
@@ -178,7 +178,7 @@ pub fn quantise(
     let mut opacities = vec![0i32; n];
     for (i, (out, &logit)) in opacities.iter_mut().zip(&gaussians.opacity_logits).enumerate() {
         let step = f64::from(geometry.opacity_step) * f64::from(1u32 << shapes[i].min(geometry.opacity_limit));
-        match code(companded(logit) / step).filter(|_| logit.abs() < LOGIT_LIMIT) {
+        match code(companded(logit) / step).filter(|_| factors[3] > 0.0 && logit.abs() < LOGIT_LIMIT) {
             Some(found) => *out = found,
             None => exact[3].push(i),
         }
@@ -194,7 +194,7 @@ pub fn quantise(
         let mut missing = Vec::new();
         let mut codes = vec![0; n * dims];
         for (i, (row, out)) in plan.quantise(&rows, &classes.colors, &choices).into_iter().zip(codes.chunks_exact_mut(dims)).enumerate() {
-            match row {
+            match row.filter(|_| factor > 0.0) {
                 Some(row) => out.copy_from_slice(&row),
                 None => missing.push(i),
             }
