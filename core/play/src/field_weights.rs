@@ -146,7 +146,7 @@ fn search_bits(counts: &[usize], range: RangeInclusive<i64>, limit: f64, attempt
 /// The numbers of bits that a weight codec can be asked for, from its capability `bits=3..12`.
 fn searched_bits(info: &Plugin) -> Option<RangeInclusive<i64>> {
     let (least, most) = info.capabilities.iter().find_map(|c| c.strip_prefix("bits="))?.split_once("..")?;
-    Some(least.parse().ok()?..=most.parse().ok()?)
+    Some(least.parse().ok()?..=most.parse().ok()?).filter(|range: &RangeInclusive<i64>| !range.is_empty())
 }
 
 #[cfg(test)]
@@ -178,5 +178,6 @@ mod tests {
         assert_eq!(searched_bits(&info(&["lossy", "bits=3..12"])), Some(3..=12));
         assert_eq!(searched_bits(&info(&["lossy"])), None);
         assert_eq!(searched_bits(&info(&["bits=few"])), None);
+        assert_eq!(searched_bits(&info(&["bits=12..3"])), None);
     }
 }
