@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Trains captures with `auto` and nothing else, beside other settings, and holds the results to floors.
 
-    python3 benches/captures.py OUT --bin BIN [--minutes 5] [--scene NAME=PATH ...] [--with none --with panoptic-cpu] [--only NAME,...]
+    python3 benches/captures.py OUT --bin BIN [--minutes 5] [--scene NAME=PATH ...] [--with none --with panoptic] [--only NAME,...]
 
 Every scene is trained once per setting for the same wall time, evaluated once on its held-out views, and reported as one row: PSNR (whole images, moving pixels),
 SSIM, Gaussians, seconds, exit code, and the plan. `auto+METHOD` keeps the plan and exchanges the field; other names are presets, which run for as many iterations

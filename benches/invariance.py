@@ -92,7 +92,7 @@ def main():
     parser.add_argument("scene", type=pathlib.Path)
     parser.add_argument("out", type=pathlib.Path)
     parser.add_argument("--bin", default="target/release/cc4dgs")
-    parser.add_argument("--preset")
+    parser.add_argument("--preset", default="auto")
     parser.add_argument("--iterations", type=int, default=400)
     parser.add_argument("--device", default="flex")
     parser.add_argument("--seeds", type=int, default=3)
@@ -102,7 +102,7 @@ def main():
     blender = (args.scene / "transforms_train.json").is_file()
     if not blender and not (args.scene / "train_meta.json").is_file():
         sys.exit(f"{args.scene}: neither transforms_train.json nor train_meta.json is there")
-    preset = args.preset or ("dnerf-cpu" if blender else "panoptic-cpu")
+    preset = args.preset
     names = args.only.split(",") if args.only else list(CHANGES)
     unknown = [name for name in names if name not in CHANGES]
     if unknown:

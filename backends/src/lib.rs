@@ -16,6 +16,7 @@ pub mod ops {
     pub mod field;
     pub mod hash;
     pub mod image;
+    pub mod life;
     pub mod lookup;
     pub mod networks;
     pub mod photometric;
@@ -31,6 +32,7 @@ pub mod cpu {
     pub mod basis;
     pub mod cross_entropy;
     pub mod heads;
+    pub mod life;
     pub mod lookup;
     pub mod mlp;
     pub mod photometric;
@@ -51,6 +53,7 @@ mod cube {
     mod basis;
     mod field;
     mod image;
+    mod life;
     mod lookup;
     mod photometric;
     mod raster;

@@ -3,11 +3,12 @@
 //! Each has a velocity and a [`Life`], and nothing else moves it. The mean of 1 - g, where g is the gate of a life, is penalised with the weight `gate_weight`, so
 //! that only what appears or moves becomes temporary.
 
-use crate::parts::centres::check_time;
+use crate::parts::lives::{Life, LifeSettings};
 use burn::tensor::{Device, Tensor};
+use cc4dgs_backends::ops::life::LifeAt;
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Life, LifeAt, LifeSettings, Offsets, Parameter, ParameterGroup, Plugin, Result,
-    SpatialFeatures, SpatialInput, config, inventory,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures, SpatialInput,
+    config, inventory,
 };
 use serde::Deserialize;
 
@@ -84,9 +85,8 @@ impl Deformer for FreeTime {
         Ok(self.deform_all(features, &[time_norm])?.pop().unwrap_or_default())
     }
     fn deform_all(&self, features: Tensor<2>, times_norm: &[f32]) -> Result<Vec<Offsets>> {
-        times_norm.iter().try_for_each(|&time_norm| check_time(time_norm))?;
-        let at = |LifeAt { shift, log_factor, .. }| Offsets { means: Some(shift), opacity_log_factor: Some(log_factor), ..Offsets::default() };
-        Ok(self.life.at(features, times_norm).into_iter().map(at).collect())
+        let at = |LifeAt { shift, log_factor }| Offsets { means: Some(shift), opacity_log_factor: Some(log_factor), ..Offsets::default() };
+        Ok(self.life.at(features, times_norm, false)?.into_iter().map(at).collect())
     }
     fn regularizer(&self, input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         input.check("free-time", &self.attributes())?;

@@ -7,6 +7,7 @@ pub mod embedding;
 pub mod free_time;
 pub mod grid4d;
 pub mod hexplane;
+pub mod life;
 pub mod native4d;
 pub mod none;
 pub mod parts;

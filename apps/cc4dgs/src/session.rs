@@ -110,7 +110,7 @@ impl Session {
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
     }
-    /// The settings of a preset (`demo`, `dnerf-cpu+hexplane`) with `key=value` overrides, on this session's device and limits.
+    /// The settings of a preset (`demo`, `dnerf+hexplane`) with `key=value` overrides, on this session's device and limits.
     ///
     /// # Errors
     /// [`Error::Parameter`](crate::Error::Parameter) for unknown presets, unknown keys and values out of range.

@@ -49,7 +49,7 @@ fn plugins_are_listed_with_four_facts_each() {
     assert!(cdf[0]["schema"].as_str().unwrap().contains("capacity"), "{cdf}");
     assert!(fail(&["plugins", "cfd"], 2).contains("cdf"));
     // What the list names can be shown, presets among it.
-    let preset = json_of(&["plugins", "dnerf-cpu+hexplane", "--json"]);
+    let preset = json_of(&["plugins", "dnerf+hexplane", "--json"]);
     assert_eq!((&preset[0]["kind"], &preset[0]["settings"]["deformer"]["kind"]), (&Value::from("preset"), &Value::from("hexplane")));
     assert!(fail(&["plugins", "dmeo"], 2).contains("demo"));
 }
@@ -61,7 +61,7 @@ fn mistakes_end_with_their_own_exit_code() {
     fail(&["trian"], 2);
     fail(&["eval"], 2);
     fail(&["render", "x", "--out", "y", "--size", "0x3"], 2);
-    assert!(fail(&["train", "--scene", "procedural", "--preset", "dnerf-gpu", "--out", text(&out)], 2).contains("dnerf-cpu"));
+    assert!(fail(&["train", "--scene", "procedural", "--preset", "dnref", "--out", text(&out)], 2).contains("dnerf"));
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--set", "train.iteratons=3", "--out", text(&out)], 2).contains("iteratons"));
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--device", "fleks", "--out", text(&out)], 2).contains("flex"));
     let unknown = "deformer.capasity=small";

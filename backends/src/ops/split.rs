@@ -122,7 +122,7 @@ impl<B: SplitBackward + SplitOps, C: CheckpointStrategy> SplitOps for Autodiff<B
 }
 
 /// The pieces of `flat` of these lengths, one after the other; together they are as long as `flat`.
-pub(super) fn split(flat: Tensor<1>, lengths: Vec<usize>) -> Vec<Tensor<1>> {
+pub fn split(flat: Tensor<1>, lengths: Vec<usize>) -> Vec<Tensor<1>> {
     let count = lengths.len();
     let pieces = Arc::new(Pieces { gradients: Shared::new(lengths.len()), lengths });
     let whole = <Dispatch as SplitOps>::whole(flat.into_dispatch(), pieces.clone());

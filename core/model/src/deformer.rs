@@ -258,3 +258,13 @@ pub struct DeformerPlugin {
     pub build: fn(&toml::Table, &DeformerContext, &Device) -> Result<Box<dyn Deformer>>,
 }
 cc4dgs_format::plugin_kind!(DeformerPlugin, "deformer");
+
+/// Something that any deformer can be given in addition, in the registry. It is a deformer around another one, asked for by a key of the `[deformer]` section
+/// that has the plug-in's name, such as `life = true`.
+pub struct DeformerLayerPlugin {
+    /// Name, version and other facts. The schema is that of the table that may stand in place of `true`.
+    pub info: Plugin,
+    /// Builds the layer around a deformer. The table holds its settings, and is empty for `true`; unknown keys are errors.
+    pub build: fn(&toml::Table, Box<dyn Deformer>) -> Result<Box<dyn Deformer>>,
+}
+cc4dgs_format::plugin_kind!(DeformerLayerPlugin, "deformer layer");

@@ -36,12 +36,13 @@ pub use cc4dgs_format::{
     unknown_name,
 };
 pub use deformer::{
-    AttributeSpec, Deformer, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures, SpatialInput, check_attributes,
+    AttributeSpec, Deformer, DeformerLayerPlugin, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures, SpatialInput,
+    check_attributes,
 };
 pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
 pub use device::{DEVICE_NAMES, parse_device};
 pub use gaussians::Gaussians;
-pub use life::{LIFE_ATTRIBUTES, Life, LifeAt, LifeSettings, gate_value};
+pub use life::{LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, gate_value};
 pub use loss::{Fusion, LossInput, LossPlugin, LossTerm};
 pub use module_deformer::ModuleDeformer;
 pub use offsets::Offsets;

@@ -1,13 +1,12 @@
 //! Offsets, the output of a deformer, and their application to Gaussians.
 
 use crate::{Error, Gaussians, Result};
-use burn::tensor::activation::{log_sigmoid, sigmoid};
 use burn::tensor::{Int, Tensor};
 
 /// Lower bound on scales after a change, world units.
 const LEAST_SCALE: f32 = 1e-7;
-/// Lower bound on 1 - opacity.
-const LEAST_REST: f32 = 1e-30;
+/// Upper bound on the opacity logits that fade: from 17 on their sigmoid is 1 in float32, and e^89 is infinite.
+const MOST_LOGIT: f32 = 60.0;
 /// Added to squared angles, so that the derivative at angle zero is finite.
 const LEAST_SQUARED_ANGLE: f32 = 1e-14;
 /// Lower bound on the norm of quaternions.
@@ -143,7 +142,7 @@ impl Offsets {
         moved.opacity_logits = add(moved.opacity_logits, self.opacity_logits, rows);
         if let Some(factor) = self.opacity_log_factor {
             let before = select(&moved.opacity_logits, rows, factor.dims()[0]);
-            moved.opacity_logits = add(moved.opacity_logits, Some(faded(before.clone(), factor) - before), rows);
+            moved.opacity_logits = add(moved.opacity_logits, Some(fading(before, factor)), rows);
         }
         if let Some(sh) = self.sh {
             let [m, k, _] = sh.dims();
@@ -246,10 +245,10 @@ fn turned(quaternions: Tensor<2>, vectors: Tensor<2>) -> Tensor<2> {
     )
 }
 
-/// The logit of sigmoid(logit) e^factor. 1 - sigmoid(x) e^f = sigmoid(-x) + sigmoid(x) (1 - e^f) does not cancel.
-fn faded(logits: Tensor<1>, factor: Tensor<1>) -> Tensor<1> {
-    let rest = sigmoid(logits.clone().neg()) + sigmoid(logits.clone()) * factor.clone().exp().neg().add_scalar(1.0);
-    log_sigmoid(logits) + factor - rest.clamp_min(LEAST_REST).log()
+/// The change of `logits` x that multiplies their sigmoid by e^f: the odds become e^x e^f / (1 + e^x (1 - e^f)).
+fn fading(logits: Tensor<1>, factor: Tensor<1>) -> Tensor<1> {
+    let rest = factor.clone().exp().neg().add_scalar(1.0);
+    factor - (logits.clamp_max(MOST_LOGIT).exp() * rest).log1p()
 }
 
 /// The values of the Gaussians `rows`, or of the first `count`.

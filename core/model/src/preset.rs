@@ -7,7 +7,7 @@ use crate::{Error, Plugin, Registry, Result, config, plugin_kind, unknown_name};
 pub enum PresetRole {
     /// Settings for a family of datasets: a whole configuration.
     Family {
-        /// The table of a method's layer that applies to this family (`dnerf` for `dnerf` and `dnerf-cpu`).
+        /// The table of a method's layer that applies to this family (`dnerf` for any family of D-NeRF scenes).
         dataset: &'static str,
         /// Whether its sizes are for two cores, so that a method's `cpu` table applies too.
         small: bool,

@@ -1,16 +1,16 @@
 //! The registry: all linked plug-ins, collected into a value. Duplicate and unknown names are errors.
 
-use crate::life::{WithLife, take_life};
 use crate::{
-    Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerPlugin, DensityControl, DensityPlugin,
-    Entries, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer, RasterizerPlugin, ReaderPlugin, Result,
-    WeightCodec, WeightCodecPlugin, split_kind,
+    Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerLayerPlugin, DeformerPlugin,
+    DensityControl, DensityPlugin, Entries, Error, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer,
+    RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin, split_kind,
 };
 use burn::tensor::Device;
 
 /// The linked plug-ins by kind and name.
 pub struct Registry {
     deformers: Entries<DeformerPlugin>,
+    layers: Entries<DeformerLayerPlugin>,
     codecs: Entries<CodecPlugin>,
     exporters: Entries<ExporterPlugin>,
     rasterizers: Entries<RasterizerPlugin>,
@@ -31,6 +31,7 @@ impl Registry {
     pub fn collect() -> Result<Self> {
         Ok(Self {
             deformers: Entries::collect()?,
+            layers: Entries::collect()?,
             codecs: Entries::collect()?,
             exporters: Entries::collect()?,
             rasterizers: Entries::collect()?,
@@ -45,8 +46,8 @@ impl Registry {
     }
     /// All entries as (kind, facts), sorted.
     pub fn plugins(&self) -> Vec<(&'static str, &'static Plugin)> {
-        let model =
-            self.codecs.facts().chain(self.deformers.facts()).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts()).chain(self.exporters.facts());
+        let deformers = self.deformers.facts().chain(self.layers.facts());
+        let model = self.codecs.facts().chain(deformers).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts()).chain(self.exporters.facts());
         let training = self.density.facts().chain(self.losses.facts()).chain(self.appearances.facts()).chain(self.optimizers.facts());
         model.chain(training).chain(self.readers.facts()).chain(self.presets.facts()).collect()
     }
@@ -124,15 +125,24 @@ impl Registry {
     pub fn presets(&self) -> impl Iterator<Item = &'static PresetPlugin> + '_ {
         self.presets.iter()
     }
-    /// Builds the deformer of a `[deformer]` section: `kind`, its settings, and `life`, which gives the Gaussians of any deformer lives ([`crate::Life`]).
+    /// Builds the deformer of a `[deformer]` section: `kind`, its settings, and the layers around it, in the order of their names. A layer's key holds true,
+    /// false or a table of its settings.
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
         let (kind, mut settings) = split_kind("deformer", section)?;
-        let life = take_life(&mut settings)?;
+        let mut layers = Vec::new();
+        for layer in self.layers.iter() {
+            match settings.remove(layer.info.name) {
+                None | Some(toml::Value::Boolean(false)) => {}
+                Some(toml::Value::Boolean(true)) => layers.push((layer, toml::Table::new())),
+                Some(toml::Value::Table(table)) => layers.push((layer, table)),
+                Some(other) => {
+                    let object = format!("deformer.{}", layer.info.name);
+                    return Err(Error::parameter(object, format!("{other} is neither true, false nor a table"), "Give true, or a table of settings"));
+                }
+            }
+        }
         let deformer = (self.deformer(&kind)?.build)(&settings, context, device)?;
-        Ok(match life {
-            Some(life) => Box::new(WithLife::new(deformer, life)?),
-            None => deformer,
-        })
+        layers.into_iter().try_fold(deformer, |inner, (layer, table)| (layer.build)(&table, inner))
     }
     /// Builds the rasterizer of a `[rasterizer]` section (`kind` and its settings).
     pub fn build_rasterizer(&self, section: &toml::Table) -> Result<Box<dyn Rasterizer>> {

@@ -219,8 +219,8 @@ mod tests {
 
     #[test]
     fn mistakes_are_named() {
-        let e = RunConfig::resolve(Some("dnerf_cpu"), None, &[]).unwrap_err().to_string();
-        assert!(e.contains("dnerf-cpu"), "{e}");
+        let e = RunConfig::resolve(Some("dnref"), None, &[]).unwrap_err().to_string();
+        assert!(e.contains("dnerf"), "{e}");
         let e = RunConfig::resolve(Some("demo"), None, &["train.densify.every=3".into()]).unwrap_err().to_string();
         assert!(e.contains("[density]"), "{e}");
         let e = RunConfig::resolve(Some("demo"), None, &["init.source=pionts".into()]).unwrap_err().to_string();

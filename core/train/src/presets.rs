@@ -50,9 +50,7 @@ families! {
     "n3dv", "n3dv", false, "Neural 3D Video, the paper's protocol";
     "technicolor", "technicolor", false, "Technicolor light field, the paper's protocol";
     "dnerf", "dnerf", false, "D-NeRF synthetic scenes at full protocol";
-    "dnerf-cpu", "dnerf", true, "D-NeRF at 400x400 on two cores";
     "panoptic", "panoptic", false, "PanopticSports, all frames";
-    "panoptic-cpu", "panoptic", true, "PanopticSports, 30 frames on two cores";
 }
 
 methods! {
@@ -76,7 +74,7 @@ mod tests {
     fn every_family_and_method_resolves() {
         let registry = Registry::collect().unwrap();
         let names = |method: bool| registry.presets().filter(move |p| (p.role == PresetRole::Method) == method).map(|p| p.info.name).collect::<Vec<_>>();
-        assert_eq!((names(false).len(), names(true).len()), (8, 9));
+        assert_eq!((names(false).len(), names(true).len()), (6, 9));
         for family in names(false) {
             for method in names(true).into_iter().map(|name| format!("+{name}")).chain([String::new()]) {
                 let name = format!("{family}{method}");

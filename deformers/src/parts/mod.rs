@@ -2,6 +2,7 @@
 
 pub mod centres;
 pub mod heads;
+pub mod lives;
 pub mod settings;
 pub mod time;
 pub mod voxels;

@@ -2,7 +2,7 @@
 //! brings it back.
 //!
 //! During the main stage, training views are rendered and compared. Compact regions that differ much are looked for in views of neighbouring times; where
-//! enough of them agree on a straight track, Gaussians are added along it, each with a velocity and a life of its own ([`cc4dgs_core::Life`]).
+//! enough of them agree on a straight track, Gaussians are added along it, each with a velocity and a life of its own ([`cc4dgs_core::LIFE_ATTRIBUTES`]).
 
 mod blobs;
 mod seeds;

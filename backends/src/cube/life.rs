@@ -1,0 +1,154 @@
+//! Lives on the device: a thread per Gaussian, for all times.
+
+use super::tensor::{THREADS, floats, upload, workgroups_for};
+use crate::ops::life::{HIDDEN, LEAST_FALLOFF, LifeBackward, LifeOps, LifeRules, MOST_LOG, OUTPUTS, WIDTH};
+use burn::backend::tensor::FloatTensor;
+use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
+use cc4dgs_core::LIFE_GATE_STEEPNESS;
+use cubecl::prelude::*;
+use std::sync::Arc;
+
+/// The smaller of the gate and 1 - gate.
+#[cube]
+fn smaller_share(logit: f32) -> f32 {
+    let small = (-logit.abs()).exp();
+    small / (1.0 + small)
+}
+
+/// e^x of a logarithm that is bounded.
+#[cube]
+fn width(log: f32) -> f32 {
+    select(log < MOST_LOG, log, MOST_LOG).exp()
+}
+
+/// The square of `in_falloffs`, bounded.
+#[cube]
+fn faded(in_falloffs: f32) -> f32 {
+    let squared = in_falloffs * in_falloffs;
+    select(squared < -HIDDEN, squared, -HIDDEN)
+}
+
+/// The opacity factor, from e^[`HIDDEN`] to 1.
+#[cube]
+fn bounded(factor: f32) -> f32 {
+    let least = 9.357_623e-14f32;
+    let factor = select(factor > least, factor, least);
+    select(factor < 1.0, factor, 1.0f32)
+}
+
+/// Shifts `[M,3]` and logarithms of factors `[M]`, time after time.
+#[cube(launch)]
+fn forward(attributes: &[f32], times: &[f32], out: &mut [f32], rows: u32, hidden_below: f32, #[comptime] gated: bool) {
+    let row = ABSOLUTE_POS;
+    if row < rows as usize {
+        let at = row * WIDTH;
+        let logit = LIFE_GATE_STEEPNESS * attributes[at + 3];
+        let smaller = smaller_share(logit);
+        let gate = select(logit < 0.0, smaller, 1.0 - smaller);
+        let temporary = select(logit < 0.0, 1.0 - smaller, smaller);
+        let half_width = width(attributes[at + 1]);
+        let wanted = width(attributes[at + 2]);
+        let falloff = select(wanted > LEAST_FALLOFF, wanted, LEAST_FALLOFF);
+        let moving = if comptime!(gated) { temporary } else { (1.0f32).runtime() };
+        for k in 0..times.len() {
+            let since = times[k] - attributes[at];
+            let beyond = since.abs() - half_width;
+            let in_falloffs = select(beyond > 0.0, beyond, 0.0f32) / falloff;
+            let factor = bounded(gate + temporary * (-faded(in_falloffs)).exp());
+            let base = k * rows as usize * OUTPUTS;
+            for axis in 0..3usize {
+                out[base + 3 * row + axis] = attributes[at + 4 + axis] * since * moving;
+            }
+            out[base + 3 * rows as usize + row] = select(factor < hidden_below, HIDDEN, factor.ln());
+        }
+    }
+}
+
+/// The gradient of the attributes `[M,7]`.
+#[cube(launch)]
+fn backward(attributes: &[f32], times: &[f32], grad: &[f32], out: &mut [f32], rows: u32, hidden_below: f32, #[comptime] gated: bool) {
+    let row = ABSOLUTE_POS;
+    if row < rows as usize {
+        let at = row * WIDTH;
+        let logit = LIFE_GATE_STEEPNESS * attributes[at + 3];
+        let smaller = smaller_share(logit);
+        let gate = select(logit < 0.0, smaller, 1.0 - smaller);
+        let temporary = select(logit < 0.0, 1.0 - smaller, smaller);
+        let half_width = width(attributes[at + 1]);
+        let wanted = width(attributes[at + 2]);
+        let falloff = select(wanted > LEAST_FALLOFF, wanted, LEAST_FALLOFF);
+        let moving = if comptime!(gated) { temporary } else { (1.0f32).runtime() };
+        let mut of_center = 0.0f32;
+        let mut of_width = 0.0f32;
+        let mut of_falloff = 0.0f32;
+        let mut of_gate = 0.0f32;
+        let mut of_x = 0.0f32;
+        let mut of_y = 0.0f32;
+        let mut of_z = 0.0f32;
+        for k in 0..times.len() {
+            let since = times[k] - attributes[at];
+            let beyond = since.abs() - half_width;
+            let in_falloffs = select(beyond > 0.0, beyond, 0.0f32) / falloff;
+            let life = (-faded(in_falloffs)).exp();
+            let factor = bounded(gate + temporary * life);
+            let base = k * rows as usize * OUTPUTS;
+            let (x, y, z) = (grad[base + 3 * row], grad[base + 3 * row + 1], grad[base + 3 * row + 2]);
+            let along = x * attributes[at + 4] + y * attributes[at + 5] + z * attributes[at + 6];
+            of_x += x * since * moving;
+            of_y += y * since * moving;
+            of_z += z * since * moving;
+            of_center -= along * moving;
+            if comptime!(gated) {
+                of_gate -= along * since;
+            }
+            if factor >= hidden_below {
+                let of_factor = grad[base + 3 * rows as usize + row] / factor;
+                of_gate += of_factor * (1.0 - life);
+                if in_falloffs > 0.0 && in_falloffs * in_falloffs < -HIDDEN {
+                    let of_falloffs = in_falloffs * (-2.0f32) * life * of_factor * temporary;
+                    let outside = of_falloffs / falloff;
+                    of_center -= select(since > 0.0, outside, -outside);
+                    of_width -= outside * half_width;
+                    of_falloff -= select(wanted > LEAST_FALLOFF, of_falloffs * in_falloffs, 0.0f32);
+                }
+            }
+        }
+        out[at] = of_center;
+        out[at + 1] = of_width;
+        out[at + 2] = of_falloff;
+        out[at + 3] = of_gate * gate * temporary * LIFE_GATE_STEEPNESS;
+        out[at + 4] = of_x;
+        out[at + 5] = of_y;
+        out[at + 6] = of_z;
+    }
+}
+
+impl LifeOps for CubeBackend {
+    fn lives(attributes: FloatTensor<Self>, rules: Arc<LifeRules>) -> FloatTensor<Self> {
+        let attributes = into_contiguous(attributes);
+        let rows = attributes.meta.shape()[0];
+        let out = floats(&attributes, [rows * OUTPUTS * rules.times_norm.len()]);
+        let client = attributes.client.clone();
+        let times = upload(&attributes, &rules.times_norm, DType::F32);
+        let (count, dim) = (workgroups_for(rows), CubeDim::new_1d(THREADS));
+        let (a, t, o) = (attributes.into_buffer_arg(), times.into_buffer_arg(), out.clone().into_buffer_arg());
+        forward::launch(&client, count, dim, a, t, o, rows as u32, rules.hidden_below, rules.gated_velocity);
+        out
+    }
+}
+
+impl LifeBackward for CubeBackend {
+    fn lives_backward(attributes: FloatTensor<Self>, rules: Arc<LifeRules>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
+        let (attributes, grad) = (into_contiguous(attributes), into_contiguous(grad));
+        let rows = attributes.meta.shape()[0];
+        let out = floats(&attributes, [rows, WIDTH]);
+        let client = attributes.client.clone();
+        let times = upload(&attributes, &rules.times_norm, DType::F32);
+        let (count, dim) = (workgroups_for(rows), CubeDim::new_1d(THREADS));
+        let (a, t, g, o) = (attributes.into_buffer_arg(), times.into_buffer_arg(), grad.into_buffer_arg(), out.clone().into_buffer_arg());
+        backward::launch(&client, count, dim, a, t, g, o, rows as u32, rules.hidden_below, rules.gated_velocity);
+        out
+    }
+}

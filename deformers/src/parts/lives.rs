@@ -1,0 +1,110 @@
+//! Lives of Gaussians, for what appears, vanishes or crosses a scene faster than smooth functions follow: settings, attributes, and the formula of
+//! [`cc4dgs_backends::ops::life`].
+
+use burn::tensor::Tensor;
+use burn::tensor::activation::sigmoid;
+use cc4dgs_backends::ops::life::{LEAST_FALLOFF, LifeAt, LifeRules, lives};
+use cc4dgs_core::{AttributeSpec, Error, LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, Result, gate_value};
+use serde::{Deserialize, Serialize};
+
+/// Where lives start and how they are learned.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LifeSettings {
+    /// Start of r, as a share of the sequence.
+    pub half_width: f32,
+    /// Start of s, as a share of the sequence.
+    pub falloff: f32,
+    /// Start of the gate, 0..1: nearly 1 is nearly as without time.
+    pub gate: f32,
+    /// Centres of life start up to this far from the middle of the sequence, as a share of it.
+    pub spread: f32,
+    /// Weight of the mean of 1 - gate; 0 is off.
+    pub gate_weight: f32,
+    /// A Gaussian whose opacity factor is below this is hidden.
+    pub hidden_below: f32,
+    /// Adam on T, as a share of the sequence.
+    pub center_lr: f64,
+    /// Adam on the logarithms of r and s.
+    pub width_lr: f64,
+    /// Adam on the gate's logit over 20.
+    pub gate_lr: f64,
+    /// Adam on the velocity in world units per sequence, times the extent of the cameras.
+    pub velocity_lr: f64,
+}
+
+impl Default for LifeSettings {
+    /// Beside another deformer: all Gaussians last, and only those that are added with a life of their own have one.
+    fn default() -> Self {
+        Self {
+            half_width: 0.05,
+            falloff: 0.1,
+            gate: 1.0,
+            spread: 0.0,
+            gate_weight: 0.0,
+            hidden_below: 0.01,
+            center_lr: 1.6e-4,
+            width_lr: 5e-3,
+            gate_lr: 0.0,
+            velocity_lr: 1.6e-3,
+        }
+    }
+}
+
+/// Lives with these settings, for Gaussians that carry [`LIFE_ATTRIBUTES`].
+pub struct Life {
+    settings: LifeSettings,
+}
+
+impl Life {
+    /// Refuses settings out of their range.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] that names the setting.
+    pub fn new(settings: LifeSettings) -> Result<Self> {
+        let limits = [
+            ("half_width", settings.half_width, 1e-4, 10.0),
+            ("falloff", settings.falloff, LEAST_FALLOFF, 10.0),
+            ("gate", settings.gate, 0.0, 1.0),
+            ("spread", settings.spread, 0.0, 10.0),
+            ("gate_weight", settings.gate_weight, 0.0, 1.0),
+            ("hidden_below", settings.hidden_below, 0.0, 0.999),
+        ];
+        match limits.into_iter().find(|(_, value, least, most)| !(*least..=*most).contains(value)) {
+            Some((name, value, least, most)) => {
+                Err(Error::parameter(format!("deformer: {name} of lives"), format!("{value} is not in {least}..{most}"), "Choose a value in this range"))
+            }
+            None => Ok(Self { settings }),
+        }
+    }
+    /// The attributes, in the order of [`LIFE_ATTRIBUTES`].
+    pub fn attributes(&self) -> Vec<AttributeSpec> {
+        let s = &self.settings;
+        let starts = [(0.5, s.spread), (s.half_width.ln(), 0.0), (s.falloff.ln(), 0.0), (gate_value(s.gate), 0.0), (0.0, 0.0)];
+        let rates = [s.center_lr, s.width_lr, s.width_lr, s.gate_lr, s.velocity_lr];
+        let spec =
+            |(((name, width), (start, spread)), lr)| AttributeSpec { spread, times_extent: name == "velocity", ..AttributeSpec::new(name, width, start, lr) };
+        LIFE_ATTRIBUTES.into_iter().zip(starts).zip(rates).map(spec).collect()
+    }
+    /// The settings.
+    pub fn settings(&self) -> &LifeSettings {
+        &self.settings
+    }
+    /// The changes at `times_norm`, for attributes side by side `[M,7]`. With `gated_velocity`, velocities are multiplied by 1 - g.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for times that are not finite.
+    pub fn at(&self, attributes: Tensor<2>, times_norm: &[f32], gated_velocity: bool) -> Result<Vec<LifeAt>> {
+        if attributes.dims()[0] == 0 {
+            let device = attributes.device();
+            let none = |_: &f32| LifeAt { shift: Tensor::zeros([0, 3], &device), log_factor: Tensor::zeros([0], &device) };
+            return Ok(times_norm.iter().map(none).collect());
+        }
+        lives(attributes, LifeRules { times_norm: times_norm.to_vec(), hidden_below: self.settings.hidden_below, gated_velocity })
+    }
+    /// The mean of 1 - gate with its weight, from the values of `life_gate` `[M,1]`.
+    pub fn regularizer(&self, gates: Tensor<2>) -> Option<Tensor<1>> {
+        let open = (self.settings.gate_weight > 0.0 && gates.dims()[0] > 0).then(|| sigmoid(gates.mul_scalar(LIFE_GATE_STEEPNESS)).mean());
+        Some(open?.neg().add_scalar(1.0).mul_scalar(self.settings.gate_weight))
+    }
+}
