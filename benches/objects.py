@@ -1,17 +1,16 @@
 #!/usr/bin/env python3
 """Whether an object of one colour is in every image that shows it: the overlap of its pixels in renders with those in the ground truth.
 
-    cc4dgs eval RUN --scene DATA/panoptic_basketball --renders RENDERS ...
-    python3 benches/objects.py RENDERS --images DATA/panoptic_basketball/ims --cameras 0,10,15,30 [--json F]
+    cc4dgs eval RUN --scene DATA/panoptic_basketball --renders RENDERS --json=EVAL.json
+    python3 benches/objects.py EVAL.json RENDERS --images DATA/panoptic_basketball/ims [--json F]
 
 The object is what is redder than RED levels above green and blue, such as the ball of PanopticSports basketball. Overlap is intersection over union of both
-sets of pixels. An image shows the object if at least LEAST pixels of the ground truth do (in an image of 640x360; other sizes in proportion). Renders are
-numbered in the order of cameras and frames, as `eval` numbers test views. Needs numpy and Pillow.
+sets of pixels. An image shows the object if at least LEAST pixels of the ground truth do (in an image of 640x360; other sizes in proportion). EVAL.json
+says camera and frame of every render. Needs numpy and Pillow.
 """
 import argparse
 import json
 import pathlib
-import sys
 
 import numpy
 from PIL import Image
@@ -29,20 +28,16 @@ def object_pixels(image):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("evaluation", type=pathlib.Path)
     parser.add_argument("renders", type=pathlib.Path)
     parser.add_argument("--images", type=pathlib.Path, required=True, help="a folder per camera")
-    parser.add_argument("--cameras", required=True, help="names of the cameras, in order, with commas")
     parser.add_argument("--json", type=pathlib.Path)
     options = parser.parse_args()
-    renders = sorted(options.renders.glob("*.png"))
-    cameras = options.cameras.split(",")
-    if not renders or len(renders) % len(cameras):
-        sys.exit(f"{len(renders)} renders cannot be those of {len(cameras)} cameras")
-    frames = len(renders) // len(cameras)
+    views = json.loads(options.evaluation.read_text())["images"]
     rows = []
-    for index, path in enumerate(renders):
-        camera, frame = cameras[index // frames], index % frames
-        render = Image.open(path)
+    for index, view in enumerate(views):
+        camera, frame = view["camera"], view["frame"]
+        render = Image.open(options.renders / f"{index:05}.png")
         truth = sorted((options.images / camera).iterdir())[frame]
         shown = object_pixels(Image.open(truth).resize(render.size, Image.Resampling.BOX))
         drawn = object_pixels(render)
@@ -51,7 +46,7 @@ def main():
         rows.append({"camera": camera, "frame": frame, "pixels": int(shown.sum()), "overlap": round(float((shown & drawn).sum() / (shown | drawn).sum()), 4)})
     overlaps = [row["overlap"] for row in rows]
     lost = [row for row in rows if row["overlap"] < THERE]
-    print(f"{len(rows)} of {len(renders)} images show it; overlap: median {numpy.median(overlaps):.2f}, least {min(overlaps):.2f}; lost (below {THERE}) in {len(lost)}")
+    print(f"{len(rows)} of {len(views)} images show it; overlap: median {numpy.median(overlaps):.2f}, least {min(overlaps):.2f}; lost (below {THERE}) in {len(lost)}")
     for row in lost:
         print(f"  camera {row['camera']}, frame {row['frame']}: {row['overlap']:.2f} of {row['pixels']} pixels")
     if options.json:

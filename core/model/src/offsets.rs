@@ -248,7 +248,8 @@ fn turned(quaternions: Tensor<2>, vectors: Tensor<2>) -> Tensor<2> {
 /// The change of `logits` x that multiplies their sigmoid by e^f: the odds become e^x e^f / (1 + e^x (1 - e^f)).
 fn fading(logits: Tensor<1>, factor: Tensor<1>) -> Tensor<1> {
     let rest = factor.clone().exp().neg().add_scalar(1.0);
-    factor - (logits.clamp_max(MOST_LOGIT).exp() * rest).log1p()
+    let bounded = logits.clone().clamp_max(MOST_LOGIT);
+    bounded.clone() - logits + factor - (bounded.exp() * rest).log1p()
 }
 
 /// The values of the Gaussians `rows`, or of the first `count`.

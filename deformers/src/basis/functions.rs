@@ -12,8 +12,11 @@ const NETWORK_FALLOFF: f32 = 1.0;
 /// The functions, in this order: the constant, t, a sine and a cosine per band, the splines, the learned ones.
 #[derive(Clone, Debug)]
 pub(super) struct TemporalFunctions {
-    /// Fourier bands of 1, 2, 4… cycles per sequence.
+    /// Fourier bands of 1, 2, 4… times `cycles` cycles per sequence.
     pub(super) bands: usize,
+    /// Cycles of the lowest band. Sums of whole cycles have the same value and slope at both ends of the sequence, which real motion does not; with half a
+    /// cycle they may differ.
+    pub(super) cycles: f32,
     /// The amplitude of each band is 2^-falloff times that of the next lower one.
     pub(super) falloff: f32,
     /// Number of cubic B-splines over the sequence: 0 or at least 4.
@@ -34,9 +37,9 @@ impl TemporalFunctions {
     pub(super) fn count(&self) -> usize {
         1 + Self::encoding(self.bands) + self.splines + self.learned()
     }
-    /// The penalty of each function in [`super::sparsity`]: 1, but 2^l times its amplitude for the l-th band, because high bands move fast.
+    /// The penalty of each function in [`super::sparsity`]: 1, but cycles times amplitude for the bands, because high bands move fast.
     pub(super) fn prices(&self) -> Vec<f32> {
-        let fourier = (0..self.bands).flat_map(|band| [(band as f32 * (1.0 - self.falloff)).exp2(); 2]);
+        let fourier = (0..self.bands).flat_map(|band| [self.cycles * (band as f32 * (1.0 - self.falloff)).exp2(); 2]);
         [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(1.0, self.splines + self.learned())).collect()
     }
     /// All functions at `times_norm` (0..1): φ(t) `[times, functions]`. `weights` are those of the network.
@@ -55,7 +58,8 @@ impl TemporalFunctions {
     }
     /// t and the bands; the amplitude of each band is 2^-falloff times that of the next lower one.
     fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
-        let mut encoding = encode(time_norm, self.bands);
+        let mut encoding = encode(time_norm * self.cycles, self.bands);
+        encoding[0] = time_norm;
         for (band, pair) in encoding[1..].chunks_exact_mut(2).enumerate() {
             pair.iter_mut().for_each(|v| *v *= (-falloff * band as f32).exp2());
         }
@@ -91,7 +95,7 @@ mod tests {
 
     #[test]
     fn bands_fall_off_by_octaves() {
-        let functions = TemporalFunctions { bands: 3, falloff: 0.5, splines: 4, network: None };
+        let functions = TemporalFunctions { bands: 3, cycles: 1.0, falloff: 0.5, splines: 4, network: None };
         let values = functions.at(&[0.2], None, &Device::flex()).unwrap().into_data().to_vec::<f32>().unwrap();
         assert_eq!(values.len(), functions.count());
         assert_eq!(functions.prices().len(), functions.count());
@@ -103,5 +107,10 @@ mod tests {
             assert!((values[k + 1] - want / octave.sqrt()).abs() < 1e-6, "{values:?}");
             assert!((smooth[k] - want / octave).abs() < 1e-6, "{smooth:?}");
         }
+        // Half a cycle: the ends differ, and t is t.
+        let half = TemporalFunctions { cycles: 0.5, ..functions };
+        let [start, end] = [0.0, 1.0].map(|t| half.encoded(t, 0.0));
+        assert!((end[0], start[0]) == (1.0, 0.0) && (start[2] - 1.0).abs() < 1e-6 && (end[2] + 1.0).abs() < 1e-6, "{start:?} {end:?}");
+        assert!((half.prices()[2] - 0.5).abs() < 1e-6);
     }
 }

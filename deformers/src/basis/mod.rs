@@ -37,6 +37,7 @@ const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as for 
 # width = 128            # width of the coefficient network (small: 64; mid: 96)
 layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
+cycles = 1.0             # cycles of the lowest band over the sequence; with whole cycles, what the bands move ends where it began
 falloff = 1.0            # amplitude of a band over the next lower one is 2^-falloff: fast motion is learned later; 0 treats all alike
 sparsity = 1e-4          # weight of a group lasso on every function of every head (Fourier bands: times their frequency); 0 is off
 splines = 0              # cubic B-splines over the sequence, in addition to the bands; 0 or at least 4
@@ -75,6 +76,7 @@ struct BasisSettings {
     width: Option<usize>,
     layers: usize,
     time_bands: usize,
+    cycles: f32,
     falloff: f32,
     sparsity: f32,
     splines: usize,
@@ -91,6 +93,7 @@ impl Default for BasisSettings {
             width: None,
             layers: 2,
             time_bands: 0,
+            cycles: 1.0,
             falloff: 1.0,
             sparsity: 1e-4,
             splines: 0,
@@ -161,6 +164,9 @@ impl CdfBasis {
             ));
         }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
+        if !(0.1..=16.0).contains(&settings.cycles) {
+            return Err(Error::parameter("deformer.cycles", format!("{} cannot be used", settings.cycles), "Give 0.1 to 16; 0.5 and 1 are usual"));
+        }
         if !(0.0..=4.0).contains(&settings.falloff) {
             return Err(Error::parameter("deformer.falloff", format!("{} cannot be used", settings.falloff), "Give 0 (none) to 4"));
         }
@@ -172,7 +178,7 @@ impl CdfBasis {
         }
         let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
         let network = (settings.learned > 0).then(|| Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(bands), width, width, settings.learned])));
-        let functions = TemporalFunctions { bands, falloff: settings.falloff, splines: settings.splines, network };
+        let functions = TemporalFunctions { bands, cycles: settings.cycles, falloff: settings.falloff, splines: settings.splines, network };
         let kept = settings.functions_of_heads(functions.count())?;
         let groups = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let shape = Arc::new(BasisShape { groups });
