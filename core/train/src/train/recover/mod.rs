@@ -33,6 +33,9 @@ const IMAGES: usize = 8;
 const LEAST_FRAMES: usize = 3;
 /// The most things at a time.
 const TRACKS: usize = 3;
+/// Share of the regions that tracks must explain before Gaussians are given lives, which cost time: else the regions are what the deformer has not learned yet, and
+/// some agree by chance.
+const LEAST_EXPLAINED: f64 = 0.35;
 
 /// What a view shows and the model does not.
 struct Lost {
@@ -67,10 +70,19 @@ impl Context<'_> {
                 tracks.push(track);
             }
         }
-        let message =
-            format!("{} compact regions of {} training views are not drawn; {} tracks of things that move", sightings.len(), lost.len(), tracks.len());
+        let explained: BTreeSet<usize> = tracks.iter().flat_map(|track| track.sightings.iter().copied()).collect();
+        let lives = state.deformer.as_ref().is_some_and(|deformer| own_lives(deformer) > 0);
+        let too_few = !lives && (explained.len() as f64) < LEAST_EXPLAINED * sightings.len() as f64;
+        let message = format!(
+            "{} compact regions of {} training views are not drawn; {} tracks of things that move go through {} of them{}",
+            sightings.len(),
+            lost.len(),
+            tracks.len(),
+            explained.len(),
+            if too_few { ": too few, nothing is added" } else { "" }
+        );
         self.job.events.emit(&Event::Note { object: "recover".into(), message });
-        if tracks.is_empty() {
+        if tracks.is_empty() || too_few {
             return Ok(());
         }
         self.give_lives(state)?;
