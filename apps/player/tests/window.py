@@ -266,6 +266,24 @@ def main():
         close(screen.display, window)
         assert viewer.wait(60) == 0, f"the window ends with {viewer.returncode}"
         say("an archive without its deformer cannot be switched")
+        changed = pathlib.Path(folder.name) / "changed.cc4d"
+        changed.write_bytes(archive.read_bytes())
+        viewer = screen.start(args.program, "--quiet", "view", changed)
+        processes.append(viewer)
+        window = screen.window(changed.name, viewer)
+        screen.wait(lambda scene: scene.std() > 4, "the scene is empty", PATIENCE)
+        screen.tool("mousemove", 640, 400), screen.tool("key", "space")
+        time.sleep(1)
+        top = numpy.asarray(screen.image()).astype(int)[:16]
+        changed.write_bytes(alone.read_bytes())
+        screen.tool("key", "x")
+        # Until the file was opened, the sign of the image under way is at the top.
+        told = lambda: computing(screen)[0] is None and different(top, numpy.asarray(screen.image()).astype(int)[:16]) > 10
+        screen.wait(lambda scene: told(), "nothing is said of a file that changed")
+        shot("exact_error")
+        close(screen.display, window)
+        assert viewer.wait(60) == 0, f"the window ends with {viewer.returncode}"
+        say("an error is said in words, and the player's image is back")
         said = subprocess.run([args.program, "--quiet", "view", damaged], env=screen.environment, capture_output=True, text=True)
         assert said.returncode == 3 and "damaged.cc4d" in said.stderr, f"a damaged file ends with {said.returncode}: {said.stderr}"
         say("view of a damaged file ends with exit code 3 and a message")
