@@ -8,6 +8,8 @@
 
 mod clock;
 mod content;
+#[cfg(not(target_arch = "wasm32"))]
+pub mod exact;
 mod navigator;
 mod render;
 #[cfg(target_arch = "wasm32")]

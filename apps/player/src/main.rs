@@ -2,9 +2,9 @@
 
 use cc4dgs_format::{Error, Limits, Result};
 use cc4dgs_player::Content;
-use cc4dgs_player::window::{Shown, show};
+use cc4dgs_player::window::{Opened, Shown, show};
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
@@ -21,7 +21,11 @@ fn main() -> ExitCode {
 fn run() -> Result<()> {
     let usage = || Error::parameter("cc4dgs-view", "no file is named", "Write cc4dgs-view FILE, with a .cc4d archive, a PLY or an SPZ file");
     let path = std::env::args_os().nth(1).map(PathBuf::from).ok_or_else(usage)?;
-    let bytes = std::fs::read(&path).map_err(|e| Error::io(&path, e))?;
+    show(&path.file_name().unwrap_or_default().to_string_lossy(), Shown::Model(Box::new(open(&path)?), Box::new(open)))
+}
+
+fn open(path: &Path) -> Result<Opened> {
+    let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
     let content = Content::read(&path.display().to_string(), bytes, &Limits::default())?;
-    show(&path.file_name().unwrap_or_default().to_string_lossy(), Shown::Model(content))
+    Ok(Opened { content, exact: Err("This program has no deformers. `cc4dgs view` has.".to_string()) })
 }

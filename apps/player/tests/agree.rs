@@ -4,6 +4,7 @@
 use cc4dgs::core::Limits;
 use cc4dgs::core::metrics::{Metric, Rounding};
 use cc4dgs::play::bake::MaxError;
+use cc4dgs::play::player::FrameOptions;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings};
 use cc4dgs::{Camera, Orbit, Session};
 use cc4dgs_player::{Content, Mode, Renderer, View, request_device};
@@ -74,6 +75,15 @@ fn agrees(deformer: &[&str]) {
             assert_eq!(found.data, renderer.image(&View::new(camera.clone(), time)).unwrap().data, "equal frames are equal bytes");
         }
     }
+    // The options that both renderers have mean the same.
+    let options = FrameOptions { sh_degree: 0, scale: 0.6 };
+    let camera = cameras(&session, &path).remove(0);
+    let wanted = player.frame_as(&camera, 0.37, options).unwrap();
+    let found = renderer.image(&View { sh_degree: options.sh_degree, scale: options.scale, ..View::new(camera.clone(), 0.37) }).unwrap();
+    let psnr = Metric::psnr(Rounding::EightBit);
+    least = least.min(psnr.score_images(&wanted, &found).unwrap());
+    assert!(psnr.score_images(&wanted, &player.frame(&camera, 0.37).unwrap()).unwrap() < LEAST_DB - 5.0, "the options change nothing");
+    assert!(player.frame_as(&camera, 0.37, FrameOptions { scale: f32::NAN, ..options }).is_err());
     assert!(least >= LEAST_DB, "{deformer:?}: {least:.1} dB between player and tile renderer");
     // The images differ over time by much more than the renderers do, so agreement says something about motion.
     assert!(motion < LEAST_DB - 5.0, "{deformer:?}: hardly anything moves ({motion:.1} dB)");

@@ -2,7 +2,7 @@
 
 use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_core::{Camera, DeformerWork, Gaussians, Image8, Rasterizer, Registry, RenderOutput, RenderSettings, Result, SpatialInput, Splats};
+use cc4dgs_core::{Camera, DeformerWork, Error, Gaussians, Image8, Rasterizer, Registry, RenderOutput, RenderSettings, Result, SpatialInput, Splats};
 use serde::Serialize;
 use std::time::Instant;
 
@@ -50,6 +50,33 @@ pub struct PlayShortcuts {
 impl Default for PlayShortcuts {
     fn default() -> Self {
         Self { static_gating: true, feature_cache: true }
+    }
+}
+
+/// How a frame is drawn where it differs from the model. The default draws the model.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameOptions {
+    /// Largest degree of spherical harmonics that is evaluated.
+    pub sh_degree: usize,
+    /// Factor of all scales.
+    pub scale: f32,
+}
+
+impl Default for FrameOptions {
+    fn default() -> Self {
+        Self { sh_degree: usize::MAX, scale: 1.0 }
+    }
+}
+
+impl FrameOptions {
+    fn splats(self, mut gaussians: Gaussians) -> Result<Splats> {
+        if !(self.scale.is_finite() && self.scale > 0.0) {
+            return Err(Error::parameter("scale of the Gaussians", format!("{} is no positive number", self.scale), "Give one such as 0.5"));
+        }
+        if self.scale != 1.0 {
+            gaussians.log_scales = gaussians.log_scales.add_scalar(self.scale.ln());
+        }
+        Ok(Splats::from_gaussians(&gaussians, self.sh_degree))
     }
 }
 
@@ -196,14 +223,25 @@ impl<'a> Player<'a> {
         let planes = self.render(camera, time_norm)?.0.planes;
         self.download(planes)
     }
+    /// As [`Player::frame`], drawn as `options` say.
+    ///
+    /// # Errors
+    /// Also [`Error::Parameter`] for scales that are no positive number.
+    pub fn frame_as(&mut self, camera: &Camera, time_norm: f32, options: FrameOptions) -> Result<Image8> {
+        let planes = self.render_as(camera, time_norm, options)?.0.planes;
+        self.download(planes)
+    }
     /// Draws one frame and waits for it.
     pub fn render(&mut self, camera: &Camera, time_norm: f32) -> Result<(RenderOutput, FrameTime)> {
+        self.render_as(camera, time_norm, FrameOptions::default())
+    }
+    fn render_as(&mut self, camera: &Camera, time_norm: f32, options: FrameOptions) -> Result<(RenderOutput, FrameTime)> {
         let began = Instant::now();
         let gaussians = self.gaussians_at(time_norm)?;
         self.sync()?;
         let field_ms = began.elapsed().as_secs_f64() * 1000.0;
         let began = Instant::now();
-        let splats = Splats::from_gaussians(&gaussians, gaussians.sh_degree);
+        let splats = options.splats(gaussians)?;
         let output = self.rasterizer.render(&splats, camera, &self.settings)?;
         self.sync()?;
         Ok((output, FrameTime { field_ms, raster_ms: began.elapsed().as_secs_f64() * 1000.0 }))
@@ -226,6 +264,6 @@ impl<'a> Player<'a> {
     }
     /// Waits until the device has finished.
     pub fn sync(&self) -> Result<()> {
-        self.device.sync().map_err(|e| cc4dgs_core::Error::backend("device", format!("{e:?}"), "Try another device (--device flex)"))
+        self.device.sync().map_err(|e| Error::backend("device", format!("{e:?}"), "Try another device (--device flex)"))
     }
 }

@@ -50,7 +50,7 @@ pub struct View {
     /// How far a point of a Gaussian may be off where motion has to be baked first; as for `bake`.
     #[arg(long, value_name = "E", default_value = "0.1px")]
     pub max_error: String,
-    /// Device that motion is baked on.
+    /// Device that motion is baked on, and that exact images are drawn on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }

@@ -7,6 +7,8 @@ mod decompress;
 mod demo;
 mod doctor;
 mod eval;
+#[cfg(feature = "view")]
+mod exact;
 mod export;
 mod info;
 mod plugins;
@@ -63,8 +65,8 @@ pub fn dispatch(cli: &Cli, output: &Output) -> Result<()> {
     #[cfg(feature = "view")]
     if let Command::View(args) = &cli.command {
         // The window belongs on the main thread.
-        let content = rayon::scope(|_| view::prepare(&context(cli, output)?, args))?;
-        return view::show(args, content);
+        let opened = rayon::scope(|_| view::prepare(&context(cli, output)?, args))?;
+        return view::show(args, limits(&cli.limits)?, opened);
     }
     #[cfg(feature = "view")]
     if let Command::Train(args) = &cli.command
@@ -89,7 +91,7 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Prune(args) => prune::run(&context, args),
         Command::Bake(args) => bake::run(&context, args),
         #[cfg(feature = "view")]
-        Command::View(args) => view::show(args, view::prepare(&context, args)?),
+        Command::View(args) => view::show(args, context.limits, view::prepare(&context, args)?),
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),

@@ -54,6 +54,11 @@ impl Window {
             // From the right end, so that the slider takes what is left.
             ui.with_layout(egui::Layout::right_to_left(egui::Align::Center), |ui| {
                 ui.toggle_value(&mut self.settings, sign("≡")).on_hover_text("Settings");
+                let exact = egui::Button::selectable(self.exact.is_on(), "Exact");
+                let exact = ui.add_enabled(self.exact.lacks().is_none(), exact).on_disabled_hover_text(self.exact.lacks().unwrap_or_default());
+                if exact.on_hover_text("Images of the deformer and the rasterizer of the model, in place of the player's (X)").clicked() {
+                    self.exact.set(!self.exact.is_on());
+                }
                 ui.add_enabled_ui(moves, |ui| {
                     ui.toggle_value(&mut self.clock.looping, sign("↻")).on_hover_text("Loop");
                     ui.add(egui::DragValue::new(&mut self.clock.speed).range(-4.0..=4.0).speed(0.02).suffix("×")).on_hover_text("Speed");
@@ -90,14 +95,21 @@ impl Window {
         ui.add(egui::Slider::new(&mut self.look.scale, 0.1..=2.0).text("Size"));
         ui.add(egui::Slider::new(&mut self.look.sh_degree, 0..=degree).text("SH degree"));
         ui.add(egui::Slider::new(&mut self.resolution, 0.25..=2.0).text("Resolution"));
-        ui.checkbox(&mut self.look.tint, "Tint what moves");
         let mut depth = self.look.mode == Mode::Depth;
-        ui.checkbox(&mut depth, "Depth");
+        ui.add_enabled_ui(!self.exact.is_on(), |ui| {
+            for (value, text) in [(&mut self.look.tint, "Tint what moves"), (&mut depth, "Depth")] {
+                ui.checkbox(value, text).on_disabled_hover_text("Exact images show the colours of the model. Switch them off for this.");
+            }
+        });
         self.look.mode = if depth { Mode::Depth } else { Mode::Color };
         ui.separator();
         if let Some(scene) = self.renderer.scene() {
             ui.small(format!("{:.0} frames/s", self.rate));
-            ui.small(format!("{} of {} Gaussians drawn, {} move", self.visible.load(Ordering::Relaxed), scene.count, scene.moving));
+            for line in self.exact.statistics() {
+                ui.small(line);
+            }
+            let drawn = if self.exact.is_on() { String::new() } else { format!("{} of ", self.visible.load(Ordering::Relaxed)) };
+            ui.small(format!("{drawn}{} Gaussians{}, {} move", scene.count, if drawn.is_empty() { "" } else { " drawn" }, scene.moving));
             if self.bytes > 0 {
                 ui.small(format!("{:.3} MB", self.bytes as f64 / 1e6));
             }
@@ -113,16 +125,17 @@ impl Window {
             return;
         }
         let (pressed, held) = ctx.input(|i| {
-            let pressed = [Key::Space, Key::Comma, Key::Period, Key::R, Key::F, Key::T, Key::Home, Key::End].map(|k| i.key_pressed(k));
+            let pressed = [Key::Space, Key::Comma, Key::Period, Key::R, Key::F, Key::T, Key::X, Key::Home, Key::End].map(|k| i.key_pressed(k));
             (pressed, [Key::D, Key::A, Key::E, Key::Q, Key::W, Key::S].map(|k| f64::from(u8::from(i.key_down(k)))))
         });
-        let actions: [fn(&mut Self); 8] = [
+        let actions: [fn(&mut Self); 9] = [
             |w| w.clock.play(!w.clock.playing),
             |w| w.clock.step(-1),
             |w| w.clock.step(1),
             |w| w.navigator.reset(),
             |w| w.flying = !w.flying,
-            |w| w.look.tint = !w.look.tint,
+            |w| w.look.tint ^= !w.exact.is_on(),
+            |w| w.exact.set(!w.exact.is_on()),
             |w| w.clock.seek(0.0),
             |w| w.clock.seek(1.0),
         ];
@@ -132,6 +145,14 @@ impl Window {
             self.navigator.fly(by(0), by(2), by(4));
             ctx.request_repaint();
         }
+    }
+    /// What the exact image in `rect` is, in its upper left corner.
+    pub(super) fn sign(&self, ui: &mut egui::Ui, rect: egui::Rect) {
+        let (text, computing) = self.exact.sign();
+        let color = if computing { ui.visuals().warn_fg_color } else { ui.visuals().text_color() };
+        ui.scope_builder(egui::UiBuilder::new().max_rect(rect.shrink(8.0)), |ui| {
+            egui::Frame::popup(ui.style()).show(ui, |ui| ui.add(egui::Label::new(egui::RichText::new(text).color(color)).selectable(false)));
+        });
     }
     pub(super) fn gestures(&mut self, ui: &egui::Ui, response: &egui::Response) {
         let height = f64::from(response.rect.height().max(1.0));

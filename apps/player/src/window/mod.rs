@@ -1,28 +1,44 @@
 //! The player in a desktop window (eframe), which shares the device with its controls.
 
 mod controls;
+mod image;
 mod live;
+mod switch;
 
+use crate::exact::Exact;
 use crate::render::descriptor;
 use crate::{Clock, Content, Navigator, Renderer, View};
-use cc4dgs_format::{Camera, Error, Limits, Result};
+use cc4dgs_format::{Camera, Error, Result};
 use eframe::egui;
 use eframe::egui_wgpu::{WgpuConfiguration, WgpuSetup, WgpuSetupCreateNew};
+use image::{FORMAT, Image};
 pub use live::Live;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-
-/// Format of the texture that egui shows.
-const FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
+use switch::Switch;
 
 /// What a window shows.
 pub enum Shown {
-    /// A model.
-    Model(Content),
+    /// A model, and how others are opened that are dropped on the window.
+    Model(Box<Opened>, Open),
     /// A training under way.
     Training(Arc<Live>),
 }
+
+/// A model for a window.
+pub struct Opened {
+    /// What the player draws.
+    pub content: Content,
+    /// The images of its deformer and rasterizer, or why there are none.
+    pub exact: Exact,
+}
+
+/// Opens the model in a file.
+pub type Open = Box<dyn Fn(&Path) -> Result<Opened>>;
+
+/// Why a training has no exact images.
+const COPIES: &str = "A training hands over copies of its Gaussians, without its deformer. Open its folder when it is done.";
 
 /// Opens a window until it is closed. Call it on the main thread: some systems allow windows there only.
 ///
@@ -61,19 +77,15 @@ fn titled(name: &str) -> String {
     format!("{name} – cc4dgs")
 }
 
-/// The image in the window.
-struct Image {
-    view: wgpu::TextureView,
-    id: egui::TextureId,
-    size: (u32, u32),
-}
-
 struct Window {
     renderer: Renderer,
     navigator: Navigator,
     clock: Clock,
     cameras: Vec<Camera>,
     live: Option<Arc<Live>>,
+    /// How files are opened that are dropped; absent from a training, which has a model of its own to show.
+    open: Option<Open>,
+    exact: Switch,
     /// What the device or the training complained about last.
     trouble: Arc<Mutex<Option<String>>>,
     lacks_motion: bool,
@@ -108,6 +120,8 @@ impl Window {
             clock: Clock::new(1, 1.0),
             cameras: Vec::new(),
             live: None,
+            open: None,
+            exact: Switch::new(Err(COPIES.to_string())),
             trouble,
             lacks_motion: false,
             bytes: 0,
@@ -121,9 +135,9 @@ impl Window {
             rate: 0.0,
         };
         match shown {
-            Shown::Model(content) => {
-                window.load(content)?;
-                window.clock.play(true);
+            Shown::Model(opened, open) => {
+                window.show(*opened)?;
+                window.open = Some(open);
             }
             Shown::Training(live) => {
                 live.open(cc.egui_ctx.clone());
@@ -154,12 +168,9 @@ impl Window {
     }
     /// Opens files that were dropped on the window; what is wrong with one is said, and the model before it stays.
     fn dropped(&mut self, ctx: &egui::Context) {
-        // A training has a model of its own to show.
-        if self.live.is_some() {
-            return;
-        }
         for path in ctx.input(|i| i.raw.dropped_files.iter().map(|file| file.path().to_path_buf()).collect::<Vec<_>>()) {
-            let opened = self.open(&path);
+            let Some(open) = &self.open else { return };
+            let opened = open(&path).and_then(|opened| self.show(opened));
             let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
             match opened {
                 Ok(()) => {
@@ -171,11 +182,11 @@ impl Window {
             ctx.request_repaint();
         }
     }
-    fn open(&mut self, path: &Path) -> Result<()> {
-        let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-        let content = Content::read(&path.display().to_string(), bytes, &Limits::default())?;
+    /// Shows a model that was opened, from its start.
+    fn show(&mut self, opened: Opened) -> Result<()> {
         self.loaded = false;
-        self.load(content)?;
+        self.load(opened.content)?;
+        self.exact.replace(opened.exact);
         self.clock.play(true);
         Ok(())
     }
@@ -187,31 +198,23 @@ impl Window {
         let most = self.renderer.device().limits().max_texture_dimension_2d;
         let side = |points: f32| ((points * scale).round() as u32).clamp(1, most);
         let size = (side(available.x), side(available.y));
-        if self.image.as_ref().is_none_or(|s| s.size != size) {
-            let texture = self.renderer.device().create_texture(&wgpu::TextureDescriptor {
-                label: Some("window"),
-                size: wgpu::Extent3d { width: size.0, height: size.1, depth_or_array_layers: 1 },
-                mip_level_count: 1,
-                sample_count: 1,
-                dimension: wgpu::TextureDimension::D2,
-                format: FORMAT,
-                usage: wgpu::TextureUsages::RENDER_ATTACHMENT | wgpu::TextureUsages::TEXTURE_BINDING,
-                view_formats: &[],
-            });
-            let view = texture.create_view(&Default::default());
-            let mut egui_renderer = state.renderer.write();
-            if let Some(old) = self.image.take() {
-                egui_renderer.free_texture(&old.id);
-            }
-            let id = egui_renderer.register_native_texture(self.renderer.device(), &view, wgpu::FilterMode::Linear);
-            self.image = Some(Image { view, id, size });
-        }
-        let Some(shown) = &self.image else { return };
-        let image = egui::Image::from_texture((shown.id, available)).sense(egui::Sense::click_and_drag());
         let view = View { camera: self.navigator.camera(size.0, size.1), time: self.clock.time, ..self.look.clone() };
-        self.renderer.draw(&view, &shown.view);
+        let exact = self.exact.follow(ui.ctx(), state, &mut self.renderer, &view).unwrap_or_else(|e| {
+            *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string());
+            ui.ctx().request_repaint();
+            None
+        });
+        let id = exact.unwrap_or_else(|| {
+            let image = Image::sized(&mut self.image, state, size);
+            self.renderer.draw(&view, &image.view);
+            image.id
+        });
+        let image = egui::Image::from_texture((id, available)).sense(egui::Sense::click_and_drag());
         let response = ui.add(image);
         self.gestures(ui, &response);
+        if self.exact.is_on() {
+            self.sign(ui, response.rect);
+        }
     }
 }
 
