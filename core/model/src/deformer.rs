@@ -259,12 +259,15 @@ pub struct DeformerPlugin {
 }
 cc4dgs_format::plugin_kind!(DeformerPlugin, "deformer");
 
+/// Puts a layer with these settings around a deformer.
+pub type BuildLayer = fn(&toml::Table, Box<dyn Deformer>) -> Result<Box<dyn Deformer>>;
+
 /// Something that any deformer can be given in addition, in the registry. It is a deformer around another one, asked for by a key of the `[deformer]` section
 /// that has the plug-in's name, such as `life = true`.
 pub struct DeformerLayerPlugin {
     /// Name, version and other facts. The schema is that of the table that may stand in place of `true`.
     pub info: Plugin,
     /// Builds the layer around a deformer. The table holds its settings, and is empty for `true`; unknown keys are errors.
-    pub build: fn(&toml::Table, Box<dyn Deformer>) -> Result<Box<dyn Deformer>>,
+    pub build: BuildLayer,
 }
 cc4dgs_format::plugin_kind!(DeformerLayerPlugin, "deformer layer");

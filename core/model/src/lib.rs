@@ -36,8 +36,8 @@ pub use cc4dgs_format::{
     unknown_name,
 };
 pub use deformer::{
-    AttributeSpec, Deformer, DeformerLayerPlugin, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures, SpatialInput,
-    check_attributes,
+    AttributeSpec, BuildLayer, Deformer, DeformerLayerPlugin, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures,
+    SpatialInput, check_attributes,
 };
 pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
 pub use device::{DEVICE_NAMES, parse_device};
