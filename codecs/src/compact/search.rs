@@ -148,15 +148,17 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             found = first;
         }
     }
-    report(&found, &allowance, start, settings, context)?;
-    let goal = match allowance {
-        Allowance::Bytes(limit) => Goal::Bytes(limit),
-        Allowance::Drop { limit, .. } => Goal::Drop(limit),
+    let goal = match &allowance {
+        Allowance::Bytes(limit) => Goal::Bytes(*limit),
+        Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
-    match context.tuner.filter(|_| settings.finetune > 0 && services.is_some() && found.allowed()) {
-        Some(tuner) => tune::tune(job, found.attempt, &goal, settings, tuner, context),
-        None => Ok(found.attempt),
+    if let Some(tuner) = context.tuner.filter(|_| settings.finetune > 0 && services.is_some())
+        && let Some(tuned) = tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)?
+    {
+        return Ok(tuned);
     }
+    report(&found, &allowance, start, settings, context)?;
+    Ok(found.attempt)
 }
 
 /// Says what was chosen; a loss or size over what the user allowed is an error.

@@ -15,7 +15,7 @@ const ROUNDS: usize = 5;
 /// Octaves by which the steps of the first round are larger than those that need no training, where a loss is allowed.
 const FIRST: f64 = 2.0;
 /// Share of the loss by rounding that training leaves, for the choice of the next steps.
-const REMAINS: f64 = 0.15;
+const REMAINS: f64 = 0.08;
 /// Octaves by which the steps of two rounds differ, at most.
 const FARTHEST: f64 = 1.0;
 /// The share of what is allowed that rounds aim at, and the last one.
@@ -62,8 +62,16 @@ impl Goal {
     }
 }
 
-/// The best streams that `goal` allows, after training; `found` are those that do without.
-pub fn tune(job: &Job, found: Attempt, goal: &Goal, settings: &Settings, tuner: &dyn TuneModel, context: &CodecContext) -> Result<Attempt> {
+/// The best streams that `goal` allows, after training; `found` are those that do without, which may be `allowed`. `None` if training finds nothing better.
+pub fn tune(
+    job: &Job,
+    found: &Attempt,
+    allowed: bool,
+    goal: &Goal,
+    settings: &Settings,
+    tuner: &dyn TuneModel,
+    context: &CodecContext,
+) -> Result<Option<Attempt>> {
     let megabytes = |bytes: usize| bytes as f64 / 1e6;
     let mut model = tuner.start(job.gaussians)?;
     let before = tuner.psnr(&model.gaussians, &model.weights, None)?;
@@ -98,18 +106,18 @@ pub fn tune(job: &Job, found: Attempt, goal: &Goal, settings: &Settings, tuner: 
         let outcome = Outcome { attempt, model: model.clone(), weight_steps, bytes, drop };
         let aim = if round + 2 == shares.len() { LAST_AIM } else { AIM };
         octaves += goal.octaves(&outcome, aim, octaves, bits_per_octave);
-        let (bytes, drop) = best.as_ref().map_or((first_bytes, untuned), |b| (b.bytes, b.drop));
+        let (bytes, drop) = best.as_ref().map_or(if allowed { (first_bytes, untuned) } else { (usize::MAX, f64::INFINITY) }, |b| (b.bytes, b.drop));
         if goal.is_better(&outcome, bytes, drop) {
             best = Some(outcome);
         }
     }
     let Some(best) = best else {
         note(context, "fine-tuning found nothing better".into());
-        return Ok(found);
+        return Ok(None);
     };
     note(context, format!("fine-tuned: {:.4} MB with the deformer's weights, PSNR {:.3} dB lower", megabytes(best.bytes), best.drop));
     tuner.adopt(best.model.weights, best.weight_steps);
-    Ok(best.attempt)
+    Ok(Some(best.attempt))
 }
 
 /// Iterations of each round, which add up to `iterations`.

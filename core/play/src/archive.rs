@@ -134,19 +134,19 @@ impl Model {
             }),
             ..CodecContext::new(seed, *limits, events)
         };
-        let streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
         // A field that moves nothing is not stored.
         let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
         let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
+        if field.is_some_and(|f| f.name() == PLAYBACK_LAYER) {
+            let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
+            return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
+        }
+        let streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
         let mut field_streams = Vec::new();
         let deformer = match field {
             None => None,
             Some(f) => {
                 let (name, settings) = split_kind("deformer", &f.section)?;
-                if name == PLAYBACK_LAYER {
-                    let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
-                    return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
-                }
                 let version = registry.deformer(&name)?.info.version.to_string();
                 let chosen = FieldWeights::parse(field_weights, registry)?;
                 let weight_version = registry.weight_codec(&chosen.name)?.info.version.to_string();

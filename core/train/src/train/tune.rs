@@ -29,8 +29,10 @@ const JUDGES: usize = 48;
 const PROBES: usize = 8;
 /// Views per iteration. With one, training loses more than rounding.
 const BATCH: usize = 4;
-/// Largest learning rate of Gaussians, in quantisation steps: larger ones make values noisy, which costs bytes.
+/// Largest learning rate of Gaussians, in quantisation steps, of a training of so many iterations: larger ones make values noisy, which costs bytes. Shorter
+/// trainings have larger ones, so that a random walk goes as far.
 const RATE: f64 = 0.01;
+const RATE_ITERATIONS: f64 = 200.0;
 /// Largest learning rate of the deformer's weights as a share of that in the middle of a main stage; ten times as much costs 0.4 dB.
 const DEFORMER_RATE: f64 = 0.1;
 /// Share of the iterations over which the learning rate rises.
@@ -60,7 +62,8 @@ pub struct TuneJob<'a> {
     pub stop: &'a AtomicBool,
 }
 
-/// Trains a model with rounded values, with the loss and the optimizer that it was trained with. Density control, appearance and noise are left out.
+/// Trains a model with rounded values, with the loss and the optimizer that it was trained with. Density control, appearance, smoothness and noise are left
+/// out.
 ///
 /// Nothing is looked at before a codec asks for it.
 pub struct Tuner<'a> {
@@ -95,11 +98,20 @@ impl<'a> Tuner<'a> {
         (config.render, config.rasterizer) = (model.render.clone(), model.rasterizer.clone());
         (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
         (config.density, config.appearance, config.train.image_growth) = (none(), none(), 0.0);
-        config.train.time_noise = 0.0;
+        (config.train.time_noise, config.train.lambda_r) = (0.0, 0.0);
         config.validate()?;
         let field_weights = FieldWeights::parse(field_weights, registry)?;
-        let weight_settings = field_weights.settings_for(model, scene, registry, device, limits, *events)?;
+        let weight_settings = match self.moving_field() {
+            Some(_) => field_weights.settings_for(model, scene, registry, device, limits, *events)?,
+            None => field_weights.settings.clone(),
+        };
         Ok(self.choices.get_or_init(|| Choices { config, field_weights, weight_settings }))
+    }
+    /// The deformer, unless nothing moves: then it is not stored.
+    fn moving_field(&self) -> Option<&ModelDeformer> {
+        let model = self.job.model;
+        let movable = model.moving.rows(&model.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
+        model.field.as_ref().filter(|f| movable && !f.field.is_static())
     }
     /// Calls `work` with the parts of a training and the state of `model`.
     fn with_state<T>(&self, model: &TunedModel, seed: Seed, work: impl FnOnce(&Context, &mut TrainState) -> Result<T>) -> Result<T> {
@@ -127,7 +139,7 @@ impl<'a> Tuner<'a> {
         };
         let of = self.job.model;
         let mut state = TrainState::new(GaussianSet::new(&model.gaussians, device), of.moving, of.normalisation, parts);
-        if let Some(of) = &of.field {
+        if let Some(of) = self.moving_field() {
             let mut field = registry.build_deformer(&of.section, &of.context, device)?;
             load_weights("tuned weights", field.as_mut(), model.weights.clone(), device)?;
             state.deformer = Some(ModelDeformer { field, section: of.section.clone(), context: of.context.clone() });
@@ -217,7 +229,7 @@ fn rate_at(done: f64) -> f64 {
 
 impl TuneModel for Tuner<'_> {
     fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
-        let weights = self.job.model.field.as_ref().map(|f| weights_of(f.field.as_ref())).transpose()?.unwrap_or_default();
+        let weights = self.moving_field().map(|f| weights_of(f.field.as_ref())).transpose()?.unwrap_or_default();
         Ok(TunedModel { gaussians: gaussians.clone(), weights })
     }
     fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel> {
@@ -241,7 +253,7 @@ impl TuneModel for Tuner<'_> {
                     fixed.size = slopes.into_iter().filter_map(in_steps).collect();
                 }
                 let share = rate_at((iteration as f64 - 0.5) / tuning.iterations as f64);
-                fixed.rate = RATE * share;
+                fixed.rate = RATE * (RATE_ITERATIONS / tuning.iterations as f64).sqrt() * share;
                 state.rounded = Some(self.round(state, tuning, &weight_settings, &fixed)?);
                 state.rates = RateFactors(BTreeMap::from([("deformer".into(), DEFORMER_RATE * share)]));
                 let schedule = self.schedule(from.gaussians.sh_degree);
