@@ -29,7 +29,7 @@ impl Model {
     /// # Errors
     /// [`Error::Parameter`](crate::Error::Parameter) for unknown codecs and profiles, and what codec and disk report.
     pub fn save(&self, path: impl AsRef<Path>, codec: &str) -> Result<u64> {
-        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None })
+        self.save_with(path, &ArchiveOptions { codec, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None, tuner: None })
     }
     /// As [`Model::save`], with settings of the codec, a weight codec for the deformer, and the scene for codecs that make use of it.
     ///

@@ -21,7 +21,7 @@ pub fn allocate(job: &Job, quality: f64, views: &dyn TrainingViews, renderer: &d
     let view = |k: usize| views.view(k * views.len() / chosen);
     let originals = (0..chosen).map(|k| Ok(renderer.render(job.gaussians, view(k).0, view(k).1)?.planes)).collect::<Result<Vec<Vec<f32>>>>()?;
     let measure = |factors: &Factors| -> Result<(f64, f64)> {
-        let attempt = job.attempt_with(quality, factors)?;
+        let attempt = job.attempt_with(job.gaussians, quality, factors)?;
         let mut error = 0.0;
         for (k, original) in originals.iter().enumerate() {
             let drawn = renderer.render(&attempt.decoded, view(k).0, view(k).1)?;

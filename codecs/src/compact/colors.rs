@@ -87,7 +87,39 @@ impl Degree {
         };
         rows.chunks_exact(self.dims).zip(classes).map(quantise).collect()
     }
-    fn step_of(&self, class: u8) -> f64 {
+    /// The derivative of the estimated bits of all coordinates by each of the values `rows` `[N,dims]`; `guesses` `[N,dims]` are predictions in steps.
+    pub fn bit_slopes(&self, rows: &[f32], classes: &[u8], guesses: Option<&[f64]>) -> Vec<f32> {
+        let Some(analysis) = analysis(&self.basis, self.dims) else { return vec![0.0; rows.len()] };
+        let mut out = vec![0.0; rows.len()];
+        for (i, ((out, row), &class)) in out.chunks_exact_mut(self.dims).zip(rows.chunks_exact(self.dims)).zip(classes).enumerate() {
+            let step = self.step_of(class);
+            let row: Vec<f64> = row.iter().zip(&self.mean).map(|(&v, &m)| f64::from(v) - f64::from(m)).collect();
+            let mut sums = vec![0.0; self.dims];
+            for (c, vector) in analysis.chunks_exact(self.dims).enumerate() {
+                let guess = guesses.map_or(0.0, |all| all[i * self.dims + c]);
+                let slope = slope(project(vector, &row) / step - guess) / step;
+                sums.iter_mut().zip(vector).for_each(|(sum, v)| *sum += slope * v);
+            }
+            out.iter_mut().zip(sums).for_each(|(out, sum)| *out = sum as f32);
+        }
+        out
+    }
+    /// The estimated bits of which [`Degree::bit_slopes`] are the derivatives.
+    #[cfg(test)]
+    pub fn bits(&self, rows: &[f32], classes: &[u8], guesses: Option<&[f64]>) -> f64 {
+        let Some(analysis) = analysis(&self.basis, self.dims) else { return 0.0 };
+        let mut sum = 0.0;
+        for (i, (row, &class)) in rows.chunks_exact(self.dims).zip(classes).enumerate() {
+            let row: Vec<f64> = row.iter().zip(&self.mean).map(|(&v, &m)| f64::from(v) - f64::from(m)).collect();
+            for (c, vector) in analysis.chunks_exact(self.dims).enumerate() {
+                let steps = project(vector, &row) / self.step_of(class) - guesses.map_or(0.0, |all| all[i * self.dims + c]);
+                sum += 0.5 * libm::log2(1.0 + steps * steps);
+            }
+        }
+        sum
+    }
+    /// Step of a coordinate.
+    pub fn step_of(&self, class: u8) -> f64 {
         f64::from(self.step) * f64::from(1u32 << class)
     }
     /// A magnitude in steps, rounded down where that costs less than the bits it saves: coordinates are thought to have a Laplace distribution.
@@ -241,6 +273,11 @@ fn largest_symbol(codes: &[i32]) -> usize {
 /// The size of a row whose largest magnitude has this symbol.
 fn size_of(symbol: usize, class: u8) -> i32 {
     2 * i32::from(class.min(15)) + if symbol == 0 { NOTHING } else { symbol as i32 }
+}
+
+/// The derivative of the estimated bits of a number by its magnitude in steps: they are the logarithm of the magnitude, flat below a step.
+pub fn slope(steps: f64) -> f64 {
+    steps / (1.0 + steps * steps) * std::f64::consts::LOG2_E
 }
 
 fn project(analysis: &[f64], row: &[f64]) -> f64 {

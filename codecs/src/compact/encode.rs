@@ -24,11 +24,19 @@ const LOGIT_LIMIT: f32 = 60.0;
 /// Share of the centres at either end of an axis that may lie outside of the grid, if the grid is too coarse otherwise.
 const OUTSIDE: f64 = 5e-4;
 
-/// Everything that is stored, in the order of the Gaussians given.
-pub struct Integers {
+/// Steps, grid and transforms: everything that decides how values are rounded.
+pub struct Plan {
     pub geometry: Geometry,
     pub degrees: Vec<Degree>,
-    pub classes: Classes,
+    /// Whether means, log-scales, quaternions, opacity logits, degree 0 and higher degrees are rounded; else they are stored exactly.
+    rounds: [bool; 6],
+    choices: Choices,
+}
+
+/// Everything that is stored, in the order of the Gaussians given.
+pub struct Integers<'a> {
+    pub plan: &'a Plan,
+    pub classes: &'a Classes,
     pub scales: Vec<[i32; 3]>,
     pub rotations: Vec<Rotation>,
     pub opacities: Vec<i32>,
@@ -119,91 +127,90 @@ fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) 
 /// Factors of the steps of the columns means, log-scales, quaternions, opacity logits, degree 0 and higher degrees.
 pub type Factors = [f64; 6];
 
-/// Quantises canonical Gaussians with the step `quality` / weight for colours. A column whose factor is 0 is stored exactly.
-pub fn quantise(
-    gaussians: &HostGaussians,
-    free: &[bool],
-    importance: &Importance,
-    classes: &Classes,
-    quality: f64,
-    factors: &Factors,
-    choices: &Choices,
-) -> Integers {
-    let (base, steps, n) = (quality / classes.top, importance.steps, gaussians.len());
-    let shapes = &classes.shapes;
-    let positive = |v: f64| (v as f32).clamp(1e-18, 1e18);
-    let finite: Vec<f64> = gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v)).collect();
-    let mut geometry = Geometry {
-        scale_origin: (finite.iter().sum::<f64>() / finite.len().max(1) as f64) as f32,
-        scale_step: positive((base * steps.log_scales * factors[1]).min(LARGEST_SCALE_STEP)),
-        rotation_step: positive(base * steps.quaternions * factors[2]),
-        opacity_step: positive((base * steps.opacity_logits * factors[3]).min(LARGEST_OPACITY_STEP)),
-        corner: [0.0; 3],
-        cell: 1.0,
-        size_floor: 0,
-        class_limit: 0,
-        scale_limit: 0,
-        opacity_limit: 0,
-    };
-    let limit = |step: f32, largest: f64| libm::log2(largest / f64::from(step)).clamp(0.0, 15.0) as u8;
-    geometry.scale_limit = limit(geometry.scale_step, LARGEST_SCALE_STEP);
-    geometry.opacity_limit = limit(geometry.opacity_step, LARGEST_OPACITY_STEP);
-    let mut exact = vec![Vec::new(); 4];
-    let mut scales = vec![[0i32; 3]; n];
-    for (i, (codes, values)) in scales.iter_mut().zip(gaussians.log_scales.chunks_exact(3)).enumerate() {
-        let step = f64::from(geometry.scale_step) * f64::from(1u32 << shapes[i].min(geometry.scale_limit));
-        let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
-        match found {
-            [Some(a), Some(b), Some(c)] if factors[1] > 0.0 && values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
-            _ => exact[1].push(i),
-        }
+impl Plan {
+    /// Plans the storage of canonical Gaussians with the step `quality` / weight for colours. A column whose factor is 0 is stored exactly.
+    pub fn new(gaussians: &HostGaussians, importance: &Importance, classes: &Classes, quality: f64, factors: &Factors, choices: &Choices) -> Self {
+        let (base, steps) = (quality / classes.top, importance.steps);
+        let positive = |v: f64| (v as f32).clamp(1e-18, 1e18);
+        let finite: Vec<f64> = gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v)).collect();
+        let mut geometry = Geometry {
+            scale_origin: (finite.iter().sum::<f64>() / finite.len().max(1) as f64) as f32,
+            scale_step: positive((base * steps.log_scales * factors[1]).min(LARGEST_SCALE_STEP)),
+            rotation_step: positive(base * steps.quaternions * factors[2]),
+            opacity_step: positive((base * steps.opacity_logits * factors[3]).min(LARGEST_OPACITY_STEP)),
+            corner: [0.0; 3],
+            cell: 1.0,
+            size_floor: 0,
+            class_limit: 0,
+            scale_limit: 0,
+            opacity_limit: 0,
+        };
+        let limit = |step: f32, largest: f64| libm::log2(largest / f64::from(step)).clamp(0.0, 15.0) as u8;
+        geometry.scale_limit = limit(geometry.scale_step, LARGEST_SCALE_STEP);
+        geometry.opacity_limit = limit(geometry.opacity_step, LARGEST_OPACITY_STEP);
+        grid(&mut geometry, gaussians, importance, base * steps.means * factors[0]);
+        let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
+        let degree = |degree: usize| {
+            let dims = 3 * (2 * degree + 1);
+            let (relative, factor) = if degree == 0 { (1.0, factors[4]) } else { (steps.sh_rest[degree - 1], factors[5]) };
+            Degree::plan(&coefficients(gaussians, degree), dims, &classes.colors, &squared, positive(base * relative * factor), choices)
+        };
+        Self { degrees: (0..=gaussians.sh_degree).map(degree).collect(), geometry, rounds: factors.map(|f| f > 0.0), choices: *choices }
     }
-    grid(&mut geometry, gaussians, importance, base * steps.means * factors[0]);
-    let mut keys = vec![0u64; n];
-    for (i, (key, mean)) in keys.iter_mut().zip(gaussians.means.chunks_exact(3)).enumerate() {
-        match geometry.key(mean, geometry.position_shift(scales[i], shapes[i])).filter(|_| factors[0] > 0.0) {
-            Some(found) => *key = found,
-            None => exact[0].push(i),
-        }
-    }
-    let mut rotations = vec![Rotation::default(); n];
-    for (i, (codes, q)) in rotations.iter_mut().zip(gaussians.quaternions.chunks_exact(4)).enumerate() {
-        let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
-        let step = geometry.rotation(geometry.rotation_shift(scales[i], shapes[i]));
-        match Some(norm).filter(|norm| factors[2] > 0.0 && NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i])) {
-            Some(found) => *codes = found,
-            None => exact[2].push(i),
-        }
-    }
-    let mut opacities = vec![0i32; n];
-    for (i, (out, &logit)) in opacities.iter_mut().zip(&gaussians.opacity_logits).enumerate() {
-        let step = f64::from(geometry.opacity_step) * f64::from(1u32 << shapes[i].min(geometry.opacity_limit));
-        match code(companded(logit) / step).filter(|_| factors[3] > 0.0 && logit.abs() < LOGIT_LIMIT) {
-            Some(found) => *out = found,
-            None => exact[3].push(i),
-        }
-    }
-    let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
-    let (mut degrees, mut colors) = (Vec::new(), Vec::new());
-    for degree in 0..=gaussians.sh_degree {
-        let rows = coefficients(gaussians, degree);
-        let dims = 3 * (2 * degree + 1);
-        let (relative, factor) = if degree == 0 { (1.0, factors[4]) } else { (steps.sh_rest[degree - 1], factors[5]) };
-        let choices = Choices { rate_weight: if degree == 0 { 0.0 } else { choices.rate_weight }, ..*choices };
-        let plan = Degree::plan(&rows, dims, &classes.colors, &squared, positive(base * relative * factor), &choices);
-        let mut missing = Vec::new();
-        let mut codes = vec![0; n * dims];
-        for (i, (row, out)) in plan.quantise(&rows, &classes.colors, &choices).into_iter().zip(codes.chunks_exact_mut(dims)).enumerate() {
-            match row.filter(|_| factor > 0.0) {
-                Some(row) => out.copy_from_slice(&row),
-                None => missing.push(i),
+    /// The integers of canonical Gaussians, as many as those that were planned for.
+    pub fn quantise<'a>(&'a self, gaussians: &HostGaussians, free: &[bool], classes: &'a Classes) -> Integers<'a> {
+        let (geometry, shapes, n) = (&self.geometry, &classes.shapes, gaussians.len());
+        let mut exact = vec![Vec::new(); 4];
+        let mut scales = vec![[0i32; 3]; n];
+        for (i, (codes, values)) in scales.iter_mut().zip(gaussians.log_scales.chunks_exact(3)).enumerate() {
+            let step = geometry.scale_step_of(shapes[i]);
+            let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
+            match found {
+                [Some(a), Some(b), Some(c)] if self.rounds[1] && values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
+                _ => exact[1].push(i),
             }
         }
-        exact.push(missing);
-        degrees.push(plan);
-        colors.push(codes);
+        let mut keys = vec![0u64; n];
+        for (i, (key, mean)) in keys.iter_mut().zip(gaussians.means.chunks_exact(3)).enumerate() {
+            match geometry.key(mean, geometry.position_shift(scales[i], shapes[i])).filter(|_| self.rounds[0]) {
+                Some(found) => *key = found,
+                None => exact[0].push(i),
+            }
+        }
+        let mut rotations = vec![Rotation::default(); n];
+        for (i, (codes, q)) in rotations.iter_mut().zip(gaussians.quaternions.chunks_exact(4)).enumerate() {
+            let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
+            let step = geometry.rotation(geometry.rotation_shift(scales[i], shapes[i]));
+            match Some(norm).filter(|norm| self.rounds[2] && NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i])) {
+                Some(found) => *codes = found,
+                None => exact[2].push(i),
+            }
+        }
+        let mut opacities = vec![0i32; n];
+        for (i, (out, &logit)) in opacities.iter_mut().zip(&gaussians.opacity_logits).enumerate() {
+            match code(companded(logit) / geometry.opacity_step_of(shapes[i])).filter(|_| self.rounds[3] && logit.abs() < LOGIT_LIMIT) {
+                Some(found) => *out = found,
+                None => exact[3].push(i),
+            }
+        }
+        let mut colors = Vec::new();
+        for (degree, plan) in self.degrees.iter().enumerate() {
+            let rounds = self.rounds[if degree == 0 { 4 } else { 5 }];
+            let choices = Choices { rate_weight: if degree == 0 { 0.0 } else { self.choices.rate_weight }, ..self.choices };
+            let mut missing = Vec::new();
+            let mut codes = vec![0; n * plan.dims];
+            let rows = plan.quantise(&coefficients(gaussians, degree), &classes.colors, &choices).into_iter().zip(codes.chunks_exact_mut(plan.dims));
+            for (i, (row, out)) in rows.enumerate() {
+                match row.filter(|_| rounds) {
+                    Some(row) => out.copy_from_slice(&row),
+                    None => missing.push(i),
+                }
+            }
+            exact.push(missing);
+            colors.push(codes);
+        }
+        Integers { plan: self, classes, scales, rotations, opacities, keys, colors, exact }
     }
-    Integers { geometry, degrees, classes: classes.clone(), scales, rotations, opacities, keys, colors, exact }
 }
 
 fn code(steps: f64) -> Option<i32> {

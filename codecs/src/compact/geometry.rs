@@ -102,11 +102,19 @@ impl Geometry {
             opacity_limit,
         })
     }
+    /// Step of a log-scale.
+    pub fn scale_step_of(&self, class: u8) -> f64 {
+        f64::from(self.scale_step) * f64::from(1u32 << class.min(self.scale_limit))
+    }
+    /// Step of a companded opacity.
+    pub fn opacity_step_of(&self, class: u8) -> f64 {
+        f64::from(self.opacity_step) * f64::from(1u32 << class.min(self.opacity_limit))
+    }
     pub fn scale(&self, code: i32, class: u8) -> f32 {
-        (f64::from(self.scale_origin) + f64::from(code) * f64::from(self.scale_step) * f64::from(1u32 << class.min(self.scale_limit))) as f32
+        (f64::from(self.scale_origin) + f64::from(code) * self.scale_step_of(class)) as f32
     }
     pub fn opacity(&self, code: i32, class: u8) -> f32 {
-        let value = f64::from(code) * f64::from(self.opacity_step) * f64::from(1u32 << class.min(self.opacity_limit));
+        let value = f64::from(code) * self.opacity_step_of(class);
         (if value < 0.0 { value } else { libm::expm1(value) } as f32).clamp(f32::MIN, f32::MAX)
     }
     /// Step of a rotation.
@@ -153,9 +161,12 @@ pub struct Rotation {
 impl Rotation {
     /// The codes of a quaternion (w,x,y,z) for a step; those of one that is `free` have a positive w, the largest component, and the norm 1.
     pub fn of(q: &[f32], norm: f64, step: f64, free: bool) -> Option<Self> {
+        // A quaternion and its negative are the same rotation; that of a free one has no sign.
+        let norm = if free && q[0] < 0.0 { -norm } else { norm };
         let unit: [f64; 4] = std::array::from_fn(|k| f64::from(q[k]) / norm);
         let index = if free { 0 } else { (0..4).max_by(|&a, &b| unit[a].abs().total_cmp(&unit[b].abs())).unwrap_or(0) };
-        let mut out = Self { form: 2 * index as u8 + u8::from(unit[index] < 0.0), norm: libm::round(libm::log(norm) / NORM_STEP) as i32, ..Default::default() };
+        let mut out =
+            Self { form: 2 * index as u8 + u8::from(unit[index] < 0.0), norm: libm::round(libm::log(norm.abs()) / NORM_STEP) as i32, ..Default::default() };
         for (code, k) in out.codes.iter_mut().zip((0..4).filter(|k| *k != index)) {
             let found = (unit[k] / step).round();
             *code = (found.abs() < CODE_LIMIT as f64).then_some(found as i32)?;

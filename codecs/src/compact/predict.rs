@@ -152,6 +152,23 @@ impl Linear {
         let round = |w: f64| libm::round(w * f64::from(1u32 << POINT)).clamp(-32767.0, 32767.0) as i16;
         Self { dims, weights: fitted.into_iter().flatten().map(round).collect() }
     }
+    /// Predictions of the rows `codes` `[N,dims]`, in the steps of each row. Lanes, in which coders start anew, are left out.
+    pub fn guesses(&self, codes: &[i32], known: &[Known]) -> Vec<f64> {
+        let (mut out, mut history) = (Vec::with_capacity(codes.len()), History::new());
+        for (i, (codes, known)) in codes.chunks_exact(self.dims).zip(known).enumerate() {
+            if i % super::blocks::ROWS == 0 {
+                history = History::new();
+            }
+            let mut row = [0; DIMS];
+            for (c, (&code, weights)) in codes.iter().zip(self.weights.chunks_exact(INPUTS)).enumerate() {
+                let sum: f64 = history.inputs(c, &row, known).into_iter().zip(weights).map(|(x, &w)| x as f64 * f64::from(w)).sum();
+                out.push(sum / f64::from(1u32 << POINT) / f64::from(1u32 << known.shift.min(15)));
+                row[c] = i64::from(code) << known.shift;
+            }
+            history.push(row);
+        }
+        out
+    }
     pub fn write(&self, out: &mut Vec<u8>) {
         self.weights.iter().for_each(|w| out.extend(w.to_le_bytes()));
     }

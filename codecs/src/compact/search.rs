@@ -2,6 +2,7 @@
 
 use super::importance::{Importance, budget};
 use super::settings::Settings;
+use super::tune::{self, Goal};
 use super::{Attempt, Job, allocate};
 use cc4dgs_format::{CodecContext, Error, Event, RenderModel, Result, TrainingViews, psnr_on_views};
 use std::ops::RangeInclusive;
@@ -116,6 +117,10 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
 pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Result<Attempt> {
     let start = estimate(settings.psnr_db, job.importance);
     let object = "codec compact";
+    if settings.finetune_wanted && settings.finetune > 0 && context.tuner.is_none() && !job.gaussians.is_empty() {
+        let problem = "fine-tuning needs the training views, and there are none";
+        return Err(Error::parameter("codec compact.finetune", problem, "Give the dataset with --scene, or leave it out"));
+    }
     let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !job.gaussians.is_empty());
     let allowance = match services {
         _ if settings.max_size_mb > 0.0 => Allowance::Bytes(1e6 * settings.max_size_mb),
@@ -142,6 +147,15 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         if first.allowed() && (worse || !found.allowed()) {
             found = first;
         }
+    }
+    let goal = match &allowance {
+        Allowance::Bytes(limit) => Goal::Bytes(*limit),
+        Allowance::Drop { limit, .. } => Goal::Drop(*limit),
+    };
+    if let Some(tuner) = context.tuner.filter(|_| settings.finetune > 0 && services.is_some())
+        && let Some(tuned) = tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)?
+    {
+        return Ok(tuned);
     }
     report(&found, &allowance, start, settings, context)?;
     Ok(found.attempt)
@@ -179,6 +193,6 @@ fn report(found: &Tried, allowance: &Allowance, start: f64, settings: &Settings,
     Ok(())
 }
 
-fn note(context: &CodecContext, message: String) {
+pub fn note(context: &CodecContext, message: String) {
     context.events.emit(&Event::Note { object: "codec compact".into(), message });
 }

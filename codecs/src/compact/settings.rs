@@ -6,6 +6,8 @@ use serde::Deserialize;
 pub(super) const SCHEMA: &str = "\
 max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. 0: psnr_db
 max_size_mb = 0.0        # the best file of at most so many MB; `compact:max-size=5MB` for short. 0: no limit
+finetune = 500           # with --scene: iterations in which Gaussians and deformer are trained further with rounded values, in larger steps; 0: none
+size_weight = 4.0        # how much bits count in fine-tuning; 0 trains for accuracy alone
 psnr_db = 50.0           # without --scene: estimated PSNR between images before and after; `compact:psnr=50dB` for short
 rate_weight = 0.0        # how much bits count when colour coefficients above degree 0 are rounded; 0 rounds to the nearest, which is best for images
 measured = true          # with --scene: weights from derivatives of renders; false: from sizes and opacities
@@ -24,6 +26,10 @@ pub struct Settings {
     pub max_drop_db: f64,
     /// Largest size in MB; 0 is no limit.
     pub max_size_mb: f64,
+    /// Iterations of fine-tuning.
+    pub finetune: usize,
+    /// How much bits count in fine-tuning.
+    pub size_weight: f64,
     /// Estimated PSNR between images before and after, in dB.
     pub psnr_db: f64,
     /// How much bits count when colour coefficients are rounded.
@@ -43,6 +49,9 @@ pub struct Settings {
     /// Whether the user chose the loss of PSNR, which needs a scene.
     #[serde(skip)]
     pub drop_wanted: bool,
+    /// Whether the user chose the iterations of fine-tuning, which need a scene.
+    #[serde(skip)]
+    pub finetune_wanted: bool,
 }
 
 impl Default for Settings {
@@ -50,6 +59,8 @@ impl Default for Settings {
         Self {
             max_drop_db: 0.05,
             max_size_mb: 0.0,
+            finetune: 500,
+            size_weight: 4.0,
             psnr_db: 50.0,
             rate_weight: 0.0,
             measured: true,
@@ -59,6 +70,7 @@ impl Default for Settings {
             transform: true,
             canonical: true,
             drop_wanted: false,
+            finetune_wanted: false,
         }
     }
 }
@@ -86,12 +98,15 @@ impl Settings {
             off.iter().for_each(|key| drop(section.insert((*key).into(), 0.0.into())));
         }
         config::merge(&mut section, table);
-        let settings = Self { drop_wanted, ..config::parse_section("codec compact", &section)? };
+        let finetune_wanted = table.contains_key("finetune");
+        let settings = Self { drop_wanted, finetune_wanted, ..config::parse_section("codec compact", &section)? };
         let bounds = [
             ("max_drop_db", settings.max_drop_db, 0.0..=20.0),
             ("max_size_mb", settings.max_size_mb, 0.0..=1e6),
             ("psnr_db", settings.psnr_db, 15.0..=90.0),
             ("rate_weight", settings.rate_weight, 0.0..=4.0),
+            ("finetune", settings.finetune as f64, 0.0..=1e6),
+            ("size_weight", settings.size_weight, 0.0..=100.0),
         ];
         match bounds.into_iter().find(|(_, value, range)| !range.contains(value)) {
             Some((name, value, range)) => {
@@ -119,6 +134,6 @@ mod tests {
         assert!(parse("max-dorp=1dB").unwrap_err().to_string().contains("max-drop"));
         let schema: toml::Table = SCHEMA.parse().unwrap();
         let (read, default) = (Settings::parse("", &schema).unwrap(), parse("").unwrap());
-        assert_eq!(format!("{:?}", Settings { drop_wanted: false, ..read }), format!("{default:?}"));
+        assert_eq!(format!("{:?}", Settings { drop_wanted: false, finetune_wanted: false, ..read }), format!("{default:?}"));
     }
 }

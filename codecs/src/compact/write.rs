@@ -64,14 +64,14 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
     let n = order.len();
     let sorted = gaussians.select(order);
     let pick = |values: &[u8]| order.iter().map(|&i| values[i]).collect::<Vec<u8>>();
-    let Classes { colors: classes, shapes, .. } = &of.classes;
+    let Classes { colors: classes, shapes, .. } = of.classes;
     let (classes, shapes) = (pick(classes), pick(shapes));
     let scales: Vec<[i32; 3]> = order.iter().map(|&i| of.scales[i]).collect();
     let moving: Vec<u8> = order.iter().map(|&i| motion.moving.as_ref().map_or(0, |m| u8::from(m[i]))).collect();
     let opacities: Vec<i32> = order.iter().map(|&i| of.opacities[i]).collect();
     let colors: Vec<Vec<i32>> =
-        of.degrees.iter().zip(&of.colors).map(|(d, codes)| order.iter().flat_map(|&i| &codes[i * d.dims..(i + 1) * d.dims]).copied().collect()).collect();
-    let geometry = &of.geometry;
+        of.plan.degrees.iter().zip(&of.colors).map(|(d, codes)| order.iter().flat_map(|&i| &codes[i * d.dims..(i + 1) * d.dims]).copied().collect()).collect();
+    let geometry = &of.plan.geometry;
     let rows = || classes.iter().zip(&shapes);
     let for_scales: Vec<Known> = rows().map(|(&c, &s)| known_classes(c, s, false, geometry.scale_limit)).collect();
     let for_opacities: Vec<Known> =
@@ -86,7 +86,7 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
     meta.extend([motion.free, u8::from(motion.moving.is_some())]);
     motion.levels.iter().for_each(|v| meta.extend(v.to_le_bytes()));
     [&scale_plan, &opacity_plan, &color_plan].iter().for_each(|plan| plan.write(&mut meta));
-    of.degrees.iter().for_each(|d| d.write(&mut meta));
+    of.plan.degrees.iter().for_each(|d| d.write(&mut meta));
 
     let small = |name: &str, values: &[u8]| blocks::encode(name, SMALL_CONTEXTS, n, |coder, range| code_small(coder, &mut values[range].to_vec()));
     let predicted = |name: &str, dims: usize, plan: &Linear, codes: &[i32], known: &[Known]| {
@@ -122,7 +122,7 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
     streams.push(predicted(OPACITIES, 1, &opacity_plan, &opacities, &for_opacities)?);
     streams.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
     let mut sizes = vec![0; n];
-    for (degree, (plan, codes)) in of.degrees.iter().zip(&colors).enumerate().skip(1) {
+    for (degree, (plan, codes)) in of.plan.degrees.iter().zip(&colors).enumerate().skip(1) {
         streams.push(blocks::encode(color_name(degree), colors::CONTEXTS, n, |coder, range| {
             let mut values = codes[range.start * plan.dims..range.end * plan.dims].to_vec();
             plan.code(coder, &mut values, &classes[range.clone()], &mut sizes[range].to_vec(), degree == 1)

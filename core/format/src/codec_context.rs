@@ -1,6 +1,6 @@
 //! The context of a codec: everything but the Gaussians or weights.
 
-use crate::{Camera, EventSink, HostGaussians, Image8, Limits, Result, Seed};
+use crate::{Camera, EventSink, HostGaussians, Image8, Limits, Result, Seed, TuneModel};
 
 /// The context of a codec. The optional parts are set if a model is encoded together with its scene. A codec may use them for a better result, but must work
 /// without them. They are never set for decoding.
@@ -17,6 +17,8 @@ pub struct CodecContext<'a> {
     pub renderer: Option<&'a dyn RenderModel>,
     /// The deformer of the model; `None` for static models.
     pub deformer: Option<&'a dyn EvaluateDeformer>,
+    /// Trains the model further with rounded values.
+    pub tuner: Option<&'a dyn TuneModel>,
     /// A Gaussian may move if and only if its dynamic score is above this: minus infinity if all may, infinity if none does. `None` if that is not known.
     pub dynamic_threshold: Option<f32>,
 }
@@ -24,7 +26,7 @@ pub struct CodecContext<'a> {
 impl<'a> CodecContext<'a> {
     /// A context without scene, renderer and deformer, as for decoding.
     pub fn new(seed: Seed, limits: Limits, events: &'a dyn EventSink) -> Self {
-        Self { seed, limits, events, views: None, renderer: None, deformer: None, dynamic_threshold: None }
+        Self { seed, limits, events, views: None, renderer: None, deformer: None, tuner: None, dynamic_threshold: None }
     }
 }
 

@@ -28,6 +28,7 @@ mod similarity;
 pub mod spz;
 pub mod storage;
 mod stored_model;
+mod tuning;
 mod weight_codec;
 
 pub use camera::Camera;
@@ -46,5 +47,6 @@ pub use rules::Rules;
 pub use seed::Seed;
 pub use similarity::Similarity;
 pub use stored_model::{MOVING, StoredModel, read_gaussians};
+pub use tuning::{Rounding, TuneModel, TunedModel, Tuning};
 pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin};
 pub use {inventory, serde, toml};

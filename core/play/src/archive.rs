@@ -11,7 +11,7 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
     AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
-    WeightArray, read_gaussians, split_kind,
+    TuneModel, WeightArray, read_gaussians, split_kind,
 };
 use serde::Serialize;
 use serde_json::Value;
@@ -32,6 +32,8 @@ pub struct ArchiveOptions<'a> {
     /// The scene that the model was trained on and the device that its field is on, for codecs that make use of the training views, of renders and of the
     /// field. Every codec works without.
     pub scene: Option<(&'a Scene, &'a Device)>,
+    /// Trains the model further with rounded values, for codecs that make use of it. The archive's deformer then has the trained weights.
+    pub tuner: Option<&'a dyn TuneModel>,
 }
 
 /// Weights of a field are stored in streams of these names, before the names that the weight codec gave them.
@@ -114,7 +116,7 @@ impl Model {
         self.archive_writer(options, registry, limits, events)?.to_bytes()
     }
     fn archive_writer(&self, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<ArchiveWriter> {
-        let ArchiveOptions { codec: spec, settings, field_weights, scene } = *options;
+        let ArchiveOptions { codec: spec, settings, field_weights, scene, tuner } = *options;
         let codec = registry.build_codec(spec, settings)?;
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
         let views = scene.map(|(scene, _)| SceneViews::new(scene));
@@ -123,6 +125,7 @@ impl Model {
             views: views.as_ref().map(|v| v as &dyn TrainingViews),
             renderer: services.as_ref().map(|s| s as &dyn cc4dgs_core::RenderModel),
             deformer: services.as_ref().filter(|_| self.field.is_some()).map(|s| s as &dyn cc4dgs_core::EvaluateDeformer),
+            tuner,
             dynamic_threshold: Some(match self.moving {
                 _ if self.field.as_ref().is_none_or(|f| f.field.is_static()) => f32::INFINITY,
                 Moving::Everything => f32::NEG_INFINITY,
@@ -131,24 +134,27 @@ impl Model {
             }),
             ..CodecContext::new(seed, *limits, events)
         };
-        let streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
         // A field that moves nothing is not stored.
         let movable = self.moving.rows(&self.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
         let field = self.field.as_ref().filter(|f| movable && !f.field.is_static());
+        if field.is_some_and(|f| f.name() == PLAYBACK_LAYER) {
+            let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
+            return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
+        }
+        let streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
         let mut field_streams = Vec::new();
         let deformer = match field {
             None => None,
             Some(f) => {
                 let (name, settings) = split_kind("deformer", &f.section)?;
-                if name == PLAYBACK_LAYER {
-                    let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
-                    return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
-                }
                 let version = registry.deformer(&name)?.info.version.to_string();
                 let chosen = FieldWeights::parse(field_weights, registry)?;
                 let weight_version = registry.weight_codec(&chosen.name)?.info.version.to_string();
                 let (seed, device) = (weight_seed(self.provenance.seed), scene.map(|(_, device)| device));
-                let (streams, weight_settings) = chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context(seed), registry)?;
+                let (streams, weight_settings) = match tuner.map(TuneModel::adopted).transpose()?.flatten() {
+                    Some((weights, settings)) => (registry.build_weight_codec(&chosen.name, &settings)?.encode(&weights, &context(seed))?, settings),
+                    None => chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context(seed), registry)?,
+                };
                 field_streams.extend(streams.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s }));
                 let weights = CodecEntry { name: chosen.name, version: weight_version, settings: weight_settings, ..Default::default() };
                 Some(DeformerEntry { name, version, settings, context: f.context.clone(), weights })
@@ -221,7 +227,7 @@ fn deviation(values: &[f32]) -> f64 {
     (values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n).sqrt()
 }
 
-fn weight_seed(root: u64) -> Seed {
+pub(crate) fn weight_seed(root: u64) -> Seed {
     Seed::root(root).child("weight-codec")
 }
 
@@ -268,7 +274,11 @@ fn check_version(object: &str, kind: &str, name: &str, stored: &str, known: &str
     Err(Error::unsupported(format!("{object}: {kind} {name}"), format!("version {stored} of its stored form"), format!("This program reads version {known}")))
 }
 
-fn weights_of(field: &dyn Deformer) -> Result<Vec<WeightArray>> {
+/// The weights of `field`.
+///
+/// # Errors
+/// [`Error::Backend`] if a tensor cannot be read.
+pub fn weights_of(field: &dyn Deformer) -> Result<Vec<WeightArray>> {
     field
         .parameters()
         .into_iter()
@@ -276,8 +286,11 @@ fn weights_of(field: &dyn Deformer) -> Result<Vec<WeightArray>> {
         .collect()
 }
 
-/// Replaces the weights of `field`, which must have arrays of the same names and shapes.
-pub(crate) fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
+/// Replaces the weights of `field`, which must have arrays of the same names and shapes. `object` names them in errors.
+///
+/// # Errors
+/// [`Error::Data`] if they do not.
+pub fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightArray>, device: &Device) -> Result<()> {
     let wanted: Vec<(String, Vec<usize>)> = field.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect();
     let found: Vec<(String, Vec<usize>)> = weights.iter().map(|w| (w.name.clone(), w.shape.clone())).collect();
     if wanted != found {

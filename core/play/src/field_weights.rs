@@ -1,10 +1,10 @@
 //! How the weights of a field are stored: `name`, `name:setting=value`, or `name:max-drop=0.01dB`, which searches the fewest bits of each array that keep the PSNR.
 
-use crate::archive::load_weights;
-use crate::codec_services::ModelServices;
+use crate::archive::{load_weights, weight_seed, weights_of};
+use crate::codec_services::{ModelServices, SceneViews};
 use crate::model::Model;
 use burn::tensor::Device;
-use cc4dgs_core::{CodecContext, Error, Event, Plugin, Registry, Result, Stream, WeightArray, config, psnr_on_views};
+use cc4dgs_core::{CodecContext, Error, Event, EventSink, Limits, Plugin, Registry, Result, Scene, Stream, WeightArray, config, psnr_on_views};
 use std::ops::RangeInclusive;
 
 /// Views on which the loss is measured.
@@ -92,6 +92,43 @@ impl FieldWeights {
         let message = format!("{} bits, PSNR {:.4} dB lower on {} training views ({limit} dB allowed)", text.join(", "), found.drop, views.len().min(VIEWS));
         context.events.emit(&if found.drop > limit { Event::Warning { object, message } } else { Event::Note { object, message } });
         Ok((found.streams, found.settings))
+    }
+}
+
+impl FieldWeights {
+    /// The settings of the weight codec for `model`, searched on the training views of `scene` where the loss was stated.
+    ///
+    /// # Errors
+    /// As [`Model::save_archive`].
+    pub fn settings_for(
+        &self,
+        model: &Model,
+        scene: &Scene,
+        registry: &Registry,
+        device: &Device,
+        limits: &Limits,
+        events: &dyn EventSink,
+    ) -> Result<toml::Table> {
+        let Some(of) = model.field.as_ref().filter(|_| self.max_drop_db.is_some()) else { return Ok(self.settings.clone()) };
+        let (views, seed) = (SceneViews::new(scene), weight_seed(model.provenance.seed));
+        let context = CodecContext { views: Some(&views), ..CodecContext::new(seed, *limits, events) };
+        Ok(self.encode(model, &weights_of(of.field.as_ref())?, Some(device), &context, registry)?.1)
+    }
+    /// `settings` with steps `factor` times as large, in quarters of a bit; unchanged where bits were not searched.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for a codec that is not in the registry.
+    pub fn coarser(&self, settings: &toml::Table, factor: f64, registry: &Registry) -> Result<toml::Table> {
+        let mut out = settings.clone();
+        if let Some(range) = searched_bits(&registry.weight_codec(&self.name)?.info)
+            && let Some(toml::Value::Array(bits)) = out.get_mut(ARRAY_BITS)
+        {
+            for bits in bits {
+                let fewer = bits.as_float().unwrap_or(*range.end() as f64) - factor.log2();
+                *bits = ((4.0 * fewer).round() / 4.0).clamp(*range.start() as f64, *range.end() as f64).into();
+            }
+        }
+        Ok(out)
     }
 }
 

@@ -19,7 +19,7 @@ pub mod prune;
 mod render;
 pub mod source;
 
-pub use archive::{ArchiveOptions, attribute_width};
+pub use archive::{ArchiveOptions, attribute_width, load_weights, weights_of};
 pub use cc4dgs_core::Moving;
 pub use model::Model;
 pub use moving::MovingRows;

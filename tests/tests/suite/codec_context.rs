@@ -95,7 +95,7 @@ fn a_codec_gets_views_renderer_and_field_only_with_a_scene() {
     let settings = toml::Table::new();
     let notes = |scene: Option<&cc4dgs_core::Scene>| -> Vec<String> {
         let events = Recorder::default();
-        let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", scene: scene.map(|s| (s, &device)) };
+        let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", scene: scene.map(|s| (s, &device)), tuner: None };
         model.save_archive(&folder.path().join("m.cc4d"), &options, &registry, &Limits::default(), &events).unwrap();
         events.events().into_iter().filter_map(|e| if let Event::Note { message, .. } = e { Some(message) } else { None }).collect()
     };
@@ -121,7 +121,7 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     let folder = tempfile::tempdir().unwrap();
     let (settings, path) = (toml::Table::new(), folder.path().join("m.cc4d"));
     let bits = |field_weights: &str| {
-        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights, scene: Some((&scene, &device)) };
+        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights, scene: Some((&scene, &device)), tuner: None };
         model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap();
         let entry = Archive::open(&path, &Limits::default()).unwrap().manifest().deformer.clone().unwrap().weights;
         Model::open(&path, &registry, &device, &Limits::default(), &Silent).unwrap();
@@ -135,10 +135,10 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     assert!(fewest.len() > 1 && fewest.iter().all(|b| *b == 3.0), "{fewest:?}");
     assert!(bits("compact:max-drop=0.000001dB").iter().sum::<f64>() > 4.0 * fewest.len() as f64);
     for bad in ["compact:max-drop=x", "fp16:max-drop=0.1dB", "compact:bits=17", "compact:bits", "nothing"] {
-        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: bad, scene: Some((&scene, &device)) };
+        let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: bad, scene: Some((&scene, &device)), tuner: None };
         assert!(model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).is_err(), "{bad}");
     }
-    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=0.1dB", scene: None };
+    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=0.1dB", scene: None, tuner: None };
     let refused = model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap_err();
     assert!(refused.to_string().contains("--scene"), "{refused}");
 }
@@ -170,7 +170,7 @@ fn attributes_of_gaussians_that_stand_still_are_not_stored_by_lossy_codecs() {
     let mut sizes = Vec::new();
     for codec in ["raw", "quantize"] {
         let path = folder.path().join(format!("{codec}.cc4d"));
-        let options = ArchiveOptions { codec, settings: &settings, field_weights: "fp32", scene: None };
+        let options = ArchiveOptions { codec, settings: &settings, field_weights: "fp32", scene: None, tuner: None };
         model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
         let stored: u64 = Archive::open(&path, &limits).unwrap().stream_sizes().iter().filter(|s| s.name.starts_with("extra.")).map(|s| s.decoded_bytes).sum();
         sizes.push(stored);

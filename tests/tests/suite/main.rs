@@ -29,3 +29,4 @@ mod readers;
 mod session;
 mod shortcuts;
 mod sort;
+mod tuning;

@@ -5,13 +5,16 @@ use crate::args::Compress;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
-use cc4dgs_core::{Event, EventSink, Result, config};
+use cc4dgs_core::{Event, EventSink, Result, TuneModel, config};
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::eval::SizeMb;
+use cc4dgs_train::train::{TuneJob, Tuner};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 /// What compression came to.
@@ -52,6 +55,8 @@ impl From<StreamInfo> for StreamSize {
     }
 }
 
+static NEVER: AtomicBool = AtomicBool::new(false);
+
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
@@ -59,12 +64,27 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     config::set_all(&mut settings, &args.sets)?;
     // An unknown name is refused before the scene is read.
     FieldWeights::parse(&args.field_weights, &context.registry)?;
-    let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?;
+    let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?.map(Arc::new);
+    let tuner = scene.as_ref().map(|scene| {
+        let (registry, limits, events) = (&context.registry, &context.limits, &events);
+        // Ctrl-C ends the process: the archive is not there before it is complete.
+        Tuner::new(TuneJob {
+            model: &loaded.model,
+            scene: scene.clone(),
+            field_weights: &args.field_weights,
+            registry,
+            device: &loaded.device,
+            limits,
+            events,
+            stop: &NEVER,
+        })
+    });
     let options = ArchiveOptions {
         codec: &args.codec,
         settings: &settings,
         field_weights: &args.field_weights,
-        scene: scene.as_ref().map(|scene| (scene, &loaded.device)),
+        scene: scene.as_deref().map(|scene| (scene, &loaded.device)),
+        tuner: tuner.as_ref().map(|tuner| tuner as &dyn TuneModel),
     };
     let report = compress(context, &loaded.model, &options, &args.out, &events)?;
     context.output.result(&report, || text(&report))

@@ -52,7 +52,7 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let events = context.listeners(Some((&args.out.join(EVENTS), true)))?;
     let archive = args.out.join("model.cc4d");
     let loaded = load_model(&args.out, &config.device, &context.registry, &context.limits, &events)?;
-    let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None };
+    let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None, tuner: None };
     let packed = compress::compress(context, &loaded.model, &options, &archive, &events)?;
 
     let scene = open_as_trained(scene_path, &loaded.model, &[], &context.registry, &context.limits)?;

@@ -29,7 +29,7 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let scene = open_as_trained(&args.scene, &loaded.model, &[], &context.registry, &context.limits)?;
     let found = prune(&mut loaded.model, &scene, args.max_drop, &context.registry, &loaded.device, &events)?;
-    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None };
+    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None, tuner: None };
     let written = compress(context, &loaded.model, &options, &args.out, &events)?;
     let report = Report { archive: args.out.clone(), bytes: written.bytes, seconds: began.elapsed().as_secs_f64(), prune: found };
     context.output.result(&report, || text(&report))

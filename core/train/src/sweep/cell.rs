@@ -48,8 +48,13 @@ impl<'a> Trained<'a> {
         let archive = folder.archive(&cell.id);
         let choice = &cell.choice;
         let began = Instant::now();
-        let options =
-            ArchiveOptions { codec: &choice.codec, settings: &choice.settings, field_weights: &choice.field_weights, scene: Some((&self.scene, &self.device)) };
+        let options = ArchiveOptions {
+            codec: &choice.codec,
+            settings: &choice.settings,
+            field_weights: &choice.field_weights,
+            scene: Some((&self.scene, &self.device)),
+            tuner: None,
+        };
         self.model.save_archive(&archive, &options, worker.registry, &self.config.limits, worker.events)?;
         let encode_seconds = began.elapsed().as_secs_f64();
         let began = Instant::now();

@@ -13,6 +13,7 @@ mod pyramid;
 mod record;
 mod recover;
 mod residual;
+mod rounded;
 mod sampler;
 mod score;
 mod settle;
@@ -20,6 +21,7 @@ mod smoothness;
 mod state;
 mod step;
 mod strain;
+mod tune;
 mod validate;
 mod watchdog;
 
@@ -29,6 +31,7 @@ pub use record::Record;
 pub(crate) use record::Score;
 pub use state::{Parts, TrainState};
 pub(crate) use strain::Neighbours;
+pub use tune::{TuneJob, Tuner};
 pub use watchdog::RateFactors;
 
 use crate::checkpoint;

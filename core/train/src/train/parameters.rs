@@ -18,10 +18,11 @@ pub(crate) fn track(parameters: Vec<&mut Parameter>) {
 }
 
 /// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `rate` gives the learning
-/// rate of a group.
+/// rate of a group. Where there are `exact` values, the tracked ones were rounded from them, and they are stepped instead.
 pub(crate) fn update(
     prefix: &str,
     mut parameters: Vec<&mut Parameter>,
+    exact: Vec<Tensor<1>>,
     groups: &[ParameterGroup],
     gradients: &Gradients,
     optimizer: &mut dyn Optimizer,
@@ -38,10 +39,12 @@ pub(crate) fn update(
             gradient_of[i] = gradient_of[i].take().map(|t| t * scale.clone());
         }
     }
+    let mut exact = exact.into_iter();
     for (parameter, gradient) in parameters.iter_mut().zip(gradient_of) {
         let device = parameter.value.device();
         // Moved out, so that the optimizer holds the only reference and works in place.
-        let value = std::mem::replace(&mut parameter.value, Tensor::empty([0], &device)).inner();
+        let tracked = std::mem::replace(&mut parameter.value, Tensor::empty([0], &device));
+        let value = exact.next().unwrap_or_else(|| tracked.inner());
         let Some(gradient) = gradient else {
             parameter.value = value;
             continue;

@@ -2,6 +2,7 @@
 
 use super::guard::Guard;
 use super::record::Record;
+use super::rounded::Rounded;
 use super::strain::Neighbours;
 use super::watchdog::RateFactors;
 use crate::gaussian_set::GaussianSet;
@@ -39,6 +40,8 @@ pub struct TrainState {
     pub rates: RateFactors,
     /// Its own numbers.
     pub record: Record,
+    /// What is drawn in place of the values, in fine-tuning.
+    pub(crate) rounded: Option<Rounded>,
     rows: Option<MovingRows>,
     pub(crate) neighbours: Option<Neighbours>,
 }
@@ -72,6 +75,7 @@ impl TrainState {
             smooth: false,
             rates: RateFactors::default(),
             record: Record::default(),
+            rounded: None,
             rows: None,
             neighbours: None,
         }

@@ -42,11 +42,14 @@ impl Context<'_> {
         self.decide_smoothness(state, schedule, moves)?;
 
         let neighbours = if moves && train.strain > 0.0 { state.current_neighbours(&self.device)? } else { None };
-        let leaves = state.set.leaves(|name| name != "dynamic_scores");
+        let leaves = state.rounded.as_ref().map_or(&state.set, |rounded| &rounded.gaussians).leaves(|name| name != "dynamic_scores");
         let gaussians = leaves.gaussians()?;
         let autodiff = gaussians.means.device();
         let spatial = match &mut state.deformer {
             Some(deformer) if moves => {
+                if let Some(rounded) = &mut state.rounded {
+                    rounded.exchange_weights(deformer.field.parameters_mut());
+                }
                 parameters::track(deformer.field.parameters_mut());
                 deformer.field.set_progress(progress as f32);
                 Some(spatial_pass(deformer, &leaves, &rows, log, n)?)
@@ -177,18 +180,25 @@ impl Context<'_> {
         let rates = state.rates.clone();
         let rate =
             |name: &str| rates.of_gaussians(name) * scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
-        self.step_gaussians(state, of_gaussians, |name| StepSettings { visible: visible.as_ref(), ..StepSettings::new(rate(name)) })?;
+        match state.rounded.take() {
+            Some(mut rounded) => {
+                rounded.step_gaussians(state, of_gaussians, visible.as_ref())?;
+                state.rounded = Some(rounded);
+            }
+            None => self.step_gaussians(state, of_gaussians, |name| StepSettings { visible: visible.as_ref(), ..StepSettings::new(rate(name)) })?,
+        }
         let of_group = |group: &ParameterGroup| scale * parameters::rate(group, progress, extent);
         let TrainState { deformer, appearance, optimizer, .. } = state;
         if let Some(deformer) = deformer.as_mut().filter(|_| deformed) {
             let groups = deformer.field.groups();
-            parameters::update("deformer/", deformer.field.parameters_mut(), &groups, &gradients, optimizer.as_mut(), |group| {
+            let exact = state.rounded.as_mut().map(|rounded| std::mem::take(&mut rounded.exact_weights)).unwrap_or_default();
+            parameters::update("deformer/", deformer.field.parameters_mut(), exact, &groups, &gradients, optimizer.as_mut(), |group| {
                 rates.of_deformer() * of_group(group)
             })?;
         }
         let groups = appearance.groups();
         let of_group = |group: &ParameterGroup| rates.of_appearance() * of_group(group);
-        parameters::update("appearance/", appearance.parameters_mut(), &groups, &gradients, optimizer.as_mut(), of_group)?;
+        parameters::update("appearance/", appearance.parameters_mut(), Vec::new(), &groups, &gradients, optimizer.as_mut(), of_group)?;
         log.step(self.job.events, schedule.iteration, state.set.len());
         Ok(None)
     }

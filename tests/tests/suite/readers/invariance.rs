@@ -196,7 +196,7 @@ fn trained(scene: Scene, seed: u64) -> (Model, f64) {
 fn exported(model: &Model) -> (DVec3, f64) {
     let (registry, limits, folder) = (Registry::collect().unwrap(), Limits::default(), tempfile::tempdir().unwrap());
     let path = folder.path().join("model.cc4d");
-    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None };
+    let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None, tuner: None };
     model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
     let model = Model::open(&path, &registry, &parse_device("flex").unwrap(), &limits, &Silent).unwrap();
     let mut gaussians = model.gaussians.clone();

@@ -1,0 +1,141 @@
+//! Fine-tuning: rounds of training with rounded values, each in the steps that the one before suggests.
+//!
+//! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The best
+//! file that keeps what is allowed is taken; if there is none, the one that needed no training.
+
+use super::encode::canonical;
+use super::rounding::Rounder;
+use super::search::note;
+use super::settings::Settings;
+use super::{Attempt, Job};
+use cc4dgs_format::{CodecContext, Result, TuneModel, TunedModel, Tuning};
+
+/// Rounds of training.
+const ROUNDS: usize = 5;
+/// Octaves by which the steps of the first round are larger than those that need no training, where a loss is allowed.
+const FIRST: f64 = 2.0;
+/// Share of the loss by rounding that training leaves, for the choice of the next steps.
+const REMAINS: f64 = 0.08;
+/// Octaves by which the steps of two rounds differ, at most.
+const FARTHEST: f64 = 1.0;
+/// The share of what is allowed that rounds aim at, and the last one.
+const AIM: f64 = 0.95;
+const LAST_AIM: f64 = 0.8;
+
+/// What is allowed.
+pub enum Goal {
+    /// A loss of PSNR in dB; the fewest bytes are best.
+    Drop(f64),
+    /// Bytes of Gaussians; the highest PSNR is best. Weights of the deformer keep their steps.
+    Bytes(f64),
+}
+
+/// What a round came to.
+struct Outcome {
+    attempt: Attempt,
+    model: TunedModel,
+    weight_steps: f64,
+    /// Bytes with the deformer's weights.
+    bytes: usize,
+    /// PSNR in dB below that of the model before compression.
+    drop: f64,
+}
+
+impl Goal {
+    fn is_better(&self, outcome: &Outcome, bytes: usize, drop: f64) -> bool {
+        match self {
+            Self::Drop(limit) => outcome.drop <= *limit && outcome.bytes < bytes,
+            Self::Bytes(limit) => outcome.attempt.bytes as f64 <= *limit && outcome.drop < drop,
+        }
+    }
+    /// By how many octaves the next steps should be larger; `aim` is a share.
+    fn octaves(&self, outcome: &Outcome, aim: f64, octaves: f64, bits_per_octave: f64) -> f64 {
+        let more = match self {
+            Self::Drop(limit) => {
+                // Rounding costs in proportion to squared steps; training gains what it gains.
+                let cost = REMAINS * limit * libm::exp2(2.0 * octaves);
+                0.5 * libm::log2(((cost + aim * limit - outcome.drop) / cost).max(1e-3))
+            }
+            Self::Bytes(limit) => 8.0 * (outcome.attempt.bytes as f64 - limit) / bits_per_octave,
+        };
+        more.clamp(-FARTHEST, FARTHEST)
+    }
+}
+
+/// The best streams that `goal` allows, after training; `found` are those that do without, which may be `allowed`. `None` if training finds nothing better.
+pub fn tune(
+    job: &Job,
+    found: &Attempt,
+    allowed: bool,
+    goal: &Goal,
+    settings: &Settings,
+    tuner: &dyn TuneModel,
+    context: &CodecContext,
+) -> Result<Option<Attempt>> {
+    let megabytes = |bytes: usize| bytes as f64 / 1e6;
+    let mut model = tuner.start(job.gaussians)?;
+    let before = tuner.psnr(&model.gaussians, &model.weights, None)?;
+    let untuned = before - tuner.psnr(&found.decoded, &model.weights, Some(1.0))?;
+    let first_bytes = found.bytes + tuner.weight_bytes(&model.weights, 1.0)?;
+    note(context, format!("without fine-tuning {:.4} MB with the deformer's weights, PSNR {untuned:.3} dB lower", megabytes(first_bytes)));
+    let mut best: Option<Outcome> = None;
+    let mut octaves = if matches!(goal, Goal::Drop(_)) { FIRST } else { 0.0 };
+    let shares = rounds(settings.finetune);
+    for (round, &iterations) in shares.iter().enumerate() {
+        let quality = found.quality * libm::exp2(octaves);
+        let weight_steps = if matches!(goal, Goal::Drop(_)) { libm::exp2(octaves) } else { 1.0 };
+        let planned = job.attempt_with(&model.gaussians, quality, &job.factors)?;
+        let doubled = job.attempt_with(&model.gaussians, 2.0 * quality, &job.factors)?;
+        let bits_per_octave = 8.0 * planned.bytes.saturating_sub(doubled.bytes).max(1) as f64;
+        let rounding = &Rounder { plan: &planned.plan, free: &job.free, classes: &job.classes };
+        let of = (shares[..round].iter().sum(), settings.finetune);
+        let seed = context.seed.child("fine-tuning").index(round as u64);
+        model = tuner.tune(&model, &Tuning { rounding, weight_steps, iterations, of, seed, size_weight: settings.size_weight, bits_per_octave })?;
+        model.gaussians = canonical(&model.gaussians, &job.free);
+        let (attempt, _) = job.attempt_planned(&model.gaussians, planned.plan, quality)?;
+        let drop = before - tuner.psnr(&attempt.decoded, &model.weights, Some(weight_steps))?;
+        let bytes = attempt.bytes + tuner.weight_bytes(&model.weights, weight_steps)?;
+        let (number, steps, gaussians) = (round + 1, libm::exp2(octaves), megabytes(attempt.bytes));
+        note(
+            context,
+            format!(
+                "fine-tuning {number}: steps {steps:.2} times larger, {gaussians:.4} MB of Gaussians, {:.4} MB in all, PSNR {drop:.3} dB lower",
+                megabytes(bytes)
+            ),
+        );
+        let outcome = Outcome { attempt, model: model.clone(), weight_steps, bytes, drop };
+        let aim = if round + 2 == shares.len() { LAST_AIM } else { AIM };
+        octaves += goal.octaves(&outcome, aim, octaves, bits_per_octave);
+        let (bytes, drop) = best.as_ref().map_or(if allowed { (first_bytes, untuned) } else { (usize::MAX, f64::INFINITY) }, |b| (b.bytes, b.drop));
+        if goal.is_better(&outcome, bytes, drop) {
+            best = Some(outcome);
+        }
+    }
+    let Some(best) = best else {
+        note(context, "fine-tuning found nothing better".into());
+        return Ok(None);
+    };
+    note(context, format!("fine-tuned: {:.4} MB with the deformer's weights, PSNR {:.3} dB lower", megabytes(best.bytes), best.drop));
+    tuner.adopt(best.model.weights, best.weight_steps);
+    Ok(Some(best.attempt))
+}
+
+/// Iterations of each round, which add up to `iterations`.
+fn rounds(iterations: usize) -> Vec<usize> {
+    let count = ROUNDS.min(iterations);
+    (0..count).map(|k| (k + 1) * iterations / count - k * iterations / count).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rounds_add_up() {
+        for iterations in [0, 1, 4, 5, 999, 1000] {
+            let rounds = rounds(iterations);
+            assert_eq!(rounds.iter().sum::<usize>(), iterations);
+            assert!(rounds.iter().all(|r| *r > 0) && rounds.len() <= ROUNDS, "{rounds:?}");
+        }
+    }
+}

@@ -1,0 +1,314 @@
+//! Fine-tuning: a trained model is trained further while its values are rounded as a codec will store them.
+
+use super::log::Log;
+use super::losses::LossTerms;
+use super::pyramid::Pyramid;
+use super::rounded::Rounded;
+use super::sampler::Sampler;
+use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
+use crate::config::RunConfig;
+use crate::gaussian_set::GaussianSet;
+use crate::sample::spread;
+use crate::schedule::StageLengths;
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{
+    AppearanceContext, CodecContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, Stream, TuneModel,
+    TunedModel, Tuning, WeightArray, WeightCodec, config,
+};
+use cc4dgs_play::field_weights::FieldWeights;
+use cc4dgs_play::model::ModelDeformer;
+use cc4dgs_play::{Model, load_weights, weights_of};
+use std::cell::{OnceCell, RefCell};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// The most views on which PSNR is measured, and those on which the loss by rounding is.
+const JUDGES: usize = 48;
+const PROBES: usize = 8;
+/// Views per iteration. With one, training loses more than rounding.
+const BATCH: usize = 4;
+/// Largest learning rate of Gaussians, in quantisation steps, of a training of so many iterations: larger ones make values noisy, which costs bytes. Shorter
+/// trainings have larger ones, so that a random walk goes as far.
+const RATE: f64 = 0.01;
+const RATE_ITERATIONS: f64 = 200.0;
+/// Largest learning rate of the deformer's weights as a share of that in the middle of a main stage; ten times as much costs 0.4 dB.
+const DEFORMER_RATE: f64 = 0.1;
+/// Share of the iterations over which the learning rate rises.
+const WARMUP: f64 = 0.1;
+/// Iterations for which derivatives of the size are kept: they change slowly.
+const SIZE_EVERY: usize = 8;
+/// Iterations between two looks for values that are not finite, and between two events.
+const CHECK_EVERY: usize = 25;
+
+/// What a [`Tuner`] works on.
+pub struct TuneJob<'a> {
+    /// The model.
+    pub model: &'a Model,
+    /// The scene that it was trained on.
+    pub scene: Arc<Scene>,
+    /// How the deformer's weights are stored: see [`FieldWeights::parse`].
+    pub field_weights: &'a str,
+    /// Where plug-ins are found.
+    pub registry: &'a Registry,
+    /// The device of the model's deformer.
+    pub device: &'a Device,
+    /// What readers may believe.
+    pub limits: &'a Limits,
+    /// Where events go.
+    pub events: &'a dyn EventSink,
+    /// Set to stop.
+    pub stop: &'a AtomicBool,
+}
+
+/// Trains a model with rounded values, with the loss and the optimizer that it was trained with. Density control, appearance, smoothness and noise are left
+/// out.
+///
+/// Nothing is looked at before a codec asks for it.
+pub struct Tuner<'a> {
+    job: TuneJob<'a>,
+    choices: OnceCell<Choices>,
+    adopted: RefCell<Option<(Vec<WeightArray>, f64)>>,
+}
+
+/// What follows from the model.
+struct Choices {
+    config: RunConfig,
+    field_weights: FieldWeights,
+    /// Settings of the weight codec without training.
+    weight_settings: toml::Table,
+}
+
+impl<'a> Tuner<'a> {
+    /// A tuner of `job.model`.
+    pub fn new(job: TuneJob<'a>) -> Self {
+        Self { job, choices: OnceCell::new(), adopted: RefCell::default() }
+    }
+    fn choices(&self) -> Result<&Choices> {
+        if let Some(known) = self.choices.get() {
+            return Ok(known);
+        }
+        let TuneJob { model, scene, field_weights, registry, device, limits, events, .. } = &self.job;
+        if scene.split(Split::Train).is_empty() {
+            return Err(Error::parameter("fine-tuning", format!("{} has no training views", scene.name), "Give the scene that the model was trained on"));
+        }
+        let none = || toml::Table::from_iter([("kind".into(), "none".into())]);
+        let mut config: RunConfig = config::parse_section("configuration of the model", &model.provenance.config)?;
+        (config.render, config.rasterizer) = (model.render.clone(), model.rasterizer.clone());
+        (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
+        (config.density, config.appearance, config.train.image_growth) = (none(), none(), 0.0);
+        (config.train.time_noise, config.train.lambda_r) = (0.0, 0.0);
+        config.validate()?;
+        let field_weights = FieldWeights::parse(field_weights, registry)?;
+        let weight_settings = match self.moving_field() {
+            Some(_) => field_weights.settings_for(model, scene, registry, device, limits, *events)?,
+            None => field_weights.settings.clone(),
+        };
+        Ok(self.choices.get_or_init(|| Choices { config, field_weights, weight_settings }))
+    }
+    /// The deformer, unless nothing moves: then it is not stored.
+    fn moving_field(&self) -> Option<&ModelDeformer> {
+        let model = self.job.model;
+        let movable = model.moving.rows(&model.gaussians.dynamic_scores).is_none_or(|rows| !rows.is_empty());
+        model.field.as_ref().filter(|f| movable && !f.field.is_static())
+    }
+    /// Calls `work` with the parts of a training and the state of `model`.
+    fn with_state<T>(&self, model: &TunedModel, seed: Seed, work: impl FnOnce(&Context, &mut TrainState) -> Result<T>) -> Result<T> {
+        let TuneJob { scene, registry, device, events, stop, .. } = &self.job;
+        let config = &self.choices()?.config;
+        let training_camera = training_cameras(scene);
+        let parts = Parts {
+            appearance: registry.build_appearance(&config.appearance, &AppearanceContext { cameras: training_camera.len(), seed }, device)?,
+            density: registry.build_density(&config.density)?,
+            optimizer: registry.build_optimizer(&config.optimizer)?,
+        };
+        let job = TrainJob { config, scene: scene.clone(), out: None, resume: false, registry, events: *events, stop, observer: None };
+        let context = Context {
+            job: &job,
+            pyramid: Pyramid::new(scene, config)?,
+            lengths: StageLengths::new(&config.train, false, scene.extent()),
+            rasterizer: registry.build_rasterizer(&config.rasterizer)?,
+            losses: LossTerms::build(registry, &config.loss)?,
+            score_loss: LossTerms::build(registry, std::slice::from_ref(&config.score_loss))?,
+            device: (*device).clone(),
+            seed,
+            masks: Vec::new(),
+            training_camera,
+            checkpoint: None,
+        };
+        let of = self.job.model;
+        let mut state = TrainState::new(GaussianSet::new(&model.gaussians, device), of.moving, of.normalisation, parts);
+        if let Some(of) = self.moving_field() {
+            let mut field = registry.build_deformer(&of.section, &of.context, device)?;
+            load_weights("tuned weights", field.as_mut(), model.weights.clone(), device)?;
+            state.deformer = Some(ModelDeformer { field, section: of.section.clone(), context: of.context.clone() });
+        }
+        state.stage = Stage::Main;
+        work(&context, &mut state)
+    }
+    /// The settings of the weight codec with steps `factor` times as large.
+    fn weight_settings(&self, factor: f64) -> Result<toml::Table> {
+        let Choices { field_weights, weight_settings, .. } = self.choices()?;
+        field_weights.coarser(weight_settings, factor, self.job.registry)
+    }
+    /// The streams of `weights`.
+    fn encoded_weights(&self, weights: &[WeightArray], settings: &toml::Table) -> Result<(Box<dyn WeightCodec>, Vec<Stream>)> {
+        let codec = self.job.registry.build_weight_codec(&self.choices()?.field_weights.name, settings)?;
+        let streams = codec.encode(weights, &self.codec_context())?;
+        Ok((codec, streams))
+    }
+    fn codec_context(&self) -> CodecContext<'_> {
+        CodecContext::new(Seed::root(self.job.model.provenance.seed).child("weight-codec"), *self.job.limits, self.job.events)
+    }
+    /// `weights` as they will be decoded.
+    fn rounded_weights(&self, weights: &[WeightArray], settings: &toml::Table) -> Result<Vec<WeightArray>> {
+        if weights.is_empty() {
+            return Ok(Vec::new());
+        }
+        let (codec, streams) = self.encoded_weights(weights, settings)?;
+        codec.decode(&streams, &self.codec_context())
+    }
+    /// Where all iterations stand: in the middle of a main stage.
+    fn schedule(&self, sh_degree: usize) -> Schedule {
+        Schedule { extent: self.job.scene.extent(), sh_degree, ..Schedule::main(2) }
+    }
+    /// Mean absolute error of `gaussians`, as they are, on a few training views.
+    fn mean_error(&self, context: &Context, state: &mut TrainState, gaussians: &HostGaussians) -> Result<f64> {
+        let scene = &self.job.scene;
+        let views = spread(&scene.split(Split::Train), PROBES);
+        let set = GaussianSet::new(gaussians, self.job.device).gaussians()?;
+        let (background, requests) = (self.choices()?.config.background()?, views.iter().map(|&v| (v, scene.views[v].time_norm)).collect::<Vec<_>>());
+        let mut sum = 0.0;
+        context.draw(state, &set, &requests, gaussians.sh_degree, |index, image| {
+            let target = context.rasterizer.upload(&scene.frame(views[index])?, background, self.job.device);
+            sum += f64::from(to_vec((image - target).abs().mean(), "mean error")?.first().copied().unwrap_or(f32::NAN));
+            Ok(())
+        })?;
+        Ok(sum / views.len().max(1) as f64)
+    }
+    /// What the next step draws, given the state's values.
+    fn round(&self, state: &TrainState, tuning: &Tuning, weight_settings: &toml::Table, fixed: &Fixed) -> Result<Rounded> {
+        let device = self.job.device;
+        let host = state.set.host_gaussians()?;
+        let weights = match &state.deformer {
+            Some(deformer) => self.rounded_weights(&weights_of(deformer.field.as_ref())?, weight_settings)?,
+            None => Vec::new(),
+        };
+        let upload = |w: WeightArray| {
+            let count = w.values.len();
+            Tensor::<1>::from_data(TensorData::new(w.values, [count]), device)
+        };
+        Ok(Rounded {
+            gaussians: GaussianSet::new(&tuning.rounding.round(&host)?, device),
+            steps: fixed.steps.clone(),
+            size: fixed.size.clone(),
+            rate: fixed.rate,
+            weights: weights.into_iter().map(upload).collect(),
+            exact_weights: Vec::new(),
+        })
+    }
+}
+
+/// What changes slowly.
+struct Fixed {
+    steps: BTreeMap<String, Tensor<2>>,
+    size: BTreeMap<String, Tensor<2>>,
+    rate: f64,
+}
+
+/// The columns of `values` as tensors by name.
+fn columns(values: &HostGaussians, device: &Device) -> BTreeMap<String, Tensor<2>> {
+    GaussianSet::new(values, device).iter().map(|(name, values)| (name.to_string(), values.clone())).collect()
+}
+
+/// Share of the largest learning rate after the share `done` of the iterations: it rises linearly, then falls as a cosine.
+fn rate_at(done: f64) -> f64 {
+    if done < WARMUP { done / WARMUP } else { 0.5 + 0.5 * (std::f64::consts::PI * (done - WARMUP) / (1.0 - WARMUP)).cos() }
+}
+
+impl TuneModel for Tuner<'_> {
+    fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
+        let weights = self.moving_field().map(|f| weights_of(f.field.as_ref())).transpose()?.unwrap_or_default();
+        Ok(TunedModel { gaussians: gaussians.clone(), weights })
+    }
+    fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel> {
+        let (device, scene) = (self.job.device, &self.job.scene);
+        let weight_settings = self.weight_settings(tuning.weight_steps)?;
+        self.with_state(from, tuning.seed, |context, state| {
+            let mut fixed = Fixed { steps: columns(&tuning.rounding.steps(&from.gaussians)?, device), size: BTreeMap::new(), rate: 0.0 };
+            let lost = self.mean_error(context, state, &tuning.rounding.round(&from.gaussians)?)? - self.mean_error(context, state, &from.gaussians)?;
+            // Where all steps are as large as they should be, an octave more of them costs as much as it saves; a step's error adds in proportion to its square.
+            let per_bit = tuning.size_weight * 2.0 * std::f64::consts::LN_2 * lost.max(0.0) / tuning.bits_per_octave;
+            let mut sampler = Sampler::new(scene.split(Split::Train), tuning.seed.child("views"), BATCH);
+            // Nothing is logged.
+            let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);
+            for iteration in 1..=tuning.iterations {
+                if self.job.stop.load(Ordering::Relaxed) {
+                    return Err(Error::Interrupted("in fine-tuning; nothing was written".into()));
+                }
+                if per_bit > 0.0 && (iteration - 1).is_multiple_of(SIZE_EVERY) {
+                    let slopes = columns(&tuning.rounding.bit_slopes(&state.set.host_gaussians()?)?, device);
+                    let in_steps = |(name, slopes): (String, Tensor<2>)| Some((name.clone(), slopes * fixed.steps.get(&name)?.clone().mul_scalar(per_bit)));
+                    fixed.size = slopes.into_iter().filter_map(in_steps).collect();
+                }
+                let share = rate_at((iteration as f64 - 0.5) / tuning.iterations as f64);
+                fixed.rate = RATE * (RATE_ITERATIONS / tuning.iterations as f64).sqrt() * share;
+                state.rounded = Some(self.round(state, tuning, &weight_settings, &fixed)?);
+                state.rates = RateFactors(BTreeMap::from([("deformer".into(), DEFORMER_RATE * share)]));
+                let schedule = self.schedule(from.gaussians.sh_degree);
+                let check = iteration.is_multiple_of(CHECK_EVERY);
+                if let Some(trouble) = context.photometric_step(&schedule, state, &sampler.batch(iteration - 1), check, &mut log)? {
+                    return Err(Error::backend("fine-tuning", format!("{} is not finite", trouble.what), "Compress with finetune=0"));
+                }
+                if check || iteration == tuning.iterations {
+                    self.job.events.emit(&Event::Progress { task: "fine-tuning".into(), done: (tuning.of.0 + iteration) as u64, total: tuning.of.1 as u64 });
+                }
+            }
+            let mut gaussians = from.gaussians.clone();
+            let found = state.set.host_gaussians()?;
+            for ((_, _, to), (_, _, values)) in gaussians.columns_mut().into_iter().zip(found.columns()) {
+                to.clone_from(values);
+            }
+            gaussians.validate("Gaussians of fine-tuning", self.job.limits)?;
+            let weights = state.deformer.as_ref().map(|d| weights_of(d.field.as_ref())).transpose()?.unwrap_or_default();
+            Ok(TunedModel { gaussians, weights })
+        })
+    }
+    fn psnr(&self, gaussians: &HostGaussians, weights: &[WeightArray], weight_steps: Option<f64>) -> Result<f64> {
+        let weights = match weight_steps {
+            Some(factor) => self.rounded_weights(weights, &self.weight_settings(factor)?)?,
+            None => weights.to_vec(),
+        };
+        let scene = &self.job.scene;
+        let validation = scene.split(Split::Validation);
+        let views = spread(&if validation.is_empty() { scene.split(Split::Train) } else { validation }, JUDGES);
+        let model = TunedModel { gaussians: gaussians.clone(), weights };
+        let mut sum = 0.0;
+        self.with_state(&model, Seed::root(0), |context, state| {
+            let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
+            let (set, background) = (state.set.gaussians()?, self.choices()?.config.background()?);
+            context.draw(state, &set, &requests, gaussians.sh_degree, |index, image| {
+                let target = context.rasterizer.upload(&scene.frame(views[index])?, background, self.job.device);
+                let difference = image.clamp(0.0, 1.0) - target;
+                let error = to_vec((difference.clone() * difference).mean(), "mean squared error")?.first().copied().unwrap_or(f32::NAN);
+                sum -= 10.0 * f64::from(error.max(1e-12)).log10();
+                Ok(())
+            })
+        })?;
+        Ok(sum / views.len().max(1) as f64)
+    }
+    fn weight_bytes(&self, weights: &[WeightArray], weight_steps: f64) -> Result<usize> {
+        if weights.is_empty() {
+            return Ok(0);
+        }
+        let (_, streams) = self.encoded_weights(weights, &self.weight_settings(weight_steps)?)?;
+        Ok(streams.iter().map(|s| s.bytes.len()).sum())
+    }
+    fn adopt(&self, weights: Vec<WeightArray>, weight_steps: f64) {
+        *self.adopted.borrow_mut() = Some((weights, weight_steps));
+    }
+    fn adopted(&self) -> Result<Option<(Vec<WeightArray>, toml::Table)>> {
+        self.adopted.borrow().as_ref().map(|(weights, factor)| Ok((weights.clone(), self.weight_settings(*factor)?))).transpose()
+    }
+}

@@ -1,0 +1,108 @@
+//! Fine-tuning through quantisation: smaller files at the same loss, reproducible, and sound for models of every kind.
+
+use burn::tensor::Device;
+use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
+use cc4dgs_core::archive::Archive;
+use cc4dgs_core::{Error, Limits, Registry, Result, Scene, Silent, TuneModel};
+use cc4dgs_play::{ArchiveOptions, Model, Moving};
+use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::data;
+use cc4dgs_train::train::{TrainJob, TuneJob, Tuner, train};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+const FIELD_WEIGHTS: &str = "compact:max-drop=0.05dB";
+const LIMIT_DB: f64 = 0.2;
+const ITERATIONS: usize = 150;
+
+/// A scene and what is needed to train and store models of it.
+struct Bench {
+    registry: Registry,
+    limits: Limits,
+    device: Device,
+    scene: Arc<Scene>,
+    never: AtomicBool,
+}
+
+impl Bench {
+    fn new(config: &RunConfig) -> Self {
+        let (registry, limits) = (Registry::collect().unwrap(), Limits::default());
+        let scene = Arc::new(data::open(Path::new("procedural"), &config.scene, &registry, &limits).unwrap());
+        Self { registry, limits, device: Device::flex(), scene, never: AtomicBool::new(false) }
+    }
+    fn train(&self, config: &RunConfig) -> Model {
+        let Self { registry, scene, never, .. } = self;
+        train(&TrainJob { config, scene: scene.clone(), out: None, resume: false, registry, events: &Silent, stop: never, observer: None }).unwrap().0
+    }
+    fn tuner<'a>(&'a self, model: &'a Model, stop: &'a AtomicBool) -> Tuner<'a> {
+        let Self { registry, limits, device, scene, .. } = self;
+        Tuner::new(TuneJob { model, scene: scene.clone(), field_weights: FIELD_WEIGHTS, registry, device, limits, events: &Silent, stop })
+    }
+    fn archive(&self, model: &Model, finetune: usize, tuner: Option<&dyn TuneModel>) -> Result<Vec<u8>> {
+        let settings: toml::Table = format!("finetune = {finetune}").parse().unwrap();
+        let codec = format!("compact:max-drop={LIMIT_DB}dB");
+        let options = ArchiveOptions { codec: &codec, settings: &settings, field_weights: FIELD_WEIGHTS, scene: Some((&self.scene, &self.device)), tuner };
+        model.to_archive(&options, &self.registry, &self.limits, &Silent)
+    }
+    fn tuned(&self, model: &Model, finetune: usize) -> Result<Vec<u8>> {
+        self.archive(model, finetune, Some(&self.tuner(model, &self.never)))
+    }
+    fn open(&self, bytes: &[u8]) -> Model {
+        let archive = Archive::from_bytes("archive", bytes.to_vec(), &self.limits).unwrap();
+        Model::of_archive("archive", &archive, &self.registry, &self.device, &self.limits, &Silent).unwrap()
+    }
+    /// PSNR in dB on training views.
+    fn psnr(&self, model: &Model) -> f64 {
+        let tuner = self.tuner(model, &self.never);
+        let start = tuner.start(&model.gaussians).unwrap();
+        tuner.psnr(&start.gaussians, &start.weights, None).unwrap()
+    }
+}
+
+fn tiny(extra: &[&str]) -> RunConfig {
+    let sets = ["scene.width=48", "scene.height=48", "train.iterations=160", "init.count=400", "train.validation=0"];
+    RunConfig::resolve(Some("demo"), None, &sets.iter().chain(extra).map(ToString::to_string).collect::<Vec<_>>()).unwrap()
+}
+
+#[test]
+fn fine_tuning_saves_bytes_at_the_same_loss() {
+    let config = tiny(&[]);
+    let bench = Bench::new(&config);
+    let model = bench.train(&config);
+    let plain = bench.archive(&model, 0, None).unwrap();
+    let tuned = bench.tuned(&model, ITERATIONS).unwrap();
+    let before = bench.psnr(&model);
+    let drops = [&plain, &tuned].map(|bytes| before - bench.psnr(&bench.open(bytes)));
+    println!("{} bytes with a loss of {:.3} dB, {} with {:.3} dB after fine-tuning", plain.len(), drops[0], tuned.len(), drops[1]);
+    assert!(drops[1] <= LIMIT_DB + 1e-3, "{drops:?}");
+    assert!(100 * tuned.len() < 97 * plain.len(), "{} bytes before, {} after", plain.len(), tuned.len());
+    assert!(tuned == bench.tuned(&model, ITERATIONS).unwrap(), "two compressions of one model differ");
+    // Without iterations the tuner changes nothing.
+    assert!(plain == bench.tuned(&model, 0).unwrap());
+
+    let stopped = AtomicBool::new(true);
+    let error = bench.archive(&model, ITERATIONS, Some(&bench.tuner(&model, &stopped))).unwrap_err();
+    assert!(matches!(error, Error::Interrupted(_)), "{error}");
+}
+
+#[test]
+fn models_of_every_kind_are_tuned_or_left_alone() {
+    let config = tiny(&["train.iterations=40", "train.dynamic=all"]);
+    let bench = Bench::new(&config);
+    let moving = bench.train(&config);
+    let mut cases = Vec::new();
+    for count in [0, 1, moving.gaussians.len()] {
+        let mut model = bench.open(&bench.archive(&moving, 0, None).unwrap());
+        model.gaussians = model.gaussians.select(&(0..count).collect::<Vec<usize>>());
+        cases.push((format!("{count} Gaussians"), model));
+    }
+    let mut fixed = bench.open(&bench.archive(&moving, 0, None).unwrap());
+    (fixed.field, fixed.moving, fixed.provenance) = (None, Moving::Nothing, Default::default());
+    cases.push(("static, without a configuration".into(), fixed));
+    for (name, model) in cases {
+        let count = model.gaussians.len();
+        let bytes = bench.tuned(&model, 7).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!(bench.open(&bytes).gaussians.len(), count, "{name}");
+    }
+}
