@@ -21,7 +21,7 @@ const LEAST_GAUSSIANS: f64 = 4000.0;
 const PER_THREAD_MINUTE: f64 = 4000.0;
 /// What that is where all of them move.
 const ALL_MOVE: f64 = 0.3;
-/// Minutes of one thread below which the finest voxels are left out: decoding their vertices is most of a step.
+/// Minutes of one thread below which the finest voxels are left out, whose vertices are most of a step, and the coefficient network is half as wide.
 const SHORT: f64 = 16.0;
 /// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
 const EXPOSURE: f32 = 0.09;
@@ -155,6 +155,7 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
         let resolutions: &[i64] = if short { &[8, 16, 32] } else { &[8, 16, 32, 64] };
         settings.push(("deformer.resolutions", Value::Array(resolutions.iter().map(|&r| Value::Integer(r)).collect())));
         settings.push(("deformer.hashes", Value::Integer(if short { 32 } else { 64 })));
+        settings.push(("deformer.width", Value::Integer(if short { 64 } else { 128 })));
     }
     choice(settings, format!("{} frames; the most accurate field for its time", facts.frames))
 }
@@ -304,7 +305,9 @@ mod tests {
         let stated = choose(&facts(Arrangement::Dome), MACHINE, 5.0, false);
         assert!(value(&stated, "deformer.kind") == Some("cdf-basis".into()) && value(&stated, "train.key_frames").is_none());
         let long = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
-        assert_eq!(value(&long, "deformer.kind"), Some("cdf-basis".into()));
+        assert_eq!((value(&long, "deformer.kind"), value(&long, "deformer.width")), (Some("cdf-basis".into()), Some(64.into())));
+        let patient = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 25.0, true);
+        assert_eq!(value(&patient, "deformer.width"), Some(128.into()));
         assert_eq!(value(&dome, "train.coarse_frames"), Some("first".into()));
         assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none());
         assert_eq!(value(&dome, "render.background"), Some(vec![0.4, 0.5, 0.6].into()));
