@@ -49,6 +49,8 @@ pub struct TrainConfig {
     pub image_growth: f64,
     /// Standard deviation, in frames, of noise on the times the field is asked about; it falls to zero by half of the main stage (Deformable 3DGS: 0.1).
     pub time_noise: f64,
+    /// Share of the Gaussians that a view is drawn without at the end of the coarse and the main stage, from 0 at their start (DropGaussian, Park et al. 2025: 0.2).
+    pub dropout: f64,
     /// Highest spherical-harmonics degree.
     pub sh_degree: usize,
     /// Reference iterations between two degrees.
@@ -103,6 +105,7 @@ impl Default for TrainConfig {
             time_ramp: 0.0,
             image_growth: 0.0,
             time_noise: 0.0,
+            dropout: 0.0,
             sh_degree: 3,
             sh_interval: 1000,
             lambda_r: 0.05,
@@ -211,6 +214,9 @@ impl TrainConfig {
         }
         if !(0.0..=10.0).contains(&t.time_noise) {
             return bad("time_noise", format!("{} frames", t.time_noise), "Give 0 to 10 frames");
+        }
+        if !(0.0..=0.9).contains(&t.dropout) {
+            return bad("dropout", format!("{} is not in 0..0.9", t.dropout), "It is a share of the Gaussians; 0.2 is usual");
         }
         Ok(())
     }

@@ -2,6 +2,7 @@
 //! appearance model and optimizer.
 
 mod density;
+mod dropout;
 mod guard;
 mod key_frames;
 mod log;

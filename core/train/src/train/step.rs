@@ -1,5 +1,6 @@
 //! One photometric step: deform, render, loss, backward, optimizer. Shared by the coarse and the main stage.
 
+use super::dropout;
 use super::log::Log;
 use super::smoothness::{flicker, smoothness};
 use super::watchdog::{Trouble, is_finite};
@@ -97,6 +98,10 @@ impl Context<'_> {
                 _ => gaussians.clone(),
             };
             let mut splats = Splats::from_gaussians(&drawn, schedule.sh_degree);
+            if train.dropout > 0.0 {
+                let seed = self.seed.child("dropout").index(schedule.iteration as u64).index(view as u64);
+                splats.opacities = dropout::dropped(splats.opacities, train.dropout * progress, seed);
+            }
             let probe = |wanted| statistics.contains(&wanted).then(|| Tensor::<2>::zeros([n, 2], &autodiff).require_grad());
             let (screen_probe, absolute_screen_probe) = (probe(Statistic::ScreenGradient), probe(Statistic::AbsoluteScreenGradient));
             splats.screen_probe = screen_probe.clone();

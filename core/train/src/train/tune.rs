@@ -98,7 +98,7 @@ impl<'a> Tuner<'a> {
         (config.render, config.rasterizer) = (model.render.clone(), model.rasterizer.clone());
         (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
         (config.density, config.appearance, config.train.image_growth) = (none(), none(), 0.0);
-        (config.train.time_noise, config.train.lambda_r) = (0.0, 0.0);
+        (config.train.time_noise, config.train.dropout, config.train.lambda_r) = (0.0, 0.0, 0.0);
         config.validate()?;
         let field_weights = FieldWeights::parse(field_weights, registry)?;
         let weight_settings = match self.moving_field() {
