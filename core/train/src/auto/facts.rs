@@ -22,6 +22,8 @@ const MOTION_OVER_NOISE: f32 = 6.0;
 const PLAIN: f32 = 0.02;
 /// Share of border pixels of that colour from which the background is plain.
 const PLAIN_SHARE: f32 = 0.9;
+/// Cosine of the angle between the axes of cameras above which they see much the same: 0.6 rad.
+const ALIKE_AXES: f64 = 0.825;
 
 /// How the training cameras stand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -255,7 +257,7 @@ impl Motion {
     }
 }
 
-/// Median |ln| of the ratio of mean brightness between each camera and the one that looks most alike at the same time.
+/// Median |ln| of the ratio of mean brightness between each camera and its nearest neighbour at the same time; `None` where few neighbours see the same.
 fn exposure(scene: &Scene, views: &[usize]) -> Result<Option<f32>> {
     let first = views.iter().map(|&v| scene.views[v].frame).min().unwrap_or(0);
     let of_first: Vec<usize> = views.iter().copied().filter(|&v| scene.views[v].frame == first).take(2 * LOOKS).collect();
@@ -264,15 +266,19 @@ fn exposure(scene: &Scene, views: &[usize]) -> Result<Option<f32>> {
     }
     let means = of_first.par_iter().map(|&v| small(scene, v).map(|image| mean(grey(&image).into_iter()).unwrap_or(0.0))).collect::<Result<Vec<_>>>()?;
     let center = |i: usize| DVec3::from(scene.camera(of_first[i]).center_world());
+    let axis = |i: usize| DVec3::from(scene.camera(of_first[i]).forward_world()).normalize_or_zero();
     let mut ratios: Vec<f32> = (0..of_first.len())
         .filter_map(|i| {
             let nearest = (0..of_first.len()).filter(|&j| j != i).min_by(|&a, &b| center(a).distance(center(i)).total_cmp(&center(b).distance(center(i))))?;
+            if axis(i).dot(axis(nearest)) < ALIKE_AXES {
+                return None;
+            }
             let ratio = (means[i].max(1e-3) / means[nearest].max(1e-3)).ln().abs();
             ratio.is_finite().then_some(ratio)
         })
         .collect();
     ratios.sort_by(f32::total_cmp);
-    Ok(ratios.get(ratios.len() / 2).copied())
+    Ok((2 * ratios.len() >= of_first.len()).then(|| ratios.get(ratios.len() / 2).copied()).flatten())
 }
 
 fn mean(values: impl Iterator<Item = f32>) -> Option<f32> {
