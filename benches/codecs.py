@@ -5,29 +5,41 @@
 
 With SCENE, PSNR and SSIM are those of `cc4dgs eval` on the test views, and codecs are given the scene. Without, a model is rendered from an orbit before and
 after by the example `compare`, which lies beside the program, and PSNR is between the two. Writes NAME.json and NAME.md, which hold numbers only.
+
+With a scene, `compact` has two rows: `finetune=0` and as it comes. Seconds are those that `compress` reports: of encoding, with the scene where there is one,
+and of decoding the file; memory is the most that its process had. Run it while nothing else does.
 """
-import argparse, json, pathlib, re, subprocess, sys, tempfile
+import argparse, json, os, pathlib, re, subprocess, sys, tempfile
 
 CODECS = "raw,quantize,sorted-image,spz,vq,cca:low,cca:mid,cca:default,compact"
 FRAMES = 12
 
 
 def run(program, *arguments):
-    done = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"{' '.join(map(str, arguments))}: {done.stderr.strip()}")
-    return done.stdout, done.stderr
+    return measured(program, *arguments)[0]
+
+
+def measured(program, *arguments):
+    """Standard output of a process that must succeed, and the most memory it had, in MB."""
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        child = subprocess.Popen([program, *map(str, arguments)], stdout=out, stderr=err)
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        out.seek(0), err.seek(0)
+        if child.returncode:
+            sys.exit(f"{' '.join(map(str, arguments))}: {err.read().decode().strip()}")
+        return out.read().decode(), usage.ru_maxrss / 1024
 
 
 def between(program, model, other):
-    return json.loads(run(pathlib.Path(program).parent / "examples/compare", model, other, FRAMES)[0])["psnr_db"]
+    return json.loads(run(pathlib.Path(program).parent / "examples/compare", model, other, FRAMES))["psnr_db"]
 
 
 def measure(program, model, scene, codec, weights, settings, before, folder):
     archive = pathlib.Path(folder) / f"{re.sub('[^a-z0-9]', '-', codec)}.cc4d"
     chosen = [part for s in settings for part in ("--set", s)]
     with_scene = ["--scene", scene] if scene else []
-    text, notes = run(program, "compress", model, "--codec", codec, "--field-weights", weights, "--out", archive, "--json", "-", *chosen, *with_scene)
+    text, peak_mb = measured(program, "compress", model, "--codec", codec, "--field-weights", weights, "--out", archive, "--json", "-", *chosen, *with_scene)
     report = json.loads(text)
     row = {
         "codec": " ".join([codec, *settings]),
@@ -38,6 +50,8 @@ def measure(program, model, scene, codec, weights, settings, before, folder):
         "field_mb": report["size_mb"]["deform"],
         "bytes_per_gaussian": round(1e6 * report["size_mb"]["point_cloud"] / report["gaussians"], 3),
         "encode_s": round(report["seconds"], 2),
+        "decode_s": round(report["decode_seconds"], 3),
+        "peak_mb": round(peak_mb),
         "streams": {s["name"]: round(s["stored_bytes"] / report["gaussians"], 3) for s in report["streams"] if s["kind"] == "canonical"},
     }
     if scene:
@@ -50,11 +64,11 @@ def measure(program, model, scene, codec, weights, settings, before, folder):
 
 def table(rows, scene):
     loss = ["drop dB", "SSIM drop"] if scene else ["PSNR between dB"]
-    lines = ["| codec | weights | " + " | ".join(loss) + " | bytes per Gaussian | Gaussians MB | total MB | encode s | bytes per Gaussian by stream |", "|" + " --- |" * (7 + len(loss))]
+    lines = ["| codec | weights | " + " | ".join(loss) + " | bytes per Gaussian | Gaussians MB | total MB | encode s | decode s | peak MB | bytes per Gaussian by stream |", "|" + " --- |" * (9 + len(loss))]
     for r in rows:
         numbers = [f"{r['drop_db']:.3f}", f"{r['ssim_drop']:.4f}"] if scene else [f"{r['psnr_between_db']:.2f}"]
         streams = ", ".join(f"{k} {v:.2f}" for k, v in r["streams"].items() if v >= 0.005)
-        lines.append(f"| {r['codec']} | {r['field_weights']} | {' | '.join(numbers)} | {r['bytes_per_gaussian']:.2f} | {r['gaussians_mb']:.4f} | {r['total_mb']:.4f} | {r['encode_s']} | {streams} |")
+        lines.append(f"| {r['codec']} | {r['field_weights']} | {' | '.join(numbers)} | {r['bytes_per_gaussian']:.2f} | {r['gaussians_mb']:.4f} | {r['total_mb']:.4f} | {r['encode_s']} | {r['decode_s']} | {r['peak_mb']} | {streams} |")
     return lines
 
 
@@ -76,7 +90,11 @@ def main():
             before = None
             if scene:
                 before = json.loads(run(args.cc4dgs, "eval", model, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet")[0])
-            todo = [(codec, []) for codec in args.codecs.split(",")] + [("compact", [s]) for s in switches]
+            # Without a scene there is nothing to fine-tune on.
+            untuned = ["finetune=0"] if scene else []
+            todo = [(codec, untuned if codec.startswith("compact") else []) for codec in args.codecs.split(",")]
+            todo += [(codec, []) for codec in args.codecs.split(",") if scene and codec.startswith("compact")]
+            todo += [("compact", [*untuned, s]) for s in switches]
             rows = [measure(args.cc4dgs, model, scene, codec, args.weights, settings, before, folder) for codec, settings in todo]
         about = f"{name}: {rows[0]['gaussians']} Gaussians" + (f", {before['psnr_db']:.3f} dB, SSIM {before['ssim']:.4f} on test views" if scene else ", no scene: PSNR between renders")
         results.append({"model": name, "scene": bool(scene), "psnr_db": before["psnr_db"] if scene else None, "rows": rows})

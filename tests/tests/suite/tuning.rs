@@ -4,10 +4,11 @@ use burn::tensor::Device;
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{Error, Limits, Registry, Result, Scene, Silent, TuneModel};
+use cc4dgs_play::prune::prune;
 use cc4dgs_play::{ArchiveOptions, Model, Moving};
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::data;
-use cc4dgs_train::train::{TrainJob, TuneJob, Tuner, train};
+use cc4dgs_train::train::{RefitJob, TrainJob, TuneJob, Tuner, prune_and_refit, train};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -105,4 +106,36 @@ fn models_of_every_kind_are_tuned_or_left_alone() {
         let bytes = bench.tuned(&model, 7).unwrap_or_else(|e| panic!("{name}: {e}"));
         assert_eq!(bench.open(&bytes).gaussians.len(), count, "{name}");
     }
+}
+
+#[test]
+fn pruning_with_refit_keeps_fewer_within_the_same_loss() {
+    let config = tiny(&[]);
+    let bench = Bench::new(&config);
+    let Bench { registry, limits, device, scene, never } = &bench;
+    let copy = |model: &Model| bench.open(&model.to_archive(&raw(), registry, limits, &Silent).unwrap());
+    let model = bench.train(&config);
+    let before = bench.psnr(&model);
+    let job = RefitJob { registry, device, limits, events: &Silent, stop: never };
+    let (mut plain, mut refitted, mut again) = (copy(&model), copy(&model), copy(&model));
+    let without = prune(&mut plain, scene, LIMIT_DB, registry, device, &Silent).unwrap();
+    let with = prune_and_refit(&mut refitted, scene, LIMIT_DB, 60, &job).unwrap();
+    println!("of {} Gaussians, {} are kept without re-fit and {} with it", with.before, without.after, with.after);
+    assert!(with.after < without.after, "{with:?} {without:?}");
+    assert_eq!(refitted.gaussians.len(), with.after);
+    let drop = before - bench.psnr(&refitted);
+    assert!(drop <= LIMIT_DB + 1e-3, "{drop} dB");
+    prune_and_refit(&mut again, scene, LIMIT_DB, 60, &job).unwrap();
+    assert!(again.gaussians == refitted.gaussians, "two runs differ");
+
+    let stopped = AtomicBool::new(true);
+    let error = prune_and_refit(&mut again, scene, LIMIT_DB, 60, &RefitJob { stop: &stopped, ..job }).unwrap_err();
+    assert!(matches!(error, Error::Interrupted(_)), "{error}");
+    let error = prune_and_refit(&mut again, scene, -1.0, 60, &RefitJob { registry, device, limits, events: &Silent, stop: never }).unwrap_err();
+    assert!(error.to_string().contains("-1 dB"), "{error}");
+}
+
+fn raw() -> ArchiveOptions<'static> {
+    static NONE: std::sync::LazyLock<toml::Table> = std::sync::LazyLock::new(toml::Table::new);
+    ArchiveOptions { codec: "raw", settings: &NONE, field_weights: "fp32", scene: None, tuner: None }
 }

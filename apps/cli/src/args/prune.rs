@@ -14,6 +14,9 @@ pub struct Prune {
     /// Largest loss of PSNR in dB, on validation views where the model was trained with some (train.validation), else on training views.
     #[arg(long, value_name = "DB", default_value = "0.1dB", value_parser = parse_decibels)]
     pub max_drop: f64,
+    /// Iterations of training after each round of removal; 0 removes without training.
+    #[arg(long, value_name = "N", default_value_t = 200)]
+    pub refit: usize,
     /// The archive to write, lossless; compress it as you would the model.
     #[arg(long, value_name = "F.cc4d")]
     pub out: PathBuf,

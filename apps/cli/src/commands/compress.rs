@@ -5,7 +5,7 @@ use crate::args::Compress;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
-use cc4dgs_core::{Event, EventSink, Result, TuneModel, config};
+use cc4dgs_core::{Event, EventSink, Result, TuneModel, config, read_gaussians};
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::{ArchiveOptions, Model};
@@ -28,6 +28,8 @@ pub struct CompressReport {
     /// Float32 size of what the archive stands for, over the archive's.
     pub ratio: f64,
     pub seconds: f64,
+    /// What decoding the Gaussians of the file that was written took.
+    pub decode_seconds: f64,
     pub streams: Vec<StreamSize>,
 }
 
@@ -90,14 +92,18 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     context.output.result(&report, || text(&report))
 }
 
-/// Writes `model` to the archive `out` and reads its directory back.
+/// Writes `model` to the archive `out` and reads it back, so that a file that cannot be decoded is an error here and not at its reader.
 pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out: &Path, events: &dyn EventSink) -> Result<CompressReport> {
     let began = Instant::now();
     create_parent(out)?;
     let bytes = model.save_archive(out, options, &context.registry, &context.limits, events)?;
     events.emit(&Event::Saved { path: out.display().to_string(), bytes });
     let seconds = began.elapsed().as_secs_f64();
-    let stored = Archive::open(out, &context.limits)?.stream_sizes();
+    let archive = Archive::open(out, &context.limits)?;
+    let began = Instant::now();
+    read_gaussians(&out.display().to_string(), &archive, &context.limits, events)?;
+    let decode_seconds = began.elapsed().as_secs_f64();
+    let stored = archive.stream_sizes();
     let of_kind = |kind| stored.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum();
     let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.float32_size() };
     Ok(CompressReport {
@@ -108,6 +114,7 @@ pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out:
         size_mb: size.into(),
         ratio: model.float32_size().total as f64 / bytes.max(1) as f64,
         seconds,
+        decode_seconds,
         streams: stored.into_iter().map(StreamSize::from).collect(),
     })
 }
@@ -115,7 +122,7 @@ pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out:
 /// The report for people.
 pub fn text(report: &CompressReport) -> String {
     let mut lines = vec![format!(
-        "{}: {:.4} MB (deform {:.4} MB, point cloud {:.4} MB), {} Gaussians, {:.1}x smaller than float32, {} in {:.1} s",
+        "{}: {:.4} MB (deform {:.4} MB, point cloud {:.4} MB), {} Gaussians, {:.1}x smaller than float32, {} in {:.1} s, decoded in {:.3} s",
         report.archive.display(),
         report.size_mb.total,
         report.size_mb.deform,
@@ -123,7 +130,8 @@ pub fn text(report: &CompressReport) -> String {
         report.gaussians,
         report.ratio,
         report.codec,
-        report.seconds
+        report.seconds,
+        report.decode_seconds
     )];
     lines.extend(report.streams.iter().map(stream_line));
     lines.join("\n")

@@ -3,13 +3,16 @@
 use super::compress::compress;
 use super::{Context, create_parent};
 use crate::args::Prune;
+use crate::interrupt;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::Result;
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_play::prune::{PruneReport, prune};
+use cc4dgs_train::train::{RefitJob, prune_and_refit};
 use serde::Serialize;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// What pruning came to.
@@ -28,9 +31,16 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
     create_parent(&args.out)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let scene = open_as_trained(&args.scene, &loaded.model, &[], &context.registry, &context.limits)?;
-    let found = prune(&mut loaded.model, &scene, args.max_drop, &context.registry, &loaded.device, &events)?;
+    let (registry, limits, events) = (&context.registry, &context.limits, &events);
+    let found = match args.refit {
+        0 => prune(&mut loaded.model, &scene, args.max_drop, registry, &loaded.device, events)?,
+        iterations => {
+            let job = RefitJob { registry, device: &loaded.device, limits, events, stop: interrupt::stop_flag()? };
+            prune_and_refit(&mut loaded.model, &Arc::new(scene), args.max_drop, iterations, &job)?
+        }
+    };
     let options = ArchiveOptions { codec: "raw", settings: &toml::Table::new(), field_weights: "fp32", scene: None, tuner: None };
-    let written = compress(context, &loaded.model, &options, &args.out, &events)?;
+    let written = compress(context, &loaded.model, &options, &args.out, events)?;
     let report = Report { archive: args.out.clone(), bytes: written.bytes, seconds: began.elapsed().as_secs_f64(), prune: found };
     context.output.result(&report, || text(&report))
 }

@@ -40,7 +40,7 @@ const WARMUP: f64 = 0.1;
 /// Iterations for which derivatives of the size are kept: they change slowly.
 const SIZE_EVERY: usize = 8;
 /// Iterations between two looks for values that are not finite, and between two events.
-const CHECK_EVERY: usize = 25;
+pub(super) const CHECK_EVERY: usize = 25;
 
 /// What a [`Tuner`] works on.
 pub struct TuneJob<'a> {
@@ -67,7 +67,7 @@ pub struct TuneJob<'a> {
 ///
 /// Nothing is looked at before a codec asks for it.
 pub struct Tuner<'a> {
-    job: TuneJob<'a>,
+    pub(super) job: TuneJob<'a>,
     choices: OnceCell<Choices>,
     adopted: RefCell<Option<(Vec<WeightArray>, f64)>>,
 }
@@ -114,7 +114,7 @@ impl<'a> Tuner<'a> {
         model.field.as_ref().filter(|f| movable && !f.field.is_static())
     }
     /// Calls `work` with the parts of a training and the state of `model`.
-    fn with_state<T>(&self, model: &TunedModel, seed: Seed, work: impl FnOnce(&Context, &mut TrainState) -> Result<T>) -> Result<T> {
+    pub(super) fn with_state<T>(&self, model: &TunedModel, seed: Seed, work: impl FnOnce(&Context, &mut TrainState) -> Result<T>) -> Result<T> {
         let TuneJob { scene, registry, device, events, stop, .. } = &self.job;
         let config = &self.choices()?.config;
         let training_camera = training_cameras(scene);
@@ -169,6 +169,15 @@ impl<'a> Tuner<'a> {
         let (codec, streams) = self.encoded_weights(weights, settings)?;
         codec.decode(&streams, &self.codec_context())
     }
+    /// `like` with the values of `state`, which must be sound; `object` names them in errors.
+    pub(super) fn columns_of(like: &HostGaussians, state: &TrainState, limits: &Limits, object: &str) -> Result<HostGaussians> {
+        let (mut gaussians, found) = (like.clone(), state.set.host_gaussians()?);
+        for ((_, _, to), (_, _, values)) in gaussians.columns_mut().into_iter().zip(found.columns()) {
+            to.clone_from(values);
+        }
+        gaussians.validate(object, limits)?;
+        Ok(gaussians)
+    }
     /// Where all iterations stand: in the middle of a main stage.
     fn schedule(&self, sh_degree: usize) -> Schedule {
         Schedule { extent: self.job.scene.extent(), sh_degree, ..Schedule::main(2) }
@@ -210,6 +219,12 @@ impl<'a> Tuner<'a> {
     }
 }
 
+/// The views on which PSNR is measured: validation views where the scene has some, else training views.
+pub(super) fn judges(scene: &Scene) -> Vec<usize> {
+    let validation = scene.split(Split::Validation);
+    spread(&if validation.is_empty() { scene.split(Split::Train) } else { validation }, JUDGES)
+}
+
 /// What changes slowly.
 struct Fixed {
     steps: BTreeMap<String, Tensor<2>>,
@@ -223,7 +238,7 @@ fn columns(values: &HostGaussians, device: &Device) -> BTreeMap<String, Tensor<2
 }
 
 /// Share of the largest learning rate after the share `done` of the iterations: it rises linearly, then falls as a cosine.
-fn rate_at(done: f64) -> f64 {
+pub(super) fn rate_at(done: f64) -> f64 {
     if done < WARMUP { done / WARMUP } else { 0.5 + 0.5 * (std::f64::consts::PI * (done - WARMUP) / (1.0 - WARMUP)).cos() }
 }
 
@@ -265,12 +280,7 @@ impl TuneModel for Tuner<'_> {
                     self.job.events.emit(&Event::Progress { task: "fine-tuning".into(), done: (tuning.of.0 + iteration) as u64, total: tuning.of.1 as u64 });
                 }
             }
-            let mut gaussians = from.gaussians.clone();
-            let found = state.set.host_gaussians()?;
-            for ((_, _, to), (_, _, values)) in gaussians.columns_mut().into_iter().zip(found.columns()) {
-                to.clone_from(values);
-            }
-            gaussians.validate("Gaussians of fine-tuning", self.job.limits)?;
+            let gaussians = Self::columns_of(&from.gaussians, state, self.job.limits, "Gaussians of fine-tuning")?;
             let weights = state.deformer.as_ref().map(|d| weights_of(d.field.as_ref())).transpose()?.unwrap_or_default();
             Ok(TunedModel { gaussians, weights })
         })
@@ -281,8 +291,7 @@ impl TuneModel for Tuner<'_> {
             None => weights.to_vec(),
         };
         let scene = &self.job.scene;
-        let validation = scene.split(Split::Validation);
-        let views = spread(&if validation.is_empty() { scene.split(Split::Train) } else { validation }, JUDGES);
+        let views = judges(scene);
         let model = TunedModel { gaussians: gaussians.clone(), weights };
         let mut sum = 0.0;
         self.with_state(&model, Seed::root(0), |context, state| {
