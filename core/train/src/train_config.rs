@@ -140,8 +140,6 @@ pub struct GaussianRates {
     pub means: f64,
     /// Positions at the last iteration of a stage, times the camera extent.
     pub means_end: f64,
-    /// What the other rates fall to over the main stage, as a share of themselves; 1 keeps them.
-    pub end_share: f64,
     /// Log-scales.
     pub log_scales: f64,
     /// Quaternions.
@@ -164,7 +162,6 @@ impl Default for GaussianRates {
             batch_power: 0.0,
             means: 1.6e-4,
             means_end: 1.6e-6,
-            end_share: 1.0,
             log_scales: 5e-3,
             quaternions: 1e-3,
             opacity: 0.05,
@@ -211,9 +208,6 @@ impl TrainConfig {
                 format!("{} is not in 0..1", t.lr.batch_power),
                 "0 leaves learning rates as they are, 0.5 takes the root of the batch",
             );
-        }
-        if !(1e-4..=1.0).contains(&t.lr.end_share) {
-            return bad("lr.end_share", format!("{} is not in 0.0001..1", t.lr.end_share), "1 keeps learning rates, 0.1 lets them fall to a tenth");
         }
         if !(0.0..=1.0).contains(&t.image_growth) {
             return bad("image_growth", format!("{} is not in 0..1", t.image_growth), "It is a share of the coarse and main stage");

@@ -5,7 +5,7 @@ use super::log::Log;
 use super::smoothness::{flicker, smoothness};
 use super::watchdog::{Trouble, is_finite};
 use super::{Context, TrainState, parameters};
-use crate::gaussian_set::{Leaves, gaussian_rate, log_linear};
+use crate::gaussian_set::{Leaves, gaussian_rate};
 use burn::tensor::{Gradients, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
@@ -182,13 +182,9 @@ impl Context<'_> {
         let of_plugin: BTreeMap<String, f64> =
             state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
         let scale = train.rate_scale(schedule.stage);
-        let fallen = if schedule.stage == Stage::Main { log_linear(1.0, train.lr.end_share, progress) } else { 1.0 };
         let rates = state.rates.clone();
-        let rate = |name: &str| {
-            // Positions have a final rate of their own.
-            let fallen = if name == "means" { 1.0 } else { fallen };
-            rates.of_gaussians(name) * scale * fallen * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent))
-        };
+        let rate =
+            |name: &str| rates.of_gaussians(name) * scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
         match state.rounded.take() {
             Some(mut rounded) => {
                 rounded.step_gaussians(state, of_gaussians, visible.as_ref())?;
