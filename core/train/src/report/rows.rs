@@ -102,9 +102,10 @@ impl<'a> Row<'a> {
     pub fn name(&self) -> String {
         format!("{} / {}", self.training(), self.codec)
     }
-    /// The codec without its profile.
+    /// The codec without its profile and settings. The grid's name of it may be anything.
     pub fn codec_family(&self) -> &'a str {
-        self.codec.split(':').next().unwrap_or(self.codec)
+        let codec = &self.cells[0].provenance.codec.codec;
+        codec.split(':').next().unwrap_or(codec)
     }
     /// The rows that share a training with this one have equal keys.
     pub fn training_key(&self) -> (&'a str, &'a str) {
