@@ -1,6 +1,6 @@
 //! Runs a cell: the trained model is stored by a codec, read back, and scored.
 
-use super::facts::{device_facts, locate};
+use super::facts::{PeakMemory, device_facts, locate};
 use super::folder::SweepFolder;
 use super::hash::name_of;
 use super::plan::{Plan, PlannedCell, PlannedTraining};
@@ -47,6 +47,7 @@ impl<'a> Trained<'a> {
     pub fn run(&self, worker: &Worker, folder: &SweepFolder, plan: &Plan, cell: &PlannedCell) -> Result<CellResult> {
         let archive = folder.archive(&cell.id);
         let choice = &cell.choice;
+        let memory = PeakMemory::begin();
         let began = Instant::now();
         let options = ArchiveOptions {
             codec: &choice.codec,
@@ -82,7 +83,7 @@ impl<'a> Trained<'a> {
             if index == 0 {
                 image_size = [truth.width, truth.height];
             }
-            frame_ms_each.push(score.field_ms + score.raster_ms);
+            frame_ms_each.push(((score.field_ms + score.raster_ms) * 1e3).round() / 1e3);
             images.push(ImageResult {
                 camera: score.camera.clone(),
                 frame: score.frame,
@@ -156,7 +157,8 @@ impl<'a> Trained<'a> {
                     raster: report.frame_ms.raster,
                 },
                 frame_ms_each,
-                peak_memory_mb: finished.peak_memory_mb,
+                training_peak_memory_mb: finished.peak_memory_mb,
+                cell_peak_memory_mb: memory.mb(),
                 finished_unix: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs()),
             },
         };
