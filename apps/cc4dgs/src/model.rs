@@ -1,10 +1,12 @@
 //! A trained model with the session it belongs to.
 
 use crate::Session;
-use cc4dgs_core::{Event, Result};
+use cc4dgs_core::{Event, Result, Scene};
 use cc4dgs_play::ArchiveOptions;
+use cc4dgs_train::train::{TuneJob, Tuner};
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
+use std::sync::Arc;
 
 /// The weight codec of [`Model::save`]: exact.
 const FIELD_WEIGHTS: &str = "fp32";
@@ -40,6 +42,25 @@ impl Model {
         let bytes = self.inner.save_archive(path, options, session.registry(), session.limits(), session.events())?;
         session.events().emit(&Event::Saved { path: path.display().to_string(), bytes });
         Ok(bytes)
+    }
+    /// As [`Model::save_with`], with the scene that the model was trained on, for codecs that make use of it: `compact` looks at how much each value matters to
+    /// training views, and trains the model further while its values are rounded. `field_weights` is the weight codec of the deformer.
+    ///
+    /// # Errors
+    /// As [`Model::save_with`], and [`Error::Interrupted`](crate::Error::Interrupted) after [`Session::stop`]; nothing is written then.
+    pub fn save_tuned(&self, path: impl AsRef<Path>, codec: &str, settings: &toml::Table, field_weights: &str, scene: &Arc<Scene>) -> Result<u64> {
+        let session = &self.session;
+        let tuner = Tuner::new(TuneJob {
+            model: &self.inner,
+            scene: scene.clone(),
+            field_weights,
+            registry: session.registry(),
+            device: session.device(),
+            limits: session.limits(),
+            events: session.events(),
+            stop: session.stopped(),
+        });
+        self.save_with(path, &ArchiveOptions { codec, settings, field_weights, scene: Some((scene, session.device())), tuner: Some(&tuner) })
     }
 }
 

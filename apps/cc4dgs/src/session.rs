@@ -110,6 +110,10 @@ impl Session {
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
     }
+    /// Set once [`Session::stop`] was called.
+    pub(crate) fn stopped(&self) -> &AtomicBool {
+        &self.shared.stop
+    }
     /// The settings of a preset (`demo`, `dnerf+hexplane`) with `key=value` overrides, on this session's device and limits.
     ///
     /// # Errors

@@ -85,7 +85,8 @@ impl AttributeCodec for Cca {
 }
 
 pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {
-    Ok(Box::new(Cca { profile: Profile::named(profile)?, settings: Settings::parse(settings)? }))
+    let settings = Settings::parse(settings)?;
+    Ok(Box::new(Cca { profile: Profile::named(profile)?.with(&settings), settings }))
 }
 
 inventory::submit! {

@@ -14,7 +14,9 @@ struct MeanSquare;
 impl LossTerm for MeanSquare {
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
         let difference = input.planes.clone().narrow(0, 0, 3) - input.target.clone();
-        Ok(Some(difference.clone().mul(difference).mean()))
+        // Divided before the sum, which would overflow where the mean does not.
+        let share = difference.mul_scalar(1.0 / (input.target.dims().iter().product::<usize>().max(1) as f64).sqrt());
+        Ok(Some(share.clone().mul(share).sum()))
     }
 }
 

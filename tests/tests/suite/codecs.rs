@@ -198,6 +198,24 @@ fn lower_profiles_take_fewer_bytes() {
 }
 
 #[test]
+fn a_bit_budget_of_cca_changes_its_own_streams_alone() {
+    let registry = Registry::collect().unwrap();
+    let g = scene(600, 1, 8);
+    let encode = |settings: &str| {
+        let codec = registry.build_codec("cca", &format!("epochs = 3\n{settings}").parse().unwrap()).unwrap();
+        hold_to_losses(settings, codec.as_ref(), &g);
+        codec.encode(&g, &context()).unwrap()
+    };
+    let base = encode("");
+    let bytes = |streams: &[Stream]| streams.iter().map(|s| s.bytes.len()).sum::<usize>();
+    for (settings, own) in [("scalar_bits = 8", "log_scales"), ("dynamic_bits = 8", "dynamic_scores")] {
+        let fewer = encode(settings);
+        let changed: Vec<&str> = base.iter().zip(&fewer).filter(|(a, b)| a.bytes != b.bytes).map(|(a, _)| a.name.as_str()).collect();
+        assert!(bytes(&fewer) < bytes(&base) && changed.contains(&own) && !changed.contains(&"means"), "{settings}: {changed:?}");
+    }
+}
+
+#[test]
 fn colours_without_structure_are_not_thrown_away() {
     // White noise in twice as many dimensions as there are latents: the loss is within the declared one for every form.
     let mut g = scene(3000, 4, 9);

@@ -38,6 +38,11 @@ fn a_session_trains_saves_opens_and_plays() {
     assert_eq!(model.save(&file, "raw").unwrap(), std::fs::metadata(&file).unwrap().len());
     assert_eq!(heard.load(Ordering::Relaxed), before + 1, "saving is an event");
     let opened = session.open(&file).unwrap();
+    // Codecs that use the scene are given it, and may train the model further.
+    let tuned = folder.path().join("tuned.cc4d");
+    let settings = "finetune = 20".parse().unwrap();
+    let bytes = model.save_tuned(&tuned, "compact", &settings, "compact", &scene).unwrap();
+    assert!(2 * bytes < std::fs::metadata(&file).unwrap().len() && session.open(&tuned).unwrap().gaussians.len() == model.gaussians.len());
     let orbit = Orbit { size: (40, 30), frames: 3, ..Orbit::default() };
     let cameras = orbit.around(&model.gaussians).unwrap();
     let (mut first, mut second) = (session.player(&model).unwrap(), session.player(&opened).unwrap());

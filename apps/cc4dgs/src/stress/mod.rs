@@ -5,6 +5,7 @@
 //! oracle, so that a pixel at which a comparison fell the other way does not hide the digits of the others; the share of values that differ by more than 1 % is
 //! stated beside it. The *limit* of a condition is the first level at which the error is over 1 %.
 
+mod exact;
 mod raster;
 mod scenes;
 mod weights;
@@ -25,6 +26,8 @@ pub struct StressJob<'a> {
     pub device: &'a Device,
     /// The device of the oracle: one for processors.
     pub host: &'a Device,
+    /// Whether the two have kernels of their own. Where they share them, a comparison says nothing, and parts without float64 have no oracle.
+    pub other_kernels: bool,
     /// Name of the rasterizer under test.
     pub rasterizer: &'a str,
     /// Name of the rasterizer that computes in float64 on the host.
@@ -46,7 +49,8 @@ pub struct StressCase {
     pub condition: String,
     /// Its level.
     pub level: String,
-    /// What it was compared with: `float64`, or `float32 on HOST` for parts without an oracle of their own; absent where nothing was.
+    /// What it was compared with: `float64`, `float32 on the host` for parts of other devices without an oracle of their own, [`NO_ORACLE`] where there is none;
+    /// absent where there were no values.
     pub oracle: Option<String>,
     /// 95th percentile of the error, relative to the oracle's largest value; absent without an oracle or without numbers.
     pub error: Option<f64>,
@@ -100,6 +104,8 @@ pub fn stress(job: &StressJob, progress: &mut dyn FnMut(&StressCase)) -> Result<
     Ok(report)
 }
 
+/// In place of an oracle's name: the values were looked at, not compared.
+pub const NO_ORACLE: &str = "no oracle";
 /// Name of oracles that compute in float64.
 const FLOAT64: &str = "float64";
 
@@ -121,7 +127,7 @@ fn case(part: &str, condition: &str, level: impl Into<String>, work: impl FnOnce
     match catch_unwind(AssertUnwindSafe(work)) {
         Err(_) => StressCase { behaves: false, outcome: "it panics".into(), ..empty },
         Ok(Err(e)) => StressCase { outcome: format!("error: {e}"), ..empty },
-        Ok(Ok((found, None))) => judge(empty, &found, None),
+        Ok(Ok((found, None))) => judge(StressCase { oracle: Some(NO_ORACLE.into()), ..empty }, &found, None),
         Ok(Ok((found, Some((name, exact))))) => judge(StressCase { oracle: Some(name.into()), ..empty }, &found, Some(&exact)),
     }
 }
@@ -163,6 +169,8 @@ mod tests {
         assert!(good.behaves && (good.error.unwrap() - 0.0).abs() < 1e-9, "{good:?}");
         assert!((good.outliers.unwrap() - 1.0 / 3.0).abs() < 1e-9 || good.outliers == Some(0.0), "{good:?}");
         assert!(!judged(|| Ok((vec![f32::NAN], None))).behaves);
+        let alone = judged(|| Ok((vec![1.0], None)));
+        assert!(alone.behaves && alone.oracle.as_deref() == Some(NO_ORACLE) && alone.error.is_none(), "{alone:?}");
         assert!(!judged(|| Ok((vec![f32::INFINITY], Some((FLOAT64, vec![1.0]))))).behaves);
         assert!(judged(|| Ok((vec![f32::INFINITY], Some((FLOAT64, vec![f32::INFINITY]))))).behaves);
         assert!(judged(|| Err(Error::data("x", "y", "z"))).behaves);

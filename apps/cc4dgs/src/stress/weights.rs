@@ -1,12 +1,13 @@
 //! Deformers, the optimizer, weight codecs and loss terms.
 
+use super::exact::Exact;
 use super::{Compared, FLOAT64, StressCase, StressJob, case};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    CodecContext, DeformerContext, Gaussians, HostGaussians, Limits, LossInput, Result, Schedule, Seed, Silent, SpatialInput, StepSettings, WeightArray,
-    split_kind, toml,
+    AttributeSpec, CodecContext, Deformer, DeformerContext, Gaussians, HostGaussians, Limits, LossInput, Result, Schedule, Seed, Silent, SpatialInput,
+    StepSettings, WeightArray, split_kind, toml,
 };
 
 /// Centres per deformer.
@@ -20,7 +21,7 @@ type Place = (&'static str, fn(usize) -> [f32; 3]);
 pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     for (kind, plugin) in job.registry.plugins() {
         match kind {
-            "deformer" => deformer(job, plugin.name, note),
+            "deformer" => deformer(job, plugin.name, note)?,
             "weight-codec" => weight_codec(job, plugin.name, note),
             "loss" => loss(job, plugin.name, note),
             _ => {}
@@ -33,7 +34,8 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
 }
 
 /// Times at the ends and beyond, and centres on the faces of voxels, in the corners of the box, and outside.
-fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
+fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Result<()> {
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
     let part = format!("deformer {name}");
     let places: [Place; 4] = [
         // Multiples of 1/64 lie on the faces of grids of any power of two.
@@ -43,29 +45,59 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
         ("centres far outside the box", |i| [0, 1, 2].map(|k| 1e30 * uniform(Seed::root(5).index(i as u64), k))),
     ];
     for (condition, place) in places {
+        let means: Vec<f32> = (0..POINTS).flat_map(place).collect();
+        let exact = if Exact::knows(name) {
+            let deformer = shaken(job, name, &context, job.host)?;
+            let columns = attribute_values(deformer.as_ref());
+            let row = |i: usize| columns.iter().flat_map(|(width, values)| values[i * width..(i + 1) * width].to_vec()).collect();
+            Some(Exact::new(name, deformer.as_ref(), &context, &means, &(0..POINTS).map(row).collect::<Vec<_>>())?)
+        } else {
+            None
+        };
         // The ends and no number first: a device with fewer levels still tries them.
         for time in [0.0f32, 1.0, f32::NAN, 2.0, 0.5, 1.0f32.next_up(), -1.0, 1e6].into_iter().take(job.deformer_levels) {
             let values = |device: &Device| -> Result<Vec<f32>> {
-                let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
-                let (kind, settings) = split_kind("deformer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
-                let mut deformer = (job.registry.deformer(&kind)?.build)(&settings, &context, device)?;
-                // Fresh deformers are the identity, whatever they are asked.
-                for (index, parameter) in deformer.parameters_mut().into_iter().enumerate() {
-                    let count = parameter.value.dims()[0];
-                    let noise: Vec<f32> = (0..count).map(|k| 0.1 * uniform(Seed::root(13).index(index as u64), k)).collect();
-                    parameter.value = parameter.value.clone() + Tensor::from_data(TensorData::new(noise, [count]), device);
-                }
-                let means: Vec<f32> = (0..POINTS).flat_map(place).collect();
-                let attributes = deformer.attributes().iter().map(|a| Tensor::<2>::full([POINTS, a.width], a.start, device)).collect();
-                let input = SpatialInput { means_world: Tensor::from_data(TensorData::new(means, [POINTS, 3]), device), attributes };
+                let deformer = shaken(job, name, &context, device)?;
+                let tensor = |values: Vec<f32>, width: usize| Tensor::<2>::from_data(TensorData::new(values, [POINTS, width]), device);
+                let attributes = attribute_values(deformer.as_ref()).into_iter().map(|(width, values)| tensor(values, width)).collect();
+                let input = SpatialInput { means_world: tensor(means.clone(), 3), attributes };
                 let offsets = deformer.deform(deformer.spatial(&input)?.values, time)?;
                 offsets.concatenated().map_or(Ok(Vec::new()), |all| to_vec(all, "offsets"))
             };
-            // The other device computes the same formulas in float32.
-            let both = || Ok((values(job.device)?, Some(("float32 on the host", values(job.host)?))));
+            let both = || {
+                let found = values(job.device)?;
+                let oracle = match &exact {
+                    Some(exact) => Some((FLOAT64, exact.at(time)?)),
+                    None if job.other_kernels => Some(("float32 on the host", values(job.host)?)),
+                    None => None,
+                };
+                Ok((found, oracle))
+            };
             note(case(&part, condition, format!("time {time}"), both));
         }
     }
+    Ok(())
+}
+
+/// The deformer called `name` with its default settings. Fresh ones are the identity, whatever they are asked, so noise is added to all weights.
+fn shaken(job: &StressJob, name: &str, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
+    let (kind, settings) = split_kind("deformer", &toml::Table::from_iter([("kind".into(), name.into())]))?;
+    let mut deformer = (job.registry.deformer(&kind)?.build)(&settings, context, device)?;
+    for (index, parameter) in deformer.parameters_mut().into_iter().enumerate() {
+        let count = parameter.value.dims()[0];
+        let noise: Vec<f32> = (0..count).map(|k| 0.1 * uniform(Seed::root(13).index(index as u64), k)).collect();
+        parameter.value = parameter.value.clone() + Tensor::from_data(TensorData::new(noise, [count]), device);
+    }
+    Ok(deformer)
+}
+
+/// Width and values `[POINTS, width]` of every attribute: its start and noise.
+fn attribute_values(deformer: &dyn Deformer) -> Vec<(usize, Vec<f32>)> {
+    let values = |(index, spec): (usize, &AttributeSpec)| {
+        let noise = |k: usize| spec.start + 0.1 * uniform(Seed::root(14).index(index as u64), k);
+        (spec.width, (0..POINTS * spec.width).map(noise).collect())
+    };
+    deformer.attributes().iter().enumerate().map(values).collect()
 }
 
 /// Many steps with gradients that vanish, against float64.

@@ -3,7 +3,7 @@
 use super::Context;
 use crate::args::Stress;
 use crate::models::resolved_device;
-use cc4dgs::stress::{StressJob, StressReport, stress};
+use cc4dgs::stress::{NO_ORACLE, StressJob, StressReport, stress};
 use cc4dgs_core::{Error, Event, EventSink, Result, parse_device};
 use serde_json::json;
 use std::collections::BTreeMap;
@@ -12,6 +12,8 @@ use std::collections::BTreeMap;
 /// tensor operations or kernel launches elsewhere.
 const SIZES: [(&str, usize, usize); 3] = [("flex", 20_000, 8), ("ndarray", 5_000, 8), ("", 1_000, 3)];
 const FULL_STEPS: usize = 1_000_000;
+/// Devices that share the kernels of the host.
+const PROCESSORS: [&str; 2] = ["flex", "ndarray"];
 /// All levels.
 const ALL_LEVELS: usize = 8;
 
@@ -24,6 +26,7 @@ pub fn run(context: &Context, args: &Stress) -> Result<()> {
         registry: &context.registry,
         device: &device,
         host: &host,
+        other_kernels: !PROCESSORS.iter().any(|processor| name.starts_with(processor)),
         rasterizer: "tile",
         oracle: "reference",
         optimizer: "adam",
@@ -53,6 +56,7 @@ fn table(device: &str, report: &StressReport) -> String {
     struct Row<'a> {
         cases: usize,
         errors: usize,
+        alone: bool,
         failed: Option<&'a str>,
         worst: Option<(f64, &'a str)>,
         limit: Option<&'a str>,
@@ -63,10 +67,11 @@ fn table(device: &str, report: &StressReport) -> String {
         let key = (case.part.as_str(), case.condition.as_str());
         let row = rows.entry(key).or_insert_with(|| {
             order.push(key);
-            Row { cases: 0, errors: 0, failed: None, worst: None, limit: None }
+            Row { cases: 0, errors: 0, alone: false, failed: None, worst: None, limit: None }
         });
         row.cases += 1;
         row.errors += usize::from(case.outcome.starts_with("error"));
+        row.alone |= case.oracle.as_deref() == Some(NO_ORACLE);
         if !case.behaves {
             row.failed = row.failed.or(Some(&case.level));
         }
@@ -90,8 +95,10 @@ fn table(device: &str, report: &StressReport) -> String {
             None if row.errors == 0 => "finite".to_string(),
             None => format!("finite, {} refused with an error", row.errors),
         };
-        let worst = row.worst.map_or_else(String::new, |(error, level)| format!("{error:.1e} at {level}"));
-        lines.push(format!("{:<24} {:<34} {:>5}  {behaviour:<34} {worst:<26} {}", key.0, key.1, row.cases, row.limit.unwrap_or("none")));
+        let unknown = if row.alone { NO_ORACLE } else { "" };
+        let worst = row.worst.map_or_else(|| unknown.to_string(), |(error, level)| format!("{error:.1e} at {level}"));
+        let limit = row.limit.unwrap_or(if row.worst.is_some() { "none" } else { "" });
+        lines.push(format!("{:<24} {:<34} {:>5}  {behaviour:<34} {worst:<26} {limit}", key.0, key.1, row.cases));
     }
     lines.join("\n")
 }

@@ -55,7 +55,8 @@ quantities! {
     TRAINING: "training_minutes", "training time", "min", 2, Lower, |c| Some(c.cost.training_seconds / 60.0);
     ENCODE: "encode_s", "encoding time", "s", 2, Lower, |c| Some(c.cost.encode_seconds);
     DECODE: "decode_s", "decoding time", "s", 2, Lower, |c| Some(c.cost.decode_seconds);
-    MEMORY: "peak_memory_mb", "peak memory", "MB", 0, Lower, |c| c.cost.peak_memory_mb;
+    TRAINING_MEMORY: "training_peak_memory_mb", "peak memory of the training", "MB", 0, Lower, |c| c.cost.training_peak_memory_mb;
+    CELL_MEMORY: "cell_peak_memory_mb", "peak memory of codec and scoring", "MB", 0, Lower, |c| c.cost.cell_peak_memory_mb;
     GAUSSIANS: "gaussians", "Gaussians", "", 0, Neither, |c| Some(c.gaussians as f64);
 }
 
@@ -102,9 +103,10 @@ impl<'a> Row<'a> {
     pub fn name(&self) -> String {
         format!("{} / {}", self.training(), self.codec)
     }
-    /// The codec without its profile.
+    /// The codec without its profile and settings. The grid's name of it may be anything.
     pub fn codec_family(&self) -> &'a str {
-        self.codec.split(':').next().unwrap_or(self.codec)
+        let codec = &self.cells[0].provenance.codec.codec;
+        codec.split(':').next().unwrap_or(codec)
     }
     /// The rows that share a training with this one have equal keys.
     pub fn training_key(&self) -> (&'a str, &'a str) {

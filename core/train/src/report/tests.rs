@@ -20,10 +20,12 @@ fn cell(id: &str, change: impl FnOnce(&mut CellResult)) -> CellResult {
 fn sweep(folder: &Path) -> Vec<CellResult> {
     let mut cells = Vec::new();
     for (m, method) in ["cdf", "hexplane"].into_iter().enumerate() {
-        for (c, codec) in ["cca:default", "cca:low"].into_iter().enumerate() {
+        for (c, codec) in ["cca-default", "cca-low"].into_iter().enumerate() {
             for seed in 0..2u64 {
                 cells.push(cell(&format!("{method}-{c}-{seed}"), |r| {
                     r.axes = crate::sweep::Axes { scene: "tiny".into(), method: method.into(), setting: "base".into(), codec: codec.into(), seed };
+                    // Names of a grid cannot have the colon of a profile.
+                    r.provenance.codec.codec = codec.replace('-', ":");
                     (r.provenance.data.path, r.provenance.data.files) = ("procedural:tiny".into(), 0);
                     let psnr = 30.0 + m as f64 - 0.5 * c as f64 + 0.2 * seed as f64;
                     r.metrics.get_mut("psnr_db").unwrap().value = psnr;
@@ -99,11 +101,26 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
     }
     // 4 rows; the mean of 31.0 and 31.2, the better of the two methods, is marked.
     assert_eq!(first.csv.lines().count(), 5);
-    assert!(first.csv.lines().nth(3).unwrap().starts_with("tiny,hexplane,base,cca:default,done,2,31.1,"), "{}", first.csv);
+    assert!(first.csv.lines().nth(3).unwrap().starts_with("tiny,hexplane,base,cca-default,done,2,31.1,"), "{}", first.csv);
     assert!(first.markdown.contains("**31.10 ± 0.14**") && first.latex.contains("\\textbf{31.10 $\\pm$ 0.14}"), "{}", first.markdown);
     // Numbers of papers are in tables of their own, below the notice.
     let notice = first.markdown.find("Reported by papers").unwrap();
     assert!(first.markdown.find("CC-4DGS").unwrap() > notice && !first.csv.contains("CC-4DGS"));
+}
+
+#[test]
+fn profiles_of_a_codec_are_joined_to_a_curve() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cells = sweep(folder.path());
+    // Lines of the plot of PSNR against size.
+    let lines = |cells: &[CellResult]| {
+        let scenes = rows(cells).unwrap();
+        let figures = charts::figures(&scenes["tiny"], &charts::Key::of(scenes.values().flatten()));
+        figures.split("PSNR against size").nth(2).unwrap().split("</svg>").next().unwrap().matches("class=\"line\"").count()
+    };
+    assert_eq!(lines(&cells), 2, "one per method");
+    cells.iter_mut().filter(|c| c.axes.codec == "cca-low").for_each(|c| c.provenance.codec.codec = "vq:low".into());
+    assert_eq!(lines(&cells), 0, "two codecs");
 }
 
 #[test]

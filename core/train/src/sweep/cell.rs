@@ -1,6 +1,6 @@
 //! Runs a cell: the trained model is stored by a codec, read back, and scored.
 
-use super::facts::{device_facts, locate};
+use super::facts::{PeakMemory, device_facts, locate};
 use super::folder::SweepFolder;
 use super::hash::name_of;
 use super::plan::{Plan, PlannedCell, PlannedTraining};
@@ -12,6 +12,7 @@ use crate::data;
 use crate::eval::{EvalReport, Scored, evaluate};
 use crate::images::write_png;
 use crate::sample::spread;
+use crate::train::{TuneJob, Tuner};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Archive, StreamKind};
 use cc4dgs_core::{Error, Result, Scene, parse_device};
@@ -20,6 +21,7 @@ use serde::Serialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
@@ -30,7 +32,7 @@ pub(super) struct Trained<'a> {
     config: RunConfig,
     device: Device,
     model: Model,
-    scene: Scene,
+    scene: Arc<Scene>,
 }
 
 impl<'a> Trained<'a> {
@@ -40,20 +42,32 @@ impl<'a> Trained<'a> {
         let device = parse_device(&config.device)?;
         let model = Model::open(&folder.training(&training.id), worker.registry, &device, &config.limits, worker.events)?;
         let scene = data::open_in(&locate(&training.data.path)?, &config.scene, &model.normalisation, worker.registry, &config.limits)?;
-        let scene = data::hold_out(&scene, config.train.validation)?;
+        let scene = Arc::new(data::hold_out(&scene, config.train.validation)?);
         Ok(Self { training, finished, config, device, model, scene })
     }
     /// Stores, reads back, scores, and writes the result.
     pub fn run(&self, worker: &Worker, folder: &SweepFolder, plan: &Plan, cell: &PlannedCell) -> Result<CellResult> {
         let archive = folder.archive(&cell.id);
         let choice = &cell.choice;
+        let memory = PeakMemory::begin();
         let began = Instant::now();
+        // Codecs that fine-tune see training and validation views only.
+        let tuner = Tuner::new(TuneJob {
+            model: &self.model,
+            scene: self.scene.clone(),
+            field_weights: &choice.field_weights,
+            registry: worker.registry,
+            device: &self.device,
+            limits: &self.config.limits,
+            events: worker.events,
+            stop: worker.stop,
+        });
         let options = ArchiveOptions {
             codec: &choice.codec,
             settings: &choice.settings,
             field_weights: &choice.field_weights,
             scene: Some((&self.scene, &self.device)),
-            tuner: None,
+            tuner: Some(&tuner),
         };
         self.model.save_archive(&archive, &options, worker.registry, &self.config.limits, worker.events)?;
         let encode_seconds = began.elapsed().as_secs_f64();
@@ -82,7 +96,7 @@ impl<'a> Trained<'a> {
             if index == 0 {
                 image_size = [truth.width, truth.height];
             }
-            frame_ms_each.push(score.field_ms + score.raster_ms);
+            frame_ms_each.push(((score.field_ms + score.raster_ms) * 1e3).round() / 1e3);
             images.push(ImageResult {
                 camera: score.camera.clone(),
                 frame: score.frame,
@@ -156,7 +170,8 @@ impl<'a> Trained<'a> {
                     raster: report.frame_ms.raster,
                 },
                 frame_ms_each,
-                peak_memory_mb: finished.peak_memory_mb,
+                training_peak_memory_mb: finished.peak_memory_mb,
+                cell_peak_memory_mb: memory.mb(),
                 finished_unix: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs()),
             },
         };

@@ -1,6 +1,7 @@
 //! Puts the results of a sweep together: checks that every cell is there exactly once, and makes the tables.
 
 use super::folder::SweepFolder;
+use super::lines::write_lines;
 use super::plan::Plan;
 use super::read::RESULTS;
 use super::result::CellResult;
@@ -44,7 +45,7 @@ pub struct Collection {
 /// What [`write_tables`] wrote.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Tables {
-    /// All results, one per line.
+    /// All results, one per line, as `docs/results.md` describes.
     pub results: PathBuf,
     /// Markdown.
     pub markdown: PathBuf,
@@ -111,7 +112,7 @@ impl Collection {
 /// As [`markdown`], and [`Error::Io`].
 pub fn write_tables(folder: &SweepFolder, results: &[CellResult]) -> Result<Tables> {
     let (table, comma_separated) = (markdown(results)?, csv(results)?);
-    let lines: String = results.iter().map(|r| r.to_line().map(|line| line + "\n")).collect::<Result<Vec<_>>>()?.concat();
+    let lines = write_lines(results)?;
     let at = |name: &str| folder.root().join(name);
     let tables = Tables { results: at("results.jsonl"), markdown: at("table.md"), csv: at("table.csv") };
     write_atomically(&tables.results, lines.as_bytes())?;

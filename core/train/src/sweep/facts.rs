@@ -167,11 +167,24 @@ fn nvidia() -> (Option<String>, Option<String>) {
     (model, version)
 }
 
-/// Most memory that this process has had, MB (10^6 bytes).
-pub fn peak_memory_mb() -> Option<f64> {
-    let text = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    line.split_whitespace().next()?.parse::<f64>().ok().map(|kib| kib * 1024.0 / 1e6)
+/// Measures the most resident memory of this process over a time. Two at once would disturb each other: a sweep has one per process.
+pub struct PeakMemory {
+    /// Whether the system forgot what was before.
+    begun: bool,
+}
+
+impl PeakMemory {
+    /// From now on.
+    pub fn begin() -> Self {
+        // Linux only (proc(5)): 5 sets the peak to what is resident now.
+        Self { begun: std::fs::write("/proc/self/clear_refs", "5").is_ok() }
+    }
+    /// The peak since then, MB (10^6 bytes), where the system tells.
+    pub fn mb(&self) -> Option<f64> {
+        let text = self.begun.then(|| std::fs::read_to_string("/proc/self/status").ok())??;
+        let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+        line.split_whitespace().next()?.parse::<f64>().ok().map(|kib| kib * 1024.0 / 1e6)
+    }
 }
 
 #[cfg(test)]
@@ -199,6 +212,19 @@ mod tests {
         std::fs::rename(at("train/a.png"), at("train/b.png")).unwrap();
         assert_ne!(of().hash, first.hash, "another name");
         assert_ne!(listing(folder.path()).unwrap(), first_listing);
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn the_peak_is_that_of_its_own_time() {
+        // Written, so that it is resident; other tests of this process use far less.
+        let large = |mb: usize| std::hint::black_box(vec![1u8; mb * 1_000_000]).len();
+        let first = PeakMemory::begin();
+        large(300);
+        let with = first.mb().unwrap();
+        let second = PeakMemory::begin();
+        large(1);
+        assert!(with > 300.0 && second.mb().unwrap() < with - 150.0, "{with} MB, then {:?}", second.mb());
     }
 
     #[cfg(unix)]

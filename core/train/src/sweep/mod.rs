@@ -5,11 +5,13 @@
 
 mod cell;
 mod collect;
+mod columns;
 mod emit;
 mod facts;
 mod folder;
 mod grid;
 mod hash;
+mod lines;
 mod lock;
 mod plan;
 mod read;

@@ -9,6 +9,7 @@ use crate::config::RunConfig;
 use crate::layers::Layers;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Registry, Result, config};
+use cc4dgs_play::field_weights::FieldWeights;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -213,7 +214,7 @@ fn codecs(grid: &Grid, registry: &Registry) -> Result<Vec<(String, CodecChoice)>
     let of = |axis: &super::grid::CodecAxis| {
         let choice = axis.choice()?;
         registry.build_codec(&choice.codec, &choice.settings)?;
-        registry.weight_codec(&choice.field_weights)?;
+        FieldWeights::parse(&choice.field_weights, registry)?;
         Ok((axis.name.clone(), choice))
     };
     grid.codec.iter().map(|axis| of(axis).map_err(|error| within(&format!("grid {}, codec '{}'", grid.name, axis.name), error))).collect()

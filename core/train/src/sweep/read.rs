@@ -1,5 +1,6 @@
 //! Reading results back, and refusing to compare what cannot be compared.
 
+use super::lines::read_lines;
 use super::result::{CellResult, KIND};
 use cc4dgs_core::{Error, Result};
 use serde_json::{Map, Value};
@@ -67,8 +68,7 @@ fn read_file(file: &Path, lenient: bool) -> Result<Vec<CellResult>> {
     }
     let text = std::fs::read_to_string(file).map_err(|e| Error::io(file, e))?;
     if file.extension().is_some_and(|e| e == "jsonl") {
-        let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-        return lines.map(|(number, line)| CellResult::from_json(&format!("{object}, line {}", number + 1), line)).collect();
+        return read_lines(&object, &text);
     }
     let is_other = |text: &str| serde_json::from_str::<Value>(text).is_ok_and(|value| value.get("kind").and_then(Value::as_str) != Some(KIND));
     if lenient && is_other(&text) {
@@ -166,12 +166,29 @@ pub(super) mod tests {
         let line = result.to_line().unwrap();
         assert_eq!(CellResult::from_json("again", &line).unwrap(), result);
         assert!(!line.contains('\n') && result.size_mb() == 0.612345);
-        let later = line.replacen("\"schema\":1", "\"schema\":2", 1);
+        let later = line.replacen("\"schema\":2", "\"schema\":3", 1);
         let error = CellResult::from_json("later.json", &later).unwrap_err();
-        assert!(matches!(error, Error::Unsupported { .. }) && error.to_string().contains("version 2"), "{error}");
-        for broken in ["{}", "[]", "nonsense", &line[..line.len() / 2], &line.replace("[260,2600]", "[260]")] {
+        assert!(matches!(error, Error::Unsupported { .. }) && error.to_string().contains("version 3"), "{error}");
+        for broken in ["{}", "[]", "nonsense", &line[..line.len() / 2], &line.replace("[260,2600]", "[260]"), &line.replace("\"frame\":[0]", "\"frame\":[0,1]")]
+        {
             assert!(matches!(CellResult::from_json("broken.json", broken), Err(Error::Data { .. })), "{broken}");
         }
+    }
+
+    #[test]
+    fn results_of_version_1_are_read() {
+        let mut old: Value = serde_json::from_str(&example().to_line().unwrap()).unwrap();
+        let image = serde_json::json!({
+            "camera": "r_000", "frame": 0, "time_norm": 0.0, "scores": { "psnr_db": 31.25, "ssim": 0.9541 }, "blocks": [12, 1, 19.4],
+            "truth": "images/d1077f2c5b9e8a46/truth/00000.png", "render": "images/4be29fd1c80a7e53/00000.png"
+        });
+        (old["schema"], old["images"]) = (1.into(), Value::Array(vec![image]));
+        let cost = old["cost"].as_object_mut().unwrap();
+        let peak = cost.remove("training_peak_memory_mb").unwrap();
+        cost.remove("cell_peak_memory_mb");
+        cost.insert("peak_memory_mb".into(), peak);
+        let expected = cell("4be29fd1c80a7e53", |r| r.cost.cell_peak_memory_mb = None);
+        assert_eq!(CellResult::from_json("old.json", &old.to_string()).unwrap(), expected);
     }
 
     #[test]

@@ -11,8 +11,8 @@ use std::path::Path;
 
 /// Value of [`CellResult::kind`].
 pub const KIND: &str = "cc4dgs-result";
-/// The version of the schema that this program writes and reads.
-pub const SCHEMA: u32 = 1;
+/// The version of the schema that this program writes. It also reads version 1, in which every image was a table of its own.
+pub const SCHEMA: u32 = 2;
 
 /// One cell: a training, stored by a codec, decoded, and scored on one side of the split.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -56,7 +56,8 @@ pub struct CellResult {
     /// Blocks of the images in which something moves, where there are any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub blocks: Option<Blocks>,
-    /// Per scored image.
+    /// Per scored image; columns in files.
+    #[serde(with = "super::columns")]
     pub images: Vec<ImageResult>,
     /// Bytes by part.
     pub storage: Storage,
@@ -118,7 +119,7 @@ pub struct ResultProvenance {
 pub struct CodecChoice {
     /// `NAME[:PROFILE]`.
     pub codec: String,
-    /// Weight codec of the deformer.
+    /// Weight codec of the deformer: see [`cc4dgs_play::field_weights::FieldWeights::parse`].
     pub field_weights: String,
     /// Settings over the profile's.
     #[serde(default)]
@@ -264,8 +265,13 @@ pub struct Cost {
     pub frame_ms: FrameMs,
     /// Milliseconds of each scored image, deformer and rasterizer together, in the order of [`CellResult::images`].
     pub frame_ms_each: Vec<f64>,
-    /// Most memory of the process that scored, MB (10^6 bytes), if the system says.
-    pub peak_memory_mb: Option<f64>,
+    /// Most resident memory of the process while it trained, from the last interruption on, MB (10^6 bytes); absent where the system does not tell. Results
+    /// of version 1 call it `peak_memory_mb`.
+    #[serde(default, alias = "peak_memory_mb")]
+    pub training_peak_memory_mb: Option<f64>,
+    /// The same while the cell was stored, read back and scored; images of the scene count as well.
+    #[serde(default)]
+    pub cell_peak_memory_mb: Option<f64>,
     /// When the result was written, seconds since 1970.
     pub finished_unix: u64,
 }
@@ -305,23 +311,24 @@ impl CellResult {
     /// # Errors
     /// [`Error::Unsupported`] for another version of the schema, [`Error::Data`] for text that is no result.
     pub fn from_json(object: &str, text: &str) -> Result<Self> {
+        let value = serde_json::from_str(text).map_err(|e| Error::data(object, e.to_string(), "Remove the file and run the cell again"))?;
+        Self::from_value(object, value)
+    }
+    /// As [`CellResult::from_json`], from JSON that has been read.
+    pub(super) fn from_value(object: &str, value: Value) -> Result<Self> {
         let damaged = |problem: String| Error::data(object, problem, "Remove the file and run the cell again");
-        #[derive(Deserialize)]
-        struct Head {
-            #[serde(default)]
-            kind: String,
-            schema: Option<u32>,
-        }
-        let head: Head = serde_json::from_str(text).map_err(|e| damaged(e.to_string()))?;
-        match (head.kind.as_str(), head.schema) {
-            (KIND, Some(SCHEMA)) => {}
+        let schema = value.get("schema").and_then(Value::as_u64);
+        match (value.get("kind").and_then(Value::as_str).unwrap_or_default(), schema) {
+            (KIND, Some(version)) if (1..=u64::from(SCHEMA)).contains(&version) => {}
             (KIND, Some(other)) => {
-                let problem = format!("it has version {other} of the result schema, this program reads version {SCHEMA}");
+                let problem = format!("it has version {other} of the result schema, this program reads versions 1 to {SCHEMA}");
                 return Err(Error::unsupported(object, problem, "Use the program that wrote it, or run the cell again"));
             }
             (other, _) => return Err(damaged(format!("its kind is \"{other}\", a result has \"{KIND}\""))),
         }
-        let result: Self = serde_json::from_str(text).map_err(|e| damaged(e.to_string()))?;
+        let result: Self = serde_json::from_value(value).map_err(|e| damaged(e.to_string()))?;
+        // Older forms are brought to this one by reading them.
+        let result = Self { schema: SCHEMA, ..result };
         let points = result.curve.iteration.len();
         if [result.curve.psnr_db.len(), result.curve.gaussians.len(), result.cost.curve_seconds.len()].iter().any(|len| *len != points) {
             return Err(damaged("the columns of its training curve differ in length".into()));

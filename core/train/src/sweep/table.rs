@@ -146,7 +146,7 @@ pub fn csv(results: &[CellResult]) -> Result<String> {
         let key = name.clone();
         columns.push((name.clone(), Box::new(move |r: &CellResult| r.metrics.get(&key).map(|s| s.value))));
     }
-    let fixed: [(&str, Number); 14] = [
+    let fixed: [(&str, Number); 15] = [
         ("worst_block_psnr_db", |r| r.blocks.map(|b| b.worst_psnr_db)),
         ("lost_blocks", |r| r.blocks.map(|b| b.lost)),
         ("size_mb", |r| Some(r.size_mb())),
@@ -159,7 +159,8 @@ pub fn csv(results: &[CellResult]) -> Result<String> {
         ("encode_seconds", |r| Some(r.cost.encode_seconds)),
         ("decode_seconds", |r| Some(r.cost.decode_seconds)),
         ("frame_ms", |r| Some(r.cost.frame_ms.mean)),
-        ("peak_memory_mb", |r| r.cost.peak_memory_mb),
+        ("training_peak_memory_mb", |r| r.cost.training_peak_memory_mb),
+        ("cell_peak_memory_mb", |r| r.cost.cell_peak_memory_mb),
         ("hopeless", |r| Some(f64::from(u8::from(r.outcome == Outcome::Hopeless)))),
     ];
     columns.extend(fixed.into_iter().map(|(name, value)| (name.to_string(), Box::new(value) as Box<Value>)));

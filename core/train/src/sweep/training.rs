@@ -1,6 +1,6 @@
 //! Runs a training of a sweep, or goes on with one that was interrupted.
 
-use super::facts::{listing, locate, peak_memory_mb};
+use super::facts::{PeakMemory, listing, locate};
 use super::folder::SweepFolder;
 use super::plan::PlannedTraining;
 use super::result::{Curve, Outcome};
@@ -72,6 +72,7 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
         let problem = "names or sizes of its files are not those of the plan";
         return Err(Error::data(format!("scene {}", training.data.path), problem, "Restore the dataset, or make the plan again"));
     }
+    let memory = PeakMemory::begin();
     std::fs::create_dir_all(&run).map_err(|e| Error::io(&run, e))?;
     // Once the configuration is written, it decides: a plan of the preset `auto` is made once.
     let own = run.join(CONFIG);
@@ -109,7 +110,7 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
         seconds: history.seconds,
         stage_seconds: history.stage_seconds,
         resumed: history.resumed,
-        peak_memory_mb: peak_memory_mb(),
+        peak_memory_mb: memory.mb(),
     };
     let json =
         serde_json::to_string(&finished).map_err(|e| Error::backend("training", e.to_string(), "Report this: every training should have a JSON form"))?;

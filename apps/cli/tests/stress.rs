@@ -1,0 +1,26 @@
+//! `cc4dgs stress`: what is compared with what.
+#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
+
+mod common;
+
+use common::json_of;
+use serde_json::Value;
+
+#[test]
+fn deformers_are_compared_with_float64_or_with_nothing() {
+    let report = json_of(&["stress", "--device", "flex", "-q", "--json"]);
+    let cases = report["cases"].as_array().unwrap();
+    assert_eq!(report["failures"], Value::Array(Vec::new()));
+    let of = |part: &str| cases.iter().filter(|case| case["part"] == part && case["oracle"].is_string()).collect::<Vec<_>>();
+    for part in ["deformer cdf", "deformer cdf-basis", "deformer deform-mlp", "deformer free-time"] {
+        let compared = of(part);
+        assert!(compared.len() >= 24 && compared.iter().all(|case| case["oracle"] == "float64"), "{part}: {compared:?}");
+        // Rounding is visible and small: an oracle that computes the same would be off by nothing, another formula by more.
+        let errors: Vec<f64> = compared.iter().filter(|case| case["level"] == "time 0.5").map(|case| case["error"].as_f64().unwrap()).collect();
+        assert!(errors.len() == 4 && errors.iter().all(|e| (1e-12..1e-4).contains(e)), "{part}: {errors:?}");
+    }
+    for part in ["deformer hexplane", "loss l1"] {
+        let alone = of(part);
+        assert!(!alone.is_empty() && alone.iter().all(|case| case["oracle"] == "no oracle" && case["error"].is_null()), "{part}: {alone:?}");
+    }
+}
