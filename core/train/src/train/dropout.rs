@@ -34,7 +34,7 @@ mod tests {
     #[test]
     fn a_share_is_dropped_and_the_rest_keeps_the_sum() {
         let device = Device::flex();
-        let seed = Seed::new(3).child("test");
+        let seed = Seed::root(3).child("test");
         let factors: Vec<f32> = factors(10_000, 0.2, seed, &device).into_data().to_vec().unwrap();
         let dropped = factors.iter().filter(|f| **f == 0.0).count();
         assert!((1_800..2_200).contains(&dropped), "{dropped}");
@@ -45,10 +45,10 @@ mod tests {
     fn logits_stay_finite_and_without_dropout_the_same() {
         let device = Device::flex();
         let logits = Tensor::<1>::from_data(TensorData::new(vec![-40.0f32, -2.0, 0.0, 3.0, 40.0], [5]), &device);
-        let same: Vec<f32> = dropped(logits.clone(), 0.0, Seed::new(0)).into_data().to_vec().unwrap();
+        let same: Vec<f32> = dropped(logits.clone(), 0.0, Seed::root(0)).into_data().to_vec().unwrap();
         assert_eq!(same, [-40.0, -2.0, 0.0, 3.0, 40.0]);
         for seed in 0..8 {
-            let drawn: Vec<f32> = dropped(logits.clone(), 0.5, Seed::new(seed)).into_data().to_vec().unwrap();
+            let drawn: Vec<f32> = dropped(logits.clone(), 0.5, Seed::root(seed)).into_data().to_vec().unwrap();
             assert!(drawn.iter().all(|l| l.is_finite() && *l < 6.0), "{drawn:?}");
         }
     }
