@@ -20,7 +20,7 @@ pub mod window;
 pub use clock::Clock;
 pub use content::{Content, Scene};
 pub use navigator::Navigator;
-pub use render::{Mode, Renderer, View, request_device};
+pub use render::{Mode, Renderer, View, device_of, request_device};
 
 /// The codecs that archives may need. Linkers drop what nobody refers to, above all on wasm32.
 pub fn link() {

@@ -2,10 +2,11 @@
 
 use cc4dgs_format::{Error, Limits, Result};
 use cc4dgs_player::Content;
-use cc4dgs_player::window::{Opened, Shown, show};
+use cc4dgs_player::window::{Opened, Shown, Source, Start, show};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
 
 fn main() -> ExitCode {
     match run() {
@@ -19,9 +20,26 @@ fn main() -> ExitCode {
 }
 
 fn run() -> Result<()> {
-    let usage = || Error::parameter("cc4dgs-view", "no file is named", "Write cc4dgs-view FILE, with a .cc4d archive, a PLY or an SPZ file");
-    let path = std::env::args_os().nth(1).map(PathBuf::from).ok_or_else(usage)?;
-    show(&path.file_name().unwrap_or_default().to_string_lossy(), Shown::Model(Box::new(open(&path)?), Box::new(open)))
+    let usage =
+        |problem: String| Error::parameter("cc4dgs-view", problem, "Write cc4dgs-view FILE [--time T] [--pose=P], with a .cc4d archive, a PLY or an SPZ file");
+    let (mut path, mut start) = (None, Start::default());
+    let mut arguments = std::env::args_os().skip(1);
+    while let Some(argument) = arguments.next() {
+        let text = argument.to_string_lossy().into_owned();
+        let (name, joined) = text.split_once('=').map_or((text.as_str(), None), |(name, value)| (name, Some(value.to_string())));
+        let mut value =
+            || joined.clone().or_else(|| arguments.next().map(|v| v.to_string_lossy().into_owned())).ok_or_else(|| usage(format!("{name} has no value")));
+        match name {
+            "--time" => start.time = Some(Start::parse_time(&value()?)?),
+            "--pose" => start.pose = Some(Start::parse_pose(&value()?)?),
+            _ if path.is_none() => path = Some(PathBuf::from(&argument)),
+            _ => return Err(usage(format!("{text:?} is one argument too many"))),
+        }
+    }
+    let path = path.ok_or_else(|| usage("no file is named".into()))?;
+    let title = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let opened = Box::new(open(&path)?);
+    show(&title, Shown::Model(opened, Source { path, open: Arc::new(open), start, command: "cc4dgs-view" }))
 }
 
 fn open(path: &Path) -> Result<Opened> {

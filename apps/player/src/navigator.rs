@@ -138,12 +138,14 @@ impl Navigator {
         let (e, t) = (self.eye, self.target);
         [e.x, e.y, e.z, t.x, t.y, t.z, self.fov_y]
     }
-    /// Takes a pose of [`Navigator::pose`]; poses that are not finite or see nothing are ignored.
-    pub fn set_pose(&mut self, pose: [f64; 7]) {
+    /// Takes a pose of [`Navigator::pose`]; poses that are not finite or see nothing are ignored. Returns whether it was taken.
+    pub fn set_pose(&mut self, pose: [f64; 7]) -> bool {
         let (eye, target) = (DVec3::new(pose[0], pose[1], pose[2]), DVec3::new(pose[3], pose[4], pose[5]));
-        if pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && (0.01..3.1).contains(&pose[6]) {
+        let sees = pose.iter().all(|v| v.is_finite()) && eye.distance(target) > 1e-9 && (0.01..3.1).contains(&pose[6]);
+        if sees {
             (self.eye, self.target, self.fov_y, self.roll) = (eye, target, pose[6], 0.0);
         }
+        sees
     }
 }
 
@@ -191,8 +193,9 @@ mod tests {
             navigator.camera(10, 10).validate().unwrap();
         }
         let pose = navigator.pose();
-        navigator.set_pose([f64::NAN; 7]);
+        assert!(!navigator.set_pose([f64::NAN; 7]));
         assert_eq!(navigator.pose(), pose);
+        assert!(navigator.set_pose(pose));
         navigator.zoom(f64::NAN);
         assert_eq!(navigator.pose(), pose);
     }

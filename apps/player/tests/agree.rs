@@ -131,3 +131,37 @@ fn options_change_what_is_drawn() {
     renderer.unload();
     assert_eq!(light(&renderer.image(&plain).unwrap().data), 0);
 }
+
+#[test]
+fn a_model_that_the_device_refuses_leaves_the_one_before() {
+    if renderer().is_none() {
+        return;
+    }
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+    let adapter = pollster::block_on(instance.request_adapter(&Default::default())).unwrap();
+    let required_limits = wgpu::Limits { max_storage_buffer_binding_size: 1 << 17, ..Default::default() };
+    let small = wgpu::DeviceDescriptor { required_limits, ..Default::default() };
+    let (device, queue) = pollster::block_on(adapter.request_device(&small)).unwrap();
+    let mut renderer = Renderer::new(device, queue, wgpu::TextureFormat::Rgba8Unorm);
+    let scene = |n: usize| {
+        let gaussians = cc4dgs::HostGaussians {
+            means: [0.0, 0.1, 0.2].repeat(n),
+            log_scales: vec![-2.0; 3 * n],
+            quaternions: [1.0, 0.0, 0.0, 0.0].repeat(n),
+            opacity_logits: vec![3.0; n],
+            sh_dc: vec![1.0; 3 * n],
+            dynamic_scores: vec![0.0; n],
+            ..Default::default()
+        };
+        Content::read("n.ply", cc4dgs::core::ply::to_bytes(&gaussians, true).unwrap(), &Limits::default()).unwrap().scene
+    };
+    let view = View::new(Camera::look_at("t", (64, 48), 0.8, [3.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]), 0.0);
+    renderer.load(scene(2)).unwrap();
+    let before = renderer.image(&view).unwrap();
+    assert!(before.data.iter().any(|v| *v > 100));
+    // 64 bytes each, so 2,048 fit.
+    let message = renderer.load(scene(2049)).unwrap_err().to_string();
+    assert!(message.contains("131072") && message.contains("2048"), "{message}");
+    assert_eq!((renderer.scene().map(|s| s.count), renderer.image(&view).unwrap().data == before.data), (Some(2), true));
+    renderer.load(scene(2048)).unwrap();
+}

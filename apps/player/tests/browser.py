@@ -13,6 +13,8 @@ FLAGS = ("--enable-unsafe-webgpu --enable-features=Vulkan --use-vulkan=swiftshad
          "--enable-unsafe-swiftshader --ignore-gpu-blocklist --no-sandbox").split()
 LEAST_DB = 40.0
 MODEL = "/model.cc4d"
+# A frame of a real scene takes seconds in software.
+PATIENCE_MS = 180000
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
@@ -83,10 +85,11 @@ def main():
 
         def open_page(query="", size=(1280, 800)):
             page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+            page.set_default_timeout(PATIENCE_MS)
             page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
             page.on("pageerror", lambda e: complaints.append(str(e)))
             page.goto(address + query)
-            page.wait_for_function("window.cc4dgs !== undefined", timeout=120000)
+            page.wait_for_function("window.cc4dgs !== undefined", timeout=PATIENCE_MS)
             return page
 
         def shot(page, name):
@@ -121,7 +124,7 @@ def main():
 
         # Plays, pauses, seeks, steps.
         page.evaluate("cc4dgs.seek(0); window.times = []; cc4dgs.on('time', e => times.push(e.time)); cc4dgs.play()")
-        page.wait_for_function("times.length > 3", timeout=60000)
+        page.wait_for_function("times.length > 3", timeout=PATIENCE_MS)
         page.evaluate("cc4dgs.pause()")
         # A short sequence may have begun again.
         assert page.evaluate("new Set(times).size === times.length")
@@ -140,12 +143,15 @@ def main():
 
         # Gestures, reset, links.
         pose = page.evaluate("Array.from(cc4dgs.gpu.pose)")
+        # Where a frame takes seconds, the wheel is heard of later than the next key.
+        page.evaluate("window.wheeled = new Promise(r => cc4dgs.ui.canvas.addEventListener('wheel', r, { once: true })).then(() => 0); 0")
         page.mouse.move(600, 300), page.mouse.down(), page.mouse.move(700, 340, steps=4), page.mouse.up(), page.mouse.wheel(0, -300)
+        page.evaluate("wheeled")
         moved = page.evaluate("Array.from(cc4dgs.gpu.pose)")
         assert max(abs(a - b) for a, b in zip(pose, moved)) > 0.05
         link = page.evaluate("cc4dgs.link()")
         page.keyboard.press("r")
-        assert max(abs(a - b) for a, b in zip(pose, page.evaluate("Array.from(cc4dgs.gpu.pose)"))) < 1e-9
+        assert max(abs(a - b) for a, b in zip(pose, page.evaluate("Array.from(cc4dgs.gpu.pose)"))) < 1e-6
         other = open_page("?" + link.split("?", 1)[1])
         assert max(abs(a - b) for a, b in zip(moved, other.evaluate("Array.from(cc4dgs.gpu.pose)"))) < 1e-3
         assert abs(other.evaluate("cc4dgs.time") - page.evaluate("cc4dgs.time")) < 1e-4
@@ -176,7 +182,7 @@ def main():
         assert page.evaluate("cc4dgs.picture().then(p => p.data.some(v => v > 60 && v < 255))")
         say("a lost device is recovered")
         page.get_by_label("Settings").first.click()
-        page.wait_for_function("document.querySelector('.stats').textContent.includes('Gaussians')", timeout=10000)
+        page.wait_for_function("document.querySelector('.stats').textContent.includes('Gaussians')", timeout=PATIENCE_MS)
         shot(page, "laptop_settings")
         page.get_by_label("Tint what moves").check(), page.get_by_label("Depth").check()
         shot(page, "laptop_depth")
@@ -218,7 +224,7 @@ def main():
         phone.wait_for_function("window.cc4dgs !== undefined")
         shot(phone, "phone_empty")
         phone.set_input_files("input[type=file]", args.archive)
-        phone.wait_for_function("cc4dgs.facts && cc4dgs.facts.frames > 1", timeout=60000)
+        phone.wait_for_function("cc4dgs.facts && cc4dgs.facts.frames > 1", timeout=PATIENCE_MS)
         phone.evaluate("cc4dgs.seek(0.4)")
         shot(phone, "phone")
         quiet("the phone")
@@ -234,10 +240,10 @@ def main():
                 file.on("request", lambda r: fetched.append(r.url) if not r.url.startswith(("data:", "blob:")) else None)
                 began = time.time()
                 file.goto(path.as_uri() + backend)
-                file.wait_for_function("window.cc4dgs?.facts", timeout=120000)
+                file.wait_for_function("window.cc4dgs?.facts", timeout=PATIENCE_MS)
                 assert file.evaluate("cc4dgs.facts.gaussians") == facts["gaussians"] and bool(backend) == file.evaluate("!!cc4dgs.gl")
                 say(f"{path.name}, {path.stat().st_size / 1e6:.2f} MB: opened from disk without a network in {time.time() - began:.1f} s, {file.title()!r}")
-                file.wait_for_function("cc4dgs.playing && cc4dgs.time > 0", timeout=60000)
+                file.wait_for_function("cc4dgs.playing && cc4dgs.time > 0", timeout=PATIENCE_MS)
                 file.evaluate("cc4dgs.pause()")
                 agree(file, "the single file" + (", WebGL2" if backend else ""))
                 assert len(fetched) == 1, f"it fetched {fetched}"

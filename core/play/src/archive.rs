@@ -247,8 +247,9 @@ pub fn attribute_width(manifest: &Manifest) -> u64 {
     widths.map_or(0, |all| all.values().filter_map(Value::as_u64).fold(0, u64::saturating_add))
 }
 
+/// `value` by way of text, so that a float32 has its own few digits and not those of the float64 beside it.
 fn json(value: &impl Serialize) -> Result<Value> {
-    serde_json::to_value(value).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))
+    serde_json::to_string(value).and_then(|text| serde_json::from_str(&text)).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))
 }
 
 /// The version of the linked plug-in that the file `object` names, or an error that says what to link. `version` is the stored one, where the file has it.

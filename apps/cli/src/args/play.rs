@@ -50,6 +50,12 @@ pub struct View {
     /// How far a point of a Gaussian may be off where motion has to be baked first; as for `bake`.
     #[arg(long, value_name = "E", default_value = "0.1px")]
     pub max_error: String,
+    /// Stand still at this normalised time, 0 to 1, instead of playing from the first frame.
+    #[arg(long, value_name = "T")]
+    pub time: Option<String>,
+    /// Begin at this pose: seven numbers with commas between, as "Print command" in the window and the links of the page have them.
+    #[arg(long, value_name = "P", allow_hyphen_values = true)]
+    pub pose: Option<String>,
     /// Device that motion is baked on, and that exact images are drawn on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,

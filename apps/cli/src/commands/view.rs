@@ -4,41 +4,66 @@ use super::{Context, exact};
 use crate::args::View;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings};
 use cc4dgs_core::archive::Archive;
-use cc4dgs_core::{Error, Limits, Result, StoredModel, parse_device};
+use cc4dgs_core::{Error, EventSink, Limits, Registry, Result, Silent, StoredModel, parse_device};
+use cc4dgs_play::bake::MaxError;
 use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_player::Content;
-use cc4dgs_player::window::{self, Opened, Shown};
+use cc4dgs_player::window::{self, Opened, Shown, Start};
 use std::path::Path;
+use std::sync::Arc;
 
-/// Loads the model; what moves and has no playback layer is baked now. [`show`] opens the window, on the main thread.
-pub fn prepare(context: &Context, args: &View) -> Result<Opened> {
-    // First, so that a change of the file after this is noticed.
-    let exact = exact::of_file(&args.model, &args.device, context.limits);
-    Ok(Opened { content: content(context, args)?, exact })
+/// How models are opened.
+#[derive(Clone)]
+struct Options {
+    device: String,
+    max_error: MaxError,
+    limits: Limits,
 }
 
-fn content(context: &Context, args: &View) -> Result<Content> {
-    let events = context.listeners(None)?;
-    let source = Source::expect(&args.model)?;
+impl Options {
+    fn of(args: &View, limits: Limits) -> Result<Self> {
+        Ok(Self { device: args.device.clone(), max_error: args.max_error.parse()?, limits })
+    }
+    /// Loads the model at `path`; what moves and has no playback layer is baked now.
+    fn open(&self, path: &Path, registry: &Registry, events: &dyn EventSink) -> Result<Opened> {
+        // First, so that a change of the file after this is noticed.
+        let exact = exact::of_file(path, &self.device, self.limits);
+        Ok(Opened { content: content(path, self, registry, events)?, exact })
+    }
+}
+
+/// Loads the model that the command names. [`show`] opens the window, on the main thread.
+pub fn prepare(context: &Context, args: &View) -> Result<Opened> {
+    start(args)?;
+    Options::of(args, context.limits)?.open(&args.model, &context.registry, &context.listeners(None)?)
+}
+
+fn start(args: &View) -> Result<Start> {
+    Ok(Start { time: args.time.as_deref().map(Start::parse_time).transpose()?, pose: args.pose.as_deref().map(Start::parse_pose).transpose()? })
+}
+
+fn content(path: &Path, options: &Options, registry: &Registry, events: &dyn EventSink) -> Result<Content> {
+    let Options { device, max_error, limits } = options;
+    let source = Source::expect(path)?;
     let object = source.file.display().to_string();
     match source.kind {
-        SourceKind::Ply | SourceKind::Spz => return read(&source.file, &context.limits),
+        SourceKind::Ply | SourceKind::Spz => return read(&source.file, limits),
         SourceKind::Archive => {
-            let archive = Archive::open(&source.file, &context.limits)?;
-            let stored = StoredModel::read(&object, &archive, &context.limits, &events)?;
+            let archive = Archive::open(&source.file, limits)?;
+            let stored = StoredModel::read(&object, &archive, limits, events)?;
             if stored.playback.is_some() || !stored.moves() {
                 return Content::of_model(stored, archive.total_bytes()?);
             }
         }
         SourceKind::Checkpoint => {}
     }
-    let device = parse_device(&args.device)?;
-    let around = Surroundings { registry: &context.registry, device: &device, limits: &context.limits, events: &events };
-    let stored = Stored::open(&args.model, Storage { codec: "raw", field_weights: "fp32" }, around)?;
+    let device = parse_device(device)?;
+    let around = Surroundings { registry, device: &device, limits, events };
+    let stored = Stored::open(path, Storage { codec: "raw", field_weights: "fp32" }, around)?;
     let presentation = stored.presentation(&[], None)?;
-    let options = PlayableOptions { max_error: Some(args.max_error.parse()?), cameras: &[], presentation, poster: false, without_field: true };
+    let options = PlayableOptions { max_error: Some(*max_error), cameras: &[], presentation, poster: false, without_field: true };
     let playable = stored.playable(options, around)?;
-    Content::read(&object, playable.bytes, &context.limits)
+    Content::read(&object, playable.bytes, limits)
 }
 
 fn read(file: &Path, limits: &Limits) -> Result<Content> {
@@ -48,10 +73,9 @@ fn read(file: &Path, limits: &Limits) -> Result<Content> {
 /// Opens the window until it is closed.
 pub fn show(args: &View, limits: Limits, opened: Opened) -> Result<()> {
     let title = args.model.file_name().map_or_else(|| args.model.display().to_string(), |n| n.to_string_lossy().into_owned());
-    let device = args.device.clone();
-    let open = move |path: &Path| {
-        let exact = exact::of_file(path, &device, limits);
-        Ok(Opened { content: read(path, &limits)?, exact })
-    };
-    window::show(&title, Shown::Model(Box::new(opened), Box::new(open)))
+    let options = Options::of(args, limits)?;
+    // On a thread of the pool, as all commands: baking computes in parallel.
+    let open = move |path: &Path| rayon::scope(|_| options.open(path, &Registry::collect()?, &Silent));
+    let source = window::Source { path: args.model.clone(), open: Arc::new(open), start: start(args)?, command: "cc4dgs view" };
+    window::show(&title, Shown::Model(Box::new(opened), source))
 }

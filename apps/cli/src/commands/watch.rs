@@ -82,8 +82,8 @@ pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> 
             result
         });
         let shown = show(&title, Shown::Training(live));
-        if shown.is_err() {
-            // A training that cannot be watched was not asked for; it leaves a checkpoint.
+        if shown.as_ref().is_err_and(|e| !matches!(e, Error::Backend { .. })) {
+            // A training that cannot be watched was not asked for; it leaves a checkpoint. One whose window lost its device goes on.
             stop.store(true, Ordering::Relaxed);
         }
         let trained = training.join().unwrap_or_else(|_| Err(Error::backend("training", "it panicked", "Report this with what it printed")));

@@ -14,7 +14,7 @@ use uploaded::Uploaded;
 
 #[cfg(all(feature = "window", not(target_arch = "wasm32")))]
 pub(crate) use device::descriptor;
-pub use device::request_device;
+pub use device::{device_of, request_device};
 #[cfg(target_arch = "wasm32")]
 pub(crate) use uniforms::{Frame, functions};
 
@@ -80,13 +80,14 @@ impl Renderer {
     pub fn queue(&self) -> &wgpu::Queue {
         &self.queue
     }
-    /// Uploads `scene` in place of the one before; buffers of the old one are freed first.
+    /// Uploads `scene` in place of the one before, whose buffers are freed first. Where it is refused, the one before stays.
     ///
     /// # Errors
     /// [`Error::Limit`] for scenes that the device has no buffers for.
     pub fn load(&mut self, scene: Scene) -> Result<()> {
+        Uploaded::check(&self.device, &scene)?;
         self.unload();
-        self.uploaded = Some(Uploaded::new(&self.device, &self.queue, &self.pipelines, scene)?);
+        self.uploaded = Some(Uploaded::new(&self.device, &self.queue, &self.pipelines, scene));
         Ok(())
     }
     /// Frees the scene.

@@ -38,8 +38,8 @@ fn group(device: &wgpu::Device, layout: &wgpu::BindGroupLayout, buffers: &[&wgpu
 }
 
 impl Uploaded {
-    pub(super) fn new(device: &wgpu::Device, queue: &wgpu::Queue, pipelines: &Pipelines, mut scene: Scene) -> Result<Self> {
-        use wgpu::BufferUsages as Usage;
+    /// Refuses scenes that `device` has no buffers for.
+    pub(super) fn check(device: &wgpu::Device, scene: &Scene) -> Result<()> {
         let n = scene.count as u64;
         let most = device.limits().max_storage_buffer_binding_size.min(device.limits().max_buffer_size);
         let words = [scene.gaussians.len(), scene.harmonics.len(), scene.starts.len(), scene.coefficients.len()];
@@ -48,11 +48,17 @@ impl Uploaded {
             let fits = n * most / bytes.max(1);
             return Err(Error::limit("largest buffer of the model, in bytes", bytes, most, format!("This device holds about {fits} such Gaussians")));
         }
-        let blocks = n.div_ceil(u64::from(BLOCK));
         let most_blocks = u64::from(device.limits().max_compute_workgroups_per_dimension);
-        if blocks > most_blocks {
+        if n.div_ceil(u64::from(BLOCK)) > most_blocks {
             return Err(Error::limit("Gaussians", n, most_blocks * u64::from(BLOCK), "Remove Gaussians with `cc4dgs prune`"));
         }
+        Ok(())
+    }
+    /// Uploads a scene that was checked.
+    pub(super) fn new(device: &wgpu::Device, queue: &wgpu::Queue, pipelines: &Pipelines, mut scene: Scene) -> Self {
+        use wgpu::BufferUsages as Usage;
+        let n = scene.count as u64;
+        let blocks = n.div_ceil(u64::from(BLOCK));
         let mut buffers = Vec::new();
         let mut buffer = |bytes: u64, usage: Usage| {
             // A binding may not be empty.
@@ -83,7 +89,7 @@ impl Uploaded {
         let frame = &pipelines.frame;
         let project = [frame, &gaussians, &harmonics, &starts, &coefficients, &functions, &splats, &keys, &visible_of_block];
         let pass = |k: usize| group(device, &pipelines.sort_layout, &[&pipelines.shifts[k], &work, &pairs[k], &pairs[1 - k], &counts]);
-        Ok(Self {
+        Self {
             project: group(device, &pipelines.project_layout, &project),
             compact: group(device, &pipelines.compact_layout, &[frame, &keys, &visible_of_block, &work, &pairs[0]]),
             sort: [pass(0), pass(1)],
@@ -92,7 +98,7 @@ impl Uploaded {
             work,
             functions,
             buffers,
-        })
+        }
     }
     pub(super) fn destroy(self) {
         self.buffers.iter().for_each(wgpu::Buffer::destroy);

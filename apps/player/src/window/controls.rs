@@ -34,6 +34,17 @@ impl Window {
                 });
             });
         }
+        drop(trouble);
+        if let Some(text) = self.notice.clone() {
+            egui::Panel::top("notice").show(ui, |ui| {
+                ui.horizontal_wrapped(|ui| {
+                    ui.label(text);
+                    if ui.button("Close").clicked() {
+                        self.notice = None;
+                    }
+                });
+            });
+        }
     }
     pub(super) fn bar(&mut self, ui: &mut egui::Ui) {
         // The proportional font of egui has none of these signs.
@@ -102,6 +113,19 @@ impl Window {
             }
         });
         self.look.mode = if depth { Mode::Depth } else { Mode::Color };
+        ui.horizontal(|ui| {
+            if ui.button("PNG (P)").on_hover_text("Save the image in the current folder").clicked() {
+                self.save_png();
+            }
+            if self.source.is_some() {
+                if ui.button("Print command (C)").on_hover_text("Print the command that opens this file at this time and pose").clicked() {
+                    self.print_command();
+                }
+                if ui.button("Open (O)").on_hover_text("Type a path; files can be dropped on the window, too").clicked() {
+                    self.ask_for_a_file();
+                }
+            }
+        });
         ui.separator();
         if let Some(scene) = self.renderer.scene() {
             ui.small(format!("{:.0} frames/s", self.rate));
@@ -125,10 +149,10 @@ impl Window {
             return;
         }
         let (pressed, held) = ctx.input(|i| {
-            let pressed = [Key::Space, Key::Comma, Key::Period, Key::R, Key::F, Key::T, Key::X, Key::Home, Key::End].map(|k| i.key_pressed(k));
+            let pressed = [Key::Space, Key::Comma, Key::Period, Key::R, Key::F, Key::T, Key::X, Key::Home, Key::End, Key::P, Key::O].map(|k| i.key_pressed(k));
             (pressed, [Key::D, Key::A, Key::E, Key::Q, Key::W, Key::S].map(|k| f64::from(u8::from(i.key_down(k)))))
         });
-        let actions: [fn(&mut Self); 9] = [
+        let actions: [fn(&mut Self); 11] = [
             |w| w.clock.play(!w.clock.playing),
             |w| w.clock.step(-1),
             |w| w.clock.step(1),
@@ -138,8 +162,18 @@ impl Window {
             |w| w.exact.set(!w.exact.is_on()),
             |w| w.clock.seek(0.0),
             |w| w.clock.seek(1.0),
+            Self::save_png,
+            Self::ask_for_a_file,
         ];
         pressed.iter().zip(actions).filter(|(pressed, _)| **pressed).for_each(|(_, act)| act(self));
+        if ctx.input(|i| i.key_pressed(Key::C)) {
+            self.print_command();
+        }
+        // For tests, which have no other way to lose a device.
+        if ctx.input_mut(|i| i.consume_key(egui::Modifiers::CTRL | egui::Modifiers::SHIFT, Key::F12)) {
+            self.renderer.device().destroy();
+            self.renderer.device().poll(wgpu::PollType::Poll).ok();
+        }
         let by = |k: usize| FLIGHT * elapsed_s * (held[k] - held[k + 1]);
         if held.iter().any(|h| *h > 0.0) {
             self.navigator.fly(by(0), by(2), by(4));

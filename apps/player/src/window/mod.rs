@@ -2,7 +2,11 @@
 
 mod controls;
 mod image;
+mod keep;
 mod live;
+mod lost;
+mod opening;
+mod start;
 mod switch;
 
 use crate::exact::Exact;
@@ -13,15 +17,18 @@ use eframe::egui;
 use eframe::egui_wgpu::{WgpuConfiguration, WgpuSetup, WgpuSetupCreateNew};
 use image::{FORMAT, Image};
 pub use live::Live;
-use std::path::Path;
+use lost::Lost;
+use opening::Opening;
+pub use start::Start;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use switch::Switch;
 
 /// What a window shows.
 pub enum Shown {
-    /// A model, and how others are opened that are dropped on the window.
-    Model(Box<Opened>, Open),
+    /// A model.
+    Model(Box<Opened>, Source),
     /// A training under way.
     Training(Arc<Live>),
 }
@@ -34,8 +41,21 @@ pub struct Opened {
     pub exact: Exact,
 }
 
+/// Where a model comes from.
+#[derive(Clone)]
+pub struct Source {
+    /// Its file or folder.
+    pub path: PathBuf,
+    /// How this file is opened again, and how others are; on a thread of its own.
+    pub open: Open,
+    /// Where the window begins.
+    pub start: Start,
+    /// The command that opens a window, such as `cc4dgs view`.
+    pub command: &'static str,
+}
+
 /// Opens the model in a file.
-pub type Open = Box<dyn Fn(&Path) -> Result<Opened>>;
+pub type Open = Arc<dyn Fn(&Path) -> Result<Opened> + Send + Sync>;
 
 /// Why a training has no exact images.
 const COPIES: &str = "A training hands over copies of its Gaussians, without its deformer. Open its folder when it is done.";
@@ -43,18 +63,24 @@ const COPIES: &str = "A training hands over copies of its Gaussians, without its
 /// Opens a window until it is closed. Call it on the main thread: some systems allow windows there only.
 ///
 /// # Errors
-/// [`Error::Limit`] for models that the device has no memory for, [`Error::Unsupported`] where no window can be opened.
+/// [`Error::Limit`] for models that the device has no memory for, [`Error::Unsupported`] where no window can be opened, [`Error::Backend`] where the device is lost.
 pub fn show(title: &str, shown: Shown) -> Result<()> {
+    let lost = Lost::default();
+    let of_window = lost.clone();
+    lost.guard(|| run(title, shown, of_window))
+}
+
+fn run(title: &str, shown: Shown, lost: Lost) -> Result<()> {
     let setup = WgpuSetupCreateNew { device_descriptor: Arc::new(descriptor), ..WgpuSetupCreateNew::without_display_handle() };
     let options = eframe::NativeOptions {
-        viewport: egui::ViewportBuilder::default().with_title(titled(title)).with_inner_size([1100.0, 760.0]),
+        viewport: egui::ViewportBuilder::default().with_title(format!("{title} – cc4dgs")).with_inner_size([1100.0, 760.0]),
         wgpu_options: WgpuConfiguration { wgpu_setup: WgpuSetup::CreateNew(setup), ..Default::default() },
         ..Default::default()
     };
     let failure = Arc::new(Mutex::new(None));
     let told = failure.clone();
     let created = move |cc: &eframe::CreationContext<'_>| -> std::result::Result<Box<dyn eframe::App>, Box<dyn std::error::Error + Send + Sync>> {
-        match Window::new(cc, shown) {
+        match Window::new(cc, shown, lost) {
             Ok(window) => Ok(Box::new(window)),
             Err(e) => {
                 let text = e.to_string();
@@ -72,9 +98,9 @@ pub fn show(title: &str, shown: Shown) -> Result<()> {
     result.map_err(|e| Error::unsupported("window", e.to_string(), "Start it in a graphical session with a Vulkan, Metal or Direct3D 12 driver"))
 }
 
-/// Title of a window that shows `name`.
-fn titled(name: &str) -> String {
-    format!("{name} – cc4dgs")
+/// Title of a window that shows the file `path`.
+fn titled(path: &Path) -> String {
+    format!("{} – cc4dgs", path.file_name().unwrap_or(path.as_os_str()).to_string_lossy())
 }
 
 struct Window {
@@ -83,11 +109,17 @@ struct Window {
     clock: Clock,
     cameras: Vec<Camera>,
     live: Option<Arc<Live>>,
-    /// How files are opened that are dropped; absent from a training, which has a model of its own to show.
-    open: Option<Open>,
+    /// Where the model comes from, and how others are opened; absent from a training, which has a model of its own to show.
+    source: Option<Source>,
+    opening: Option<Opening>,
+    /// The path that is being typed.
+    typed: Option<String>,
     exact: Switch,
     /// What the device or the training complained about last.
     trouble: Arc<Mutex<Option<String>>>,
+    /// What was done.
+    notice: Option<String>,
+    lost: Lost,
     lacks_motion: bool,
     /// Size of the file; 0 where there is none.
     bytes: u64,
@@ -98,6 +130,8 @@ struct Window {
     flying: bool,
     settings: bool,
     image: Option<Image>,
+    /// Size of the player's last image in pixels.
+    drawn: (u32, u32),
     visible: Arc<AtomicU32>,
     counted: f64,
     /// Frames per second, smoothed.
@@ -105,13 +139,14 @@ struct Window {
 }
 
 impl Window {
-    fn new(cc: &eframe::CreationContext<'_>, shown: Shown) -> Result<Self> {
+    fn new(cc: &eframe::CreationContext<'_>, shown: Shown, lost: Lost) -> Result<Self> {
         let none = || Error::unsupported("window", "it has no wgpu device", "Install a Vulkan, Metal or Direct3D 12 driver");
         let state = cc.wgpu_render_state.as_ref().ok_or_else(none)?;
         let trouble = Arc::new(Mutex::new(None));
         let told = trouble.clone();
         // Without a handler, wgpu ends the process.
         state.device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| *told.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string())));
+        lost.watch(&state.device, &cc.egui_ctx);
         let navigator = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]);
         let mut window = Self {
             renderer: Renderer::new(state.device.clone(), state.queue.clone(), FORMAT),
@@ -120,9 +155,13 @@ impl Window {
             clock: Clock::new(1, 1.0),
             cameras: Vec::new(),
             live: None,
-            open: None,
+            source: None,
+            opening: None,
+            typed: None,
             exact: Switch::new(Err(COPIES.to_string())),
             trouble,
+            notice: None,
+            lost,
             lacks_motion: false,
             bytes: 0,
             loaded: false,
@@ -130,14 +169,22 @@ impl Window {
             flying: false,
             settings: false,
             image: None,
+            drawn: (1, 1),
             visible: Arc::default(),
             counted: 0.0,
             rate: 0.0,
         };
         match shown {
-            Shown::Model(opened, open) => {
+            Shown::Model(opened, source) => {
                 window.show(*opened)?;
-                window.open = Some(open);
+                if let Some(pose) = source.start.pose {
+                    window.navigator.set_pose(pose);
+                }
+                if let Some(time) = source.start.time {
+                    window.clock.play(false);
+                    window.clock.seek(time);
+                }
+                window.source = Some(source);
             }
             Shown::Training(live) => {
                 live.open(cc.egui_ctx.clone());
@@ -163,32 +210,31 @@ impl Window {
     fn follow(&mut self) {
         let Some(content) = self.live.as_ref().and_then(|live| live.take()) else { return };
         if let Err(e) = self.load(content) {
-            *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string());
+            self.complain(e.to_string());
         }
     }
-    /// Opens files that were dropped on the window; what is wrong with one is said, and the model before it stays.
-    fn dropped(&mut self, ctx: &egui::Context) {
-        for path in ctx.input(|i| i.raw.dropped_files.iter().map(|file| file.path().to_path_buf()).collect::<Vec<_>>()) {
-            let Some(open) = &self.open else { return };
-            let opened = open(&path).and_then(|opened| self.show(opened));
-            let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
-            match opened {
-                Ok(()) => {
-                    *trouble = None;
-                    ctx.send_viewport_cmd(egui::ViewportCommand::Title(titled(&path.file_name().unwrap_or_default().to_string_lossy())));
-                }
-                Err(e) => *trouble = Some(e.to_string()),
-            }
-            ctx.request_repaint();
-        }
+    /// Says what is wrong.
+    fn complain(&self, text: String) {
+        *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = Some(text);
     }
-    /// Shows a model that was opened, from its start.
+    /// Forgets what was wrong.
+    fn silence(&self) {
+        *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+    /// Shows a model that was opened, from its start. Where it is refused, the one before stays.
     fn show(&mut self, opened: Opened) -> Result<()> {
-        self.loaded = false;
-        self.load(opened.content)?;
+        let before = std::mem::replace(&mut self.loaded, false);
+        if let Err(e) = self.load(opened.content) {
+            self.loaded = before;
+            return Err(e);
+        }
         self.exact.replace(opened.exact);
         self.clock.play(true);
         Ok(())
+    }
+    /// The view of an image of this size.
+    fn view(&self, width: u32, height: u32) -> View {
+        View { camera: self.navigator.camera(width, height), time: self.clock.time, ..self.look.clone() }
     }
     /// Draws the scene and shows it in what is left of the window.
     fn scene(&mut self, ui: &mut egui::Ui, frame: &eframe::Frame) {
@@ -198,9 +244,10 @@ impl Window {
         let most = self.renderer.device().limits().max_texture_dimension_2d;
         let side = |points: f32| ((points * scale).round() as u32).clamp(1, most);
         let size = (side(available.x), side(available.y));
-        let view = View { camera: self.navigator.camera(size.0, size.1), time: self.clock.time, ..self.look.clone() };
+        self.drawn = size;
+        let view = self.view(size.0, size.1);
         let exact = self.exact.follow(ui.ctx(), state, &mut self.renderer, &view).unwrap_or_else(|e| {
-            *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string());
+            self.complain(e.to_string());
             ui.ctx().request_repaint();
             None
         });
@@ -229,6 +276,11 @@ impl Drop for Window {
 impl eframe::App for Window {
     fn ui(&mut self, ui: &mut egui::Ui, frame: &mut eframe::Frame) {
         let ctx = ui.ctx().clone();
+        if self.lost.is_lost() {
+            ctx.send_viewport_cmd(egui::ViewportCommand::Close);
+            return;
+        }
+        self.lost.note(self.command());
         let elapsed = ctx.input(|i| i.stable_dt).min(0.25);
         self.rate += 0.1 * (1.0 / elapsed.max(1e-4) - self.rate);
         if self.clock.tick(elapsed) {
@@ -238,6 +290,7 @@ impl eframe::App for Window {
         self.dropped(&ctx);
         self.keys(&ctx, f64::from(elapsed));
         self.messages(ui);
+        self.opening_lines(ui);
         egui::Panel::bottom("time").show(ui, |ui| self.bar(ui));
         if self.settings {
             let adapter = frame.wgpu_render_state().map(|s| s.adapter.get_info().name).unwrap_or_default();

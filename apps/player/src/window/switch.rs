@@ -167,6 +167,10 @@ impl Switch {
     fn current(&self) -> Option<&Shown> {
         self.shown.as_ref().filter(|shown| self.seen.as_ref() == Some(&shown.view))
     }
+    /// The exact image of the view, where it is shown and complete.
+    pub(super) fn complete(&self) -> Option<&Image8> {
+        self.current().map(|shown| &*shown.image)
+    }
     /// A line over the image, and whether the exact image of the view is still being computed.
     pub(super) fn sign(&self) -> (String, bool) {
         match (self.current(), &self.shown) {

@@ -1,0 +1,86 @@
+//! The time and the pose that a window begins at, as the options of a command.
+
+use crate::Navigator;
+use cc4dgs_format::{Error, Result};
+use std::path::Path;
+
+/// Where a window begins; what is absent is as the model says: the first frame, the home camera, playing.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Start {
+    /// Normalised time, 0..1, at which it stands still.
+    pub time: Option<f32>,
+    /// A pose of [`Navigator::pose`].
+    pub pose: Option<[f64; 7]>,
+}
+
+impl Start {
+    /// Reads a pose as links of the page have it: seven numbers with commas between.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for text that is none, and for poses that see nothing.
+    pub fn parse_pose(text: &str) -> Result<[f64; 7]> {
+        let remedy = "Write EYE_X,EYE_Y,EYE_Z,TARGET_X,TARGET_Y,TARGET_Z,FOV_Y with the vertical angle in radians, as a shared link has it";
+        let wrong = |problem: String| Error::parameter("pose", problem, remedy);
+        let numbers: Vec<f64> = text.split(',').map(|v| v.trim().parse().map_err(|_| wrong(format!("{v:?} is no number")))).collect::<Result<_>>()?;
+        let pose: [f64; 7] = numbers.try_into().map_err(|n: Vec<f64>| wrong(format!("it has {} numbers, not 7", n.len())))?;
+        let sees = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]).set_pose(pose);
+        if sees { Ok(pose) } else { Err(wrong("a number is not finite, eye and target are one point, or the angle is not between 0.01 and 3.1".into())) }
+    }
+    /// Reads a normalised time.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for what is no number from 0 to 1.
+    pub fn parse_time(text: &str) -> Result<f32> {
+        let time = text.parse().ok().filter(|t| (0.0..=1.0).contains(t));
+        time.ok_or_else(|| Error::parameter("time", format!("{text:?} is no number from 0 to 1"), "0 is the first frame, 1 the last"))
+    }
+    /// The command that opens `file` here with `program`, for a POSIX shell.
+    pub fn command(&self, program: &str, file: &Path) -> String {
+        let mut out = format!("{program} {}", quoted(&file.to_string_lossy()));
+        if let Some(time) = self.time {
+            out += &format!(" --time {}", digits(f64::from(time)));
+        }
+        if let Some(pose) = self.pose {
+            out += &format!(" --pose={}", pose.map(|v| digits(v).to_string()).join(","));
+        }
+        out
+    }
+}
+
+/// `value` with six significant digits.
+fn digits(value: f64) -> f64 {
+    format!("{value:.5e}").parse().unwrap_or(value)
+}
+
+fn quoted(text: &str) -> String {
+    let plain = !text.is_empty() && !text.starts_with('-') && text.chars().all(|c| c.is_ascii_alphanumeric() || "_-./".contains(c));
+    if plain { text.to_string() } else { format!("'{}'", text.replace('\'', r"'\''")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_says_where_it_begins() {
+        let pose = [1.0, -2.5, 1.0 / 3.0, 0.0, 0.0, 1e-7, 0.9];
+        let start = Start { time: Some(0.37), pose: Some(pose) };
+        let command = start.command("cc4dgs view", Path::new("it's here/a.cc4d"));
+        assert_eq!(command, r"cc4dgs view 'it'\''s here/a.cc4d' --time 0.37 --pose=1,-2.5,0.333333,0,0,0.0000001,0.9");
+        let read = Start::parse_pose(command.split_once("--pose=").unwrap().1).unwrap();
+        assert!(read.iter().zip(pose).all(|(a, b)| (a - b).abs() < 1e-6), "{read:?}");
+        assert_eq!(Start::default().command("cc4dgs view", Path::new("runs/mutant")), "cc4dgs view runs/mutant");
+    }
+
+    #[test]
+    fn poses_and_times_that_mean_nothing_are_refused() {
+        for (text, said) in
+            [("1,2,3", "3 numbers"), ("a,0,0,0,0,0,1", "\"a\""), ("1,1,1,1,1,1,0.9", "one point"), ("0,0,0,1,0,0,9", "angle"), ("NaN,0,0,1,0,0,1", "one point")]
+        {
+            let message = Start::parse_pose(text).unwrap_err().to_string();
+            assert!(message.contains(said), "{text}: {message}");
+        }
+        assert_eq!(Start::parse_time("0.5").unwrap(), 0.5);
+        assert!(Start::parse_time("1.5").is_err() && Start::parse_time("NaN").is_err() && Start::parse_time("now").is_err());
+    }
+}
