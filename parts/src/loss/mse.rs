@@ -1,4 +1,4 @@
-//! Loss term: mean squared difference of rendered and recorded image. Beside L1 it moves errors from contours into surfaces.
+//! Loss term: mean squared difference of rendered and recorded image.
 
 use burn::tensor::Tensor;
 
