@@ -1,7 +1,14 @@
-//! Finds the codecs and reads an archive where there is neither C nor a file system. CI builds this for wasm32 and calls it from Node.
+//! Finds the codecs and reads archives where there is neither C nor a file system. CI builds this for wasm32 and calls it from Node.
 
-use cc4dgs_format::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamKind};
-use cc4dgs_format::{CodecContext, CodecPlugin, Entries, HostGaussians, Limits, Result, Seed, Silent, WeightCodecPlugin, toml};
+#[path = "wasm/decoded.rs"]
+mod decoded;
+
+use cc4dgs_format::{CodecPlugin, Entries, WeightCodecPlugin};
+use std::cell::RefCell;
+
+thread_local! {
+    static FILE: RefCell<Vec<u8>> = const { RefCell::new(Vec::new()) };
+}
 
 /// The number of codecs and weight codecs that were found.
 #[unsafe(no_mangle)]
@@ -12,24 +19,17 @@ pub extern "C" fn plugin_count() -> u32 {
     (codecs + weight_codecs) as u32
 }
 
-/// Writes an archive of `count` Gaussians and reads it; returns how many came back, 0 on any error.
+/// Address of `bytes` bytes of memory, into which the caller copies a file.
 #[unsafe(no_mangle)]
-pub extern "C" fn archive_round_trip(count: u32) -> u32 {
-    round_trip(count as usize).map_or(0, |found| found.len() as u32)
+pub extern "C" fn reserve(bytes: u32) -> *mut u8 {
+    FILE.with_borrow_mut(|file| {
+        *file = vec![0; bytes as usize];
+        file.as_mut_ptr()
+    })
 }
 
-fn round_trip(count: usize) -> Result<HostGaussians> {
-    let mut gaussians = HostGaussians { sh_degree: 1, opacity_logits: vec![0.0; count], ..Default::default() };
-    for (_, width, values) in gaussians.columns_mut() {
-        *values = (0..count * width).map(|i| (i as f32 * 0.1).sin()).collect();
-    }
-    let limits = Limits::default();
-    let context = CodecContext::new(Seed::root(u64::from(count as u32)), limits, &Silent);
-    let codecs = Entries::<CodecPlugin>::collect()?;
-    let codec = (codecs.get("quantize")?.build)("", &toml::Table::new())?;
-    let entry = CodecEntry { name: "quantize".into(), ..Default::default() };
-    let manifest = Manifest { codec: entry, frame_count: 1, gaussian_count: count as u64, sh_degree: 1, ..Default::default() };
-    let bytes = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, codec.encode(&gaussians, &context)?).to_bytes()?;
-    let archive = Archive::from_bytes("memory", bytes, &limits)?;
-    codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)
+/// What that file decodes to, as a checksum; 0 on any error.
+#[unsafe(no_mangle)]
+pub extern "C" fn checksum() -> u64 {
+    decoded::checksum(FILE.take()).unwrap_or(0)
 }

@@ -38,28 +38,57 @@ fn bounded(factor: f32) -> f32 {
     select(factor < 1.0, factor, 1.0f32)
 }
 
+/// What a Gaussian's life is at all times.
+#[derive(CubeType, Copy, Clone)]
+struct Life {
+    /// Share of the opacity that does not depend on time, and the rest.
+    gate: f32,
+    temporary: f32,
+    half_width: f32,
+    falloff: f32,
+    /// Whether the falloff is above its least value, so that it has a gradient.
+    falloff_is_free: bool,
+    /// What multiplies the velocity.
+    moving: f32,
+}
+
+#[cube]
+impl Life {
+    /// The life whose attributes begin at index `at`.
+    fn of(attributes: &[f32], at: usize, #[comptime] gated: bool) -> Life {
+        let logit = LIFE_GATE_STEEPNESS * attributes[at + 3];
+        let smaller = smaller_share(logit);
+        let temporary = select(logit < 0.0, 1.0 - smaller, smaller);
+        let wanted = width(attributes[at + 2]);
+        Life {
+            gate: select(logit < 0.0, smaller, 1.0 - smaller),
+            temporary,
+            half_width: width(attributes[at + 1]),
+            falloff: select(wanted > LEAST_FALLOFF, wanted, LEAST_FALLOFF),
+            falloff_is_free: wanted > LEAST_FALLOFF,
+            moving: if comptime!(gated) { temporary } else { (1.0f32).runtime() },
+        }
+    }
+    /// How far the time `since` after the centre is outside the life, in falloffs.
+    fn in_falloffs(&self, since: f32) -> f32 {
+        let beyond = since.abs() - self.half_width;
+        select(beyond > 0.0, beyond, 0.0f32) / self.falloff
+    }
+}
+
 /// Shifts `[M,3]` and logarithms of factors `[M]`, time after time.
 #[cube(launch)]
 fn forward(attributes: &[f32], times: &[f32], out: &mut [f32], rows: u32, hidden_below: f32, #[comptime] gated: bool) {
     let row = ABSOLUTE_POS;
     if row < rows as usize {
         let at = row * WIDTH;
-        let logit = LIFE_GATE_STEEPNESS * attributes[at + 3];
-        let smaller = smaller_share(logit);
-        let gate = select(logit < 0.0, smaller, 1.0 - smaller);
-        let temporary = select(logit < 0.0, 1.0 - smaller, smaller);
-        let half_width = width(attributes[at + 1]);
-        let wanted = width(attributes[at + 2]);
-        let falloff = select(wanted > LEAST_FALLOFF, wanted, LEAST_FALLOFF);
-        let moving = if comptime!(gated) { temporary } else { (1.0f32).runtime() };
+        let life = Life::of(attributes, at, gated);
         for k in 0..times.len() {
             let since = times[k] - attributes[at];
-            let beyond = since.abs() - half_width;
-            let in_falloffs = select(beyond > 0.0, beyond, 0.0f32) / falloff;
-            let factor = bounded(gate + temporary * (-faded(in_falloffs)).exp());
+            let factor = bounded(life.gate + life.temporary * (-faded(life.in_falloffs(since))).exp());
             let base = k * rows as usize * OUTPUTS;
             for axis in 0..3usize {
-                out[base + 3 * row + axis] = attributes[at + 4 + axis] * since * moving;
+                out[base + 3 * row + axis] = attributes[at + 4 + axis] * since * life.moving;
             }
             out[base + 3 * rows as usize + row] = select(factor < hidden_below, HIDDEN, factor.ln());
         }
@@ -72,14 +101,7 @@ fn backward(attributes: &[f32], times: &[f32], grad: &[f32], out: &mut [f32], ro
     let row = ABSOLUTE_POS;
     if row < rows as usize {
         let at = row * WIDTH;
-        let logit = LIFE_GATE_STEEPNESS * attributes[at + 3];
-        let smaller = smaller_share(logit);
-        let gate = select(logit < 0.0, smaller, 1.0 - smaller);
-        let temporary = select(logit < 0.0, 1.0 - smaller, smaller);
-        let half_width = width(attributes[at + 1]);
-        let wanted = width(attributes[at + 2]);
-        let falloff = select(wanted > LEAST_FALLOFF, wanted, LEAST_FALLOFF);
-        let moving = if comptime!(gated) { temporary } else { (1.0f32).runtime() };
+        let life = Life::of(attributes, at, gated);
         let mut of_center = 0.0f32;
         let mut of_width = 0.0f32;
         let mut of_falloff = 0.0f32;
@@ -89,36 +111,35 @@ fn backward(attributes: &[f32], times: &[f32], grad: &[f32], out: &mut [f32], ro
         let mut of_z = 0.0f32;
         for k in 0..times.len() {
             let since = times[k] - attributes[at];
-            let beyond = since.abs() - half_width;
-            let in_falloffs = select(beyond > 0.0, beyond, 0.0f32) / falloff;
-            let life = (-faded(in_falloffs)).exp();
-            let factor = bounded(gate + temporary * life);
+            let in_falloffs = life.in_falloffs(since);
+            let left = (-faded(in_falloffs)).exp();
+            let factor = bounded(life.gate + life.temporary * left);
             let base = k * rows as usize * OUTPUTS;
             let (x, y, z) = (grad[base + 3 * row], grad[base + 3 * row + 1], grad[base + 3 * row + 2]);
             let along = x * attributes[at + 4] + y * attributes[at + 5] + z * attributes[at + 6];
-            of_x += x * since * moving;
-            of_y += y * since * moving;
-            of_z += z * since * moving;
-            of_center -= along * moving;
+            of_x += x * since * life.moving;
+            of_y += y * since * life.moving;
+            of_z += z * since * life.moving;
+            of_center -= along * life.moving;
             if comptime!(gated) {
                 of_gate -= along * since;
             }
             if factor >= hidden_below {
                 let of_factor = grad[base + 3 * rows as usize + row] / factor;
-                of_gate += of_factor * (1.0 - life);
+                of_gate += of_factor * (1.0 - left);
                 if in_falloffs > 0.0 && in_falloffs * in_falloffs < -HIDDEN {
-                    let of_falloffs = in_falloffs * (-2.0f32) * life * of_factor * temporary;
-                    let outside = of_falloffs / falloff;
+                    let of_falloffs = in_falloffs * (-2.0f32) * left * of_factor * life.temporary;
+                    let outside = of_falloffs / life.falloff;
                     of_center -= select(since > 0.0, outside, -outside);
-                    of_width -= outside * half_width;
-                    of_falloff -= select(wanted > LEAST_FALLOFF, of_falloffs * in_falloffs, 0.0f32);
+                    of_width -= outside * life.half_width;
+                    of_falloff -= select(life.falloff_is_free, of_falloffs * in_falloffs, 0.0f32);
                 }
             }
         }
         out[at] = of_center;
         out[at + 1] = of_width;
         out[at + 2] = of_falloff;
-        out[at + 3] = of_gate * gate * temporary * LIFE_GATE_STEEPNESS;
+        out[at + 3] = of_gate * life.gate * life.temporary * LIFE_GATE_STEEPNESS;
         out[at + 4] = of_x;
         out[at + 5] = of_y;
         out[at + 6] = of_z;

@@ -3,7 +3,7 @@
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::model::Model;
 use burn::tensor::Device;
-use cc4dgs_core::{Error, Event, EventSink, Registry, RenderModel, Result, Scene, Seed, Split, TrainingViews, psnr_on_views};
+use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Registry, RenderModel, Result, Scene, Seed, Split, TrainingViews, psnr_on_views};
 use serde::Serialize;
 
 /// Training views from which contributions are taken.
@@ -48,6 +48,20 @@ pub fn contributions(model: &Model, scene: &Scene, registry: &Registry, device: 
     Ok(sum)
 }
 
+/// The rows of Gaussians, those of the largest contribution first; equal ones in their order.
+pub fn by_contribution(contribution: &[f64]) -> Vec<usize> {
+    let mut rows: Vec<usize> = (0..contribution.len()).collect();
+    rows.sort_by(|&a, &b| contribution[b].total_cmp(&contribution[a]).then(a.cmp(&b)));
+    rows
+}
+
+/// `gaussians` at `rows`, in their old order.
+pub fn at_rows(gaussians: &HostGaussians, rows: &[usize]) -> HostGaussians {
+    let mut rows = rows.to_vec();
+    rows.sort_unstable();
+    gaussians.select(&rows)
+}
+
 /// Removes as many Gaussians from `model` as lower the PSNR by at most `max_drop_db`, those of the least contribution first.
 ///
 /// # Errors
@@ -62,13 +76,8 @@ pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Regi
         return Err(Error::parameter("prune", format!("{} has no training views", scene.name), "Give the scene that the model was trained on"));
     }
     let contribution = contributions(model, scene, registry, device, events)?;
-    let mut order: Vec<usize> = (0..contribution.len()).collect();
-    order.sort_by(|&a, &b| contribution[b].total_cmp(&contribution[a]).then(a.cmp(&b)));
-    let kept = |count: usize| {
-        let mut rows = order[..count].to_vec();
-        rows.sort_unstable();
-        model.gaussians.select(&rows)
-    };
+    let order = by_contribution(&contribution);
+    let kept = |count: usize| at_rows(&model.gaussians, &order[..count]);
     let n = order.len();
     let services = ModelServices::new(model, registry, device)?;
     let psnr_before_db = psnr_on_views(&model.gaussians, &judges, &services, JUDGES)?;

@@ -13,19 +13,20 @@ const MOST_FILES: usize = 1000;
 impl Window {
     /// Saves the image in the window as PNG: the exact one where it is shown and complete, else the player's.
     pub(super) fn save_png(&mut self) {
-        let saved = self.picture().and_then(|(image, by)| {
+        let saved = self.current_image().and_then(|(image, by)| {
             let name = self.file().and_then(Path::file_stem).map_or_else(|| "training".into(), |stem| stem.to_string_lossy().into_owned());
             let path = free_name(Path::new(""), &format!("{name}_frame_{:04}", self.clock.frame()))?;
             write_atomically(&path, &png_bytes(&image)?)?;
-            let place = std::path::absolute(&path).unwrap_or(path);
-            Ok(format!("Saved {} ({}×{} pixels, {by})", place.display(), image.width, image.height))
+            let full = std::path::absolute(&path).unwrap_or(path);
+            Ok(format!("Saved {} ({}×{} pixels, {by})", full.display(), image.width, image.height))
         });
         match saved {
             Ok(text) => self.notice = Some(text),
             Err(e) => self.complain(e.to_string()),
         }
     }
-    fn picture(&mut self) -> Result<(Image8, &'static str)> {
+    /// The image that the window shows, and what drew it.
+    fn current_image(&mut self) -> Result<(Image8, &'static str)> {
         if let Some(image) = self.exact.complete() {
             return Ok((image.clone(), "exact"));
         }

@@ -4,11 +4,12 @@ use super::log::Log;
 use super::sampler::Sampler;
 use super::tune::{CHECK_EVERY, TuneJob, Tuner, rate_at};
 use super::{RateFactors, TrainState};
-use cc4dgs_core::{Error, Event, HostGaussians, Result, Scene, Schedule, Seed, Split, Stage, TuneModel, TunedModel};
-use cc4dgs_play::prune::{PruneReport, contributions};
+use burn::tensor::Device;
+use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, TuneModel, TunedModel};
+use cc4dgs_play::prune::{PruneReport, at_rows, by_contribution, contributions};
 use cc4dgs_play::{Model, load_weights, weights_of};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Views per iteration.
 const BATCH: usize = 4;
@@ -45,12 +46,8 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
         if share < LEAST_SHARE || removed == 0 || removed == n {
             break;
         }
-        let contribution = contributions(model, scene, job.registry, job.device, job.events)?;
-        let mut order: Vec<usize> = (0..n).collect();
-        order.sort_by(|&a, &b| contribution[b].total_cmp(&contribution[a]).then(a.cmp(&b)));
-        order.truncate(n - removed);
-        order.sort_unstable();
-        let rest = model.gaussians.select(&order);
+        let order = by_contribution(&contributions(model, scene, job.registry, job.device, job.events)?);
+        let rest = at_rows(&model.gaussians, &order[..n - removed]);
         let tuner = job.tuner(model, scene);
         let seed = Seed::root(model.provenance.seed).child("refit").index(round as u64);
         let found = refit(&tuner, &rest, iterations, seed)?;
@@ -77,15 +74,15 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
 /// What a [`prune_and_refit`] works with; see [`TuneJob`].
 pub struct RefitJob<'a> {
     /// Where plug-ins are found.
-    pub registry: &'a cc4dgs_core::Registry,
+    pub registry: &'a Registry,
     /// The device of the model's deformer.
-    pub device: &'a burn::tensor::Device,
+    pub device: &'a Device,
     /// What readers may believe.
-    pub limits: &'a cc4dgs_core::Limits,
+    pub limits: &'a Limits,
     /// Where events go.
-    pub events: &'a dyn cc4dgs_core::EventSink,
+    pub events: &'a dyn EventSink,
     /// Set to stop.
-    pub stop: &'a std::sync::atomic::AtomicBool,
+    pub stop: &'a AtomicBool,
 }
 
 impl<'a> RefitJob<'a> {

@@ -219,20 +219,3 @@ fn only_what_covers_an_image_is_made_smaller() {
     assert_eq!(plain.log_scales[..3000], capped.log_scales[..3000]);
     assert!(plain.log_scales[3000] > capped.log_scales[3000] + 1.0, "{} {}", plain.log_scales[3000], capped.log_scales[3000]);
 }
-
-#[test]
-#[ignore = "takes a minute; prints a report"]
-fn report_points_of_captures() {
-    let names = std::env::var("CAPTURES").unwrap_or_else(|_| "sparse,long,units,dome,photos,rig".into());
-    for name in names.split(',').map(|n| format!("captures/{n}")) {
-        let truth = ProceduralScene::named(&name).unwrap();
-        let scene = open(std::path::Path::new(&format!("procedural:{name}")), &options(), &Limits::default()).unwrap();
-        let began = std::time::Instant::now();
-        let found = find_points(&scene, InitSource::Auto, 12_000, Seed::root(1)).unwrap();
-        let seconds = began.elapsed().as_secs_f64();
-        let (matched, rest) = found.cloud.positions.split_at(found.matched);
-        let share = |points: &[[f32; 3]]| 100.0 * on_surfaces(&scene, &truth, points, 0.02);
-        let between = &rest[..found.between];
-        println!("{name}: {} in {seconds:.1} s; on surfaces {:.0} % of the matched, {:.0} % between", found.describe(), share(matched), share(between));
-    }
-}
