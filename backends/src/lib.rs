@@ -14,11 +14,9 @@ pub mod ops {
     pub mod basis;
     pub mod corners;
     pub mod field;
-    pub mod hash;
     pub mod image;
     pub mod life;
     pub mod lookup;
-    pub mod networks;
     pub mod photometric;
     pub mod rasterize;
     mod shared;

@@ -3,6 +3,8 @@
 //!
 //! `cargo run --release -p cc4dgs-codecs --example archives -- FOLDER | FILE...`
 
+#![allow(clippy::print_stdout)]
+
 #[path = "wasm/decoded.rs"]
 mod decoded;
 
@@ -39,7 +41,7 @@ fn write_all(folder: &Path) -> Result<Vec<PathBuf>> {
     let weights = [WeightArray { name: "table".into(), shape: vec![64, 48], values: (0..64 * 48).map(|i| draw(i, 8)).collect() }];
     let entry = |name: &str, settings: toml::Table| CodecEntry { name: name.into(), settings, ..Default::default() };
     let mut files = Vec::new();
-    for (plugin, weight_plugin) in codecs.iter().zip(weight_codecs.iter().cycle()) {
+    for (plugin, weight_plugin) in codecs.iter().zip(weight_codecs.iter().collect::<Vec<_>>().into_iter().cycle()) {
         let mut settings = toml::Table::new();
         if plugin.info.schema.contains("sample_budget") {
             settings.insert("sample_budget".into(), 20_000.into());

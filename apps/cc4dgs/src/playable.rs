@@ -4,6 +4,7 @@ use crate::play::bake::{AddedMotion, Additions, BakeOptions, BakeReport, MaxErro
 use crate::play::source::{Source, SourceKind};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Archive, Presentation, StreamKind};
+use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{Camera, EventSink, Limits, Registry, Result};
 use cc4dgs_play::model::Model as PlayModel;
 use cc4dgs_play::{ArchiveOptions, Player, presentation};
@@ -59,8 +60,10 @@ pub struct PlayableOptions<'a> {
     pub presentation: Presentation,
     /// Whether to store a small image of the home camera at half time.
     pub poster: bool,
-    /// Whether to leave the deformer's weights out.
+    /// Whether to leave the deformer's weights out, unless players compute the motion from them.
     pub without_field: bool,
+    /// Whether to bake a layer even where players can compute the motion from the deformer's weights.
+    pub baked: bool,
 }
 
 /// An archive that plays, and how its layer came out.
@@ -113,6 +116,12 @@ impl Stored {
         let found = presented(&self.model, cameras, up)?;
         Ok(Presentation { frames_per_second: stored.frames_per_second, seconds: stored.seconds, ..found })
     }
+    /// Whether the archive has no layer and needs none: players compute the motion from the deformer's weights.
+    fn computes_motion(&self, around: Surroundings) -> Result<bool> {
+        let archive = &self.archive;
+        Ok(PlaybackLayer::may_be_computed(archive)?
+            && PlaybackLayer::computed("the stored model", archive, &self.model.gaussians, self.model.moving, around.limits)?.is_some())
+    }
     /// The archive with a playback layer, cameras and a poster.
     ///
     /// # Errors
@@ -121,7 +130,8 @@ impl Stored {
         options.presentation.validate("presentation")?;
         let stored = &self.archive.manifest().presentation.cameras;
         let cameras = if options.cameras.is_empty() { stored.as_slice() } else { options.cameras };
-        let kept = options.max_error.is_none() && self.bytes_of(StreamKind::Playback) > 0;
+        let computed = !options.baked && self.computes_motion(around)?;
+        let kept = computed || options.max_error.is_none() && self.bytes_of(StreamKind::Playback) > 0;
         let baked = if kept {
             None
         } else {
@@ -136,7 +146,7 @@ impl Stored {
             motion: if kept { AddedMotion::Kept } else { AddedMotion::Replaced(baked.as_ref()) },
             presentation: options.presentation,
             poster,
-            without_field: options.without_field,
+            without_field: options.without_field && !computed,
         };
         Ok(Playable { bytes: with_additions(&self.archive, additions)?, report: baked.map(|b| b.report) })
     }

@@ -215,6 +215,12 @@ pub struct Report {
     /// Only results with this scene, method, setting, codec, seed, device or split; may be given several times.
     #[arg(long = "where", value_name = "KEY=VALUE")]
     pub only: Vec<String>,
+    /// Columns of the summary tables by their names in the CSV file, such as psnr_db,size_mb,frame_ms; all by default.
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
+    pub columns: Vec<String>,
+    /// Also write every plot as an SVG file into this folder.
+    #[arg(long, value_name = "DIR")]
+    pub figures: Option<PathBuf>,
 }
 
 /// Whose images a report contains.

@@ -22,7 +22,8 @@ pub use content::{Content, Scene};
 pub use navigator::Navigator;
 pub use render::{Mode, Renderer, View, device_of, request_device};
 
-/// The codecs that archives may need. Linkers drop what nobody refers to, above all on wasm32.
+/// The codecs and fields that archives may need. Linkers drop what nobody refers to, above all on wasm32.
 pub fn link() {
     cc4dgs_codecs::link();
+    cc4dgs_fields::link();
 }

@@ -2,6 +2,7 @@
 
 use crate::cpu::mlp::{mish, relu};
 use crate::cpu::tensor::CpuBackend;
+use crate::cpu::vertex::hash::signatures;
 use crate::cpu::vertex::interpolate;
 use crate::ops::autodiff::{differentiate, record};
 use crate::ops::split::split;
@@ -16,8 +17,8 @@ use std::sync::Arc;
 
 pub use crate::cpu::vertex::index::MAX_RESOLUTION;
 pub use crate::ops::corners::{GridBox, VoxelCorners};
-pub use crate::ops::hash::LevelHash;
-pub use crate::ops::networks::{MishShape, ReluShape};
+pub use cc4dgs_fields::hash::LevelHash;
+pub use cc4dgs_fields::networks::{MishShape, ReluShape};
 
 /// One level's decoder: hash functions and layer widths (the input width is the number of functions).
 #[derive(Clone, Debug, PartialEq)]
@@ -73,7 +74,7 @@ impl<B: CpuBackend> FieldKernels for B {
     fn decode_backward(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>, grad: FloatTensor<Self>) -> FloatTensor<Self> {
         let vertices = triples::<B>(&vertices);
         let width = decoder.hash.len().max(1);
-        let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
+        let rows = |first: usize, out: &mut [f32]| signatures(&decoder.hash, &vertices[first..first + out.len() / width], out);
         let out = mish::backward(&decoder.shape, &B::floats(&weights), vertices.len(), &rows, &B::floats(&grad), None);
         B::from_floats(out, weights.shape())
     }
@@ -99,7 +100,7 @@ impl<B: CpuBackend> FieldOps for B {
     fn decode(weights: FloatTensor<Self>, vertices: IntTensor<Self>, decoder: Arc<Decoder>) -> FloatTensor<Self> {
         let vertices = triples::<Self>(&vertices);
         let width = decoder.hash.len().max(1);
-        let rows = |first: usize, out: &mut [f32]| decoder.hash.signatures(&vertices[first..first + out.len() / width], out);
+        let rows = |first: usize, out: &mut [f32]| signatures(&decoder.hash, &vertices[first..first + out.len() / width], out);
         let out = mish::forward(&decoder.shape, &Self::floats(&weights), vertices.len(), &rows);
         Self::from_floats(out, [vertices.len(), decoder.shape.output])
     }

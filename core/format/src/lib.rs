@@ -46,7 +46,7 @@ pub use plugin::{Entries, Plugin, PluginEntry, split_kind, unknown_name};
 pub use rules::Rules;
 pub use seed::Seed;
 pub use similarity::Similarity;
-pub use stored_model::{MOVING, StoredModel, read_gaussians};
+pub use stored_model::{FIELD_STREAMS, MOVING, StoredModel, read_gaussians, read_weights, weight_seed};
 pub use tuning::{Rounding, TuneModel, TunedModel, Tuning};
 pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin};
 pub use {inventory, serde, toml};

@@ -1,9 +1,9 @@
 //! A model as an archive holds it, opened without its deformer.
 
-use crate::archive::{Archive, Manifest, StreamKind};
+use crate::archive::{Archive, CodecEntry, Manifest, StreamKind};
 use crate::playback::PlaybackLayer;
 use crate::plugin::{Entries, PluginEntry};
-use crate::{CodecContext, CodecPlugin, Error, EventSink, HostGaussians, Limits, Moving, Result, Seed};
+use crate::{CodecContext, CodecPlugin, Error, EventSink, HostGaussians, Limits, Moving, Result, Seed, Stream, WeightArray, WeightCodecPlugin};
 use std::path::Path;
 
 /// Key of the manifest's `extra` under which [`Moving`] is stored.
@@ -18,7 +18,7 @@ pub struct StoredModel {
     pub gaussians: HostGaussians,
     /// What the deformer may move.
     pub moving: Moving,
-    /// The motion.
+    /// The motion: the layer of the archive, or one that was computed from the deformer's weights.
     pub playback: Option<PlaybackLayer>,
 }
 
@@ -37,7 +37,11 @@ impl StoredModel {
         let gaussians = read_gaussians(object, archive, limits, events)?;
         let moving = Moving::of_manifest(object, &manifest)?;
         let streams = archive.read_kind(StreamKind::Playback)?;
-        let playback = if streams.is_empty() { None } else { Some(PlaybackLayer::decode(&streams, gaussians.len(), gaussians.sh_degree, limits)?) };
+        let playback = if streams.is_empty() {
+            PlaybackLayer::computed(object, archive, &gaussians, moving, limits)?
+        } else {
+            Some(PlaybackLayer::decode(&streams, gaussians.len(), gaussians.sh_degree, limits)?)
+        };
         Ok(Self { manifest, gaussians, moving, playback })
     }
     /// Whether the model moves, so that it needs a deformer or a playback layer.
@@ -72,6 +76,42 @@ impl Moving {
     }
 }
 
+/// Weights of a deformer are stored in streams of these names, before the names that the weight codec gave them.
+pub const FIELD_STREAMS: &str = "field.";
+
+/// The seed of the weight codec of a model with the root seed `root`.
+pub fn weight_seed(root: u64) -> Seed {
+    Seed::root(root).child("weight-codec")
+}
+
+/// The weights of the deformer of `archive`, decoded by the weight codec `entry`, which must be linked; `object` names the archive in errors.
+///
+/// # Errors
+/// As [`read_gaussians`].
+pub fn read_weights(object: &str, archive: &Archive, entry: &CodecEntry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
+    let codec = (linked::<WeightCodecPlugin>(object, entry)?.build)(&entry.settings)?;
+    let own = |s: Stream| Some(Stream { name: s.name.strip_prefix(FIELD_STREAMS)?.to_string(), bytes: s.bytes });
+    let streams: Vec<Stream> = archive.read_kind(StreamKind::Field)?.into_iter().filter_map(own).collect();
+    codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events))
+}
+
+/// The linked plug-in that `object` names, of the version that it names.
+fn linked<P: PluginEntry>(object: &str, entry: &CodecEntry) -> Result<&'static P> {
+    let (linked, kind) = (Entries::<P>::collect()?, P::KIND.replace('-', " "));
+    let Some(plugin) = linked.iter().find(|p| p.info().name == entry.name) else {
+        let names: Vec<&str> = linked.iter().map(|p| p.info().name).collect();
+        let remedy = format!("Use a program that links the crate of this {kind}; this one links {}", names.join(", "));
+        let problem = format!("it needs the {kind} '{}' (version {}), which is not linked into this program", entry.name, entry.version);
+        return Err(Error::unsupported(object, problem, remedy));
+    };
+    let known = plugin.info().version;
+    if known != entry.version {
+        let problem = format!("version {} of its stored form", entry.version);
+        return Err(Error::unsupported(format!("{object}: {kind} {}", entry.name), problem, format!("This program reads version {known}")));
+    }
+    Ok(plugin)
+}
+
 /// The canonical Gaussians of `archive`, decoded by its codec, which must be linked; `object` names the archive in errors.
 ///
 /// # Errors
@@ -80,18 +120,7 @@ impl Moving {
 pub fn read_gaussians(object: &str, archive: &Archive, limits: &Limits, events: &dyn EventSink) -> Result<HostGaussians> {
     let manifest = archive.manifest();
     let entry = &manifest.codec;
-    let linked = Entries::<CodecPlugin>::collect()?;
-    let Some(plugin) = linked.iter().find(|p| p.info().name == entry.name) else {
-        let names: Vec<&str> = linked.iter().map(|p| p.info().name).collect();
-        let remedy = format!("Use a program that links the crate of this codec; this one links {}", names.join(", "));
-        let problem = format!("it needs the codec '{}' (version {}), which is not linked into this program", entry.name, entry.version);
-        return Err(Error::unsupported(object, problem, remedy));
-    };
-    if plugin.info.version != entry.version {
-        let problem = format!("version {} of its stored form", entry.version);
-        return Err(Error::unsupported(format!("{object}: codec {}", entry.name), problem, format!("This program reads version {}", plugin.info.version)));
-    }
-    let codec = (plugin.build)(&entry.profile, &entry.settings)?;
+    let codec = (linked::<CodecPlugin>(object, entry)?.build)(&entry.profile, &entry.settings)?;
     let context = CodecContext::new(Seed::root(manifest.provenance.seed).child("codec"), *limits, events);
     let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
     gaussians.validate(object, limits)?;

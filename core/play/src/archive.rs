@@ -10,8 +10,8 @@ use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Ma
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream, TrainingViews,
-    TuneModel, WeightArray, read_gaussians, split_kind,
+    AttributeCodec, CodecContext, Deformer, Error, EventSink, FIELD_STREAMS, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream,
+    TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
 };
 use serde::Serialize;
 use serde_json::Value;
@@ -35,9 +35,6 @@ pub struct ArchiveOptions<'a> {
     /// Trains the model further with rounded values, for codecs that make use of it. The archive's deformer then has the trained weights.
     pub tuner: Option<&'a dyn TuneModel>,
 }
-
-/// Weights of a field are stored in streams of these names, before the names that the weight codec gave them.
-const FIELD_STREAMS: &str = "field.";
 
 impl Model {
     /// The model of an open archive; `object` names it in errors. Where the weights of its deformer were left out, its playback layer moves the Gaussians.
@@ -67,7 +64,7 @@ impl Model {
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
                 let mut field = registry.build_deformer(&section, &entry.context, device)?;
-                let weights = read_weights(archive, object, &entry.weights, registry, limits, events)?;
+                let weights = read_weights(object, archive, &entry.weights, limits, events)?;
                 load_weights(object, field.as_mut(), weights, device)?;
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
             }
@@ -225,20 +222,6 @@ fn deviation(values: &[f32]) -> f64 {
     let n = values.len().max(1) as f64;
     let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
     (values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n).sqrt()
-}
-
-pub(crate) fn weight_seed(root: u64) -> Seed {
-    Seed::root(root).child("weight-codec")
-}
-
-/// The field's weights, decoded by the codec that the manifest names.
-fn read_weights(archive: &Archive, object: &str, entry: &CodecEntry, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
-    check_version(object, "weight codec", &entry.name, &entry.version, linked(object, "weight-codec", &entry.name, Some(&entry.version), registry)?)?;
-    let codec = registry.build_weight_codec(&entry.name, &entry.settings)?;
-    let streams = archive.read_kind(StreamKind::Field)?;
-    let streams: Vec<Stream> =
-        streams.into_iter().filter_map(|s| Some(Stream { name: s.name.strip_prefix(FIELD_STREAMS)?.to_string(), bytes: s.bytes })).collect();
-    codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events))
 }
 
 /// Floats per Gaussian of all plug-in attributes that the archive of `manifest` holds.

@@ -1,9 +1,10 @@
 //! How the weights of a field are stored: `name`, `name:setting=value`, or `name:max-drop=0.01dB`, which searches the fewest bits of each array that keep the PSNR.
 
-use crate::archive::{load_weights, weight_seed, weights_of};
+use crate::archive::{load_weights, weights_of};
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::model::Model;
 use burn::tensor::Device;
+use cc4dgs_core::weight_seed;
 use cc4dgs_core::{CodecContext, Error, Event, EventSink, Limits, Plugin, Registry, Result, Scene, Stream, WeightArray, config, psnr_on_views};
 use std::ops::RangeInclusive;
 

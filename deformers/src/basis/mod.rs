@@ -9,26 +9,22 @@
 //!
 //! After training, functions that a head hardly uses and heads without effect are dropped: see `simplify`.
 
-mod functions;
 mod simplify;
 mod sparsity;
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::{Rates, take, within};
-use crate::parts::time::bands_for;
-use crate::parts::voxels::{VoxelSettings, Voxels, parameter};
+use crate::parts::settings::{Rates, take};
+use crate::parts::voxels::{Voxels, parameter};
 use crate::parts::weights;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine_all};
-use cc4dgs_backends::ops::field::{ReluShape, mlp_relu_flat};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu, mlp_relu_flat};
 use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
-    SpatialInput, config, inventory,
+    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
+    SpatialInput, inventory,
 };
-use functions::TemporalFunctions;
-use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use cc4dgs_fields::basis::{BasisPlan, BasisSettings, Rotation, TemporalFunctions};
 use std::sync::Arc;
 
 /// Settings with their defaults, as shown to users.
@@ -53,80 +49,9 @@ clip_norm = 1.0          # gradient-norm clip per group; 0 is off
 # means = [0, 1, 2]
 "#;
 
-/// Largest number of bands chosen automatically: up to 32 cycles per sequence.
-const MOST_BANDS: usize = 6;
 /// Parameter groups by index.
 const GRID: usize = 0;
 const NET: usize = 1;
-
-/// How rotations change.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
-#[serde(rename_all = "snake_case")]
-enum Rotation {
-    /// Four numbers added to the quaternion (paper Section IV-B).
-    Additive,
-    /// Three numbers: the axis times the angle of a rotation in front of the canonical one.
-    Exponential,
-}
-
-/// Settings of everything after the voxel features.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct BasisSettings {
-    width: Option<usize>,
-    layers: usize,
-    time_bands: usize,
-    cycles: f32,
-    falloff: f32,
-    sparsity: f32,
-    splines: usize,
-    learned: usize,
-    heads: Vec<Head>,
-    rotation: Rotation,
-    unused: f64,
-    kept: BTreeMap<String, Vec<usize>>,
-}
-
-impl Default for BasisSettings {
-    fn default() -> Self {
-        Self {
-            width: None,
-            layers: 2,
-            time_bands: 0,
-            cycles: 1.0,
-            falloff: 1.0,
-            sparsity: 1e-4,
-            splines: 0,
-            learned: 16,
-            heads: vec![Head::Means, Head::LogScales, Head::Quaternions],
-            rotation: Rotation::Additive,
-            unused: 0.01,
-            kept: BTreeMap::new(),
-        }
-    }
-}
-
-impl BasisSettings {
-    /// Values per Gaussian of a head.
-    fn width_of(&self, head: Head, sh_degree: usize) -> usize {
-        if head == Head::Quaternions && self.rotation == Rotation::Exponential { 3 } else { head.width(sh_degree) }
-    }
-    /// The function indices of every head: all of `count` unless some were dropped.
-    fn functions_of_heads(&self, count: usize) -> Result<Vec<Vec<usize>>> {
-        if let Some(name) = self.kept.keys().find(|name| !self.heads.iter().any(|h| h.name() == name.as_str())) {
-            return Err(Error::parameter(format!("deformer.kept.{name}"), "no such head", "Name heads of deformer.heads"));
-        }
-        let of_head = |head: &Head| {
-            let Some(own) = self.kept.get(head.name()) else { return Ok((0..count).collect()) };
-            if own.is_empty() || own.windows(2).any(|w| w[0] >= w[1]) || own.iter().any(|&f| f >= count) {
-                let problem = format!("{own:?} is not an ascending list of function indices below {count}");
-                return Err(Error::parameter(format!("deformer.kept.{}", head.name()), problem, "Give each function once, or omit the list"));
-            }
-            Ok(own.clone())
-        };
-        self.heads.iter().map(of_head).collect()
-    }
-}
 
 /// The deformer. Parameters: decoders by level, the functions' network (if any), the coefficients' trunk, one head each.
 struct CdfBasis {
@@ -146,41 +71,11 @@ struct CdfBasis {
 impl CdfBasis {
     fn new(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Self> {
         let mut rest = section.clone();
-        let (voxel_settings, rates): (VoxelSettings, Rates) = (take(&mut rest, &VoxelSettings::KEYS)?, take(&mut rest, &Rates::KEYS)?);
-        let settings: BasisSettings = config::parse_section("deformer cdf-basis", &rest)?;
+        let rates: Rates = take(&mut rest, &Rates::KEYS)?;
         rates.check()?;
-        heads::check(&settings.heads)?;
-        let width = settings.width.unwrap_or(voxel_settings.capacity.width());
-        within("width", width, 1, 4096)?;
-        within("layers", settings.layers, 1, 8)?;
-        within("time_bands", settings.time_bands, 0, 24)?;
-        within("learned", settings.learned, 0, 256)?;
-        within("splines", settings.splines, 0, 1024)?;
-        if (1..4).contains(&settings.splines) {
-            return Err(Error::parameter(
-                "deformer.splines",
-                format!("{} splines are too few; cubic splines need 4", settings.splines),
-                "Give 0 (none) or at least 4",
-            ));
-        }
-        within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
-        if !(0.1..=16.0).contains(&settings.cycles) {
-            return Err(Error::parameter("deformer.cycles", format!("{} cannot be used", settings.cycles), "Give 0.1 to 16; 0.5 and 1 are usual"));
-        }
-        if !(0.0..=4.0).contains(&settings.falloff) {
-            return Err(Error::parameter("deformer.falloff", format!("{} cannot be used", settings.falloff), "Give 0 (none) to 4"));
-        }
-        if !(0.0..=1.0).contains(&settings.sparsity) {
-            return Err(Error::parameter("deformer.sparsity", format!("{} cannot be used", settings.sparsity), "Give 0 (off) to 1"));
-        }
-        if !(0.0..1.0).contains(&settings.unused) {
-            return Err(Error::parameter("deformer.unused", format!("{} is not in 0..1", settings.unused), "Give a share from 0 to below 1"));
-        }
-        let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
-        let network = (settings.learned > 0).then(|| Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(bands), width, width, settings.learned])));
-        let functions = TemporalFunctions { bands, cycles: settings.cycles, falloff: settings.falloff, splines: settings.splines, network };
-        let kept = settings.functions_of_heads(functions.count())?;
-        let groups = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
+        let plan = BasisPlan::new(&rest, context)?;
+        let width = plan.width();
+        let BasisPlan { settings, voxels: voxel_settings, functions, kept, groups, coefficients } = plan;
         let shape = Arc::new(BasisShape { groups });
 
         let (voxels, mut parameters) = Voxels::new(&voxel_settings, context, GRID, device)?;
@@ -189,15 +84,11 @@ impl CdfBasis {
         if let Some(shape) = &functions.network {
             add("net.functions".into(), weights::chain(seed.child("functions"), &weights::widths(shape)));
         }
-        let trunk = vec![width; settings.layers];
-        let chain: Vec<usize> = std::iter::once(voxels.width()).chain(trunk.iter().copied()).collect();
+        let chain: Vec<usize> = std::iter::once(voxels.width()).chain(coefficients.trunk.iter().copied()).collect();
         add("net.trunk".into(), weights::chain(seed.child("trunk"), &chain));
-        let outputs: Vec<usize> = shape.groups.iter().map(|g| g.0 * g.1).collect();
-        for (head, &output) in settings.heads.iter().zip(&outputs) {
-            add(format!("net.head.{}", head.name()), weights::head(seed.child(head.name()), width, output));
+        for (head, &(values, own)) in settings.heads.iter().zip(&shape.groups) {
+            add(format!("net.head.{}", head.name()), weights::head(seed.child(head.name()), width, values * own));
         }
-        let heads = outputs.iter().map(|&output| vec![width, output]).collect();
-        let coefficients = Arc::new(ReluShape { input: voxels.width(), trunk, heads });
         let (section, context) = (section.clone(), context.clone());
         Ok(Self { section, context, rates, voxels, functions, kept, shape, coefficients, parameters, settings })
     }
@@ -213,7 +104,17 @@ impl CdfBasis {
     /// All functions at `times_norm` (0..1): φ(t) `[times, functions]`.
     fn functions_at(&self, times_norm: &[f32], like: &Device) -> Result<Tensor<2>> {
         let weights = self.functions.network.as_ref().map(|_| self.parameters[self.voxels.levels()].value.clone());
-        self.functions.at(times_norm, weights, like)
+        let rows = |of: &dyn Fn(f32) -> Vec<f32>| {
+            let values: Vec<f32> = times_norm.iter().flat_map(|&t| of(t)).collect();
+            let width = values.len() / times_norm.len().max(1);
+            Tensor::<2>::from_data(TensorData::new(values, [times_norm.len(), width]), like)
+        };
+        let functions = &self.functions;
+        let mut parts = vec![rows(&|t| functions.plain(t))];
+        if let (Some(network), Some(weights)) = (&functions.network, weights) {
+            parts.extend(mlp_relu(rows(&|t| functions.network_input(t)), weights, network)?);
+        }
+        Ok(Tensor::cat(parts, 1))
     }
     /// φ(t) at each of `times_norm` for each head (its own functions only), concatenated head after head.
     fn functions_by_head(&self, times_norm: &[f32], like: &Device) -> Result<Vec<Tensor<1>>> {
@@ -299,3 +200,6 @@ inventory::submit! {
         build,
     }
 }
+
+#[cfg(test)]
+mod tests;

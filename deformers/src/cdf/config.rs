@@ -2,10 +2,10 @@
 
 use crate::parts::heads::{self, Head};
 use crate::parts::settings::{Rates, take, within};
-use crate::parts::time::bands_for;
 use crate::parts::voxels::{VoxelSettings, VoxelSizes};
 use cc4dgs_backends::ops::field::ReluShape;
 use cc4dgs_core::{DeformerContext, Result, config};
+use cc4dgs_fields::time::bands_for;
 use serde::{Deserialize, Deserializer};
 
 /// Settings with their defaults, as shown to users.

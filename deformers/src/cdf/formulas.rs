@@ -2,11 +2,11 @@
 //! fused implementation with it, and so do the benchmarks.
 
 use super::Cdf;
-use crate::parts::time;
 use burn::tensor::activation::{mish, relu};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{MishShape, VoxelCorners};
 use cc4dgs_core::{Error, Result};
+use cc4dgs_fields::time;
 
 /// A deformer to be evaluated step by step.
 pub struct Formulas<'a>(pub &'a Cdf);

@@ -14,13 +14,14 @@ pub use config::{CdfConfig, Fusion, SCHEMA, Sizes, TimeEncoding};
 pub use formulas::Formulas;
 
 use crate::parts::voxels::{Voxels, parameter};
-use crate::parts::{heads, time, weights};
+use crate::parts::{heads, weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::{
     Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput,
     config as toml_config, inventory,
 };
+use cc4dgs_fields::time;
 use std::sync::Arc;
 
 /// Parameter groups by index.

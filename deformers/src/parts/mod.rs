@@ -4,6 +4,5 @@ pub mod centres;
 pub mod heads;
 pub mod lives;
 pub mod settings;
-pub mod time;
 pub mod voxels;
 pub mod weights;

@@ -1,92 +1,13 @@
 //! Features of canonical centres without stored tables (paper Section IV-B). The vertices of a multi-resolution grid have hash signatures. One small decoder per
 //! level turns signatures into features. A centre interpolates the features of its eight corners.
 
-use super::settings::{Capacity, within};
+pub use cc4dgs_fields::voxels::{VoxelSettings, VoxelSizes};
+
 use super::weights;
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_backends::ops::field::{Decoder, GridBox, LevelHash, MAX_RESOLUTION, MishShape, VoxelCorners};
+use cc4dgs_backends::ops::field::{Decoder, GridBox, VoxelCorners};
 use cc4dgs_core::{DeformerContext, DeformerWork, Error, Parameter, Part, Result};
-use serde::Deserialize;
 use std::sync::Arc;
-
-/// Settings of the grid and its decoders.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct VoxelSettings {
-    /// Defaults of the sizes below.
-    pub capacity: Capacity,
-    /// Grid levels.
-    pub levels: Option<usize>,
-    /// Cells per axis of each level.
-    pub resolutions: Option<Vec<u32>>,
-    /// Widths of the decoders' hidden layers.
-    pub hidden: Option<Vec<usize>>,
-    /// Features per level.
-    pub features: Option<usize>,
-    /// Hash functions per vertex.
-    pub hashes: usize,
-    /// m of the hash functions.
-    pub modulus: u32,
-    /// Whether a vertex that several centres share is decoded once.
-    pub vertex_reuse: bool,
-}
-
-impl Default for VoxelSettings {
-    fn default() -> Self {
-        Self { capacity: Capacity::Default, levels: None, resolutions: None, hidden: None, features: None, hashes: 128, modulus: 1_000_000, vertex_reuse: true }
-    }
-}
-
-/// The sizes of grid and decoders.
-#[derive(Clone, Debug, PartialEq)]
-pub struct VoxelSizes {
-    /// Cells per axis of each level.
-    pub resolutions: Vec<u32>,
-    /// The decoder of every level.
-    pub decoder: MishShape,
-}
-
-impl VoxelSizes {
-    /// Features per centre: those of all levels together.
-    pub fn width(&self) -> usize {
-        self.resolutions.len() * self.decoder.output
-    }
-}
-
-impl VoxelSettings {
-    /// The keys of these settings in a `[deformer]` section.
-    pub const KEYS: [&'static str; 8] = ["capacity", "levels", "resolutions", "hidden", "features", "hashes", "modulus", "vertex_reuse"];
-
-    /// Computes the sizes.
-    ///
-    /// # Errors
-    /// [`Error::Parameter`] for sizes out of range.
-    pub fn sizes(&self) -> Result<VoxelSizes> {
-        let (levels, hidden, features) = match self.capacity {
-            Capacity::Small => (4, vec![64, 64], 16),
-            Capacity::Mid => (5, vec![96, 96], 32),
-            Capacity::Default => (5, vec![128, 128], 32),
-        };
-        let levels = self.levels.or(self.resolutions.as_ref().map(Vec::len)).unwrap_or(levels);
-        within("levels", levels, 1, 16)?;
-        let doubling = || (0..levels).map(|l| 16u32.checked_shl(l as u32).unwrap_or(u32::MAX)).collect();
-        let resolutions: Vec<u32> = self.resolutions.clone().unwrap_or_else(doubling);
-        if resolutions.len() != levels {
-            return Err(Error::parameter("deformer.resolutions", format!("{} entries for {levels} levels", resolutions.len()), "Give one per level"));
-        }
-        for &r in &resolutions {
-            within("resolutions", r as usize, 1, MAX_RESOLUTION as usize)?;
-        }
-        let hidden = self.hidden.clone().unwrap_or(hidden);
-        within("hidden (layers)", hidden.len(), 0, 8)?;
-        let features = self.features.unwrap_or(features);
-        for (name, value) in hidden.iter().map(|&h| ("hidden", h)).chain([("features", features), ("hashes", self.hashes)]) {
-            within(name, value, 1, 4096)?;
-        }
-        within("modulus", self.modulus as usize, 2, 1 << 24)?;
-        Ok(VoxelSizes { resolutions, decoder: MishShape { input: self.hashes, hidden, output: features } })
-    }
-}
 
 /// The grid over a scene's box with the hash functions and layer shapes of its decoders. The weights are [`Parameter`]s of the deformer that owns the grid.
 #[derive(Clone, Debug)]
@@ -111,8 +32,7 @@ impl Voxels {
             let seed = context.seed.child("level").index(level as u64);
             let values = weights::decoder(seed.child("weights"), &sizes.decoder);
             parameters.push(parameter(format!("grid.level{level}"), Part::Grid, group, values, device));
-            let hash = LevelHash::new(seed.child("hash"), settings.hashes, settings.modulus);
-            decoders.push(Arc::new(Decoder { hash, shape: sizes.decoder.clone() }));
+            decoders.push(Arc::new(Decoder { hash: settings.hash(context, level), shape: sizes.decoder.clone() }));
         }
         let (box_min, box_max, width) = (context.box_min, context.box_max, sizes.width());
         Ok((Self { box_min, box_max, resolutions: sizes.resolutions, decoders, reuse: settings.vertex_reuse, width }, parameters))

@@ -1,7 +1,7 @@
 //! `web`: the model with the player, as one HTML file that opens from disk without a network, or as a folder for any static server.
 //!
-//! The player's page is built apart from this program (`apps/player/build-web`); [`Page`] finds it. The archive is stored with a playback layer and without the
-//! deformer, which the page cannot evaluate.
+//! The player's page is built apart from this program (`apps/player/build-web`); [`Page`] finds it. The archive is stored with the deformer's weights where the page
+//! can compute the motion from them, else with a playback layer and without the deformer.
 
 mod html;
 mod page;
@@ -15,6 +15,7 @@ use std::path::Path;
 
 const SCHEMA: &str = "\
 max_error = \"0.1px\"      # how far a point may be off where motion has to be baked; as for `cc4dgs bake`
+baked = false            # bake motion even where the page can compute it from the deformer's weights: a larger file that opens sooner
 autoplay = true          # play as soon as the model is there
 page = \"\"                # folder of the page that apps/player/build-web made; by default the one that `cc4dgs doctor` names
 ";
@@ -38,18 +39,20 @@ const FOLDER: [&str; PAGE_FILES.len() + 2] = {
 #[serde(deny_unknown_fields, default)]
 struct Settings {
     max_error: String,
+    baked: bool,
     autoplay: bool,
     page: String,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { max_error: "0.1px".into(), autoplay: true, page: String::new() }
+        Self { max_error: "0.1px".into(), baked: false, autoplay: true, page: String::new() }
     }
 }
 
 struct Web {
     max_error: MaxError,
+    baked: bool,
     autoplay: bool,
     /// Folder of the page, or empty. It is read when a file is written, so that settings can be checked without one.
     page: String,
@@ -61,12 +64,15 @@ impl Exporter for Web {
             return "It holds the Gaussians and the player.".into();
         }
         let bound = self.max_error;
-        format!("It holds the Gaussians, their motion within {bound} (or as the archive has it baked) and the player, without the deformer.")
+        if self.baked {
+            return format!("It holds the Gaussians, their motion within {bound} (or as the archive has it baked) and the player, without the deformer.");
+        }
+        format!("It holds the Gaussians, the player, and the motion: as the deformer's weights where the page can compute it from them, else within {bound}.")
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         let page = &if self.page.is_empty() { Page::find()? } else { Page::read(Path::new(&self.page))? };
         let facts = source.facts().clone();
-        let archive = source.playable(self.max_error)?;
+        let archive = source.playable(self.max_error, self.baked)?;
         source.progress(1, 2)?;
         let mut notes = vec![format!("The archive in it has {:.3} MB, the player is from {}", archive.len() as f64 / 1e6, page.origin)];
         if path.is_dir() {
@@ -85,10 +91,10 @@ impl Exporter for Web {
 }
 
 pub(crate) fn build(settings: &toml::Table) -> Result<Box<dyn Exporter>> {
-    let Settings { max_error, autoplay, page } = config::parse_section("exporter web", settings)?;
+    let Settings { max_error, baked, autoplay, page } = config::parse_section("exporter web", settings)?;
     let max_error =
         max_error.parse().map_err(|e: Error| Error::parameter("exporter web: max_error", e.to_string(), "Write pixels, 0.1px, or a length, 0.002"))?;
-    Ok(Box::new(Web { max_error, autoplay, page }))
+    Ok(Box::new(Web { max_error, baked, autoplay, page }))
 }
 
 inventory::submit! {

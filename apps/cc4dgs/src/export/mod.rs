@@ -194,7 +194,7 @@ impl ExportSource for ModelSource<'_> {
             None => Err(Error::parameter("image", format!("{index} of {}", self.facts.images), "Ask for an image that is there")),
         }
     }
-    fn playable(&mut self, max_error: MaxError) -> Result<Vec<u8>> {
+    fn playable(&mut self, max_error: MaxError, baked: bool) -> Result<Vec<u8>> {
         let ExportJob { model, request, registry, device, limits, events, .. } = self.job;
         let around = Surroundings { registry, device, limits, events: *events };
         let stored = match self.job.archive {
@@ -208,7 +208,7 @@ impl ExportSource for ModelSource<'_> {
             Presentation { frames_per_second: before.frames_per_second.or(Some(request.frames_per_second as f32)), seconds: before.seconds, ..shown };
         // A layer that is there was made with a bound of its own.
         let max_error = (stored.bytes_of(StreamKind::Playback) == 0).then_some(max_error);
-        let options = PlayableOptions { max_error, cameras: &request.cameras, presentation, poster: true, without_field: true };
+        let options = PlayableOptions { max_error, cameras: &request.cameras, presentation, poster: true, without_field: true, baked };
         Ok(stored.playable(options, around)?.bytes)
     }
     fn progress(&mut self, done: usize, total: usize) -> Result<()> {

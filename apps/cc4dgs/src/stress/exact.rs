@@ -2,7 +2,7 @@
 //!
 //! Weights and attributes are read from a deformer by name, as float32; everything computed from them is float64.
 
-use cc4dgs_backends::ops::field::{LevelHash, MishShape};
+use cc4dgs_backends::ops::field::MishShape;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Deformer, DeformerContext, Error, LIFE_GATE_STEEPNESS, Result, config, toml};
 use cc4dgs_deformers::cdf::CdfConfig;
@@ -108,8 +108,7 @@ impl Exact {
         let sizes = settings.sizes()?;
         let mut rows = vec![Vec::new(); points.len()];
         for (level, &resolution) in sizes.resolutions.iter().enumerate() {
-            let seed = context.seed.child("level").index(level as u64).child("hash");
-            let hash = LevelHash::new(seed, settings.hashes, settings.modulus);
+            let hash = settings.hash(context, level);
             let weights = self.weights(&format!("grid.level{level}"))?;
             for (point, row) in points.iter().zip(&mut rows) {
                 // The cell, and where in it the point lies.
@@ -206,7 +205,7 @@ fn free_time(row: &[f64], t: f64) -> Vec<f64> {
     row[4..7].iter().map(|v| v * since).chain([log_factor]).collect()
 }
 
-/// As [`cc4dgs_deformers::parts::time::bands_for`] says: the highest band is near half the frame count.
+/// As `cc4dgs_fields::time::bands_for` says: the highest band is near half the frame count.
 fn bands_for(frames: usize) -> usize {
     (frames.max(1) as f64).log2().round().clamp(1.0, 16.0) as usize
 }

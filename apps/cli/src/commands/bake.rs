@@ -37,7 +37,14 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
         None => stored.archive.manifest().presentation.cameras.clone(),
     };
     let presentation = shown(args, &stored, &cameras)?;
-    let options = PlayableOptions { max_error: Some(max_error), cameras: &cameras, presentation, poster: !args.no_poster, without_field: args.without_field };
+    let options = PlayableOptions {
+        max_error: Some(max_error),
+        cameras: &cameras,
+        presentation,
+        poster: !args.no_poster,
+        without_field: args.without_field,
+        baked: true,
+    };
     let playable = stored.playable(options, around)?;
     write_atomically(&args.out, &playable.bytes)?;
     let bytes = playable.bytes.len() as u64;

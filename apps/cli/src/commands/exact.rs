@@ -103,7 +103,7 @@ mod tests {
         let around = Surroundings { registry: session.registry(), device: session.device(), limits: session.limits(), events: session.events() };
         let stored = Stored::open(plain, Storage::default(), around).unwrap();
         let presentation = stored.presentation(&[], None).unwrap();
-        let options = PlayableOptions { max_error: None, cameras: &[], presentation, poster: false, without_field };
+        let options = PlayableOptions { max_error: None, cameras: &[], presentation, poster: false, without_field, baked: true };
         std::fs::write(out, stored.playable(options, around).unwrap().bytes).unwrap();
     }
 

@@ -11,7 +11,14 @@ pub fn run(context: &Context, args: &Report) -> Result<()> {
         ImagesArg::BuiltIn => ImageChoice::BuiltIn,
         ImagesArg::All => ImageChoice::All,
     };
-    let options = ReportOptions { title: args.title.clone(), images, views: usize::from(args.views), only: args.only.clone() };
+    let options = ReportOptions {
+        title: args.title.clone(),
+        images,
+        views: usize::from(args.views),
+        only: args.only.clone(),
+        columns: args.columns.clone(),
+        figures: args.figures.clone(),
+    };
     let out = args.out.clone().unwrap_or_else(|| match args.results.is_dir() {
         true => args.results.join("report.html"),
         false => args.results.with_extension("html"),

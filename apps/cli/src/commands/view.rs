@@ -61,7 +61,7 @@ fn content(path: &Path, options: &Options, registry: &Registry, events: &dyn Eve
     let around = Surroundings { registry, device: &device, limits, events };
     let stored = Stored::open(path, Storage { codec: "raw", field_weights: "fp32" }, around)?;
     let presentation = stored.presentation(&[], None)?;
-    let options = PlayableOptions { max_error: Some(*max_error), cameras: &[], presentation, poster: false, without_field: true };
+    let options = PlayableOptions { max_error: Some(*max_error), cameras: &[], presentation, poster: false, without_field: true, baked: false };
     let playable = stored.playable(options, around)?;
     Content::read(&object, playable.bytes, limits)
 }

@@ -5,6 +5,7 @@
 mod common;
 mod read;
 
+use cc4dgs::core::archive::{Archive, StreamKind};
 use cc4dgs::exporters::web::PAGE_FILES;
 use cc4dgs::{HostGaussians, Image8, Model, Orbit, Session};
 use common::{fail, json_of, succeed, text};
@@ -173,7 +174,7 @@ fn videos_have_their_images() {
 
 /// The page of the player is no part of this program; this stands in for it.
 #[test]
-fn pages_hold_a_baked_archive() {
+fn pages_hold_an_archive_that_plays() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     train(&at("run"), "cdf-basis", 0);
@@ -193,6 +194,13 @@ fn pages_hold_a_baked_archive() {
     let events = cc4dgs_core::Silent;
     let model = cc4dgs_core::StoredModel::open(site.join("model.cc4d"), &cc4dgs::Limits::default(), &events).unwrap();
     assert!(model.playback.is_some() && model.manifest.presentation.home.is_some());
+    // The page computes the motion of this deformer from its weights, unless a layer is asked for.
+    let kinds = |site: &str| {
+        let archive = Archive::open(at(site).join("model.cc4d"), &cc4dgs::Limits::default()).unwrap();
+        [StreamKind::Field, StreamKind::Playback].map(|kind| archive.stream_sizes().iter().any(|s| s.kind == kind))
+    };
+    export_with(&dir, &at("layer"), &["--set", "baked=true"]);
+    assert_eq!((kinds("site"), kinds("layer")), ([true, false], [false, true]));
     // An archive that is baked keeps its layer: the bound of the page does not apply to it.
     succeed(&["bake", text(&dir), "--out", text(&baked), "--max-error", "2px", "-q"]);
     export(&baked, &again);

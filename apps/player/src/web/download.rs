@@ -47,10 +47,15 @@ impl Download {
     }
     /// The streams as JSON: name, kind, first byte and bytes of each. The header must have arrived.
     pub fn streams(&mut self) -> std::result::Result<String, JsError> {
-        let streams = self.opened().map_err(error)?.stream_sizes();
+        crate::link();
+        let archive = self.opened().map_err(error)?;
+        let computed = PlaybackLayer::may_be_computed(archive).map_err(error)?;
+        let streams = archive.stream_sizes();
         let kind = |kind| match kind {
             StreamKind::Canonical => "canonical",
             StreamKind::Playback => "playback",
+            // The page needs the weights where it computes the motion from them.
+            StreamKind::Field if computed => "playback",
             StreamKind::Poster => "poster",
             _ => "other",
         };
@@ -89,9 +94,11 @@ impl Download {
         let bytes = archive.total_bytes()?;
         if motion {
             let streams = archive.read_kind(StreamKind::Playback)?;
-            if !streams.is_empty() {
-                model.playback = Some(PlaybackLayer::decode(&streams, model.gaussians.len(), model.gaussians.sh_degree, limits)?);
-            }
+            model.playback = if streams.is_empty() {
+                PlaybackLayer::computed(&name, archive, &model.gaussians, model.moving, limits)?
+            } else {
+                Some(PlaybackLayer::decode(&streams, model.gaussians.len(), model.gaussians.sh_degree, limits)?)
+            };
             return Content::of_model(model, bytes);
         }
         self.model = Some(model.clone());

@@ -1,6 +1,6 @@
 //! Mish and LayerNorm over rows, forward and backward, in loops that vectorise.
 
-use crate::ops::networks::LAYER_NORM_EPSILON;
+use cc4dgs_fields::networks::LAYER_NORM_EPSILON;
 
 /// e^x for |x| <= 87, branch-free; relative error below 2e-7.
 #[inline(always)]

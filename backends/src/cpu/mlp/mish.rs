@@ -9,7 +9,7 @@ use super::matmul::{add_column_sums, add_transposed_matmul, fill_rows, matmul, t
 use super::{blocks_per_run, sum_in_order};
 use crate::cpu::scratch::{Scratch, scratch};
 use crate::cpu::simd::vectorized;
-use crate::ops::networks::{MishLayer, MishShape};
+use cc4dgs_fields::networks::{MishLayer, MishShape};
 use rayon::prelude::*;
 
 /// Rows per block.

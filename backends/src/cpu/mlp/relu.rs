@@ -9,7 +9,7 @@ use super::{blocks_per_run, sum_in_order};
 use crate::cpu::heads::row_blocks;
 use crate::cpu::scratch::{Scratch, scratch};
 use crate::cpu::simd::vectorized;
-use crate::ops::networks::{Layer, ReluShape};
+use cc4dgs_fields::networks::{Layer, ReluShape};
 use rayon::prelude::*;
 
 /// Rows per block.

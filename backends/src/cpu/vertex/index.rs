@@ -3,8 +3,7 @@
 use crate::cpu::sort::stable_order;
 use rayon::prelude::*;
 
-/// Upper bound on the cells per axis; (cells + 1)^3 keys then fit in 32 bits.
-pub const MAX_RESOLUTION: u32 = 1600;
+pub use cc4dgs_fields::voxels::MAX_RESOLUTION;
 
 /// The corners of all points on one level.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -6,10 +6,10 @@ use super::layers::{self, Dense};
 use super::program::{Input, Program, SavedNorm, Step, Target, parts, scales};
 use crate::cube::tensor::{THREADS, floats, upload, workgroups_for};
 use crate::ops::field::Decoder;
-use crate::ops::hash::LevelHash;
-use crate::ops::networks::{LAYER_NORM_EPSILON as EPSILON, MishLayer, MishShape};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
+use cc4dgs_fields::hash::LevelHash;
+use cc4dgs_fields::networks::{LAYER_NORM_EPSILON as EPSILON, MishLayer, MishShape};
 use cubecl::prelude::*;
 
 /// 2^31 - 1.

@@ -4,9 +4,9 @@ use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
 use super::program::{Input, Program, Step, Target, parts};
 use crate::cube::tensor::{floats, upload};
-use crate::ops::networks::{Layer, ReluShape};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
+use cc4dgs_fields::networks::{Layer, ReluShape};
 
 fn dense(layer: &Layer) -> Dense {
     Dense { input: layer.input, output: layer.output, at: layer.weight.start }

@@ -83,7 +83,7 @@ impl ExportSource for MovingModel {
         Ok(Image8 { width, height, channels: 3, data })
     }
     /// No real archive: exporters pass its bytes on and do not look into them.
-    fn playable(&mut self, _: MaxError) -> Result<Vec<u8>> {
+    fn playable(&mut self, _: MaxError, _: bool) -> Result<Vec<u8>> {
         crate::ply::to_bytes(&self.canonical, true)
     }
     fn progress(&mut self, _: usize, _: usize) -> Result<()> {
@@ -113,9 +113,9 @@ impl ExportSource for Failing {
         self.count()?;
         self.0.image(index)
     }
-    fn playable(&mut self, max_error: MaxError) -> Result<Vec<u8>> {
+    fn playable(&mut self, max_error: MaxError, baked: bool) -> Result<Vec<u8>> {
         self.count()?;
-        self.0.playable(max_error)
+        self.0.playable(max_error, baked)
     }
     fn progress(&mut self, _: usize, _: usize) -> Result<()> {
         self.count()

@@ -91,11 +91,13 @@ pub trait ExportSource {
     /// # Errors
     /// What the renderer reports; [`Error::Unsupported`](crate::Error::Unsupported) where there is none.
     fn image(&mut self, index: usize) -> Result<Image8>;
-    /// The model as the bytes of an archive with a playback layer, in the coordinates of the model. Points are off by at most `max_error`.
+    /// The model as the bytes of an archive that players without burn play, in the coordinates of the model: with the deformer's weights where its motion can be
+    /// computed from them ([`PlaybackLayer::computed`](crate::playback::PlaybackLayer::computed)) and `baked` does not ask for a layer; else with a layer in which
+    /// points are off by at most `max_error`.
     ///
     /// # Errors
     /// What baking reports; [`Error::Unsupported`](crate::Error::Unsupported) where the source cannot bake.
-    fn playable(&mut self, max_error: MaxError) -> Result<Vec<u8>>;
+    fn playable(&mut self, max_error: MaxError, baked: bool) -> Result<Vec<u8>>;
     /// Reports `done` of `total` pieces of work.
     ///
     /// # Errors

@@ -103,7 +103,7 @@ mod tests {
         fn image(&mut self, _: usize) -> Result<Image8> {
             Err(Error::unsupported("image", "none", "None"))
         }
-        fn playable(&mut self, _: MaxError) -> Result<Vec<u8>> {
+        fn playable(&mut self, _: MaxError, _: bool) -> Result<Vec<u8>> {
             Err(Error::unsupported("archive", "none", "None"))
         }
         fn progress(&mut self, _: usize, _: usize) -> Result<()> {

@@ -177,10 +177,10 @@ fn change(track: &Track, row: usize, functions: &[f32], out: &mut HostGaussians,
         }
         Head::Opacities => {
             let logit = &mut out.opacity_logits[gaussian];
-            let mut opacity = [1.0 / (1.0 + (-*logit).exp())];
+            let mut opacity = [1.0 / (1.0 + libm::expf(-*logit))];
             track.add(row, functions, &mut opacity);
             let opacity = opacity[0].clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY);
-            *logit = (opacity / (1.0 - opacity)).ln();
+            *logit = libm::logf(opacity / (1.0 - opacity));
         }
         Head::Colors => {
             let rest = 3 * sh_rest_len(out.sh_degree);

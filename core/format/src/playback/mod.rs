@@ -6,12 +6,16 @@
 //! truncated singular value decomposition over the samples. Where motion is large, the sequence is divided into segments with functions and coefficients of their
 //! own; neighbours share the sample between them.
 //!
+//! Layers of deformers that are linear can be computed from their weights when a model is opened ([`PlaybackLayer::computed`]): such files need none.
+//!
 //! `cc4dgs bake` writes the layer into an archive, beside the Gaussians that it moves. [`PlaybackLayer::apply`] is the reference for players.
 
+mod computed;
 mod layer;
 mod max_error;
 mod streams;
 
+pub use computed::{LayerPlugin, LayerSource};
 pub use layer::{Head, MAX_FUNCTIONS, MAX_SAMPLES, MAX_SEGMENTS, PlaybackLayer, Segment, TimeWeights, Track};
 pub use max_error::MaxError;
 pub use streams::{CodedTrack, exponent_step};

@@ -47,7 +47,7 @@ pub(super) fn pack(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Pa
     let byte = |v: f32| v.round().clamp(0.0, 255.0) as u8;
     let unit: Vec<Option<[f32; 4]>> = gaussians.quaternions.as_chunks::<4>().0.iter().map(|q| normalized(*q)).collect();
     // A quaternion of norm zero is not drawn, so its Gaussian is stored with an opacity of zero.
-    let alphas = gaussians.opacity_logits.iter().zip(&unit).map(|(o, q)| if q.is_some() { byte(255.0 / (1.0 + (-o).exp())) } else { 0 }).collect();
+    let alphas = gaussians.opacity_logits.iter().zip(&unit).map(|(o, q)| if q.is_some() { byte(255.0 / (1.0 + libm::expf(-o))) } else { 0 }).collect();
     let colors = gaussians.sh_dc.iter().map(|c| byte((c * COLOR + 0.5) * 255.0)).collect();
     let scales = gaussians.log_scales.iter().map(|s| byte((s + 10.0) * 16.0)).collect();
     let rotations = unit.iter().flat_map(|q| {
@@ -80,7 +80,7 @@ pub(super) fn unpack(packed: &Packed) -> HostGaussians {
     let coordinate = |b: &[u8; 3]| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 * scale;
     let means = positions.as_chunks::<9>().0.iter().flat_map(|p| turned([0, 3, 6].map(|k| coordinate(&[p[k], p[k + 1], p[k + 2]])))).collect();
     // Half a step inside, where the logit is finite.
-    let opacity_logits = alphas.iter().map(|&a| f32::from(a).clamp(0.5, 254.5)).map(|a| (a / (255.0 - a)).ln()).collect();
+    let opacity_logits = alphas.iter().map(|&a| f32::from(a).clamp(0.5, 254.5)).map(|a| libm::logf(a / (255.0 - a))).collect();
     let sh_dc = colors.iter().map(|&c| (f32::from(c) / 255.0 - 0.5) / COLOR).collect();
     let log_scales = scales.iter().map(|&s| f32::from(s) / 16.0 - 10.0).collect();
     let rotations: Vec<[f32; 4]> = if packed.rotation_bytes == 4 {

@@ -2,8 +2,8 @@
 
 use super::bars::{Bars, Strips, swatch};
 use super::pareto::front;
-use super::plot::{Axis, COLOURS, Plot, Point, Series, marker};
-use super::rows::{Better, DECODE, ENCODE, FRAME, LPIPS, PSNR, Quantity, Row, SIZE, SSIM, TRAINING};
+use super::plot::{Axis, COLOURS, Entry, Plot, Point, Series, marker};
+use super::rows::{Better, CodecFamily, DECODE, ENCODE, FRAME, LPIPS, PSNR, Quantity, Row, SIZE, SSIM, TRAINING};
 use super::text::html;
 use crate::sweep::CellResult;
 use std::collections::{BTreeMap, BTreeSet};
@@ -28,6 +28,13 @@ impl Key {
     fn marker(&self, row: &Row) -> usize {
         self.codecs.iter().position(|name| name == row.codec).unwrap_or(0)
     }
+    /// What the colours, or the shapes, of a plot mean.
+    fn entries(&self, plot: &Plot, shapes: bool) -> Vec<Entry> {
+        let shown = |i: usize| plot.series.iter().filter(|s| !s.points.is_empty()).any(|s| if shapes { s.marker == Some(i) } else { s.colour == i });
+        let names = if shapes { &self.codecs } else { &self.trainings };
+        let entry = |(i, name): (usize, &String)| Entry { colour: (!shapes).then_some(i), marker: shapes.then_some(i), name: name.clone() };
+        names.iter().enumerate().filter(|(i, _)| shown(*i)).map(entry).collect()
+    }
     /// What colours and shapes mean.
     pub fn legend(&self) -> String {
         let colours: String = self.trainings.iter().enumerate().map(|(i, name)| swatch(COLOURS[i % COLOURS.len()], name)).collect();
@@ -38,25 +45,58 @@ impl Key {
     }
 }
 
+/// The plots of a scene that have something to show.
+#[derive(Debug)]
+struct Plots {
+    rate: Vec<Plot>,
+    cost: Vec<Plot>,
+    progress: Vec<Plot>,
+}
+
+impl Plots {
+    fn of(rows: &[Row], key: &Key) -> Self {
+        let best: Vec<Row> = best_codecs(rows).into_iter().cloned().collect();
+        let costs =
+            |metric| [(&FRAME, rows), (&TRAINING, &best), (&ENCODE, rows), (&DECODE, rows), (&SIZE, rows)].map(|(cost, rows)| pareto(rows, cost, metric, key));
+        let shown = |plots: &mut dyn Iterator<Item = Plot>| plots.filter(|plot| !plot.is_empty()).collect();
+        Self {
+            rate: shown(&mut [&PSNR, &SSIM, &LPIPS].into_iter().map(|metric| rate_distortion(rows, metric, key))),
+            cost: shown(&mut [&PSNR, &LPIPS].into_iter().flat_map(costs)),
+            progress: shown(&mut [training_curves(rows, key, false), training_curves(rows, key, true), per_frame(rows, key)].into_iter()),
+        }
+    }
+}
+
+/// The plots of a scene as SVG files with legends, by name.
+pub fn files(scene: &str, rows: &[Row], key: &Key) -> Vec<(String, String)> {
+    let plots = Plots::of(rows, key);
+    let name = |plot: &Plot| {
+        let text = format!("{scene} {}", plot.title).to_lowercase();
+        text.split(|c: char| !c.is_ascii_alphanumeric()).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".svg"
+    };
+    let of_trainings = |plot: &Plot| key.entries(plot, false);
+    let of_points = |plot: &Plot| [key.entries(plot, false), key.entries(plot, true)].concat();
+    let file = |plot: &Plot, legend: Vec<Entry>| (name(plot), plot.file(&format!("{scene}: {}", plot.title), &legend));
+    let points = plots.rate.iter().chain(&plots.cost).map(|plot| file(plot, of_points(plot)));
+    points.chain(plots.progress.iter().map(|plot| file(plot, of_trainings(plot)))).collect()
+}
+
 /// All figures of a scene but images, as HTML.
 pub fn figures(rows: &[Row], key: &Key) -> String {
-    let plots = |plots: &mut dyn Iterator<Item = Plot>| grid("", plots.filter(|plot| !plot.is_empty()).map(|plot| plot.figure()).collect());
-    let note = "A point is the mean over seeds, its whisker the least and the largest seed. Lines join the settings and profiles of one method with one codec.";
+    let plots = |plots: &[Plot]| grid("", plots.iter().map(Plot::figure).collect());
+    let Plots { rate, cost, progress } = Plots::of(rows, key);
+    let note = "A point is the mean over seeds, its whisker the least and the largest seed. Lines join the profiles of a codec, and the settings of a method.";
     let mut out = heading("Rate and distortion", note) + &key.legend();
-    out += &plots(&mut [&PSNR, &SSIM, &LPIPS].into_iter().map(|metric| rate_distortion(rows, metric, key)));
+    out += &plots(&rate);
 
     let note = "Ringed points are on the Pareto front: nothing here is better in one of the two without being worse in the other. Left is cheaper. Training time is shown with the codec of the highest PSNR.";
     out += &(heading("Time and size against error", note) + &key.legend());
-    let best: Vec<Row> = best_codecs(rows).into_iter().cloned().collect();
-    for metric in [&PSNR, &LPIPS] {
-        let costs = [(&FRAME, rows), (&TRAINING, &best), (&ENCODE, rows), (&DECODE, rows), (&SIZE, rows)];
-        out += &plots(&mut costs.into_iter().map(|(cost, rows)| pareto(rows, cost, metric, key)));
-    }
+    out += &plots(&cost);
 
     out += &heading("Where time and bytes go", "");
     out += &grid(" bars", [stage_bars(rows), frame_bars(rows), storage_bars(rows)].map(|bars| bars.figure()).concat());
     out += &(heading("Training, frames, seeds", "") + &key.legend());
-    out += &plots(&mut [training_curves(rows, key, false), training_curves(rows, key, true), per_frame(rows, key)].into_iter());
+    out += &plots(&progress);
     if rows.iter().any(|row| row.cells.len() > 1) {
         let values = |row: &Row| row.cells.iter().filter_map(|cell| PSNR.of(cell)).collect();
         let lines = rows.iter().map(|row| (row.name(), key.colour(row), values(row))).collect();
@@ -94,7 +134,7 @@ fn metric_axis(metric: &Quantity) -> Axis {
 }
 
 fn rate_distortion(rows: &[Row], metric: &Quantity, key: &Key) -> Plot {
-    let mut curves: BTreeMap<(&str, &str), Vec<(usize, Point)>> = BTreeMap::new();
+    let mut curves: BTreeMap<(&str, CodecFamily), Vec<(usize, Point)>> = BTreeMap::new();
     for row in rows {
         if let Some(point) = point(row, &SIZE, metric) {
             curves.entry((row.method, row.codec_family())).or_default().push((key.colour(row), point));
@@ -109,7 +149,7 @@ fn rate_distortion(rows: &[Row], metric: &Quantity, key: &Key) -> Plot {
         })
         .collect();
     series.extend(points(rows, &SIZE, metric, key));
-    Plot { title: format!("{} against size", metric.name), x: Axis::ranged("archive (MB)"), y: metric_axis(metric), series, front: Vec::new() }
+    Plot { title: format!("Rate and distortion: {}", metric.name), x: Axis::ranged("archive (MB)"), y: metric_axis(metric), series, front: Vec::new() }
 }
 
 fn pareto(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key) -> Plot {

@@ -42,11 +42,15 @@ pub struct ReportOptions {
     pub views: usize,
     /// `KEY=VALUE`, as [`select`] takes them.
     pub only: Vec<String>,
+    /// Keys of [`QUANTITIES`] that the summary tables show, in this order; all where it is empty.
+    pub columns: Vec<String>,
+    /// Folder for the plots as SVG files.
+    pub figures: Option<PathBuf>,
 }
 
 impl Default for ReportOptions {
     fn default() -> Self {
-        Self { title: None, images: ImageChoice::BuiltIn, views: 3, only: Vec::new() }
+        Self { title: None, images: ImageChoice::BuiltIn, views: 3, only: Vec::new(), columns: Vec::new(), figures: None }
     }
 }
 
@@ -61,6 +65,8 @@ pub struct Report {
     pub markdown: String,
     /// The tables of the page.
     pub latex: String,
+    /// The plots of the page as SVG files: names and texts.
+    pub figures: Vec<(String, String)>,
     /// Results that it is made of.
     pub cells: usize,
 }
@@ -76,6 +82,8 @@ pub struct ReportFiles {
     pub markdown: PathBuf,
     /// The tables.
     pub latex: PathBuf,
+    /// The plots.
+    pub figures: Vec<PathBuf>,
     /// Results that it is made of.
     pub cells: usize,
     /// Size of the page in bytes.
@@ -95,6 +103,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let folder = if beside { path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")) } else { path };
     let public = images::built_in(&scenes);
     let key = charts::Key::of(scenes.values().flatten());
+    let columns = columns(&options.columns)?;
 
     let title = options.title.clone().unwrap_or_else(|| {
         let sweeps: std::collections::BTreeSet<&str> = results.iter().map(|r| r.sweep.as_str()).collect();
@@ -110,7 +119,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     );
     let mut latex = String::from("% Mean and sample standard deviation over seeds. MB are 10^6 bytes.\n");
     for (i, (scene, rows)) in scenes.iter().enumerate() {
-        let table = tables::summary(scene, rows);
+        let table = tables::summary(scene, rows, &columns);
         markdown += &table.markdown();
         latex += &table.latex();
         let class = if i == 0 { " class=\"first\"" } else { "" };
@@ -131,7 +140,20 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
         latex += &table.latex();
     }
     body += "</div>\n";
-    Ok(Report { html: page::page(&title, &body), csv: tables::csv(&scenes), markdown, latex, cells: results.len() })
+    let figures = scenes.iter().flat_map(|(scene, rows)| charts::files(scene, rows, &key)).collect();
+    Ok(Report { html: page::page(&title, &body), csv: tables::csv(&scenes), markdown, latex, figures, cells: results.len() })
+}
+
+/// The quantities with these keys.
+fn columns(keys: &[String]) -> Result<Vec<&'static Quantity>> {
+    if keys.is_empty() {
+        return Ok(QUANTITIES.iter().collect());
+    }
+    let all = || QUANTITIES.iter().map(|q| q.key).collect::<Vec<_>>().join(", ");
+    let found = |key: &String| {
+        QUANTITIES.iter().find(|q| q.key == key).ok_or_else(|| Error::parameter("--columns", format!("there is no '{key}'"), format!("Choose from {}", all())))
+    };
+    keys.iter().map(found).collect()
 }
 
 /// Makes a report and writes the page to `out`, and the tables beside it as `.csv`, `.md` and `.tex`.
@@ -150,7 +172,16 @@ pub fn write_report(path: &Path, out: &Path, options: &ReportOptions) -> Result<
         let file = out.with_extension(extension);
         write_atomically(&file, text.as_bytes()).map(|()| file)
     };
+    let figures = match &options.figures {
+        Some(folder) => {
+            std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
+            let write = |(name, svg): &(String, String)| write_atomically(folder.join(name), svg.as_bytes()).map(|()| folder.join(name));
+            report.figures.iter().map(write).collect::<Result<Vec<PathBuf>>>()?
+        }
+        None => Vec::new(),
+    };
     Ok(ReportFiles {
+        figures,
         csv: write("csv", &report.csv)?,
         markdown: write("md", &report.markdown)?,
         latex: write("tex", &report.latex)?,

@@ -13,7 +13,7 @@ pub fn page(title: &str, body: &str) -> String {
     )
 }
 
-const STYLE: &str = include_str!("page.css");
+const STYLE: &str = concat!(include_str!("page.css"), include_str!("plot.css"));
 const SCRIPT: &str = include_str!("page.js");
 
 /// A line of contents.

@@ -1,4 +1,4 @@
-//! Plots as inline SVG: axes with ticks and titles, lines, markers, bands of spread.
+//! Plots as SVG, inline or as files: axes with ticks and titles, lines, markers, bands of spread.
 
 use super::text::{html, short};
 use std::fmt::Write;
@@ -16,6 +16,11 @@ const LEFT: f64 = 62.0;
 const RIGHT: f64 = 14.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 46.0;
+
+/// Height of a line of a file's legend, and the width of a character there at most.
+const LEGEND_LINE: f64 = 18.0;
+const CHARACTER: f64 = 7.0;
+const STYLE: &str = include_str!("plot.css");
 
 /// One axis.
 #[derive(Clone, Debug)]
@@ -58,6 +63,16 @@ pub struct Series {
     /// Whether the points are joined.
     pub line: bool,
     pub points: Vec<Point>,
+}
+
+/// An entry of a legend.
+#[derive(Clone, Debug)]
+pub struct Entry {
+    /// Index into [`COLOURS`]; black where absent.
+    pub colour: Option<usize>,
+    /// Index of the [`marker`]; a square where absent.
+    pub marker: Option<usize>,
+    pub name: String,
 }
 
 /// A plot.
@@ -164,11 +179,40 @@ impl Plot {
     }
     /// A figure with the drawing.
     pub fn figure(&self) -> String {
+        let name = format!("{}: {} against {}", self.title, self.y.title, self.x.title);
+        format!("<figure><figcaption>{}</figcaption>{}{}</svg></figure>\n", html(&self.title), open_svg(WIDTH, HEIGHT, &name), self.drawing())
+    }
+    /// An SVG file with a heading and a legend.
+    pub fn file(&self, heading: &str, legend: &[Entry]) -> String {
+        let (above, mut x, mut y) = (24.0, LEFT, 0.0);
+        let mut entries = String::new();
+        for entry in legend {
+            let width = 24.0 + CHARACTER * entry.name.chars().count() as f64;
+            if x > LEFT && x + width > WIDTH {
+                (x, y) = (LEFT, y + LEGEND_LINE);
+            }
+            let (at, colour) = (above + HEIGHT + y + 8.0, entry.colour.map_or("#333", |c| COLOURS[c % COLOURS.len()]));
+            let symbol = match entry.marker {
+                Some(kind) => marker(kind, x + 6.0, at, colour),
+                None => format!("<rect x=\"{x:.1}\" y=\"{:.1}\" width=\"12\" height=\"12\" fill=\"{colour}\"/>", at - 6.0),
+            };
+            _ = write!(entries, "{symbol}<text x=\"{:.1}\" y=\"{:.1}\">{}</text>", x + 17.0, at + 4.0, html(&entry.name));
+            x += width;
+        }
+        let height = above + HEIGHT + y + LEGEND_LINE + 4.0;
+        format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH:.0} {height:.0}\" width=\"{WIDTH:.0}\" height=\"{height:.0}\" role=\"img\">\n<title>{title}</title><style>\n{STYLE}</style>\n<rect width=\"100%\" height=\"100%\" fill=\"#fff\"/><text class=\"title\" x=\"{LEFT}\" y=\"17\" font-weight=\"600\">{title}</text>\n<g transform=\"translate(0 {above})\">{}</g>\n{entries}\n</svg>\n",
+            self.drawing(),
+            title = html(heading)
+        )
+    }
+    /// Everything within the axes, and the axes.
+    fn drawing(&self) -> String {
         let points = || self.series.iter().flat_map(|s| &s.points);
         let x = Scale::new(points().map(|p| p.x), self.x.may_be_log, LEFT, WIDTH - RIGHT);
         let heights = points().flat_map(|p| [Some(p.y), p.y_range.map(|r| r.0), p.y_range.map(|r| r.1)]).flatten();
         let y = Scale::new(heights, self.y.may_be_log, HEIGHT - BOTTOM, TOP);
-        let mut svg = open_svg(WIDTH, HEIGHT, &format!("{}: {} against {}", self.title, self.y.title, self.x.title));
+        let mut svg = String::new();
         self.axes(&mut svg, &x, &y);
         if self.front.len() > 1 {
             let corners = self.front.windows(2).map(|w| format!("H{:.1}V{:.1}", x.at(w[1].0), y.at(w[1].1))).collect::<String>();
@@ -181,7 +225,7 @@ impl Plot {
         for (at_x, at_y) in &self.front {
             _ = write!(svg, "<circle class=\"onfront\" cx=\"{:.1}\" cy=\"{:.1}\" r=\"8\"/>", x.at(*at_x), y.at(*at_y));
         }
-        format!("<figure><figcaption>{}</figcaption>{svg}</svg></figure>\n", html(&self.title))
+        svg
     }
     fn axes(&self, svg: &mut String, x: &Scale, y: &Scale) {
         let (bottom, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);

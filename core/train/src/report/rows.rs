@@ -74,6 +74,9 @@ impl Quantity {
     }
 }
 
+/// A codec without its profile, and what was set beside the profile.
+pub type CodecFamily<'a> = (&'a str, String);
+
 /// The results that differ in their seed alone.
 #[derive(Clone, Debug)]
 pub struct Row<'a> {
@@ -103,10 +106,10 @@ impl<'a> Row<'a> {
     pub fn name(&self) -> String {
         format!("{} / {}", self.training(), self.codec)
     }
-    /// The codec without its profile and settings. The grid's name of it may be anything.
-    pub fn codec_family(&self) -> &'a str {
-        let codec = &self.cells[0].provenance.codec.codec;
-        codec.split(':').next().unwrap_or(codec)
+    /// The profiles of one codec are one family. The grid's name of it may be anything.
+    pub fn codec_family(&self) -> CodecFamily<'a> {
+        let choice = &self.cells[0].provenance.codec;
+        (choice.codec.split(':').next().unwrap_or(&choice.codec), choice.settings.to_string())
     }
     /// The rows that share a training with this one have equal keys.
     pub fn training_key(&self) -> (&'a str, &'a str) {

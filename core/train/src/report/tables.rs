@@ -37,8 +37,8 @@ pub struct Table {
     pub notes: Vec<String>,
 }
 
-/// The rows of a scene with every quantity that one of them has: mean and sample standard deviation over seeds, the best mean of a column marked.
-pub fn summary(scene: &str, rows: &[Row]) -> Table {
+/// The rows of a scene with every one of `quantities` that one of them has: mean and sample standard deviation over seeds, the best mean of a column marked.
+pub fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity]) -> Table {
     let settings = rows.iter().any(|row| row.setting != "base");
     let mut head: Vec<String> = ["method", "setting", "codec", "seeds"].map(str::to_string).to_vec();
     if !settings {
@@ -56,7 +56,7 @@ pub fn summary(scene: &str, rows: &[Row]) -> Table {
             line.into_iter().map(Cell::plain).collect()
         })
         .collect();
-    for quantity in QUANTITIES {
+    for quantity in quantities {
         let spreads: Vec<_> = rows.iter().map(|row| row.spread(quantity)).collect();
         if spreads.iter().all(Option::is_none) {
             continue;

@@ -2,7 +2,7 @@ use super::*;
 use crate::sweep::{CellResult, Spread};
 use crate::sweep::{ImageResult, Outcome};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 const EVIL: &str = "<script>alert(1)</script>&\"'|`$x_1$\u{202e}";
 
@@ -103,6 +103,20 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
     assert_eq!(first.csv.lines().count(), 5);
     assert!(first.csv.lines().nth(3).unwrap().starts_with("tiny,hexplane,base,cca-default,done,2,31.1,"), "{}", first.csv);
     assert!(first.markdown.contains("**31.10 ± 0.14**") && first.latex.contains("\\textbf{31.10 $\\pm$ 0.14}"), "{}", first.markdown);
+    // Plots as files, and tables of some columns.
+    let options = ReportOptions { columns: ["size_mb", "psnr_db"].map(String::from).to_vec(), figures: Some(folder.path().join("svg")), ..Default::default() };
+    let chosen = write_report(folder.path(), &out, &options).unwrap();
+    let table = std::fs::read_to_string(&chosen.markdown).unwrap();
+    assert!(table.contains("| seeds | size (MB) ↓ | PSNR (dB) ↑ |"), "{table}");
+    let svg = std::fs::read_to_string(folder.path().join("svg/tiny-rate-and-distortion-psnr.svg")).unwrap();
+    for part in ["xmlns=", "hexplane</text>", "cca-low</text>", "archive (MB)", ".axis {"] {
+        assert!(svg.contains(part), "{part}");
+    }
+    assert!(!svg.contains("NaN") && !svg.contains("var(") && chosen.figures.len() > 5);
+    let names: std::collections::BTreeSet<&PathBuf> = chosen.figures.iter().collect();
+    assert_eq!(names.len(), chosen.figures.len(), "no two plots have one name");
+    let wrong = ReportOptions { columns: vec!["speed".into()], ..Default::default() };
+    assert!(report(folder.path(), &wrong).unwrap_err().to_string().contains("frame_ms"));
     // Numbers of papers are in tables of their own, below the notice.
     let notice = first.markdown.find("Reported by papers").unwrap();
     assert!(first.markdown.find("CC-4DGS").unwrap() > notice && !first.csv.contains("CC-4DGS"));
@@ -116,9 +130,12 @@ fn profiles_of_a_codec_are_joined_to_a_curve() {
     let lines = |cells: &[CellResult]| {
         let scenes = rows(cells).unwrap();
         let figures = charts::figures(&scenes["tiny"], &charts::Key::of(scenes.values().flatten()));
-        figures.split("PSNR against size").nth(2).unwrap().split("</svg>").next().unwrap().matches("class=\"line\"").count()
+        figures.split("Rate and distortion: PSNR").nth(2).unwrap().split("</svg>").next().unwrap().matches("class=\"line\"").count()
     };
     assert_eq!(lines(&cells), 2, "one per method");
+    let mut other = cells.clone();
+    other.iter_mut().filter(|c| c.axes.codec == "cca-low").for_each(|c| _ = c.provenance.codec.settings.insert("codebook".into(), 64.into()));
+    assert_eq!(lines(&other), 0, "a setting beside the profile is no point of its curve");
     cells.iter_mut().filter(|c| c.axes.codec == "cca-low").for_each(|c| c.provenance.codec.codec = "vq:low".into());
     assert_eq!(lines(&cells), 0, "two codecs");
 }

@@ -161,7 +161,7 @@ fn write_playable(context: &Context, model: &Model, camera: &Camera, device: &De
     let stored = Stored::of_model(model, Storage::default(), around)?;
     let cameras = std::slice::from_ref(camera);
     let presentation = presented(&stored.model, cameras, None)?;
-    let options = PlayableOptions { max_error: None, cameras, presentation, poster: false, without_field: true };
+    let options = PlayableOptions { max_error: None, cameras, presentation, poster: false, without_field: true, baked: true };
     create_parent(path)?;
     let bytes = stored.playable(options, around)?.bytes;
     write_atomically(path, &bytes)?;

@@ -8,9 +8,9 @@ mod steps;
 pub use steps::is_vertex;
 
 use crate::cube::tensor::{binding_bytes, shared_bytes, spread, upload};
-use crate::ops::hash::LevelHash;
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
+use cc4dgs_fields::hash::LevelHash;
 use cubecl::prelude::*;
 use fields::{FIELDS, Fields, LOAD, MASK, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, SAVE};
 use std::ops::Range;

@@ -7,7 +7,7 @@ use super::fields::{
 };
 use crate::cube::field::activation::{mish, mish_derivative};
 use crate::cube::field::decoder::signature;
-use crate::ops::networks::LAYER_NORM_EPSILON as EPSILON;
+use cc4dgs_fields::networks::LAYER_NORM_EPSILON as EPSILON;
 use cubecl::prelude::*;
 
 /// Rows and columns a thread computes: 64 sums for 16 loads.

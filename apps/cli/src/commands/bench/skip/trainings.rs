@@ -18,6 +18,10 @@ use std::time::Instant;
 /// At most so many views are scored.
 const SCORED: usize = 10;
 
+/// All heads of deformers that have a choice, and the largest degree of spherical harmonics.
+const HEADS: [&str; 5] = ["means", "log_scales", "quaternions", "opacity", "sh"];
+const MOST_SH_DEGREE: usize = 3;
+
 /// Trainings with something switched off.
 #[derive(Serialize)]
 pub struct StepRow {
@@ -93,6 +97,13 @@ impl StepBench<'_> {
         let unless = |used: bool| (!used).then(|| "the configuration does not use it".to_string());
         let switch = |name, missing, set: &[String]| Switch { name, off: set.to_vec(), missing };
         let single = ["train.batch=1".to_string(), "train.coarse_batch=0".into(), format!("train.iterations={}", self.iterations * batch)];
+        let list = |key: &str| base.deformer.get(key).and_then(toml::Value::as_array);
+        let few_heads = list("heads").is_some_and(|heads| heads.len() < HEADS.len());
+        let coarse_voxels = list("resolutions").filter(|_| shares);
+        let finer = coarse_voxels.map_or_else(String::new, |voxels| {
+            let next = voxels.last().and_then(toml::Value::as_integer).map_or(8, |finest| 2 * finest);
+            format!("deformer.resolutions={}", toml::Value::Array([voxels.as_slice(), &[next.into()]].concat()))
+        });
         let gates = matches!(dynamic, Dynamic::Auto | Dynamic::Score);
         Ok(vec![
             switch("static gating", unless(gates), &["train.dynamic=all".into()]),
@@ -102,6 +113,9 @@ impl StepBench<'_> {
             switch("sparse Adam", unless(sparse_adam), &["train.sparse_adam=false".into()]),
             switch("several views per spatial pass", unless(batch > 1), &single),
             switch("lower resolution early", unless(image_growth > 0.0), &["train.image_growth=0.0".into()]),
+            switch("leaving out heads", unless(few_heads), &[format!("deformer.heads={HEADS:?}")]),
+            switch("leaving out finer voxels", unless(coarse_voxels.is_some()), &[finer]),
+            switch("leaving out higher SH degrees", unless(sh_degree < MOST_SH_DEGREE), &[format!("train.sh_degree={MOST_SH_DEGREE}")]),
             switch("SH degrees one after another", unless(sh_degree > 0), &["train.sh_interval=1".into()]),
         ])
     }

@@ -1,9 +1,8 @@
 //! The functions of time that all Gaussians share: a constant, t, Fourier bands, cubic B-splines, and functions learned by a small network.
 
-use crate::parts::time::encode;
-use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
-use cc4dgs_core::Result;
+use crate::forward::network;
+use crate::networks::ReluShape;
+use crate::time::encode;
 use std::sync::Arc;
 
 /// Falloff of the network's input bands. It favours smooth functions, so that the network does not fit each training time separately.
@@ -11,50 +10,54 @@ const NETWORK_FALLOFF: f32 = 1.0;
 
 /// The functions, in this order: the constant, t, a sine and a cosine per band, the splines, the learned ones.
 #[derive(Clone, Debug)]
-pub(super) struct TemporalFunctions {
+pub struct TemporalFunctions {
     /// Fourier bands of 1, 2, 4… times `cycles` cycles per sequence.
-    pub(super) bands: usize,
+    pub bands: usize,
     /// Cycles of the lowest band. Sums of whole cycles have the same value and slope at both ends of the sequence, which real motion does not; with half a
     /// cycle they may differ.
-    pub(super) cycles: f32,
+    pub cycles: f32,
     /// The amplitude of each band is 2^-falloff times that of the next lower one.
-    pub(super) falloff: f32,
+    pub falloff: f32,
     /// Number of cubic B-splines over the sequence: 0 or at least 4.
-    pub(super) splines: usize,
+    pub splines: usize,
     /// The network from time to the learned functions.
-    pub(super) network: Option<Arc<ReluShape>>,
+    pub network: Option<Arc<ReluShape>>,
 }
 
 impl TemporalFunctions {
     /// Inputs of the network: t and the bands.
-    pub(super) fn encoding(bands: usize) -> usize {
+    pub fn encoding(bands: usize) -> usize {
         1 + 2 * bands
     }
     fn learned(&self) -> usize {
         self.network.as_ref().and_then(|n| n.output_widths().first().copied()).unwrap_or(0)
     }
     /// The number of functions.
-    pub(super) fn count(&self) -> usize {
+    pub fn count(&self) -> usize {
         1 + Self::encoding(self.bands) + self.splines + self.learned()
     }
-    /// The penalty of each function in [`super::sparsity`]: 1, but cycles times amplitude for the bands, because high bands move fast.
-    pub(super) fn prices(&self) -> Vec<f32> {
+    /// The penalty of each function in the group lasso: 1, but cycles times amplitude for the bands, because high bands move fast.
+    pub fn prices(&self) -> Vec<f32> {
         let fourier = (0..self.bands).flat_map(|band| [self.cycles * (band as f32 * (1.0 - self.falloff)).exp2(); 2]);
         [1.0, 1.0].into_iter().chain(fourier).chain(std::iter::repeat_n(1.0, self.splines + self.learned())).collect()
     }
-    /// All functions at `times_norm` (0..1): φ(t) `[times, functions]`. `weights` are those of the network.
-    pub(super) fn at(&self, times_norm: &[f32], weights: Option<Tensor<1>>, like: &Device) -> Result<Tensor<2>> {
-        let rows = |of: &dyn Fn(f32) -> Vec<f32>| {
-            let values: Vec<f32> = times_norm.iter().flat_map(|&t| of(t)).collect();
-            let width = values.len() / times_norm.len().max(1);
-            Tensor::<2>::from_data(TensorData::new(values, [times_norm.len(), width]), like)
-        };
-        let plain = |t: f32| [1.0].into_iter().chain(self.encoded(t, self.falloff)).chain(splines_at(t, self.splines)).collect();
-        let mut parts = vec![rows(&plain)];
-        if let (Some(network), Some(weights)) = (&self.network, weights) {
-            parts.extend(mlp_relu(rows(&|t| self.encoded(t, NETWORK_FALLOFF)), weights, network)?);
-        }
-        Ok(Tensor::cat(parts, 1))
+    /// All functions but the learned ones at `time_norm` (0..1).
+    pub fn plain(&self, time_norm: f32) -> Vec<f32> {
+        [1.0].into_iter().chain(self.encoded(time_norm, self.falloff)).chain(splines_at(time_norm, self.splines)).collect()
+    }
+    /// What the network of the learned functions reads.
+    pub fn network_input(&self, time_norm: f32) -> Vec<f32> {
+        self.encoded(time_norm, NETWORK_FALLOFF)
+    }
+    /// All functions at `times_norm`, `[times, functions]`. `weights` are those of the network, if there is one.
+    pub fn at(&self, times_norm: &[f32], weights: &[f32]) -> Vec<Vec<f32>> {
+        let learned = self.network.as_ref().map(|shape| {
+            let inputs: Vec<f32> = times_norm.iter().flat_map(|&t| self.network_input(t)).collect();
+            network(shape, weights, &inputs).concat()
+        });
+        let learned = learned.unwrap_or_default();
+        let of = |k: usize| &learned[k * self.learned()..(k + 1) * self.learned()];
+        times_norm.iter().enumerate().map(|(k, &t)| [self.plain(t).as_slice(), of(k)].concat()).collect()
     }
     /// t and the bands; the amplitude of each band is 2^-falloff times that of the next lower one.
     fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
@@ -96,7 +99,7 @@ mod tests {
     #[test]
     fn bands_fall_off_by_octaves() {
         let functions = TemporalFunctions { bands: 3, cycles: 1.0, falloff: 0.5, splines: 4, network: None };
-        let values = functions.at(&[0.2], None, &Device::flex()).unwrap().into_data().to_vec::<f32>().unwrap();
+        let values = functions.at(&[0.2], &[]).remove(0);
         assert_eq!(values.len(), functions.count());
         assert_eq!(functions.prices().len(), functions.count());
         let angle = std::f32::consts::TAU * 0.2;

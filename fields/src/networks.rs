@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 /// Added to the variance in LayerNorm.
-pub(crate) const LAYER_NORM_EPSILON: f32 = 1e-5;
+pub const LAYER_NORM_EPSILON: f32 = 1e-5;
 
 /// Layer widths of trunk and heads.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -18,16 +18,21 @@ pub struct ReluShape {
 
 /// One layer: its position in the tree and in the flat weights.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Layer {
+pub struct Layer {
     /// The layer whose output it reads; `None` is the network's input.
-    pub(crate) parent: Option<usize>,
-    pub(crate) input: usize,
-    pub(crate) output: usize,
-    pub(crate) weight: Range<usize>,
-    pub(crate) bias: Range<usize>,
-    pub(crate) relu: bool,
+    pub parent: Option<usize>,
+    /// Input width.
+    pub input: usize,
+    /// Output width.
+    pub output: usize,
+    /// W `[input, output]`.
+    pub weight: Range<usize>,
+    /// b `[output]`.
+    pub bias: Range<usize>,
+    /// Whether it ends in a ReLU.
+    pub relu: bool,
     /// Which output it writes, if any.
-    pub(crate) slot: Option<usize>,
+    pub slot: Option<usize>,
 }
 
 impl ReluShape {
@@ -38,7 +43,8 @@ impl ReluShape {
             [] => Self::default(),
         }
     }
-    pub(crate) fn layers(&self) -> Vec<Layer> {
+    /// The layers: the trunk's, then head after head. A layer comes after its parent.
+    pub fn layers(&self) -> Vec<Layer> {
         let mut layers: Vec<Layer> = Vec::new();
         let mut at = 0;
         let mut push = |parent: Option<usize>, input: usize, output: usize, relu: bool, slot: Option<usize>| {
@@ -132,7 +138,8 @@ impl MishShape {
     pub fn parameter_count(&self) -> usize {
         self.layers().last().map_or(0, |l| l.bias.end)
     }
-    pub(crate) fn widest(&self) -> usize {
+    /// The widest array of a row.
+    pub fn widest(&self) -> usize {
         self.hidden.iter().copied().chain([self.input, self.output]).max().unwrap_or(0)
     }
 }

@@ -1,0 +1,106 @@
+//! The field evaluated without burn is the same field.
+
+use super::*;
+use burn::tensor::TensorData;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::playback::{Head as LayerHead, LayerPlugin, LayerSource};
+use cc4dgs_core::{Entries, HostGaussians, Seed, WeightArray};
+
+const COUNT: usize = 37;
+const SAMPLES: usize = 9;
+
+fn draw(column: usize, index: usize) -> f32 {
+    (Seed::root(3).index(column as u64).index(index as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+}
+
+/// The largest difference between offsets of the deformer and those of the layer, over the largest offset, head by head.
+fn differences(section: &str, sh_degree: usize) -> Vec<f32> {
+    let device = Device::flex();
+    let context = DeformerContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.7, 2.0], frame_count: 20, sh_degree, seed: Seed::root(8) };
+    let settings: toml::Table = section.parse().unwrap();
+    let mut field = CdfBasis::new(&settings, &context, &device).unwrap();
+    for (column, parameter) in field.parameters.iter_mut().enumerate() {
+        // Heads start at zero, where there is nothing to compare.
+        let count = parameter.shape.iter().product::<usize>();
+        let noise = Tensor::<1>::from_data(TensorData::new((0..count).map(|i| 0.2 * draw(column, i)).collect::<Vec<f32>>(), [count]), &device);
+        parameter.value = parameter.value.clone() + noise;
+    }
+    let columns = |column: usize, width: usize| (0..COUNT * width).map(|i| draw(100 + column, i)).collect::<Vec<f32>>();
+    let gaussians = HostGaussians {
+        means: columns(0, 3).into_iter().map(|v| 1.5 * v).collect(),
+        log_scales: columns(1, 3),
+        quaternions: columns(2, 4),
+        opacity_logits: columns(3, 1),
+        sh_dc: columns(4, 3),
+        sh_rest: columns(5, 3 * ((sh_degree + 1).pow(2) - 1)),
+        dynamic_scores: vec![1.0; COUNT],
+        sh_degree,
+        ..Default::default()
+    };
+    let weights: Vec<WeightArray> = field
+        .parameters
+        .iter()
+        .map(|p| WeightArray { name: p.name.clone(), shape: p.shape.clone(), values: to_vec(p.value.clone(), &p.name).unwrap() })
+        .collect();
+    let source =
+        LayerSource { settings: &settings, context: &context, weights: &weights, gaussians: &gaussians, samples: SAMPLES, most_coefficients: usize::MAX };
+    let plugin = Entries::<LayerPlugin>::collect().unwrap().get("cdf-basis").unwrap();
+    let tracks = (plugin.tracks)(&source).unwrap().unwrap();
+    assert!((plugin.tracks)(&LayerSource { most_coefficients: 10, ..source }).unwrap().is_none());
+
+    let means = Tensor::<2>::from_data(TensorData::new(gaussians.means.clone(), [COUNT, 3]), &device);
+    let features = field.packed(field.spatial(&SpatialInput { means_world: means, attributes: Vec::new() }).unwrap().values);
+    let of_track = |track: &cc4dgs_core::playback::Track| {
+        let (width, mut worst, mut largest) = (track.head.width(sh_degree), 0.0f32, 0.0f32);
+        for sample in 0..SAMPLES {
+            let offsets = field.deform(features.clone(), sample as f32 / (SAMPLES - 1) as f32).unwrap();
+            let exact = match track.head {
+                LayerHead::Means => to_vec(offsets.means.unwrap(), "means"),
+                LayerHead::LogScales => to_vec(offsets.log_scales.unwrap(), "log-scales"),
+                LayerHead::Rotations => to_vec(offsets.quaternions.unwrap(), "quaternions"),
+                LayerHead::Opacities => unreachable!("it is not linear"),
+                LayerHead::Colors => to_vec(offsets.sh.unwrap(), "colours"),
+            };
+            let functions: Vec<f32> = track.functions.chunks_exact(SAMPLES).map(|f| f[sample]).collect();
+            for (row, exact) in exact.unwrap().chunks_exact(width).enumerate() {
+                let q = &gaussians.quaternions[4 * row..4 * row + 4];
+                let norm = if track.head == LayerHead::Rotations { q.iter().map(|v| v * v).sum::<f32>().sqrt() } else { 1.0 };
+                let mut found = vec![0.0; width];
+                track.add(row, &functions, &mut found);
+                for (found, exact) in found.iter().zip(exact) {
+                    (worst, largest) = (worst.max((found - exact / norm).abs()), largest.max((exact / norm).abs()));
+                }
+            }
+        }
+        worst / largest
+    };
+    tracks.iter().map(of_track).collect()
+}
+
+#[test]
+fn players_compute_what_the_deformer_computes() {
+    let small = "capacity = 'small'\nresolutions = [3, 8]\nhashes = 24\nwidth = 16\n";
+    for (section, sh_degree, heads) in [
+        (small.to_string(), 1, 3),
+        (format!("{small}layers = 1\nlearned = 0\nsplines = 6\ncycles = 0.5\nfalloff = 0.0\nheads = ['sh', 'means']\nlr_start = 0.1"), 2, 2),
+        (format!("{small}learned = 4\ntime_bands = 3\nheads = ['quaternions', 'log_scales']\n[kept]\nquaternions = [1, 5, 9]"), 0, 2),
+    ] {
+        let found = differences(&section, sh_degree);
+        assert_eq!(found.len(), heads);
+        assert!(found.iter().all(|d| *d < 2e-5), "{section}: {found:?}");
+    }
+}
+
+#[test]
+fn what_is_not_linear_is_left_to_baking() {
+    let context = DeformerContext { box_min: [0.0; 3], box_max: [1.0; 3], frame_count: 3, sh_degree: 0, seed: Seed::root(1) };
+    let plugin = Entries::<LayerPlugin>::collect().unwrap().get("cdf-basis").unwrap();
+    let gaussians = HostGaussians::default();
+    let of = |section: &str| {
+        let settings: toml::Table = section.parse().unwrap();
+        (plugin.tracks)(&LayerSource { settings: &settings, context: &context, weights: &[], gaussians: &gaussians, samples: 2, most_coefficients: 1 << 20 })
+    };
+    assert!(of("rotation = 'exponential'").unwrap().is_none() && of("heads = ['opacity']").unwrap().is_none());
+    // Weights are missing, settings unknown.
+    assert!(of("heads = ['means']").is_err() && of("speed = 3").is_err());
+}

@@ -1,0 +1,121 @@
+//! The field as a playback layer.
+
+use super::{BasisPlan, Rotation};
+use crate::forward::network;
+use crate::heads::Head;
+use crate::settings::RATE_KEYS;
+use crate::voxels::features;
+use cc4dgs_format::playback::Head as LayerHead;
+use cc4dgs_format::playback::{LayerPlugin, LayerSource, MAX_FUNCTIONS, Track};
+use cc4dgs_format::{HostGaussians, Plugin, Result, inventory};
+use rayon::prelude::*;
+
+/// Features of Gaussians and vertices at most: 256 MB.
+const MOST_FLOATS: u64 = 64 << 20;
+/// Multiplications at most: some ten seconds in a browser, and a second or two on a desktop.
+const MOST_MULTIPLICATIONS: u64 = 20_000_000_000;
+/// Gaussians whose coefficients are computed at a time.
+const BLOCK: usize = 1024;
+
+/// What a head changes in a layer; `None` for a head that is not linear there.
+fn layer_head(head: Head, rotation: Rotation) -> Option<LayerHead> {
+    match head {
+        Head::Means => Some(LayerHead::Means),
+        Head::LogScales => Some(LayerHead::LogScales),
+        Head::Quaternions if rotation == Rotation::Additive => Some(LayerHead::Rotations),
+        Head::Sh => Some(LayerHead::Colors),
+        // Rotation vectors, and logits in front of the sigmoid.
+        Head::Quaternions | Head::Opacity => None,
+    }
+}
+
+pub(crate) fn tracks(source: &LayerSource) -> Result<Option<Vec<Track>>> {
+    let mut section = source.settings.clone();
+    RATE_KEYS.iter().for_each(|key| _ = section.remove(*key));
+    let plan = BasisPlan::new(&section, source.context)?;
+    let heads: Option<Vec<LayerHead>> = plan.settings.heads.iter().map(|&head| layer_head(head, plan.settings.rotation)).collect();
+    let (Some(heads), m) = (heads, source.gaussians.len()) else { return Ok(None) };
+    let per_gaussian: usize = plan.groups.iter().map(|(values, own)| values * own).sum();
+    let coefficients = per_gaussian.saturating_mul(m);
+    if plan.kept.iter().any(|own| own.len() > MAX_FUNCTIONS) || coefficients > source.most_coefficients || too_much(&plan, m, source.samples)? {
+        return Ok(None);
+    }
+
+    let of_functions = match &plan.functions.network {
+        Some(shape) => source.weights("net.functions", shape.parameter_count())?,
+        None => &[],
+    };
+    let last = (source.samples - 1) as f32;
+    let times: Vec<f32> = (0..source.samples).map(|k| k as f32 / last).collect();
+    let functions = plan.functions.at(&times, of_functions);
+
+    let decoder = plan.voxels.sizes()?.decoder.parameter_count();
+    let voxels = features(&plan.voxels, source.context, &source.gaussians.means, |level| source.weights(&format!("grid.level{level}"), decoder))?;
+    let weights = coefficient_weights(&plan, source)?;
+    let width = plan.coefficients.input;
+    let blocks: Vec<Vec<Vec<f32>>> = voxels.par_chunks(BLOCK * width).map(|voxels| network(&plan.coefficients, &weights, voxels)).collect();
+
+    let track = |(index, &head): (usize, &LayerHead)| {
+        let ((values, own), kept) = (plan.groups[index], &plan.kept[index]);
+        let mut coefficients = Vec::with_capacity(m * values * own);
+        let rows = blocks.iter().flat_map(|block| block[index].chunks_exact(values * own));
+        for (row, gaussian) in rows.zip(0..) {
+            let factor = factor(head, source.gaussians, gaussian);
+            // From [values, functions] to [functions, values].
+            coefficients.extend((0..own).flat_map(|f| (0..values).map(move |v| factor * row[v * own + f])));
+        }
+        let ranks = vec![own as u8; m];
+        let functions = kept.iter().flat_map(|&f| functions.iter().map(move |at| at[f])).collect();
+        Track { head, functions, starts: Track::starts_of(&ranks), ranks, coefficients }
+    };
+    let mut tracks: Vec<Track> = heads.iter().enumerate().map(track).collect();
+    tracks.sort_by_key(|track| track.head);
+    Ok(Some(tracks))
+}
+
+/// Whether features or multiplications for `m` Gaussians and `samples` of time are more than a player should spend.
+fn too_much(plan: &BasisPlan, m: usize, samples: usize) -> Result<bool> {
+    let sizes = plan.voxels.sizes()?;
+    let vertices = |resolution: &u32| (u64::from(*resolution) + 1).pow(3).min(8 * m as u64);
+    let vertices: u64 = sizes.resolutions.iter().map(vertices).sum();
+    let floats = (m as u64).saturating_mul(sizes.width() as u64).saturating_add(vertices.saturating_mul(sizes.decoder.output as u64));
+    let of_vertices = vertices.saturating_mul(sizes.decoder.parameter_count() as u64);
+    let of_gaussians = (m as u64).saturating_mul(plan.coefficients.parameter_count() as u64);
+    let of_functions = plan.functions.network.as_ref().map_or(0, |shape| (samples as u64).saturating_mul(shape.parameter_count() as u64));
+    Ok(floats > MOST_FLOATS || of_vertices.saturating_add(of_gaussians).saturating_add(of_functions) > MOST_MULTIPLICATIONS)
+}
+
+/// The weights of trunk and heads, one after the other.
+fn coefficient_weights(plan: &BasisPlan, source: &LayerSource) -> Result<Vec<f32>> {
+    let (shape, width) = (&plan.coefficients, plan.width());
+    let inputs = std::iter::once(shape.input).chain(shape.trunk.iter().copied());
+    let trunk: usize = inputs.zip(&shape.trunk).map(|(input, output)| (input + 1) * output).sum();
+    let mut weights = source.weights("net.trunk", trunk)?.to_vec();
+    for (head, (values, own)) in plan.settings.heads.iter().zip(&plan.groups) {
+        weights.extend(source.weights(&format!("net.head.{}", head.name()), (width + 1) * (width + values * own))?);
+    }
+    Ok(weights)
+}
+
+/// Layers add to quaternions after those were divided by their norms.
+fn factor(head: LayerHead, gaussians: &HostGaussians, gaussian: usize) -> f32 {
+    if head != LayerHead::Rotations {
+        return 1.0;
+    }
+    let norm = gaussians.quaternions[4 * gaussian..4 * gaussian + 4].iter().map(|v| v * v).sum::<f32>().sqrt();
+    if norm > 1e-15 { 1.0 / norm } else { 0.0 }
+}
+
+inventory::submit! {
+    LayerPlugin {
+        info: Plugin {
+            name: "cdf-basis",
+            version: "2",
+            summary: "the coefficients of cdf-basis, from its weights",
+            paper: "this project",
+            schema: "",
+            capabilities: &[],
+        },
+        tracks,
+    }
+}
