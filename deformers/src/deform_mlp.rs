@@ -3,7 +3,7 @@
 //! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code.
 
 use crate::parts::centres::{check_time, finite};
-use crate::parts::settings::within;
+use crate::parts::settings::{bounded, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -81,6 +81,7 @@ impl DeformMlp {
         let before = ReluShape { input, trunk: vec![w; settings.skip], heads: Vec::new() };
         let after = ReluShape { input: input + w, trunk: vec![w; settings.layers - settings.skip], heads: OUTPUTS.iter().map(|&out| vec![out]).collect() };
         let time = settings.time_network.then(|| ReluShape::chain(&[of_time, TIME_WIDTHS[0], TIME_WIDTHS[1]]));
+        bounded([before.parameter_count(), after.parameter_count()])?;
         let seed = context.seed;
         let layers = |name: &str, pairs: Vec<(usize, usize)>| -> Vec<f32> {
             pairs.into_iter().enumerate().flat_map(|(i, (a, b))| weights::torch(seed.child(name).index(i as u64), a, b)).collect()

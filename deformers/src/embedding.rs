@@ -5,7 +5,7 @@
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::within;
+use crate::parts::settings::{bounded, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -92,6 +92,7 @@ impl Embedding {
         heads::check(&settings.heads)?;
         let (w, input) = (settings.width, settings.gaussian_features + settings.time_features);
         let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
+        bounded([settings.time_rows * settings.time_features, 2 * network.parameter_count()])?;
         let seed = context.seed;
         // Uniform with the standard deviation of the published normal: 0.01 / sqrt(width).
         let bound = 0.01 * 3f32.sqrt() / (settings.time_features as f32).sqrt();

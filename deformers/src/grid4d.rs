@@ -4,7 +4,7 @@
 //! by the deformer's box rather than by a fixed bound per dataset. R(q) passes no gradient to the canonical centre.
 
 use crate::parts::centres::{check_time, column, finite, in_box};
-use crate::parts::settings::within;
+use crate::parts::settings::{bounded, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::activation::sigmoid;
@@ -137,6 +137,8 @@ impl Grid4d {
         let attention = ReluShape::chain(&[space.width(), s.width]);
         let temporal = ReluShape { input: 3 * time.width(), trunk: vec![s.width], heads: Vec::new() };
         let network = ReluShape { input: s.width, trunk: vec![s.width; s.depth], heads: OUTPUTS.iter().map(|&out| vec![out]).collect() };
+        bounded([space.parameter_count(), time.parameter_count().saturating_mul(NAMES.len())])?;
+        bounded([&attention, &temporal, &network].map(ReluShape::parameter_count))?;
         let seed = context.seed;
         let table = |name: &str, shape: &GridShape| {
             parameter(format!("grid.{name}"), Part::Grid, GRID, weights::uniform(seed.child(name), shape.parameter_count(), TABLE), device)

@@ -4,7 +4,7 @@
 
 use crate::parts::centres::{check_time, column, in_box};
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::within;
+use crate::parts::settings::{bounded, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor};
@@ -96,22 +96,27 @@ impl HexPlane {
         within("features", settings.features, 1, 256)?;
         within("width", settings.width, 1, 4096)?;
         heads::check(&settings.heads)?;
-        let seed = context.seed;
-        let (mut planes, mut parameters) = (Vec::new(), Vec::new());
-        for (p, axes) in PLANES.iter().enumerate() {
+        let (input, w) = (settings.features * settings.multires.len(), settings.width);
+        let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
+        let plane = |axes: &[usize; 2]| {
             let mut shape =
                 GridShape { dims: 2, features: settings.features, levels: Vec::new(), stagger: 0.0, smooth: false, clamps: true, outside: Outside::Clamp };
             for &factor in &settings.multires {
                 let size = axes.map(|axis| if axis == TIME { settings.time_resolution } else { settings.resolution * factor });
                 shape.push(&size, &size.map(|s| s as f32 - 1.0), usize::MAX);
             }
+            shape
+        };
+        let shapes = PLANES.each_ref().map(plane);
+        bounded(shapes.iter().map(GridShape::parameter_count).chain([network.parameter_count()]))?;
+        let seed = context.seed;
+        let (mut planes, mut parameters) = (Vec::new(), Vec::new());
+        for (p, (axes, shape)) in PLANES.iter().zip(shapes).enumerate() {
             let mut random = seed.child("planes").index(p as u64).rng();
             let values = (0..shape.parameter_count()).map(|_| if axes[1] == TIME { 1.0 } else { random.random_range(0.1f32..0.5) }).collect();
             parameters.push(parameter(format!("grid.{}", ["xy", "xz", "xt", "yz", "yt", "zt"][p]), Part::Grid, GRID, values, device));
             planes.push(Arc::new(shape));
         }
-        let (input, w) = (settings.features * settings.multires.len(), settings.width);
-        let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
         let mut values = weights::glorot_with_bias(seed.child("trunk"), input, w);
         for (i, head) in network.heads.iter().enumerate() {
             let own = seed.child("heads").index(i as u64);

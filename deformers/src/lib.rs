@@ -12,3 +12,30 @@ pub mod native4d;
 pub mod none;
 pub mod parts;
 pub mod swift4d;
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::Device;
+    use cc4dgs_core::{DeformerContext, Registry, Seed, toml};
+
+    #[test]
+    fn sizes_that_no_machine_has_are_refused_before_they_are_allocated() {
+        let registry = Registry::collect().unwrap();
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(1) };
+        let voxels = "resolutions = [8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8]\nhidden = [4096, 4096, 4096, 4096, 4096, 4096, 4096, 4096]\nfeatures = 4096\nhashes = 4096";
+        for (kind, settings) in [
+            ("cdf", voxels),
+            ("cdf-basis", voxels),
+            ("hexplane", "resolution = 4096\nmultires = [64, 64, 64, 64, 64, 64, 64, 64]\nfeatures = 256"),
+            ("grid4d", "log2_rows = 24\nspace_levels = 64\nfeatures = 16\nspace_base = 65536\nspace_final = 65536"),
+            ("swift4d-hash", "log2_rows = 24\nlevels = 20\nfeatures = 16"),
+            ("embedding", "time_rows = 100000\ntime_features = 4096"),
+            ("deform-mlp", "width = 4096\nlayers = 32"),
+        ] {
+            let mut section: toml::Table = settings.parse().unwrap();
+            section.insert("kind".into(), kind.into());
+            let error = registry.build_deformer(&section, &context, &Device::flex()).err().unwrap_or_else(|| panic!("{kind} was built"));
+            assert!(error.exit_code() == 4 && error.to_string().contains("parameters of the deformer"), "{kind}: {error}");
+        }
+    }
+}

@@ -5,7 +5,7 @@
 
 use crate::parts::centres::{check_time, column, in_box};
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::within;
+use crate::parts::settings::{bounded, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor};
@@ -79,6 +79,7 @@ impl Swift4d {
         let w = settings.width;
         let outputs: Vec<usize> = settings.heads.iter().map(|h| h.width(context.sh_degree).next_multiple_of(PADDED)).collect();
         let network = ReluShape { input: grid.width(), trunk: vec![w, w], heads: outputs.iter().map(|&out| vec![w, w, out]).collect() };
+        bounded([grid.parameter_count(), network.parameter_count()])?;
         let seed = context.seed;
         let matrices = |seed: cc4dgs_core::Seed, widths: &[usize]| -> Vec<f32> {
             widths.windows(2).enumerate().flat_map(|(i, pair)| weights::glorot(seed.index(i as u64), pair[0], pair[1])).collect()

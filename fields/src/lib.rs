@@ -12,6 +12,6 @@ pub mod voxels;
 
 /// Keeps every plug-in of this crate in the program: linkers for wasm32 drop object files that nothing refers to.
 pub fn link() {
-    let tracks: fn(&_) -> _ = basis::tracks;
-    std::hint::black_box(tracks);
+    let motion: fn(&_) -> _ = basis::motion;
+    std::hint::black_box(motion);
 }

@@ -50,3 +50,29 @@ pub fn within(name: &str, value: usize, low: usize, high: usize) -> Result<()> {
     }
     Err(Error::parameter(format!("deformer.{name}"), format!("{value} is outside {low}..={high}"), "Choose a value in that range"))
 }
+
+/// Parameters of a deformer at most: 1 GiB of float32. The largest published one, `grid4d` at its full size, has a quarter of that.
+const MOST_PARAMETERS: usize = 1 << 28;
+
+/// Refuses arrays of more parameters together than a deformer may have. Call it before they are allocated: sizes may come from a file.
+///
+/// # Errors
+/// [`Error::Limit`].
+pub fn bounded(counts: impl IntoIterator<Item = usize>) -> Result<()> {
+    let total = counts.into_iter().fold(0usize, usize::saturating_add);
+    if total <= MOST_PARAMETERS {
+        return Ok(());
+    }
+    Err(Error::limit("parameters of the deformer", total as u64, MOST_PARAMETERS as u64, "Choose smaller sizes in the [deformer] section"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_of_sizes_are_bounded() {
+        assert!(bounded([]).is_ok() && bounded([MOST_PARAMETERS / 2, MOST_PARAMETERS / 2]).is_ok());
+        assert!(bounded([MOST_PARAMETERS, 1]).is_err() && bounded([usize::MAX, usize::MAX]).is_err());
+    }
+}

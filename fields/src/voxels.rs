@@ -3,7 +3,7 @@
 use crate::forward::decode;
 use crate::hash::LevelHash;
 use crate::networks::MishShape;
-use crate::settings::{Capacity, within};
+use crate::settings::{Capacity, bounded, within};
 use cc4dgs_format::{DeformerContext, Error, Result};
 use rayon::prelude::*;
 use serde::Deserialize;
@@ -89,7 +89,9 @@ impl VoxelSettings {
             within(name, value, 1, 4096)?;
         }
         within("modulus", self.modulus as usize, 2, 1 << 24)?;
-        Ok(VoxelSizes { resolutions, decoder: MishShape { input: self.hashes, hidden, output: features } })
+        let decoder = MishShape { input: self.hashes, hidden, output: features };
+        bounded(resolutions.iter().map(|_| decoder.parameter_count()))?;
+        Ok(VoxelSizes { resolutions, decoder })
     }
 }
 

@@ -1,5 +1,6 @@
 //! The registry: all linked plug-ins, collected into a value. Duplicate and unknown names are errors.
 
+use crate::playback::MotionPlugin;
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerLayerPlugin, DeformerPlugin,
     DensityControl, DensityPlugin, Entries, Error, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer,
@@ -11,6 +12,7 @@ use burn::tensor::Device;
 pub struct Registry {
     deformers: Entries<DeformerPlugin>,
     layers: Entries<DeformerLayerPlugin>,
+    motions: Entries<MotionPlugin>,
     codecs: Entries<CodecPlugin>,
     exporters: Entries<ExporterPlugin>,
     rasterizers: Entries<RasterizerPlugin>,
@@ -32,6 +34,7 @@ impl Registry {
         Ok(Self {
             deformers: Entries::collect()?,
             layers: Entries::collect()?,
+            motions: Entries::collect()?,
             codecs: Entries::collect()?,
             exporters: Entries::collect()?,
             rasterizers: Entries::collect()?,
@@ -46,7 +49,7 @@ impl Registry {
     }
     /// All entries as (kind, facts), sorted.
     pub fn plugins(&self) -> Vec<(&'static str, &'static Plugin)> {
-        let deformers = self.deformers.facts().chain(self.layers.facts());
+        let deformers = self.deformers.facts().chain(self.layers.facts()).chain(self.motions.facts());
         let model = self.codecs.facts().chain(deformers).chain(self.rasterizers.facts()).chain(self.weight_codecs.facts()).chain(self.exporters.facts());
         let training = self.density.facts().chain(self.losses.facts()).chain(self.appearances.facts()).chain(self.optimizers.facts());
         model.chain(training).chain(self.readers.facts()).chain(self.presets.facts()).collect()

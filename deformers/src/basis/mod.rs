@@ -24,7 +24,7 @@ use cc4dgs_core::{
     Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
     SpatialInput, inventory,
 };
-use cc4dgs_fields::basis::{BasisPlan, BasisSettings, Rotation, TemporalFunctions};
+use cc4dgs_fields::basis::{BasisPlan, BasisSettings, NAME, Rotation, TemporalFunctions, VERSION};
 use std::sync::Arc;
 
 /// Settings with their defaults, as shown to users.
@@ -190,8 +190,8 @@ fn build(settings: &toml::Table, context: &DeformerContext, device: &Device) -> 
 inventory::submit! {
     DeformerPlugin {
         info: Plugin {
-            name: "cdf-basis",
-            version: "2",
+            name: NAME,
+            version: VERSION,
             summary: "computational deformation field, linear in shared functions of time: a dot product per frame",
             paper: "CC-4DGS, Section IV-B (spatial half); DynMF, Gaussian-Flow (shared temporal functions)",
             schema: SCHEMA,

@@ -3,11 +3,19 @@
 use super::*;
 use burn::tensor::TensorData;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::playback::{Head as LayerHead, LayerPlugin, LayerSource};
+use cc4dgs_core::playback::{ComputedMotion, Head as LayerHead, MotionPlugin, MotionSource, frame_time};
 use cc4dgs_core::{Entries, HostGaussians, Seed, WeightArray};
 
 const COUNT: usize = 37;
-const SAMPLES: usize = 9;
+const LEAST_SAMPLES: usize = 9;
+
+/// The evaluation without burn of the version that is trained.
+fn plugin() -> &'static MotionPlugin {
+    let plugin = Entries::<MotionPlugin>::collect().unwrap().get("cdf-basis").unwrap();
+    let trained = Entries::<DeformerPlugin>::collect().unwrap().get("cdf-basis").unwrap();
+    assert_eq!(plugin.info.version, trained.info.version);
+    plugin
+}
 
 fn draw(column: usize, index: usize) -> f32 {
     (Seed::root(3).index(column as u64).index(index as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
@@ -42,18 +50,25 @@ fn differences(section: &str, sh_degree: usize) -> Vec<f32> {
         .iter()
         .map(|p| WeightArray { name: p.name.clone(), shape: p.shape.clone(), values: to_vec(p.value.clone(), &p.name).unwrap() })
         .collect();
-    let source =
-        LayerSource { settings: &settings, context: &context, weights: &weights, gaussians: &gaussians, samples: SAMPLES, most_coefficients: usize::MAX };
-    let plugin = Entries::<LayerPlugin>::collect().unwrap().get("cdf-basis").unwrap();
-    let tracks = (plugin.tracks)(&source).unwrap().unwrap();
-    assert!((plugin.tracks)(&LayerSource { most_coefficients: 10, ..source }).unwrap().is_none());
+    let source = MotionSource {
+        object: "the model",
+        settings: &settings,
+        context: &context,
+        weights: &weights,
+        gaussians: &gaussians,
+        least_samples: LEAST_SAMPLES,
+        most_coefficients: usize::MAX,
+    };
+    let plugin = plugin();
+    let ComputedMotion { samples, tracks } = (plugin.motion)(&source).unwrap().unwrap();
+    assert!((plugin.motion)(&MotionSource { most_coefficients: 10, ..source }).unwrap().is_none());
 
     let means = Tensor::<2>::from_data(TensorData::new(gaussians.means.clone(), [COUNT, 3]), &device);
     let features = field.packed(field.spatial(&SpatialInput { means_world: means, attributes: Vec::new() }).unwrap().values);
     let of_track = |track: &cc4dgs_core::playback::Track| {
         let (width, mut worst, mut largest) = (track.head.width(sh_degree), 0.0f32, 0.0f32);
-        for sample in 0..SAMPLES {
-            let offsets = field.deform(features.clone(), sample as f32 / (SAMPLES - 1) as f32).unwrap();
+        for sample in (0..samples).step_by((samples - 1) / 8) {
+            let offsets = field.deform(features.clone(), frame_time(sample, samples)).unwrap();
             let exact = match track.head {
                 LayerHead::Means => to_vec(offsets.means.unwrap(), "means"),
                 LayerHead::LogScales => to_vec(offsets.log_scales.unwrap(), "log-scales"),
@@ -61,7 +76,7 @@ fn differences(section: &str, sh_degree: usize) -> Vec<f32> {
                 LayerHead::Opacities => unreachable!("it is not linear"),
                 LayerHead::Colors => to_vec(offsets.sh.unwrap(), "colours"),
             };
-            let functions: Vec<f32> = track.functions.chunks_exact(SAMPLES).map(|f| f[sample]).collect();
+            let functions: Vec<f32> = track.functions.chunks_exact(samples).map(|f| f[sample]).collect();
             for (row, exact) in exact.unwrap().chunks_exact(width).enumerate() {
                 let q = &gaussians.quaternions[4 * row..4 * row + 4];
                 let norm = if track.head == LayerHead::Rotations { q.iter().map(|v| v * v).sum::<f32>().sqrt() } else { 1.0 };
@@ -94,13 +109,15 @@ fn players_compute_what_the_deformer_computes() {
 #[test]
 fn what_is_not_linear_is_left_to_baking() {
     let context = DeformerContext { box_min: [0.0; 3], box_max: [1.0; 3], frame_count: 3, sh_degree: 0, seed: Seed::root(1) };
-    let plugin = Entries::<LayerPlugin>::collect().unwrap().get("cdf-basis").unwrap();
     let gaussians = HostGaussians::default();
     let of = |section: &str| {
         let settings: toml::Table = section.parse().unwrap();
-        (plugin.tracks)(&LayerSource { settings: &settings, context: &context, weights: &[], gaussians: &gaussians, samples: 2, most_coefficients: 1 << 20 })
+        let (object, settings, context) = ("the model", &settings, &context);
+        let source = MotionSource { object, settings, context, weights: &[], gaussians: &gaussians, least_samples: 2, most_coefficients: 1 << 20 };
+        (plugin().motion)(&source)
     };
     assert!(of("rotation = 'exponential'").unwrap().is_none() && of("heads = ['opacity']").unwrap().is_none());
-    // Weights are missing, settings unknown.
-    assert!(of("heads = ['means']").is_err() && of("speed = 3").is_err());
+    assert!(of("life = true").unwrap().is_none() && of("life = { gate = 0.5 }").unwrap().is_none(), "lives change the motion");
+    assert!(of("time_bands = 20").unwrap().is_none(), "too fast for samples");
+    assert!(of("heads = ['means']").unwrap_err().to_string().contains("of the model"), "weights are missing");
 }

@@ -1,7 +1,7 @@
 //! Settings of the computational deformation field and the sizes that follow from them.
 
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::{Rates, take, within};
+use crate::parts::settings::{Rates, bounded, take, within};
 use crate::parts::voxels::{VoxelSettings, VoxelSizes};
 use cc4dgs_backends::ops::field::ReluShape;
 use cc4dgs_core::{DeformerContext, Result, config};
@@ -159,11 +159,13 @@ impl CdfConfig {
             let widths: Vec<usize> = std::iter::once(input).chain(std::iter::repeat_n(width, hidden)).chain([output]).collect();
             ReluShape::chain(&widths)
         };
+        let time = chain(1 + 2 * time_bands, network.time_layers, width);
+        bounded([time.parameter_count()])?;
         Ok(Sizes {
             voxels,
             width,
             time_bands,
-            time: chain(1 + 2 * time_bands, network.time_layers, width),
+            time,
             film: (network.fusion == Fusion::Film).then(|| chain(width, 1, 2 * width)),
             network: ReluShape {
                 input: width,

@@ -1,21 +1,28 @@
 //! The field as a playback layer.
 
-use super::{BasisPlan, Rotation};
+use super::{BasisPlan, NAME, Rotation, TemporalFunctions, VERSION};
 use crate::forward::network;
 use crate::heads::Head;
 use crate::settings::RATE_KEYS;
 use crate::voxels::features;
 use cc4dgs_format::playback::Head as LayerHead;
-use cc4dgs_format::playback::{LayerPlugin, LayerSource, MAX_FUNCTIONS, Track};
+use cc4dgs_format::playback::{ComputedMotion, MAX_FUNCTIONS, MAX_SAMPLES, MotionPlugin, MotionSource, Track, frame_time};
 use cc4dgs_format::{HostGaussians, Plugin, Result, inventory};
 use rayon::prelude::*;
 
-/// Features of Gaussians and vertices at most: 256 MB.
+/// Memory at most, in floats: 256 MB.
 const MOST_FLOATS: u64 = 64 << 20;
+/// What a vertex takes beside its features, in floats: its place in the list and in the ordered map of vertices. And a Gaussian, for the corners of its cell.
+const FLOATS_OF_VERTEX: u64 = 12;
+const FLOATS_OF_GAUSSIAN: u64 = 16;
 /// Multiplications at most: some ten seconds in a browser, and a second or two on a desktop.
 const MOST_MULTIPLICATIONS: u64 = 20_000_000_000;
 /// Gaussians whose coefficients are computed at a time.
 const BLOCK: usize = 1024;
+/// Samples per cycle of the fastest band: straight lines between them are off by at most half a percent of its amplitude.
+const SAMPLES_PER_CYCLE: f64 = 32.0;
+/// Samples per spline.
+const SAMPLES_PER_SPLINE: usize = 16;
 
 /// What a head changes in a layer; `None` for a head that is not linear there.
 fn layer_head(head: Head, rotation: Rotation) -> Option<LayerHead> {
@@ -29,15 +36,18 @@ fn layer_head(head: Head, rotation: Rotation) -> Option<LayerHead> {
     }
 }
 
-pub(crate) fn tracks(source: &LayerSource) -> Result<Option<Vec<Track>>> {
+pub(crate) fn motion(source: &MotionSource) -> Result<Option<ComputedMotion>> {
     let mut section = source.settings.clone();
     RATE_KEYS.iter().for_each(|key| _ = section.remove(*key));
-    let plan = BasisPlan::new(&section, source.context)?;
+    // Settings that are unknown here may be those of a layer around the deformer. Baking builds both, and says what is wrong if anything is.
+    let Ok(plan) = BasisPlan::new(&section, source.context) else { return Ok(None) };
     let heads: Option<Vec<LayerHead>> = plan.settings.heads.iter().map(|&head| layer_head(head, plan.settings.rotation)).collect();
     let (Some(heads), m) = (heads, source.gaussians.len()) else { return Ok(None) };
     let per_gaussian: usize = plan.groups.iter().map(|(values, own)| values * own).sum();
     let coefficients = per_gaussian.saturating_mul(m);
-    if plan.kept.iter().any(|own| own.len() > MAX_FUNCTIONS) || coefficients > source.most_coefficients || too_much(&plan, m, source.samples)? {
+    let samples = source.least_samples.max(samples_for(&plan.functions));
+    let many = samples > MAX_SAMPLES || plan.kept.iter().any(|own| own.len() > MAX_FUNCTIONS) || coefficients > source.most_coefficients;
+    if many || too_much(&plan, m, samples)? {
         return Ok(None);
     }
 
@@ -45,8 +55,7 @@ pub(crate) fn tracks(source: &LayerSource) -> Result<Option<Vec<Track>>> {
         Some(shape) => source.weights("net.functions", shape.parameter_count())?,
         None => &[],
     };
-    let last = (source.samples - 1) as f32;
-    let times: Vec<f32> = (0..source.samples).map(|k| k as f32 / last).collect();
+    let times: Vec<f32> = (0..samples).map(|k| frame_time(k, samples)).collect();
     let functions = plan.functions.at(&times, of_functions);
 
     let decoder = plan.voxels.sizes()?.decoder.parameter_count();
@@ -68,9 +77,14 @@ pub(crate) fn tracks(source: &LayerSource) -> Result<Option<Vec<Track>>> {
         let functions = kept.iter().flat_map(|&f| functions.iter().map(move |at| at[f])).collect();
         Track { head, functions, starts: Track::starts_of(&ranks), ranks, coefficients }
     };
-    let mut tracks: Vec<Track> = heads.iter().enumerate().map(track).collect();
-    tracks.sort_by_key(|track| track.head);
-    Ok(Some(tracks))
+    Ok(Some(ComputedMotion { samples, tracks: heads.iter().enumerate().map(track).collect() }))
+}
+
+/// Samples of time between which straight lines follow the fastest function.
+fn samples_for(functions: &TemporalFunctions) -> usize {
+    let fastest = if functions.bands == 0 { 0.0 } else { f64::from(functions.cycles) * (functions.bands as f64 - 1.0).exp2() };
+    let of_bands = (SAMPLES_PER_CYCLE * fastest).ceil() as usize;
+    of_bands.max(SAMPLES_PER_SPLINE * functions.splines) + 1
 }
 
 /// Whether features or multiplications for `m` Gaussians and `samples` of time are more than a player should spend.
@@ -78,7 +92,8 @@ fn too_much(plan: &BasisPlan, m: usize, samples: usize) -> Result<bool> {
     let sizes = plan.voxels.sizes()?;
     let vertices = |resolution: &u32| (u64::from(*resolution) + 1).pow(3).min(8 * m as u64);
     let vertices: u64 = sizes.resolutions.iter().map(vertices).sum();
-    let floats = (m as u64).saturating_mul(sizes.width() as u64).saturating_add(vertices.saturating_mul(sizes.decoder.output as u64));
+    let of_gaussian = sizes.width() as u64 + FLOATS_OF_GAUSSIAN;
+    let floats = (m as u64).saturating_mul(of_gaussian).saturating_add(vertices.saturating_mul(sizes.decoder.output as u64 + FLOATS_OF_VERTEX));
     let of_vertices = vertices.saturating_mul(sizes.decoder.parameter_count() as u64);
     let of_gaussians = (m as u64).saturating_mul(plan.coefficients.parameter_count() as u64);
     let of_functions = plan.functions.network.as_ref().map_or(0, |shape| (samples as u64).saturating_mul(shape.parameter_count() as u64));
@@ -86,7 +101,7 @@ fn too_much(plan: &BasisPlan, m: usize, samples: usize) -> Result<bool> {
 }
 
 /// The weights of trunk and heads, one after the other.
-fn coefficient_weights(plan: &BasisPlan, source: &LayerSource) -> Result<Vec<f32>> {
+fn coefficient_weights(plan: &BasisPlan, source: &MotionSource) -> Result<Vec<f32>> {
     let (shape, width) = (&plan.coefficients, plan.width());
     let inputs = std::iter::once(shape.input).chain(shape.trunk.iter().copied());
     let trunk: usize = inputs.zip(&shape.trunk).map(|(input, output)| (input + 1) * output).sum();
@@ -107,15 +122,15 @@ fn factor(head: LayerHead, gaussians: &HostGaussians, gaussian: usize) -> f32 {
 }
 
 inventory::submit! {
-    LayerPlugin {
+    MotionPlugin {
         info: Plugin {
-            name: "cdf-basis",
-            version: "2",
+            name: NAME,
+            version: VERSION,
             summary: "the coefficients of cdf-basis, from its weights",
             paper: "this project",
             schema: "",
             capabilities: &[],
         },
-        tracks,
+        motion,
     }
 }

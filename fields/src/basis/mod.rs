@@ -5,16 +5,20 @@ mod layer;
 
 use crate::heads::{self, Head};
 use crate::networks::ReluShape;
-use crate::settings::{take, within};
+use crate::settings::{bounded, take, within};
 use crate::time::bands_for;
 use crate::voxels::VoxelSettings;
 use cc4dgs_format::{DeformerContext, Error, Result, config};
 pub use functions::TemporalFunctions;
-pub(crate) use layer::tracks;
+pub(crate) use layer::motion;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+/// The field's name.
+pub const NAME: &str = "cdf-basis";
+/// The version of its stored form.
+pub const VERSION: &str = "2";
 /// Largest number of bands chosen automatically: up to 32 cycles per sequence.
 pub const MOST_BANDS: usize = 6;
 
@@ -159,6 +163,7 @@ impl BasisPlan {
         let groups: Vec<(usize, usize)> = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let outputs = groups.iter().map(|(values, own)| vec![width, values * own]).collect();
         let coefficients = Arc::new(ReluShape { input: voxels.sizes()?.width(), trunk: vec![width; settings.layers], heads: outputs });
+        bounded([coefficients.parameter_count(), functions.network.as_ref().map_or(0, |n| n.parameter_count())])?;
         Ok(Self { settings, voxels, functions, kept, groups, coefficients })
     }
     /// Width of the coefficient network.

@@ -10,6 +10,9 @@ pub const MAX_SEGMENTS: usize = 64;
 /// Most functions of a track.
 pub const MAX_FUNCTIONS: usize = 255;
 
+/// Coefficients and functions are smaller in magnitude, so that their products and sums are finite.
+const LARGEST: f32 = 1e18;
+
 /// What a track changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Head {
@@ -78,6 +81,10 @@ impl Track {
     /// The number of functions R.
     pub fn function_count(&self) -> usize {
         usize::from(self.ranks.iter().copied().max().unwrap_or(0))
+    }
+    /// A coefficient or function that is not finite, or so large that sums would not be.
+    pub(super) fn impossible(&self) -> Option<f32> {
+        self.coefficients.iter().chain(&self.functions).copied().find(|v| !v.is_finite() || v.abs() >= LARGEST)
     }
     /// φ at a time: one number per function.
     pub fn functions_at(&self, at: &TimeWeights) -> Vec<f32> {

@@ -15,7 +15,12 @@ mod layer;
 mod max_error;
 mod streams;
 
-pub use computed::{LayerPlugin, LayerSource};
+pub use computed::{ComputedMotion, MotionPlugin, MotionSource};
 pub use layer::{Head, MAX_FUNCTIONS, MAX_SAMPLES, MAX_SEGMENTS, PlaybackLayer, Segment, TimeWeights, Track};
 pub use max_error::MaxError;
 pub use streams::{CodedTrack, exponent_step};
+
+/// Normalised time of frame `frame` of `frames`: 0 for the first, 1 for the last.
+pub fn frame_time(frame: usize, frames: usize) -> f32 {
+    (frame as f64 / frames.saturating_sub(1).max(1) as f64) as f32
+}

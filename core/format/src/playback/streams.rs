@@ -219,7 +219,7 @@ impl TrackShape {
         reader.finish()?;
         let track = CodedTrack { head: self.head, peaks, functions, ranks, step, exponents, coefficients }.decoded(self.width);
         // A product of finite numbers may overflow.
-        match track.coefficients.iter().chain(&track.functions).find(|v| !v.is_finite() || v.abs() >= 1e18) {
+        match track.impossible() {
             Some(v) => Err(Error::data("playback layer", format!("a coefficient or function of {} is {v}", self.head.name()), "Bake the archive again")),
             None => Ok(track),
         }
