@@ -11,6 +11,7 @@ use burn::tensor::Device;
 use cc4dgs_core::archive::{Presentation, StreamKind};
 use cc4dgs_core::exporter::export;
 use cc4dgs_core::playback::MaxError;
+use cc4dgs_core::playback::frame_time;
 use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Limits, Registry, Result};
 use cc4dgs_play::model::Model as PlayModel;
 use cc4dgs_play::player::Player;
@@ -165,7 +166,7 @@ impl<'a> ModelSource<'a> {
             moving: player.moving(),
             sh_degree: model.gaussians.sh_degree,
             time_norm: request.time_norm,
-            times_norm: (0..frames).map(|k| k as f32 / frames as f32).collect(),
+            times_norm: (0..frames).map(|k| frame_time(k, frames)).collect(),
             frames_per_second: request.frames_per_second,
             antialiased: model.render.antialiased,
             up: request.up,

@@ -27,8 +27,9 @@ use tolerance::Tolerances;
 const SAMPLED_ROWS: usize = 3072;
 /// Floats of offsets held at a time.
 const FLOATS: usize = 24 << 20;
-/// Samples per frame at most.
+/// Samples per frame at most, but any sequence may have so many: functions are shared by all Gaussians.
 const SAMPLES_PER_FRAME: usize = 8;
+const SAMPLES_OF_ANY: usize = 257;
 /// The part of the tolerance that linear interpolation between samples may use up before the samples are doubled.
 const BETWEEN_SHARE: f32 = 0.5;
 
@@ -147,7 +148,8 @@ fn choose_samples(motion: &Motion, tolerances: &Tolerances, probe: &[usize], fra
     loop {
         let finer = 2 * samples - 1;
         let error = motion.evaluate(&few, finer, tolerances)?.largest_bend();
-        if error <= BETWEEN_SHARE || finer > SAMPLES_PER_FRAME.saturating_mul(frames.max(2)).min(MAX_SAMPLES / 2) {
+        let most = SAMPLES_PER_FRAME.saturating_mul(frames.max(2)).clamp(SAMPLES_OF_ANY, MAX_SAMPLES / 2);
+        if error <= BETWEEN_SHARE || finer > most {
             return Ok((samples, error));
         }
         samples = finer;

@@ -1,6 +1,7 @@
 //! Which views of a dataset a scene has: frames, held-out cameras, missing images, the cap on training views.
 
-use cc4dgs_core::{CameraRef, Error, ImageSource, RawScene, Result, SceneOptions, Split, View};
+use cc4dgs_core::playback::frame_time;
+use cc4dgs_core::{CameraRef, Error, ImageSource, RawScene, RawView, Result, SceneOptions, Split, View};
 
 /// Applies the options that choose views to `raw`, sorts its views by frame, then camera, drops cameras that show nothing, and returns the chosen views.
 pub(super) fn select(raw: &mut RawScene, options: &SceneOptions) -> Result<Vec<View>> {
@@ -12,12 +13,17 @@ pub(super) fn select(raw: &mut RawScene, options: &SceneOptions) -> Result<Vec<V
     raw.views.sort_by_key(|v| (v.frame, v.camera));
     cap_training_views(raw, options.max_views);
     drop_unused_cameras(raw);
-    let count = raw.views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
-    Ok(raw
-        .views
-        .iter()
-        .map(|v| View { camera: v.camera, frame: v.frame, time_norm: v.time.unwrap_or(v.frame as f64 / count as f64).clamp(0.0, 1.0) as f32, split: v.split })
-        .collect())
+    let times = times_norm(&raw.views);
+    Ok(raw.views.iter().zip(times).map(|(v, time_norm)| View { camera: v.camera, frame: v.frame, time_norm, split: v.split }).collect())
+}
+
+/// Times of views, 0 for the first frame and 1 for the last: those that are stated, or even ones.
+fn times_norm(views: &[RawView]) -> Vec<f32> {
+    let count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
+    let times: Vec<f64> = views.iter().map(|v| v.time.unwrap_or_else(|| f64::from(frame_time(v.frame, count)))).collect();
+    let (first, last) = times.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &t| (a.min(t), b.max(t)));
+    let length = if last > first { last - first } else { 1.0 };
+    times.iter().map(|t| ((t - first) / length) as f32).collect()
 }
 
 fn choose_frames(raw: &mut RawScene, options: &SceneOptions) -> Result<()> {

@@ -14,8 +14,15 @@ fn frames_are_chosen_and_renumbered() {
     for (view, v) in scene.views.iter().enumerate() {
         let c: usize = scene.camera(view).name.parse().unwrap();
         assert_eq!(scene.frame(view).unwrap().data[2] as usize, 10 * c + 1 + 2 * v.frame);
-        assert!((v.time_norm - v.frame as f32 / 3.0).abs() < 1e-6);
+        assert!((v.time_norm - v.frame as f32 / 2.0).abs() < 1e-6);
     }
+    // Times that are stated begin at 0 and end at 1, too.
+    let stated = tempfile::tempdir().unwrap();
+    write_dnerf(stated.path(), 5, 1, 16);
+    let scene = open(stated.path(), &SceneOptions { frames: Some([1, 3, 1]), ..Default::default() }, &Limits::default()).unwrap();
+    let mut times: Vec<f32> = scene.views.iter().map(|v| v.time_norm).collect();
+    times.dedup();
+    assert_eq!(times, [0.0, 0.5, 1.0]);
     let none = SceneOptions { frames: Some([50, 3, 1]), ..Default::default() };
     let message = open(dir.path(), &none, &Limits::default()).err().unwrap().to_string();
     assert!(message.contains("9 frames"), "{message}");
