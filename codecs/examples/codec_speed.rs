@@ -1,4 +1,4 @@
-//! Bytes per stream and seconds of codecs on a PLY file, repeated to a larger model: `codec_speed FILE.ply REPEAT CODEC[:PROFILE]...`, JSON lines. Where the
+//! Bytes per stream and seconds of codecs on a PLY file, repeated to a larger model: `codec_speed FILE.ply REPEAT CODEC[:PROFILE][;SETTINGS]...`, JSON lines. Where the
 //! variable `DECODED` names a folder, what was decoded is written there as PLY files. `DECODES` is how often it decodes, the fastest counts; 3 by default.
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
@@ -10,7 +10,7 @@ fn main() -> Result<()> {
     cc4dgs_codecs::link();
     let arguments: Vec<String> = std::env::args().collect();
     let [_, path, repeat, specs @ ..] = arguments.as_slice() else {
-        return Err(Error::parameter("codec_speed", "too few arguments", "Write codec_speed FILE.ply REPEAT CODEC[:PROFILE]..."));
+        return Err(Error::parameter("codec_speed", "too few arguments", "Write codec_speed FILE.ply REPEAT CODEC[:PROFILE][;SETTINGS]..."));
     };
     let repeat = repeat.parse::<usize>().map_err(|e| Error::parameter("REPEAT", e.to_string(), "Write a number of copies"))?;
     let limits = Limits::default();
@@ -19,8 +19,10 @@ fn main() -> Result<()> {
     let codecs = Entries::<CodecPlugin>::collect()?;
     let decodes = std::env::var("DECODES").ok().and_then(|v| v.parse().ok()).unwrap_or(3);
     for spec in specs {
-        let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
-        let codec = (codecs.get(name)?.build)(profile, &toml::Table::new())?;
+        let (named, settings) = spec.split_once(';').unwrap_or((spec, ""));
+        let (name, profile) = named.split_once(':').unwrap_or((named, ""));
+        let settings = settings.parse().map_err(|e: toml::de::Error| Error::parameter("SETTINGS", e.to_string(), "Write TOML, such as layers=1"))?;
+        let codec = (codecs.get(name)?.build)(profile, &settings)?;
         let began = Instant::now();
         let streams = codec.encode(&gaussians, &context)?;
         let encode = began.elapsed().as_secs_f64();

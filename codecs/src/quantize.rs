@@ -2,11 +2,13 @@
 
 use crate::morton;
 use cc4dgs_format::storage::{
-    ESCAPES, Shape, assemble, close,
+    ESCAPES, HARMONICS, Shape, assemble, close,
     column::{self, Column, Target},
-    interleave, load, open, split, store,
+    interleave, load, open, skip, split, stage_of_column, store,
 };
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
+use cc4dgs_format::{
+    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, StreamStage, config, inventory, unknown_name,
+};
 use serde::Deserialize;
 
 /// Version of the stored form.
@@ -120,18 +122,33 @@ impl AttributeCodec for Quantize {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let (set, mut meta, shape) = open("quantize", streams, VERSION, &context.limits)?;
-        let mut escapes = set.reader(ESCAPES)?;
-        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
-        for (name, width, values) in out.columns_mut() {
-            *values = interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count);
-        }
-        close(&set, &shape, [meta, escapes], out, &context.limits)
+        decode(streams, context, true)
+    }
+    fn stage(&self, name: &str) -> StreamStage {
+        stage_of_column(name)
+    }
+    fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        decode(streams, context, false)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {
         self.bits.losses()
     }
+}
+
+/// Without `harmonics`, their streams are not read, and the column is zeros.
+fn decode(streams: &[Stream], context: &CodecContext, harmonics: bool) -> Result<HostGaussians> {
+    let (set, mut meta, shape) = open("quantize", streams, VERSION, &context.limits)?;
+    let mut escapes = set.reader(ESCAPES)?;
+    let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+    for (name, width, values) in out.columns_mut() {
+        *values = if name == HARMONICS && !harmonics {
+            skip(shape.count, width, &mut meta, &mut escapes)?
+        } else {
+            interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count)
+        };
+    }
+    close(&set, &shape, [meta, escapes], out, &context.limits)
 }
 
 pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {

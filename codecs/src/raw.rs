@@ -1,7 +1,9 @@
 //! `raw`: every attribute as float32, bit-exact and in order.
 
-use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams, from_planes, open, to_planes};
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, config, inventory, unknown_name};
+use cc4dgs_format::storage::{Attributes, HARMONICS, META, Shape, extra_streams, from_planes, open, stage_of_column, to_planes};
+use cc4dgs_format::{
+    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, StreamStage, config, inventory, unknown_name,
+};
 use serde::Deserialize;
 
 /// Version of the stored form.
@@ -21,20 +23,31 @@ impl AttributeCodec for Raw {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let (set, meta, shape) = open("raw", streams, VERSION, &context.limits)?;
-        meta.finish()?;
-        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
-        for (name, width, values) in out.columns_mut() {
-            *values = from_planes(set.reader(name)?, shape.count, width)?;
-        }
-        shape.read_extra(&set, &mut out)?;
-        out.validate("decoded Gaussians", &context.limits)?;
-        Ok(out)
+        decode(streams, context, true)
+    }
+    fn stage(&self, name: &str) -> StreamStage {
+        stage_of_column(name)
+    }
+    fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        decode(streams, context, false)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {
         Vec::new()
     }
+}
+
+/// Without `harmonics`, their streams are not read, and the column is zeros.
+fn decode(streams: &[Stream], context: &CodecContext, harmonics: bool) -> Result<HostGaussians> {
+    let (set, meta, shape) = open("raw", streams, VERSION, &context.limits)?;
+    meta.finish()?;
+    let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+    for (name, width, values) in out.columns_mut() {
+        *values = if name == HARMONICS && !harmonics { vec![0.0; shape.count * width] } else { from_planes(set.reader(name)?, shape.count, width)? };
+    }
+    shape.read_extra(&set, &mut out)?;
+    out.validate("decoded Gaussians", &context.limits)?;
+    Ok(out)
 }
 
 #[derive(Deserialize)]

@@ -7,11 +7,11 @@ use crate::morton;
 use crate::quantize::Bits;
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::storage::{
-    ESCAPES, Shape, assemble, close,
+    ESCAPES, HARMONICS, Shape, assemble, close,
     column::{self, Column},
-    interleave, load, open, split, store,
+    interleave, load, open, skip, split, stage_of_column, store,
 };
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, StreamStage, inventory};
 use png::{BitDepth, ColorType, Decoder, Encoder, Filter, Limits as PngLimits};
 use std::io::Cursor;
 
@@ -115,29 +115,44 @@ impl AttributeCodec for SortedImage {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let (set, mut meta, shape) = open("sorted-image", streams, VERSION, &context.limits)?;
-        let mut escapes = set.reader(ESCAPES)?;
-        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
-        for (name, width, values) in out.columns_mut() {
-            let widths = column::widths(meta.clone(), width)?;
-            let wanted: usize = widths.iter().sum();
-            let image = set.reader(name)?;
-            let object = format!("sorted-image stream '{name}'");
-            let planes = if wanted * shape.count == 0 {
-                image.finish()?;
-                Vec::new()
-            } else {
-                from_png(&object, image.rest(), shape.count, wanted)?
-            };
-            let codes = codes(&planes, &widths, shape.count);
-            *values = interleave(&load(ByteReader::new(object, &codes), shape.count, width, &mut meta, &mut escapes)?, shape.count);
-        }
-        close(&set, &shape, [meta, escapes], out, &context.limits)
+        decode(streams, context, true)
+    }
+    fn stage(&self, name: &str) -> StreamStage {
+        stage_of_column(name)
+    }
+    fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        decode(streams, context, false)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {
         self.bits.losses()
     }
+}
+
+/// Without `harmonics`, their streams are not read, and the column is zeros.
+fn decode(streams: &[Stream], context: &CodecContext, harmonics: bool) -> Result<HostGaussians> {
+    let (set, mut meta, shape) = open("sorted-image", streams, VERSION, &context.limits)?;
+    let mut escapes = set.reader(ESCAPES)?;
+    let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+    for (name, width, values) in out.columns_mut() {
+        if name == HARMONICS && !harmonics {
+            *values = skip(shape.count, width, &mut meta, &mut escapes)?;
+            continue;
+        }
+        let widths = column::widths(meta.clone(), width)?;
+        let wanted: usize = widths.iter().sum();
+        let image = set.reader(name)?;
+        let object = format!("sorted-image stream '{name}'");
+        let planes = if wanted * shape.count == 0 {
+            image.finish()?;
+            Vec::new()
+        } else {
+            from_png(&object, image.rest(), shape.count, wanted)?
+        };
+        let codes = codes(&planes, &widths, shape.count);
+        *values = interleave(&load(ByteReader::new(object, &codes), shape.count, width, &mut meta, &mut escapes)?, shape.count);
+    }
+    close(&set, &shape, [meta, escapes], out, &context.limits)
 }
 
 pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {

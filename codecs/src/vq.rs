@@ -4,12 +4,12 @@
 
 use crate::{kmeans, morton};
 use cc4dgs_format::storage::{
-    ESCAPES, Shape, assemble, close,
+    ESCAPES, HARMONICS, Shape, assemble, close,
     column::{self, Target},
-    from_planes, interleave, load, open, split, store, to_planes,
+    from_planes, interleave, load, open, skip, split, stage_of_column, store, to_planes,
 };
 use cc4dgs_format::{
-    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, config, inventory, unknown_name,
+    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, StreamStage, config, inventory, unknown_name,
 };
 use rand::seq::index::sample;
 use serde::Deserialize;
@@ -105,32 +105,13 @@ impl AttributeCodec for Vq {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let (set, mut meta, shape) = open("vq", streams, VERSION, &context.limits)?;
-        let mut escapes = set.reader(ESCAPES)?;
-        let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
-        for (name, width, values) in out.columns_mut() {
-            let book_rows = if BOOKS.contains(&name) { meta.u32()? as usize } else { 0 };
-            if book_rows == 0 {
-                *values = interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count);
-                continue;
-            }
-            if book_rows > 1 << 16 || book_rows > shape.count {
-                return Err(meta.error(format!("a codebook of {book_rows} rows for {} Gaussians is impossible", shape.count)));
-            }
-            let book = from_planes(set.reader(&format!("{name}.book"))?, book_rows, width)?;
-            let mut labels = set.reader(name)?;
-            let bytes = labels.take(shape.count.saturating_mul(2))?;
-            values.reserve(shape.count * width);
-            for code in bytes.as_chunks::<2>().0 {
-                let row = usize::from(u16::from_le_bytes(*code));
-                let Some(found) = book.get(row * width..(row + 1) * width) else {
-                    return Err(labels.error(format!("label {row} is beyond the {book_rows} rows of the codebook")));
-                };
-                values.extend_from_slice(found);
-            }
-            labels.finish()?;
-        }
-        close(&set, &shape, [meta, escapes], out, &context.limits)
+        decode(streams, context, true)
+    }
+    fn stage(&self, name: &str) -> StreamStage {
+        stage_of_column(name)
+    }
+    fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        decode(streams, context, false)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {
@@ -142,6 +123,40 @@ impl AttributeCodec for Vq {
             .map(|(name, loss)| DeclaredLoss { attribute: name.into(), relative_rms: loss })
             .collect()
     }
+}
+
+/// Without `harmonics`, their streams are not read, and the column is zeros.
+fn decode(streams: &[Stream], context: &CodecContext, harmonics: bool) -> Result<HostGaussians> {
+    let (set, mut meta, shape) = open("vq", streams, VERSION, &context.limits)?;
+    let mut escapes = set.reader(ESCAPES)?;
+    let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
+    for (name, width, values) in out.columns_mut() {
+        let book_rows = if BOOKS.contains(&name) { meta.u32()? as usize } else { 0 };
+        if name == HARMONICS && !harmonics {
+            *values = if book_rows == 0 { skip(shape.count, width, &mut meta, &mut escapes)? } else { vec![0.0; shape.count * width] };
+            continue;
+        }
+        if book_rows == 0 {
+            *values = interleave(&load(set.reader(name)?, shape.count, width, &mut meta, &mut escapes)?, shape.count);
+            continue;
+        }
+        if book_rows > 1 << 16 || book_rows > shape.count {
+            return Err(meta.error(format!("a codebook of {book_rows} rows for {} Gaussians is impossible", shape.count)));
+        }
+        let book = from_planes(set.reader(&format!("{name}.book"))?, book_rows, width)?;
+        let mut labels = set.reader(name)?;
+        let bytes = labels.take(shape.count.saturating_mul(2))?;
+        values.reserve(shape.count * width);
+        for code in bytes.as_chunks::<2>().0 {
+            let row = usize::from(u16::from_le_bytes(*code));
+            let Some(found) = book.get(row * width..(row + 1) * width) else {
+                return Err(labels.error(format!("label {row} is beyond the {book_rows} rows of the codebook")));
+            };
+            values.extend_from_slice(found);
+        }
+        labels.finish()?;
+    }
+    close(&set, &shape, [meta, escapes], out, &context.limits)
 }
 
 pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {

@@ -1,7 +1,7 @@
 //! `compact`: the conformance suite, a stored file that must stay readable, motion, and sizes.
 #![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, Entries, HostGaussians, Limits, Seed, Silent, Stream, conformance, toml};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, Entries, HostGaussians, Limits, Seed, Silent, Stream, StreamStage, conformance, toml};
 
 fn plugin() -> &'static CodecPlugin {
     cc4dgs_codecs::link();
@@ -38,8 +38,8 @@ fn scene(count: usize, sh_degree: usize) -> HostGaussians {
 
 #[test]
 fn the_suite_passes() {
-    for profile in ["", "psnr=35dB", "psnr=70dB", "max-size=1MB"] {
-        let findings = conformance::codec(plugin(), profile, &toml::Table::new());
+    for (profile, layers) in [("", 0), ("psnr=35dB", 2), ("psnr=70dB", 5), ("max-size=1MB", 0)] {
+        let findings = conformance::codec(plugin(), profile, &toml::Table::from_iter([("layers".into(), layers.into())]));
         assert!(findings.is_empty(), "{}", findings.join("\n"));
     }
 }
@@ -141,10 +141,35 @@ fn what_is_far_out_is_exact_and_the_smallest_weights_are_stored() {
     }
 }
 
-/// Streams of version 3 and what they decode to, written by this test where the variable is set.
+#[test]
+fn the_most_important_gaussians_come_first() {
+    let g = scene(4000, 2);
+    let settings = toml::Table::from_iter([("layers".into(), 3.into())]);
+    let codec = (plugin().build)("", &settings).unwrap();
+    let streams = codec.encode(&g, &context(Some(5.0))).unwrap();
+    let up_to = |layer: u8| {
+        let streams: Vec<Stream> = streams.iter().filter(|s| codec.stage(&s.name) <= StreamStage::Layer(layer)).cloned().collect();
+        codec.decode_stage(&streams, &context(None)).unwrap()
+    };
+    let found: Vec<HostGaussians> = (0..3).map(up_to).collect();
+    assert_eq!(found.iter().map(HostGaussians::len).collect::<Vec<_>>(), [1000, 2000, 4000]);
+    assert!(found.iter().all(|g| g.sh_rest.iter().all(|v| *v == 0.0)));
+    // Large opaque ones matter most.
+    let area = |g: &HostGaussians, rows: std::ops::Range<usize>| {
+        let of = |i: usize| f64::from(g.opacity_logits[i]).tanh() + 1.0 + 0.1 * f64::from(g.log_scales[3 * i] + g.log_scales[3 * i + 1]);
+        rows.clone().map(of).sum::<f64>() / rows.len() as f64
+    };
+    assert!(area(&found[2], 0..1000) > area(&found[2], 2000..4000));
+    // Layers cost little, and the classes that they separate need fewer bits.
+    let size = |streams: &[Stream]| streams.iter().map(|s| s.bytes.len()).sum::<usize>();
+    let one = size(&self::codec("").encode(&g, &context(Some(5.0))).unwrap());
+    assert!(size(&streams) < one + one / 4, "{} bytes in layers, {one} without", size(&streams));
+}
+
+/// Streams of version 4 and what they decode to, written by this test where the variable is set.
 #[test]
 fn stored_streams_decode_to_the_same_bits() {
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-3.bin");
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-4.bin");
     let put = |out: &mut Vec<u8>, bytes: &[u8]| {
         out.extend((bytes.len() as u32).to_le_bytes());
         out.extend(bytes);

@@ -152,14 +152,20 @@ fn damaged_gaussians_give_errors() {
     let plugins: Vec<_> = Entries::<CodecPlugin>::collect().unwrap().iter().collect();
     let time = seconds(plugins.len() * 2);
     for plugin in plugins {
-        let quick = if plugin.info.schema.contains("sample_budget") { "sample_budget = 20000".parse().unwrap() } else { toml::Table::new() };
-        let codec: Box<dyn AttributeCodec> = (plugin.build)("", &quick).unwrap();
+        let mut settings = toml::Table::new();
+        for (name, value) in [("sample_budget", 20000), ("layers", 3)] {
+            if plugin.info.schema.contains(&format!("{name} ")) {
+                settings.insert(name.into(), value.into());
+            }
+        }
+        let codec: Box<dyn AttributeCodec> = (plugin.build)("", &settings).unwrap();
         // The larger model is enough for forms that are chosen for large ones only.
         for (count, degree, threshold) in [(40, 3, Some(5.0)), (3000, 1, None)] {
             let sound = codec.encode(&scene(count, degree), &context(threshold)).unwrap();
-            let tried = attack(plugin.info.name, &sound, time, &|streams| match codec.decode(streams, &context(None)) {
-                Ok(found) => found.validate("decoded", &LIMITS).err().map(|e: Error| e.to_string()),
-                Err(_) => None,
+            let wrong = |found: HostGaussians| found.validate("decoded", &LIMITS).err().map(|e: Error| e.to_string());
+            let tried = attack(plugin.info.name, &sound, time, &|streams| {
+                let found = [codec.decode(streams, &context(None)), codec.decode_stage(streams, &context(None))];
+                found.into_iter().flatten().find_map(wrong)
             });
             println!("{}: {tried} damaged versions of {count} Gaussians", plugin.info.name);
         }

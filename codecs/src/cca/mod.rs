@@ -21,8 +21,9 @@ mod shard;
 mod train;
 
 use crate::morton;
-use cc4dgs_format::storage::{Attributes, ESCAPES, META, Shape, extra_streams, from_planes, open, to_planes};
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, inventory};
+use cc4dgs_format::gaussians::sh_rest_len;
+use cc4dgs_format::storage::{Attributes, ESCAPES, META, Shape, extra_streams, from_planes, open, stage_of_column, to_planes};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, HostGaussians, Plugin, Result, Stream, StreamStage, inventory};
 pub use profile::{Profile, Settings};
 
 /// Version of the stored form.
@@ -55,21 +56,13 @@ impl AttributeCodec for Cca {
     }
 
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        let (set, mut meta, shape) = open("cca", streams, VERSION, &context.limits)?;
-        let mut escapes = set.reader(ESCAPES)?;
-        let mut out = HostGaussians {
-            sh_degree: shape.sh_degree,
-            means: from_planes(set.reader("means")?, shape.count, 3)?,
-            sh_dc: from_planes(set.reader("sh_dc")?, shape.count, 3)?,
-            ..Default::default()
-        };
-        geometry::decode(&set, shape.count, &mut meta, &mut escapes, &mut out)?;
-        out.sh_rest = appearance::decode(&set, &out, shape.count, &mut meta, &mut escapes)?;
-        shape.read_extra(&set, &mut out)?;
-        meta.finish()?;
-        escapes.finish()?;
-        out.validate("decoded Gaussians", &context.limits)?;
-        Ok(out)
+        decode(streams, context, true)
+    }
+    fn stage(&self, name: &str) -> StreamStage {
+        stage_of_column(name)
+    }
+    fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        decode(streams, context, false)
     }
 
     fn losses(&self) -> Vec<DeclaredLoss> {
@@ -82,6 +75,30 @@ impl AttributeCodec for Cca {
             of("sh_rest", self.profile.appearance_loss),
         ]
     }
+}
+
+/// Without `harmonics`, their streams are not read, and the column is zeros.
+fn decode(streams: &[Stream], context: &CodecContext, harmonics: bool) -> Result<HostGaussians> {
+    let (set, mut meta, shape) = open("cca", streams, VERSION, &context.limits)?;
+    let mut escapes = set.reader(ESCAPES)?;
+    let mut out = HostGaussians {
+        sh_degree: shape.sh_degree,
+        means: from_planes(set.reader("means")?, shape.count, 3)?,
+        sh_dc: from_planes(set.reader("sh_dc")?, shape.count, 3)?,
+        ..Default::default()
+    };
+    geometry::decode(&set, shape.count, &mut meta, &mut escapes, &mut out)?;
+    // Last in meta and escapes.
+    if harmonics {
+        out.sh_rest = appearance::decode(&set, &out, shape.count, &mut meta, &mut escapes)?;
+        meta.finish()?;
+        escapes.finish()?;
+    } else {
+        out.sh_rest = vec![0.0; shape.count * 3 * sh_rest_len(shape.sh_degree)];
+    }
+    shape.read_extra(&set, &mut out)?;
+    out.validate("decoded Gaussians", &context.limits)?;
+    Ok(out)
 }
 
 pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {

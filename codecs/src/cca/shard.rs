@@ -3,6 +3,7 @@
 use super::geometry::CONDITIONS;
 use super::network::{HALF, Layer, decoder, encoder, gelu_with_slopes, latents};
 use cc4dgs_format::Seed;
+#[cfg(not(target_arch = "wasm32"))]
 use gemm::Parallelism;
 use rand::Rng;
 
@@ -158,7 +159,22 @@ pub(super) fn backward(net: &Net, parameters: &[f32], data: &Data, shard: &mut S
     }
 }
 
+/// out `[m,n]` (+)= a `[m,k]` b `[k,n]`, all row-major; a flag is set if the array holds the transpose. Pages only decode: plain loops keep the library's kernels
+/// out of what they fetch.
+#[cfg(target_arch = "wasm32")]
+fn matmul([m, n, k]: [usize; 3], (a, a_transposed): (&[f32], bool), (b, b_transposed): (&[f32], bool), out: &mut [f32], accumulate: bool) {
+    assert!(a.len() == m * k && b.len() == k * n && out.len() == m * n, "matrix sizes");
+    let a = |row: usize, column: usize| if a_transposed { a[column * m + row] } else { a[row * k + column] };
+    let b = |row: usize, column: usize| if b_transposed { b[column * k + row] } else { b[row * n + column] };
+    for (at, out) in out.iter_mut().enumerate() {
+        let (row, column) = (at / n, at % n);
+        let sum: f32 = (0..k).map(|i| a(row, i) * b(i, column)).sum();
+        *out = if accumulate { *out + sum } else { sum };
+    }
+}
+
 /// out `[m,n]` (+)= a `[m,k]` b `[k,n]`, all row-major; a flag is set if the array holds the transpose.
+#[cfg(not(target_arch = "wasm32"))]
 fn matmul([m, n, k]: [usize; 3], (a, a_transposed): (&[f32], bool), (b, b_transposed): (&[f32], bool), out: &mut [f32], accumulate: bool) {
     assert!(a.len() == m * k && b.len() == k * n && out.len() == m * n, "matrix sizes");
     let strides = |rows: usize, columns: usize, transposed: bool| if transposed { (1, rows as isize) } else { (columns as isize, 1) };

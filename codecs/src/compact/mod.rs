@@ -2,7 +2,8 @@
 //!
 //! The step of every value follows from how much its error changes rendered images. Gaussians fall into classes; the steps of one class are twice those of
 //! the class before. Weights come from derivatives of renders on the training views, or from sizes and opacities. Streams, in the order in which a player
-//! needs them: classes, scales, centres, rotations, opacities, degree-0 colours, then the higher degrees one by one.
+//! needs them: of each layer classes, scales, centres, rotations, opacities and degree-0 colours, then the higher degrees one by one. Layers are sets of
+//! Gaussians by falling weight.
 
 mod allocate;
 mod bits;
@@ -12,6 +13,7 @@ mod encode;
 mod entropy;
 mod geometry;
 mod importance;
+mod layers;
 mod predict;
 mod read;
 mod rounding;
@@ -25,7 +27,7 @@ mod write;
 pub(crate) use weights::build as build_weights;
 
 use cc4dgs_format::storage::relative_rms;
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, inventory};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, StreamStage, inventory};
 use colors::Choices;
 use encode::{Classes, Factors, Plan};
 use importance::Importance;
@@ -33,7 +35,7 @@ use settings::Settings;
 use write::Motion;
 
 /// Version of the stored form.
-const VERSION: u8 = 3;
+const VERSION: u8 = 4;
 /// Largest losses: column and root-mean-square error over the standard deviation. Gaussians that are hardly seen may lose everything: a colour that becomes
 /// the mean has a loss of 1, a rotation that has nothing to do with the true one of 1.4.
 const LOSSES: [(&str, f64); 7] = [
@@ -61,6 +63,8 @@ struct Job<'a> {
     free: Vec<bool>,
     importance: &'a Importance,
     classes: Classes,
+    /// The layer of each Gaussian, and how many each layer has.
+    layers: (Vec<u8>, Vec<usize>),
     motion: Motion,
     choices: Choices,
     /// Of the columns, to start with.
@@ -110,9 +114,9 @@ impl Job<'_> {
     fn attempt_planned(&self, gaussians: &HostGaussians, plan: Plan, quality: f64) -> Result<(Attempt, Vec<usize>)> {
         let of = plan.quantise(gaussians, &self.free, &self.classes);
         let mut order: Vec<usize> = (0..gaussians.len()).collect();
-        order.sort_by_key(|&i| (of.keys[i], i));
-        let streams = write::write(gaussians, &of, &self.motion, &order)?;
-        let decoded = read::read(&streams, &CodecContext::new(self.limits.seed, self.limits.limits, self.limits.events))?;
+        order.sort_by_key(|&i| (self.layers.0[i], of.keys[i], i));
+        let streams = write::write(gaussians, &of, &self.motion, &order, &self.layers.1)?;
+        let decoded = read::read(&streams, &CodecContext::new(self.limits.seed, self.limits.limits, self.limits.events), true)?;
         Ok((Attempt { quality, bytes: streams.iter().map(|s| s.bytes.len()).sum(), streams, decoded, plan }, order))
     }
 }
@@ -169,11 +173,18 @@ impl AttributeCodec for Compact {
         let canonical = encode::canonical(gaussians, &free);
         let classes = encode::classify(&importance.weights, &importance.shapes, self.settings.adaptive);
         let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
-        let mut job = Job { gaussians: &canonical, free, importance: &importance, classes, motion, choices, factors: [1.0; 6], limits: context };
+        let layers = layers::assign(&importance.weights, layers::number(self.settings.layers, gaussians.len()));
+        let mut job = Job { gaussians: &canonical, free, importance: &importance, classes, layers, motion, choices, factors: [1.0; 6], limits: context };
         Ok(search::search(&mut job, &self.settings, context)?.streams)
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
-        read::read(streams, context)
+        read::read(streams, context, true)
+    }
+    fn stage(&self, name: &str) -> StreamStage {
+        layers::stage(name)
+    }
+    fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        read::read(streams, context, false)
     }
     fn losses(&self) -> Vec<DeclaredLoss> {
         LOSSES.map(|(attribute, relative_rms)| DeclaredLoss { attribute: attribute.into(), relative_rms }).into()
@@ -191,7 +202,7 @@ inventory::submit! {
     CodecPlugin {
         info: Plugin {
             name: "compact",
-            version: "3",
+            version: "4",
             summary: "steps by what is seen, transformed colours, entropy coding: the smallest files",
             paper: "rate-distortion allocation; octave classes; Karhunen-Loève transform; asymmetric numeral systems (constriction)",
             schema: settings::SCHEMA,
@@ -215,7 +226,7 @@ mod tests {
     fn other_versions_are_refused_by_number() {
         let streams = [Stream { name: "meta".into(), bytes: vec![2; 40] }];
         let context = CodecContext::new(cc4dgs_format::Seed::root(1), Default::default(), &cc4dgs_format::Silent);
-        let message = read::read(&streams, &context).map(|_| ()).expect_err("version 2").to_string();
-        assert!(message.contains("version 2 is not 3"), "{message}");
+        let message = read::read(&streams, &context, true).map(|_| ()).expect_err("version 2").to_string();
+        assert!(message.contains("version 2 is not 4"), "{message}");
     }
 }

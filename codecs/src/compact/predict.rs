@@ -117,7 +117,8 @@ impl Linear {
     pub const fn contexts(dims: usize) -> usize {
         dims * LEVELS
     }
-    /// Fits the weights to the rows `codes` `[N,dims]`. Blocks start where [`super::blocks`] starts them; that lanes start anew matters little.
+    /// Fits the weights to the rows `codes` `[N,dims]`. Blocks start where they would in one layer; that layers and lanes start anew matters
+    /// little.
     pub fn fit(dims: usize, codes: &[i32], known: &[Known]) -> Self {
         let mut fitted = vec![[0.0; INPUTS]; dims];
         let mut spread = [0.0; DIMS];

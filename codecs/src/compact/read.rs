@@ -4,6 +4,7 @@ use super::VERSION;
 use super::blocks::{Blocks, ROWS};
 use super::colors::{self, Degree, SMALL_CONTEXTS, code_small};
 use super::geometry::{Geometry, KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
+use super::layers;
 use super::predict::{Known, Linear};
 use super::write::{APART, CLASSES, EXACT, MEANS, MOVING, Motion, OPACITIES, ROTATIONS, SCALES, SCORES, SHAPES, color_name, known_classes, known_scales};
 use cc4dgs_format::archive::ByteReader;
@@ -13,6 +14,7 @@ use cc4dgs_format::storage::{StreamSet, open};
 use cc4dgs_format::{CodecContext, Error, HostGaussians, Result, Stream};
 use rayon::prelude::*;
 use std::ops::Range;
+use std::slice;
 
 /// Gaussians per byte of all streams that a decoder believes: a block of 2^14 takes eight bytes or more in each of eight streams.
 const PER_BYTE: u64 = 512;
@@ -27,45 +29,59 @@ struct Rows {
     scales: Vec<[i32; 3]>,
 }
 
-/// Decodes what [`super::write::write`] wrote.
-pub fn read(streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+/// Decodes what [`super::write::write`] wrote: all of it, or where it is not `whole` the layers that are there, without harmonics.
+pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<HostGaussians> {
     let (set, mut meta, shape) = open("compact", streams, VERSION, &context.limits)?;
-    let (n, bytes) = (shape.count, streams.iter().map(|s| s.bytes.len() as u64).sum::<u64>());
-    if n as u64 > PER_BYTE.saturating_mul(bytes) {
-        return Err(meta.error(format!("{n} Gaussians in {bytes} bytes are more than there can be")));
-    }
     let geometry = Geometry::read(&mut meta)?;
     let (free, scored) = (meta.u8()?, meta.u8()?);
     let levels = [meta.f32()?, meta.f32()?];
     if free > 2 || scored > 1 || free == 2 && scored == 0 {
         return Err(meta.error(format!("rotations of kind {free} and scores of kind {scored} are impossible")));
     }
+    let sizes = layers::read(&mut meta, shape.count)?;
     let (scale_plan, opacity_plan, color_plan) = (Linear::read(3, &mut meta)?, Linear::read(1, &mut meta)?, Linear::read(3, &mut meta)?);
     let degrees = (0..=shape.sh_degree).map(|d| Degree::read(&mut meta, 3 * (2 * d + 1))).collect::<Result<Vec<Degree>>>()?;
+    let complete = |layer: &usize| set.has(&layers::stream(&color_name(0), *layer));
+    let layer_count = if whole { sizes.len() } else { (0..sizes.len()).take_while(complete).count().max(1) };
+    let layers = layers::ranges(&sizes[..layer_count]);
+    let (n, all) = (sizes[..layer_count].iter().sum::<usize>(), layer_count == sizes.len());
+    let bytes = streams.iter().map(|s| s.bytes.len() as u64).sum::<u64>();
+    if n as u64 > PER_BYTE.saturating_mul(bytes) {
+        return Err(meta.error(format!("{n} Gaussians in {bytes} bytes are more than there can be")));
+    }
     meta.finish()?;
-    let coded = |name: &str, contexts: usize| Blocks::read(name, set.reader(name)?, contexts, n);
+    let coded = |name: &str, contexts: usize| Blocks::read(&set, name, contexts, &layers);
 
-    let classes = small(&set, CLASSES, n, 15)?;
-    let mut shapes = small(&set, SHAPES, n, 15)?;
+    let classes = small(&set, CLASSES, &layers, 15)?;
+    let mut shapes = small(&set, SHAPES, &layers, 15)?;
     for (shape, &color) in shapes.iter_mut().zip(&classes) {
         *shape = (color + *shape).checked_sub(APART).filter(|s| *s < 16).ok_or_else(|| impossible(SHAPES, "a class is below 0 or above 15"))?;
     }
-    let moving = if scored == 1 { small(&set, MOVING, n, 1)? } else { Vec::new() };
+    let moving = if scored == 1 { small(&set, MOVING, &layers, 1)? } else { Vec::new() };
     let mut rows = Rows { geometry, motion: Motion { free, moving: None, levels }, classes, shapes, moving, scales: Vec::new() };
     rows.scales = rows.read_scales(&coded(SCALES, Linear::contexts(3))?, &scale_plan)?;
     let rows = &rows;
 
     // The others depend on classes and scales alone.
     let mut out = HostGaussians { sh_degree: shape.sh_degree, ..Default::default() };
-    out.dynamic_scores = if scored == 1 { rows.moving.iter().map(|&m| levels[usize::from(m)]).collect() } else { read_scores(set.reader(SCORES)?, n)? };
+    out.dynamic_scores =
+        if scored == 1 { rows.moving.iter().map(|&m| levels[usize::from(m)]).collect() } else { read_scores(set.reader(SCORES)?, shape.count, n)? };
     let (means, rotations) = (coded(MEANS, KEY_CONTEXTS)?, coded(ROTATIONS, ROTATION_CONTEXTS)?);
     let (opacities, base) = (coded(OPACITIES, Linear::contexts(1))?, coded(&color_name(0), Linear::contexts(3))?);
     let (first, higher) = degrees.split_at(1);
-    let names = (1..=shape.sh_degree).map(color_name);
-    let higher: Vec<(&Degree, Blocks)> = higher.iter().zip(names).map(|(plan, name)| Ok((plan, coded(&name, colors::CONTEXTS)?))).collect::<Result<_>>()?;
+    let rows_of_all = 0..n;
+    let higher = if whole { higher } else { &[] };
+    let coded_higher = |(plan, degree)| Ok((plan, Blocks::read(&set, &color_name(degree), colors::CONTEXTS, slice::from_ref(&rows_of_all))?));
+    let higher: Vec<(&Degree, Blocks)> = higher.iter().zip(1..).map(coded_higher).collect::<Result<_>>()?;
+    let width = 3 * sh_rest_len(shape.sh_degree);
     let (geometry, appearance) = rayon::join(
         || rayon::join(|| rows.means(&means), || rows.quaternions(&rotations)),
-        || rayon::join(|| Ok::<_, Error>((rows.opacities(&opacities, &opacity_plan)?, rows.base(&base, &color_plan, &first[0])?)), || rows.rest(&higher)),
+        || {
+            rayon::join(
+                || Ok::<_, Error>((rows.opacities(&opacities, &opacity_plan)?, rows.base(&base, &color_plan, &first[0])?)),
+                || rows.rest(&higher, width),
+            )
+        },
     );
     (out.means, out.quaternions) = (geometry.0?, geometry.1?);
     (out.opacity_logits, out.sh_dc) = appearance.0?;
@@ -75,16 +91,19 @@ pub fn read(streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>
     let mut exact = set.reader(EXACT)?;
     let columns = [(3, &mut out.means), (3, &mut out.log_scales), (4, &mut out.quaternions), (1, &mut out.opacity_logits), (3, &mut out.sh_dc)];
     for (width, values) in columns {
-        read_exact(&mut exact, (width, 0..width), n, values)?;
+        read_exact(&mut exact, (width, 0..width), shape.count, values)?;
     }
-    let width = 3 * sh_rest_len(shape.sh_degree);
-    let mut at = 0;
-    for (plan, _) in &higher {
-        read_exact(&mut exact, (width, at..at + plan.dims), n, &mut out.sh_rest)?;
-        at += plan.dims;
+    if whole {
+        let mut at = 0;
+        for (plan, _) in &higher {
+            read_exact(&mut exact, (width, at..at + plan.dims), n, &mut out.sh_rest)?;
+            at += plan.dims;
+        }
+        exact.finish()?;
     }
-    exact.finish()?;
-    shape.read_extra(&set, &mut out)?;
+    if whole || all && shape.has_extra(&set) {
+        shape.read_extra(&set, &mut out)?;
+    }
     out.validate("decoded Gaussians", &context.limits)?;
     Ok(out)
 }
@@ -159,11 +178,11 @@ impl Rows {
         })?;
         Ok(out)
     }
-    /// The higher degrees `[N, width]`. Those of a block follow each other, because the larger ones are predicted by the smaller ones.
-    fn rest(&self, degrees: &[(&Degree, Blocks)]) -> Result<Vec<f32>> {
-        let width: usize = degrees.iter().map(|d| d.0.dims).sum();
+    /// The higher degrees `[N, width]`; those that are not among `degrees` are 0. Those of a block follow each other, because the larger ones are predicted by
+    /// the smaller ones.
+    fn rest(&self, degrees: &[(&Degree, Blocks)], width: usize) -> Result<Vec<f32>> {
         let mut out = vec![0.0; width * self.len()];
-        if width == 0 {
+        if degrees.is_empty() {
             return Ok(out);
         }
         let bases: Vec<Vec<f32>> = degrees.iter().map(|d| d.0.scaled_basis()).collect();
@@ -188,38 +207,43 @@ fn impossible(name: &str, problem: impl Into<String>) -> Error {
     Error::data(format!("compact stream '{name}'"), problem, "The file is damaged; fetch or write it again")
 }
 
-/// A stream of numbers up to `most`, which is below 16.
-fn small(set: &StreamSet, name: &str, count: usize, most: u8) -> Result<Vec<u8>> {
-    let mut values = vec![0; count];
-    Blocks::read(name, set.reader(name)?, SMALL_CONTEXTS, count)?.decode_into(&mut values, 1, |coder, _, values| code_small(coder, values))?;
+/// Numbers up to `most`, which is below 16.
+fn small(set: &StreamSet, name: &str, layers: &[Range<usize>], most: u8) -> Result<Vec<u8>> {
+    let mut values = vec![0; layers.last().map_or(0, |l| l.end)];
+    Blocks::read(set, name, SMALL_CONTEXTS, layers)?.decode_into(&mut values, 1, |coder, _, values| code_small(coder, values))?;
     match values.iter().find(|v| **v > most) {
         Some(v) => Err(impossible(name, format!("{v} is over {most}"))),
         None => Ok(values),
     }
 }
 
-fn read_scores(mut stream: ByteReader, count: usize) -> Result<Vec<f32>> {
+/// The scores of the first `n` of `count` Gaussians.
+fn read_scores(mut stream: ByteReader, count: usize, n: usize) -> Result<Vec<f32>> {
     let form = Form::read(&mut stream)?;
     let escapes = column::read_escapes(&mut stream)?;
-    let values = column::read(&mut stream, form, count, &escapes)?;
+    let mut values = column::read(&mut stream, form, count, &escapes)?;
     stream.finish()?;
+    values.truncate(n);
     Ok(values)
 }
 
-/// Reads rows that are stored as they are into the columns `at` of `values` `[N,width]`: their number, their indices unless it is all, and their values.
-fn read_exact(stream: &mut ByteReader, (width, at): (usize, Range<usize>), n: usize, values: &mut [f32]) -> Result<()> {
-    let count = stream.u32()? as usize;
-    if count > n {
-        return Err(stream.error(format!("{count} exact values of {n} Gaussians")));
+/// Reads rows that are stored as they are into the columns `at` of `values` `[N,width]`, which may have the first rows only: their number, their indices
+/// unless it is all, and their values.
+fn read_exact(stream: &mut ByteReader, (width, at): (usize, Range<usize>), count: usize, values: &mut [f32]) -> Result<()> {
+    let stored = stream.u32()? as usize;
+    if stored > count {
+        return Err(stream.error(format!("{stored} exact values of {count} Gaussians")));
     }
-    let indices = if count == n { &[] } else { stream.take(count.saturating_mul(4))?.as_chunks::<4>().0 };
-    let exact = stream.f32s(count.saturating_mul(at.len()))?;
+    let indices = if stored == count { &[] } else { stream.take(stored.saturating_mul(4))?.as_chunks::<4>().0 };
+    let exact = stream.f32s(stored.saturating_mul(at.len()))?;
     for (k, exact) in exact.chunks_exact(at.len()).enumerate() {
         let row = indices.get(k).map_or(k, |b| u32::from_le_bytes(*b) as usize);
-        if row >= n {
-            return Err(stream.error(format!("an exact value of row {row} of {n}")));
+        if row >= count {
+            return Err(stream.error(format!("an exact value of row {row} of {count}")));
         }
-        values[row * width + at.start..row * width + at.end].copy_from_slice(exact);
+        if let Some(values) = values.get_mut(row * width + at.start..row * width + at.end) {
+            values.copy_from_slice(exact);
+        }
     }
     Ok(())
 }

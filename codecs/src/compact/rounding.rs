@@ -171,7 +171,7 @@ fn keep_exact(codes: &Integers, from: &HostGaussians, to: &mut HostGaussians) {
 #[cfg(test)]
 mod tests {
     use super::super::encode::{canonical, classify};
-    use super::super::{Choices, Job, Motion, importance};
+    use super::super::{Choices, Job, Motion, importance, layers};
     use super::*;
     use cc4dgs_format::{CodecContext, Limits, Seed, Silent};
 
@@ -197,8 +197,9 @@ mod tests {
             let importance = importance::estimate(&g, &limits);
             let classes = classify(&importance.weights, &importance.shapes, true);
             let motion = Motion { free: u8::from(free[0]), moving: None, levels: [0.0; 2] };
+            let layers = layers::assign(&importance.weights, 2);
             let choices = Choices { transform: true, rate_weight: 0.0 };
-            let job = Job { gaussians: &g, free, importance: &importance, classes, motion, choices, factors: [1.0; 6], limits: &limits };
+            let job = Job { gaussians: &g, free, importance: &importance, classes, layers, motion, choices, factors: [1.0; 6], limits: &limits };
             let plan = Plan::new(&g, &importance, &job.classes, 0.02, &[1.0; 6], &job.choices);
             let (attempt, order) = job.attempt_planned(&g, plan, 0.02).unwrap();
             let rounder = Rounder { plan: &attempt.plan, free: &job.free, classes: &job.classes };

@@ -1,5 +1,6 @@
 //! Settings, and the profiles that are short for them.
 
+use super::layers::MOST as MOST_LAYERS;
 use cc4dgs_format::{Error, Result, config, unknown_name};
 use serde::Deserialize;
 
@@ -16,6 +17,7 @@ shapes = true            # with --scene: steps of shapes by the weights of shape
 allocate = true          # with --scene: correct the steps of the columns by what a change of each costs and saves
 transform = true         # transform the colour coefficients of each degree
 canonical = true         # sort the axes of Gaussians whose shape does not change
+layers = 0               # sets of Gaussians by falling weight, which a player draws one by one while they arrive, up to 6; 0: 3 from 131,072 Gaussians on, else 1
 ";
 
 /// Settings of the codec.
@@ -46,6 +48,8 @@ pub struct Settings {
     pub transform: bool,
     /// Sort axes.
     pub canonical: bool,
+    /// Sets of Gaussians by falling weight; 0 chooses by their number.
+    pub layers: usize,
     /// Whether the user chose the loss of PSNR, which needs a scene.
     #[serde(skip)]
     pub drop_wanted: bool,
@@ -69,6 +73,7 @@ impl Default for Settings {
             allocate: true,
             transform: true,
             canonical: true,
+            layers: 0,
             drop_wanted: false,
             finetune_wanted: false,
         }
@@ -107,6 +112,7 @@ impl Settings {
             ("rate_weight", settings.rate_weight, 0.0..=4.0),
             ("finetune", settings.finetune as f64, 0.0..=1e6),
             ("size_weight", settings.size_weight, 0.0..=100.0),
+            ("layers", settings.layers as f64, 0.0..=MOST_LAYERS as f64),
         ];
         match bounds.into_iter().find(|(_, value, range)| !range.contains(value)) {
             Some((name, value, range)) => {

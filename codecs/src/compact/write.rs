@@ -4,10 +4,11 @@ use super::colors::{self, SMALL_CONTEXTS, code_small};
 use super::encode::{Classes, Integers, coefficients};
 use super::geometry::{KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
 use super::predict::{Known, Linear};
-use super::{VERSION, blocks};
+use super::{VERSION, blocks, layers};
 use cc4dgs_format::storage::column::{self, Target};
 use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams};
 use cc4dgs_format::{HostGaussians, Result, Stream};
+use std::slice;
 
 pub(super) const CLASSES: &str = "classes";
 pub(super) const SHAPES: &str = "shapes";
@@ -59,9 +60,9 @@ pub fn known_scales(color: u8, shape: u8, scales: &[i32; 3], scale_limit: u8, li
     out
 }
 
-/// All streams; `order` sorts the rows by their keys.
-pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &[usize]) -> Result<Vec<Stream>> {
-    let n = order.len();
+/// All streams; `order` sorts the rows by layer, of `sizes` rows each, and then by their keys.
+pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &[usize], sizes: &[usize]) -> Result<Vec<Stream>> {
+    let (n, ranges) = (order.len(), layers::ranges(sizes));
     let sorted = gaussians.select(order);
     let pick = |values: &[u8]| order.iter().map(|&i| values[i]).collect::<Vec<u8>>();
     let Classes { colors: classes, shapes, .. } = of.classes;
@@ -85,51 +86,53 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
     geometry.write(&mut meta);
     meta.extend([motion.free, u8::from(motion.moving.is_some())]);
     motion.levels.iter().for_each(|v| meta.extend(v.to_le_bytes()));
+    layers::write(sizes, &mut meta);
     [&scale_plan, &opacity_plan, &color_plan].iter().for_each(|plan| plan.write(&mut meta));
     of.plan.degrees.iter().for_each(|d| d.write(&mut meta));
 
-    let small = |name: &str, values: &[u8]| blocks::encode(name, SMALL_CONTEXTS, n, |coder, range| code_small(coder, &mut values[range].to_vec()));
+    let small = |name: &str, values: &[u8]| blocks::encode(name, SMALL_CONTEXTS, &ranges, |coder, range| code_small(coder, &mut values[range].to_vec()));
     let predicted = |name: &str, dims: usize, plan: &Linear, codes: &[i32], known: &[Known]| {
-        blocks::encode(name, Linear::contexts(dims), n, |coder, range| {
+        blocks::encode(name, Linear::contexts(dims), &ranges, |coder, range| {
             plan.code(coder, &mut codes[range.start * dims..range.end * dims].to_vec(), &known[range])
         })
     };
     let apart: Vec<u8> = rows().map(|(&c, &s)| s + APART - c).collect();
     let mut streams = vec![Stream { name: META.into(), bytes: meta }, Stream { name: EXACT.into(), bytes: write_exact(&sorted, of, order) }];
-    streams.extend([small(CLASSES, &classes)?, small(SHAPES, &apart)?]);
-    streams.push(match motion.moving {
-        Some(_) => small(MOVING, &moving)?,
-        None => {
-            let column = column::encode(&sorted.dynamic_scores, SCORE);
-            let mut bytes = Vec::new();
-            column.form.write(&mut bytes);
-            column::write_escapes(&column.escapes, &mut bytes);
-            bytes.extend(column.codes);
-            Stream { name: SCORES.into(), bytes }
-        }
-    });
-    streams.push(predicted(SCALES, 3, &scale_plan, scales.as_flattened(), &for_scales)?);
+    let mut columns = vec![small(CLASSES, &classes)?, small(SHAPES, &apart)?];
+    if motion.moving.is_some() {
+        columns.push(small(MOVING, &moving)?);
+    } else {
+        let column = column::encode(&sorted.dynamic_scores, SCORE);
+        let mut bytes = Vec::new();
+        column.form.write(&mut bytes);
+        column::write_escapes(&column.escapes, &mut bytes);
+        bytes.extend(column.codes);
+        streams.push(Stream { name: SCORES.into(), bytes });
+    }
+    columns.push(predicted(SCALES, 3, &scale_plan, scales.as_flattened(), &for_scales)?);
     let keys: Vec<u64> = order.iter().map(|&i| of.keys[i]).collect();
-    streams.push(blocks::encode(MEANS, KEY_CONTEXTS, n, |coder, range| {
+    columns.push(blocks::encode(MEANS, KEY_CONTEXTS, &ranges, |coder, range| {
         let shifts: Vec<u32> = range.clone().map(|i| geometry.position_shift(scales[i], shapes[i])).collect();
         code_keys(coder, &mut keys[range].to_vec(), &shifts)
     })?);
     let rotations: Vec<Rotation> = order.iter().map(|&i| of.rotations[i]).collect();
-    streams.push(blocks::encode(ROTATIONS, ROTATION_CONTEXTS, n, |coder, range| {
+    columns.push(blocks::encode(ROTATIONS, ROTATION_CONTEXTS, &ranges, |coder, range| {
         let shifts: Vec<(i32, bool)> = range.clone().map(|i| (geometry.rotation_shift(scales[i], shapes[i]), motion.is_free(i, &moving))).collect();
         code_rotations(coder, &mut rotations[range].to_vec(), &shifts)
     })?);
-    streams.push(predicted(OPACITIES, 1, &opacity_plan, &opacities, &for_opacities)?);
-    streams.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
-    let mut sizes = vec![0; n];
+    columns.push(predicted(OPACITIES, 1, &opacity_plan, &opacities, &for_opacities)?);
+    columns.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
+    let mut columns: Vec<_> = columns.into_iter().map(Vec::into_iter).collect();
+    ranges.iter().for_each(|_| streams.extend(columns.iter_mut().filter_map(Iterator::next)));
+    streams.extend(extra_streams(&sorted, Attributes::AsAllowed));
+    let (all, mut sizes) = (0..n, vec![0; n]);
     for (degree, (plan, codes)) in of.plan.degrees.iter().zip(&colors).enumerate().skip(1) {
-        streams.push(blocks::encode(color_name(degree), colors::CONTEXTS, n, |coder, range| {
+        streams.extend(blocks::encode(&color_name(degree), colors::CONTEXTS, slice::from_ref(&all), |coder, range| {
             let mut values = codes[range.start * plan.dims..range.end * plan.dims].to_vec();
             plan.code(coder, &mut values, &classes[range.clone()], &mut sizes[range].to_vec(), degree == 1)
         })?);
         plan.note(codes, &classes, &mut sizes);
     }
-    streams.extend(extra_streams(&sorted, Attributes::AsAllowed));
     Ok(streams)
 }
 

@@ -22,6 +22,20 @@ pub struct DeclaredLoss {
     pub relative_rms: f64,
 }
 
+/// When a player needs a stream of a codec. Files have streams in this order, with the motion between layers and harmonics.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum StreamStage {
+    /// More Gaussians, together with the streams of lower layers. Codecs without layers have layer 0 alone.
+    Layer(u8),
+    /// Nothing but colour coefficients of degree 1 and up.
+    Harmonics,
+}
+
+impl StreamStage {
+    /// All layers.
+    pub const BASE: Self = Self::Layer(u8::MAX);
+}
+
 /// Gaussians to bytes and back (paper Section IV-D for `cca`).
 pub trait AttributeCodec: Send + Sync {
     /// Encodes all attributes. Deterministic: equal Gaussians, settings and `context` give equal bytes.
@@ -30,6 +44,15 @@ pub trait AttributeCodec: Send + Sync {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>>;
     /// Decodes what [`AttributeCodec::encode`] wrote. Bytes are untrusted: an error, never a panic. `context` has no views, renderer and deformer.
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians>;
+    /// When a player needs the stream `name`.
+    fn stage(&self, _name: &str) -> StreamStage {
+        StreamStage::Layer(0)
+    }
+    /// Decodes the streams of [`StreamStage::Layer`], of all layers or of the first ones: the first rows of [`AttributeCodec::decode`]. [`HostGaussians::sh_rest`] is all
+    /// zeros where the codec has streams of [`StreamStage::Harmonics`]. Extra attributes are there where all layers are.
+    fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
+        self.decode(streams, context)
+    }
     /// The largest error of each attribute. Attributes that are not listed are bit-exact.
     fn losses(&self) -> Vec<DeclaredLoss>;
     /// Whether a decoded score is above [`CodecContext::dynamic_threshold`] if and only if the given one was, wherever the context of encoding states the threshold.

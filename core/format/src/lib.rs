@@ -32,7 +32,7 @@ mod tuning;
 mod weight_codec;
 
 pub use camera::Camera;
-pub use codec::{AttributeCodec, CodecPlugin, DeclaredLoss, Stream};
+pub use codec::{AttributeCodec, CodecPlugin, DeclaredLoss, Stream, StreamStage};
 pub use codec_context::{CodecContext, EvaluateDeformer, RenderModel, RenderedPlanes, TrainingViews, psnr_on_views};
 pub use deformer_context::DeformerContext;
 pub use error::{Error, Result};
@@ -46,7 +46,7 @@ pub use plugin::{Entries, Plugin, PluginEntry, split_kind, unknown_name};
 pub use rules::Rules;
 pub use seed::Seed;
 pub use similarity::Similarity;
-pub use stored_model::{FIELD_STREAMS, MOVING, StoredModel, read_gaussians, read_weights, weight_seed};
+pub use stored_model::{FIELD_STREAMS, MOVING, StoredModel, canonical_stages, read_gaussians, read_stage, read_weights, weight_seed};
 pub use tuning::{Rounding, TuneModel, TunedModel, Tuning};
 pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin};
 pub use {inventory, serde, toml};

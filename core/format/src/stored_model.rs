@@ -3,7 +3,10 @@
 use crate::archive::{Archive, CodecEntry, Manifest, StreamKind};
 use crate::playback::PlaybackLayer;
 use crate::plugin::{Entries, PluginEntry};
-use crate::{CodecContext, CodecPlugin, Error, EventSink, HostGaussians, Limits, Moving, Result, Seed, Stream, WeightArray, WeightCodecPlugin};
+use crate::{
+    AttributeCodec, CodecContext, CodecPlugin, Error, EventSink, HostGaussians, Limits, Moving, Result, Seed, Silent, Stream, StreamStage, WeightArray,
+    WeightCodecPlugin,
+};
 use std::path::Path;
 
 /// Key of the manifest's `extra` under which [`Moving`] is stored.
@@ -36,12 +39,7 @@ impl StoredModel {
         let manifest = archive.manifest().clone();
         let gaussians = read_gaussians(object, archive, limits, events)?;
         let moving = Moving::of_manifest(object, &manifest)?;
-        let streams = archive.read_kind(StreamKind::Playback)?;
-        let playback = if streams.is_empty() {
-            PlaybackLayer::computed(object, archive, &gaussians, moving, limits)?
-        } else {
-            Some(PlaybackLayer::decode(&streams, gaussians.len(), gaussians.sh_degree, limits)?)
-        };
+        let playback = PlaybackLayer::of_archive(object, archive, &gaussians, moving, limits)?;
         Ok(Self { manifest, gaussians, moving, playback })
     }
     /// Whether the model moves, so that it needs a deformer or a playback layer.
@@ -112,25 +110,51 @@ fn linked<P: PluginEntry>(object: &str, entry: &CodecEntry) -> Result<&'static P
     Ok(plugin)
 }
 
+/// The codec of `archive`, which must be linked, and the context of decoding with it.
+fn codec_of<'a>(object: &str, archive: &Archive, limits: &Limits, events: &'a dyn EventSink) -> Result<(Box<dyn AttributeCodec>, CodecContext<'a>)> {
+    let (manifest, entry) = (archive.manifest(), &archive.manifest().codec);
+    let codec = (linked::<CodecPlugin>(object, entry)?.build)(&entry.profile, &entry.settings)?;
+    Ok((codec, CodecContext::new(Seed::root(manifest.provenance.seed).child("codec"), *limits, events)))
+}
+
 /// The canonical Gaussians of `archive`, decoded by its codec, which must be linked; `object` names the archive in errors.
 ///
 /// # Errors
 /// [`Error::Unsupported`] for a codec that is not linked or has another version, [`Error::Data`] for streams that are damaged or contradict the manifest,
 /// [`Error::Limit`].
 pub fn read_gaussians(object: &str, archive: &Archive, limits: &Limits, events: &dyn EventSink) -> Result<HostGaussians> {
-    let manifest = archive.manifest();
-    let entry = &manifest.codec;
-    let codec = (linked::<CodecPlugin>(object, entry)?.build)(&entry.profile, &entry.settings)?;
-    let context = CodecContext::new(Seed::root(manifest.provenance.seed).child("codec"), *limits, events);
+    let (codec, context) = codec_of(object, archive, limits, events)?;
     let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
+    checked(object, archive, limits, gaussians, true)
+}
+
+/// The stage of each canonical stream of `archive`, in file order.
+///
+/// # Errors
+/// [`Error::Unsupported`] for a codec that is not linked or has another version.
+pub fn canonical_stages(object: &str, archive: &Archive) -> Result<Vec<StreamStage>> {
+    let (codec, _) = codec_of(object, archive, &Limits::default(), &Silent)?;
+    Ok(archive.stream_sizes().iter().filter(|s| s.kind == StreamKind::Canonical).map(|s| codec.stage(&s.name)).collect())
+}
+
+/// The Gaussians of the layers up to `stage`: those of [`read_gaussians`] or the first of them, as [`AttributeCodec::decode_stage`] gives them.
+///
+/// # Errors
+/// As [`read_gaussians`].
+pub fn read_stage(object: &str, archive: &Archive, stage: StreamStage, limits: &Limits, events: &dyn EventSink) -> Result<HostGaussians> {
+    let (codec, context) = codec_of(object, archive, limits, events)?;
+    let streams = archive.read_those(|info| info.kind == StreamKind::Canonical && codec.stage(&info.name) <= stage)?;
+    checked(object, archive, limits, codec.decode_stage(&streams, &context)?, stage >= StreamStage::BASE)
+}
+
+/// `gaussians`, where they are what the manifest says, or the first of them.
+fn checked(object: &str, archive: &Archive, limits: &Limits, gaussians: HostGaussians, all: bool) -> Result<HostGaussians> {
     gaussians.validate(object, limits)?;
-    if gaussians.len() as u64 != manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
+    let (manifest, found) = (archive.manifest(), gaussians.len() as u64);
+    if found > manifest.gaussian_count || all && found < manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
         let problem = format!(
-            "the manifest says {} Gaussians of degree {}, the streams hold {} of degree {}",
-            manifest.gaussian_count,
-            manifest.sh_degree,
-            gaussians.len(),
-            gaussians.sh_degree
+            "the manifest says {} Gaussians of degree {}, the streams hold {found} of degree {}",
+            manifest.gaussian_count, manifest.sh_degree, gaussians.sh_degree
         );
         return Err(Error::data(object, problem, "The archive is damaged; fetch it again"));
     }

@@ -11,12 +11,22 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
     AttributeCodec, CodecContext, Deformer, Error, EventSink, FIELD_STREAMS, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream,
-    TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
+    StreamStage, TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
 };
 use serde::Serialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
+
+/// What is wrong with settings of a file is not the user's mistake.
+fn stored_settings(object: &str, error: Error) -> Error {
+    match error {
+        Error::Parameter { object: setting, problem, .. } => {
+            Error::data(object, format!("{setting}: {problem}"), "The file is damaged or of another version; fetch or write it again")
+        }
+        other => other,
+    }
+}
 
 /// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
 const ATTRIBUTES: &str = "attributes";
@@ -63,7 +73,7 @@ impl Model {
                 check_version(object, "deformer", &entry.name, &entry.version, known)?;
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
-                let mut field = registry.build_deformer(&section, &entry.context, device)?;
+                let mut field = registry.build_deformer(&section, &entry.context, device).map_err(|e| stored_settings(object, e))?;
                 let weights = read_weights(object, archive, &entry.weights, limits, events)?;
                 load_weights(object, field.as_mut(), weights, device)?;
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
@@ -138,7 +148,9 @@ impl Model {
             let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
             return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
         }
-        let streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
+        let mut streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
+        streams.sort_by_key(|s| codec.stage(&s.name));
+        let harmonics = streams.split_off(streams.partition_point(|s| codec.stage(&s.name) < StreamStage::Harmonics));
         let mut field_streams = Vec::new();
         let deformer = match field {
             None => None,
@@ -187,7 +199,9 @@ impl Model {
             extra,
             ..Default::default()
         };
-        Ok(ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams))
+        // In the order in which a player needs them.
+        let writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams);
+        Ok(writer.add_all(StreamKind::Canonical, harmonics))
     }
     /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
     fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {

@@ -164,7 +164,11 @@ impl Archive {
     }
     /// Reads all streams of `kind`, in file order.
     pub fn read_kind(&self, kind: StreamKind) -> Result<Vec<Stream>> {
-        let entries: Vec<&Entry> = self.entries.iter().filter(|e| e.info.kind == kind).collect();
+        self.read_those(|info| info.kind == kind)
+    }
+    /// Reads the streams that are `wanted`, in file order.
+    pub(crate) fn read_those(&self, wanted: impl Fn(&StreamInfo) -> bool) -> Result<Vec<Stream>> {
+        let entries: Vec<&Entry> = self.entries.iter().filter(|e| wanted(&e.info)).collect();
         entries.into_par_iter().map(|e| Ok(Stream { name: e.info.name.clone(), bytes: self.read_entry(e)? })).collect()
     }
     fn read_entry(&self, entry: &Entry) -> Result<Vec<u8>> {

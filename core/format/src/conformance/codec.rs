@@ -2,7 +2,7 @@
 
 use super::uniform;
 use crate::gaussians::sh_rest_len;
-use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, NeededRows, Result, Seed, Silent, Stream};
+use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, NeededRows, Result, Seed, Silent, Stream, StreamStage};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Name of the extra attribute that identifies the Gaussians after a codec has reordered them.
@@ -17,6 +17,7 @@ const DAMAGES: usize = 24;
 /// - The error of each column is at most the declared one.
 /// - Equal inputs give equal bytes.
 /// - Sets of no Gaussians and of one Gaussian can be stored; Gaussians that are not finite are refused.
+/// - The streams of the first layers hold the first rows of the whole, without harmonics where these have streams of their own.
 /// - Truncated, damaged and missing streams give an error or valid Gaussians within the limits, never a panic.
 ///
 /// `profile` is the part after the colon of `name:profile`; `settings` can make an expensive codec fast.
@@ -38,6 +39,9 @@ pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec
         note(&format!("{count} Gaussians of degree {degree}"), comes_back(codec, &scene(count, degree)));
     }
     note("repeats", repeats(codec));
+    for (count, degree) in [(0, 1), (1, 2), (300, 3)] {
+        note(&format!("stages of {count} Gaussians"), arrives_in_stages(codec, &scene(count, degree)));
+    }
     note("values that are not finite", refuses_what_is_not_finite(codec));
     note("damaged streams", survives_damage(codec));
     findings
@@ -166,6 +170,36 @@ fn repeats(codec: &dyn AttributeCodec) -> Result<Option<String>> {
     Ok((a != b).then(|| "two decodings of the same streams differ".into()))
 }
 
+fn arrives_in_stages(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Option<String>> {
+    let streams = codec.encode(given, &context())?;
+    let whole = codec.decode(&streams, &context())?;
+    let mut stages: Vec<StreamStage> = streams.iter().map(|s| codec.stage(&s.name)).collect();
+    stages.sort_unstable();
+    stages.dedup();
+    let (apart, layers) = (stages.contains(&StreamStage::Harmonics), stages.iter().filter(|s| **s < StreamStage::Harmonics));
+    let (mut before, last) = (0, layers.clone().max().copied());
+    for &stage in layers {
+        let arrived: Vec<Stream> = streams.iter().filter(|s| codec.stage(&s.name) <= stage).cloned().collect();
+        let found = codec.decode_stage(&arrived, &context())?;
+        let (rows, complete) = (found.len(), Some(stage) == last);
+        if rows < before || rows > whole.len() || complete && rows < whole.len() || found.sh_degree != whole.sh_degree {
+            return Ok(Some(format!("{stage:?} has {rows} of {} Gaussians; the one before had {before}", whole.len())));
+        }
+        for ((name, width, part), (_, _, all)) in found.columns().into_iter().zip(whole.columns()) {
+            let zero = apart && name == "sh_rest";
+            let same = |(a, b): (&f32, &f32)| if zero { *a == 0.0 } else { a.to_bits() == b.to_bits() };
+            if part.len() != rows * width || !part.iter().zip(all).all(same) {
+                return Ok(Some(format!("{name} of {stage:?} is not that of the first rows of the whole, or not zero where harmonics are apart")));
+            }
+        }
+        if complete && found.extra != whole.extra {
+            return Ok(Some(format!("extra attributes of {stage:?}, which has all Gaussians, are not those of the whole")));
+        }
+        before = rows;
+    }
+    Ok(None)
+}
+
 fn refuses_what_is_not_finite(codec: &dyn AttributeCodec) -> Result<Option<String>> {
     for value in [f32::NAN, f32::INFINITY] {
         let mut given = scene(20, 1);
@@ -207,12 +241,14 @@ fn survives_damage(codec: &dyn AttributeCodec) -> Result<Option<String>> {
         tries.push((format!("'{name}' has trailing bytes"), longer));
     }
     for (what, streams) in tries {
-        match catch_unwind(AssertUnwindSafe(|| codec.decode(&streams, &context))) {
-            Err(_) => return Ok(Some(format!("it panics where {what}"))),
-            Ok(Err(_)) => {}
-            Ok(Ok(found)) => {
-                if found.validate("decoded", &limits).is_err() {
-                    return Ok(Some(format!("invalid Gaussians were returned where {what}")));
+        for decode in [AttributeCodec::decode, AttributeCodec::decode_stage] {
+            match catch_unwind(AssertUnwindSafe(|| decode(codec, &streams, &context))) {
+                Err(_) => return Ok(Some(format!("it panics where {what}"))),
+                Ok(Err(_)) => {}
+                Ok(Ok(found)) => {
+                    if found.validate("decoded", &limits).is_err() {
+                        return Ok(Some(format!("invalid Gaussians were returned where {what}")));
+                    }
                 }
             }
         }

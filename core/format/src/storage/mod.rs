@@ -3,7 +3,7 @@
 //! * [`Shape`], [`StreamSet`], [`open`], [`assemble`], [`close`]: the common structure of codecs. A `meta` stream holds a version, the number of Gaussians, the
 //!   degree and the extra attributes; a decoder reads and checks them before it allocates memory.
 //! * [`extra_streams`], [`Shape::read_extra`]: the extra attributes of plug-ins, bit for bit or within their tolerance, in the rows that are needed.
-//! * [`mod@column`], [`store`], [`load`], [`split`], [`interleave`]: columns of codes with few bits, outliers stored exactly in a separate list.
+//! * [`mod@column`], [`store`], [`load`], [`split`], [`interleave`], [`skip`]: columns of codes with few bits, outliers stored exactly in a separate list.
 //! * [`to_planes`], [`from_planes`]: float32 values, column by column.
 //! * [`write_shapes`], [`read_shapes`]: names and shapes of a deformer's weights.
 //!
@@ -44,6 +44,6 @@ mod streams;
 
 pub use column::relative_rms;
 pub use extra::{Attributes, extra_streams};
-pub use rows::{interleave, load, split, store};
+pub use rows::{interleave, load, skip, split, store};
 pub use shapes::{read_shapes, value_count, write_shapes};
-pub use streams::{ESCAPES, META, Shape, StreamSet, assemble, close, from_planes, open, to_planes};
+pub use streams::{ESCAPES, HARMONICS, META, Shape, StreamSet, assemble, close, from_planes, open, stage_of_column, to_planes};

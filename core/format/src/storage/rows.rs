@@ -24,6 +24,15 @@ pub fn load(mut codes: ByteReader, count: usize, width: usize, meta: &mut ByteRe
     Ok(columns)
 }
 
+/// Passes over `width` columns of [`store`] whose codes are not there. Rows of zeros `[count,width]` stand in for them.
+pub fn skip(count: usize, width: usize, meta: &mut ByteReader, escapes: &mut ByteReader) -> Result<Vec<f32>> {
+    for _ in 0..width {
+        Form::read(meta)?;
+        column::read_escapes(escapes)?;
+    }
+    Ok(vec![0.0; count * width])
+}
+
 /// The columns of `rows` `[N,width]`.
 pub fn split(rows: &[f32], width: usize) -> Vec<Vec<f32>> {
     (0..width).map(|c| rows.iter().skip(c).step_by(width).copied().collect()).collect()

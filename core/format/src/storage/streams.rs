@@ -3,13 +3,22 @@
 use super::extra::{self, Attributes, extra_streams};
 use crate::archive::ByteReader;
 use crate::gaussians::sh_rest_len;
-use crate::{Error, HostGaussians, Limits, Result, Stream};
+use crate::{Error, HostGaussians, Limits, Result, Stream, StreamStage};
 
 /// The stream that describes the others.
 pub const META: &str = "meta";
 
 /// The stream with the values outside the range of their quantiser.
 pub const ESCAPES: &str = "escapes";
+
+/// The column of colour coefficients of degree 1 and up.
+pub const HARMONICS: &str = "sh_rest";
+
+/// [`crate::AttributeCodec::stage`] of codecs that store this column in a stream of its name, and in others whose names begin with it and a dot.
+pub fn stage_of_column(name: &str) -> StreamStage {
+    let harmonics = name.strip_prefix(HARMONICS).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+    if harmonics { StreamStage::Harmonics } else { StreamStage::Layer(0) }
+}
 
 /// The streams of a decoder, by name.
 pub struct StreamSet<'a> {
@@ -21,6 +30,10 @@ impl<'a> StreamSet<'a> {
     /// The streams of a decoder; `codec` is the name in errors.
     pub fn new(codec: &'static str, streams: &'a [Stream]) -> Self {
         Self { codec, streams }
+    }
+    /// Whether there is a stream `name`.
+    pub fn has(&self, name: &str) -> bool {
+        self.streams.iter().any(|s| s.name == name)
     }
     /// A reader over the stream `name`.
     ///
@@ -136,6 +149,10 @@ impl Shape {
         }
         limits.check_bytes("decoded Gaussians", count.saturating_mul(4 * floats))?;
         Ok(Self { count: count as usize, sh_degree, extra })
+    }
+    /// Whether the streams of all extra attributes are there.
+    pub fn has_extra(&self, set: &StreamSet) -> bool {
+        self.extra.iter().all(|(name, _)| set.has(&extra::stream_name(name)))
     }
     /// Reads the extra attributes back into `gaussians`.
     pub fn read_extra(&self, set: &StreamSet, gaussians: &mut HostGaussians) -> Result<()> {

@@ -2,7 +2,7 @@
 
 use super::Baked;
 use cc4dgs_core::archive::{Archive, ArchiveWriter, Presentation, StreamKind};
-use cc4dgs_core::{Error, Result, Stream};
+use cc4dgs_core::{Error, Result, Stream, StreamStage, canonical_stages};
 
 /// Key of the manifest's `extra` with the figures of the layer.
 pub const PLAYBACK: &str = "playback";
@@ -28,7 +28,7 @@ pub struct Additions<'a> {
 }
 
 /// The bytes of `archive` with `additions`. A poster that it has already is replaced or dropped. Streams come in the order in which a player
-/// needs them: poster, Gaussians, playback layer, field, all others.
+/// needs them: poster, Gaussians, their motion (the playback layer, or without one the field), harmonics where the codec has them apart, all others.
 ///
 /// # Errors
 /// What reading and writing report.
@@ -52,11 +52,16 @@ pub fn with_additions(archive: &Archive, additions: Additions) -> Result<Vec<u8>
     if let Some(bytes) = additions.poster {
         writer = writer.add(StreamKind::Poster, Stream { name: "poster".into(), bytes });
     }
-    writer = writer.add_all(StreamKind::Canonical, archive.read_kind(StreamKind::Canonical)?).add_all(StreamKind::Playback, layer);
+    let mut canonical: Vec<(StreamStage, Stream)> =
+        canonical_stages("the archive", archive)?.into_iter().zip(archive.read_kind(StreamKind::Canonical)?).collect();
+    canonical.sort_by_key(|(stage, _)| *stage);
+    let harmonics = canonical.split_off(canonical.partition_point(|(stage, _)| *stage < StreamStage::Harmonics));
+    let streams = |staged: Vec<(StreamStage, Stream)>| staged.into_iter().map(|(_, stream)| stream);
+    let field = if additions.without_field { Vec::new() } else { archive.read_kind(StreamKind::Field)? };
+    let (motion, unused) = if layer.is_empty() { (field, Vec::new()) } else { (Vec::new(), field) };
+    writer = writer.add_all(StreamKind::Canonical, streams(canonical)).add_all(StreamKind::Playback, layer).add_all(StreamKind::Field, motion);
+    writer = writer.add_all(StreamKind::Canonical, streams(harmonics)).add_all(StreamKind::Field, unused);
     let mut kinds = vec![StreamKind::Meta];
-    if !additions.without_field {
-        kinds.insert(0, StreamKind::Field);
-    }
     for stream in archive.stream_sizes() {
         if let StreamKind::Other(_) = stream.kind
             && !kinds.contains(&stream.kind)
