@@ -4,7 +4,7 @@
 PAGE is the folder of apps/player/build-web. The model is a room of `cc4dgs bench frame`, as large as published scenes: 335,000 Gaussians at 1352x1014, of which
 12 % move. It is stored with a playback layer (`--archive`), and page and tile renderer look from the same camera. Prints JSON: bytes of the bundle (gzipped) and of
 the archive, milliseconds from the last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the device `flex`,
-deformer included; the medians of alternating rounds. Needs playwright, and Chromium on the path.
+deformer included; the medians of alternating rounds. Frames of WebGL2 do not wait for the worker that sorts. Needs playwright, and Chromium on the path.
 """
 import argparse, gzip, json, pathlib, statistics, subprocess, tempfile
 from chromium import launch, serve

@@ -1,12 +1,13 @@
 //! Every exporter of this crate with the conformance suite.
 
-use cc4dgs_exporters::web::PAGE_FILES;
+use cc4dgs_exporters::web::{PAGE_FILES, PAGE_VERSION};
 use cc4dgs_format::{Entries, ExporterPlugin, config, conformance};
 
 #[test]
 fn every_exporter_conforms() {
     let folder = tempfile::tempdir().unwrap();
-    PAGE_FILES.iter().for_each(|name| std::fs::write(folder.path().join(name), format!("/* {name} */")).unwrap());
+    let text = |name: &str| format!("/* {name} */\nexport const PAGE_VERSION = {PAGE_VERSION};\n");
+    PAGE_FILES.iter().for_each(|name| std::fs::write(folder.path().join(name), text(name)).unwrap());
     let page = toml::Table::from_iter([("page".to_string(), folder.path().to_str().unwrap().into())]);
     let exporters: Vec<_> = Entries::<ExporterPlugin>::collect().unwrap().iter().collect();
     let settings = |plugin: &ExporterPlugin| if plugin.info.capabilities.contains(&"player") { page.clone() } else { toml::Table::new() };

@@ -126,13 +126,10 @@ impl Scene {
     /// [`Error::Limit`] for more coefficients than a 32-bit index reaches.
     pub fn new(gaussians: &HostGaussians, layer: Option<PlaybackLayer>) -> Result<Self> {
         let n = gaussians.len();
-        let mut still = vec![true; n];
-        let rows: Vec<usize> = layer.iter().flat_map(|l| &l.rows).map(|&r| r as usize).collect();
-        rows.iter().for_each(|&row| still[row] = false);
-        let order: Vec<usize> = rows.iter().copied().chain((0..n).filter(|&i| still[i])).collect();
+        let order = order(n, layer.as_ref());
         let mut out = Self {
             count: n,
-            moving: rows.len(),
+            moving: layer.as_ref().map_or(0, |l| l.rows.len()),
             sh_degree: gaussians.sh_degree,
             bounds: bounds(&gaussians.means),
             reach: bounds(&gaussians.means),
@@ -142,14 +139,12 @@ impl Scene {
             antialiased: false,
             square: false,
             gaussians: Vec::with_capacity(GAUSSIAN_FLOATS * n),
-            harmonics: Vec::new(),
+            harmonics: harmonics(gaussians, &order),
             starts: Vec::new(),
             coefficients: Vec::new(),
             layer: None,
             tracks: Vec::new(),
         };
-        let rest = 3 * sh_rest_len(gaussians.sh_degree);
-        out.harmonics.reserve(n * out.harmonics_words());
         for &i in &order {
             let q = &gaussians.quaternions[4 * i..4 * i + 4];
             let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
@@ -159,13 +154,22 @@ impl Scene {
             let (m, s, d) = (&gaussians.means[3 * i..3 * i + 3], &gaussians.log_scales[3 * i..3 * i + 3], &gaussians.sh_dc[3 * i..3 * i + 3]);
             out.gaussians.extend([m[0], m[1], m[2], opacity, s[0], s[1], s[2], 0.0]);
             out.gaussians.extend([unit(q[0]), unit(q[1]), unit(q[2]), unit(q[3]), d[0], d[1], d[2], 0.0]);
-            out.harmonics.extend(gaussians.sh_rest[rest * i..rest * (i + 1)].chunks(2).map(pair_of_halves));
         }
         if let Some(layer) = layer {
             out.reach = reach(&gaussians.means, out.reach, &layer);
             out.set_layer(layer)?;
         }
         Ok(out)
+    }
+    /// The coefficients of degree 1 and up of `gaussians`, which the scene was made of before these had arrived, as `harmonics` holds them.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for other Gaussians.
+    pub(crate) fn harmonics_of(&self, gaussians: &HostGaussians) -> Result<Vec<u32>> {
+        if (gaussians.len(), gaussians.sh_degree) != (self.count, self.sh_degree) {
+            return Err(Error::data("colour coefficients", "they are those of another model", "Load it again"));
+        }
+        Ok(harmonics(gaussians, &order(self.count, self.layer.as_ref())))
     }
     /// Words of harmonics per Gaussian.
     pub(crate) fn harmonics_words(&self) -> usize {
@@ -194,6 +198,21 @@ impl Scene {
     pub fn gpu_bytes(&self) -> u64 {
         4 * (self.gaussians.len() + self.harmonics.len() + self.starts.len() + self.coefficients.len()) as u64
     }
+}
+
+/// The rows of `n` Gaussians, those first that `layer` moves.
+fn order(n: usize, layer: Option<&PlaybackLayer>) -> Vec<usize> {
+    let mut still = vec![true; n];
+    let rows: Vec<usize> = layer.into_iter().flat_map(|l| &l.rows).map(|&r| r as usize).collect();
+    rows.iter().for_each(|&row| still[row] = false);
+    rows.into_iter().chain((0..n).filter(|&i| still[i])).collect()
+}
+
+fn harmonics(gaussians: &HostGaussians, order: &[usize]) -> Vec<u32> {
+    let rest = 3 * sh_rest_len(gaussians.sh_degree);
+    let mut out = Vec::with_capacity(order.len() * rest.div_ceil(2));
+    order.iter().for_each(|&i| out.extend(gaussians.sh_rest[rest * i..rest * (i + 1)].chunks(2).map(pair_of_halves)));
+    out
 }
 
 fn pair_of_halves(pair: &[f32]) -> u32 {
@@ -258,6 +277,27 @@ mod tests {
         assert_eq!(scene.bounds, [[0.0, 1.0, 2.0], [9.0, 10.0, 11.0]]);
         // Two functions of 0 to 1 with coefficients of 1.
         assert_eq!(scene.reach, [[0.0, 1.0, 2.0], [11.0, 12.0, 13.0]]);
+    }
+
+    #[test]
+    fn harmonics_that_arrive_later_are_those_of_the_whole() {
+        let whole = HostGaussians {
+            sh_degree: 1,
+            means: vec![0.0; 9],
+            log_scales: vec![0.0; 9],
+            quaternions: [1.0, 0.0, 0.0, 0.0].repeat(3),
+            opacity_logits: vec![0.0; 3],
+            sh_dc: vec![0.0; 9],
+            sh_rest: (0..27).map(|v| v as f32).collect(),
+            dynamic_scores: vec![0.0; 3],
+            ..Default::default()
+        };
+        let layer = || Some(PlaybackLayer { rows: vec![2], samples: 1, sh_degree: 1, segments: vec![Segment { first: 0, last: 0, tracks: Vec::new() }] });
+        let base = Scene::new(&HostGaussians { sh_rest: vec![0.0; 27], ..whole.clone() }, layer()).unwrap();
+        let complete = Scene::new(&whole, layer()).unwrap();
+        assert!(base.harmonics.iter().all(|v| *v == 0) && complete.harmonics[0] == pair_of_halves(&[18.0, 19.0]));
+        assert_eq!(base.harmonics_of(&whole).unwrap(), complete.harmonics);
+        assert!(base.harmonics_of(&whole.select(&[0, 1])).is_err());
     }
 
     #[test]

@@ -1,7 +1,9 @@
-// Fetches a model and shows what has arrived: poster, then the Gaussians, then their motion. Ranges where the server has them, else the whole file; streams that only
-// the desktop needs are not fetched.
+// Fetches a model and shows what has arrived: poster, then the Gaussians in colours of degree 0, layer by layer, then their motion, then the harmonics. Ranges where the
+// server has them, else the whole file; streams that only the desktop needs are not fetched.
 
 const FIRST = 65536;
+// All layers.
+const BASE = 255;
 const MAGIC = [0x89, 0x43, 0x43, 0x34, 0x44, 0x0d, 0x0a, 0x1a];
 
 /// Calls `sink(offset, bytes)` with all that arrives of `response`, which begins at byte `offset`, until it returns false.
@@ -30,11 +32,18 @@ class Progress {
         this.arrived = 0;
         this.header = 0;
         this.streams = null;
-        this.shown = { poster: false, base: false, motion: false };
+        this.shown = { poster: false, layer: -1, motion: false, harmonics: false };
+    }
+    /// The last layer of which, and of those before, everything is there: -1 for none, BASE for all.
+    get layer() {
+        const missing = this.streams.filter(s => s.kind === "canonical" && this.arrived < s.offset + s.bytes).map(s => s.layer);
+        const first = Math.min(...missing);
+        if (!missing.length) return BASE;
+        return Math.max(-1, ...this.streams.filter(s => s.kind === "canonical" && s.layer < first).map(s => s.layer));
     }
     end(kind) { return Math.max(0, ...this.streams.filter(s => s.kind === kind).map(s => s.offset + s.bytes)); }
     /// Bytes that a player needs; the rest of the file is not fetched.
-    get needed() { return this.streams ? Math.max(this.header, this.end("canonical"), this.end("playback")) : this.total; }
+    get needed() { return this.streams ? Math.max(this.header, ...["canonical", "playback", "harmonics"].map(kind => this.end(kind))) : this.total; }
     put(offset, bytes) {
         this.download.put(offset, bytes);
         this.arrived = Math.max(this.arrived, offset + bytes.length);
@@ -45,21 +54,25 @@ class Progress {
         if (!this.header && this.arrived >= Math.min(24, this.total)) this.header = this.download.headerEnd();
         if (this.header && !this.streams && this.arrived >= Math.min(this.header, this.total)) this.streams = JSON.parse(this.download.streams());
         if (!this.streams) return true;
-        const has = kind => this.arrived >= this.end(kind);
-        if (!this.shown.poster && this.end("poster") && has("poster")) { this.shown.poster = true; this.show.poster(this.download.poster()); }
-        this.show.progress(this.arrived / this.needed, this.arrived);
-        const motion = this.arrived >= this.needed;
+        const { shown, show, download } = this, has = kind => this.arrived >= this.end(kind);
+        if (!shown.poster && this.end("poster") && has("poster")) { shown.poster = true; show.poster(download.poster()); }
+        show.progress(this.arrived / this.needed, this.arrived);
         // A file that is there as a whole is decoded once.
-        if (!motion && !this.shown.base && has("canonical")) { this.shown.base = true; this.show.part(this.download, false, true); }
-        if (motion && !this.shown.motion) {
-            this.shown.motion = true;
-            this.show.part(this.download, true, !this.shown.base);
-            return false;
+        const all = this.arrived >= this.needed, motion = all || (this.end("playback") > 0 && has("canonical") && has("playback")), { layer } = this;
+        if (motion && !shown.motion) {
+            show.part(download, BASE, true, has("harmonics"), shown.layer < 0);
+            [shown.layer, shown.motion, shown.harmonics] = [BASE, true, has("harmonics")];
+        } else if (layer > shown.layer) {
+            show.part(download, layer, false, layer === BASE && has("harmonics"), shown.layer < 0);
+            shown.layer = layer;
+        } else if (all && !shown.harmonics) {
+            show.harmonics(download);
+            shown.harmonics = true;
         }
-        return true;
+        return !all;
     }
     finish() {
-        if (!this.shown.motion) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
+        if (!this.shown.harmonics) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
     }
 }
 
@@ -71,7 +84,7 @@ export function nameOf(path) {
 
 function isArchive(bytes) { return MAGIC.every((b, i) => bytes[i] === b); }
 
-/// Loads `url`; `show` has poster(bytes), part(download, motion, first), whole(name, bytes), progress(share, bytes).
+/// Loads `url`; `show` has poster(bytes), part(download, layer, motion, harmonics, first), harmonics(download), whole(name, bytes), progress(share, bytes).
 export async function loadUrl(wasm, url, show, signal) {
     const name = nameOf(url);
     const get = async headers => {

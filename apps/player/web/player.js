@@ -12,6 +12,9 @@ import { addGestures, addKeys } from "./gestures.js";
 import { WebGl } from "./webgl.js";
 import { build } from "./controls.js";
 
+// What exports need of a page: raise it together with PAGE_VERSION in exporters/src/web/page.rs where archives need a newer one.
+export const PAGE_VERSION = 2;
+
 let ready;
 
 export async function createPlayer(container, options = {}) {
@@ -22,9 +25,8 @@ export async function createPlayer(container, options = {}) {
         ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined);
         await ready;
         await player.start();
-        if (src) await player.load(src, options.name);
-        player.followLink();
-        if (autoplay && src) player.play();
+        if (src) await player.load(src, options.name, { autoplay });
+        else player.followLink();
     } catch (e) {
         player.fail(e);
     }
@@ -75,7 +77,8 @@ class Page {
         }
         // A lost context stays that of its canvas until the browser restores it.
         if (this.gl?.lost) await new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
-        this.gl = new WebGl(this.ui.canvas);
+        this.gl?.free();
+        this.gl = new WebGl(this.ui.canvas, () => { this.dirty = true; });
         this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height);
     }
     commands(act) {
@@ -97,17 +100,19 @@ class Page {
         this.emit("error", { message });
     }
     // Loading
-    async load(source, name) {
+    /// `first` is for the model that a page opens with: it takes time and pose of the link when it is seen, and plays when it can (`autoplay`).
+    async load(source, name, first = null) {
         this.abort?.abort();
         this.abort = new AbortController();
         const { signal } = this.abort;
         const again = source === this.source && this.facts;
         const kept = again ? { pose: this.gpu.pose, time: this.gpu.time } : null;
-        [this.source, this.name] = [source, name];
+        [this.source, this.name, this.first] = [source, name, first];
         this.ui.loading(true);
         const show = {
             poster: bytes => { if (bytes && !this.facts) this.ui.poster(bytes); },
-            part: (download, motion, first) => this.loaded(JSON.parse(this.gpu.openPart(download, motion, first))),
+            part: (download, ...what) => this.loaded(JSON.parse(this.gpu.openPart(download, ...what))),
+            harmonics: download => { this.gpu.openHarmonics(download); this.gl?.loadHarmonics(this.gpu); this.draw(); },
             whole: (name, bytes) => this.loaded(JSON.parse(this.gpu.open(name, bytes))),
             progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
         };
@@ -140,9 +145,12 @@ class Page {
     }
     loaded(facts) {
         this.facts = facts;
-        this.gl?.load(this.gpu);
+        this.gl?.load(this.gpu, facts.moving);
         this.ui.facts(facts);
         this.apply();
+        const { first } = this;
+        if (first && !first.followed) { first.followed = true; this.followLink(); }
+        if (first?.autoplay && facts.frames > 1) { this.first = null; this.play(); }
         this.draw();
         this.ui.poster(null);
     }

@@ -1,5 +1,7 @@
 // Drawing with WebGL2, for browsers without WebGPU. Motion, projection and colour are computed in the vertex shader from data textures; the order, nearest last, comes
-// from the module. The formulas are those of src/shaders.
+// from sort.js. The formulas are those of src/shaders.
+
+import { Sorter, sortable } from "./sort.js";
 
 const WIDTH = 2048;
 
@@ -145,8 +147,11 @@ in vec2 place;
 out vec4 result;
 void main() { vec4 seen = texture(image, place); result = vec4(seen.rgb + (1.0 - seen.a) * frame[8].rgb, 1.0); }`;
 
+const NONE = new Uint32Array(0);
+
 export class WebGl {
-    constructor(canvas) {
+    /// Calls `changed` when a newer order has arrived, so that the frame is worth drawing again.
+    constructor(canvas, changed) {
         const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" });
         if (!gl) throw new Error("This browser has neither WebGPU nor WebGL2. Use a current browser, or open the file with `cc4dgs view`.");
         if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
@@ -154,18 +159,26 @@ export class WebGl {
         }
         this.gl = gl;
         this.canvas = canvas;
+        this.changed = changed;
         this.draws = this.program(VERTEX, FRAGMENT);
         this.presents = this.program(COVER, PRESENT);
-        this.order = gl.createBuffer();
+        this.indices = gl.createBuffer();
         this.array = gl.createVertexArray();
         gl.bindVertexArray(this.array);
-        gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
+        gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
         gl.enableVertexAttribArray(0);
         gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
         gl.vertexAttribDivisor(0, 1);
         this.empty = gl.createVertexArray();
         this.textures = {};
+        this.sorter = null;
+        // The order in `indices`.
+        this.uploaded = null;
+        // Gaussians of the last interactive frame, and whether it had the order of its own view.
+        [this.visible, this.settled] = [0, false];
     }
+    /// Ends the worker. The context stays that of the canvas.
+    free() { this.sorter?.close(); }
     get name() {
         const info = this.gl.getExtension("WEBGL_debug_renderer_info");
         return `WebGL2 ${info ? this.gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""}`;
@@ -200,14 +213,25 @@ export class WebGl {
         for (const which of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, which, kind);
         for (const which of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, which, gl.CLAMP_TO_EDGE);
     }
-    /// Uploads the scene of `player`.
-    load(player) {
+    /// Uploads the scene of `player`, of whose Gaussians the first `moving` move.
+    load(player, moving) {
         const { gl } = this;
+        this.sorter?.close();
+        this.sorter = null;
         const floats = [gl.RGBA32F, gl.RGBA, gl.FLOAT], words = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT];
-        this.texture("gaussians", player.plainFloats(0), floats, 4);
-        this.texture("coefficients", player.plainFloats(1), floats, 4);
-        this.texture("harmonics", player.plainWords(0), words, 4);
-        this.texture("starts", player.plainWords(1), words, 4);
+        const gaussians = player.plainFloats(0), coefficients = player.plainFloats(1), starts = player.plainWords(1);
+        this.texture("gaussians", gaussians, floats, 4);
+        this.texture("coefficients", coefficients, floats, 4);
+        this.loadHarmonics(player);
+        this.texture("starts", starts, words, 4);
+        const { model, tracks } = sortable(gaussians, starts, coefficients, player.plainWords(2), moving);
+        this.tracks = tracks;
+        this.sorter = new Sorter(model, this.changed);
+    }
+    /// Uploads the harmonics of `player` alone.
+    loadHarmonics(player) {
+        const { gl } = this;
+        this.texture("harmonics", player.plainWords(0), [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT], 4);
     }
     target(width, height) {
         const { gl } = this;
@@ -230,14 +254,23 @@ export class WebGl {
         gl.uniform4uiv(at("flags"), words.subarray(4, 8));
         gl.uniform4uiv(at("heads"), words.subarray(8, 28));
     }
-    /// Draws the view of `player` (or through a camera at a time) to the canvas, or to `output`.
+    /// The order for the frame with the uniforms `bytes`: its own where it is a capture, else the newest that there is.
+    order(bytes, functions, capture) {
+        if (!this.sorter) return NONE;
+        const floats = new Float32Array(bytes.buffer, 0, 36), [start, , first, width] = new Uint32Array(bytes.buffer, 176, 4);
+        const view = { row: floats.slice(8, 12), near: floats[26], track: width ? this.tracks.get(start) : -1, first, functions };
+        if (capture) return this.sorter.sort(view);
+        const order = this.sorter.newest(view);
+        [this.visible, this.settled] = [order.length, this.sorter.has(view)];
+        return order;
+    }
+    /// Draws the view of `player` to the canvas; or a capture through a camera at a time to `output`.
     draw(player, camera, time, output = null, size = [this.canvas.width, this.canvas.height]) {
         const { gl } = this;
         const bytes = player.plainFrame(camera, time).slice();
         const shape = new Float32Array(bytes.buffer, 96, 2);
         this.target(shape[0], shape[1]);
-        const order = player.plainOrder(camera, time), functions = player.plainFunctions(time);
-        this.visible = order.length;
+        const functions = player.plainFunctions(time), order = this.order(bytes, functions, output !== null);
         gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
         gl.viewport(0, 0, shape[0], shape[1]);
         gl.clearColor(0, 0, 0, 0);
@@ -253,8 +286,9 @@ export class WebGl {
                 gl.uniform1i(this.draws.at(name), unit);
             });
             gl.bindVertexArray(this.array);
-            gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-            gl.bufferData(gl.ARRAY_BUFFER, order, gl.STREAM_DRAW);
+            gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
+            if (this.uploaded !== order) gl.bufferData(gl.ARRAY_BUFFER, order, gl.STREAM_DRAW);
+            this.uploaded = order;
             gl.enable(gl.BLEND);
             gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
             gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.length);

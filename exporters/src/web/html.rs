@@ -120,7 +120,7 @@ mod tests {
         other.files[0].1 = b"import { a } from \"./unknown.js\";".to_vec();
         assert!(single(&other, "t", b"", true).unwrap_err().to_string().contains("player.js"));
         let mut other = page();
-        other.files[5].1 = b"a { } </style><script>".to_vec();
+        other.files[6].1 = b"a { } </style><script>".to_vec();
         assert!(single(&other, "t", b"", true).unwrap_err().to_string().contains("player.css"));
     }
 

@@ -9,8 +9,10 @@ pub const PAGE_VARIABLE: &str = "CC4DGS_PAGE";
 /// Name of the folder in the other places.
 const PAGE_FOLDER: &str = "page";
 /// Files of the page that `apps/player/build-web` makes; `index.html` is written anew.
-pub const PAGE_FILES: [&str; 8] =
-    ["player.js", "controls.js", "gestures.js", "loading.js", "webgl.js", "player.css", "cc4dgs_player.js", "cc4dgs_player_bg.wasm"];
+pub const PAGE_FILES: [&str; 9] =
+    ["player.js", "controls.js", "gestures.js", "loading.js", "sort.js", "webgl.js", "player.css", "cc4dgs_player.js", "cc4dgs_player_bg.wasm"];
+/// The version of the page that plays what is exported, as `player.js` states it: version 2 computes motion from weights.
+pub const PAGE_VERSION: u32 = 2;
 /// Largest file that is taken for one of them, in bytes.
 const MOST_BYTES: u64 = 64 << 20;
 
@@ -46,7 +48,7 @@ impl Page {
             return Self::read(folder);
         }
         if let Some(files) = embedded() {
-            return Ok(Self { files: PAGE_FILES.into_iter().zip(files).collect(), origin: "this program".into() });
+            return Self { files: PAGE_FILES.into_iter().zip(files).collect(), origin: "this program".into() }.checked();
         }
         let looked: Vec<String> = places.iter().map(|p| p.display().to_string()).collect();
         let problem = format!("it is neither built in nor in {}", looked.join(" or "));
@@ -56,7 +58,7 @@ impl Page {
     /// The page in `folder`.
     ///
     /// # Errors
-    /// [`Error::Io`] for files that are missing, [`Error::Limit`] for files that are too large for it.
+    /// [`Error::Io`] for files that are missing, [`Error::Limit`] for files that are too large for it, [`Error::Unsupported`] for an older page.
     pub fn read(folder: &Path) -> Result<Self> {
         let read = |name: &'static str| {
             let path = folder.join(name);
@@ -66,7 +68,16 @@ impl Page {
             }
             Ok((name, std::fs::read(&path).map_err(|e| Error::io(&path, e))?))
         };
-        Ok(Self { files: PAGE_FILES.into_iter().map(read).collect::<Result<_>>()?, origin: folder.display().to_string() })
+        Self { files: PAGE_FILES.into_iter().map(read).collect::<Result<_>>()?, origin: folder.display().to_string() }.checked()
+    }
+    /// The page, where it has the version that is needed.
+    fn checked(self) -> Result<Self> {
+        let stated = format!("export const PAGE_VERSION = {PAGE_VERSION};");
+        if String::from_utf8_lossy(self.file("player.js")).contains(&stated) {
+            return Ok(self);
+        }
+        let problem = format!("it is not version {PAGE_VERSION} of the page, which plays what is exported");
+        Err(Error::unsupported(self.origin, problem, "Build it again with apps/player/build-web FOLDER"))
     }
     /// The file `name` of [`PAGE_FILES`].
     pub(super) fn file(&self, name: &str) -> &[u8] {
@@ -91,6 +102,7 @@ fn embedded() -> Option<[Vec<u8>; PAGE_FILES.len()]> {
         file!("controls.js"),
         file!("gestures.js"),
         file!("loading.js"),
+        file!("sort.js"),
         file!("webgl.js"),
         file!("player.css"),
         file!("cc4dgs_player.js"),
@@ -101,4 +113,19 @@ fn embedded() -> Option<[Vec<u8>; PAGE_FILES.len()]> {
 #[cfg(not(feature = "embed-page"))]
 fn embedded() -> Option<[Vec<u8>; PAGE_FILES.len()]> {
     None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn older_pages_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        PAGE_FILES.iter().for_each(|name| std::fs::write(folder.path().join(name), "export const PAGE_VERSION = 1;").unwrap());
+        let message = Page::read(folder.path()).unwrap_err().to_string();
+        assert!(message.contains(&folder.path().display().to_string()) && message.contains("build-web"), "{message}");
+        std::fs::write(folder.path().join("player.js"), include_str!("../../../apps/player/web/player.js")).unwrap();
+        assert!(Page::read(folder.path()).is_ok());
+    }
 }

@@ -7,7 +7,7 @@ mod uniforms;
 mod uploaded;
 
 use crate::content::Scene;
-use cc4dgs_format::{Camera, Error, Image8, Result};
+use cc4dgs_format::{Camera, Error, HostGaussians, Image8, Result};
 use pipelines::Pipelines;
 use target::Target;
 use uploaded::Uploaded;
@@ -88,6 +88,16 @@ impl Renderer {
         Uploaded::check(&self.device, &scene)?;
         self.unload();
         self.uploaded = Some(Uploaded::new(&self.device, &self.queue, &self.pipelines, scene));
+        Ok(())
+    }
+    /// Takes the colour coefficients of degree 1 and up of `gaussians`, of which the scene was made before these had arrived.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for other Gaussians.
+    pub fn load_harmonics(&mut self, gaussians: &HostGaussians) -> Result<()> {
+        if let Some(uploaded) = &self.uploaded {
+            uploaded.write_harmonics(&self.queue, &uploaded.scene.harmonics_of(gaussians)?);
+        }
         Ok(())
     }
     /// Frees the scene.

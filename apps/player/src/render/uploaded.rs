@@ -25,6 +25,7 @@ pub(super) struct Uploaded {
     pub(super) scene: Scene,
     pub(super) work: wgpu::Buffer,
     pub(super) draw: wgpu::BindGroup,
+    harmonics: wgpu::Buffer,
     functions: wgpu::Buffer,
     project: wgpu::BindGroup,
     compact: wgpu::BindGroup,
@@ -96,9 +97,14 @@ impl Uploaded {
             draw: group(device, &pipelines.draw_layout, &[frame, &splats, &pairs[0], &work]),
             scene,
             work,
+            harmonics,
             functions,
             buffers,
         }
+    }
+    /// Writes harmonics that arrived after the scene; `words` are as many as it had.
+    pub(super) fn write_harmonics(&self, queue: &wgpu::Queue, words: &[u32]) {
+        queue.write_buffer(&self.harmonics, 0, bytemuck::cast_slice(words));
     }
     pub(super) fn destroy(self) {
         self.buffers.iter().for_each(wgpu::Buffer::destroy);

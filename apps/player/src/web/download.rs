@@ -4,7 +4,7 @@ use super::error;
 use crate::Content;
 use cc4dgs_format::archive::{Archive, StreamKind};
 use cc4dgs_format::playback::PlaybackLayer;
-use cc4dgs_format::{Error, Limits, Moving, Result, Silent, StoredModel, read_gaussians};
+use cc4dgs_format::{Error, HostGaussians, Limits, Moving, Result, Silent, StoredModel, StreamStage, canonical_stages, read_gaussians, read_stage};
 use wasm_bindgen::prelude::*;
 
 /// Bytes of an archive, some of which are still missing. The page fetches ranges, in the order that [`Download::streams`] suggests.
@@ -13,8 +13,8 @@ pub struct Download {
     name: String,
     bytes: Vec<u8>,
     archive: Option<Archive>,
-    /// The Gaussians, decoded once.
-    model: Option<StoredModel>,
+    /// The Gaussians without their motion, and the stage up to which they are there: kept until the motion has arrived.
+    model: Option<(StoredModel, StreamStage)>,
 }
 
 #[wasm_bindgen]
@@ -45,22 +45,30 @@ impl Download {
         let prefix = &self.bytes[..self.bytes.len().min(Archive::PREFIX_BYTES)];
         Ok(Archive::header_end(&self.name, prefix, &super::LIMITS).map_err(error)? as f64)
     }
-    /// The streams as JSON: name, kind, first byte and bytes of each. The header must have arrived.
+    /// The streams as JSON: name, kind, layer, first byte and bytes of each. The header must have arrived.
     pub fn streams(&mut self) -> std::result::Result<String, JsError> {
         crate::link();
+        let name = self.name.clone();
         let archive = self.opened().map_err(error)?;
         let computed = PlaybackLayer::may_be_computed(archive).map_err(error)?;
         let streams = archive.stream_sizes();
-        let kind = |kind| match kind {
-            StreamKind::Canonical => "canonical",
-            StreamKind::Playback => "playback",
+        let mut stages = canonical_stages(&name, archive).map_err(error)?.into_iter();
+        let mut kind = |kind| match kind {
+            StreamKind::Canonical => match stages.next() {
+                Some(StreamStage::Layer(layer)) => ("canonical", layer),
+                _ => ("harmonics", 0),
+            },
+            StreamKind::Playback => ("playback", 0),
             // The page needs the weights where it computes the motion from them.
-            StreamKind::Field if computed => "playback",
-            StreamKind::Poster => "poster",
-            _ => "other",
+            StreamKind::Field if computed => ("playback", 0),
+            StreamKind::Poster => ("poster", 0),
+            _ => ("other", 0),
         };
-        let list: Vec<_> =
-            streams.iter().map(|s| serde_json::json!({ "name": s.name, "kind": kind(s.kind), "offset": s.offset, "bytes": s.stored_bytes })).collect();
+        let mut list = Vec::with_capacity(streams.len());
+        for stream in &streams {
+            let (kind, layer) = kind(stream.kind);
+            list.push(serde_json::json!({ "name": stream.name, "kind": kind, "layer": layer, "offset": stream.offset, "bytes": stream.stored_bytes }));
+        }
         Ok(serde_json::Value::from(list).to_string())
     }
     /// The poster's bytes (PNG or JPEG), if the archive has one and it has arrived.
@@ -76,32 +84,32 @@ impl Download {
         }
         self.archive.as_ref().ok_or_else(|| Error::data(self.name.clone(), "nothing has arrived", "Load it again"))
     }
-    /// What the archive holds, with its motion or still without.
-    pub(super) fn content(&mut self, motion: bool, limits: &Limits) -> Result<Content> {
+    /// The Gaussians up to `stage`.
+    pub(super) fn gaussians(&mut self, stage: StreamStage, limits: &Limits) -> Result<HostGaussians> {
         crate::link();
         let name = self.name.clone();
-        let known = self.model.take();
         let archive = self.opened()?;
-        let mut model = match known {
-            Some(model) => model,
+        if stage == StreamStage::Harmonics { read_gaussians(&name, archive, limits, &Silent) } else { read_stage(&name, archive, stage, limits, &Silent) }
+    }
+    /// What the archive holds up to `stage`, with motion or still without.
+    pub(super) fn content(&mut self, stage: StreamStage, motion: bool, limits: &Limits) -> Result<Content> {
+        let name = self.name.clone();
+        let known = self.model.take().filter(|(_, known)| *known >= stage);
+        let model = match known {
+            Some((model, _)) => model,
             None => {
-                let manifest = archive.manifest().clone();
-                let gaussians = read_gaussians(&name, archive, limits, &Silent)?;
+                let gaussians = self.gaussians(stage, limits)?;
+                let manifest = self.opened()?.manifest().clone();
                 let moving = Moving::of_manifest(&name, &manifest)?;
                 StoredModel { manifest, gaussians, moving, playback: None }
             }
         };
-        let bytes = archive.total_bytes()?;
-        if motion {
-            let streams = archive.read_kind(StreamKind::Playback)?;
-            model.playback = if streams.is_empty() {
-                PlaybackLayer::computed(&name, archive, &model.gaussians, model.moving, limits)?
-            } else {
-                Some(PlaybackLayer::decode(&streams, model.gaussians.len(), model.gaussians.sh_degree, limits)?)
-            };
-            return Content::of_model(model, bytes);
+        let bytes = self.opened()?.total_bytes()?;
+        if !motion {
+            self.model = Some((model.clone(), stage));
+            return Ok(Content { lacks_motion: false, ..Content::of_model(model, bytes)? });
         }
-        self.model = Some(model.clone());
-        Ok(Content { lacks_motion: false, ..Content::of_model(model, bytes)? })
+        let playback = PlaybackLayer::of_archive(&name, self.opened()?, &model.gaussians, model.moving, limits)?;
+        Content::of_model(StoredModel { playback, ..model }, bytes)
     }
 }

@@ -1,10 +1,11 @@
 //! The player in a browser: what the page's JavaScript calls. Gestures, buttons and fetching are the page's, everything else is here.
 
 mod download;
-mod plain;
 
+use crate::render::{Frame, functions};
 use crate::{Clock, Content, Mode, Navigator, Renderer, Scene, View, request_device};
-use cc4dgs_format::{Camera, Image8, Limits};
+use cc4dgs_format::playback::Head;
+use cc4dgs_format::{Camera, Image8, Limits, StreamStage};
 use download::Download;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -89,11 +90,23 @@ impl Player {
         let content = Content::read(name, bytes, &LIMITS).map_err(error)?;
         self.show(content, true)
     }
-    /// Shows what has arrived of `download`: the Gaussians, and their motion once that is there. Returns facts as JSON.
+    /// Shows what has arrived of `download`: the Gaussians up to `layer` (255: all), and where these are there their motion and harmonics. Returns facts as JSON.
     #[wasm_bindgen(js_name = openPart)]
-    pub fn open_part(&mut self, download: &mut Download, motion: bool, first: bool) -> Result<String, JsError> {
-        let content = download.content(motion, &LIMITS).map_err(error)?;
+    pub fn open_part(&mut self, download: &mut Download, layer: u8, motion: bool, harmonics: bool, first: bool) -> Result<String, JsError> {
+        let stage = if harmonics { StreamStage::Harmonics } else { StreamStage::Layer(layer) };
+        let content = download.content(stage, motion, &LIMITS).map_err(error)?;
         self.show(content, first)
+    }
+    /// Adds the harmonics of `download` to what `openPart` shows.
+    #[wasm_bindgen(js_name = openHarmonics)]
+    pub fn open_harmonics(&mut self, download: &mut Download) -> Result<(), JsError> {
+        let gaussians = download.gaussians(StreamStage::Harmonics, &LIMITS).map_err(error)?;
+        match &mut self.output {
+            Output::WebGpu { renderer, .. } => renderer.load_harmonics(&gaussians).map_err(error)?,
+            Output::Plain(Some(scene)) => scene.harmonics = scene.harmonics_of(&gaussians).map_err(error)?,
+            Output::Plain(None) => {}
+        }
+        Ok(())
     }
     fn show(&mut self, content: Content, first: bool) -> Result<String, JsError> {
         let Content { scene, presentation, frame_count, lacks_motion, bytes } = content;
@@ -163,10 +176,14 @@ impl Player {
     pub fn plain_floats(&self, which: usize) -> Vec<f32> {
         self.plain_scene().map_or_else(Vec::new, |s| if which == 0 { s.gaussians.clone() } else { s.coefficients.clone() })
     }
-    /// For WebGL2: the harmonics (0) or the starts (1).
+    /// For WebGL2: the harmonics (0), the starts (1), or per segment where starts and coefficients of the centres begin (2; all ones where centres do not move).
     #[wasm_bindgen(js_name = plainWords)]
     pub fn plain_words(&self, which: usize) -> Vec<u32> {
-        self.plain_scene().map_or_else(Vec::new, |s| if which == 0 { s.harmonics.clone() } else { s.starts.clone() })
+        self.plain_scene().map_or_else(Vec::new, |s| match which {
+            0 => s.harmonics.clone(),
+            1 => s.starts.clone(),
+            _ => s.tracks.iter().flat_map(|tracks| tracks[Head::Means as usize].map_or([u32::MAX; 2], <[u32; 2]>::from)).collect(),
+        })
     }
     /// For WebGL2: the uniforms of a frame.
     #[wasm_bindgen(js_name = plainFrame)]
@@ -180,18 +197,13 @@ impl Player {
                 &empty
             }
         };
-        Ok(plain::frame(scene, &view))
+        let (_, heads) = functions(scene, view.time);
+        Ok(bytemuck::bytes_of(&Frame::new(scene, &view, view.background.unwrap_or(scene.background), heads)).to_vec())
     }
     /// For WebGL2: φ at a time.
     #[wasm_bindgen(js_name = plainFunctions)]
     pub fn plain_functions(&self, time: Option<f32>) -> Vec<f32> {
-        self.plain_scene().map_or_else(Vec::new, |s| crate::render::functions(s, time.unwrap_or(self.clock.time)).0)
-    }
-    /// For WebGL2: the Gaussians before the camera, farthest first.
-    #[wasm_bindgen(js_name = plainOrder)]
-    pub fn plain_order(&self, camera: Option<String>, time: Option<f32>) -> Result<Vec<u32>, JsError> {
-        let view = self.view_of(camera, time)?;
-        Ok(self.plain_scene().map_or_else(Vec::new, |s| plain::order(s, &view)))
+        self.plain_scene().map_or_else(Vec::new, |s| functions(s, time.unwrap_or(self.clock.time)).0)
     }
     /// Moves the clock on; whether time changed.
     pub fn tick(&mut self, elapsed_s: f32) -> bool {

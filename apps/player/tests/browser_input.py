@@ -1,0 +1,85 @@
+"""Checks of browser.py: files that are dropped, fingers on a screen."""
+import math
+from browser_pages import MODEL, PATIENCE_MS, say
+
+POSE = "Array.from(cc4dgs.gpu.pose)"
+
+
+def drop(page, facts):
+    """A file that is dragged over the page and dropped is opened."""
+    files = page.evaluate_handle("""async address => { const bytes = await (await fetch(address)).arrayBuffer(), files = new DataTransfer();
+        files.items.add(new File([bytes], "dropped.cc4d")); return files; }""", MODEL)
+    page.evaluate("window.opened = null; cc4dgs.on('loaded', facts => { opened = facts; }); 0")
+    for event in ("dragenter", "dragover"):
+        page.dispatch_event(".cc canvas", event, {"dataTransfer": files})
+    assert page.locator(".cc.dropping").count() == 1, "nothing says that a file can be dropped"
+    page.dispatch_event(".cc canvas", "drop", {"dataTransfer": files})
+    page.wait_for_function("opened")
+    opened = page.evaluate("opened")
+    assert page.locator(".cc.dropping").count() == 0
+    assert opened["gaussians"] == facts["gaussians"] and opened["frames"] == facts["frames"], opened
+    assert page.evaluate("cc4dgs.source.name") == "dropped.cc4d" and page.title().startswith("dropped.cc4d")
+    say("a file that is dropped on the page is opened")
+
+
+def arm(pose):
+    """From the orbited point to the eye."""
+    return [pose[k] - pose[3 + k] for k in range(3)]
+
+
+def length(vector):
+    return math.sqrt(sum(v * v for v in vector))
+
+
+def touch(page):
+    """One finger orbits, two that part zoom in. The page must be that of a touch screen, with a model."""
+    devtools = page.context.new_cdp_session(page)
+    canvas = page.locator(".cc canvas").bounding_box()
+    x, y = canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2
+
+    def fingers(kind, *points):
+        devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x + dx, "y": y + dy, "id": n} for n, (dx, dy) in enumerate(points)]})
+
+    def gesture(*paths):
+        """Fingers along straight paths, from and to; the poses before and after."""
+        before = page.evaluate(POSE)
+        page.evaluate("window.lifted = false; cc4dgs.ui.canvas.addEventListener('pointerup', () => { lifted = true; }, { once: true })")
+        steps = 8
+        at = lambda k: [(a[0] + (b[0] - a[0]) * k / steps, a[1] + (b[1] - a[1]) * k / steps) for a, b in paths]
+        fingers("touchStart", *at(0))
+        for k in range(1, steps + 1):
+            fingers("touchMove", *at(k))
+        fingers("touchEnd")
+        page.wait_for_function("lifted")
+        return before, page.evaluate(POSE)
+
+    page.evaluate("cc4dgs.reset()")
+    before, after = gesture(((-40, 0), (40, 0)))
+    (a, b), moved = (arm(before), arm(after)), length([p - q for p, q in zip(before[3:6], after[3:6])])
+    turned = math.acos(sum(p * q for p, q in zip(a, b)) / (length(a) * length(b)))
+    # 4 radians per height of the canvas; away from the equator the eye moves along a smaller circle.
+    wanted = 4 * 80 / canvas["height"]
+    assert moved < 1e-6 and abs(length(a) / length(b) - 1) < 1e-6, "orbiting moved the orbited point or changed the distance"
+    assert 0.3 * wanted < turned < 1.1 * wanted, f"one finger turned {turned:.3f} rad, {wanted:.3f} was expected at the equator"
+
+    before, after = gesture(((-50, 0), (-100, 0)), ((50, 0), (100, 0)))
+    nearer = length(arm(before)) / length(arm(after))
+    assert abs(nearer - 2) < 0.1, f"two fingers came {nearer:.2f} times nearer instead of 2"
+    assert abs(sum(p * q for p, q in zip(arm(before), arm(after))) / (length(arm(before)) * length(arm(after))) - 1) < 1e-6, "pinching turned the camera"
+    page.evaluate("cc4dgs.reset()")
+    say(f"one finger orbits ({turned:.2f} rad), two that part come nearer ({nearer:.2f} times)")
+
+
+def embedded(pages):
+    """In an iframe of 480x320 the page loads and plays."""
+    page = pages.watch(pages.browser.new_page(viewport={"width": 800, "height": 600}))
+    page.goto(f"{pages.address}/embedding.html")
+    frame = page.frames[1]
+    frame.wait_for_function("window.cc4dgs?.facts && cc4dgs.playing && cc4dgs.time > 0", timeout=PATIENCE_MS)
+    size = frame.evaluate("[cc4dgs.ui.canvas.width, cc4dgs.ui.canvas.height, cc4dgs.facts.frames]")
+    assert size[:2] == [480, 320] and size[2] > 1, size
+    frame.evaluate("cc4dgs.pause()")
+    pages.shot(page, "iframe")
+    page.close()
+    pages.quiet("the iframe")
+    say("in an iframe of 480x320 the page loads and plays")
