@@ -72,7 +72,7 @@ pub fn files(scene: &str, rows: &[Row], key: &Key) -> Vec<(String, String)> {
     let plots = Plots::of(rows, key);
     let name = |plot: &Plot| {
         let text = format!("{scene} {}", plot.title).to_lowercase();
-        text.split(|c: char| !c.is_ascii_alphanumeric()).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".svg"
+        text.split(|c: char| !c.is_alphanumeric()).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".svg"
     };
     let of_trainings = |plot: &Plot| key.entries(plot, false);
     let of_points = |plot: &Plot| [key.entries(plot, false), key.entries(plot, true)].concat();
