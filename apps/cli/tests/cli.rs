@@ -140,8 +140,8 @@ fn a_scene_goes_through_the_whole_chain() {
     let report = json_of(&["render", text(&archive), "--out", text(&frames), "--frames", "3", "--size", "48x36", "-q", "--json"]);
     assert_eq!(report["frames"], 3);
     for i in 0..3 {
-        let picture = image::open(frames.join(format!("frame_{i:05}.png"))).unwrap();
-        assert_eq!((picture.width(), picture.height()), (48, 36));
+        let image = image::open(frames.join(format!("frame_{i:05}.png"))).unwrap();
+        assert_eq!((image.width(), image.height()), (48, 36));
     }
     succeed(&["render", text(&archive), "--out", text(&at("views")), "--scene", "procedural:tiny", "--frames", "2", "-q"]);
     assert_eq!(std::fs::read_dir(at("views")).unwrap().count(), 2);

@@ -15,7 +15,7 @@ POSE = "Array.from(cc4dgs.gpu.pose)"
 
 # A number for the image from a pose at 0.6.
 IMAGE = """async pose => { cc4dgs.seek(0.6); cc4dgs.gpu.pose = new Float64Array(pose);
-    const { data } = await cc4dgs.picture(); return data.reduce((sum, v) => (31 * sum + v) >>> 0, 0); }"""
+    const { data } = await cc4dgs.capture(); return data.reduce((sum, v) => (31 * sum + v) >>> 0, 0); }"""
 # Notes what is shown of a model that arrives.
 STAGES = """() => { const { gpu } = cc4dgs, { openPart, openHarmonics } = gpu;
     window.stages = [];
@@ -134,7 +134,7 @@ def lost(pages, page, facts):
     page.evaluate("window.recovered = new Promise(r => cc4dgs.on('recovered', r)); cc4dgs.gpu.loseDevice()")
     page.evaluate("recovered")
     assert page.evaluate("cc4dgs.facts.gaussians") == facts["gaussians"] and abs(page.evaluate("cc4dgs.time") - before) < 1e-6
-    assert page.evaluate("cc4dgs.picture().then(p => p.data.some(v => v > 60 && v < 255))")
+    assert page.evaluate("cc4dgs.capture().then(p => p.data.some(v => v > 60 && v < 255))")
     say("a lost device is recovered")
     page.get_by_label("Settings").first.click()
     page.wait_for_function("document.querySelector('.stats').textContent.includes('Gaussians')")

@@ -116,7 +116,7 @@ class Pages:
         least = 99.0
         for entry in json.loads((self.reference / "reference.json").read_text()):
             wanted = numpy.asarray(Image.open(self.reference / entry["image"]).convert("RGB"))
-            found = page.evaluate("async ([camera, time]) => { const p = await cc4dgs.picture(camera, time); return [p.width, p.height, Array.from(p.data)]; }",
+            found = page.evaluate("async ([camera, time]) => { const p = await cc4dgs.capture(camera, time); return [p.width, p.height, Array.from(p.data)]; }",
                                   [entry["camera"], entry["time"]])
             image = numpy.array(found[2], numpy.uint8).reshape(found[1], found[0], 4)[..., :3]
             decibels = psnr(image, wanted)

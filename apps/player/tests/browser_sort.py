@@ -6,7 +6,7 @@ STILL = """async () => {
     const { canvas } = cc4dgs.ui, copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");
     cc4dgs.draw();
     copy.drawImage(canvas, 0, 0);
-    const shown = copy.getImageData(0, 0, canvas.width, canvas.height).data, { data } = await cc4dgs.picture();
+    const shown = copy.getImageData(0, 0, canvas.width, canvas.height).data, { data } = await cc4dgs.capture();
     return { settled: cc4dgs.gl.settled, pixels: data.length / 4, same: shown.length === data.length && shown.every((v, i) => v === data[i]),
         seen: data.some((v, i) => i % 4 < 3 && v !== data[i % 4]) };
 }"""

@@ -233,18 +233,18 @@ class Page {
             this.emit("recovered", {});
         } catch (e) { this.fail(e); }
     }
-    // Pictures and links
-    async picture(camera, time) {
+    // Images and links
+    async capture(camera, time) {
         const json = camera ? JSON.stringify(camera) : undefined;
-        if (this.gl) return this.gl.picture(this.gpu, json, time);
-        const picture = await this.gpu.capture(json, time);
-        const out = { width: picture.width, height: picture.height, data: picture.rgba };
-        picture.free();
+        if (this.gl) return this.gl.capture(this.gpu, json, time);
+        const image = await this.gpu.capture(json, time);
+        const out = { width: image.width, height: image.height, data: image.rgba };
+        image.free();
         return out;
     }
     async savePng() {
         if (!this.facts) return;
-        const { width, height, data } = await this.picture();
+        const { width, height, data } = await this.capture();
         const canvas = Object.assign(document.createElement("canvas"), { width, height });
         canvas.getContext("2d").putImageData(new ImageData(data, width, height), 0, 0);
         const link = Object.assign(document.createElement("a"), { href: canvas.toDataURL("image/png"), download: `frame_${String(this.gpu.frame).padStart(4, "0")}.png` });

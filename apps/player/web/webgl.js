@@ -305,7 +305,7 @@ export class WebGl {
         gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
     /// RGBA pixels, the upper row first.
-    picture(player, camera, time) {
+    capture(player, camera, time) {
         const { gl } = this;
         const shape = new Float32Array(player.plainFrame(camera, time).slice().buffer, 96, 2);
         const [width, height] = shape;

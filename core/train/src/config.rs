@@ -30,7 +30,7 @@ pub struct RunConfig {
     /// How the scene is read.
     #[serde(default)]
     pub scene: SceneOptions,
-    /// How pictures are drawn.
+    /// How images are drawn.
     #[serde(default)]
     pub render: RenderConfig,
     /// The rasterizer plug-in: `kind` and its settings.

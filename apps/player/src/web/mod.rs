@@ -332,14 +332,14 @@ impl Player {
     pub fn set_depth(&mut self, on: bool) {
         self.look.mode = if on { Mode::Depth } else { Mode::Color };
     }
-    /// The RGBA pixels of the current view at the size of the canvas, or through `camera` (JSON of a camera) at `time`; a promise of a `Picture`.
+    /// The RGBA pixels of the current view at the size of the canvas, or through `camera` (JSON of a camera) at `time`; a promise of a [`Capture`].
     pub fn capture(&mut self, camera: Option<String>, time: Option<f32>) -> Result<js_sys::Promise, JsError> {
         let view = self.view_of(camera, time)?;
         let Output::WebGpu { renderer, .. } = &mut self.output else { return Err(JsError::new("the page draws by itself")) };
         Ok(js_sys::Promise::new(&mut |resolve, reject| {
             renderer.capture(&view, move |image| {
                 let called = match image {
-                    Ok(image) => resolve.call1(&JsValue::NULL, &Picture { image }.into()),
+                    Ok(image) => resolve.call1(&JsValue::NULL, &Capture { image }.into()),
                     Err(e) => reject.call1(&JsValue::NULL, &error(e).into()),
                 };
                 drop(called);
@@ -357,14 +357,14 @@ impl Player {
     }
 }
 
-/// Pixels.
+/// The pixels of a view.
 #[wasm_bindgen]
-pub struct Picture {
+pub struct Capture {
     image: Image8,
 }
 
 #[wasm_bindgen]
-impl Picture {
+impl Capture {
     /// Pixels per row.
     #[wasm_bindgen(getter)]
     pub fn width(&self) -> u32 {

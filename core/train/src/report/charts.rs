@@ -28,12 +28,15 @@ impl Key {
     fn marker(&self, row: &Row) -> usize {
         self.codecs.iter().position(|name| name == row.codec).unwrap_or(0)
     }
-    /// What the colours, or the shapes, of a plot mean.
-    fn entries(&self, plot: &Plot, shapes: bool) -> Vec<Entry> {
-        let shown = |i: usize| plot.series.iter().filter(|s| !s.points.is_empty()).any(|s| if shapes { s.marker == Some(i) } else { s.colour == i });
-        let names = if shapes { &self.codecs } else { &self.trainings };
-        let entry = |(i, name): (usize, &String)| Entry { colour: (!shapes).then_some(i), marker: shapes.then_some(i), name: name.clone() };
-        names.iter().enumerate().filter(|(i, _)| shown(*i)).map(entry).collect()
+    /// What the colours of a plot mean.
+    fn colours(&self, plot: &Plot) -> Vec<Entry> {
+        let entry = |(i, name): (usize, &String)| Entry { colour: Some(i), marker: None, name: name.clone() };
+        self.trainings.iter().enumerate().filter(|(i, _)| shows(plot, |s| s.colour == *i)).map(entry).collect()
+    }
+    /// What the markers of a plot mean.
+    fn markers(&self, plot: &Plot) -> Vec<Entry> {
+        let entry = |(i, name): (usize, &String)| Entry { colour: None, marker: Some(i), name: name.clone() };
+        self.codecs.iter().enumerate().filter(|(i, _)| shows(plot, |s| s.marker == Some(*i))).map(entry).collect()
     }
     /// What colours and shapes mean.
     pub fn legend(&self) -> String {
@@ -43,6 +46,11 @@ impl Key {
         let shapes: String = self.codecs.iter().enumerate().map(|(i, name)| shape(i, name)).collect();
         format!("<p class=\"legend\"><i>training:</i> {colours}</p><p class=\"legend\"><i>codec:</i> {shapes}</p>\n")
     }
+}
+
+/// Whether one of the series that `plot` shows is as asked.
+fn shows(plot: &Plot, asked: impl Fn(&Series) -> bool) -> bool {
+    plot.series.iter().any(|s| !s.points.is_empty() && asked(s))
 }
 
 /// The plots of a scene that have something to show.
@@ -74,8 +82,8 @@ pub fn files(scene: &str, rows: &[Row], key: &Key) -> Vec<(String, String)> {
         let text = format!("{scene} {}", plot.title).to_lowercase();
         text.split(|c: char| !c.is_alphanumeric()).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".svg"
     };
-    let of_trainings = |plot: &Plot| key.entries(plot, false);
-    let of_points = |plot: &Plot| [key.entries(plot, false), key.entries(plot, true)].concat();
+    let of_trainings = |plot: &Plot| key.colours(plot);
+    let of_points = |plot: &Plot| [key.colours(plot), key.markers(plot)].concat();
     let file = |plot: &Plot, legend: Vec<Entry>| (name(plot), plot.file(&format!("{scene}: {}", plot.title), &legend));
     let points = plots.rate.iter().chain(&plots.cost).map(|plot| file(plot, of_points(plot)));
     points.chain(plots.progress.iter().map(|plot| file(plot, of_trainings(plot)))).collect()

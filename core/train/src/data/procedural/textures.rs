@@ -113,7 +113,7 @@ impl Texture {
                 // Off the faces of boxes whose sizes are multiples of a line, where rounding would choose the cell.
                 let (x, z) = (p.x / (0.8 * line) + OFF_FACES, p.z / line + OFF_FACES);
                 let (row, up) = cell_of(z);
-                // A block of a few lines is a heading, a picture or text.
+                // A block of a few lines is a heading, an image or text.
                 let kind = random((row / 3.0).floor(), 0.0, 3.0, seed);
                 let (column, _) = cell_of(x);
                 let ink = (0.2..0.8).contains(&up) && random(column, row, 1.0, seed) > 0.35;
