@@ -15,7 +15,8 @@ struct PlySequence {}
 impl Exporter for PlySequence {
     fn loses(&self, facts: &ExportFacts) -> String {
         let frames = facts.times_norm.len();
-        format!("It holds {frames} frames and nothing between them, without times, background and dynamic scores.")
+        let blur = facts.blur().map_or_else(String::new, |blur| format!(", {blur}"));
+        format!("It holds {frames} frames and nothing between them, without times, background{blur} and dynamic scores.")
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         let facts = source.facts().clone();

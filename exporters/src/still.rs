@@ -24,7 +24,8 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 
 /// The parts of what is lost as one sentence; empty parts are left out.
 pub fn sentence(facts: &ExportFacts, parts: &[(bool, &str)]) -> String {
-    let lost: Vec<&str> = parts.iter().filter(|(applies, _)| *applies).map(|(_, part)| *part).collect();
+    let blur = facts.blur();
+    let lost: Vec<&str> = parts.iter().filter(|(applies, _)| *applies).map(|(_, part)| *part).chain(blur.as_deref()).collect();
     let rest = match lost.as_slice() {
         [] => String::new(),
         [one] => format!(", without {one}"),

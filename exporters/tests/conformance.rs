@@ -16,6 +16,17 @@ fn every_exporter_conforms() {
 }
 
 #[test]
+fn formats_for_other_viewers_say_that_they_lose_the_blur() {
+    let (usual, mut facts) = (conformance::export_facts(3, 0), conformance::export_facts(3, 0));
+    facts.blur = 0.1;
+    for plugin in Entries::<ExporterPlugin>::collect().unwrap().iter().filter(|plugin| !plugin.info.capabilities.contains(&"player")) {
+        let exporter = (plugin.build)(&toml::Table::new()).unwrap();
+        let (usual, other) = (exporter.loses(&usual), exporter.loses(&facts));
+        assert!(!usual.contains("blur") && other.contains("the blur of 0.1 square pixels"), "{}: {usual} / {other}", plugin.info.name);
+    }
+}
+
+#[test]
 fn settings_out_of_range_are_refused_before_a_model_is_read() {
     let exporters = Entries::<ExporterPlugin>::collect().unwrap();
     for (name, bad) in [

@@ -3,10 +3,13 @@
 use cc4dgs_format::archive::{Archive, MAGIC, Presentation, StreamKind};
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::playback::{Head, PlaybackLayer};
-use cc4dgs_format::{Error, HostGaussians, Limits, Result, Rules, Silent, StoredModel, ply, spz};
+use cc4dgs_format::{BLUR, Error, HostGaussians, Limits, Result, Rules, Silent, StoredModel, ply, spz};
 
 /// Smallest near plane: depths are sorted by their logarithm.
 const LEAST_NEAR: f32 = 1e-6;
+/// Blur at least and at most, as rasterizers take it.
+const LEAST_BLUR: f32 = 0.01;
+const MOST_BLUR: f32 = 100.0;
 /// Greatest.
 const MOST_NEAR: f32 = 1e6;
 /// Floats of a Gaussian in [`Scene::gaussians`].
@@ -44,6 +47,8 @@ pub struct Scene {
     pub near: f32,
     /// Cap of alpha.
     pub alpha_max: f32,
+    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels.
+    pub blur: f32,
     /// Whether opacity is scaled by the share of the footprint that the pixel blur added.
     pub antialiased: bool,
     /// Whether a square of 3 sigma in whole tiles limits footprints (Inria's rules).
@@ -104,6 +109,7 @@ impl Content {
         let rules = manifest.rasterizer.rules;
         scene.background = manifest.background;
         scene.antialiased = manifest.rasterizer.antialiased;
+        scene.blur = Some(manifest.rasterizer.blur).filter(|blur| blur.is_finite()).unwrap_or(BLUR).clamp(LEAST_BLUR, MOST_BLUR);
         scene.square = rules == Rules::Inria;
         scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(if scene.square { 0.2 } else { 0.01 }).clamp(LEAST_NEAR, MOST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
@@ -136,6 +142,7 @@ impl Scene {
             background: [0.0; 3],
             near: 0.01,
             alpha_max: 0.99,
+            blur: BLUR,
             antialiased: false,
             square: false,
             gaussians: Vec::with_capacity(GAUSSIAN_FLOATS * n),

@@ -13,7 +13,7 @@ import { WebGl } from "./webgl.js";
 import { build } from "./controls.js";
 
 // What exports need of a page: raise it together with PAGE_VERSION in exporters/src/web/page.rs where archives need a newer one.
-export const PAGE_VERSION = 2;
+export const PAGE_VERSION = 3;
 
 let ready;
 

@@ -94,9 +94,9 @@ void main() {
     vec3 r0 = (t0 - held.x * t2) * (frame[4].x / point.z), r1 = (t1 - held.y * t2) * (frame[4].y / point.z);
     float raw_xx = dot(r0, r0), xy = dot(r0, r1), raw_yy = dot(r1, r1);
     vec3 normal = cross(r0, r1);
-    float raw_determinant = dot(normal, normal), determinant = raw_determinant + (raw_xx + raw_yy) * 0.3 + 0.09;
+    float blur = frame[3].w, raw_determinant = dot(normal, normal), determinant = raw_determinant + (raw_xx + raw_yy) * blur + blur * blur;
     if (!(determinant > 0.0 && determinant < 1e30)) return;
-    float xx = raw_xx + 0.3, yy = raw_yy + 0.3;
+    float xx = raw_xx + blur, yy = raw_yy + blur;
     if (flags.x == 1u) opacity *= sqrt(max(raw_determinant / determinant, 2.5e-5));
     float reach = 2.0 * (log(max(opacity * 255.0, 1e-30)) + 0.005);
     if (!(opacity >= ALPHA_MIN && reach > 0.0)) return;

@@ -5,6 +5,9 @@ use cc4dgs_core::{Camera, Error, RenderSettings, Result, SplatColors, Splats};
 
 /// Pixels of the largest image drawn.
 const MAX_PIXELS: u64 = 1 << 28;
+/// Blur at least and at most, square pixels: with less the smallest footprints fall between pixels, with more images are no longer of use.
+const LEAST_BLUR: f32 = 0.01;
+const MOST_BLUR: f32 = 100.0;
 
 /// Checks shapes, camera and degree, and gathers the numbers of a render.
 pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RasterSettings> {
@@ -53,6 +56,10 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
     if let Some(near) = settings.near.filter(|near| !near.is_finite() || *near < 0.0) {
         return Err(Error::parameter("render.near", format!("{near} is not a depth"), "Give a finite depth of 0 or more, in world units"));
     }
+    if !(LEAST_BLUR..=MOST_BLUR).contains(&settings.blur) {
+        let problem = format!("{} is not between {LEAST_BLUR} and {MOST_BLUR}", settings.blur);
+        return Err(Error::parameter("render.blur", problem, "Give a variance in square pixels, such as 0.3 or 0.1"));
+    }
     if let Some(background) = &settings.background {
         shape("background", &background.dims(), &[3])?;
     }
@@ -67,6 +74,7 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
         rules: settings.rules,
         near: settings.near,
         antialiased: settings.antialiased,
+        blur: settings.blur,
         space: splats.space,
         sh_degree,
         max_weights: settings.max_weights,

@@ -29,7 +29,7 @@ pub use appearance::{Appearance, AppearanceContext, AppearancePlugin};
 pub use burn;
 pub use cc4dgs_format as format;
 pub use cc4dgs_format::{
-    AttributeCodec, Camera, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Entries, Error, EvaluateDeformer, Event, EventSink, ExportFacts,
+    AttributeCodec, BLUR, Camera, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Entries, Error, EvaluateDeformer, Event, EventSink, ExportFacts,
     ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, ExtraAttribute, FIELD_STREAMS, Fanout, HostGaussians, Image8, Limits, MOVING, Moving,
     NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rounding, Rules, Seed, Silent, Similarity, StoredModel, Stream,
     StreamStage, TrainingViews, TuneModel, TunedModel, Tuning, WeightArray, WeightCodec, WeightCodecPlugin, archive, canonical_stages, config, exporter,

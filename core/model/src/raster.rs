@@ -1,7 +1,7 @@
 //! Rasterizers: the trait, its inputs and outputs.
 
 use crate::gaussians::to_vec;
-use crate::{Camera, Error, Gaussians, Image8, Plugin, Result, Rules};
+use crate::{BLUR, Camera, Error, Gaussians, Image8, Plugin, Result, Rules};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -82,6 +82,8 @@ pub struct RenderSettings {
     pub rules: Rules,
     /// Scale opacity by the share of the footprint the pixel blur added (Mip-Splatting's 2D filter).
     pub antialiased: bool,
+    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels, 0.01 to 100.
+    pub blur: f32,
     /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
     pub near: Option<f32>,
     /// Colour behind everything, linear RGB in 0..1 `[3]`; may carry a gradient. `None` is black.
@@ -95,7 +97,7 @@ pub struct RenderSettings {
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, near: None, background: None, max_weights: false, pair_capacity: None }
+        Self { rules: Rules::Gsplat099, antialiased: false, blur: BLUR, near: None, background: None, max_weights: false, pair_capacity: None }
     }
 }
 

@@ -98,6 +98,7 @@ impl Model {
             render: RenderConfig {
                 rules: manifest.rasterizer.rules,
                 antialiased: manifest.rasterizer.antialiased,
+                blur: manifest.rasterizer.blur,
                 near: manifest.rasterizer.near,
                 background: Some(manifest.background),
             },
@@ -184,6 +185,7 @@ impl Model {
                 name: rasterizer,
                 rules: self.render.rules,
                 antialiased: self.render.antialiased,
+                blur: self.render.blur,
                 near: self.render.near,
                 settings: rasterizer_settings,
             },

@@ -11,8 +11,8 @@ const PAGE_FOLDER: &str = "page";
 /// Files of the page that `apps/player/build-web` makes; `index.html` is written anew.
 pub const PAGE_FILES: [&str; 9] =
     ["player.js", "controls.js", "gestures.js", "loading.js", "sort.js", "webgl.js", "player.css", "cc4dgs_player.js", "cc4dgs_player_bg.wasm"];
-/// The version of the page that plays what is exported, as `player.js` states it: version 2 computes motion from weights.
-pub const PAGE_VERSION: u32 = 2;
+/// The version of the page that plays what is exported, as `player.js` states it: version 2 computes motion from weights, version 3 draws with the blur of the model.
+pub const PAGE_VERSION: u32 = 3;
 /// Largest file that is taken for one of them, in bytes.
 const MOST_BYTES: u64 = 64 << 20;
 

@@ -183,8 +183,15 @@ fn check_operation(scene: &Scene, device: &Device, findings: &mut Findings) {
         cy: s.cy,
         world_to_camera: s.world_to_camera,
     };
-    let render =
-        RenderSettings { rules: s.rules, antialiased: s.antialiased, near: None, background: Some(background.clone()), max_weights: true, pair_capacity: None };
+    let render = RenderSettings {
+        rules: s.rules,
+        antialiased: s.antialiased,
+        blur: s.blur,
+        near: None,
+        background: Some(background.clone()),
+        max_weights: true,
+        pair_capacity: None,
+    };
     let out = TileRasterizer.render(&splats, &camera, &render).unwrap();
     let weights = Tensor::<3>::from_data(tensor(&scene.upstream(), vec![5, s.height, s.width]), &device);
     let grads = (out.planes.clone() * weights).sum().backward();

@@ -6,7 +6,7 @@ use cc4dgs_backends::cpu::raster::{self, Gradients, SplatArrays};
 use cc4dgs_backends::ops::rasterize::{GradientRequest, RasterSettings};
 use cc4dgs_backends::rasterizers::reference::{self, ReferenceInput, ReferenceRasterizer};
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
-use cc4dgs_core::{Camera, Error, Gaussians, HostGaussians, ParameterSpace, Rasterizer, Registry, RenderSettings, Rules, Seed, SplatColors, Splats};
+use cc4dgs_core::{BLUR, Camera, Error, Gaussians, HostGaussians, ParameterSpace, Rasterizer, Registry, RenderSettings, Rules, Seed, SplatColors, Splats};
 
 const EVERYTHING: GradientRequest = GradientRequest {
     means: true,
@@ -33,7 +33,7 @@ fn arrays<'a>(g: &'a HostGaussians, background: [f32; 3]) -> SplatArrays<'a> {
     }
 }
 
-fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> RasterSettings {
+fn settings(camera: &Camera, rules: Rules, antialiased: bool, blur: f32, degree: usize) -> RasterSettings {
     RasterSettings {
         width: camera.width as usize,
         height: camera.height as usize,
@@ -45,6 +45,7 @@ fn settings(camera: &Camera, rules: Rules, antialiased: bool, degree: usize) -> 
         rules,
         near: None,
         antialiased,
+        blur,
         space: ParameterSpace::Raw,
         sh_degree: Some(degree),
         max_weights: true,
@@ -86,13 +87,15 @@ fn columns(g: &Gradients) -> [&Vec<f32>; 10] {
 #[test]
 fn tile_agrees_with_the_reference() {
     let seed = Seed::root(11);
-    for (k, (rules, antialiased, degree)) in
-        [(Rules::Gsplat099, false, 3), (Rules::Gsplat0999, true, 2), (Rules::Inria, false, 1), (Rules::Inria, true, 0)].into_iter().enumerate()
+    for (k, (rules, antialiased, blur, degree)) in
+        [(Rules::Gsplat099, false, 0.1, 3), (Rules::Gsplat0999, true, BLUR, 2), (Rules::Inria, false, BLUR, 1), (Rules::Inria, true, 0.8, 0)]
+            .into_iter()
+            .enumerate()
     {
         // Sizes with partial tiles on both axes.
         let camera = step_camera(&StepCase { width: 53, height: 37, gaussians: 400 });
         let g = scene(400, seed.index(k as u64));
-        let settings = settings(&camera, rules, antialiased, degree);
+        let settings = settings(&camera, rules, antialiased, blur, degree);
         let background = [0.2, 0.5, 0.9];
         let splats = arrays(&g, background);
         let mut tile = raster::forward(&splats, &settings).unwrap();
@@ -140,7 +143,7 @@ fn reference_gradients_match_finite_differences() {
     let camera = step_camera(&StepCase { width: 20, height: 14, gaussians: 12 });
     let mut g = random_gaussians(12, Seed::root(3));
     g.log_scales.iter_mut().for_each(|s| *s = -0.8);
-    let s = settings(&camera, Rules::Gsplat099, true, 3);
+    let s = settings(&camera, Rules::Gsplat099, true, 0.1, 3);
     let base = ReferenceInput::widen(&arrays(&g, [0.1, 0.4, 0.7]));
     let upstream: Vec<f64> = noise(Seed::root(4), 5 * 20 * 14).into_iter().map(f64::from).collect();
     let loss = |input: &ReferenceInput, s: &RasterSettings| -> f64 { reference::forward(input, s).planes.iter().zip(&upstream).map(|(a, b)| a * b).sum() };
@@ -239,7 +242,7 @@ fn operation_gradients_match_finite_differences() {
 fn bytes_do_not_depend_on_threads() {
     let camera = step_camera(&STANDARD_CASES[0]);
     let g = scene(3000, Seed::root(8));
-    let s = settings(&camera, Rules::Gsplat099, false, 3);
+    let s = settings(&camera, Rules::Gsplat099, false, BLUR, 3);
     let upstream = noise(Seed::root(9), 5 * s.width * s.height);
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -264,9 +267,9 @@ fn hostile_gaussians_never_reach_the_image() {
     let camera = step_camera(&StepCase { width: 40, height: 24, gaussians: 64 });
     let clean = scene(64, Seed::root(21));
     let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30, -1e30, 3e38, 1e-40, 100.0];
-    let s = settings(&camera, Rules::Gsplat099, true, 3);
-    for rules in [Rules::Gsplat099, Rules::Inria] {
-        let s = RasterSettings { rules, ..s.clone() };
+    let s = settings(&camera, Rules::Gsplat099, true, BLUR, 3);
+    for (rules, blur) in [(Rules::Gsplat099, BLUR), (Rules::Inria, 0.01)] {
+        let s = RasterSettings { rules, blur, ..s.clone() };
         for (k, value) in bad.into_iter().enumerate() {
             for column in 0..6 {
                 let mut g = clean.clone();
@@ -317,7 +320,7 @@ fn one_pixel_and_a_camera_inside_the_cloud() {
     let g = scene(500, Seed::root(31));
     for (width, height, eye) in [(1, 1, [0.0, 0.0, -7.0]), (1, 1, [0.0; 3]), (70, 9, [0.1, 0.2, 0.3])] {
         let camera = Camera::look_at("inside", (width, height), 1.2, eye, [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]);
-        let s = settings(&camera, Rules::Gsplat099, false, 3);
+        let s = settings(&camera, Rules::Gsplat099, false, BLUR, 3);
         let splats = arrays(&g, [0.0; 3]);
         let out = raster::forward(&splats, &s).unwrap();
         let exact = reference::forward(&ReferenceInput::widen(&splats), &s);

@@ -169,6 +169,7 @@ impl<'a> ModelSource<'a> {
             times_norm: (0..frames).map(|k| frame_time(k, frames)).collect(),
             frames_per_second: request.frames_per_second,
             antialiased: model.render.antialiased,
+            blur: model.render.blur,
             up: request.up,
             home: home.map(|camera| model.normalisation.inverse().apply_camera(&camera)),
             images: request.shots.len(),

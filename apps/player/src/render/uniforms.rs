@@ -46,7 +46,7 @@ impl Frame {
         let per_ln = LAST_KEY / (far / near).ln();
         Self {
             world_to_camera: std::array::from_fn(|i| std::array::from_fn(|j| m[i][j] as f32)),
-            center: [center[0] as f32, center[1] as f32, center[2] as f32, 0.0],
+            center: [center[0] as f32, center[1] as f32, center[2] as f32, scene.blur],
             intrinsics: [camera.fx as f32, camera.fy as f32, camera.cx as f32, camera.cy as f32],
             ratio_limits: [x0, x1, y0, y1],
             size: [size[0] as f32, size[1] as f32, scene.near, FAR],

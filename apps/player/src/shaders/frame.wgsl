@@ -3,7 +3,7 @@
 struct Frame {
     // Rows of world to camera; the fourth number is the translation.
     world_to_camera: array<vec4<f32>, 3>,
-    // Camera centre.
+    // Camera centre, and what a pixel adds to both diagonal entries of the projected covariance in square pixels.
     center: vec4<f32>,
     // fx, fy, cx, cy in pixels.
     intrinsics: vec4<f32>,

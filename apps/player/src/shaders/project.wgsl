@@ -33,7 +33,6 @@ const LOG_SCALES: u32 = 1u;
 const ROTATIONS: u32 = 2u;
 const OPACITIES: u32 = 3u;
 const COLORS: u32 = 4u;
-const BLUR: f32 = 0.3;
 const MIN_COMPENSATION: f32 = 0.005;
 const CUTOFF_MARGIN: f32 = 0.005;
 
@@ -170,12 +169,13 @@ fn project(i: u32) -> bool {
     let raw_yy = dot(row1, row1);
     let normal = cross(row0, row1);
     let raw_determinant = dot(normal, normal);
-    let determinant = raw_determinant + (raw_xx + raw_yy) * BLUR + BLUR * BLUR;
+    let blur = frame.center.w;
+    let determinant = raw_determinant + (raw_xx + raw_yy) * blur + blur * blur;
     // Also refuses what overflowed.
     if (!(determinant > 0.0 && determinant < 1e30)) { return false; }
     let inverse = 1.0 / determinant;
-    let xx = raw_xx + BLUR;
-    let yy = raw_yy + BLUR;
+    let xx = raw_xx + blur;
+    let yy = raw_yy + blur;
     var opacity = opacity_now;
     if (frame.flags.x == 1u) { opacity *= sqrt(max(raw_determinant * inverse, MIN_COMPENSATION * MIN_COMPENSATION)); }
     let reach = (log(max(opacity * 255.0, 1e-30)) + CUTOFF_MARGIN) * 2.0;

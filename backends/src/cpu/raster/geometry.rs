@@ -3,7 +3,7 @@
 //! With M = R S (rotation times scales) the projected covariance is U U^T + blur, U = J W M being 2x3. The unblurred determinant is then
 //! |U0 x U1|^2 and the blurred one a sum of positive terms, so neither cancels for needles.
 
-use super::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE};
+use super::camera::{CameraConstants, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE};
 use crate::cpu::simd::{Lanes, Mask, each};
 use pulp::Simd;
 
@@ -173,9 +173,9 @@ pub fn project<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, quaternion: [La
     let (xx, xy, yy) = (dot(rows[0], rows[0]), dot(rows[0], rows[1]), dot(rows[1], rows[1]));
     let normal = cross(rows[0], rows[1]);
     let raw_determinant = dot(normal, normal);
-    let determinant = raw_determinant + (xx + yy).fma(like(EPS_2D), like(EPS_2D * EPS_2D));
+    let determinant = raw_determinant + (xx + yy).fma(like(camera.blur), like(camera.blur * camera.blur));
     let inverse = like(1.0) / determinant;
-    let covariance = [xx + EPS_2D, xy, yy + EPS_2D];
+    let covariance = [xx + camera.blur, xy, yy + camera.blur];
     Projection {
         point,
         center: each(
@@ -274,7 +274,7 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
         |k| {
             each(
                 #[inline(always)]
-                |j| (axes[k][j] * EPS_2D + adjugate[k][j]) * inverse,
+                |j| (axes[k][j] * camera.blur + adjugate[k][j]) * inverse,
             )
         },
     );
@@ -295,7 +295,7 @@ pub fn project_backward<S: Simd>(camera: &CameraConstants, mean: Vec3<S>, p: &Pr
     let alive = share.gt(like(MIN_COMPENSATION * MIN_COMPENSATION));
     let d_share = alive.keep(g.compensation * 0.5 / p.compensation) * inverse;
     let d_raw = d_share * (like(1.0) - share);
-    let d_trace = -(d_share * share * EPS_2D);
+    let d_trace = -(d_share * share * camera.blur);
     let two = like(2.0);
     let d_scales: Vec3<S> = each(
         #[inline(always)]

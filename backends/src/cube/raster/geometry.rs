@@ -1,7 +1,7 @@
 //! EWA projection of one Gaussian and its derivative; the arithmetic of `cpu::raster::geometry`, one Gaussian per thread.
 
 use super::vector::{V3, V4, add, combine, cross, dot, load3, scale, times, v3};
-use crate::ops::rasterize::camera::{CameraConstants, EPS_2D, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE, RuleConstants};
+use crate::ops::rasterize::camera::{CameraConstants, MIN_COMPENSATION, QUATERNION_RANGE, RESCALE, RuleConstants};
 use cubecl::prelude::*;
 
 /// Index of the translation in the camera buffer, which starts with the rotation by rows.
@@ -24,6 +24,8 @@ const DEPTH: usize = 26;
 const DEPTH_REST: usize = 30;
 /// Index of a zero that compilers do not know, see [`rounded`].
 const ZERO: usize = 34;
+/// Index of the blur of a pixel.
+const BLUR: usize = 35;
 /// Mask of the upper half of a float32's significand; products of halves are exact.
 const UPPER_HALF: u32 = 0xffff_f000;
 
@@ -38,7 +40,7 @@ pub fn camera_buffer(camera: &CameraConstants, rules: &RuleConstants, width: usi
     values.extend([rules.near, width as f32, height as f32]);
     values.extend(camera.depth_row.map(|v| v as f32));
     values.extend(camera.depth_row.map(|v| (v - f64::from(v as f32)) as f32));
-    values.push(0.0);
+    values.extend([0.0, camera.blur]);
     values
 }
 
@@ -157,9 +159,9 @@ pub fn project(cam: &[f32], mean: V3, q: V4, s: V3) -> Projected {
     let raw_yy = dot(row1, row1);
     let normal = cross(row0, row1);
     let raw_determinant = dot(normal, normal);
-    let determinant = raw_determinant + (raw_xx + raw_yy) * EPS_2D + EPS_2D * EPS_2D;
+    let determinant = raw_determinant + (raw_xx + raw_yy) * cam[BLUR] + cam[BLUR] * cam[BLUR];
     let inverse = 1.0 / determinant;
-    let (xx, yy) = (raw_xx + EPS_2D, raw_yy + EPS_2D);
+    let (xx, yy) = (raw_xx + cam[BLUR], raw_yy + cam[BLUR]);
     let share = raw_determinant * inverse;
     let floor = MIN_COMPENSATION * MIN_COMPENSATION;
     Projected {
@@ -223,8 +225,8 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     let adjugate0 = cross(times(axes1, squared), normal);
     let adjugate1 = cross(normal, times(axes0, squared));
     let inverse = 1.0 / p.determinant;
-    let seen0 = scale(add(scale(axes0, EPS_2D), adjugate0), inverse);
-    let seen1 = scale(add(scale(axes1, EPS_2D), adjugate1), inverse);
+    let seen0 = scale(add(scale(axes0, cam[BLUR]), adjugate0), inverse);
+    let seen1 = scale(add(scale(axes1, cam[BLUR]), adjugate1), inverse);
     // d covariance = -K G K with G the symmetric gradient of the conic.
     let half = d_conic.y * 0.5;
     let weighted0 = add(scale(seen0, d_conic.x), scale(seen1, half));
@@ -233,7 +235,7 @@ pub fn project_backward(cam: &[f32], mean: V3, s: V3, p: Projected, d_x: f32, d_
     let share = p.raw_determinant * inverse;
     let d_share = select(share > MIN_COMPENSATION * MIN_COMPENSATION, d_compensation * 0.5 / p.compensation, 0.0f32) * inverse;
     let d_raw = d_share * (1.0 - share);
-    let d_trace = -(d_share * share * EPS_2D);
+    let d_trace = -(d_share * share * cam[BLUR]);
     let n = times(normal, normal);
     let raw = v3(squared.y * n.z + squared.z * n.y, squared.z * n.x + squared.x * n.z, squared.x * n.y + squared.y * n.x);
     let trace = add(times(axes0, axes0), times(axes1, axes1));

@@ -4,8 +4,6 @@ use super::RasterSettings;
 use cc4dgs_core::Rules;
 use glam::{DMat4, DVec3, DVec4};
 
-/// Blur added to both diagonal entries of the projected covariance, in square pixels.
-pub const EPS_2D: f32 = 0.3;
 /// Smallest opacity factor of the antialiasing compensation.
 pub const MIN_COMPENSATION: f32 = 0.005;
 /// Squared norms of quaternions beyond this, or below one over it, are rescaled before they are used.
@@ -65,6 +63,8 @@ pub struct CameraConstants {
     pub principal: [f32; 2],
     /// Where x/z and y/z are clamped in the Jacobian: (lower, upper) per axis.
     pub ratio_limits: [[f32; 2]; 2],
+    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels.
+    pub blur: f32,
     /// The row of world to camera that gives the depth, unrounded.
     pub depth_row: [f64; 4],
 }
@@ -89,6 +89,7 @@ impl CameraConstants {
             focal: focal.map(|v| v as f32),
             principal: principal.map(|v| v as f32),
             ratio_limits: [limits(0), limits(1)],
+            blur: settings.blur,
             depth_row: m[2],
         }
     }

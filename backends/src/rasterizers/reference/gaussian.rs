@@ -5,8 +5,6 @@ use crate::ops::rasterize::RasterSettings;
 use crate::ops::rasterize::camera::{ALPHA_MIN, FAR, RuleConstants};
 use cc4dgs_core::ParameterSpace;
 
-/// Blur added to the diagonal of the projected covariance, square pixels.
-const BLUR: f64 = 0.3;
 /// Least compensation.
 const COMPENSATION_FLOOR: f64 = 0.005;
 /// Side of Inria's tiles in pixels.
@@ -143,7 +141,7 @@ pub fn project<T: Real>(g: &Gaussian<T>, settings: &RasterSettings) -> Projected
     let camera = multiply(multiply(w, world), transpose(w));
     let half: [[T; 3]; 2] = std::array::from_fn(|i| std::array::from_fn(|k| dot(j[i], camera[k])));
     let (xx, xy, yy) = (dot(half[0], j[0]), dot(half[0], j[1]), dot(half[1], j[1]));
-    let eps = c(BLUR);
+    let eps = c(f64::from(settings.blur));
     let raw = xx * yy - xy * xy;
     let (bxx, byy) = (xx + eps, yy + eps);
     let determinant = bxx * byy - xy * xy;

@@ -1,7 +1,7 @@
 //! The manifest of an archive.
 
 use super::Presentation;
-use crate::{DeformerContext, Error, Limits, Result, Rules, Similarity};
+use crate::{BLUR, DeformerContext, Error, Limits, Result, Rules, Similarity};
 use serde::{Deserialize, Serialize};
 
 /// The archive version this build writes and reads.
@@ -36,7 +36,7 @@ pub struct DeformerEntry {
 }
 
 /// How the model is rendered.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RasterizerEntry {
     /// Registry name of the rasterizer used in training.
     pub name: String,
@@ -44,11 +44,24 @@ pub struct RasterizerEntry {
     pub rules: Rules,
     /// Whether the antialiasing compensation was on.
     pub antialiased: bool,
+    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; [`BLUR`] in files that lack it.
+    #[serde(default = "blur")]
+    pub blur: f32,
     /// Smallest camera depth drawn, units of the model; absent if the rules' default was used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
     /// Its settings, without `kind`.
     pub settings: toml::Table,
+}
+
+fn blur() -> f32 {
+    BLUR
+}
+
+impl Default for RasterizerEntry {
+    fn default() -> Self {
+        Self { name: String::new(), rules: Rules::default(), antialiased: false, blur: BLUR, near: None, settings: toml::Table::new() }
+    }
 }
 
 /// The origin of a model. It has nothing that differs between equal runs (no clock, no host name), so that equal runs write equal bytes.

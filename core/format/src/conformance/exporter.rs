@@ -4,7 +4,7 @@ use super::uniform;
 use crate::exporter::export;
 use crate::gaussians::sh_rest_len;
 use crate::playback::MaxError;
-use crate::{Error, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Result, Seed};
+use crate::{BLUR, Error, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Result, Seed};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
@@ -25,6 +25,7 @@ pub fn export_facts(gaussians: usize, sh_degree: usize) -> ExportFacts {
         times_norm: (0..5).map(|i| i as f32 / 4.0).collect(),
         frames_per_second: 5.0,
         antialiased: false,
+        blur: BLUR,
         up: [0.0, 0.0, 1.0],
         home: None,
         images: 2,

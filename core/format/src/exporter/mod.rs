@@ -10,7 +10,7 @@ pub use place::export;
 
 use crate::playback::MaxError;
 use crate::plugin::Plugin;
-use crate::{Camera, HostGaussians, Image8, Result};
+use crate::{BLUR, Camera, HostGaussians, Image8, Result};
 use serde::Serialize;
 use std::path::Path;
 
@@ -61,6 +61,8 @@ pub struct ExportFacts {
     pub frames_per_second: f64,
     /// Whether the model wants Mip-Splatting's 2D filter.
     pub antialiased: bool,
+    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; viewers take [`BLUR`](crate::BLUR) unless told.
+    pub blur: f32,
     /// The signed unit axis of the world that points up.
     pub up: [f64; 3],
     /// A camera to look at the model from.
@@ -70,6 +72,10 @@ pub struct ExportFacts {
 }
 
 impl ExportFacts {
+    /// What a format loses that cannot tell viewers the blur, if they would take another one.
+    pub fn blur(&self) -> Option<String> {
+        (self.blur != BLUR).then(|| format!("the blur of {} square pixels (viewers take {BLUR})", self.blur))
+    }
     /// What a format loses that holds one instant without motion, as the beginning of a sentence without a full stop.
     pub fn still(&self) -> String {
         let what = self.time_norm.map_or_else(|| "the canonical Gaussians".to_string(), |t| format!("the Gaussians at time {t}"));

@@ -1,7 +1,7 @@
 //! Reads the golden fixtures of the rasterizer.
 
 use cc4dgs_backends::ops::rasterize::RasterSettings;
-use cc4dgs_core::{ParameterSpace, Rules};
+use cc4dgs_core::{BLUR, ParameterSpace, Rules};
 use cc4dgs_tests::golden::folder;
 pub use cc4dgs_tests::golden::{Fixture, largest_difference, narrow, relative_l2, widen};
 
@@ -23,6 +23,7 @@ pub fn settings(width: usize, height: usize, k: &[f64], view: &[f64]) -> RasterS
         rules: Rules::Gsplat099,
         near: None,
         antialiased: false,
+        blur: BLUR,
         space: ParameterSpace::Activated,
         sh_degree: None,
         max_weights: false,
