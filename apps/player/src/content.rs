@@ -8,8 +8,8 @@ use cc4dgs_format::{BLUR, Error, HostGaussians, Limits, Result, Rules, Silent, S
 /// Smallest near plane: depths are sorted by their logarithm.
 const LEAST_NEAR: f32 = 1e-6;
 /// Blur at least and at most, as rasterizers take it.
-const LEAST_BLUR: f32 = 0.01;
-const MOST_BLUR: f32 = 100.0;
+const LEAST_BLUR: f64 = 0.01;
+const MOST_BLUR: f64 = 100.0;
 /// Greatest.
 const MOST_NEAR: f32 = 1e6;
 /// Floats of a Gaussian in [`Scene::gaussians`].
@@ -109,7 +109,7 @@ impl Content {
         let rules = manifest.rasterizer.rules;
         scene.background = manifest.background;
         scene.antialiased = manifest.rasterizer.antialiased;
-        scene.blur = Some(manifest.rasterizer.blur).filter(|blur| blur.is_finite()).unwrap_or(BLUR).clamp(LEAST_BLUR, MOST_BLUR);
+        scene.blur = Some(manifest.rasterizer.blur).filter(|blur| blur.is_finite()).unwrap_or(BLUR).clamp(LEAST_BLUR, MOST_BLUR) as f32;
         scene.square = rules == Rules::Inria;
         scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(if scene.square { 0.2 } else { 0.01 }).clamp(LEAST_NEAR, MOST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
@@ -142,7 +142,7 @@ impl Scene {
             background: [0.0; 3],
             near: 0.01,
             alpha_max: 0.99,
-            blur: BLUR,
+            blur: BLUR as f32,
             antialiased: false,
             square: false,
             gaussians: Vec::with_capacity(GAUSSIAN_FLOATS * n),

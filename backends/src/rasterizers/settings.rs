@@ -6,8 +6,8 @@ use cc4dgs_core::{Camera, Error, RenderSettings, Result, SplatColors, Splats};
 /// Pixels of the largest image drawn.
 const MAX_PIXELS: u64 = 1 << 28;
 /// Blur at least and at most, square pixels: with less the smallest footprints fall between pixels, with more images are no longer of use.
-const LEAST_BLUR: f32 = 0.01;
-const MOST_BLUR: f32 = 100.0;
+const LEAST_BLUR: f64 = 0.01;
+const MOST_BLUR: f64 = 100.0;
 
 /// Checks shapes, camera and degree, and gathers the numbers of a render.
 pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RasterSettings> {

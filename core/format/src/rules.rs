@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 /// The blur of 3D Gaussian splatting: what a pixel adds to both diagonal entries of the projected covariance, square pixels. A square pixel by itself has 1/12.
-pub const BLUR: f32 = 0.3;
+pub const BLUR: f64 = 0.3;
 
 /// Which reference implementation's rules decide the corner cases of projection and blending.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -83,7 +83,7 @@ pub struct RenderSettings {
     /// Scale opacity by the share of the footprint the pixel blur added (Mip-Splatting's 2D filter).
     pub antialiased: bool,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels, 0.01 to 100.
-    pub blur: f32,
+    pub blur: f64,
     /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
     pub near: Option<f32>,
     /// Colour behind everything, linear RGB in 0..1 `[3]`; may carry a gradient. `None` is black.

@@ -18,7 +18,7 @@ pub struct RenderConfig {
     /// Mip-Splatting's 2D filter.
     pub antialiased: bool,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels, 0.01 to 100: 0.3 in 3D Gaussian splatting, less is sharper.
-    pub blur: f32,
+    pub blur: f64,
     /// Smallest camera depth drawn, units of the normalised frame; absent, the rules' own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,

@@ -32,7 +32,7 @@ struct Needles {
     upstream: Vec<f64>,
 }
 
-fn needles(seed: Seed, blur: f32) -> Needles {
+fn needles(seed: Seed, blur: f64) -> Needles {
     let numbers = |name: &str, len: usize| -> Vec<f64> {
         let child = seed.child(name);
         (0..len as u64).map(|k| (child.index(k).value() >> 11) as f64 / (1u64 << 53) as f64).collect()

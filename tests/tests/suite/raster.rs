@@ -33,7 +33,7 @@ fn arrays<'a>(g: &'a HostGaussians, background: [f32; 3]) -> SplatArrays<'a> {
     }
 }
 
-fn settings(camera: &Camera, rules: Rules, antialiased: bool, blur: f32, degree: usize) -> RasterSettings {
+fn settings(camera: &Camera, rules: Rules, antialiased: bool, blur: f64, degree: usize) -> RasterSettings {
     RasterSettings {
         width: camera.width as usize,
         height: camera.height as usize,

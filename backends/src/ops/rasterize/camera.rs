@@ -89,7 +89,7 @@ impl CameraConstants {
             focal: focal.map(|v| v as f32),
             principal: principal.map(|v| v as f32),
             ratio_limits: [limits(0), limits(1)],
-            blur: settings.blur,
+            blur: settings.blur as f32,
             depth_row: m[2],
         }
     }

@@ -52,7 +52,7 @@ pub struct RasterSettings {
     /// Multiply opacity by the compensation of the pixel blur.
     pub antialiased: bool,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; positive.
-    pub blur: f32,
+    pub blur: f64,
     /// Whether scales and opacities still need their activations.
     pub space: ParameterSpace,
     /// Degree of the spherical harmonics, or `None` for colours blended as they are.

@@ -141,7 +141,7 @@ pub fn project<T: Real>(g: &Gaussian<T>, settings: &RasterSettings) -> Projected
     let camera = multiply(multiply(w, world), transpose(w));
     let half: [[T; 3]; 2] = std::array::from_fn(|i| std::array::from_fn(|k| dot(j[i], camera[k])));
     let (xx, xy, yy) = (dot(half[0], j[0]), dot(half[0], j[1]), dot(half[1], j[1]));
-    let eps = c(f64::from(settings.blur));
+    let eps = c(settings.blur);
     let raw = xx * yy - xy * xy;
     let (bxx, byy) = (xx + eps, yy + eps);
     let determinant = bxx * byy - xy * xy;

@@ -46,7 +46,7 @@ pub struct RasterizerEntry {
     pub antialiased: bool,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; [`BLUR`] in files that lack it.
     #[serde(default = "blur")]
-    pub blur: f32,
+    pub blur: f64,
     /// Smallest camera depth drawn, units of the model; absent if the rules' default was used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
@@ -54,7 +54,7 @@ pub struct RasterizerEntry {
     pub settings: toml::Table,
 }
 
-fn blur() -> f32 {
+fn blur() -> f64 {
     BLUR
 }
 

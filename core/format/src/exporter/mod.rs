@@ -62,7 +62,7 @@ pub struct ExportFacts {
     /// Whether the model wants Mip-Splatting's 2D filter.
     pub antialiased: bool,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; viewers take [`BLUR`](crate::BLUR) unless told.
-    pub blur: f32,
+    pub blur: f64,
     /// The signed unit axis of the world that points up.
     pub up: [f64; 3],
     /// A camera to look at the model from.
