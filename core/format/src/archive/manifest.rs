@@ -44,8 +44,8 @@ pub struct RasterizerEntry {
     pub rules: Rules,
     /// Whether the antialiasing compensation was on.
     pub antialiased: bool,
-    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; [`BLUR`] in files that lack it.
-    #[serde(default = "blur")]
+    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; absent if it is [`BLUR`].
+    #[serde(default = "blur", skip_serializing_if = "is_usual")]
     pub blur: f64,
     /// Smallest camera depth drawn, units of the model; absent if the rules' default was used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -56,6 +56,10 @@ pub struct RasterizerEntry {
 
 fn blur() -> f64 {
     BLUR
+}
+
+fn is_usual(blur: &f64) -> bool {
+    *blur == BLUR
 }
 
 impl Default for RasterizerEntry {
