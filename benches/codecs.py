@@ -55,7 +55,7 @@ def measure(program, model, scene, codec, weights, settings, before, folder):
         "streams": {s["name"]: round(s["stored_bytes"] / report["gaussians"], 3) for s in report["streams"] if s["kind"] == "canonical"},
     }
     if scene:
-        found = json.loads(run(program, "eval", archive, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet")[0])
+        found = json.loads(run(program, "eval", archive, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet"))
         row |= {"psnr_db": found["psnr_db"], "ssim": found["ssim"], "drop_db": before["psnr_db"] - found["psnr_db"], "ssim_drop": before["ssim"] - found["ssim"]}
     else:
         row["psnr_between_db"] = between(program, model, archive)
@@ -89,7 +89,7 @@ def main():
         with tempfile.TemporaryDirectory() as folder:
             before = None
             if scene:
-                before = json.loads(run(args.cc4dgs, "eval", model, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet")[0])
+                before = json.loads(run(args.cc4dgs, "eval", model, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet"))
             # Without a scene there is nothing to fine-tune on.
             untuned = ["finetune=0"] if scene else []
             todo = [(codec, untuned if codec.startswith("compact") else []) for codec in args.codecs.split(",")]
