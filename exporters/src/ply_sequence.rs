@@ -15,7 +15,7 @@ struct PlySequence {}
 impl Exporter for PlySequence {
     fn loses(&self, facts: &ExportFacts) -> String {
         let frames = facts.times_norm.len();
-        let blur = facts.blur().map_or_else(String::new, |blur| format!(", {blur}"));
+        let blur = facts.lost_blur().map_or_else(String::new, |blur| format!(", {blur}"));
         format!("It holds {frames} frames and nothing between them, without times, background{blur} and dynamic scores.")
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {

@@ -24,7 +24,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 
 /// The parts of what is lost as one sentence; empty parts are left out.
 pub fn sentence(facts: &ExportFacts, parts: &[(bool, &str)]) -> String {
-    let blur = facts.blur();
+    let blur = facts.lost_blur();
     let lost: Vec<&str> = parts.iter().filter(|(applies, _)| *applies).map(|(_, part)| *part).chain(blur.as_deref()).collect();
     let rest = match lost.as_slice() {
         [] => String::new(),

@@ -3,13 +3,10 @@
 use cc4dgs_format::archive::{Archive, MAGIC, Presentation, StreamKind};
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::playback::{Head, PlaybackLayer};
-use cc4dgs_format::{BLUR, Error, HostGaussians, Limits, Result, Rules, Silent, StoredModel, ply, spz};
+use cc4dgs_format::{BLUR, BLUR_RANGE, Error, HostGaussians, Limits, Result, Rules, Silent, StoredModel, ply, spz};
 
 /// Smallest near plane: depths are sorted by their logarithm.
 const LEAST_NEAR: f32 = 1e-6;
-/// Blur at least and at most, as rasterizers take it.
-const LEAST_BLUR: f64 = 0.01;
-const MOST_BLUR: f64 = 100.0;
 /// Greatest.
 const MOST_NEAR: f32 = 1e6;
 /// Floats of a Gaussian in [`Scene::gaussians`].
@@ -109,7 +106,7 @@ impl Content {
         let rules = manifest.rasterizer.rules;
         scene.background = manifest.background;
         scene.antialiased = manifest.rasterizer.antialiased;
-        scene.blur = Some(manifest.rasterizer.blur).filter(|blur| blur.is_finite()).unwrap_or(BLUR).clamp(LEAST_BLUR, MOST_BLUR) as f32;
+        scene.blur = Some(manifest.rasterizer.blur).filter(|blur| blur.is_finite()).unwrap_or(BLUR).clamp(*BLUR_RANGE.start(), *BLUR_RANGE.end()) as f32;
         scene.square = rules == Rules::Inria;
         scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(if scene.square { 0.2 } else { 0.01 }).clamp(LEAST_NEAR, MOST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };

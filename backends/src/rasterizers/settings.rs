@@ -1,13 +1,10 @@
 //! Checks the inputs of a render and converts them to the form of the operation.
 
 use crate::ops::rasterize::RasterSettings;
-use cc4dgs_core::{Camera, Error, RenderSettings, Result, SplatColors, Splats};
+use cc4dgs_core::{BLUR_RANGE, Camera, Error, RenderSettings, Result, SplatColors, Splats};
 
 /// Pixels of the largest image drawn.
 const MAX_PIXELS: u64 = 1 << 28;
-/// Blur at least and at most, square pixels: with less the smallest footprints fall between pixels, with more images are no longer of use.
-const LEAST_BLUR: f64 = 0.01;
-const MOST_BLUR: f64 = 100.0;
 
 /// Checks shapes, camera and degree, and gathers the numbers of a render.
 pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RasterSettings> {
@@ -56,8 +53,8 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
     if let Some(near) = settings.near.filter(|near| !near.is_finite() || *near < 0.0) {
         return Err(Error::parameter("render.near", format!("{near} is not a depth"), "Give a finite depth of 0 or more, in world units"));
     }
-    if !(LEAST_BLUR..=MOST_BLUR).contains(&settings.blur) {
-        let problem = format!("{} is not between {LEAST_BLUR} and {MOST_BLUR}", settings.blur);
+    if !BLUR_RANGE.contains(&settings.blur) {
+        let problem = format!("{} is not between {} and {}", settings.blur, BLUR_RANGE.start(), BLUR_RANGE.end());
         return Err(Error::parameter("render.blur", problem, "Give a variance in square pixels, such as 0.3 or 0.1"));
     }
     if let Some(background) = &settings.background {

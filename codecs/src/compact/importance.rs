@@ -3,7 +3,7 @@
 //! Where errors of all parameters add the same to the squared error of images, a file of a given size has the smallest error. A parameter's step is
 //! therefore inversely proportional to its *weight*: the root of the sum, over pixels and channels of an image, of the squared derivatives.
 
-use cc4dgs_format::{CodecContext, HostGaussians, Result};
+use cc4dgs_format::{BLUR, CodecContext, HostGaussians, Result};
 use std::ops::RangeInclusive;
 
 /// Value of the spherical-harmonics basis function of degree 0.
@@ -15,8 +15,6 @@ const WORK: usize = 2_000_000;
 const CAMERAS: usize = 24;
 /// Width and height of the images that are assumed without views.
 const IMAGE: (f64, f64) = (800.0, 600.0);
-/// Variance of the pixel blur of rasterizers.
-const BLUR: f64 = 0.3;
 /// Root of the mean squared transmittance in front of a Gaussian that is assumed without a renderer.
 const SEEN: f64 = 0.6;
 /// The contrast of a Gaussian with what is behind it, assumed without a renderer.

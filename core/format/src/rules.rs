@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 /// The blur of 3D Gaussian splatting: what a pixel adds to both diagonal entries of the projected covariance, square pixels. A square pixel by itself has 1/12.
 pub const BLUR: f64 = 0.3;
 
+/// The blurs that can be drawn, square pixels: with less the smallest footprints fall between pixels, with more images are no longer of use.
+pub const BLUR_RANGE: std::ops::RangeInclusive<f64> = 0.01..=100.0;
+
 /// Which reference implementation's rules decide the corner cases of projection and blending.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -3,7 +3,7 @@
 use crate::auto::AutoConfig;
 use crate::layers::Layers;
 pub use crate::train_config::{CoarseFrames, Dynamic, GaussianRates, TrainConfig};
-use cc4dgs_core::{Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
+use cc4dgs_core::{BLUR_RANGE, Error, Limits, Registry, Result, Scene, SceneOptions, config, split_kind};
 use cc4dgs_play::{RenderConfig, default_rasterizer};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -176,6 +176,10 @@ impl RunConfig {
                 "Give a finite depth of 0 or more, in units of the normalised frame (cameras are about 4 from what they see)",
             ));
         }
+        if !BLUR_RANGE.contains(&self.render.blur) {
+            let problem = format!("{} is not between {} and {}", self.render.blur, BLUR_RANGE.start(), BLUR_RANGE.end());
+            return Err(Error::parameter("render.blur", problem, "Give a variance in square pixels, such as 0.3 or 0.1"));
+        }
         if let Some(background) = self.render.background.filter(|b| b.iter().any(|c| !(0.0..=1.0).contains(c))) {
             return Err(Error::parameter("render.background", format!("{background:?} is not RGB in 0..1"), "Give three numbers in 0..1"));
         }
@@ -227,5 +231,9 @@ mod tests {
         assert!(e.contains("pionts") && e.contains("points"), "{e}");
         let e = RunConfig::resolve(Some("demo"), None, &["train.iteratons=3".into()]).unwrap_err().to_string();
         assert!(e.contains("iteratons"), "{e}");
+        for blur in ["0", "-0.1", "nan", "101"] {
+            let e = RunConfig::resolve(Some("demo"), None, &[format!("render.blur={blur}")]).unwrap_err().to_string();
+            assert!(e.contains("render.blur") && e.contains("0.01 and 100"), "{e}");
+        }
     }
 }

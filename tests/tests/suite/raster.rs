@@ -316,6 +316,18 @@ fn no_gaussians_show_the_background() {
 }
 
 #[test]
+fn impossible_blurs_are_refused() {
+    let camera = step_camera(&StepCase { width: 5, height: 3, gaussians: 0 });
+    for (name, device) in cc4dgs_tests::devices() {
+        for blur in [0.0, -0.1, f64::NAN, f64::INFINITY, 1e-300] {
+            let render = RenderSettings { blur, ..Default::default() };
+            let message = TileRasterizer.render(&empty_splats(&device), &camera, &render).map(|_| ()).unwrap_err().to_string();
+            assert!(message.contains("render.blur"), "{name}, {blur}: {message}");
+        }
+    }
+}
+
+#[test]
 fn one_pixel_and_a_camera_inside_the_cloud() {
     let g = scene(500, Seed::root(31));
     for (width, height, eye) in [(1, 1, [0.0, 0.0, -7.0]), (1, 1, [0.0; 3]), (70, 9, [0.1, 0.2, 0.3])] {

@@ -215,6 +215,16 @@ mod tests {
     }
 
     #[test]
+    fn the_usual_blur_is_not_written_and_another_one_comes_back() {
+        let of = |blur: f64| RasterizerEntry { blur, ..Default::default() };
+        let text = |entry: &RasterizerEntry| serde_json::to_string(entry).unwrap();
+        assert!(!text(&of(BLUR)).contains("blur") && text(&of(0.1)).contains("\"blur\":0.1"));
+        for entry in [of(BLUR), of(0.1)] {
+            assert_eq!(serde_json::from_str::<RasterizerEntry>(&text(&entry)).unwrap(), entry);
+        }
+    }
+
+    #[test]
     fn long_decimals_are_no_reason_to_refuse() {
         // Thresholds that `auto` chooses, as float64: serde_json returns some of them in another last bit unless its feature float_roundtrip is on.
         for hundredths in 50..500u16 {

@@ -73,7 +73,7 @@ pub struct ExportFacts {
 
 impl ExportFacts {
     /// What a format loses that cannot tell viewers the blur, if they would take another one.
-    pub fn blur(&self) -> Option<String> {
+    pub fn lost_blur(&self) -> Option<String> {
         (self.blur != BLUR).then(|| format!("the blur of {} square pixels (viewers take {BLUR})", self.blur))
     }
     /// What a format loses that holds one instant without motion, as the beginning of a sentence without a full stop.
