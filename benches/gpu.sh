@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
 # Every measurement of a graphics card in one call: no network, no build, time-boxed steps, JSON out.
 #
-#   benches/gpu.sh [--bin FILE] [--out DIR] [--device NAME] [--scale SHARE] [--data DIR] [--train MINUTES] [--step SECONDS] [--frames N]
+#   benches/gpu.sh [--bin FILE] [--out DIR] [--device NAME] [--scale SHARE] [--data DIR] [--train MINUTES] [--step SECONDS] [--frames N] [--player FILE]
 #
-# FILE is a built cc4dgs (default: target/release/cc4dgs), which may have been carried here from another machine. --scale shrinks pictures and Gaussians for
+# FILE is a built cc4dgs (default: target/release/cc4dgs), which may have been carried here from another machine. --scale shrinks images and Gaussians for
 # devices that are slow. --data names a folder with dnerf_mutant and panoptic_basketball; with it and --train, both are trained at full size within the minutes.
+# --player names the example `frames` of the player (cargo build --release -p cc4dgs-player --example frames); with it the player's renderer is timed too.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-bin=target/release/cc4dgs out="benches/results/$(date -u +%Y-%m-%d)-gpu" device=wgpu scale=1 data="" minutes=0 limit=120 frames=50
+bin=target/release/cc4dgs out="benches/results/$(date -u +%Y-%m-%d)-gpu" device=wgpu scale=1 data="" player="" minutes=0 limit=120 frames=50
 while [ $# -gt 1 ]; do
     case "$1" in
         --bin) bin=$2 ;;
@@ -16,6 +17,7 @@ while [ $# -gt 1 ]; do
         --device) device=$2 ;;
         --scale) scale=$2 ;;
         --data) data=$2 ;;
+        --player) player=$2 ;;
         --train) minutes=$2 ;;
         --step) limit=$2 ;;
         --frames) frames=$2 ;;
@@ -81,6 +83,13 @@ kernels kernels-frame bench frame --device "$device" --case n3dv --scale "$scale
 kernels kernels-step bench step --device "$device" --case n3dv --scale "$scale" --repeats "$repeats"
 kernels kernels-field bench field --device "$device" --gaussians "$moving" --repeats "$repeats"
 step growth "$limit" bench frame --device "$device" --growth --scale "$scale" --frames "$frames"
+
+if [ -n "$player" ]; then
+    step player-model 300 bench frame --device flex --case n3dv --scale "$scale" --motion 0.05 --frames 1 --set deformer.kind=cdf-basis --archive "$out/player.cc4d"
+    echo "== player"
+    timeout --kill-after=10 "$limit" "$player" "$out/player.cc4d" --frames "$frames" >"$out/player.json" 2>"$out/player.log" || { tail -3 "$out/player.log"; failed=1; }
+    rm -f "$out/player.cc4d"
+fi
 
 if [ -n "$data" ] && [ "$minutes" != 0 ]; then
     for scene in dnerf_mutant:dnerf panoptic_basketball:panoptic; do

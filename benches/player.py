@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Times the page of the player in Chromium with SwiftShader, and the tile renderer beside it: player.py PAGE [--program cc4dgs] [--case n3dv] [--out FILE].
+"""Times the page of the player in Chromium with SwiftShader, and the tile renderer beside it: player.py PAGE [--program cc4dgs] [--native frames] [--case n3dv] [--out FILE].
 
 PAGE is the folder of apps/player/build-web. The model is a room of `cc4dgs bench frame`, as large as published scenes: 335,000 Gaussians at 1352x1014, of which
 12 % move. It is stored with a playback layer (`--archive`), and page and tile renderer look from the same camera. Prints JSON: bytes of the bundle (gzipped) and of
 the archive, milliseconds from the last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the device `flex`,
-deformer included; the medians of alternating rounds. Frames of WebGL2 do not wait for the worker that sorts. Needs playwright, and Chromium on the path.
+deformer included; the medians of alternating rounds. Frames of WebGL2 do not wait for the worker that sorts. With --native (the example `frames` of the player), also
+those of the renderer of the window on the graphics adapter of this machine. Needs playwright, and Chromium on the path.
 """
 import argparse, gzip, json, pathlib, statistics, subprocess, tempfile
 from chromium import launch, serve
@@ -41,10 +42,18 @@ def room(args, frames, *more):
     return json.loads(ran.stdout)["cases"][0]
 
 
+def native(args, archive, size):
+    """What the example `frames` says of the archive."""
+    ran = subprocess.run([args.native, str(archive), "--size", size, "--frames", str(FRAMES)], capture_output=True, text=True)
+    if ran.returncode:
+        raise SystemExit(ran.stderr)
+    return json.loads(ran.stdout)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page"), parser.add_argument("--program", default="cc4dgs"), parser.add_argument("--case", default="n3dv")
-    parser.add_argument("--scale", default="1"), parser.add_argument("--deformer", default="cdf-basis"), parser.add_argument("--out")
+    parser.add_argument("--scale", default="1"), parser.add_argument("--deformer", default="cdf-basis"), parser.add_argument("--native"), parser.add_argument("--out")
     args = parser.parse_args()
     folder = tempfile.TemporaryDirectory()
     archive = pathlib.Path(folder.name) / "room.cc4d"
@@ -75,10 +84,15 @@ def main():
                 times[name].append(page.evaluate(FRAME, FRAMES))
             case = room(args, FRAMES)
             times["tile"].append(case["field"]["median_ms"] + case["raster"]["median_ms"])
+            if args.native:
+                found = native(args, archive, out["size"])
+                times.setdefault("native", []).append(found["median_ms"])
+                out |= {"native_adapter": f"{found['adapter']}, {found['driver']}", "native_first_frame_ms": round(found["first_frame_ms"], 1)}
+                out["native_frames_per_second"] = round(found["frames_per_second"], 2)
         browser.close()
     medians = {name: statistics.median(values) for name, values in times.items()}
     out |= {"frame_ms": {name: round(value, 1) for name, value in medians.items()}, "rounds": times}
-    out["tile_over_player"] = {name: round(medians["tile"] / medians[name], 2) for name in pages}
+    out["tile_over_player"] = {name: round(medians["tile"] / medians[name], 2) for name in times if name != "tile"}
     text = json.dumps(out, indent=1)
     print(text)
     if args.out:

@@ -54,6 +54,7 @@ families! {
 }
 
 methods! {
+    "cdf", "the paper's field", "CC-4DGS";
     "swift4d", "Swift4D's joint hash grid", "Swift4D (Wu et al. 2025)";
     "grid4d", "Grid4D's four hash grids", "Grid4D (Xu et al. 2024)";
     "hexplane", "4DGS's planes", "4DGS (Wu et al. 2024)";
@@ -74,7 +75,7 @@ mod tests {
     fn every_family_and_method_resolves() {
         let registry = Registry::collect().unwrap();
         let names = |method: bool| registry.presets().filter(move |p| (p.role == PresetRole::Method) == method).map(|p| p.info.name).collect::<Vec<_>>();
-        assert_eq!((names(false).len(), names(true).len()), (6, 9));
+        assert_eq!((names(false).len(), names(true).len()), (6, 10));
         for family in names(false) {
             for method in names(true).into_iter().map(|name| format!("+{name}")).chain([String::new()]) {
                 let name = format!("{family}{method}");

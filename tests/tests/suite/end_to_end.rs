@@ -14,15 +14,20 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock};
 
-/// The demo at small size: every stage runs, and every kind of density control happens at least once.
+/// The demo at small size: every stage runs, and density control happens at least once.
 fn tiny(extra: &[&str]) -> RunConfig {
+    tiny_of("demo", extra)
+}
+
+/// [`tiny`] with another method.
+fn tiny_of(preset: &str, extra: &[&str]) -> RunConfig {
     let mut sets: Vec<String> =
         ["scene.width=48", "scene.height=48", "train.iterations=160", "train.batch=2", "init.count=400", "train.log_every=5", "train.lambda_r=0.01"]
             .iter()
             .map(ToString::to_string)
             .collect();
     sets.extend(extra.iter().map(ToString::to_string));
-    RunConfig::resolve(Some("demo"), None, &sets).unwrap()
+    RunConfig::resolve(Some(preset), None, &sets).unwrap()
 }
 
 /// Storage with `codec` and the weight codec `field_weights`, without a scene.
@@ -122,7 +127,7 @@ fn resuming_with_another_configuration_is_refused() {
 fn cache_and_reuse_change_the_work_and_not_the_image() {
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
-    let base = tiny(&["train.dynamic=all", "train.iterations=60"]);
+    let base = tiny_of("demo+cdf", &["train.dynamic=all", "train.iterations=60"]);
     run(&base, folder.path(), false, &Silent, &never).unwrap();
     let registry = Registry::collect().unwrap();
     let scene = open(&base);
@@ -158,7 +163,7 @@ fn cache_and_reuse_change_the_work_and_not_the_image() {
 fn static_gaussians_cost_no_field_time() {
     let folder = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
-    let config = tiny(&["train.zeta=3.0"]);
+    let config = tiny(&["train.zeta=0.3"]);
     let report = run(&config, folder.path(), false, &Silent, &never).unwrap();
     let model = load(folder.path());
     let mut player = Player::new(&model, &Registry::collect().unwrap(), &Device::flex()).unwrap();

@@ -208,7 +208,7 @@ fn random_points_are_in_view_and_leave_it_open() {
 fn only_what_covers_an_image_is_made_smaller() {
     let mut scene = film(&playground(), arc(6, 1.0), &(0..6).map(|i| (i, 0)).collect::<Vec<_>>());
     let grid: Vec<[f32; 3]> = (0..1000).map(|i| [i % 10, i / 10 % 10, i / 100].map(|k| 0.1 * (k as f32 - 4.5))).collect();
-    let start = |scene: &Scene| initialise(scene, &config(&["init.source=points"]), Seed::root(0), &Silent).unwrap();
+    let start = |scene: &Scene| initialise(scene, &config(&["init.source=points", "train.sh_degree=2"]), Seed::root(0), &Silent).unwrap();
     let mut points = PointCloud { colors: vec![[0.5; 3]; grid.len()], positions: grid };
     scene.points = Some(points.clone());
     assert_eq!(start(&scene), from_points(&points, 2, 0.1), "ordinary points stay as they are");
