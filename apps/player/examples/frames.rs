@@ -5,6 +5,8 @@
 //! It looks from where the window would begin. Of N frames at times from start to end, the milliseconds of each are those from its commands until the device is idle;
 //! frames per second are those of N frames sent without waiting. The first frame counts from the bytes in memory.
 
+#![allow(clippy::print_stdout, reason = "its output is what it is for")]
+
 use cc4dgs_format::{Error, Limits, Result};
 use cc4dgs_player::{Content, Navigator, Renderer, View, request_device};
 use std::time::Instant;

@@ -46,6 +46,8 @@ pub struct Scene {
     pub alpha_max: f32,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels.
     pub blur: f32,
+    /// Longest focal length in pixels of the training images: longer ones blur more ([`blur_at`](cc4dgs_format::blur_at)).
+    pub focal: Option<f64>,
     /// Whether opacity is scaled by the share of the footprint that the pixel blur added.
     pub antialiased: bool,
     /// Whether a square of 3 sigma in whole tiles limits footprints (Inria's rules).
@@ -107,6 +109,7 @@ impl Content {
         scene.background = manifest.background;
         scene.antialiased = manifest.rasterizer.antialiased;
         scene.blur = Some(manifest.rasterizer.blur).filter(|blur| blur.is_finite()).unwrap_or(BLUR).clamp(*BLUR_RANGE.start(), *BLUR_RANGE.end()) as f32;
+        scene.focal = manifest.rasterizer.focal.filter(|focal| focal.is_finite() && *focal > 0.0);
         scene.square = rules == Rules::Inria;
         scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(if scene.square { 0.2 } else { 0.01 }).clamp(LEAST_NEAR, MOST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
@@ -140,6 +143,7 @@ impl Scene {
             near: 0.01,
             alpha_max: 0.99,
             blur: BLUR as f32,
+            focal: None,
             antialiased: false,
             square: false,
             gaussians: Vec::with_capacity(GAUSSIAN_FLOATS * n),

@@ -1,7 +1,7 @@
 //! Checks the inputs of a render and converts them to the form of the operation.
 
 use crate::ops::rasterize::RasterSettings;
-use cc4dgs_core::{BLUR_RANGE, Camera, Error, RenderSettings, Result, SplatColors, Splats};
+use cc4dgs_core::{BLUR_RANGE, Camera, Error, RenderSettings, Result, SplatColors, Splats, blur_at};
 
 /// Pixels of the largest image drawn.
 const MAX_PIXELS: u64 = 1 << 28;
@@ -57,6 +57,9 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
         let problem = format!("{} is not between {} and {}", settings.blur, BLUR_RANGE.start(), BLUR_RANGE.end());
         return Err(Error::parameter("render.blur", problem, "Give a variance in square pixels, such as 0.3 or 0.1"));
     }
+    if let Some(focal) = settings.focal.filter(|focal| !focal.is_finite() || *focal <= 0.0) {
+        return Err(Error::parameter("render.focal", format!("{focal} is not a focal length"), "Give the longest one of the training images, in pixels"));
+    }
     if let Some(background) = &settings.background {
         shape("background", &background.dims(), &[3])?;
     }
@@ -71,7 +74,7 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
         rules: settings.rules,
         near: settings.near,
         antialiased: settings.antialiased,
-        blur: settings.blur,
+        blur: blur_at(settings.blur, settings.focal, camera.fx, camera.fy),
         space: splats.space,
         sh_degree,
         max_weights: settings.max_weights,

@@ -43,7 +43,7 @@ pub use image::Image8;
 pub use limits::Limits;
 pub use moving::Moving;
 pub use plugin::{Entries, Plugin, PluginEntry, split_kind, unknown_name};
-pub use rules::{BLUR, BLUR_RANGE, Rules};
+pub use rules::{BLUR, BLUR_RANGE, Rules, blur_at};
 pub use seed::Seed;
 pub use similarity::Similarity;
 pub use stored_model::{FIELD_STREAMS, MOVING, StoredModel, canonical_stages, read_gaussians, read_stage, read_weights, weight_seed};

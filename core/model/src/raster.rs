@@ -84,6 +84,8 @@ pub struct RenderSettings {
     pub antialiased: bool,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels, 0.01 to 100.
     pub blur: f64,
+    /// Longest focal length in pixels of the images that the model was trained on: longer ones blur more ([`blur_at`](crate::blur_at)). `None`: all blur alike.
+    pub focal: Option<f64>,
     /// Smallest camera depth drawn, world units; `None` leaves it to the rules.
     pub near: Option<f32>,
     /// Colour behind everything, linear RGB in 0..1 `[3]`; may carry a gradient. `None` is black.
@@ -97,7 +99,7 @@ pub struct RenderSettings {
 
 impl Default for RenderSettings {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, blur: BLUR, near: None, background: None, max_weights: false, pair_capacity: None }
+        Self { rules: Rules::Gsplat099, antialiased: false, blur: BLUR, focal: None, near: None, background: None, max_weights: false, pair_capacity: None }
     }
 }
 

@@ -19,6 +19,10 @@ pub struct RenderConfig {
     pub antialiased: bool,
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels, 0.01 to 100: 0.3 in 3D Gaussian splatting, less is sharper.
     pub blur: f64,
+    /// Longest focal length in pixels of the images that the model is trained on. Images with longer ones, which magnify it, blur in proportion. Absent in
+    /// a configuration: as found in the scene; in a model: all blur alike.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub focal: Option<f64>,
     /// Smallest camera depth drawn, units of the normalised frame; absent, the rules' own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
@@ -29,13 +33,14 @@ pub struct RenderConfig {
 
 impl Default for RenderConfig {
     fn default() -> Self {
-        Self { rules: Rules::Gsplat099, antialiased: false, blur: BLUR, near: None, background: None }
+        Self { rules: Rules::Gsplat099, antialiased: false, blur: BLUR, focal: None, near: None, background: None }
     }
 }
 
 impl RenderConfig {
     /// What a rasterizer is told; the colour behind everything comes as a tensor, `None` is black.
     pub fn settings(&self, background: Option<Tensor<1>>) -> RenderSettings {
-        RenderSettings { rules: self.rules, antialiased: self.antialiased, blur: self.blur, near: self.near, background, ..RenderSettings::default() }
+        let Self { rules, antialiased, blur, focal, near, background: _ } = *self;
+        RenderSettings { rules, antialiased, blur, focal, near, background, ..RenderSettings::default() }
     }
 }

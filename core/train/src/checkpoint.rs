@@ -104,7 +104,7 @@ impl Checkpoint {
         };
         let arrays = training.optimizer.iter().zip(&self.arrays.optimizer).map(two).collect();
         parts.optimizer.restore(OptimizerState { arrays, steps: training.optimizer_steps })?;
-        let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, parts);
+        let mut state = TrainState::new(GaussianSet::new(&model.gaussians, &self.device), model.moving, model.normalisation, model.render.focal, parts);
         (state.stage, state.iteration, state.smooth, state.deformer) = (training.stage, training.iteration, training.smooth, model.field);
         (state.guard, state.record) = (guard, training.record);
         if let Some((part, rate)) = training.rates.iter().find(|(_, rate)| !(0.0..=1.0).contains(*rate)) {
@@ -171,7 +171,7 @@ pub fn save(path: &Path, state: &TrainState, config: &RunConfig) -> Result<u64> 
             frame_count: frame_count(state),
             normalisation: state.normalisation,
             background: config.background()?,
-            render: config.render.clone(),
+            render: state.render(config),
             rasterizer: config.rasterizer.clone(),
             deformer: state.deformer.as_ref().map(|d| DeformerHeader { section: d.section.clone(), context: d.context.clone() }),
             provenance: provenance(config)?,
@@ -215,12 +215,12 @@ pub fn load(path: &Path, registry: &Registry, device: &Device, limits: &Limits) 
 pub fn trained_model(state: TrainState, config: &RunConfig) -> Result<Model> {
     let (gaussians, frame_count) = (state.set.host_gaussians()?, frame_count(&state));
     Ok(Model {
+        render: state.render(config),
         size: ModelSize::float32(&gaussians, state.deformer.as_ref()),
         gaussians,
         field: state.deformer,
         moving: state.moving,
         background: Some(config.background()?),
-        render: config.render.clone(),
         rasterizer: config.rasterizer.clone(),
         frame_count,
         normalisation: state.normalisation,

@@ -180,6 +180,9 @@ impl RunConfig {
             let problem = format!("{} is not between {} and {}", self.render.blur, BLUR_RANGE.start(), BLUR_RANGE.end());
             return Err(Error::parameter("render.blur", problem, "Give a variance in square pixels, such as 0.3 or 0.1"));
         }
+        if let Some(focal) = self.render.focal.filter(|focal| !focal.is_finite() || *focal <= 0.0) {
+            return Err(Error::parameter("render.focal", format!("{focal} is not a focal length"), "Give the longest one of the training images, in pixels"));
+        }
         if let Some(background) = self.render.background.filter(|b| b.iter().any(|c| !(0.0..=1.0).contains(c))) {
             return Err(Error::parameter("render.background", format!("{background:?} is not RGB in 0..1"), "Give three numbers in 0..1"));
         }
@@ -234,6 +237,10 @@ mod tests {
         for blur in ["0", "-0.1", "nan", "101"] {
             let e = RunConfig::resolve(Some("demo"), None, &[format!("render.blur={blur}")]).unwrap_err().to_string();
             assert!(e.contains("render.blur") && e.contains("0.01 and 100"), "{e}");
+        }
+        for focal in ["0", "-1", "inf"] {
+            let e = RunConfig::resolve(Some("demo"), None, &[format!("render.focal={focal}")]).unwrap_err().to_string();
+            assert!(e.contains("render.focal"), "{e}");
         }
     }
 }

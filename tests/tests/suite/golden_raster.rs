@@ -187,6 +187,7 @@ fn check_operation(scene: &Scene, device: &Device, findings: &mut Findings) {
         rules: s.rules,
         antialiased: s.antialiased,
         blur: s.blur,
+        focal: None,
         near: None,
         background: Some(background.clone()),
         max_weights: true,

@@ -5,6 +5,7 @@
 mod auto;
 mod baselines;
 mod basis;
+mod blur;
 mod cdf;
 mod checkpoints;
 mod checks;

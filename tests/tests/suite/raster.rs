@@ -291,7 +291,7 @@ fn hostile_gaussians_never_reach_the_image() {
     }
 }
 
-fn empty_splats(device: &Device) -> Splats {
+pub fn empty_splats(device: &Device) -> Splats {
     let host = HostGaussians { sh_degree: 0, ..Default::default() };
     Splats::from_gaussians(&Gaussians::from_host(&host, device), 0)
 }
@@ -311,18 +311,6 @@ fn no_gaussians_show_the_background() {
                 assert!(planes[plane * 15..(plane + 1) * 15].iter().all(|&v| v == expected), "plane {plane}: {planes:?}");
             }
             assert_eq!(out.stats.work.visible, 0);
-        }
-    }
-}
-
-#[test]
-fn impossible_blurs_are_refused() {
-    let camera = step_camera(&StepCase { width: 5, height: 3, gaussians: 0 });
-    for (name, device) in cc4dgs_tests::devices() {
-        for blur in [0.0, -0.1, f64::NAN, f64::INFINITY, 1e-300] {
-            let render = RenderSettings { blur, ..Default::default() };
-            let message = TileRasterizer.render(&empty_splats(&device), &camera, &render).map(|_| ()).unwrap_err().to_string();
-            assert!(message.contains("render.blur"), "{name}, {blur}: {message}");
         }
     }
 }

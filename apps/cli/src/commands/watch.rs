@@ -58,7 +58,14 @@ fn content(snapshot: Snapshot) -> Result<Content> {
     let manifest = Manifest {
         frame_count: standing.frame_count,
         background,
-        rasterizer: RasterizerEntry { rules: render.rules, antialiased: render.antialiased, blur: render.blur, near: render.near, ..Default::default() },
+        rasterizer: RasterizerEntry {
+            rules: render.rules,
+            antialiased: render.antialiased,
+            blur: render.blur,
+            focal: render.focal,
+            near: render.near,
+            ..Default::default()
+        },
         presentation: presentation::of_cameras(&cameras, None),
         ..Default::default()
     };

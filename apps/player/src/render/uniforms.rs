@@ -4,7 +4,7 @@ use super::View;
 use super::pipelines::Pipelines;
 use crate::content::Scene;
 use bytemuck::{Pod, Zeroable};
-use cc4dgs_format::Camera;
+use cc4dgs_format::{Camera, blur_at};
 
 /// Beyond this depth nothing is drawn.
 const FAR: f32 = 1e10;
@@ -46,7 +46,7 @@ impl Frame {
         let per_ln = LAST_KEY / (far / near).ln();
         Self {
             world_to_camera: std::array::from_fn(|i| std::array::from_fn(|j| m[i][j] as f32)),
-            center: [center[0] as f32, center[1] as f32, center[2] as f32, scene.blur],
+            center: [center[0] as f32, center[1] as f32, center[2] as f32, blur_at(f64::from(scene.blur), scene.focal, camera.fx, camera.fy) as f32],
             intrinsics: [camera.fx as f32, camera.fy as f32, camera.cx as f32, camera.cy as f32],
             ratio_limits: [x0, x1, y0, y1],
             size: [size[0] as f32, size[1] as f32, scene.near, FAR],

@@ -47,6 +47,9 @@ pub struct RasterizerEntry {
     /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; absent if it is [`BLUR`].
     #[serde(default = "blur", skip_serializing_if = "is_usual")]
     pub blur: f64,
+    /// Longest focal length in pixels of the training images: longer ones blur more ([`blur_at`](crate::blur_at)); absent if all blur alike.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub focal: Option<f64>,
     /// Smallest camera depth drawn, units of the model; absent if the rules' default was used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub near: Option<f32>,
@@ -64,7 +67,7 @@ fn is_usual(blur: &f64) -> bool {
 
 impl Default for RasterizerEntry {
     fn default() -> Self {
-        Self { name: String::new(), rules: Rules::default(), antialiased: false, blur: BLUR, near: None, settings: toml::Table::new() }
+        Self { name: String::new(), rules: Rules::default(), antialiased: false, blur: BLUR, focal: None, near: None, settings: toml::Table::new() }
     }
 }
 
@@ -217,9 +220,11 @@ mod tests {
     #[test]
     fn the_usual_blur_is_not_written_and_another_one_comes_back() {
         let of = |blur: f64| RasterizerEntry { blur, ..Default::default() };
+        let larger = RasterizerEntry { focal: Some(123.45), ..of(0.1) };
         let text = |entry: &RasterizerEntry| serde_json::to_string(entry).unwrap();
         assert!(!text(&of(BLUR)).contains("blur") && text(&of(0.1)).contains("\"blur\":0.1"));
-        for entry in [of(BLUR), of(0.1)] {
+        assert!(!text(&of(0.1)).contains("focal"));
+        for entry in [of(BLUR), of(0.1), larger] {
             assert_eq!(serde_json::from_str::<RasterizerEntry>(&text(&entry)).unwrap(), entry);
         }
     }

@@ -182,7 +182,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         }
         _ => {
             let host = initialise(&job.scene, config, seed.child("init"), job.events)?;
-            TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, parts)
+            TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, state::longest_focal(&job.scene), parts)
         }
     };
     let mut context = Context {

@@ -61,7 +61,7 @@ impl Context<'_> {
         let gaussians = state.set.host_gaussians()?;
         let (rows, moved) = self.moved(state, &gaussians.dynamic_scores, times)?;
         let cameras = super::training_cameras(scene).into_keys().map(|index| scene.cameras[index].clone()).collect();
-        observer.receive(Snapshot { standing, gaussians, rows, moved, background: config.background()?, render: config.render.clone(), cameras });
+        observer.receive(Snapshot { standing, gaussians, rows, moved, background: config.background()?, render: state.render(config), cameras });
         Ok(())
     }
     /// The Gaussians that move by their scores, and what they are at `count` even times.

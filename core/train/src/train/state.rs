@@ -5,12 +5,13 @@ use super::record::Record;
 use super::rounded::Rounded;
 use super::strain::Neighbours;
 use super::watchdog::RateFactors;
+use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
 use burn::tensor::Device;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Appearance, DeformerContext, DensityControl, Optimizer, Result, Seed, Similarity, SpatialInput, Stage};
+use cc4dgs_core::{Appearance, DeformerContext, DensityControl, Optimizer, Result, Scene, Seed, Similarity, SpatialInput, Split, Stage};
 use cc4dgs_play::model::ModelDeformer;
-use cc4dgs_play::{Moving, MovingRows};
+use cc4dgs_play::{Moving, MovingRows, RenderConfig};
 
 /// The state between two iterations.
 pub struct TrainState {
@@ -24,6 +25,8 @@ pub struct TrainState {
     pub moving: Moving,
     /// From the coordinates of the dataset to those of the Gaussians.
     pub normalisation: Similarity,
+    /// Longest focal length of the training images in pixels ([`longest_focal`]).
+    pub focal: Option<f64>,
     /// The deformer, from the main stage on.
     pub deformer: Option<ModelDeformer>,
     /// Between rendered and recorded images.
@@ -46,6 +49,12 @@ pub struct TrainState {
     pub(crate) neighbours: Option<Neighbours>,
 }
 
+/// Longest focal length of the training images of `scene` in pixels, rounded up to hundredths.
+pub(crate) fn longest_focal(scene: &Scene) -> Option<f64> {
+    let focal = |view: usize| (100.0 * (scene.camera(view).fx * scene.camera(view).fy).sqrt()).ceil() / 100.0;
+    scene.split(Split::Train).into_iter().map(focal).reduce(f64::max)
+}
+
 /// The parts of the trainer that have state.
 pub struct Parts {
     /// Between rendered and recorded images.
@@ -58,7 +67,7 @@ pub struct Parts {
 
 impl TrainState {
     /// A fresh run.
-    pub fn new(set: GaussianSet, moving: Moving, normalisation: Similarity, parts: Parts) -> Self {
+    pub fn new(set: GaussianSet, moving: Moving, normalisation: Similarity, focal: Option<f64>, parts: Parts) -> Self {
         let Parts { appearance, density, optimizer } = parts;
         let guard = Guard::default();
         Self {
@@ -67,6 +76,7 @@ impl TrainState {
             set,
             moving,
             normalisation,
+            focal,
             deformer: None,
             appearance,
             density,
@@ -79,6 +89,10 @@ impl TrainState {
             rows: None,
             neighbours: None,
         }
+    }
+    /// How the model of a run with `config` is drawn: images that are larger than the training images blur in proportion, unless `config` says from where on.
+    pub fn render(&self, config: &RunConfig) -> RenderConfig {
+        RenderConfig { focal: config.render.focal.or(self.focal), ..config.render.clone() }
     }
     /// New optimizer state and statistics, as every stage starts with (Swift4D).
     pub fn begin_stage(&mut self, device: &Device) {

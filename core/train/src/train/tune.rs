@@ -138,7 +138,7 @@ impl<'a> Tuner<'a> {
             checkpoint: None,
         };
         let of = self.job.model;
-        let mut state = TrainState::new(GaussianSet::new(&model.gaussians, device), of.moving, of.normalisation, parts);
+        let mut state = TrainState::new(GaussianSet::new(&model.gaussians, device), of.moving, of.normalisation, of.render.focal, parts);
         if let Some(of) = self.moving_field() {
             let mut field = registry.build_deformer(&of.section, &of.context, device)?;
             load_weights("tuned weights", field.as_mut(), model.weights.clone(), device)?;
