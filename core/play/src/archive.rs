@@ -6,7 +6,7 @@ use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, RasterizerEntry, StreamKind};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
@@ -182,15 +182,7 @@ impl Model {
         let manifest = Manifest {
             codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
             deformer,
-            rasterizer: RasterizerEntry {
-                name: rasterizer,
-                rules: self.render.rules,
-                antialiased: self.render.antialiased,
-                blur: self.render.blur,
-                focal: self.render.focal,
-                near: self.render.near,
-                settings: rasterizer_settings,
-            },
+            rasterizer: self.render.entry(rasterizer, rasterizer_settings),
             frame_count: self.frame_count,
             normalisation: self.normalisation,
             time_range: [0.0, 1.0],

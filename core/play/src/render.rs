@@ -1,6 +1,7 @@
 //! How images are drawn, in training and afterwards.
 
 use burn::tensor::Tensor;
+use cc4dgs_core::archive::RasterizerEntry;
 use cc4dgs_core::{BLUR, RenderSettings, Rules};
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +39,11 @@ impl Default for RenderConfig {
 }
 
 impl RenderConfig {
+    /// The entry of an archive's manifest, with the rasterizer's name and its settings; the manifest has the background apart.
+    pub fn entry(&self, name: String, settings: toml::Table) -> RasterizerEntry {
+        let Self { rules, antialiased, blur, focal, near, background: _ } = *self;
+        RasterizerEntry { name, rules, antialiased, blur, focal, near, settings }
+    }
     /// What a rasterizer is told; the colour behind everything comes as a tensor, `None` is black.
     pub fn settings(&self, background: Option<Tensor<1>>) -> RenderSettings {
         let Self { rules, antialiased, blur, focal, near, background: _ } = *self;

@@ -3,7 +3,7 @@
 use super::{Context, train};
 use crate::args::Train;
 use crate::interrupt;
-use cc4dgs_core::archive::{Manifest, RasterizerEntry};
+use cc4dgs_core::archive::Manifest;
 use cc4dgs_core::{Error, Moving, Result, StoredModel};
 use cc4dgs_play::bake::keyframes;
 use cc4dgs_play::presentation;
@@ -58,14 +58,7 @@ fn content(snapshot: Snapshot) -> Result<Content> {
     let manifest = Manifest {
         frame_count: standing.frame_count,
         background,
-        rasterizer: RasterizerEntry {
-            rules: render.rules,
-            antialiased: render.antialiased,
-            blur: render.blur,
-            focal: render.focal,
-            near: render.near,
-            ..Default::default()
-        },
+        rasterizer: render.entry(String::new(), Default::default()),
         presentation: presentation::of_cameras(&cameras, None),
         ..Default::default()
     };
