@@ -14,18 +14,16 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock};
 
-/// The demo at small size: every stage runs, and density control happens at least once.
+/// The demo at small size with `clone-split`: every stage runs, and every kind of density control happens at least once.
 fn tiny(extra: &[&str]) -> RunConfig {
     tiny_of("demo", extra)
 }
 
 /// [`tiny`] with another method.
 fn tiny_of(preset: &str, extra: &[&str]) -> RunConfig {
+    let small = ["scene.width=48", "scene.height=48", "train.iterations=160", "train.batch=2", "init.count=400"];
     let mut sets: Vec<String> =
-        ["scene.width=48", "scene.height=48", "train.iterations=160", "train.batch=2", "init.count=400", "train.log_every=5", "train.lambda_r=0.01"]
-            .iter()
-            .map(ToString::to_string)
-            .collect();
+        small.iter().chain(&["train.log_every=5", "train.lambda_r=0.01", "density.kind=clone-split"]).map(ToString::to_string).collect();
     sets.extend(extra.iter().map(ToString::to_string));
     RunConfig::resolve(Some(preset), None, &sets).unwrap()
 }
@@ -168,6 +166,8 @@ fn static_gaussians_cost_no_field_time() {
     let model = load(folder.path());
     let mut player = Player::new(&model, &Registry::collect().unwrap(), &Device::flex()).unwrap();
     player.gaussians_at(0.5).unwrap();
+    let longest = open(&config).cameras.iter().map(|c| (c.fx * c.fy).sqrt()).fold(0.0, f64::max);
+    assert!(model.render.focal.is_some_and(|focal| (longest..longest + 0.011).contains(&focal)), "{:?}, {longest}", model.render);
     let still = (report.gaussians - report.dynamic_gaussians) as u64;
     assert!(still > 0 && report.dynamic_gaussians > 0, "{report:?}");
     assert_eq!((player.work.deformed, player.work.static_skipped), (report.dynamic_gaussians as u64, still));
@@ -264,6 +264,7 @@ fn every_field_trains_resumes_plays_and_is_archived() {
             let archive = folder.path().join(format!("{method}-{precision}.cc4d"));
             model.save_archive(&archive, &options("raw", precision), &registry, &Limits::default(), &Silent).unwrap();
             let stored = load(&archive);
+            assert_eq!(stored.render.focal, model.render.focal, "{method}");
             let after = score(&stored, &config).psnr_db;
             assert!((before - after).abs() < allowed, "{method}: {before} dB, {after} from the archive with {precision} weights");
             deform.push(stored.size.deform);
