@@ -88,6 +88,7 @@ impl<P: PluginEntry> Entries<P> {
 pub fn unknown_name<'a>(kind: &str, name: &str, known: impl Iterator<Item = &'a str>) -> Error {
     let mut known: Vec<&str> = known.collect();
     known.sort_by(|a, b| strsim::jaro_winkler(b, name).total_cmp(&strsim::jaro_winkler(a, name)).then(a.cmp(b)));
+    known.dedup();
     // Jaro-Winkler misses swapped letters in short names; edit distance misses long names that share only a prefix.
     let few_edits = |k: &str| strsim::damerau_levenshtein(k, name) <= (name.chars().count() / 3).min(2);
     let near: Vec<&str> = known.iter().copied().filter(|k| strsim::jaro_winkler(k, name) > 0.75 || few_edits(k)).take(3).collect();

@@ -24,6 +24,10 @@ mod registry;
 mod scene;
 mod schedule;
 
+// burn draws random numbers through it, and it has none in browsers unless it is asked to.
+#[cfg(target_arch = "wasm32")]
+use getrandom as _;
+
 pub use adapters::{Adapter, AdapterKind, adapters, auto_device};
 pub use appearance::{Appearance, AppearanceContext, AppearancePlugin};
 pub use burn;

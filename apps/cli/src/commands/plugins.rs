@@ -2,8 +2,11 @@
 
 use super::Context;
 use crate::args::Plugins;
-use cc4dgs_core::{DEVICE_NAMES, Result, unknown_name};
+use cc4dgs_core::{DEVICE_NAMES, Error, Result};
 use serde_json::json;
+
+/// Names that the error about an unknown one lists, at most.
+const NEAREST: usize = 8;
 
 pub fn run(context: &Context, args: &Plugins) -> Result<()> {
     match &args.name {
@@ -35,6 +38,17 @@ fn show_preset(context: &Context, name: &str, settings: &toml::Table) -> Result<
     context.output.result(&array, || format!("preset {name}\n\n{settings}"))
 }
 
+/// The error about a name that is none of `known`. They are too many to be listed.
+fn unknown(name: &str, mut known: Vec<&str>) -> Error {
+    // Jaro-Winkler misses swapped letters in short names, edit distance long names that share only a prefix.
+    let likeness = |other: &str| strsim::jaro_winkler(other, name).max(strsim::normalized_damerau_levenshtein(other, name));
+    known.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)).then(a.cmp(b)));
+    known.dedup();
+    known.truncate(NEAREST);
+    let remedy = format!("The nearest are {}; `cc4dgs plugins` lists all", known.join(", "));
+    Error::parameter(format!("plug-in or preset '{name}'"), "unknown name", remedy)
+}
+
 /// Everything of the name, whatever its kind: a codec and a deformer may share one.
 fn show(context: &Context, name: &str) -> Result<()> {
     let plugins = context.registry.plugins();
@@ -42,7 +56,7 @@ fn show(context: &Context, name: &str) -> Result<()> {
     if found.is_empty() {
         return match context.registry.preset(name) {
             Ok(settings) => show_preset(context, name, &settings),
-            Err(_) => Err(unknown_name("plug-in or preset", name, plugins.iter().map(|(_, p)| p.name))),
+            Err(_) => Err(unknown(name, plugins.iter().map(|(_, p)| p.name).collect())),
         };
     }
     let full = |(kind, p): &&(&str, &cc4dgs_core::Plugin)| json!({ "kind": kind, "name": p.name, "version": p.version, "summary": p.summary, "paper": p.paper, "capabilities": p.capabilities, "schema": p.schema });

@@ -13,7 +13,9 @@ mod rasterizer;
 mod reader;
 
 pub use appearance::appearance;
-pub use cc4dgs_format::conformance::{codec, exporter, weight_codec};
+#[cfg(not(target_arch = "wasm32"))]
+pub use cc4dgs_format::conformance::exporter;
+pub use cc4dgs_format::conformance::{codec, weight_codec};
 pub use deformer::deformer;
 pub use density::density;
 pub use loss::loss;

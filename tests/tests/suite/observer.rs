@@ -1,5 +1,4 @@
 //! Looking at a training changes no byte of its result, and shows the model as it is.
-#![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
 use cc4dgs::play::bake::keyframes;
 use cc4dgs::train::train::{Observer, Snapshot, Standing, TrainJob, train};
