@@ -12,6 +12,7 @@ enum Mistake {
     None,
     DoubledGradient,
     DetachedGradient,
+    DetachedRegularizer,
     NameTwice,
     WrongShape,
     Panic,
@@ -53,6 +54,11 @@ impl Deformer for Velocities {
         };
         Ok(Offsets { means: Some(means), ..Offsets::default() })
     }
+    fn regularizer(&self, input: &SpatialInput, _: f32, _: f32) -> Result<Option<Tensor<1>>> {
+        let velocity = input.attributes.first().cloned();
+        let velocity = velocity.map(|v| if self.0 == Mistake::DetachedRegularizer { v.detach() } else { v });
+        Ok(velocity.map(|v| v.powi_scalar(2).mean()))
+    }
     fn parameters(&self) -> Vec<&Parameter> {
         Vec::new()
     }
@@ -92,9 +98,10 @@ fn a_deformer_that_lives_in_its_attributes_conforms() {
 
 #[test]
 fn mistakes_are_found() {
-    let cases: [(Build, &str); 8] = [
+    let cases: [(Build, &str); 9] = [
         (with!(DoubledGradient), "attribute velocity: the value rises"),
         (with!(DetachedGradient), "no gradient reaches attribute velocity"),
+        (with!(DetachedRegularizer), "regularizer: at progress 0: no gradient reaches attribute velocity, but"),
         (with!(NameTwice), "the name is used twice"),
         (with!(WrongShape), "head means"),
         (with!(Panic), "it panics"),

@@ -21,7 +21,8 @@ const CENTRES: usize = 48;
 /// - equal seeds give equal weights; weights, parameters and attributes have unique names, matching shapes and existing groups;
 /// - every head has its shape; offsets have the same heads at every time and at every progress of training, are finite, and repeat bit for bit;
 /// - a deformer that declares `starts-as-identity` moves nothing initially, a static one never does;
-/// - gradients of all weights and of all attributes agree with finite differences, through the offsets and through the regularizer;
+/// - gradients of all weights and of all attributes agree with finite differences, through the offsets and through the regularizer; a regularizer has a
+///   gradient for every array that it depends on;
 /// - several times at once give the offsets of each; packed features give the same offsets; weights can be copied to a new deformer, bit for bit;
 /// - what `simplified` returns can be built again from its settings, and moves Gaussians in nearly the same way;
 /// - no centres, one centre and centres that are not finite give offsets or errors; missing attributes and times that are not numbers are refused.
