@@ -49,6 +49,7 @@ pub mod cpu {
 mod cube {
     mod adam;
     mod basis;
+    mod cross_entropy;
     mod field;
     mod image;
     mod life;
