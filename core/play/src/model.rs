@@ -1,6 +1,7 @@
 //! A trained model: canonical Gaussians, the field that moves them, and how they want to be drawn.
 
 use crate::checkpoint;
+use crate::orbit::middle_and_radius;
 use crate::source::{Source, SourceKind};
 use crate::{Moving, RenderConfig, default_rasterizer};
 use burn::tensor::Device;
@@ -8,6 +9,11 @@ use cc4dgs_core::archive::{Archive, Provenance};
 use cc4dgs_core::{Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Similarity, ply, spz};
 use serde::Serialize;
 use std::path::Path;
+
+/// The smallest depth that is drawn where a model does not say otherwise: that of the default rules.
+const NEAR: f32 = 0.01;
+/// The smallest depth drawn of a model in unknown units, as a share of its radius; cameras that see the whole model are some three radii away.
+const NEAR_OF_RADIUS: f64 = 0.01;
 
 /// A model, wherever it came from.
 pub struct Model {
@@ -82,7 +88,7 @@ impl Model {
     /// ([`SourceKind`]). PLY and SPZ files become static models, drawn by the default rasterizer.
     ///
     /// # Errors
-    /// [`Error::Data`] for files that are no model or damaged, [`Error::Unsupported`] for versions and plug-ins this program does not have,
+    /// [`Error::Parameter`] for a path that does not exist, [`Error::Data`] for files that are no model or damaged, [`Error::Unsupported`] for versions and plug-ins this program does not have,
     /// [`Error::Limit`] for claims over `limits`.
     pub fn open(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
         let Source { kind, file } = Source::expect(path)?;
@@ -107,13 +113,14 @@ impl Model {
             }
         }
     }
-    /// A static model of `gaussians` that take `bytes` in their file.
+    /// A static model of `gaussians` that take `bytes` in their file. The file does not say its units: cameras around a small model are near it too.
     fn from_static(gaussians: HostGaussians, bytes: u64) -> Self {
+        let near = (middle_and_radius(&gaussians).1 * NEAR_OF_RADIUS) as f32;
         Self {
             gaussians,
             field: None,
             moving: Moving::Nothing,
-            render: RenderConfig::default(),
+            render: RenderConfig { near: (near < NEAR).then_some(near), ..RenderConfig::default() },
             background: None,
             rasterizer: default_rasterizer(),
             frame_count: 1,

@@ -70,7 +70,7 @@ impl Orbit {
 }
 
 /// The median of the centres and the distance within which 70 % of them lie: a background far away must not push the camera out.
-fn middle_and_radius(gaussians: &HostGaussians) -> ([f64; 3], f64) {
+pub(crate) fn middle_and_radius(gaussians: &HostGaussians) -> ([f64; 3], f64) {
     let centre = |i: usize| -> [f64; 3] { std::array::from_fn(|k| f64::from(gaussians.means[3 * i + k])) };
     let mut kept: Vec<[f64; 3]> = (0..gaussians.len()).filter(|&i| gaussians.opacity_logits[i] > FAINT_LOGIT).map(centre).collect();
     if kept.is_empty() {

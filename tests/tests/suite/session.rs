@@ -1,6 +1,7 @@
 //! The library as used by a program.
 
 use cc4dgs::{Error, Event, Orbit, Session, Split};
+use cc4dgs_core::{Seed, Similarity, ply};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -101,5 +102,28 @@ fn errors_are_sentences_however_they_are_printed() {
     ] {
         assert_eq!(format!("{error:?}"), error.to_string());
         assert!(error.to_string().contains(". "), "no remedy: {error}");
+    }
+}
+
+#[test]
+fn a_ply_in_any_unit_looks_the_same() {
+    let session = flex();
+    let folder = tempfile::tempdir().unwrap();
+    let original = crate::raster::scene(300, Seed::root(3));
+    let image = |scale: f64| {
+        let mut gaussians = original.clone();
+        Similarity { scale, translation: [0.0; 3] }.apply_gaussians(&mut gaussians);
+        let file = folder.path().join("model.ply");
+        ply::write(&file, &gaussians, false).unwrap();
+        let model = session.open(&file).unwrap();
+        let camera = Orbit { size: (48, 36), frames: 1, ..Orbit::default() }.around(&model.gaussians).unwrap().remove(0);
+        session.player(&model).unwrap().frame(&camera, 0.0).unwrap().data
+    };
+    let usual = image(1.0);
+    let range = usual.iter().max().unwrap() - usual.iter().min().unwrap();
+    assert!(range > 100, "the image shows nothing: its values differ by {range}");
+    for scale in [1e-6, 1e-4, 1e4] {
+        let worst = image(scale).iter().zip(&usual).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+        assert!(worst <= 2, "scaled by {scale}: a value differs by {worst}");
     }
 }
