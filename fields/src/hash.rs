@@ -51,7 +51,7 @@ impl LevelHash {
     pub fn len(&self) -> usize {
         self.b.len()
     }
-    /// A's three rows `[k]` each, then b [k]: the constants as other devices read them.
+    /// A's three rows `[k]` each, then b `[k]`: the constants as other devices read them.
     pub fn constants(&self) -> Vec<u32> {
         self.a.iter().chain([&self.b]).flatten().copied().collect()
     }

@@ -1,6 +1,6 @@
 //! Settings that several fields share.
 
-use cc4dgs_format::{Error, Result, config};
+use cc4dgs_format::{Error, Result, config, unknown_name};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
@@ -38,6 +38,18 @@ impl Capacity {
 pub fn take<T: DeserializeOwned>(section: &mut toml::Table, keys: &[&str]) -> Result<T> {
     let own: toml::Table = keys.iter().filter_map(|k| section.remove(*k).map(|v| (k.to_string(), v))).collect();
     config::parse_section("deformer", &own)
+}
+
+/// Refuses a key that is in none of `keys`. For sections that are read in parts, so that the error lists the settings of all.
+///
+/// # Errors
+/// [`Error::Parameter`] with the most similar names, and all.
+pub fn refuse_unknown(section: &toml::Table, keys: &[&[&str]]) -> Result<()> {
+    let known = || keys.iter().flat_map(|part| part.iter().copied());
+    match section.keys().find(|key| known().all(|name| name != key.as_str())) {
+        Some(key) => Err(unknown_name("setting of the deformer", key, known())),
+        None => Ok(()),
+    }
 }
 
 /// Refuses a size outside `low..=high`.

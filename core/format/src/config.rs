@@ -8,8 +8,54 @@ use serde::de::DeserializeOwned;
 /// # Errors
 /// [`Error::Parameter`] with section and key, for unknown keys, wrong types and missing values.
 pub fn parse_section<T: DeserializeOwned>(object: &str, section: &toml::Table) -> Result<T> {
-    T::deserialize(toml::Value::Table(section.clone()))
-        .map_err(|e| Error::parameter(object, e.message().trim().to_string(), "`cc4dgs plugins NAME` and the presets show the known keys"))
+    T::deserialize(toml::Value::Table(section.clone())).map_err(|e| {
+        let key = key_at_fault::<T>(section, e.message());
+        let object = if key.is_empty() { object.to_string() } else { format!("{object}, {key}") };
+        Error::parameter(object, in_words(e.message()), "`cc4dgs plugins NAME` and the presets show the known keys")
+    })
+}
+
+/// The key without which `section` would not fail with `message`, such as `train.batch`; empty where no single key is at fault.
+fn key_at_fault<T: DeserializeOwned>(section: &toml::Table, message: &str) -> String {
+    let mut path: Vec<String> = Vec::new();
+    while let Some(key) = at(section, &path).and_then(|inner| inner.keys().find(|key| fails_otherwise::<T>(section, &path, key, message))) {
+        path.push(key.clone());
+    }
+    path.join(".")
+}
+
+/// The table at `path`.
+fn at<'t>(section: &'t toml::Table, path: &[String]) -> Option<&'t toml::Table> {
+    path.iter().try_fold(section, |table, key| table.get(key)?.as_table())
+}
+
+/// Whether `section` without `key` in the table at `path` can be read, or fails with another message.
+fn fails_otherwise<T: DeserializeOwned>(section: &toml::Table, path: &[String], key: &str, message: &str) -> bool {
+    let mut without = section.clone();
+    let inner = path.iter().try_fold(&mut without, |table, key| table.get_mut(key)?.as_table_mut());
+    inner.is_some_and(|table| table.remove(key).is_some()) && T::deserialize(toml::Value::Table(without)).err().is_none_or(|e| e.message() != message)
+}
+
+/// A message of serde in the words of TOML.
+fn in_words(message: &str) -> String {
+    let message = message.trim();
+    let parts = message.strip_prefix("invalid type: ").or_else(|| message.strip_prefix("invalid value: ")).and_then(|m| m.split_once(", expected "));
+    let Some((found, expected)) = parts else { return message.to_string() };
+    let found = match found {
+        "map" => "a table".to_string(),
+        "sequence" => "a list".to_string(),
+        other => format!("the {}", other.replace("floating point", "number").replace("integer", "number")),
+    };
+    let expected = match expected {
+        "u8" | "u16" | "u32" | "u64" | "usize" => "a whole number of 0 or more",
+        "i8" | "i16" | "i32" | "i64" | "isize" => "a whole number",
+        "f32" | "f64" => "a number",
+        "a sequence" => "a list",
+        "a map" => "a table",
+        other if other.starts_with("struct ") => "a table",
+        other => other,
+    };
+    format!("{found} where {expected} is expected")
 }
 
 /// Parses TOML text into a table; `object` names the file in errors.
@@ -37,6 +83,19 @@ pub fn merge(base: &mut toml::Table, over: &toml::Table) {
             }
         }
     }
+}
+
+/// A plug-in's section with the settings that its `schema` states where it has none of its own.
+///
+/// # Errors
+/// [`Error::Parameter`] for a schema that is not TOML.
+pub fn filled(schema: &str, section: &toml::Table) -> Result<toml::Table> {
+    let mut full = parse_table("plug-in schema", schema)?;
+    if let Some(kind) = section.get("kind") {
+        full.insert("kind".into(), kind.clone());
+    }
+    merge(&mut full, section);
+    Ok(full)
 }
 
 /// Applies one `--set a.b.c=value`. The value is parsed as TOML; bare words become strings.
@@ -110,5 +169,34 @@ mod tests {
         }
         let e = parse_section::<S>("train", &parse_table("t", "a = 1\niteratons = 3").unwrap()).err().unwrap().to_string();
         assert!(e.contains("iteratons") && e.contains("train"), "{e}");
+    }
+
+    #[test]
+    fn keys_of_wrong_types_are_named() {
+        #[derive(Debug, serde::Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Train {
+            #[allow(dead_code)]
+            batch: usize,
+        }
+        #[derive(Debug, serde::Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Run {
+            #[allow(dead_code)]
+            seed: u64,
+            #[allow(dead_code)]
+            train: Train,
+        }
+        let error = |text: &str| parse_section::<Run>("configuration", &parse_table("t", text).unwrap()).unwrap_err().to_string();
+        let e = error("seed = 1\n[train]\nbatch = 'abc'");
+        assert!(e.starts_with("configuration, train.batch: the string \"abc\" where a whole number of 0 or more is expected"), "{e}");
+        let e = error("seed = -1\n[train]\nbatch = 1");
+        assert!(e.contains("configuration, seed") && e.contains("-1"), "{e}");
+        let e = error("seed = 1\n[train]\nbatch = 1\nnope = 2");
+        assert!(e.contains("configuration, train.nope"), "{e}");
+        let e = error("seed = 1\ntrain = 3");
+        assert!(e.contains("configuration, train: the number `3` where a table is expected"), "{e}");
+        let e = error("seed = 1\n[train]");
+        assert!(e.contains("batch"), "{e}");
     }
 }

@@ -4,7 +4,7 @@ use crate::playback::MotionPlugin;
 use crate::{
     Appearance, AppearanceContext, AppearancePlugin, AttributeCodec, CodecPlugin, Deformer, DeformerContext, DeformerLayerPlugin, DeformerPlugin,
     DensityControl, DensityPlugin, Entries, Error, Exporter, ExporterPlugin, LossPlugin, Optimizer, OptimizerPlugin, Plugin, PresetPlugin, Rasterizer,
-    RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin, split_kind,
+    RasterizerPlugin, ReaderPlugin, Result, WeightCodec, WeightCodecPlugin, config, split_kind,
 };
 use burn::tensor::Device;
 
@@ -132,6 +132,26 @@ impl Registry {
     /// false or a table of its settings.
     pub fn build_deformer(&self, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
         let (kind, mut settings) = split_kind("deformer", section)?;
+        let layers = self.take_layers(&mut settings)?;
+        let deformer = (self.deformer(&kind)?.build)(&settings, context, device)?;
+        layers.into_iter().try_fold(deformer, |inner, (layer, table)| (layer.build)(&table, inner))
+    }
+    /// A `[deformer]` section with every setting of the deformer and of the layers around it stated, defaults included.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for an unknown `kind`, and for a layer whose key holds neither a boolean nor a table.
+    pub fn complete_deformer(&self, section: &toml::Table) -> Result<toml::Table> {
+        let (kind, mut settings) = split_kind("deformer", section)?;
+        let layers = self.take_layers(&mut settings)?;
+        let mut full = config::filled(self.deformer(&kind)?.info.schema, &settings)?;
+        full.insert("kind".into(), kind.into());
+        for (layer, table) in layers {
+            full.insert(layer.info.name.into(), config::filled(layer.info.schema, &table)?.into());
+        }
+        Ok(full)
+    }
+    /// Moves the layers that a `[deformer]` section asks for out of it, with the settings of each.
+    fn take_layers(&self, settings: &mut toml::Table) -> Result<Vec<(&'static DeformerLayerPlugin, toml::Table)>> {
         let mut layers = Vec::new();
         for layer in self.layers.iter() {
             match settings.remove(layer.info.name) {
@@ -144,8 +164,7 @@ impl Registry {
                 }
             }
         }
-        let deformer = (self.deformer(&kind)?.build)(&settings, context, device)?;
-        layers.into_iter().try_fold(deformer, |inner, (layer, table)| (layer.build)(&table, inner))
+        Ok(layers)
     }
     /// Builds the rasterizer of a `[rasterizer]` section (`kind` and its settings).
     pub fn build_rasterizer(&self, section: &toml::Table) -> Result<Box<dyn Rasterizer>> {

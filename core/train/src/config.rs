@@ -140,13 +140,13 @@ impl RunConfig {
     pub fn completed(&self, registry: &Registry) -> Result<Self> {
         let mut full = self.clone();
         let kind = |section: &toml::Table, object: &str| split_kind(object, section).map(|(kind, _)| kind);
-        full.deformer = filled(registry.deformer(&kind(&self.deformer, "deformer")?)?.info.schema, &self.deformer)?;
-        full.rasterizer = filled(registry.rasterizer(&kind(&self.rasterizer, "rasterizer")?)?.info.schema, &self.rasterizer)?;
-        full.density = filled(registry.density(&kind(&self.density, "density")?)?.info.schema, &self.density)?;
-        full.appearance = filled(registry.appearance(&kind(&self.appearance, "appearance")?)?.info.schema, &self.appearance)?;
-        full.optimizer = filled(registry.optimizer(&kind(&self.optimizer, "optimizer")?)?.info.schema, &self.optimizer)?;
+        full.deformer = registry.complete_deformer(&self.deformer)?;
+        full.rasterizer = config::filled(registry.rasterizer(&kind(&self.rasterizer, "rasterizer")?)?.info.schema, &self.rasterizer)?;
+        full.density = config::filled(registry.density(&kind(&self.density, "density")?)?.info.schema, &self.density)?;
+        full.appearance = config::filled(registry.appearance(&kind(&self.appearance, "appearance")?)?.info.schema, &self.appearance)?;
+        full.optimizer = config::filled(registry.optimizer(&kind(&self.optimizer, "optimizer")?)?.info.schema, &self.optimizer)?;
         for section in full.loss.iter_mut().chain([&mut full.score_loss]) {
-            *section = filled(registry.loss(&kind(section, "loss")?)?.info.schema, section)?;
+            *section = config::filled(registry.loss(&kind(section, "loss")?)?.info.schema, section)?;
         }
         Ok(full)
     }
@@ -195,16 +195,6 @@ impl RunConfig {
         }
         Ok(())
     }
-}
-
-/// `section` with the settings that its plug-in's `schema` states where it has none of its own.
-fn filled(schema: &str, section: &toml::Table) -> Result<toml::Table> {
-    let mut full = config::parse_table("plug-in schema", schema)?;
-    if let Some(kind) = section.get("kind") {
-        full.insert("kind".into(), kind.clone());
-    }
-    config::merge(&mut full, section);
-    Ok(full)
 }
 
 #[cfg(test)]

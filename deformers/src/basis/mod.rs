@@ -29,7 +29,10 @@ use std::sync::Arc;
 
 /// Settings with their defaults, as shown to users.
 const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as for `cdf`
-# levels, resolutions, hidden, features, hashes, modulus, vertex_reuse: as for `cdf`
+# levels, resolutions, hidden, features: as for `cdf`
+hashes = 128             # hash functions per vertex
+modulus = 1000000        # m of the hash functions
+vertex_reuse = true      # decode a vertex once, however many Gaussians share it
 # width = 128            # width of the coefficient network (small: 64; mid: 96)
 layers = 2               # hidden layers of the coefficient network
 time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6

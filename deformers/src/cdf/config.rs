@@ -1,7 +1,7 @@
 //! Settings of the computational deformation field and the sizes that follow from them.
 
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::{Rates, bounded, take, within};
+use crate::parts::settings::{Rates, bounded, refuse_unknown, take, within};
 use crate::parts::voxels::{VoxelSettings, VoxelSizes};
 use cc4dgs_backends::ops::field::ReluShape;
 use cc4dgs_core::{DeformerContext, Result, config};
@@ -67,6 +67,7 @@ impl<'de> Deserialize<'de> for CdfConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
         let mut section = toml::Table::deserialize(deserializer)?;
         let parse = |section: &mut toml::Table| -> Result<Self> {
+            refuse_unknown(section, &[&VoxelSettings::KEYS, &NetworkSettings::KEYS, &Rates::KEYS])?;
             let (voxels, rates) = (take(section, &VoxelSettings::KEYS)?, take(section, &Rates::KEYS)?);
             Ok(Self { voxels, rates, network: config::parse_section("deformer cdf", section)? })
         };
@@ -92,6 +93,11 @@ pub struct NetworkSettings {
     pub heads: Vec<Head>,
     /// Whether playback keeps spatial features.
     pub cache: bool,
+}
+
+impl NetworkSettings {
+    /// The keys of these settings in a `[deformer]` section.
+    pub const KEYS: [&'static str; 7] = ["width", "time_encoding", "time_bands", "time_layers", "fusion", "heads", "cache"];
 }
 
 impl Default for NetworkSettings {

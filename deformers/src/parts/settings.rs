@@ -1,6 +1,6 @@
 //! Settings that several deformers share. They are taken out of a `[deformer]` section before the deformer parses the rest.
 
-pub use cc4dgs_fields::settings::{Capacity, RATE_KEYS, bounded, take, within};
+pub use cc4dgs_fields::settings::{Capacity, RATE_KEYS, bounded, refuse_unknown, take, within};
 
 use cc4dgs_core::{Error, ParameterGroup, Result};
 use serde::Deserialize;

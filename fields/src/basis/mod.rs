@@ -5,7 +5,7 @@ mod layer;
 
 use crate::heads::{self, Head};
 use crate::networks::ReluShape;
-use crate::settings::{bounded, take, within};
+use crate::settings::{RATE_KEYS, bounded, refuse_unknown, take, within};
 use crate::time::bands_for;
 use crate::voxels::VoxelSettings;
 use cc4dgs_format::{DeformerContext, Error, Result, config};
@@ -81,7 +81,13 @@ impl Default for BasisSettings {
     }
 }
 
+/// The key that training writes: function indices by head.
+const KEPT: &str = "kept";
+
 impl BasisSettings {
+    /// The keys of these settings in a `[deformer]` section, but for the one that training writes.
+    pub const KEYS: [&'static str; 11] =
+        ["width", "layers", "time_bands", "cycles", "falloff", "sparsity", "splines", "learned", "heads", "rotation", "unused"];
     /// Values per Gaussian of a head.
     pub fn width_of(&self, head: Head, sh_degree: usize) -> usize {
         if head == Head::Quaternions && self.rotation == Rotation::Exponential { 3 } else { head.width(sh_degree) }
@@ -127,6 +133,9 @@ impl BasisPlan {
     /// [`Error::Parameter`] for unknown keys and values out of range.
     pub fn new(section: &toml::Table, context: &DeformerContext) -> Result<Self> {
         let mut rest = section.clone();
+        let kept = rest.remove(KEPT);
+        refuse_unknown(&rest, &[&VoxelSettings::KEYS, &BasisSettings::KEYS, &RATE_KEYS])?;
+        rest.extend(kept.map(|kept| (KEPT.to_string(), kept)));
         let voxels: VoxelSettings = take(&mut rest, &VoxelSettings::KEYS)?;
         let settings: BasisSettings = config::parse_section("deformer cdf-basis", &rest)?;
         heads::check(&settings.heads)?;

@@ -261,3 +261,27 @@ fn odd_requests_get_answers() {
     let commented: String = schema.lines().map(|l| l.strip_prefix("# ").unwrap_or(l)).collect::<Vec<_>>().join("\n");
     assert_eq!(Cdf::new(config(&commented), &context(300), &device).expect("the schema's settings").sizes(), shown.sizes());
 }
+
+#[test]
+fn completed_sections_state_every_default() {
+    let registry = Registry::collect().unwrap();
+    let section = |text: &str| cc4dgs_core::config::parse_table("test", text).unwrap();
+    let device = cc4dgs_core::parse_device("flex").unwrap();
+    for kind in ["cdf", "cdf-basis"] {
+        let given = section(&format!("kind = '{kind}'\ncapacity = 'small'\nlife = true"));
+        let full = registry.complete_deformer(&given).unwrap();
+        for key in ["capacity", "hashes", "modulus", "vertex_reuse", "time_bands", "heads", "lr_start"] {
+            assert!(full.contains_key(key), "{kind}: no {key} in {full}");
+        }
+        assert!(full["life"].as_table().unwrap().len() >= 10, "{full}");
+        assert_eq!(registry.complete_deformer(&full).unwrap(), full);
+        let shapes = |section: &toml::Table| {
+            let deformer = registry.build_deformer(section, &context(8), &device).unwrap();
+            deformer.parameters().iter().map(|p| (p.name.clone(), p.shape.clone())).collect::<Vec<_>>()
+        };
+        assert_eq!(shapes(&given), shapes(&full), "{kind}");
+    }
+    let unknown = section("kind = 'cdf-basis'\nresolution = 16");
+    let message = registry.build_deformer(&unknown, &context(8), &device).err().unwrap().to_string();
+    assert!(message.contains("Did you mean resolutions") && message.contains("lr_start") && !message.contains("kept"), "{message}");
+}

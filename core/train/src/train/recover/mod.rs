@@ -144,6 +144,7 @@ impl Context<'_> {
         let Some(old) = state.deformer.as_ref().filter(|old| own_lives(old) == 0) else { return Ok(()) };
         let mut section = old.section.clone();
         section.insert("life".into(), true.into());
+        let section = self.job.registry.complete_deformer(&section)?;
         let mut field = self.job.registry.build_deformer(&section, &old.context, &self.device)?;
         for (to, from) in field.parameters_mut().into_iter().zip(old.field.parameters()) {
             to.value = from.value.clone();
