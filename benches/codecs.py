@@ -39,7 +39,7 @@ def measure(program, model, scene, codec, weights, settings, before, folder):
     archive = pathlib.Path(folder) / f"{re.sub('[^a-z0-9]', '-', codec)}.cc4d"
     chosen = [part for s in settings for part in ("--set", s)]
     with_scene = ["--scene", scene] if scene else []
-    text, peak_mb = measured(program, "compress", model, "--codec", codec, "--field-weights", weights, "--out", archive, "--json", "-", *chosen, *with_scene)
+    text, peak_mb = measured(program, "compress", model, "--codec", codec, "--field-weights", weights, "--out", archive, "--overwrite", "--json", "-", *chosen, *with_scene)
     report = json.loads(text)
     row = {
         "codec": " ".join([codec, *settings]),

@@ -97,7 +97,7 @@ if [ -n "$data" ] && [ "$minutes" != 0 ]; then
         step "${scene%%:*}-train" $((60 * minutes)) train --scene "$path" --preset "$preset" --device "$device" --out "$run"
         [ -f "$run/checkpoint" ] || continue
         step "${scene%%:*}-eval" 300 eval "$run" --scene "$path" --device "$device"
-        step "${scene%%:*}-compress" 300 compress "$run" --codec cca:default --out "$run.cc4d"
+        step "${scene%%:*}-compress" 300 compress "$run" --codec cca:default --out "$run.cc4d" --overwrite
         step "${scene%%:*}-eval-compressed" 300 eval "$run.cc4d" --scene "$path" --device "$device"
     done
 fi

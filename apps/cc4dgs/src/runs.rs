@@ -18,16 +18,17 @@ pub enum Existing {
     Overwrite,
 }
 
-/// Refuses a folder that holds a run which would be overwritten unasked. `remedy` says how to ask.
+/// Refuses a folder that holds a run which would be overwritten unasked, and one to go on from that holds no checkpoint. `remedy` says what to do instead.
 ///
 /// # Errors
-/// [`Error::Parameter`] that names the folder and the file found there.
+/// [`Error::Parameter`] that names the folder and what is found there.
 pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<()> {
+    let refuse = |problem: String| Err(Error::parameter(format!("run folder {}", folder.display()), problem, remedy));
     let found = [CHECKPOINT, EVENTS, CONFIG].into_iter().find(|name| folder.join(name).exists());
-    match found {
-        Some(name) if existing == Existing::Refuse => {
-            Err(Error::parameter(format!("run folder {}", folder.display()), format!("it holds a run already ({name})"), remedy))
-        }
+    match (existing, found) {
+        (Existing::Refuse, Some(name)) => refuse(format!("it holds a run already ({name})")),
+        // The checkpoint is what is looked for first.
+        (Existing::Resume, found) if found != Some(CHECKPOINT) => refuse("nothing to resume, it has no checkpoint".into()),
         _ => Ok(()),
     }
 }
@@ -43,6 +44,11 @@ mod tests {
         check(Existing::Refuse).unwrap();
         std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
         check(Existing::Refuse).unwrap();
+        // A run that ended before its first checkpoint.
+        std::fs::write(folder.path().join(CONFIG), "").unwrap();
+        assert!(check(Existing::Refuse).is_err());
+        let message = check(Existing::Resume).unwrap_err().to_string();
+        assert!(message.contains("nothing to resume") && message.contains("--overwrite"), "{message}");
         std::fs::write(folder.path().join(CHECKPOINT), "x").unwrap();
         let message = check(Existing::Refuse).unwrap_err().to_string();
         assert!(message.contains("checkpoint") && message.contains("--overwrite"), "{message}");

@@ -165,6 +165,7 @@ impl Session {
     /// # Errors
     /// As [`Session::train`], and for a folder without a run.
     pub fn resume(&self, scene: impl Into<Arc<Scene>>, folder: &Path) -> Result<Model> {
+        check_folder(folder, Existing::Resume, "Begin with Session::train")?;
         let config = RunConfig::resolve(None, Some(&folder.join(CONFIG)), &[])?;
         self.run(&config, scene.into(), Some(folder), true)
     }

@@ -8,16 +8,14 @@ mod sweep;
 
 pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLoss, BenchPlay, BenchSkip, BenchSort, BenchStep, BenchWhat};
 pub use files::{Decompress, Export, Render, Shots};
-pub use play::Bake;
-#[cfg(feature = "view")]
-pub use play::View;
+pub use play::{Bake, View};
 pub use prune::Prune;
 pub use sweep::{SchedulerArg, Sweep, SweepCollect, SweepEmit, SweepPlan, SweepRun, SweepWhat};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
-const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 back end, 6 a training that failed, 130 interrupted. Sizes are in MB = 10^6 bytes.";
+const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out of memory or over a limit, 5 backend, 6 a training that failed, 130 interrupted. Sizes are in MB = 10^6 bytes.";
 
 /// Dynamic Gaussian splatting: train, compress, play back.
 #[derive(Debug, Parser)]
@@ -54,9 +52,9 @@ pub enum Command {
     /// Add a playback layer to a model's archive, so that players without the deformer can play it.
     Bake(Bake),
     /// Play a model in a window.
-    #[cfg(feature = "view")]
+    #[cfg_attr(not(feature = "view"), command(hide = true))]
     View(View),
-    /// The same as `export ply` or `export spz`, by the ending of the file; replaces it where it exists.
+    /// The same as `export ply` or `export spz`, by the ending of the file.
     Decompress(Decompress),
     /// Render a model to PNG frames, and to a video if asked; `export mp4` makes the video alone.
     Render(Render),
@@ -124,8 +122,8 @@ pub struct Train {
     #[arg(long, conflicts_with = "resume")]
     pub overwrite: bool,
     /// Show the model in a window while it trains. The result is the same.
-    #[cfg(feature = "view")]
     #[arg(long)]
+    #[cfg_attr(not(feature = "view"), arg(hide = true))]
     pub view: bool,
 }
 
@@ -140,7 +138,7 @@ pub struct Compress {
     /// Override a setting of the codec; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// Weight codec of the field, such as fp32, fp16, int8, compact, compact:bits=6 or compact:max-drop=0.01dB; see `cc4dgs plugins`.
+    /// Weight codec of the deformer, such as fp32, fp16, int8, compact, compact:bits=6 or compact:max-drop=0.01dB; see `cc4dgs plugins`.
     #[arg(long, value_name = "NAME[:SETTING]", default_value = "fp32")]
     pub field_weights: String,
     /// The dataset that the model was trained on, for codecs that make use of its training views.
@@ -149,7 +147,10 @@ pub struct Compress {
     /// The archive to write.
     #[arg(long, value_name = "F.cc4d")]
     pub out: PathBuf,
-    /// Device the field is loaded on.
+    /// Replace F.cc4d where it exists.
+    #[arg(long)]
+    pub overwrite: bool,
+    /// Device the deformer is loaded on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }

@@ -52,6 +52,9 @@ fn plugins_are_listed_with_four_facts_each() {
     let preset = json_of(&["plugins", "dnerf+hexplane", "--json"]);
     assert_eq!((&preset[0]["kind"], &preset[0]["settings"]["deformer"]["kind"]), (&Value::from("preset"), &Value::from("hexplane")));
     assert!(fail(&["plugins", "dmeo"], 2).contains("demo"));
+    // A few names, each once.
+    let unknown = fail(&["plugins", "panoptik"], 2);
+    assert!(unknown.matches("panoptic").count() == 1 && unknown.split(", ").count() <= 8 && unknown.contains("`cc4dgs plugins`"), "{unknown}");
 }
 
 #[test]
@@ -61,17 +64,23 @@ fn mistakes_end_with_their_own_exit_code() {
     fail(&["trian"], 2);
     fail(&["eval"], 2);
     fail(&["render", "x", "--out", "y", "--size", "0x3"], 2);
+    // An orbit has no split and no scene options.
+    assert!(fail(&["render", "x", "--out", "y", "--split", "test"], 2).contains("--scene"));
+    assert!(fail(&["render", "x", "--out", "y", "--set", "scene.width=8"], 2).contains("--scene"));
     assert!(fail(&["train", "--scene", "procedural", "--preset", "dnref", "--out", text(&out)], 2).contains("dnerf"));
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--set", "train.iteratons=3", "--out", text(&out)], 2).contains("iteratons"));
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--device", "fleks", "--out", text(&out)], 2).contains("flex"));
     let unknown = "deformer.capasity=small";
     assert!(fail(&["train", "--scene", "procedural", "--preset", "demo", "--set", unknown, "--out", text(&out)], 2).contains("capasity"));
     fail(&["train", "--scene", text(&folder.path().join("nowhere")), "--out", text(&out)], 2);
+    let absent = fail(&["train", "--scene", "procedural:tiny", "--resume", "--out", text(&out)], 2);
+    assert!(absent.contains("nothing to resume") && absent.contains("--overwrite"), "{absent}");
     assert!(!out.exists(), "a refused command leaves nothing behind");
     std::fs::write(&broken, b"\x89CC4D\r\n\x1a\x02\0\0\0\x10\0\0\0 and then nothing that makes sense as a header").unwrap();
     fail(&["info", text(&broken)], 3);
     fail(&["eval", text(&broken), "--scene", "procedural:tiny"], 3);
-    fail(&["decompress", text(&folder.path().join("missing.cc4d")), "--out", text(&out)], 3);
+    let missing = fail(&["decompress", text(&folder.path().join("missing.cc4d")), "--out", text(&out)], 2);
+    assert!(missing.contains("missing.cc4d: no such file") && missing.contains("the folder of a run"), "{missing}");
     fail(&["--limit", "max_gausians=3", "doctor"], 2);
     let output = run(&["info", text(&broken), "--json"]);
     let object: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -93,6 +102,11 @@ fn a_scene_goes_through_the_whole_chain() {
     assert!(events.iter().any(|e| e["event"] == "stage-started" && e["stage"] == "main"), "{log}");
 
     succeed(&["compress", text(&dir), "--codec", "cca:default", "--out", text(&archive), "-q"]);
+    let packed = std::fs::read(&archive).unwrap();
+    for again in [&["compress", text(&dir), "--codec", "raw"][..], &["bake", text(&archive)], &["decompress", text(&archive)]] {
+        assert!(fail(&[again, &["--out", text(&archive), "-q"]].concat(), 2).contains("--overwrite"));
+    }
+    assert!(std::fs::read(&archive).unwrap() == packed, "a refused command leaves the file alone");
     let (json, sheet) = (at("eval.json"), at("eval.png"));
     succeed(&["eval", text(&archive), "--scene", "procedural:tiny", "--split", "test", "-q", "--json", text(&json)]);
     let report = read_json(&json);
@@ -177,13 +191,13 @@ fn every_kind_of_model_is_taken_everywhere() {
         let count = info.pointer("/gaussians/count").or(info.pointer("/manifest/gaussian_count")).unwrap().as_u64().unwrap();
         assert!(count > 0);
         let (packed, flat, frames) = (at("packed.cc4d"), at("flat.ply"), at("frames"));
-        let report = json_of(&["compress", source, "--codec", "quantize", "--out", text(&packed), "-q", "--json"]);
+        let report = json_of(&["compress", source, "--codec", "quantize", "--out", text(&packed), "--overwrite", "-q", "--json"]);
         assert_eq!(report["gaussians"].as_u64(), Some(count), "{source}");
         // Against float32, whatever the source was.
         assert!(report["ratio"].as_f64().unwrap() > 1.2, "{source}: {report}");
-        let report = json_of(&["decompress", source, "--out", text(&flat), "-q", "--json"]);
+        let report = json_of(&["decompress", source, "--out", text(&flat), "--overwrite", "-q", "--json"]);
         assert_eq!(report["gaussians"].as_u64(), Some(count), "{source}");
-        json_of(&["decompress", text(&packed), "--out", text(&flat), "--time", "0.5", "-q", "--json"]);
+        json_of(&["decompress", text(&packed), "--out", text(&flat), "--time", "0.5", "--overwrite", "-q", "--json"]);
         let report = json_of(&["render", source, "--out", text(&frames), "--frames", "2", "--size", "40x30", "--device", "flex", "-q", "--json"]);
         assert_eq!(report["frames"], 2);
         let drawn = image::open(frames.join("frame_00000.png")).unwrap().to_rgb8();
@@ -210,7 +224,7 @@ fn the_storage_table_counts_attributes() {
     succeed(&args);
     // Every codec stores attributes in streams of its own.
     for codec in ["raw", "quantize"] {
-        succeed(&["compress", text(&run), "--codec", codec, "--out", text(&archive), "-q"]);
+        succeed(&["compress", text(&run), "--codec", codec, "--out", text(&archive), "--overwrite", "-q"]);
         let [before, after] = [&run, &archive].map(|path| json_of(&["info", text(path), "--json"]));
         assert!(before["gaussians"]["extra"].as_array().unwrap().len() > 2, "{before}");
         for row in 0..5 {
@@ -268,11 +282,30 @@ fn an_interrupted_run_resumes_to_the_same_bytes() {
     assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8_lossy(&output.stderr));
     assert_ne!(std::fs::read(parts.join("checkpoint")).unwrap(), std::fs::read(whole.join("checkpoint")).unwrap());
 
+    // A continuation with other settings is refused and leaves those of the run.
+    let config = std::fs::read_to_string(parts.join("config.toml")).unwrap();
+    let other = ["train", "--scene", "procedural:tiny", "--resume", "--set", "train.iterations=500", "--out", text(&parts), "-q"];
+    assert!(fail(&other, 2).contains("the configuration differs"));
+    assert_eq!(std::fs::read_to_string(parts.join("config.toml")).unwrap(), config);
+
     let lines = std::fs::read_to_string(&log).unwrap().lines().count();
     succeed(&["train", "--scene", "procedural:tiny", "--resume", "--out", text(&parts), "-q"]);
     assert!(std::fs::read_to_string(&log).unwrap().lines().count() > lines, "the log goes on where it ended");
     let same = std::fs::read(parts.join("checkpoint")).unwrap() == std::fs::read(whole.join("checkpoint")).unwrap();
     assert!(same, "interruption changed the result");
+}
+
+#[cfg(not(feature = "view"))]
+#[test]
+fn commands_that_need_a_window_say_how_to_build_it() {
+    let train = ["train", "--view", "--scene", "procedural", "--out", "no/such/folder"];
+    let view = ["view", "--time", "0.5", "a.cc4d"];
+    for (args, named) in [(&view[..1], "view:"), (&view[..], "view --time 0.5 a.cc4d:"), (&train[..], "train --view:")] {
+        let message = fail(args, 2);
+        assert!(message.contains(named) && message.contains("left out of this build") && message.contains("--features view"), "{message}");
+    }
+    let help = String::from_utf8(succeed(&["--help"]).stdout).unwrap();
+    assert!(!help.contains("window"), "{help}");
 }
 
 #[test]

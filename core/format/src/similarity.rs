@@ -18,6 +18,14 @@ impl Default for Similarity {
     }
 }
 
+impl std::fmt::Display for Similarity {
+    /// All digits: two similarities may differ in the last ones alone.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let [x, y, z] = self.translation;
+        write!(f, "scale {} and translation ({x}, {y}, {z})", self.scale)
+    }
+}
+
 impl Similarity {
     /// The identity.
     pub const IDENTITY: Self = Self { scale: 1.0, translation: [0.0; 3] };
@@ -33,11 +41,7 @@ impl Similarity {
         if sound {
             return Ok(());
         }
-        Err(Error::data(
-            object,
-            format!("scale {} and translation {:?} are not a change of unit and origin", self.scale, self.translation),
-            "The file is damaged; fetch or write it again",
-        ))
+        Err(Error::data(object, format!("{self} are not a change of unit and origin"), "The file is damaged; fetch or write it again"))
     }
     /// A point's coordinates in the target.
     pub fn apply(&self, point: [f64; 3]) -> [f64; 3] {

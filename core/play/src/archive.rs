@@ -293,7 +293,11 @@ pub fn load_weights(object: &str, field: &mut dyn Deformer, weights: Vec<WeightA
             .zip(&found)
             .find(|(a, b)| a != b)
             .map_or_else(|| format!("{} arrays, {} expected", found.len(), wanted.len()), |(a, b)| format!("found {b:?}, expected {a:?}"));
-        return Err(Error::data(object, format!("field weights do not fit the field: {odd}"), "The archive is damaged or of another version of the deformer"));
+        return Err(Error::data(
+            object,
+            format!("the stored weights do not fit the deformer: {odd}"),
+            "The archive is damaged or of another version of the deformer",
+        ));
     }
     for (parameter, array) in field.parameters_mut().into_iter().zip(weights) {
         let len = array.values.len();

@@ -5,11 +5,14 @@ use cc4dgs_core::archive::MAGIC;
 use cc4dgs_core::spz::begins_as_spz;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
-use std::io::Read;
+use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 /// Bytes that tell all kinds apart.
 const HEAD_BYTES: u64 = 9;
+
+/// What a model may be, as the remedy of an error.
+const REMEDY: &str = "Give the folder of a run, a checkpoint, a .cc4d archive, a PLY file of 3D Gaussian splatting or an SPZ file";
 
 /// What a model is stored as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -55,24 +58,26 @@ impl Source {
     /// What lies at `path`: the folder of a run, or a file. `None` for everything that is no model, such as a dataset.
     ///
     /// # Errors
-    /// [`Error::Io`] for a path that cannot be read.
+    /// [`Error::Parameter`] for a path that does not exist, [`Error::Io`] for one that cannot be read.
     pub fn find(path: &Path) -> Result<Option<Self>> {
         let file = if path.is_dir() { path.join(CHECKPOINT) } else { path.to_path_buf() };
         if path.is_dir() && !file.is_file() {
             return Ok(None);
         }
         let mut head = Vec::new();
-        std::fs::File::open(&file).and_then(|f| f.take(HEAD_BYTES).read_to_end(&mut head)).map_err(|e| Error::io(&file, e))?;
+        std::fs::File::open(&file).and_then(|f| f.take(HEAD_BYTES).read_to_end(&mut head)).map_err(|e| match e.kind() {
+            ErrorKind::NotFound => Error::parameter(format!("model {}", path.display()), "no such file or folder", REMEDY),
+            _ => Error::io(&file, e),
+        })?;
         Ok(SourceKind::of_bytes(&head).map(|kind| Self { kind, file }))
     }
     /// As [`Source::find`], where a model must be.
     ///
     /// # Errors
-    /// [`Error::Data`] for a path that holds no model.
+    /// As [`Source::find`], and [`Error::Data`] for a path that holds no model.
     pub fn expect(path: &Path) -> Result<Self> {
         let problem = if path.is_dir() { "the folder holds no checkpoint" } else { "it begins like no model" };
-        let remedy = "Give the folder of a run, a checkpoint, a .cc4d archive, a PLY file of 3D Gaussian splatting or an SPZ file";
-        Self::find(path)?.ok_or_else(|| Error::data(path.display().to_string(), problem, remedy))
+        Self::find(path)?.ok_or_else(|| Error::data(path.display().to_string(), problem, REMEDY))
     }
 }
 
@@ -99,7 +104,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         assert_eq!(Source::find(folder.path()).unwrap(), None);
         assert!(Source::expect(folder.path()).unwrap_err().to_string().contains("no checkpoint"));
-        assert!(Source::find(&folder.path().join("missing")).is_err());
+        let missing = Source::find(&folder.path().join("missing")).unwrap_err();
+        assert!(matches!(missing, Error::Parameter { .. }) && missing.to_string().contains("SPZ"), "{missing}");
         let file = folder.path().join(CHECKPOINT);
         std::fs::write(&file, b"\x10\x02\0\0\0\0\0\0{").unwrap();
         assert_eq!(Source::find(folder.path()).unwrap(), Some(Source { kind: SourceKind::Checkpoint, file }));

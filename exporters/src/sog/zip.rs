@@ -48,7 +48,7 @@ pub fn store(files: &[(&str, Vec<u8>)]) -> Result<Vec<u8>> {
     Ok(out)
 }
 
-/// The members of a ZIP file that [`store`] could have written, as (name, content). For tests and tools; files of other writers may be refused.
+/// The members of a ZIP file that `store` could have written, as (name, content). For tests and tools; files of other writers may be refused.
 ///
 /// # Errors
 /// [`Error::Data`] for other files and wrong checksums.

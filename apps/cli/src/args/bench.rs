@@ -14,9 +14,9 @@ pub struct Bench {
 pub enum BenchWhat {
     /// A whole static training step: project, rasterize, L1 and SSIM, backward, Adam.
     Step(BenchStep),
-    /// Playback of a room with people as large as published scenes: field and rasterizer, frame by frame.
+    /// Playback of a room with people as large as published scenes: deformer and rasterizer, frame by frame.
     Frame(BenchFrame),
-    /// Playback of a trained model through the cameras of a dataset: field and rasterizer, frame by frame.
+    /// Playback of a trained model through the cameras of a dataset: deformer and rasterizer, frame by frame.
     Play(BenchPlay),
     /// A trained model with each kind of skipped work switched off: time saved, and whether the bits stay the same.
     Skip(BenchSkip),

@@ -12,6 +12,9 @@ pub struct Decompress {
     /// The file to write: PLY in the layout of 3DGS, or Niantic's SPZ where it ends in .spz.
     #[arg(long, value_name = "F.ply|F.spz")]
     pub out: PathBuf,
+    /// Replace the file where it exists.
+    #[arg(long)]
+    pub overwrite: bool,
     /// Leave the dynamic scores out, for viewers that insist on the 62 floats of static 3DGS.
     #[arg(long)]
     pub no_dynamic: bool,
@@ -33,8 +36,8 @@ pub struct Render {
     pub out: PathBuf,
     #[command(flatten)]
     pub shots: Shots,
-    /// Scene options over those the model was trained with, such as scene.width=800; may be given several times.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
+    /// Scene options over those the model was trained with, such as scene.width=800; with --scene only; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE", requires = "scene")]
     pub sets: Vec<String>,
     /// Also make a video of the frames with the ffmpeg command.
     #[arg(long, value_name = "F.mp4")]
@@ -50,8 +53,8 @@ pub struct Shots {
     /// Take the cameras and times of this dataset instead of an orbit around the model.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
-    /// Which side of the dataset's split.
-    #[arg(long, value_enum, default_value_t = SplitArg::Test)]
+    /// Which side of the dataset's split; with --scene only.
+    #[arg(long, value_enum, default_value_t = SplitArg::Test, requires = "scene")]
     pub split: SplitArg,
     /// Frames: of the orbit (default 60), or at most so many of the dataset, evenly spread.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]

@@ -2,16 +2,21 @@
 
 use super::UpArg;
 use clap::Args;
+#[cfg(not(feature = "view"))]
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct Bake {
-    /// An archive, a run's folder or a checkpoint.
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
     /// The archive to write.
     #[arg(long, value_name = "F.cc4d")]
     pub out: PathBuf,
+    /// Replace F.cc4d where it exists.
+    #[arg(long)]
+    pub overwrite: bool,
     /// How far a point of a Gaussian may be off: pixels in the nearest camera that sees it (0.1px), or a length in units of the model (0.002).
     #[arg(long, value_name = "E", default_value = "0.1px")]
     pub max_error: String,
@@ -21,7 +26,7 @@ pub struct Bake {
     /// Codec of the Gaussians, where MODEL is no archive yet.
     #[arg(long, value_name = "NAME[:PROFILE]", default_value = "quantize:high")]
     pub codec: String,
-    /// Weight codec of the field, where MODEL is no archive yet.
+    /// Weight codec of the deformer, where MODEL is no archive yet.
     #[arg(long, value_name = "NAME", default_value = "fp16")]
     pub field_weights: String,
     /// Leave the deformer's weights out. The archive is smaller and moves by its layer; it cannot be compressed again.
@@ -36,7 +41,7 @@ pub struct Bake {
     /// Leave out the small image that players show first.
     #[arg(long)]
     pub no_poster: bool,
-    /// Device the field is evaluated on.
+    /// Device the deformer is evaluated on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }
@@ -59,4 +64,12 @@ pub struct View {
     /// Device that motion is baked on, and that exact images are drawn on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
+}
+
+// Whatever is given: the command answers that it is left out of this build.
+#[cfg(not(feature = "view"))]
+#[derive(Debug, Args)]
+pub struct View {
+    #[arg(value_name = "MODEL", trailing_var_arg = true, allow_hyphen_values = true, hide = true)]
+    pub given: Vec<OsString>,
 }

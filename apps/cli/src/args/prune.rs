@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct Prune {
-    /// A run's folder, a checkpoint or an archive.
+    /// A run's folder, a checkpoint, an archive, a PLY or an SPZ file.
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
     /// The dataset that the model was trained on.
@@ -20,6 +20,9 @@ pub struct Prune {
     /// The archive to write, lossless; compress it as you would the model.
     #[arg(long, value_name = "F.cc4d")]
     pub out: PathBuf,
+    /// Replace F.cc4d where it exists.
+    #[arg(long)]
+    pub overwrite: bool,
     /// Device to render on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,

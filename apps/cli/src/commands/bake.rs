@@ -1,6 +1,6 @@
 //! `cc4dgs bake`.
 
-use super::{Context, create_parent, megabytes};
+use super::{Context, create_parent, megabytes, refuse_existing};
 use crate::args::Bake;
 use crate::shots::capture_cameras;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
@@ -27,6 +27,7 @@ struct Report {
 
 pub fn run(context: &Context, args: &Bake) -> Result<()> {
     let began = Instant::now();
+    refuse_existing(&args.out, args.overwrite)?;
     let max_error: MaxError = args.max_error.parse()?;
     let (events, device) = (context.listeners(None)?, parse_device(&args.device)?);
     create_parent(&args.out)?;
@@ -76,7 +77,7 @@ fn shown(args: &Bake, stored: &Stored, cameras: &[Camera]) -> Result<Presentatio
 
 fn text(report: &Report) -> String {
     let first = format!(
-        "{}: {:.4} MB, of which the layer {:.4} MB (weights of the field: {:.4} MB), poster {:.4} MB, in {:.1} s",
+        "{}: {:.4} MB, of which the layer {:.4} MB (weights of the deformer: {:.4} MB), poster {:.4} MB, in {:.1} s",
         report.archive.display(),
         megabytes(report.bytes),
         megabytes(report.layer_bytes),

@@ -1,6 +1,6 @@
 //! `cc4dgs compress`.
 
-use super::{Context, create_parent, megabytes};
+use super::{Context, create_parent, megabytes, refuse_existing};
 use crate::args::Compress;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
@@ -60,6 +60,7 @@ impl From<StreamInfo> for StreamSize {
 static NEVER: AtomicBool = AtomicBool::new(false);
 
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
+    refuse_existing(&args.out, args.overwrite)?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let mut settings = toml::Table::new();

@@ -24,7 +24,7 @@ pub fn run(context: &Context, args: &Decompress) -> Result<()> {
             settings: &settings,
             request: ExportRequest { time_norm: args.time, ..ExportRequest::default() },
             out: &args.out,
-            overwrite: true,
+            overwrite: args.overwrite,
             registry: &context.registry,
             device: &loaded.device,
             limits: &context.limits,

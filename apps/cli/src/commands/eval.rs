@@ -119,7 +119,7 @@ pub fn measure(
     }
     for (counter, done, skipped) in [
         ("Gaussians deformed", report.work.deformed, report.work.static_skipped),
-        ("spatial passes of the field", report.work.frames - report.work.spatial_cached, report.work.spatial_cached),
+        ("spatial passes of the deformer", report.work.frames - report.work.spatial_cached, report.work.spatial_cached),
         ("vertices decoded", report.work.spatial.vertices_decoded, report.work.spatial.vertices_queried - report.work.spatial.vertices_decoded),
     ] {
         events.emit(&Event::Work { stage: "eval".into(), counter: counter.into(), done, skipped });
@@ -174,7 +174,7 @@ pub fn text(report: &FullReport) -> String {
         format!("  size {:.4} MB: deform {:.4} MB, point cloud {:.4} MB", e.size_mb.total, e.size_mb.deform, e.size_mb.point_cloud),
         format!("  {} Gaussians, {} of them dynamic", e.gaussians, e.dynamic_gaussians),
         format!(
-            "  frame {:.2} ms: field {:.2} + rasterizer {:.2}; first frame: field {:.2} + rasterizer {:.2}",
+            "  frame {:.2} ms: deformer {:.2} + rasterizer {:.2}; first frame: deformer {:.2} + rasterizer {:.2}",
             e.frame_ms.mean, e.frame_ms.field, e.frame_ms.raster, e.frame_ms.field_first, e.frame_ms.raster_first
         ),
     ];

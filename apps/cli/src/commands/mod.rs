@@ -85,6 +85,8 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
     let context = context(cli, output)?;
     match &cli.command {
         Command::Demo(args) => demo::run(&context, args),
+        #[cfg(not(feature = "view"))]
+        Command::Train(args) if args.view => Err(no_window("train --view".into())),
         Command::Train(args) => train::run(&context, args, None),
         Command::Compress(args) => compress::run(&context, args),
         Command::Export(args) => export::run(&context, args),
@@ -92,6 +94,11 @@ fn run(cli: &Cli, output: &Output) -> Result<()> {
         Command::Bake(args) => bake::run(&context, args),
         #[cfg(feature = "view")]
         Command::View(args) => view::show(args, context.limits, view::prepare(&context, args)?),
+        #[cfg(not(feature = "view"))]
+        Command::View(args) => {
+            let command = args.given.iter().fold("view".to_string(), |command, word| format!("{command} {}", word.to_string_lossy()));
+            Err(no_window(command))
+        }
         Command::Decompress(args) => decompress::run(&context, args),
         Command::Render(args) => render::run(&context, args),
         Command::Eval(args) => eval::run(&context, args),
@@ -124,6 +131,22 @@ fn limits(options: &[String]) -> Result<Limits> {
     let mut table = toml::Table::new();
     config::set_all(&mut table, options)?;
     config::parse_section("--limit", &table)
+}
+
+/// The error of `command`, which needs a window, in a build without one.
+#[cfg(not(feature = "view"))]
+fn no_window(command: String) -> Error {
+    let remedy = "Build with the feature `view`: cargo run --release -p cc4dgs-cli --features view -- view MODEL (or train --view ...)";
+    Error::unsupported(command, "the window is left out of this build", remedy)
+}
+
+/// Refuses a file to write that exists, unless it may be replaced; before any long work.
+pub fn refuse_existing(out: &Path, overwrite: bool) -> Result<()> {
+    // A link that leads nowhere exists, too.
+    if overwrite || out.symlink_metadata().is_err() {
+        return Ok(());
+    }
+    Err(Error::parameter(out.display().to_string(), "it exists already", "Give another name, or --overwrite to replace it"))
 }
 
 /// Creates the folder a file will be written to, before any long work that would be lost without it.

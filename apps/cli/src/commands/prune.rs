@@ -1,12 +1,12 @@
 //! `cc4dgs prune`.
 
 use super::compress::compress;
-use super::{Context, create_parent};
+use super::{Context, create_parent, refuse_existing};
 use crate::args::Prune;
 use crate::interrupt;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs_core::Result;
+use cc4dgs_core::{Result, Split};
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_play::prune::{PruneReport, prune};
 use cc4dgs_train::train::{RefitJob, prune_and_refit};
@@ -27,6 +27,7 @@ struct Report {
 
 pub fn run(context: &Context, args: &Prune) -> Result<()> {
     let began = Instant::now();
+    refuse_existing(&args.out, args.overwrite)?;
     let events = context.listeners(None)?;
     create_parent(&args.out)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
@@ -47,15 +48,19 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
 
 fn text(report: &Report) -> String {
     let p = &report.prune;
+    let judges = match p.judged_by {
+        Split::Train => "training",
+        Split::Validation => "validation",
+        Split::Test => "test",
+    };
     format!(
-        "{}: {} of {} Gaussians kept, PSNR {:.3} dB instead of {:.3} dB on {} {:?} views, {:.1} s",
+        "{}: {} of {} Gaussians kept, PSNR {:.3} dB instead of {:.3} dB on {} {judges} views, {:.1} s",
         report.archive.display(),
         p.after,
         p.before,
         p.psnr_after_db,
         p.psnr_before_db,
         p.views,
-        p.judged_by,
         report.seconds
     )
 }

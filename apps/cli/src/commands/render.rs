@@ -74,7 +74,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     context.output.result(&report, || {
         let video = args.mp4.as_ref().map_or_else(String::new, |p| format!(" and {}", p.display()));
         format!(
-            "{} frames in {}{video}; field {:.2} + rasterizer {:.2} ms per frame",
+            "{} frames in {}{video}; deformer {:.2} + rasterizer {:.2} ms per frame",
             report.frames,
             args.out.display(),
             report.frame_ms.field,

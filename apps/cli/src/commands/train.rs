@@ -78,7 +78,11 @@ pub struct Trained {
 /// Trains the scene at `scene_path` into the folder `out`; `observer` looks at it.
 pub fn train_into(context: &Context, layers: &Layers, scene_path: &Path, out: &Path, existing: Existing, observer: Option<&dyn Observer>) -> Result<Trained> {
     let stop = interrupt::stop_flag()?;
-    check_folder(out, existing, "Go on with it (train --resume), start anew in its place (--overwrite), or choose another folder")?;
+    let remedy = match existing {
+        Existing::Resume => "Leave --resume out to begin; add --overwrite where a run ended before its first checkpoint",
+        _ => "Go on with it (train --resume), start anew in its place (--overwrite), or choose another folder",
+    };
+    check_folder(out, existing, remedy)?;
     if !layers.want_plan() {
         plugins::check(&layers.config()?, &context.registry)?;
     }

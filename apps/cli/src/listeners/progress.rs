@@ -75,6 +75,18 @@ impl State {
     }
 }
 
+/// The counts of an [`Event::Work`] in words; the counters are those of trainings and evaluations.
+fn work(counter: &str, done: u64, skipped: u64) -> String {
+    match counter {
+        "vertices decoded" => format!("{done} vertices decoded, {skipped} reused"),
+        "Gaussians deformed" => format!("{done} Gaussians deformed, {skipped} static ones left alone"),
+        "Gaussians updated" => format!("{done} Gaussians updated, {skipped} out of view left alone (in the iterations that are logged)"),
+        "Gaussians that move" => format!("{done} Gaussians move, {skipped} stay"),
+        "spatial passes of the deformer" => format!("{done} spatial passes of the deformer, {skipped} taken from the cache"),
+        _ => format!("{counter}: {done}, skipped {skipped}"),
+    }
+}
+
 impl EventSink for Progress {
     fn emit(&self, event: &Event) {
         let Ok(mut state) = self.state.lock() else { return };
@@ -95,10 +107,22 @@ impl EventSink for Progress {
                 state.clear();
                 state.say(&format!("stage {stage} done in {seconds:.1} s, {gaussians} Gaussians"));
             }
-            Event::Work { stage, counter, done, skipped } => state.say(&format!("{stage}: {counter}: {done} done, {skipped} skipped")),
+            Event::Work { stage, counter, done, skipped } => state.say(&format!("{stage}: {}", work(counter, *done, *skipped))),
             Event::Saved { path, bytes } => state.say(&format!("wrote {path} ({:.3} MB)", *bytes as f64 / 1e6)),
             // Densification shows in the number of Gaussians; the log has the rest.
             _ => {}
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::work;
+
+    #[test]
+    fn counts_are_worded_by_what_they_count() {
+        assert_eq!(work("Gaussians that move", 0, 600), "0 Gaussians move, 600 stay");
+        assert_eq!(work("vertices decoded", 8, 2), "8 vertices decoded, 2 reused");
+        assert_eq!(work("things of a plug-in", 3, 1), "things of a plug-in: 3, skipped 1");
     }
 }

@@ -61,7 +61,7 @@ pub struct ExportFacts {
     pub frames_per_second: f64,
     /// Whether the model wants Mip-Splatting's 2D filter.
     pub antialiased: bool,
-    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; viewers take [`BLUR`](crate::BLUR) unless told.
+    /// What a pixel adds to both diagonal entries of the projected covariance, square pixels; viewers take [`BLUR`] unless told.
     pub blur: f64,
     /// The signed unit axis of the world that points up.
     pub up: [f64; 3],

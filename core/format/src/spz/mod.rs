@@ -1,7 +1,7 @@
 //! Niantic's SPZ: static Gaussians in some 20 bytes plus harmonics, read by most viewers. The layouts are those of the format's published description.
 //!
 //! Versions 2 and 3 are one gzip stream of a header of 16 bytes and the attributes one after the other; version 4 has a plain header of 32 bytes, a table and
-//! one Zstandard frame per attribute, so that a reader can start with what it needs. Versions 3 and 4 are written, 2 to 4 are read. [`values`] has the
+//! one Zstandard frame per attribute, so that a reader can start with what it needs. Versions 3 and 4 are written, 2 to 4 are read. `values` has the
 //! quantisation, which the versions share.
 //!
 //! SPZ's axes are right, up, back; those of cameras and PLY files here are right, down, forward. Reading and writing rotate by 180 degrees around x.

@@ -170,7 +170,7 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
         settings.push(("deformer.hashes", Value::Integer(if short { 32 } else { 64 })));
         settings.push(("deformer.width", Value::Integer(if short { 64 } else { 128 })));
     }
-    choice(settings, format!("{} frames; the most accurate field for its time", facts.frames))
+    choice(settings, format!("{} frames; the most accurate deformer for its time", facts.frames))
 }
 
 fn stages(facts: &Facts, key_frames: Option<usize>) -> Choice {

@@ -184,7 +184,7 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spen
     let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
     let rates = [("train.batch", toml::Value::Integer(views as i64)), ("train.coarse_batch", 1.into()), ("train.lr.batch_power", 0.5.into())];
     [
-        Choice { settings: rates.to_vec(), reason: format!("a pass through the field takes {field:.0} ms, a view {:.0} ms", timing.still) },
+        Choice { settings: rates.to_vec(), reason: format!("a pass through the deformer takes {field:.0} ms, a view {:.0} ms", timing.still) },
         Choice {
             settings: vec![("train.iterations", toml::Value::Integer(count as i64))],
             reason: format!("{left:.1} of {minutes} minutes at about {ms:.0} ms per iteration on this machine"),

@@ -18,9 +18,13 @@ const FRAMES: &str = "frames";
 /// another kind are skipped. The results are in the order of their axes.
 ///
 /// # Errors
-/// [`Error::Data`] for damaged files, for a cell that is there twice with different content and where there is no result; [`Error::Unsupported`] for other
-/// versions of the schema.
+/// [`Error::Parameter`] for a path that does not exist; [`Error::Data`] for damaged files, for a cell that is there twice with different content and where
+/// there is no result; [`Error::Unsupported`] for other versions of the schema.
 pub fn read_results(path: &Path) -> Result<Vec<CellResult>> {
+    if !path.exists() {
+        let remedy = "Give the folder of a sweep, a folder of results, or one file of them";
+        return Err(Error::parameter(format!("results {}", path.display()), "no such file or folder", remedy));
+    }
     let mut found: BTreeMap<String, CellResult> = BTreeMap::new();
     for file in files(path)? {
         for result in read_file(&file, path.is_dir())? {

@@ -74,7 +74,8 @@ impl Log {
     }
     /// Tells the counted work of the stage.
     pub(crate) fn finish(&self, events: &dyn EventSink) {
-        let names = ["vertices decoded", "Gaussians deformed", "Gaussians stepped (sampled)"];
+        // The last is counted in the iterations that are logged alone.
+        let names = ["vertices decoded", "Gaussians deformed", "Gaussians updated"];
         for (name, (done, skipped)) in names.into_iter().zip(self.work) {
             if done + skipped > 0 {
                 events.emit(&Event::Work { stage: self.stage.name().into(), counter: name.into(), done, skipped });

@@ -3,6 +3,7 @@
 
 mod density;
 mod dropout;
+mod folder;
 mod guard;
 mod key_frames;
 mod log;
@@ -27,6 +28,7 @@ mod tune;
 mod validate;
 mod watchdog;
 
+pub use folder::CONFIG;
 pub use guard::Guard;
 pub use observe::{Observer, Snapshot, Standing};
 pub use record::Record;
@@ -46,7 +48,6 @@ use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
 use crate::schedule::StageLengths;
 use burn::tensor::Device;
-use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{AppearanceContext, Error, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, check_attributes, parse_device};
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::model::ModelDeformer;
@@ -61,9 +62,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 use watchdog::Watchdog;
-
-/// Name of the configuration inside a run's folder.
-pub const CONFIG: &str = "config.toml";
 
 /// What to train, where to, and who listens.
 pub struct TrainJob<'a> {
@@ -134,9 +132,8 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
     let scene = hold_out(&job.scene, config.train.validation)?;
     let job = &TrainJob { config, scene: Arc::new(scene), out: job.out.clone(), ..*job };
-    if let Some(out) = &job.out {
-        std::fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
-        write_atomically(out.join(CONFIG), config.to_toml()?.as_bytes())?;
+    if !job.resume {
+        folder::write_config(job)?;
     }
     let device = parse_device(&config.device)?;
     let seed = Seed::root(config.seed);
@@ -169,17 +166,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     };
     let checkpoint = job.out.as_ref().map(|out| out.join(CHECKPOINT));
     let mut state = match &checkpoint {
-        Some(path) if job.resume => {
-            let stored = checkpoint::load(path, job.registry, &device, &config.limits)?;
-            if stored.normalisation() != job.scene.normalisation {
-                return Err(Error::parameter(
-                    "--resume",
-                    format!("the scene's normalisation is {:?}, the checkpoint's {:?}", job.scene.normalisation, stored.normalisation()),
-                    "Resume on the dataset the run was started on, or start in another folder",
-                ));
-            }
-            stored.into_state(config, parts)?
-        }
+        Some(path) if job.resume => folder::resumed(job, path, &device, parts)?,
         _ => {
             let host = initialise(&job.scene, config, seed.child("init"), job.events)?;
             TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, state::longest_focal(&job.scene), parts)
@@ -340,7 +327,7 @@ impl Context<'_> {
         if stage == Stage::Score {
             let moving = state.moving_rows(&self.device)?.count() as u64;
             let all = state.set.len() as u64;
-            events.emit(&Event::Work { stage: "score".into(), counter: "gaussians that move".into(), done: moving, skipped: all - moving });
+            events.emit(&Event::Work { stage: "score".into(), counter: "Gaussians that move".into(), done: moving, skipped: all - moving });
         }
         Ok(())
     }

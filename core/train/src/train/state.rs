@@ -25,7 +25,7 @@ pub struct TrainState {
     pub moving: Moving,
     /// From the coordinates of the dataset to those of the Gaussians.
     pub normalisation: Similarity,
-    /// Longest focal length of the training images in pixels ([`longest_focal`]).
+    /// Longest focal length of the training images in pixels (`longest_focal`).
     pub focal: Option<f64>,
     /// The deformer, from the main stage on.
     pub deformer: Option<ModelDeformer>,

@@ -228,7 +228,7 @@ fn time_field(field: &mut dyn Deformer, means_world: Tensor<2>, repeats: u32) ->
 
 fn text(report: &FrameReport) -> String {
     let mut lines = vec![format!("playback on {}, {} threads, deformer {}", report.device, report.threads, report.deformer)];
-    lines.push("case             image  Gaussians  moving   field ms  raster ms    play ms   frames/s  first ms  spatial ms  field fwd+bwd ms".into());
+    lines.push("case             image  Gaussians  moving  deform ms  raster ms    play ms   frames/s  first ms  spatial ms deform fwd+bwd ms".into());
     lines.extend(report.cases.iter().map(|c| {
         format!(
             "{:<12} {:>4}x{:<4} {:>9} {:>7} {:>10.3} {:>10.2} {:>10.2} {:>10.1} {:>9.1} {:>11.2} {:>17.2}",

@@ -56,7 +56,7 @@ pub fn play(context: &Context, args: &BenchPlay) -> Result<()> {
 fn text(report: &PlayReport) -> String {
     let p = &report.playback;
     format!(
-        "{} on {}, {}, {} threads: {}x{}, {} Gaussians, {} of them moving\n  {:.1} frames/s without waiting; field {:.3} ms + rasterizer {:.2} ms (medians, waited for); first frame {:.1} + {:.1} ms",
+        "{} on {}, {}, {} threads: {}x{}, {} Gaussians, {} of them moving\n  {:.1} frames/s without waiting; deformer {:.3} ms + rasterizer {:.2} ms (medians, waited for); first frame {:.1} + {:.1} ms",
         report.model,
         report.scene,
         report.device,

@@ -167,7 +167,7 @@ fn text(report: &SkipReport) -> String {
         report.model, report.scene, report.device, report.threads, report.image_size[0], report.image_size[1], report.gaussians, report.dynamic_gaussians
     )];
     let bits = |same: bool| if same { "the same" } else { "others" };
-    lines.push(format!("{:<32} {:>9} {:>9} {:>9} {:>6}  bits", "a frame without", "field ms", "raster ms", "frame ms", "ratio"));
+    lines.push(format!("{:<32} {:>9} {:>9} {:>9} {:>6}  bits", "a frame without", "deform ms", "raster ms", "frame ms", "ratio"));
     lines.extend(report.frames.iter().map(|r| {
         format!("{:<32} {:>9.2} {:>9.2} {:>9.2} {:>6.2}  {}", r.off, r.field.median_ms, r.raster.median_ms, r.frame.median_ms, r.ratio, bits(r.same_bits))
     }));
