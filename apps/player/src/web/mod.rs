@@ -10,6 +10,8 @@ use download::Download;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use wasm_bindgen::prelude::*;
+// Asynchronous methods expand to calls of it.
+use wasm_bindgen_futures as _;
 
 /// Memory of a browser's tab is small.
 const LIMITS: Limits = Limits { max_bytes: 1 << 30, max_gaussians: 8_000_000, max_pixels: 64 << 20, max_depth: 64 };
