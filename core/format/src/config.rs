@@ -8,32 +8,31 @@ use serde::de::DeserializeOwned;
 /// # Errors
 /// [`Error::Parameter`] with section and key, for unknown keys, wrong types and missing values.
 pub fn parse_section<T: DeserializeOwned>(object: &str, section: &toml::Table) -> Result<T> {
-    T::deserialize(toml::Value::Table(section.clone())).map_err(|e| {
-        let key = key_at_fault::<T>(section, e.message());
-        let object = if key.is_empty() { object.to_string() } else { format!("{object}, {key}") };
-        Error::parameter(object, in_words(e.message()), "`cc4dgs plugins NAME` and the presets show the known keys")
-    })
+    read::<T>(section.clone()).map_err(|message| at_fault(object, section, &message, &|other| read::<T>(other).err()))
 }
 
-/// The key without which `section` would not fail with `message`, such as `train.batch`; empty where no single key is at fault.
-fn key_at_fault<T: DeserializeOwned>(section: &toml::Table, message: &str) -> String {
-    let mut path: Vec<String> = Vec::new();
-    while let Some(key) = at(section, &path).and_then(|inner| inner.keys().find(|key| fails_otherwise::<T>(section, &path, key, message))) {
-        path.push(key.clone());
+/// Reads a section, or says why not. All that is compiled for every type.
+#[inline(never)]
+fn read<T: DeserializeOwned>(section: toml::Table) -> std::result::Result<T, String> {
+    T::deserialize(toml::Value::Table(section)).map_err(|e| e.message().to_string())
+}
+
+/// The error of a section that fails with `message`. `fails` says why another section fails.
+fn at_fault(object: &str, section: &toml::Table, message: &str, fails: &dyn Fn(toml::Table) -> Option<String>) -> Error {
+    // The key without which the section does not fail in this way.
+    let mut path: Vec<&str> = Vec::new();
+    let mut inner = Some(section);
+    while let Some(table) = inner {
+        let key = table.keys().find(|key| {
+            let mut without = section.clone();
+            let around = path.iter().try_fold(&mut without, |table, key| table.get_mut(*key)?.as_table_mut());
+            around.is_some_and(|table| table.remove(key.as_str()).is_some()) && fails(without).is_none_or(|other| other != message)
+        });
+        path.extend(key.map(String::as_str));
+        inner = key.and_then(|key| table[key].as_table());
     }
-    path.join(".")
-}
-
-/// The table at `path`.
-fn at<'t>(section: &'t toml::Table, path: &[String]) -> Option<&'t toml::Table> {
-    path.iter().try_fold(section, |table, key| table.get(key)?.as_table())
-}
-
-/// Whether `section` without `key` in the table at `path` can be read, or fails with another message.
-fn fails_otherwise<T: DeserializeOwned>(section: &toml::Table, path: &[String], key: &str, message: &str) -> bool {
-    let mut without = section.clone();
-    let inner = path.iter().try_fold(&mut without, |table, key| table.get_mut(key)?.as_table_mut());
-    inner.is_some_and(|table| table.remove(key).is_some()) && T::deserialize(toml::Value::Table(without)).err().is_none_or(|e| e.message() != message)
+    let object = if path.is_empty() { object.to_string() } else { format!("{object}, {}", path.join(".")) };
+    Error::parameter(object, in_words(message), "`cc4dgs plugins NAME` and the presets show the known keys")
 }
 
 /// A message of serde in the words of TOML.
