@@ -12,6 +12,8 @@
 //!
 //! All register themselves; link this crate (`use cc4dgs_codecs as _;`, or [`link`] on wasm32) and look them up with [`cc4dgs_format::Entries`].
 
+use cc4dgs_format::{Error, Result};
+
 pub mod cca;
 mod compact;
 mod grid_sort;
@@ -23,6 +25,19 @@ mod sorted_image;
 mod spz;
 mod vq;
 mod weights;
+
+/// Refuses where the crate was built without the feature `encoders`. The compiler then leaves out what follows.
+#[inline(always)]
+pub(crate) fn require_encoders() -> Result<()> {
+    if cfg!(feature = "encoders") {
+        return Ok(());
+    }
+    Err(Error::parameter(
+        "codec",
+        "this program was built to play models, without encoders",
+        "Use the program cc4dgs, or the feature encoders of cc4dgs-codecs",
+    ))
+}
 
 /// Keeps every plug-in of this crate in the program. Linkers for wasm32 drop object files that nothing refers to, and no code refers to a plug-in. On other
 /// targets `use cc4dgs_codecs as _;` is enough.

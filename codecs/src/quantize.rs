@@ -108,6 +108,7 @@ struct Quantize {
 
 impl AttributeCodec for Quantize {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         // In Morton order neighbours in the streams are similar, which Zstandard exploits.
         let sorted = gaussians.select(&morton::order(&gaussians.means));

@@ -13,6 +13,7 @@ struct Raw;
 
 impl AttributeCodec for Raw {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let mut meta = vec![VERSION];
         Shape::of(gaussians).write(&mut meta)?;

@@ -96,6 +96,7 @@ fn from_png(object: &str, bytes: &[u8], count: usize, wanted: usize) -> Result<V
 
 impl AttributeCodec for SortedImage {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let order = square_order(gaussians, &morton::order(&gaussians.means), context.seed.child("square"));
         let sorted = gaussians.select(&order);

@@ -30,6 +30,7 @@ struct Spz {
 
 impl AttributeCodec for Spz {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let mut meta = vec![VERSION];
         Shape::of(gaussians).write(&mut meta)?;

@@ -79,6 +79,7 @@ fn steps(values: &[f32], width: usize, bits: u8, loss: f64, meta: &mut Vec<u8>, 
 
 impl AttributeCodec for Vq {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let sorted = gaussians.select(&morton::order(&gaussians.means));
         let (mut meta, mut escapes, mut streams) = (vec![VERSION], Vec::new(), Vec::new());

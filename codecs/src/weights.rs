@@ -89,6 +89,7 @@ impl Precision {
 
 impl WeightCodec for Precision {
     fn encode(&self, weights: &[WeightArray], _: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         let mut bytes = Vec::new();
         write_shapes(weights, &mut bytes)?;
         weights.iter().try_for_each(|array| self.write(&array.name, &array.values, &mut bytes))?;

@@ -1,20 +1,84 @@
-//! Damaged streams of every codec and weight codec: an error or a sound result, never a panic, and no memory that the limits do not allow.
+//! Damaged streams of every codec, weight codec and playback layer: an error or a sound result, never a panic, and no allocation that the limits do not allow.
 //!
-//! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test; by default it is a second per codec.
+//! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test; by default it is a second per codec. A program
+//! of its own, because it watches every allocation.
 
+use cc4dgs_format::playback::{CodedTrack, Head, PlaybackLayer};
 use cc4dgs_format::{
-    AttributeCodec, CodecContext, CodecPlugin, Entries, Error, ExtraAttribute, HostGaussians, Limits, Seed, Silent, Stream, WeightArray, WeightCodec,
-    WeightCodecPlugin, toml,
+    AttributeCodec, Camera, CodecContext, CodecPlugin, Entries, Error, EvaluateDeformer, ExtraAttribute, HostGaussians, Image8, Limits, RenderModel,
+    RenderedPlanes, Result, Seed, Silent, Stream, TrainingViews, WeightArray, WeightCodec, WeightCodecPlugin, toml,
 };
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
+
+/// Remembers the largest single allocation.
+struct Watching;
+static LARGEST: AtomicUsize = AtomicUsize::new(0);
+// SAFETY: every call is passed on to the system allocator unchanged.
+unsafe impl GlobalAlloc for Watching {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        LARGEST.fetch_max(size, Ordering::Relaxed);
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+#[global_allocator]
+static ALLOCATOR: Watching = Watching;
 
 /// Enough for what is encoded here, far below what damaged counts claim.
 const LIMITS: Limits = Limits { max_bytes: 64 << 20, max_gaussians: 100_000, max_pixels: 1 << 20, max_depth: 16 };
 
 fn context(threshold: Option<f32>) -> CodecContext<'static> {
     CodecContext { dynamic_threshold: threshold, ..CodecContext::new(Seed::root(17), LIMITS, &Silent) }
+}
+
+/// An image of 64 pixels, each the sum of the values of some Gaussians, so that an encoder finds that everything matters.
+struct Sums(Camera);
+
+impl RenderModel for Sums {
+    fn render(&self, g: &HostGaussians, _: &Camera, _: f32) -> Result<RenderedPlanes> {
+        let mut planes = vec![0.0; 5 * 64];
+        let columns = g.columns().into_iter().map(|(_, width, values)| (width, values)).chain(g.extra.values().map(|a| (a.width, &a.values)));
+        for (width, values) in columns.filter(|(width, _)| *width > 0) {
+            for (k, value) in values.iter().enumerate() {
+                planes[(k / width * 7 + k % width) % (3 * 64)] += 1e-4 * value;
+            }
+        }
+        Ok(RenderedPlanes { width: 8, height: 8, planes })
+    }
+    fn background(&self) -> [f32; 3] {
+        [0.0; 3]
+    }
+}
+
+impl EvaluateDeformer for Sums {
+    fn deform(&self, gaussians: &HostGaussians, _: f32) -> Result<HostGaussians> {
+        Ok(gaussians.clone())
+    }
+}
+
+impl TrainingViews for Sums {
+    fn len(&self) -> usize {
+        1
+    }
+    fn view(&self, _: usize) -> (&Camera, f32) {
+        (&self.0, 0.5)
+    }
+    fn image(&self, _: usize) -> Result<Image8> {
+        Ok(RenderedPlanes { width: 8, height: 8, planes: vec![0.5; 5 * 64] }.to_image())
+    }
 }
 
 /// A damage to one stream. Places are fractions of its length.
@@ -142,6 +206,8 @@ fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream
         if let Err(e) = outcome {
             panic!("{name}: {e}");
         }
+        let largest = LARGEST.load(Ordering::Relaxed) as u64;
+        assert!(largest <= LIMITS.max_bytes, "{name}: {largest} bytes at once, {} are allowed", LIMITS.max_bytes);
     }
     tried.get()
 }
@@ -150,7 +216,8 @@ fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream
 fn damaged_gaussians_give_errors() {
     cc4dgs_codecs::link();
     let plugins: Vec<_> = Entries::<CodecPlugin>::collect().unwrap().iter().collect();
-    let time = seconds(plugins.len() * 2);
+    let time = seconds(plugins.len() * 3);
+    let drawn = Sums(Camera::look_at("view", (8, 8), 0.8, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]));
     for plugin in plugins {
         let mut settings = toml::Table::new();
         for (name, value) in [("sample_budget", 20000), ("layers", 3)] {
@@ -160,16 +227,44 @@ fn damaged_gaussians_give_errors() {
         }
         let codec: Box<dyn AttributeCodec> = (plugin.build)("", &settings).unwrap();
         // The larger model is enough for forms that are chosen for large ones only.
-        for (count, degree, threshold) in [(40, 3, Some(5.0)), (3000, 1, None)] {
-            let sound = codec.encode(&scene(count, degree), &context(threshold)).unwrap();
+        for (count, degree, threshold, seen) in [(40, 3, Some(5.0), false), (3000, 1, None, false), (200, 1, Some(5.0), true)] {
+            let without = context(threshold);
+            let context_of_scene = CodecContext { views: Some(&drawn), renderer: Some(&drawn), deformer: Some(&drawn), ..without };
+            let sound = codec.encode(&scene(count, degree), if seen { &context_of_scene } else { &without }).unwrap();
             let wrong = |found: HostGaussians| found.validate("decoded", &LIMITS).err().map(|e: Error| e.to_string());
             let tried = attack(plugin.info.name, &sound, time, &|streams| {
                 let found = [codec.decode(streams, &context(None)), codec.decode_stage(streams, &context(None))];
                 found.into_iter().flatten().find_map(wrong)
             });
-            println!("{}: {tried} damaged versions of {count} Gaussians", plugin.info.name);
+            println!("{}: {tried} damaged versions of {count} Gaussians, {:.1} s", plugin.info.name, time.as_secs_f64());
         }
     }
+}
+
+#[test]
+fn damaged_playback_layers_give_errors() {
+    let (rows, samples, degree) = ([1u32, 4, 5, 9, 30], 6, 1);
+    let track = |head: Head, first: usize, last: usize| {
+        let ranks = vec![2u8, 0, 1, 2, 1];
+        let coefficients = ranks.iter().map(|r| usize::from(*r)).sum::<usize>() * head.width(degree);
+        CodedTrack {
+            head,
+            peaks: vec![0.5, 2.0],
+            functions: (0..2 * (last - first + 1)).map(|k| (k as i16 * 9973).wrapping_mul(3)).collect(),
+            step: 1e-3,
+            exponents: ranks.iter().map(|r| 3 * r).collect(),
+            ranks,
+            coefficients: (0..coefficients as i32).map(|k| k * 37 - 200).collect(),
+        }
+    };
+    let segments = [(3, vec![track(Head::ALL[0], 0, 3), track(Head::ALL[2], 0, 3)]), (5, vec![track(Head::ALL[0], 3, 5)])];
+    let sound = PlaybackLayer::encode(&rows, degree, samples, &segments).unwrap();
+    PlaybackLayer::decode(&sound, 40, degree, &LIMITS).unwrap();
+    let tried = attack("playback layer", &sound, seconds(1), &|streams| {
+        let found = PlaybackLayer::decode(streams, 40, degree, &LIMITS).ok()?;
+        found.rows.iter().any(|row| *row >= 40).then(|| "a row beyond the Gaussians".to_string())
+    });
+    println!("playback layer: {tried} damaged versions");
 }
 
 #[test]

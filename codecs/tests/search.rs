@@ -2,22 +2,29 @@
 #![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
 use cc4dgs_format::{
-    Camera, CodecContext, CodecPlugin, Entries, Event, EventSink, HostGaussians, Image8, Limits, RenderModel, RenderedPlanes, Result, Seed, Silent, Stream,
-    TrainingViews, toml,
+    Camera, CodecContext, CodecPlugin, Entries, EvaluateDeformer, Event, EventSink, ExtraAttribute, HostGaussians, Image8, Limits, RenderModel, RenderedPlanes,
+    Result, Seed, Silent, Stream, TrainingViews, toml,
 };
 use std::sync::Mutex;
 
 const SIZE: usize = 24;
 
-/// Draws every Gaussian as a blot, without order, so that images depend smoothly on all values.
+/// Draws every Gaussian as a blot, without order, so that images depend smoothly on all values. The attribute `velocity` moves it.
 struct Blots;
+
+impl EvaluateDeformer for Blots {
+    fn deform(&self, gaussians: &HostGaussians, _: f32) -> Result<HostGaussians> {
+        Ok(gaussians.clone())
+    }
+}
 
 impl RenderModel for Blots {
     fn render(&self, g: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<RenderedPlanes> {
         let mut planes = vec![0.0; 5 * SIZE * SIZE];
         let width = g.sh_rest.len() / g.len().max(1);
         for i in 0..g.len() {
-            let (x, y) = (g.means[3 * i] + 0.1 * time_norm, g.means[3 * i + 1]);
+            let velocity = g.extra.get("velocity").map_or([0.0; 2], |a| [a.values[2 * i], a.values[2 * i + 1]]);
+            let (x, y) = (g.means[3 * i] + (0.1 + velocity[0]) * time_norm, g.means[3 * i + 1] + velocity[1] * time_norm);
             let s = &g.log_scales[3 * i..3 * i + 3];
             let q = &g.quaternions[4 * i..4 * i + 4];
             let turn = q[1] * q[2] / q.iter().map(|v| v * v).sum::<f32>();
@@ -88,19 +95,22 @@ fn psnr(g: &HostGaussians, views: &Views) -> f64 {
     views.0.iter().map(of).sum::<f64>() / views.0.len() as f64
 }
 
+/// What is recorded differs from what is drawn, as for a trained model.
+fn recorded(g: &HostGaussians) -> Views {
+    let view = |k: u8| {
+        let camera = Camera { cx: f64::from(k), ..Camera::look_at("view", (SIZE as u32, SIZE as u32), 0.8, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]) };
+        let mut drawn = Blots.render(g, &camera, 0.3 * f32::from(k)).unwrap();
+        drawn.planes.iter_mut().enumerate().for_each(|(p, v)| *v += 0.02 * draw(p, 50 + usize::from(k)));
+        (camera, 0.3 * f32::from(k), drawn.to_image())
+    };
+    Views((0..4).map(view).collect())
+}
+
 #[test]
 fn the_loss_is_kept_and_measured_steps_save_bytes() {
     cc4dgs_codecs::link();
     let g = scene(600);
-    // What is recorded differs from what is drawn, as for a trained model.
-    let views = (0..4).map(|k| {
-        let camera = Camera { cx: f64::from(k), ..Camera::look_at("view", (SIZE as u32, SIZE as u32), 0.8, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]) };
-        let mut drawn = Blots.render(&g, &camera, 0.3 * k as f32).unwrap();
-        drawn.planes.iter_mut().enumerate().for_each(|(p, v)| *v += 0.02 * draw(p, 50 + k as usize));
-        (camera, 0.3 * k as f32, drawn.to_image())
-    });
-    let views = Views(views.collect());
-    let notes = Notes::default();
+    let (views, notes) = (recorded(&g), Notes::default());
     let context = CodecContext {
         views: Some(&views),
         renderer: Some(&Blots),
@@ -125,4 +135,55 @@ fn the_loss_is_kept_and_measured_steps_save_bytes() {
     assert!(plain_drop <= 0.5 && 100 * loose < 98 * plain, "{loose} bytes with measured steps, {plain} without");
     let (sized, _) = encode(&format!("max-size={}MB", loose as f64 / 1e6), "");
     assert!(sized <= loose);
+}
+
+#[test]
+fn attributes_of_plug_ins_are_rounded_by_what_is_seen() {
+    cc4dgs_codecs::link();
+    let plugin = Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap();
+    // Blots are no ellipsoids, so no axes may be exchanged.
+    let codec = (plugin.build)("max-drop=0.05dB", &toml::Table::from_iter([("canonical".into(), false.into())])).unwrap();
+    let plain = CodecContext::new(Seed::root(1), Limits::default(), &Silent);
+    let bytes = |streams: &[Stream]| streams.iter().filter(|s| s.name.contains("velocity") || s.name == "coded").map(|s| s.bytes.len()).sum::<usize>();
+    let count = 600;
+    let velocity = ExtraAttribute::exact(2, (0..2 * count).map(|i| 0.2 * draw(i, 90)).collect());
+    let moves: Vec<bool> = scene(count).dynamic_scores.iter().map(|s| *s > 0.0).collect();
+    let others: Vec<bool> = (0..count).map(|i| i % 3 == 0).collect();
+    let stored = |rows: &[bool]| rows.iter().filter(|r| **r).count();
+    for (velocity, rows) in [
+        (velocity.clone(), &vec![true; count]),
+        (velocity.clone().needed_in(moves.clone(), 0.0), &moves),
+        (velocity.within(1e-4).needed_in(others.clone(), 0.0), &others),
+    ] {
+        let mut g = scene(count);
+        let tolerance = velocity.tolerance;
+        g.extra.insert("velocity".into(), velocity);
+        // What is not needed has no effect, as where nothing moves.
+        let mut drawn = g.clone();
+        drawn.extra.get_mut("velocity").unwrap().values.chunks_exact_mut(2).zip(rows).filter(|(_, r)| !**r).for_each(|(v, _)| v.fill(0.0));
+        let views = recorded(&drawn);
+        let context = CodecContext { views: Some(&views), renderer: Some(&Blots), deformer: Some(&Blots), dynamic_threshold: Some(0.0), ..plain };
+        let streams = codec.encode(&drawn, &context).unwrap();
+        let found = codec.decode(&streams, &plain).unwrap();
+        let drop = psnr(&drawn, &views) - psnr(&found, &views);
+        assert!(drop <= 0.05, "{drop} dB");
+        let values = &found.extra["velocity"].values;
+        // The order of the rows differs: those that are not needed are counted.
+        let without = values.chunks_exact(2).filter(|v| *v == [0.0; 2]).count();
+        assert!(without >= count - stored(rows), "{without} rows without velocity, {} are needed", stored(rows));
+        println!("{} bytes for {} rows", bytes(&streams), stored(rows));
+        match tolerance {
+            // 8 bytes per row are exact. Random values are the worst case.
+            None => assert!(2 * bytes(&streams) < 8 * stored(rows), "{} bytes for {} rows", bytes(&streams), stored(rows)),
+            Some(tolerance) => {
+                // Every decoded row is near one of those given.
+                let given = &drawn.extra["velocity"].values;
+                let near = |v: &[f32]| given.chunks_exact(2).any(|w| (v[0] - w[0]).abs() <= tolerance && (v[1] - w[1]).abs() <= tolerance);
+                assert!(values.chunks_exact(2).all(near), "an error over {tolerance}");
+            }
+        }
+        // Without harmonics, as a player reads it first.
+        let base: Vec<Stream> = streams.into_iter().filter(|s| s.name != "sh.1").collect();
+        assert_eq!(&codec.decode_stage(&base, &plain).unwrap().extra["velocity"].values, values);
+    }
 }

@@ -40,13 +40,13 @@ pub fn take<T: DeserializeOwned>(section: &mut toml::Table, keys: &[&str]) -> Re
     config::parse_section("deformer", &own)
 }
 
-/// Refuses a key that is in none of `keys`. For sections that are read in parts, so that the error lists the settings of all.
+/// Refuses one of `given` that is in none of the `parts`. For sections that are read in parts, so that the error lists the settings of all.
 ///
 /// # Errors
 /// [`Error::Parameter`] with the most similar names, and all.
-pub fn refuse_unknown(section: &toml::Table, keys: &[&[&str]]) -> Result<()> {
-    let known = || keys.iter().flat_map(|part| part.iter().copied());
-    match section.keys().find(|key| known().all(|name| name != key.as_str())) {
+pub fn refuse_unknown<'k>(mut given: impl Iterator<Item = &'k String>, parts: &[&[&str]]) -> Result<()> {
+    let known = || parts.iter().flat_map(|part| part.iter().copied());
+    match given.find(|key| known().all(|name| name != key.as_str())) {
         Some(key) => Err(unknown_name("setting of the deformer", key, known())),
         None => Ok(()),
     }

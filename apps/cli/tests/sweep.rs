@@ -175,7 +175,7 @@ fn the_grids_of_the_studies_expand() {
     let folder = tempfile::tempdir().unwrap();
     let grids = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../benches/grids");
     let mut count = 0;
-    for entry in std::fs::read_dir(grids).unwrap() {
+    for entry in std::fs::read_dir(&grids).unwrap() {
         let path = entry.unwrap().path();
         let mut text_of_grid = std::fs::read_to_string(&path).unwrap();
         for dataset in ["dnerf_mutant", "panoptic_basketball"] {
@@ -183,6 +183,8 @@ fn the_grids_of_the_studies_expand() {
         }
         // Scenes that become the same one still differ in their options, if not in their data.
         text_of_grid = text_of_grid.replace("name = \"basketball\"\n", "name = \"basketball\"\nsize = 1.5\n");
+        // Paths in a grid are relative to the working directory.
+        text_of_grid = text_of_grid.replace("config = \"benches", &format!("config = \"{}", grids.parent().unwrap().display()));
         let grid = folder.path().join(path.file_name().unwrap());
         std::fs::write(&grid, text_of_grid).unwrap();
         let report = succeed(&["sweep", "plan", text(&grid)]);

@@ -111,7 +111,7 @@ impl Content {
         scene.blur = Some(manifest.rasterizer.blur).filter(|blur| blur.is_finite()).unwrap_or(BLUR).clamp(*BLUR_RANGE.start(), *BLUR_RANGE.end()) as f32;
         scene.focal = manifest.rasterizer.focal.filter(|focal| focal.is_finite() && *focal > 0.0);
         scene.square = rules == Rules::Inria;
-        scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(if scene.square { 0.2 } else { 0.01 }).clamp(LEAST_NEAR, MOST_NEAR);
+        scene.near = manifest.rasterizer.near.filter(|near| near.is_finite()).unwrap_or(rules.near()).clamp(LEAST_NEAR, MOST_NEAR);
         scene.alpha_max = if rules == Rules::Gsplat0999 { 0.999 } else { 0.99 };
         let frame_count = if moves { manifest.frame_count } else { 1 };
         Ok(Self { scene, presentation: manifest.presentation.clone(), frame_count, lacks_motion, bytes })
@@ -140,7 +140,7 @@ impl Scene {
             bounds: bounds(&gaussians.means),
             reach: bounds(&gaussians.means),
             background: [0.0; 3],
-            near: 0.01,
+            near: Rules::default().near(),
             alpha_max: 0.99,
             blur: BLUR as f32,
             focal: None,

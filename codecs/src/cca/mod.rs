@@ -38,6 +38,7 @@ pub struct Cca {
 
 impl AttributeCodec for Cca {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let sorted = gaussians.select(&morton::order(&gaussians.means));
         let mut meta = vec![VERSION];

@@ -13,7 +13,7 @@ const WORK: usize = 1_000_000;
 /// The change of a step that is tried.
 const CHANGE: f64 = 2.0;
 /// Largest factor, and the inverse of the smallest.
-const LARGEST: f64 = 2.0;
+const LARGEST: f64 = 8.0;
 
 /// The factors of the columns at about the step factor `quality`.
 pub fn allocate(job: &Job, quality: f64, views: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<Factors> {

@@ -1,5 +1,6 @@
 //! From Gaussians to integers: classes, canonical rotations, steps, order, and rows that are stored exactly.
 
+use super::attributes::{Coded, Coding};
 use super::colors::{Choices, Degree};
 use super::geometry::{CODE_LIMIT, GRID_BITS, Geometry, Rotation, companded};
 use super::importance::{Importance, median};
@@ -9,8 +10,8 @@ use rayon::prelude::*;
 
 /// The coarsest class.
 pub const CLASSES: u8 = 12;
-/// Share of the Gaussians with the largest weights that share class 0.
-const FINEST: f64 = 1e-3;
+/// What Gaussians of larger weights than that of class 0 add to the squared error of images, as a share of what all others do.
+const EXCESS: f64 = 2e-3;
 /// Largest step of a centre, in middle scales.
 const LARGEST_STEP: f64 = 1.0;
 /// Largest steps of log-scales and companded opacities.
@@ -28,6 +29,8 @@ const OUTSIDE: f64 = 5e-4;
 pub struct Plan {
     pub geometry: Geometry,
     pub degrees: Vec<Degree>,
+    /// Attributes of plug-ins, and the rows of each that are stored.
+    attributes: Vec<(Coding, Vec<bool>)>,
     /// Whether means, log-scales, quaternions, opacity logits, degree 0 and higher degrees are rounded; else they are stored exactly.
     rounds: [bool; 6],
     choices: Choices,
@@ -43,6 +46,8 @@ pub struct Integers<'a> {
     pub keys: Vec<u64>,
     /// `[N,dims]` per degree.
     pub colors: Vec<Vec<i32>>,
+    /// Attributes of plug-ins that are coded; others are stored as they may be.
+    pub attributes: Vec<Coded<'a>>,
     /// Rows whose values are stored as float32, by column: means, log-scales, quaternions, opacity logits, then degrees.
     pub exact: Vec<Vec<usize>>,
 }
@@ -119,7 +124,16 @@ fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) 
         // One step for all that costs as much error as steps of their own would.
         return (vec![0; weights.len()], (sorted.iter().map(|w| w * w).sum::<f64>() / sorted.len() as f64).sqrt());
     }
-    let top = top.unwrap_or(sorted[sorted.len() - 1 - (FINEST * sorted.len() as f64) as usize]);
+    let top = top.unwrap_or_else(|| {
+        // A few Gaussians may matter a hundred times as much as others, such as those right before a camera.
+        let mut larger = 0.0;
+        let allowed = sorted.iter().rev().take_while(|&&w| {
+            let fits = larger <= EXCESS * sorted.len() as f64 * w * w;
+            larger += w * w;
+            fits
+        });
+        allowed.last().copied().unwrap_or(sorted[sorted.len() - 1])
+    });
     let class = |w: &f64| if *w > 0.0 { libm::log2(top / w).round().clamp(0.0, f64::from(CLASSES)) as u8 } else { CLASSES };
     (weights.iter().map(class).collect(), top)
 }
@@ -155,7 +169,8 @@ impl Plan {
             let (relative, factor) = if degree == 0 { (1.0, factors[4]) } else { (steps.sh_rest[degree - 1], factors[5]) };
             Degree::plan(&coefficients(gaussians, degree), dims, &classes.colors, &squared, positive(base * relative * factor), choices)
         };
-        Self { degrees: (0..=gaussians.sh_degree).map(degree).collect(), geometry, rounds: factors.map(|f| f > 0.0), choices: *choices }
+        let attributes = importance.attributes.iter().filter_map(|of| Coding::plan(gaussians, of, &geometry, quality)).collect();
+        Self { degrees: (0..=gaussians.sh_degree).map(degree).collect(), attributes, geometry, rounds: factors.map(|f| f > 0.0), choices: *choices }
     }
     /// The integers of canonical Gaussians, as many as those that were planned for.
     pub fn quantise<'a>(&'a self, gaussians: &HostGaussians, free: &[bool], classes: &'a Classes) -> Integers<'a> {
@@ -209,7 +224,8 @@ impl Plan {
             exact.push(missing);
             colors.push(codes);
         }
-        Integers { plan: self, classes, scales, rotations, opacities, keys, colors, exact }
+        let attributes = self.attributes.iter().filter_map(|(coding, rows)| Coded::new(coding, rows, gaussians, geometry, &scales, shapes)).collect();
+        Integers { plan: self, classes, scales, rotations, opacities, keys, colors, attributes, exact }
     }
 }
 

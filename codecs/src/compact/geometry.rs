@@ -140,9 +140,9 @@ impl Geometry {
     }
 }
 
-fn sorted(mut codes: [i32; 3]) -> [i32; 3] {
-    codes.sort_unstable();
-    codes
+fn sorted([a, b, c]: [i32; 3]) -> [i32; 3] {
+    let (low, high) = (a.min(b), a.max(b));
+    [low.min(c), low.max(high.min(c)), high.max(c)]
 }
 
 /// The opacity logit on the scale on which it is quantised: errors of opaque Gaussians matter less.

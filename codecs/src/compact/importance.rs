@@ -3,6 +3,7 @@
 //! Where errors of all parameters add the same to the squared error of images, a file of a given size has the smallest error. A parameter's step is
 //! therefore inversely proportional to its *weight*: the root of the sum, over pixels and channels of an image, of the squared derivatives.
 
+use super::sensitivity::Sensitivity;
 use cc4dgs_format::{BLUR, CodecContext, HostGaussians, Result};
 use std::ops::RangeInclusive;
 
@@ -39,6 +40,8 @@ pub struct Importance {
     pub pixels_per_unit: f64,
     /// Steps relative to those of degree-0 colours.
     pub steps: Steps,
+    /// Attributes of plug-ins that were measured; others are stored as the plug-in allows.
+    pub attributes: Vec<Sensitivity>,
 }
 
 /// Steps relative to the step of a degree-0 colour coefficient.
@@ -81,7 +84,7 @@ pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance
         SH0 * SEEN * alpha * (std::f64::consts::PI * area).min(samples).sqrt()
     };
     let weights: Vec<f64> = (0..gaussians.len()).map(weight).collect();
-    Importance { shapes: weights.clone(), weights, samples, pixels_per_unit: median(&scale), steps: Steps::default() }
+    Importance { shapes: weights.clone(), weights, samples, pixels_per_unit: median(&scale), steps: Steps::default(), attributes: Vec::new() }
 }
 
 /// Weights from derivatives of renders; `None` where the context cannot tell them. `apart` says whether shapes have weights of their own.
@@ -161,7 +164,7 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool) -
     };
     let (scale, samples) = pixel_scales(gaussians, context);
     let root = |squares: Vec<f64>| squares.into_iter().map(|w| (w / chosen as f64).sqrt()).collect();
-    Ok(Some(Importance { weights: root(colours), shapes: root(shapes), samples, pixels_per_unit: median(&scale), steps }))
+    Ok(Some(Importance { weights: root(colours), shapes: root(shapes), samples, pixels_per_unit: median(&scale), steps, attributes: Vec::new() }))
 }
 
 /// Pixels per world unit at each Gaussian (root of the mean square over cameras that see it), and the samples of an image.

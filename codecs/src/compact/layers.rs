@@ -1,5 +1,6 @@
 //! Layers: a player draws the most important Gaussians while the others arrive.
 
+use super::attributes::CODED;
 use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::{Result, StreamStage};
 use std::ops::Range;
@@ -89,7 +90,7 @@ pub fn stage(name: &str) -> StreamStage {
     if name.strip_prefix("sh.").is_some_and(|degree| degree != "0" && number(degree).is_some()) {
         return StreamStage::Harmonics;
     }
-    if name.starts_with("extra.") {
+    if name.starts_with("extra.") || name.strip_prefix(CODED).is_some_and(|rest| rest.is_empty() || rest.starts_with('.')) {
         return StreamStage::BASE;
     }
     // Not the 0 of `sh.0`.
@@ -128,10 +129,10 @@ mod tests {
 
     #[test]
     fn streams_come_in_the_order_of_their_stages() {
-        let stages = ["meta", "exact", "means", "sh.0", "means.1", "sh.0.1", "sh.0.5", "extra.a.3", "sh.1", "sh.4"].map(stage);
+        let stages = ["meta", "exact", "means", "sh.0", "means.1", "sh.0.1", "sh.0.5", "extra.a.3", "coded", "coded.a.1", "sh.1", "sh.4"].map(stage);
         let layers = [0, 0, 0, 0, 1, 1, 5].map(StreamStage::Layer);
         assert_eq!(stages[..7], layers);
-        assert_eq!(stages[7..], [StreamStage::BASE, StreamStage::Harmonics, StreamStage::Harmonics]);
+        assert_eq!(stages[7..], [[StreamStage::BASE; 3].as_slice(), &[StreamStage::Harmonics; 2]].concat());
         assert!(stages.is_sorted());
     }
 }

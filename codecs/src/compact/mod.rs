@@ -3,9 +3,10 @@
 //! The step of every value follows from how much its error changes rendered images. Gaussians fall into classes; the steps of one class are twice those of
 //! the class before. Weights come from derivatives of renders on the training views, or from sizes and opacities. Streams, in the order in which a player
 //! needs them: of each layer classes, scales, centres, rotations, opacities and degree-0 colours, then the higher degrees one by one. Layers are sets of
-//! Gaussians by falling weight.
+//! Gaussians by falling weight. Attributes of plug-ins follow the layers.
 
 mod allocate;
+mod attributes;
 mod bits;
 mod blocks;
 mod colors;
@@ -18,6 +19,7 @@ mod predict;
 mod read;
 mod rounding;
 mod search;
+mod sensitivity;
 mod settings;
 mod transform;
 mod tune;
@@ -166,12 +168,16 @@ fn keeps_shapes(gaussians: &HostGaussians, context: &CodecContext) -> Result<boo
 
 impl AttributeCodec for Compact {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
         let measured = if self.settings.measured { importance::measure(gaussians, context, self.settings.adaptive && self.settings.shapes)? } else { None };
-        let importance = measured.unwrap_or_else(|| importance::estimate(gaussians, context));
+        let mut importance = measured.unwrap_or_else(|| importance::estimate(gaussians, context));
         let (motion, free) = self.motion(gaussians, context)?;
         let canonical = encode::canonical(gaussians, &free);
         let classes = encode::classify(&importance.weights, &importance.shapes, self.settings.adaptive);
+        if self.settings.measured {
+            importance.attributes = sensitivity::measure(&canonical, &classes, context, search::estimate(self.settings.psnr_db, &importance))?;
+        }
         let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
         let layers = layers::assign(&importance.weights, layers::number(self.settings.layers, gaussians.len()));
         let mut job = Job { gaussians: &canonical, free, importance: &importance, classes, layers, motion, choices, factors: [1.0; 6], limits: context };

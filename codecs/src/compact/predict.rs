@@ -95,9 +95,16 @@ impl History {
     #[inline(always)]
     fn means(&self, c: usize) -> [i64; 2] {
         let last = |k: usize| self.rows[(self.count + MEMORY - k) % MEMORY][c];
-        // A division by a constant is fast, and the usual one.
-        let all = if self.count < MEMORY { self.sums[c] / self.count.max(1) as i64 } else { self.sums[c] / MEMORY as i64 };
+        // A division by a constant is fast, and the usual one. The other is a function of its own because rustc 1.95 divided by `count` in both branches of
+        // some builds.
+        let all = if self.count < MEMORY { self.early_mean(c) } else { self.sums[c] / MEMORY as i64 };
         [(last(1) + last(2)) / 2, all]
+    }
+    /// The mean over all rows where there are fewer than are remembered.
+    #[cold]
+    #[inline(never)]
+    fn early_mean(&self, c: usize) -> i64 {
+        self.sums[c] / self.count.max(1) as i64
     }
     /// Inputs of the component `c` of a row whose components before are `row`.
     #[inline]

@@ -1,6 +1,7 @@
 //! Gaussians from streams.
 
 use super::VERSION;
+use super::attributes::{self, RowFacts};
 use super::blocks::{Blocks, ROWS};
 use super::colors::{self, Degree, SMALL_CONTEXTS, code_small};
 use super::geometry::{Geometry, KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
@@ -101,8 +102,9 @@ pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<H
         }
         exact.finish()?;
     }
-    if whole || all && shape.has_extra(&set) {
-        shape.read_extra(&set, &mut out)?;
+    if whole || all && attributes::complete(&set, &shape) {
+        let Rows { geometry, classes, shapes, moving, scales, .. } = rows;
+        attributes::read(&set, &shape, &RowFacts { geometry, classes, shapes, moving, scales }, &mut out)?;
     }
     out.validate("decoded Gaussians", &context.limits)?;
     Ok(out)

@@ -40,6 +40,7 @@ impl Rounding for Rounder<'_> {
             place(&mut out, degree, &steps);
         }
         keep_exact(&codes, &zeros_like(gaussians), &mut out);
+        out.extra = codes.attributes.iter().map(|coded| (coded.coding.name.clone(), coded.steps())).collect();
         Ok(out)
     }
     fn bit_slopes(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
@@ -54,7 +55,8 @@ impl Rounding for Rounder<'_> {
                 out.quaternions[4 * i + k] = (slope(q[k] / step) / step) as f32;
             }
         }
-        let guesses = self.guesses(&codes);
+        let order = by_key(&codes);
+        let guesses = self.guesses(&codes, &order);
         for (i, &shape) in shapes.iter().enumerate() {
             let (step, origin) = (geometry.scale_step_of(shape), f64::from(geometry.scale_origin));
             for k in 3 * i..3 * i + 3 {
@@ -69,6 +71,11 @@ impl Rounding for Rounder<'_> {
             place(&mut out, degree, &plan.bit_slopes(&coefficients(gaussians, degree), &self.classes.colors, guesses));
         }
         keep_exact(&codes, &zeros_like(gaussians), &mut out);
+        for coded in &codes.attributes {
+            if let Some(attribute) = gaussians.extra.get(&coded.coding.name) {
+                out.extra.insert(coded.coding.name.clone(), coded.bit_slopes(&attribute.values, &order, self.classes));
+            }
+        }
         Ok(out)
     }
 }
@@ -83,9 +90,8 @@ struct Guesses {
 }
 
 impl Rounder<'_> {
-    fn guesses(&self, codes: &Integers) -> Guesses {
-        let mut order: Vec<usize> = (0..codes.keys.len()).collect();
-        order.sort_by_key(|&i| (codes.keys[i], i));
+    /// The predictions of `codes`, whose rows are coded in `order`.
+    fn guesses(&self, codes: &Integers, order: &[usize]) -> Guesses {
         let (geometry, classes) = (&self.plan.geometry, self.classes);
         let guesses = |dims: usize, values: &[i32], known: &dyn Fn(usize) -> Known| {
             let sorted: Vec<i32> = order.iter().flat_map(|&i| &values[i * dims..(i + 1) * dims]).copied().collect();
@@ -102,6 +108,13 @@ impl Rounder<'_> {
             colors: guesses(3, &codes.colors[0], &|i| known_classes(of(i).0, of(i).1, true, 15)),
         }
     }
+}
+
+/// Rows in the order of their keys.
+fn by_key(codes: &Integers) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..codes.keys.len()).collect();
+    order.sort_by_key(|&i| (codes.keys[i], i));
+    order
 }
 
 /// What the integers of `gaussians` stand for, in the same order.
@@ -127,6 +140,7 @@ pub fn restored(codes: &Integers, gaussians: &HostGaussians) -> HostGaussians {
         place(&mut out, degree, &rows);
     }
     keep_exact(codes, gaussians, &mut out);
+    out.extra.extend(codes.attributes.iter().map(|coded| (coded.coding.name.clone(), coded.restored())));
     out
 }
 
@@ -171,9 +185,10 @@ fn keep_exact(codes: &Integers, from: &HostGaussians, to: &mut HostGaussians) {
 #[cfg(test)]
 mod tests {
     use super::super::encode::{canonical, classify};
+    use super::super::sensitivity::{Growth, Sensitivity};
     use super::super::{Choices, Job, Motion, importance, layers};
     use super::*;
-    use cc4dgs_format::{CodecContext, Limits, Seed, Silent};
+    use cc4dgs_format::{CodecContext, ExtraAttribute, Limits, Seed, Silent};
 
     fn scene(n: usize) -> HostGaussians {
         let draw = |i: usize, k: usize| (Seed::root(5).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
@@ -182,6 +197,7 @@ mod tests {
             let shift = if name == "log_scales" { -3.0 } else { 0.0 };
             *values = (0..n * width).map(|k| shift + draw(k, column)).collect();
         }
+        g.extra.insert("a".into(), ExtraAttribute::exact(2, (0..2 * n).map(|k| draw(k, 99)).collect()));
         // Rows that no step can hold.
         g.quaternions[..4].fill(100.0);
         g.log_scales[7] = 80.0;
@@ -194,7 +210,8 @@ mod tests {
         for free in [false, true] {
             let free = vec![free; 300];
             let g = canonical(&scene(300), &free);
-            let importance = importance::estimate(&g, &limits);
+            let mut importance = importance::estimate(&g, &limits);
+            importance.attributes = vec![Sensitivity { name: "a".into(), growth: Growth::None, weight: 30.0 }];
             let classes = classify(&importance.weights, &importance.shapes, true);
             let motion = Motion { free: u8::from(free[0]), moving: None, levels: [0.0; 2] };
             let layers = layers::assign(&importance.weights, 2);
@@ -208,6 +225,8 @@ mod tests {
             for ((name, _, a), (_, _, b)) in found.columns().into_iter().zip(attempt.decoded.columns()).filter(|c| c.0.0 != "dynamic_scores") {
                 assert!(a == b, "{name} differ");
             }
+            assert_eq!(found.extra, attempt.decoded.extra);
+            assert!(rounded.extra["a"] != g.extra["a"] && steps.extra["a"].values.iter().all(|s| *s > 0.0));
             // Free quaternions have the norm 1 in canonical form, which can be rounded.
             assert_eq!((steps.quaternions[0] == 0.0, steps.log_scales[7]), (!job.free[0], 0.0), "rows that are stored exactly");
             // Nothing moves by much more than half a step; norms of quaternions are rounded apart.

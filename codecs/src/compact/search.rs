@@ -152,7 +152,15 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         Allowance::Bytes(limit) => Goal::Bytes(*limit),
         Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
-    if let Some(tuner) = context.tuner.filter(|_| settings.finetune > 0 && services.is_some())
+    let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
+    let refusal = tuner.map(|t| t.refusal()).transpose()?.flatten();
+    if let Some(why) = &refusal {
+        if settings.finetune_wanted {
+            return Err(Error::parameter("codec compact.finetune", format!("the model cannot be fine-tuned: {why}"), "Leave it out"));
+        }
+        context.events.emit(&Event::Warning { object: object.into(), message: format!("the model is not fine-tuned: {why}") });
+    }
+    if let Some(tuner) = tuner.filter(|_| refusal.is_none())
         && let Some(tuned) = tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)?
     {
         return Ok(tuned);

@@ -5,8 +5,8 @@ use cc4dgs_format::{Error, Result, config, unknown_name};
 use serde::Deserialize;
 
 pub(super) const SCHEMA: &str = "\
-max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. 0: psnr_db
-max_size_mb = 0.0        # the best file of at most so many MB; `compact:max-size=5MB` for short. 0: no limit
+max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. Without fine-tuning the deformer's weights are not counted. 0: psnr_db
+max_size_mb = 0.0        # the best Gaussians in at most so many MB; `compact:max-size=5MB` for short. The deformer's weights come on top. 0: no limit
 finetune = 500           # with --scene: iterations in which Gaussians and deformer are trained further with rounded values, in larger steps; 0: none
 size_weight = 4.0        # how much bits count in fine-tuning; 0 trains for accuracy alone
 psnr_db = 50.0           # without --scene: estimated PSNR between images before and after; `compact:psnr=50dB` for short
@@ -26,7 +26,7 @@ layers = 0               # sets of Gaussians by falling weight, which a player d
 pub struct Settings {
     /// Largest loss of PSNR on training views in dB; 0 chooses by `psnr_db`.
     pub max_drop_db: f64,
-    /// Largest size in MB; 0 is no limit.
+    /// Largest size of all streams of Gaussians in MB; 0 is no limit.
     pub max_size_mb: f64,
     /// Iterations of fine-tuning.
     pub finetune: usize,

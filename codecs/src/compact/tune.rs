@@ -12,15 +12,18 @@ use cc4dgs_format::{CodecContext, Result, TuneModel, TunedModel, Tuning};
 
 /// Rounds of training.
 const ROUNDS: usize = 5;
-/// Octaves by which the steps of the first round are larger than those that need no training, where a loss is allowed.
+/// Share of the loss by rounding that training leaves. With steps k times those that need no training, rounding costs k² times what is allowed.
+const REMAINS: f64 = 0.3;
+/// What further training gains in dB in the first round, whatever is rounded; models that were trained for a few minutes gain more.
+const GAIN: f64 = 0.15;
+/// The most octaves by which the steps of the first round are larger than those that need no training, where a loss is allowed.
 const FIRST: f64 = 2.0;
-/// Share of the loss by rounding that training leaves, for the choice of the next steps.
-const REMAINS: f64 = 0.08;
 /// Octaves by which the steps of two rounds differ, at most.
 const FARTHEST: f64 = 1.0;
-/// The share of what is allowed that rounds aim at, and the last one.
+/// The share of what is allowed that rounds aim at, and the last one, less what a round differs from what is expected, in dB.
 const AIM: f64 = 0.95;
 const LAST_AIM: f64 = 0.8;
+const SPREAD: f64 = 0.03;
 
 /// What is allowed.
 pub enum Goal {
@@ -48,13 +51,20 @@ impl Goal {
             Self::Bytes(limit) => outcome.attempt.bytes as f64 <= *limit && outcome.drop < drop,
         }
     }
+    /// Octaves by which the steps of the first round are larger than those that need no training.
+    fn first(&self) -> f64 {
+        match self {
+            Self::Drop(limit) => (0.5 * libm::log2((AIM + GAIN / limit.max(1e-9)) / REMAINS)).min(FIRST),
+            Self::Bytes(_) => 0.0,
+        }
+    }
     /// By how many octaves the next steps should be larger; `aim` is a share.
     fn octaves(&self, outcome: &Outcome, aim: f64, octaves: f64, bits_per_octave: f64) -> f64 {
         let more = match self {
             Self::Drop(limit) => {
                 // Rounding costs in proportion to squared steps; training gains what it gains.
                 let cost = REMAINS * limit * libm::exp2(2.0 * octaves);
-                0.5 * libm::log2(((cost + aim * limit - outcome.drop) / cost).max(1e-3))
+                0.5 * libm::log2(((cost + aim * limit - SPREAD - outcome.drop) / cost).max(1e-3))
             }
             Self::Bytes(limit) => 8.0 * (outcome.attempt.bytes as f64 - limit) / bits_per_octave,
         };
@@ -78,8 +88,13 @@ pub fn tune(
     let untuned = before - tuner.psnr(&found.decoded, &model.weights, Some(1.0))?;
     let first_bytes = found.bytes + tuner.weight_bytes(&model.weights, 1.0)?;
     note(context, format!("without fine-tuning {:.4} MB with the deformer's weights, PSNR {untuned:.3} dB lower", megabytes(first_bytes)));
+    // Weights are rounded too, and the loss was measured on fewer views before.
+    let allowed = match goal {
+        Goal::Drop(limit) => allowed && untuned <= *limit,
+        Goal::Bytes(_) => allowed,
+    };
     let mut best: Option<Outcome> = None;
-    let mut octaves = if matches!(goal, Goal::Drop(_)) { FIRST } else { 0.0 };
+    let mut octaves = goal.first();
     let shares = rounds(settings.finetune);
     for (round, &iterations) in shares.iter().enumerate() {
         let quality = found.quality * libm::exp2(octaves);

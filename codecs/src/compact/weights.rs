@@ -104,6 +104,7 @@ impl Weights {
 
 impl WeightCodec for Weights {
     fn encode(&self, weights: &[WeightArray], _: &CodecContext) -> Result<Vec<Stream>> {
+        crate::require_encoders()?;
         let (mut shapes, mut coder) = (Vec::new(), Encoder::default());
         write_shapes(weights, &mut shapes)?;
         for (index, array) in weights.iter().enumerate() {

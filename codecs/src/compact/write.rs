@@ -4,9 +4,9 @@ use super::colors::{self, SMALL_CONTEXTS, code_small};
 use super::encode::{Classes, Integers, coefficients};
 use super::geometry::{KEY_CONTEXTS, ROTATION_CONTEXTS, Rotation, code_keys, code_rotations};
 use super::predict::{Known, Linear};
-use super::{VERSION, blocks, layers};
+use super::{VERSION, attributes, blocks, layers};
 use cc4dgs_format::storage::column::{self, Target};
-use cc4dgs_format::storage::{Attributes, META, Shape, extra_streams};
+use cc4dgs_format::storage::{META, Shape};
 use cc4dgs_format::{HostGaussians, Result, Stream};
 use std::slice;
 
@@ -124,7 +124,7 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
     columns.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
     let mut columns: Vec<_> = columns.into_iter().map(Vec::into_iter).collect();
     ranges.iter().for_each(|_| streams.extend(columns.iter_mut().filter_map(Iterator::next)));
-    streams.extend(extra_streams(&sorted, Attributes::AsAllowed));
+    streams.extend(attributes::write(&sorted, of, order, &moving)?);
     let (all, mut sizes) = (0..n, vec![0; n]);
     for (degree, (plan, codes)) in of.plan.degrees.iter().zip(&colors).enumerate().skip(1) {
         streams.extend(blocks::encode(&color_name(degree), colors::CONTEXTS, slice::from_ref(&all), |coder, range| {

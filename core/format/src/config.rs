@@ -17,11 +17,26 @@ fn read<T: DeserializeOwned>(section: toml::Table) -> std::result::Result<T, Str
     T::deserialize(toml::Value::Table(section)).map_err(|e| e.message().to_string())
 }
 
+/// Values of a section in which the key at fault is looked for: every key costs a copy. Sections that people write are smaller; stored ones may be hostile.
+const MOST_VALUES: usize = 4096;
+
+/// The number of values of `table`, those of inner tables and lists included.
+fn values(table: &toml::Table) -> usize {
+    fn of(value: &toml::Value) -> usize {
+        match value {
+            toml::Value::Table(table) => 1 + values(table),
+            toml::Value::Array(list) => 1 + list.iter().map(of).sum::<usize>(),
+            _ => 1,
+        }
+    }
+    table.values().map(of).sum()
+}
+
 /// The error of a section that fails with `message`. `fails` says why another section fails.
 fn at_fault(object: &str, section: &toml::Table, message: &str, fails: &dyn Fn(toml::Table) -> Option<String>) -> Error {
     // The key without which the section does not fail in this way.
     let mut path: Vec<&str> = Vec::new();
-    let mut inner = Some(section);
+    let mut inner = (values(section) <= MOST_VALUES).then_some(section);
     while let Some(table) = inner {
         let key = table.keys().find(|key| {
             let mut without = section.clone();
@@ -197,5 +212,9 @@ mod tests {
         assert!(e.contains("configuration, train: the number `3` where a table is expected"), "{e}");
         let e = error("seed = 1\n[train]");
         assert!(e.contains("batch"), "{e}");
+        // A search through all of these would take hours.
+        let huge = (0..200_000).map(|k| format!("k{k} = [1, 2]\n")).collect::<String>() + "z = 'abc'";
+        let e = parse_section::<std::collections::BTreeMap<String, Vec<u32>>>("kept", &parse_table("t", &huge).unwrap()).unwrap_err().to_string();
+        assert!(e.starts_with("kept: the string \"abc\" where a list is expected"), "{e}");
     }
 }

@@ -22,7 +22,8 @@ pub struct ExtraAttribute {
     pub width: usize,
     /// Row-major values `[N, width]`.
     pub values: Vec<f32>,
-    /// Largest absolute error of a value after decoding; `None` means bit for bit.
+    /// Largest absolute error of a value after decoding. `None`: the deformer does not say; a codec that can measure what errors change in images may round
+    /// by that, others store bit for bit.
     pub tolerance: Option<f32>,
     /// The rows that must be stored; `None` means all.
     pub needed: Option<NeededRows>,

@@ -84,11 +84,18 @@ impl<P: PluginEntry> Entries<P> {
     }
 }
 
+/// The `known` names without repetitions, those that are most like `name` first.
+pub fn by_likeness<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+    let likeness = |other: &str| strsim::jaro_winkler(other, name).max(strsim::normalized_damerau_levenshtein(other, name));
+    let mut known: Vec<&str> = known.collect();
+    known.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)).then(a.cmp(b)));
+    known.dedup();
+    known
+}
+
 /// An error for the unknown `name` of a `kind`; it lists all `known` names and the most similar ones.
 pub fn unknown_name<'a>(kind: &str, name: &str, known: impl Iterator<Item = &'a str>) -> Error {
-    let mut known: Vec<&str> = known.collect();
-    known.sort_by(|a, b| strsim::jaro_winkler(b, name).total_cmp(&strsim::jaro_winkler(a, name)).then(a.cmp(b)));
-    known.dedup();
+    let known = by_likeness(name, known);
     // Jaro-Winkler misses swapped letters in short names; edit distance misses long names that share only a prefix.
     let few_edits = |k: &str| strsim::damerau_levenshtein(k, name) <= (name.chars().count() / 3).min(2);
     let near: Vec<&str> = known.iter().copied().filter(|k| strsim::jaro_winkler(k, name) > 0.75 || few_edits(k)).take(3).collect();

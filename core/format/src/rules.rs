@@ -27,3 +27,13 @@ pub enum Rules {
     /// Inria: near 0.2, square of 3 sigma of the major axis, alpha cap 0.99 that passes the gradient on.
     Inria,
 }
+
+impl Rules {
+    /// Smallest camera depth drawn where a model does not say otherwise.
+    pub fn near(self) -> f32 {
+        match self {
+            Self::Gsplat099 | Self::Gsplat0999 => 0.01,
+            Self::Inria => 0.2,
+        }
+    }
+}

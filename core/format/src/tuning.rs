@@ -53,6 +53,11 @@ pub struct Tuning<'a> {
 
 /// Trains a model further on its training views. A deformer's weights are rounded as their own codec stores them.
 pub trait TuneModel {
+    /// Why the model cannot be trained further, if it cannot.
+    ///
+    /// # Errors
+    /// What the model's configuration reports.
+    fn refusal(&self) -> Result<Option<String>>;
     /// `gaussians` with the weights of the model.
     ///
     /// # Errors

@@ -147,12 +147,13 @@ pub struct AttributeSpec {
     pub lr: f64,
     /// Whether the rate is multiplied by the extent of the cameras (as that of the positions is).
     pub times_extent: bool,
-    /// Largest absolute error of a float after lossy compression; `None` means bit-exact.
+    /// Largest absolute error of a float after lossy compression. `None`: codecs that measure what errors change in images round by that, others store it
+    /// bit for bit.
     pub tolerance: Option<f32>,
 }
 
 impl AttributeSpec {
-    /// An attribute of `width` floats with start value `start` and learning rate `lr`, stored exactly.
+    /// An attribute of `width` floats with start value `start` and learning rate `lr`, without a tolerance.
     pub fn new(name: &str, width: usize, start: f32, lr: f64) -> Self {
         Self { name: name.into(), width, start, spread: 0.0, lr, times_extent: false, tolerance: None }
     }

@@ -24,7 +24,7 @@ mod registry;
 mod scene;
 mod schedule;
 
-// burn draws random numbers through it, and it has none in browsers unless it is asked to.
+// burn draws its random numbers with it; the feature that this crate asks for makes it work in browsers.
 #[cfg(target_arch = "wasm32")]
 use getrandom as _;
 
@@ -36,8 +36,8 @@ pub use cc4dgs_format::{
     AttributeCodec, BLUR, BLUR_RANGE, Camera, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Entries, Error, EvaluateDeformer, Event, EventSink,
     ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, ExtraAttribute, FIELD_STREAMS, Fanout, HostGaussians, Image8, Limits, MOVING,
     Moving, NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rounding, Rules, Seed, Silent, Similarity, StoredModel, Stream,
-    StreamStage, TrainingViews, TuneModel, TunedModel, Tuning, WeightArray, WeightCodec, WeightCodecPlugin, archive, blur_at, canonical_stages, config,
-    exporter, inventory, playback, plugin_kind, ply, psnr_on_views, read_gaussians, read_stage, read_weights, serde, split_kind, spz, storage, toml,
+    StreamStage, TrainingViews, TuneModel, TunedModel, Tuning, WeightArray, WeightCodec, WeightCodecPlugin, archive, blur_at, by_likeness, canonical_stages,
+    config, exporter, inventory, playback, plugin_kind, ply, psnr_on_views, read_gaussians, read_stage, read_weights, serde, split_kind, spz, storage, toml,
     unknown_name, weight_seed,
 };
 pub use deformer::{

@@ -38,6 +38,11 @@ impl TrainingViews for SceneViews<'_> {
     }
 }
 
+/// What is added to colours where derivatives are measured: no trained colour is as far below 0.
+const BRIGHTER: f64 = 16.0;
+/// Value of the spherical-harmonics basis function of degree 0.
+const SH0: f64 = 0.282_094_791_773_878_14;
+
 /// Moves and draws Gaussians as a model does.
 pub struct ModelServices<'a> {
     model: &'a Model,
@@ -94,8 +99,11 @@ impl RenderModel for ModelServices<'_> {
     fn squared_derivatives(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32, seed: Seed) -> Result<Option<HostGaussians>> {
         let tracked = self.device.clone().autodiff();
         let leaf = |t: Tensor<2>| Tensor::<2>::from_inner(t).require_grad();
-        let moved = self.moved(gaussians, time_norm)?;
+        let mut moved = self.moved(gaussians, time_norm)?;
         let [n, coefficients, _] = moved.sh_rest.dims();
+        // A colour below 0 is drawn as 0 and has no derivative, but a rounded one may be above. All colours and the background are made brighter alike, which
+        // changes no other derivative.
+        moved.sh_dc = moved.sh_dc + BRIGHTER / SH0;
         let (means, log_scales, quaternions, sh_dc) = (leaf(moved.means), leaf(moved.log_scales), leaf(moved.quaternions), leaf(moved.sh_dc));
         let opacity_logits = Tensor::<1>::from_inner(moved.opacity_logits).require_grad();
         let sh_rest = Tensor::<3>::from_inner(moved.sh_rest).require_grad();
@@ -110,7 +118,7 @@ impl RenderModel for ModelServices<'_> {
             absolute_screen_probe: None,
             camera_probe: None,
         };
-        let background = self.settings.background.clone().map(Tensor::<1>::from_inner);
+        let background = self.settings.background.clone().map(|b| Tensor::<1>::from_inner(b + BRIGHTER));
         let planes = self.rasterizer.render(&splats, camera, &RenderSettings { background, ..self.settings.clone() })?.image();
         let shape = planes.dims();
         let signs = rand_signs(seed, shape.iter().product());

@@ -10,8 +10,6 @@ use cc4dgs_core::{Deformer, DeformerContext, Error, Event, EventSink, HostGaussi
 use serde::Serialize;
 use std::path::Path;
 
-/// The smallest depth that is drawn where a model does not say otherwise: that of the default rules.
-const NEAR: f32 = 0.01;
 /// The smallest depth drawn of a model in unknown units, as a share of its radius; cameras that see the whole model are some three radii away.
 const NEAR_OF_RADIUS: f64 = 0.01;
 
@@ -88,8 +86,8 @@ impl Model {
     /// ([`SourceKind`]). PLY and SPZ files become static models, drawn by the default rasterizer.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for a path that does not exist, [`Error::Data`] for files that are no model or damaged, [`Error::Unsupported`] for versions and plug-ins this program does not have,
-    /// [`Error::Limit`] for claims over `limits`.
+    /// [`Error::Parameter`] for a path that does not exist, [`Error::Data`] for files that are no model or damaged, [`Error::Unsupported`] for versions and
+    /// plug-ins this program does not have, [`Error::Limit`] for claims over `limits`.
     pub fn open(path: &Path, registry: &Registry, device: &Device, limits: &Limits, events: &dyn EventSink) -> Result<Self> {
         let Source { kind, file } = Source::expect(path)?;
         match kind {
@@ -116,11 +114,12 @@ impl Model {
     /// A static model of `gaussians` that take `bytes` in their file. The file does not say its units: cameras around a small model are near it too.
     fn from_static(gaussians: HostGaussians, bytes: u64) -> Self {
         let near = (middle_and_radius(&gaussians).1 * NEAR_OF_RADIUS) as f32;
+        let usual = RenderConfig::default();
         Self {
             gaussians,
             field: None,
             moving: Moving::Nothing,
-            render: RenderConfig { near: (near < NEAR).then_some(near), ..RenderConfig::default() },
+            render: RenderConfig { near: (near < usual.rules.near()).then_some(near), ..usual },
             background: None,
             rasterizer: default_rasterizer(),
             frame_count: 1,

@@ -24,6 +24,9 @@ pub struct PruneReport {
     pub psnr_before_db: f64,
     /// PSNR in dB after.
     pub psnr_after_db: f64,
+    /// PSNR in dB of all Gaussians after one re-fit, nothing removed: what training alone gives. Missing without re-fit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr_refit_alone_db: Option<f64>,
     /// Which views judged: validation views where the model was trained with some, else training views.
     pub judged_by: Split,
     /// Number of those views.
@@ -100,5 +103,5 @@ pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Regi
     drop(services);
     model.gaussians = rest;
     let views = judges.len().min(JUDGES);
-    Ok(PruneReport { before: n, after: enough, psnr_before_db, psnr_after_db, judged_by, views })
+    Ok(PruneReport { before: n, after: enough, psnr_before_db, psnr_after_db, psnr_refit_alone_db: None, judged_by, views })
 }

@@ -10,7 +10,7 @@ use cc4dgs_play::Model;
 use cc4dgs_play::checkpoint::{CheckpointArrays, CheckpointFile, DeformerHeader, FORMAT, ModelHeader};
 use cc4dgs_play::model::ModelSize;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// Everything about a checkpoint that is not an array.
@@ -71,18 +71,20 @@ impl Checkpoint {
     pub fn normalisation(&self) -> Similarity {
         self.model.normalisation
     }
-    /// The state to go on from, with freshly built `parts`. Refuses a configuration other than the one the run was started with.
-    pub fn into_state(self, run: &RunConfig, mut parts: Parts) -> Result<TrainState> {
+    /// The state to go on from, with freshly built `parts`. Refuses a configuration other than the one the run was started with; a setting that
+    /// did not exist yet when the run was started has its default.
+    pub fn into_state(self, run: &RunConfig, registry: &Registry, mut parts: Parts) -> Result<TrainState> {
         let stored: RunConfig = config::parse_section("configuration of the checkpoint", &self.model.provenance.config)?;
-        let (mut now, mut then) = (run.clone(), stored);
-        // What a run says about itself does not change its result.
-        (now.train.log_every, now.train.checkpoint_every) = (0, 0);
-        (then.train.log_every, then.train.checkpoint_every) = (0, 0);
-        (now.train.checks, then.train.checks) = (true, true);
-        if now.to_toml()? != then.to_toml()? {
+        let comparable = |run: &RunConfig| {
+            let mut run = run.completed(registry)?;
+            // What a run says about itself does not change its result.
+            (run.train.log_every, run.train.checkpoint_every, run.train.checks) = (0, 0, true);
+            config::parse_table("configuration", &run.to_toml()?)
+        };
+        if let Some(difference) = first_difference("", &comparable(&stored)?, &comparable(run)?) {
             return Err(Error::parameter(
                 "--resume",
-                "the configuration differs from the checkpoint's",
+                format!("the configuration differs from the checkpoint's: {difference}"),
                 "Resume with the run's own config.toml, or start in another folder",
             ));
         }
@@ -120,6 +122,19 @@ impl Checkpoint {
         }
         Ok(state)
     }
+}
+
+/// The first setting that differs between two configurations, with both values.
+fn first_difference(section: &str, then: &toml::Table, now: &toml::Table) -> Option<String> {
+    let keys: BTreeSet<&String> = then.keys().chain(now.keys()).collect();
+    let shown = |value: Option<&toml::Value>| value.map_or("nothing".to_string(), ToString::to_string);
+    keys.into_iter().filter(|key| then.get(*key) != now.get(*key)).find_map(|key| {
+        let name = if section.is_empty() { key.clone() } else { format!("{section}.{key}") };
+        match (then.get(key), now.get(key)) {
+            (Some(toml::Value::Table(then)), Some(toml::Value::Table(now))) => first_difference(&name, then, now),
+            (then, now) => Some(format!("{name} was {} and is {}", shown(then), shown(now))),
+        }
+    })
 }
 
 /// Writes `state` to `path` and returns its size in bytes.

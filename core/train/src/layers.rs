@@ -12,7 +12,7 @@ pub struct Layers {
 }
 
 impl Layers {
-    /// Layers a preset, a TOML file and `key=value` overrides, in that order. Without `preset`, the preset that the file names.
+    /// Layers a preset, a TOML file and `key=value` overrides, in that order. Without `preset`, or with an empty one, the preset that the file names.
     ///
     /// # Errors
     /// [`Error::Parameter`] for unknown presets, text that is not TOML and keys of earlier versions; [`Error::Io`] for the file.
@@ -25,7 +25,7 @@ impl Layers {
             None => toml::Table::new(),
         };
         let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
-        let mut table = match preset.map(str::to_string).or(named) {
+        let mut table = match preset.filter(|p| !p.is_empty()).map(str::to_string).or(named) {
             Some(name) => registry.preset(&name)?,
             None => toml::Table::new(),
         };

@@ -1,7 +1,7 @@
 //! The configuration of the trainer, `[train]`.
 
 use crate::masks::PUBLISHED_SIGMA;
-use cc4dgs_core::{Error, Result, Stage};
+use cc4dgs_core::{Error, Result, Schedule, Stage};
 use serde::{Deserialize, Serialize};
 
 /// The frames that the coarse stage sees.
@@ -136,6 +136,8 @@ impl Default for TrainConfig {
 pub struct GaussianRates {
     /// Every rate, those of plug-ins included, is multiplied by the views per iteration to this power: 0 leaves them as they are, 0.5 takes the root.
     pub batch_power: f64,
+    /// Share of the main stage, at its end, over which every rate falls to 0 as a cosine; 0 is off.
+    pub cooldown: f64,
     /// Positions at the first iteration of a stage, times the camera extent.
     pub means: f64,
     /// Positions at the last iteration of a stage, times the camera extent.
@@ -160,6 +162,7 @@ impl Default for GaussianRates {
     fn default() -> Self {
         Self {
             batch_power: 0.0,
+            cooldown: 0.0,
             means: 1.6e-4,
             means_end: 1.6e-6,
             log_scales: 5e-3,
@@ -209,6 +212,9 @@ impl TrainConfig {
                 "0 leaves learning rates as they are, 0.5 takes the root of the batch",
             );
         }
+        if !(0.0..=1.0).contains(&t.lr.cooldown) {
+            return bad("lr.cooldown", format!("{} is not in 0..1", t.lr.cooldown), "It is a share of the main stage; 0.1 is usual");
+        }
         if !(0.0..=1.0).contains(&t.image_growth) {
             return bad("image_growth", format!("{} is not in 0..1", t.image_growth), "It is a share of the coarse and main stage");
         }
@@ -224,8 +230,29 @@ impl TrainConfig {
     pub fn views_per_iteration(&self, stage: Stage) -> usize {
         if stage == Stage::Coarse && self.coarse_batch > 0 { self.coarse_batch } else { self.batch }
     }
-    /// What every learning rate of `stage` is multiplied by.
-    pub fn rate_scale(&self, stage: Stage) -> f64 {
-        (self.views_per_iteration(stage) as f64).powf(self.lr.batch_power)
+    /// What every learning rate of an iteration is multiplied by.
+    pub fn rate_scale(&self, schedule: &Schedule) -> f64 {
+        let of_batch = (self.views_per_iteration(schedule.stage) as f64).powf(self.lr.batch_power);
+        let begin = 1.0 - self.lr.cooldown;
+        if schedule.stage != Stage::Main || schedule.progress() <= begin {
+            return of_batch;
+        }
+        of_batch * (0.5 + 0.5 * (std::f64::consts::PI * (schedule.progress() - begin) / self.lr.cooldown).cos())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_fall_at_the_end_of_the_main_stage_alone() {
+        let train = TrainConfig { batch: 4, lr: GaussianRates { batch_power: 0.5, cooldown: 0.25, ..Default::default() }, ..Default::default() };
+        let at = |stage: Stage, iteration: usize| train.rate_scale(&Schedule { stage, iteration, ..Schedule::main(1000) });
+        assert_eq!([1, 500, 750].map(|iteration| at(Stage::Main, iteration)), [2.0; 3]);
+        assert!((at(Stage::Main, 875) - 1.0).abs() < 1e-9 && at(Stage::Main, 1000).abs() < 1e-9);
+        assert_eq!(at(Stage::Score, 1000), 2.0);
+        let without = TrainConfig { lr: GaussianRates::default(), ..train.clone() };
+        assert_eq!(without.rate_scale(&Schedule { iteration: 1000, ..Schedule::main(1000) }), 1.0);
     }
 }

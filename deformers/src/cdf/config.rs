@@ -67,7 +67,7 @@ impl<'de> Deserialize<'de> for CdfConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
         let mut section = toml::Table::deserialize(deserializer)?;
         let parse = |section: &mut toml::Table| -> Result<Self> {
-            refuse_unknown(section, &[&VoxelSettings::KEYS, &NetworkSettings::KEYS, &Rates::KEYS])?;
+            refuse_unknown(section.keys(), &[&VoxelSettings::KEYS, &NetworkSettings::KEYS, &Rates::KEYS])?;
             let (voxels, rates) = (take(section, &VoxelSettings::KEYS)?, take(section, &Rates::KEYS)?);
             Ok(Self { voxels, rates, network: config::parse_section("deformer cdf", section)? })
         };

@@ -133,9 +133,7 @@ impl BasisPlan {
     /// [`Error::Parameter`] for unknown keys and values out of range.
     pub fn new(section: &toml::Table, context: &DeformerContext) -> Result<Self> {
         let mut rest = section.clone();
-        let kept = rest.remove(KEPT);
-        refuse_unknown(&rest, &[&VoxelSettings::KEYS, &BasisSettings::KEYS, &RATE_KEYS])?;
-        rest.extend(kept.map(|kept| (KEPT.to_string(), kept)));
+        refuse_unknown(rest.keys().filter(|key| *key != KEPT), &[&VoxelSettings::KEYS, &BasisSettings::KEYS, &RATE_KEYS])?;
         let voxels: VoxelSettings = take(&mut rest, &VoxelSettings::KEYS)?;
         let settings: BasisSettings = config::parse_section("deformer cdf-basis", &rest)?;
         heads::check(&settings.heads)?;

@@ -144,6 +144,27 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
 }
 
 #[test]
+fn an_archive_has_the_same_bits_on_every_device() {
+    let registry = Registry::collect().unwrap();
+    let (model, scene, device) = (model(&registry), scene(), Device::flex());
+    let folder = tempfile::tempdir().unwrap();
+    let (path, limits) = (folder.path().join("m.cc4d"), Limits::default());
+    let settings = "finetune = 0\nmax_drop_db = 1.0".parse().unwrap();
+    let options = ArchiveOptions { codec: "compact", settings: &settings, field_weights: "compact", scene: Some((&scene, &device)), tuner: None };
+    model.save_archive(&path, &options, &registry, &limits, &Silent).unwrap();
+    let stored = Archive::open(&path, &limits).unwrap().stream_sizes();
+    assert!(stored.iter().any(|s| s.name.starts_with("coded.")), "attributes are rounded where the scene is given");
+    let opened = |device: &Device| {
+        let model = Model::open(&path, &registry, device, &limits, &Silent).unwrap();
+        (model.gaussians, cc4dgs_play::weights_of(model.field.unwrap().field.as_ref()).unwrap())
+    };
+    let expected = opened(&device);
+    for (name, device) in cc4dgs_tests::devices() {
+        assert!(opened(&device) == expected, "{name}");
+    }
+}
+
+#[test]
 fn services_move_and_draw_as_playback_does() {
     let registry = Registry::collect().unwrap();
     let (model, scene, device) = (model(&registry), scene(), Device::flex());
@@ -186,4 +207,19 @@ fn attributes_of_gaussians_that_stand_still_are_not_stored_by_lossy_codecs() {
         }
     }
     assert!(2 * sizes[1] < sizes[0], "{sizes:?}: two thirds of the rows need no bytes");
+}
+
+#[test]
+fn a_colour_below_zero_matters_as_much_as_any_other() {
+    let registry = Registry::collect().unwrap();
+    let (model, scene, device) = (model(&registry), scene(), Device::flex());
+    let services = ModelServices::new(&model, &registry, &device).unwrap();
+    let views = SceneViews::new(&scene);
+    let of = |gaussians: &HostGaussians| services.squared_derivatives(gaussians, views.view(0).0, 0.3, Seed::root(1)).unwrap().unwrap().sh_dc;
+    // All are drawn black; once rounded they may not be.
+    let dark = HostGaussians { sh_dc: vec![-9.0; 3 * COUNT], ..model.gaussians.clone() };
+    let (bright, dark) = (of(&model.gaussians), of(&dark));
+    assert!(bright.iter().filter(|v| **v > 0.0).count() > COUNT);
+    let worst = bright.iter().zip(&dark).map(|(a, b)| (a - b).abs() / (a.max(*b) + 1e-6)).fold(0.0, f32::max);
+    assert!(worst < 1e-3, "derivatives differ by {worst} of their size");
 }

@@ -109,6 +109,21 @@ fn models_of_every_kind_are_tuned_or_left_alone() {
 }
 
 #[test]
+fn models_with_colours_per_camera_are_not_trained_further() {
+    let config = tiny(&["train.iterations=20", "train.dynamic=all"]);
+    let bench = Bench::new(&config);
+    let mut model = bench.train(&config);
+    let affine = toml::Table::from_iter([("kind".into(), "affine".into())]);
+    model.provenance.config.insert("appearance".into(), affine.into());
+    let refused = bench.tuned(&model, 7).map(|_| ()).unwrap_err().to_string();
+    assert!(refused.contains("colours per camera") && refused.contains("finetune"), "{refused}");
+    let Bench { registry, limits, device, scene, never } = &bench;
+    let job = RefitJob { registry, device, limits, events: &Silent, stop: never };
+    let refused = prune_and_refit(&mut model, scene, LIMIT_DB, 60, &job).map(|_| ()).unwrap_err().to_string();
+    assert!(refused.contains("colours per camera") && refused.contains("--refit 0"), "{refused}");
+}
+
+#[test]
 fn pruning_with_refit_keeps_fewer_within_the_same_loss() {
     let config = tiny(&[]);
     let bench = Bench::new(&config);
@@ -122,6 +137,7 @@ fn pruning_with_refit_keeps_fewer_within_the_same_loss() {
     let with = prune_and_refit(&mut refitted, scene, LIMIT_DB, 60, &job).unwrap();
     println!("of {} Gaussians, {} are kept without re-fit and {} with it", with.before, without.after, with.after);
     assert!(with.after < without.after, "{with:?} {without:?}");
+    assert!(without.psnr_refit_alone_db.is_none() && with.psnr_refit_alone_db.unwrap() > with.psnr_before_db, "{with:?}");
     assert_eq!(refitted.gaussians.len(), with.after);
     let drop = before - bench.psnr(&refitted);
     assert!(drop <= LIMIT_DB + 1e-3, "{drop} dB");

@@ -1,10 +1,11 @@
 //! `cc4dgs bake`.
 
-use super::{Context, create_parent, megabytes, refuse_existing};
+use super::{Context, create_parent, megabytes};
 use crate::args::Bake;
 use crate::shots::capture_cameras;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use cc4dgs_core::archive::{Archive, Presentation, StreamKind, write_atomically};
+use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Camera, Event, EventSink, Result, parse_device};
 use cc4dgs_play::bake::{BakeReport, MaxError};
 use serde::Serialize;

@@ -1,10 +1,11 @@
 //! `cc4dgs compress`.
 
-use super::{Context, create_parent, megabytes, refuse_existing};
+use super::{Context, create_parent, megabytes};
 use crate::args::Compress;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
+use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Event, EventSink, Result, TuneModel, config, read_gaussians};
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;

@@ -140,15 +140,6 @@ fn no_window(command: String) -> Error {
     Error::unsupported(command, "the window is left out of this build", remedy)
 }
 
-/// Refuses a file to write that exists, unless it may be replaced; before any long work.
-pub fn refuse_existing(out: &Path, overwrite: bool) -> Result<()> {
-    // A link that leads nowhere exists, too.
-    if overwrite || out.symlink_metadata().is_err() {
-        return Ok(());
-    }
-    Err(Error::parameter(out.display().to_string(), "it exists already", "Give another name, or --overwrite to replace it"))
-}
-
 /// Creates the folder a file will be written to, before any long work that would be lost without it.
 pub fn create_parent(path: &Path) -> Result<()> {
     match path.parent().filter(|p| !p.as_os_str().is_empty()) {

@@ -2,7 +2,7 @@
 
 use super::Context;
 use crate::args::Plugins;
-use cc4dgs_core::{DEVICE_NAMES, Error, Result};
+use cc4dgs_core::{DEVICE_NAMES, Error, Result, by_likeness};
 use serde_json::json;
 
 /// Names that the error about an unknown one lists, at most.
@@ -39,14 +39,9 @@ fn show_preset(context: &Context, name: &str, settings: &toml::Table) -> Result<
 }
 
 /// The error about a name that is none of `known`. They are too many to be listed.
-fn unknown(name: &str, mut known: Vec<&str>) -> Error {
-    // Jaro-Winkler misses swapped letters in short names, edit distance long names that share only a prefix.
-    let likeness = |other: &str| strsim::jaro_winkler(other, name).max(strsim::normalized_damerau_levenshtein(other, name));
-    known.sort_by(|a, b| likeness(b).total_cmp(&likeness(a)).then(a.cmp(b)));
-    known.dedup();
-    known.truncate(NEAREST);
-    let remedy = format!("The nearest are {}; `cc4dgs plugins` lists all", known.join(", "));
-    Error::parameter(format!("plug-in or preset '{name}'"), "unknown name", remedy)
+fn unknown<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> Error {
+    let nearest = by_likeness(name, known).into_iter().take(NEAREST).collect::<Vec<_>>().join(", ");
+    Error::parameter(format!("plug-in or preset '{name}'"), "unknown name", format!("The nearest are {nearest}; `cc4dgs plugins` lists all"))
 }
 
 /// Everything of the name, whatever its kind: a codec and a deformer may share one.
@@ -56,7 +51,7 @@ fn show(context: &Context, name: &str) -> Result<()> {
     if found.is_empty() {
         return match context.registry.preset(name) {
             Ok(settings) => show_preset(context, name, &settings),
-            Err(_) => Err(unknown(name, plugins.iter().map(|(_, p)| p.name).collect())),
+            Err(_) => Err(unknown(name, plugins.iter().map(|(_, p)| p.name))),
         };
     }
     let full = |(kind, p): &&(&str, &cc4dgs_core::Plugin)| json!({ "kind": kind, "name": p.name, "version": p.version, "summary": p.summary, "paper": p.paper, "capabilities": p.capabilities, "schema": p.schema });

@@ -1,11 +1,12 @@
 //! `cc4dgs prune`.
 
 use super::compress::compress;
-use super::{Context, create_parent, refuse_existing};
+use super::{Context, create_parent};
 use crate::args::Prune;
 use crate::interrupt;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
+use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Result, Split};
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_play::prune::{PruneReport, prune};
@@ -53,8 +54,9 @@ fn text(report: &Report) -> String {
         Split::Validation => "validation",
         Split::Test => "test",
     };
+    let alone = p.psnr_refit_alone_db.map_or(String::new(), |psnr| format!(" ({psnr:.3} dB after one re-fit with nothing removed)"));
     format!(
-        "{}: {} of {} Gaussians kept, PSNR {:.3} dB instead of {:.3} dB on {} {judges} views, {:.1} s",
+        "{}: {} of {} Gaussians kept, PSNR {:.3} dB instead of {:.3} dB on {} {judges} views{alone}, {:.1} s",
         report.archive.display(),
         p.after,
         p.before,

@@ -36,14 +36,11 @@ pub struct RuleConstants {
 impl RuleConstants {
     /// The constants of the rules in `settings`, whose near plane may be its own.
     pub fn new(settings: &RasterSettings) -> Self {
-        let rules = Self::of(settings.rules);
-        Self { near: settings.near.unwrap_or(rules.near), ..rules }
-    }
-    fn of(rules: Rules) -> Self {
-        match rules {
-            Rules::Gsplat099 => Self { near: 0.01, alpha_max: 0.99, pass_capped: false, square_tiles: false },
-            Rules::Gsplat0999 => Self { near: 0.01, alpha_max: 0.999, pass_capped: false, square_tiles: false },
-            Rules::Inria => Self { near: 0.2, alpha_max: 0.99, pass_capped: true, square_tiles: true },
+        let near = settings.near.unwrap_or(settings.rules.near());
+        match settings.rules {
+            Rules::Gsplat099 => Self { near, alpha_max: 0.99, pass_capped: false, square_tiles: false },
+            Rules::Gsplat0999 => Self { near, alpha_max: 0.999, pass_capped: false, square_tiles: false },
+            Rules::Inria => Self { near, alpha_max: 0.99, pass_capped: true, square_tiles: true },
         }
     }
 }

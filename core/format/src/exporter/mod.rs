@@ -6,7 +6,7 @@
 mod place;
 
 #[cfg(not(target_arch = "wasm32"))]
-pub use place::export;
+pub use place::{export, refuse_existing};
 
 use crate::playback::MaxError;
 use crate::plugin::Plugin;

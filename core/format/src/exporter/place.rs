@@ -46,13 +46,22 @@ pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn Ex
     Ok((exported, bytes))
 }
 
+/// Refuses a `path` that exists, unless it may be replaced. A link that leads nowhere exists, too. Call it before long work.
+///
+/// # Errors
+/// [`Error::Parameter`].
+pub fn refuse_existing(path: &Path, overwrite: bool) -> Result<()> {
+    if overwrite || path.symlink_metadata().is_err() {
+        return Ok(());
+    }
+    Err(Error::parameter(path.display().to_string(), "it exists already", "Give another name, or --overwrite to replace it"))
+}
+
 /// Refuses a `path` that may not be replaced.
 fn check(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
     let refuse = |problem: &str, remedy: &str| Err(Error::parameter(path.display().to_string(), problem, remedy));
+    refuse_existing(path, overwrite)?;
     let Ok(found) = std::fs::symlink_metadata(path) else { return Ok(()) };
-    if !overwrite {
-        return refuse("it exists already", "Give another name, or --overwrite to replace it");
-    }
     match target {
         ExportTarget::File(_) if found.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
         ExportTarget::Folder(_) if !found.is_dir() => refuse("it is a file, and this format is a folder of files", "Give the name of a folder"),

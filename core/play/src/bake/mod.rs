@@ -33,6 +33,9 @@ const SAMPLES_OF_ANY: usize = 257;
 /// The part of the tolerance that linear interpolation between samples may use up before the samples are doubled.
 const BETWEEN_SHARE: f32 = 0.5;
 
+/// Errors over the tolerance from which on a warning is given; a little is left for rounding.
+const KEPT: f32 = 1.001;
+
 /// What [`bake`] is asked for.
 pub struct BakeOptions<'a> {
     /// How far a point of a Gaussian may be off.
@@ -136,6 +139,13 @@ pub fn bake(model: &Model, options: &BakeOptions, device: &Device, events: &dyn 
         .collect();
     let indices: Vec<u32> = motion.rows.iter().map(|&row| row as u32).collect();
     let streams = PlaybackLayer::encode(&indices, model.gaussians.sh_degree, samples, &segments)?;
+    if at_samples.max(between_samples) > KEPT {
+        let message = format!(
+            "a point may be {at_samples:.2} times as far off as allowed at the {samples} samples of time, and {between_samples:.2} times half way between \
+             them, because it moves too fast for so many; look at the result, or play the model with its deformer"
+        );
+        events.emit(&Event::Warning { object: "bake".into(), message });
+    }
     let report = BakeReport { moving: indices.len(), samples, segments: segments.len(), max_error: options.max_error, heads, at_samples, between_samples };
     Ok(Some(Baked { streams, report }))
 }

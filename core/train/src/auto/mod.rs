@@ -35,6 +35,9 @@ const UNKNOWN_MOTION: f32 = 0.1;
 /// Views of an iteration take about twice as long as the pass through the field that they share, but are not more than these.
 const FIELD_VIEWS: f64 = 0.5;
 const MOST_VIEWS: f64 = 8.0;
+/// Share of the main stage over which learning rates fall at its end, and the iterations from which on that was better: shorter runs still learn too much.
+const COOLDOWN: f64 = 0.1;
+const COOLED: f64 = 2000.0;
 /// Iterations below which a run is too short for its scene.
 const SHORT: f64 = 2000.0;
 /// Iterations of the score stage per unit of the score that a Gaussian can reach in them.
@@ -170,7 +173,7 @@ fn for_density_of(layers: &Layers, asked: &RunConfig, mut choice: Choice, regist
 }
 
 /// How many views share a pass through the field, and the iterations that `minutes` allow, of which the plan has `spent` some. `batch` is the number that the user stated.
-fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spent: f64, batch: Option<usize>) -> [Choice; 2] {
+fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spent: f64, batch: Option<usize>) -> Vec<Choice> {
     let total: f64 = config.train.shares.iter().sum::<f64>().max(1e-9);
     let main = config.train.shares[2] / total;
     let scored = config.train.dynamic != Dynamic::All;
@@ -183,13 +186,18 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spen
     let count = (left * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
     let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
     let rates = [("train.batch", toml::Value::Integer(views as i64)), ("train.coarse_batch", 1.into()), ("train.lr.batch_power", 0.5.into())];
-    [
+    let mut choices = vec![
         Choice { settings: rates.to_vec(), reason: format!("a pass through the deformer takes {field:.0} ms, a view {:.0} ms", timing.still) },
         Choice {
             settings: vec![("train.iterations", toml::Value::Integer(count as i64))],
             reason: format!("{left:.1} of {minutes} minutes at about {ms:.0} ms per iteration on this machine"),
         },
-    ]
+    ];
+    if count >= COOLED {
+        let reason = "a run of so many iterations is limited by the noise of its steps, too".into();
+        choices.push(Choice { settings: vec![("train.lr.cooldown", COOLDOWN.into())], reason });
+    }
+    choices
 }
 
 /// Width and height in pixels of the median training camera.

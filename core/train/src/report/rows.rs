@@ -51,6 +51,7 @@ quantities! {
     LPIPS: "lpips", "LPIPS", "", 4, Lower, |c| metric(c, "lpips");
     FLIP: "flip", "FLIP", "", 4, Lower, |c| metric(c, "flip");
     SIZE: "size_mb", "size", "MB", 3, Lower, |c| Some(c.size_mb());
+    GAUSSIAN_BYTES: "bytes_per_gaussian", "bytes per Gaussian", "", 1, Lower, |c| (c.gaussians > 0).then(|| c.storage.point_cloud_bytes as f64 / c.gaussians as f64);
     FRAME: "frame_ms", "frame time", "ms", 2, Lower, |c| Some(c.cost.frame_ms.mean);
     TRAINING: "training_minutes", "training time", "min", 2, Lower, |c| Some(c.cost.training_seconds / 60.0);
     ENCODE: "encode_s", "encoding time", "s", 2, Lower, |c| Some(c.cost.encode_seconds);

@@ -20,7 +20,11 @@ pub fn locate(text: &str) -> Result<PathBuf> {
     let (variable, tail) = rest.split_once('/').unwrap_or((rest, ""));
     match std::env::var_os(variable) {
         Some(value) if !value.is_empty() => Ok(if tail.is_empty() { PathBuf::from(value) } else { Path::new(&value).join(tail) }),
-        _ => Err(Error::parameter(format!("scene {text}"), format!("the environment variable {variable} is not set"), "Set it to the folder of the datasets")),
+        _ => Err(Error::parameter(
+            format!("path {text}"),
+            format!("the environment variable {variable} is not set"),
+            "Set it to the folder that the path starts from",
+        )),
     }
 }
 

@@ -1,5 +1,6 @@
 //! A grid: scenes x methods x settings x codecs x seeds, as a TOML file. `docs/sweeps.md` describes the keys.
 
+use super::facts::locate;
 use super::result::CodecChoice;
 use crate::auto::PRESET as AUTO;
 use cc4dgs_core::{Error, Result, Split, config};
@@ -37,6 +38,9 @@ impl From<ScoredViews> for Split {
 pub struct Axis<T> {
     /// Its name in tables.
     pub name: String,
+    /// A configuration file (a path, also one that starts with an environment variable), whose settings come before `set`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub config: Option<String>,
     /// Settings, `key=value`.
     pub set: Vec<String>,
     /// Multiplies the grid's size.
@@ -68,7 +72,7 @@ pub struct SceneKeys {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MethodKeys {
-    /// A preset, such as `auto+hexplane`; `+hexplane` is put on the scene's family, `+` alone is that family.
+    /// A preset, such as `auto+hexplane`; `+hexplane` is put on the scene's family, `+` alone is that family. Empty: the program's defaults.
     pub preset: String,
 }
 
@@ -82,6 +86,8 @@ pub struct SettingKeys {}
 struct NamedTable {
     name: String,
     #[serde(default)]
+    config: Option<String>,
+    #[serde(default)]
     set: Vec<String>,
     #[serde(default = "one")]
     size: f64,
@@ -93,8 +99,8 @@ struct NamedTable {
 impl<T: DeserializeOwned> TryFrom<NamedTable> for Axis<T> {
     type Error = toml::de::Error;
     fn try_from(table: NamedTable) -> std::result::Result<Self, Self::Error> {
-        let NamedTable { name, set, size, others } = table;
-        Ok(Self { name, set, size, own: others.try_into()? })
+        let NamedTable { name, config, set, size, others } = table;
+        Ok(Self { name, config, set, size, own: others.try_into()? })
     }
 }
 
@@ -104,6 +110,27 @@ impl<T> Axis<T> {
     }
     fn sizes(axis: &[Self]) -> impl Iterator<Item = f64> + '_ {
         axis.iter().map(|value| value.size)
+    }
+    /// The settings of its file, then its own, as `key=value`: a plan does not change with the file.
+    pub(super) fn settings(&self) -> Result<Vec<String>> {
+        let mut all = Vec::new();
+        if let Some(text) = &self.config {
+            let path = locate(text)?;
+            let content = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
+            assignments(&config::parse_table(&path.display().to_string(), &content)?, "", &mut all);
+        }
+        all.extend_from_slice(&self.set);
+        Ok(all)
+    }
+}
+
+/// Every value of `table` as `key.of.tables=value`.
+fn assignments(table: &toml::Table, prefix: &str, to: &mut Vec<String>) {
+    for (key, value) in table {
+        match value {
+            toml::Value::Table(inner) => assignments(inner, &format!("{prefix}{key}."), to),
+            value => to.push(format!("{prefix}{key}={value}")),
+        }
     }
 }
 
@@ -201,7 +228,7 @@ fn first_seed() -> Vec<u64> {
     vec![0]
 }
 fn base() -> Vec<SettingAxis> {
-    vec![SettingAxis { name: "base".into(), set: Vec::new(), size: 1.0, own: SettingKeys {} }]
+    vec![SettingAxis { name: "base".into(), config: None, set: Vec::new(), size: 1.0, own: SettingKeys {} }]
 }
 
 impl Grid {
@@ -292,6 +319,22 @@ mod tests {
         assert_eq!(validation.validation_views(), VALIDATION_VIEWS);
         let again: Grid = toml::from_str(&toml::to_string(&grid).unwrap()).unwrap();
         assert_eq!(again, grid);
+    }
+
+    #[test]
+    fn a_file_of_settings_comes_before_those_of_its_axis() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("reference.toml");
+        std::fs::write(&file, "seed = 9\n[train]\niterations = 5\nbatch = 2\n[train.lr]\nmeans = 0.5\n[[loss]]\nkind = 'l1'\nweight = 1.0\n").unwrap();
+        let method = |config: &str| {
+            let text = format!("[[method]]\nname = 'x'\npreset = ''\nconfig = '{config}'\nset = ['train.batch=3']\n");
+            Grid::parse("g.toml", &format!("{SMALL}{text}")).unwrap().method.remove(1).settings()
+        };
+        let mut made = toml::Table::new();
+        config::set_all(&mut made, &method(&file.display().to_string()).unwrap()).unwrap();
+        let expected = "seed = 9\n[train]\niterations = 5\nbatch = 3\n[train.lr]\nmeans = 0.5\n[[loss]]\nkind = 'l1'\nweight = 1.0\n";
+        assert_eq!(made, expected.parse().unwrap());
+        assert!(matches!(method("no/such.toml").unwrap_err(), Error::Io { .. }));
     }
 
     #[test]

@@ -127,7 +127,7 @@ impl Plan {
             let listing = listing(&locate(&scene.own.path)?)?;
             for (method, setting) in grid.method.iter().flat_map(|method| grid.setting.iter().map(move |setting| (method, setting))) {
                 for &seed in &grid.seeds {
-                    let mut training = planned(grid, scene, method, setting, seed, data.clone(), listing.clone());
+                    let mut training = planned(grid, scene, method, setting, seed, data.clone(), listing.clone())?;
                     let stated = stated(grid, &training, registry, check).map_err(|error| at(&training, error))?;
                     training.id = name_of(&(&stated, &data.hash, version, commit, seed))?;
                     if let Some(other) = labels.insert(training.id.clone(), training.label()) {
@@ -221,14 +221,23 @@ fn codecs(grid: &Grid, registry: &Registry) -> Result<Vec<(String, CodecChoice)>
 }
 
 /// Everything about a training but its name.
-fn planned(grid: &Grid, scene: &SceneAxis, method: &MethodAxis, setting: &SettingAxis, seed: u64, data: DataFingerprint, listing: String) -> PlannedTraining {
+fn planned(
+    grid: &Grid,
+    scene: &SceneAxis,
+    method: &MethodAxis,
+    setting: &SettingAxis,
+    seed: u64,
+    data: DataFingerprint,
+    listing: String,
+) -> Result<PlannedTraining> {
     let preset = match method.own.preset.strip_prefix('+') {
         Some("") => scene.own.family.clone(),
         Some(method) => format!("{}+{method}", scene.own.family),
         None => method.own.preset.clone(),
     };
     let size = scene.size * method.size * setting.size;
-    let mut sets = [grid.set.as_slice(), &scene.set, &method.set, &setting.set].concat();
+    let mut sets = grid.set.clone();
+    sets.extend(scene.settings()?.into_iter().chain(method.settings()?).chain(setting.settings()?));
     if let Some(iterations) = grid.iterations {
         sets.push(format!("train.iterations={}", (iterations as f64 * size).round().max(1.0)));
     }
@@ -240,7 +249,7 @@ fn planned(grid: &Grid, scene: &SceneAxis, method: &MethodAxis, setting: &Settin
     }
     sets.extend([format!("device={}", grid.device), format!("seed={seed}")]);
     let (scene, method, setting) = (scene.name.clone(), method.name.clone(), setting.name.clone());
-    PlannedTraining { id: String::new(), scene, method, setting, seed, preset, sets, data, listing }
+    Ok(PlannedTraining { id: String::new(), scene, method, setting, seed, preset, sets, data, listing })
 }
 
 /// The configuration as far as it is known before the scene is looked at: all of it, or what the preset `auto` is told.
@@ -254,7 +263,7 @@ fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &
         return Ok(layers.table().clone());
     }
     if grid.minutes.is_some() {
-        let problem = format!("preset {} cannot be sized in minutes", training.preset);
+        let problem = format!("preset '{}' cannot be sized in minutes", training.preset);
         return Err(Error::parameter("minutes", problem, "Use a preset auto or auto+METHOD, or size the grid in iterations"));
     }
     check(&known)?;
@@ -263,7 +272,7 @@ fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &
 
 /// `error` with the training it is about.
 fn at(training: &PlannedTraining, error: Error) -> Error {
-    within(&format!("training '{}' (preset {})", training.label(), training.preset), error)
+    within(&format!("training '{}' (preset '{}')", training.label(), training.preset), error)
 }
 
 /// `error` with where it happened.
@@ -297,7 +306,7 @@ pub(super) mod tests {
         let mut all = Vec::new();
         for (method, setting) in grid.method.iter().flat_map(|m| grid.setting.iter().map(move |s| (m, s))) {
             for &seed in &grid.seeds {
-                let training = planned(&grid, &grid.scene[0], method, setting, seed, data.clone(), String::new());
+                let training = planned(&grid, &grid.scene[0], method, setting, seed, data.clone(), String::new())?;
                 let layers = training.layers(&registry)?;
                 layers.config().map_err(|error| at(&training, error))?;
                 all.push((training, layers.table().clone()));

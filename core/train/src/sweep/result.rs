@@ -220,7 +220,7 @@ pub struct Storage {
 pub struct StreamBytes {
     /// Its name.
     pub name: String,
-    /// `canonical`, `field`, `meta` or `other`.
+    /// `canonical`, `field`, `meta`, `playback`, `poster` or `other`.
     pub kind: String,
     /// On disk.
     pub stored_bytes: u64,

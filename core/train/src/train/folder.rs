@@ -36,7 +36,7 @@ pub(super) fn resumed(job: &TrainJob, path: &Path, device: &Device, parts: Parts
             "Resume on the dataset the run was started on, or start in another folder",
         ));
     }
-    let state = stored.into_state(job.config, parts)?;
+    let state = stored.into_state(job.config, job.registry, parts)?;
     write_config(job)?;
     Ok(state)
 }

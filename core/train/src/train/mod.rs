@@ -132,9 +132,6 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
     let scene = hold_out(&job.scene, config.train.validation)?;
     let job = &TrainJob { config, scene: Arc::new(scene), out: job.out.clone(), ..*job };
-    if !job.resume {
-        folder::write_config(job)?;
-    }
     let device = parse_device(&config.device)?;
     let seed = Seed::root(config.seed);
     job.events.emit(&Event::RunStarted { command: "train".into(), device: config.device.clone(), seed: config.seed });
@@ -145,6 +142,10 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         job.events.emit(&Event::Warning { object: job.scene.name.clone(), message: message.clone() });
     }
     let doubts = if config.train.checks { examine(&job.scene, config.background()?, job.events)? } else { Vec::new() };
+    // A device or a scene that is refused leaves the run that was to be overwritten.
+    if !job.resume {
+        folder::write_config(job)?;
+    }
 
     let moving = decide_moving(job);
     let training_camera = training_cameras(&job.scene);

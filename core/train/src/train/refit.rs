@@ -24,7 +24,8 @@ const GAUSSIAN_RATE: f64 = 0.5;
 const DEFORMER_RATE: f64 = 0.3;
 
 /// Removes Gaussians of `job.model` in rounds, each followed by `iterations` of training, as long as the PSNR stays within `max_drop_db` of what it was, on
-/// validation views where the scene has some, else on training views. Returns the Gaussians and weights of the last round that did, and what it came to.
+/// validation views where the scene has some, else on training views. Returns the Gaussians and weights of the last round that did, and what it came to; what
+/// one re-fit gives by itself, with nothing removed, is measured too.
 ///
 /// # Errors
 /// [`Error::Parameter`] for a drop that is not positive or a scene without training views, [`Error::Interrupted`], and what scene and rasterizer report.
@@ -34,11 +35,21 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
     }
     let judged_by = if scene.split(Split::Validation).is_empty() { Split::Train } else { Split::Validation };
     let before = model.gaussians.len();
-    let psnr_before_db = {
+    let seed = Seed::root(model.provenance.seed).child("refit");
+    let (psnr_before_db, psnr_refit_alone_db) = {
         let tuner = job.tuner(model, scene);
+        if let Some(why) = tuner.refusal()? {
+            return Err(Error::parameter("--refit", format!("the model cannot be trained further: {why}"), "Prune with --refit 0"));
+        }
         let start = tuner.start(&model.gaussians)?;
-        tuner.psnr(&start.gaussians, &start.weights, None)?
+        let alone = (before > 0).then(|| refit(&tuner, &model.gaussians, iterations, seed.child("alone"))).transpose()?;
+        let alone = alone.map(|found| tuner.psnr(&found.gaussians, &found.weights, None)).transpose()?;
+        (tuner.psnr(&start.gaussians, &start.weights, None)?, alone)
     };
+    if let Some(alone) = psnr_refit_alone_db {
+        let message = format!("{before} Gaussians, {psnr_before_db:.3} dB; {alone:.3} dB after re-fit with nothing removed");
+        job.events.emit(&Event::Note { object: "prune".into(), message });
+    }
     let (mut share, mut psnr_after_db) = (FIRST_SHARE, psnr_before_db);
     for round in 0..ROUNDS {
         let n = model.gaussians.len();
@@ -49,8 +60,7 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
         let order = by_contribution(&contributions(model, scene, job.registry, job.device, job.events)?);
         let rest = at_rows(&model.gaussians, &order[..n - removed]);
         let tuner = job.tuner(model, scene);
-        let seed = Seed::root(model.provenance.seed).child("refit").index(round as u64);
-        let found = refit(&tuner, &rest, iterations, seed)?;
+        let found = refit(&tuner, &rest, iterations, seed.index(round as u64))?;
         let psnr = tuner.psnr(&found.gaussians, &found.weights, None)?;
         drop(tuner);
         let kept = psnr_before_db - psnr <= max_drop_db;
@@ -68,7 +78,7 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
         }
     }
     let views = super::tune::judges(scene).len();
-    Ok(PruneReport { before, after: model.gaussians.len(), psnr_before_db, psnr_after_db, judged_by, views })
+    Ok(PruneReport { before, after: model.gaussians.len(), psnr_before_db, psnr_after_db, psnr_refit_alone_db, judged_by, views })
 }
 
 /// What a [`prune_and_refit`] works with; see [`TuneJob`].

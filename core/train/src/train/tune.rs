@@ -98,7 +98,7 @@ impl<'a> Tuner<'a> {
         (config.render, config.rasterizer) = (model.render.clone(), model.rasterizer.clone());
         (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
         (config.density, config.appearance, config.train.image_growth) = (none(), none(), 0.0);
-        (config.train.time_noise, config.train.dropout, config.train.lambda_r) = (0.0, 0.0, 0.0);
+        (config.train.time_noise, config.train.dropout, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0);
         config.validate()?;
         let field_weights = FieldWeights::parse(field_weights, registry)?;
         let weight_settings = match self.moving_field() {
@@ -175,6 +175,11 @@ impl<'a> Tuner<'a> {
         for ((_, _, to), (_, _, values)) in gaussians.columns_mut().into_iter().zip(found.columns()) {
             to.clone_from(values);
         }
+        for (name, attribute) in &mut gaussians.extra {
+            if let Some(found) = found.extra.get(name) {
+                attribute.values.clone_from(&found.values);
+            }
+        }
         gaussians.validate(object, limits)?;
         Ok(gaussians)
     }
@@ -243,6 +248,12 @@ pub(super) fn rate_at(done: f64) -> f64 {
 }
 
 impl TuneModel for Tuner<'_> {
+    fn refusal(&self) -> Result<Option<String>> {
+        let config: RunConfig = config::parse_section("configuration of the model", &self.job.model.provenance.config)?;
+        let kind = config.appearance.get("kind").and_then(|kind| kind.as_str()).unwrap_or("none");
+        let why = "it was trained with colours per camera, which models do not keep; without them, further training would fit the colours of single cameras";
+        Ok((kind != "none").then(|| format!("{why} (appearance '{kind}')")))
+    }
     fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
         let weights = self.moving_field().map(|f| weights_of(f.field.as_ref())).transpose()?.unwrap_or_default();
         Ok(TunedModel { gaussians: gaussians.clone(), weights })
