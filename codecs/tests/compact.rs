@@ -166,36 +166,40 @@ fn the_most_important_gaussians_come_first() {
     assert!(size(&streams) < one + one / 4, "{} bytes in layers, {one} without", size(&streams));
 }
 
-/// Streams of version 4 and what they decode to, written by this test where the variable is set.
+/// Streams of version 4, in one layer and in three, and what they decode to, written by this test where the variable is set.
 #[test]
 fn stored_streams_decode_to_the_same_bits() {
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/compact-4.bin");
     let put = |out: &mut Vec<u8>, bytes: &[u8]| {
         out.extend((bytes.len() as u32).to_le_bytes());
         out.extend(bytes);
     };
     let values = |g: &HostGaussians| g.columns().iter().flat_map(|(_, _, v)| v.iter().flat_map(|v| v.to_le_bytes())).collect::<Vec<u8>>();
-    if std::env::var_os("CC4DGS_WRITE_FIXTURES").is_some() {
-        let streams = codec("").encode(&scene(60, 3), &context(Some(5.0))).unwrap();
-        let mut out = Vec::new();
-        put(&mut out, &values(&codec("").decode(&streams, &context(None)).unwrap()));
-        for stream in &streams {
-            put(&mut out, stream.name.as_bytes());
-            put(&mut out, &stream.bytes);
+    for (name, layers) in [("compact-4", 1), ("compact-4-layers", 3)] {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/fixtures/{name}.bin"));
+        let codec = (plugin().build)("", &toml::Table::from_iter([("layers".into(), layers.into())])).unwrap();
+        if std::env::var_os("CC4DGS_WRITE_FIXTURES").is_some() {
+            let streams = codec.encode(&scene(60, 3), &context(Some(5.0))).unwrap();
+            let mut out = Vec::new();
+            put(&mut out, &values(&codec.decode(&streams, &context(None)).unwrap()));
+            for stream in &streams {
+                put(&mut out, stream.name.as_bytes());
+                put(&mut out, &stream.bytes);
+            }
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(&path, out).unwrap();
         }
-        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-        std::fs::write(&path, out).unwrap();
+        let stored = std::fs::read(&path).unwrap();
+        let mut reader = cc4dgs_format::archive::ByteReader::new("fixture", &stored);
+        let mut next = || {
+            let length = reader.u32().ok()? as usize;
+            Some(reader.take(length).unwrap().to_vec())
+        };
+        let expected = next().unwrap();
+        let mut streams = Vec::new();
+        while let Some(name) = next() {
+            streams.push(Stream { name: String::from_utf8(name).unwrap(), bytes: next().unwrap() });
+        }
+        assert_eq!(streams.iter().filter(|s| s.name.starts_with("means")).count(), layers, "{name}");
+        assert_eq!(values(&codec.decode(&streams, &context(None)).unwrap()), expected, "{name}");
     }
-    let stored = std::fs::read(&path).unwrap();
-    let mut reader = cc4dgs_format::archive::ByteReader::new("fixture", &stored);
-    let mut next = || {
-        let length = reader.u32().ok()? as usize;
-        Some(reader.take(length).unwrap().to_vec())
-    };
-    let expected = next().unwrap();
-    let mut streams = Vec::new();
-    while let Some(name) = next() {
-        streams.push(Stream { name: String::from_utf8(name).unwrap(), bytes: next().unwrap() });
-    }
-    assert_eq!(values(&codec("").decode(&streams, &context(None)).unwrap()), expected);
 }

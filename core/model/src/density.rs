@@ -84,7 +84,7 @@ impl DensityPlan {
     pub fn keep(&mut self, row: usize) -> usize {
         self.add(row, false)
     }
-    /// Adds a Gaussian with the attributes of the old row `parent` and zero optimizer state; returns its new row. A split is two copies with new values, without
+    /// Adds a Gaussian with the attributes of the old row `parent` and no momentum in the optimizer; returns its new row. A split is two copies with new values, without
     /// [`DensityPlan::keep`] of the parent. A relocation is a copy instead of keeping a dead row.
     pub fn copy(&mut self, parent: usize) -> usize {
         self.add(parent, true)
@@ -117,7 +117,7 @@ impl DensityPlan {
         });
         self.report.removed = self.report.removed.saturating_sub(rows.len());
     }
-    /// Resets the optimizer state of `attribute` to zero in all rows (opacity resets).
+    /// Starts the optimizer state of `attribute` anew in all rows (opacity resets).
     pub fn restart(&mut self, attribute: &str) {
         self.restarted.push(attribute.into());
     }
@@ -133,7 +133,7 @@ impl DensityPlan {
     pub fn parents(&self) -> &[usize] {
         &self.parents
     }
-    /// Whether the optimizer state of a new row starts from zero.
+    /// Whether a new row starts without momentum in the optimizer.
     pub fn fresh(&self) -> &[bool] {
         &self.fresh
     }
@@ -141,7 +141,7 @@ impl DensityPlan {
     pub fn values(&self) -> &[RowValues] {
         &self.values
     }
-    /// Attributes whose optimizer state starts from zero.
+    /// Attributes whose optimizer state starts anew in all rows.
     pub fn restarted(&self) -> &[String] {
         &self.restarted
     }

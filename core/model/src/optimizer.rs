@@ -38,7 +38,8 @@ pub trait Optimizer: Send {
     fn step(&mut self, name: &str, value: Tensor<2>, gradient: Tensor<2>, settings: &StepSettings) -> Result<Tensor<2>>;
     /// Removes the state of all arrays whose names begin with `prefix`.
     fn restart(&mut self, prefix: &str);
-    /// Reorders the state of the arrays whose names begin with `prefix`: row i is a copy of the old row `parents[i]`, or zero if `fresh[i]` is set.
+    /// Reorders the state of the arrays whose names begin with `prefix`: row i is a copy of the old row `parents[i]`. Where `fresh[i]` is set, it starts without
+    /// momentum, but its steps have the size of its parent's.
     ///
     /// # Errors
     /// [`Error::Backend`] for rows that do not exist.

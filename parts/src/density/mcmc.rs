@@ -2,6 +2,8 @@
 //!
 //! Faded Gaussians are removed, and as many others are split, drawn by their screen gradients. The budget grows with the root of the progress. The two halves of a
 //! split together draw nearly what the whole drew, so that a round costs little.
+//!
+//! In the main stage every round also moves a share of those that are hardly seen: hidden, faint or covered by others, they cost as much as any other.
 
 use super::halves;
 use super::statistics::Statistics;
@@ -23,6 +25,7 @@ min_opacity = 0.005      # fainter Gaussians are removed, and the budget is spen
 growth = 0.1             # most Gaussians split in a round, as a share of all
 coarse_share = 0.6       # share of max_gaussians that the coarse stage grows to
 max_gaussians = 400000   # the budget at the end
+relocate = 0.02          # Gaussians that a round of the main stage moves, those with the smallest blending weights, as a share of all; 0 is off
 noise = 0.0              # random steps of faint Gaussians, as a share of their size per iteration; 0 is off
 ";
 
@@ -33,6 +36,10 @@ const COARSE_ROUNDS: f64 = 0.9;
 /// Opacity around which noise fades, and how steeply (3DGS-MCMC).
 const NOISE_OPACITY: f32 = 0.005;
 const NOISE_STEEPNESS: f32 = 100.0;
+/// Share of the sums of blending weights that a round leaves to the next: a round alone has not seen every view.
+const MEMORY: f32 = 0.7;
+/// Rounds after which a Gaussian is judged by its blending weights: until then, halves are still fainter than they will be.
+const LEAST_ROUNDS: f32 = 3.0;
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -44,12 +51,13 @@ struct Settings {
     growth: f64,
     coarse_share: f64,
     max_gaussians: usize,
+    relocate: f64,
     noise: f32,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { from: 500, until: 15_000, every: 100, min_opacity: 0.005, growth: 0.1, coarse_share: 0.6, max_gaussians: 400_000, noise: 0.0 }
+        Self { from: 500, until: 15_000, every: 100, min_opacity: 0.005, growth: 0.1, coarse_share: 0.6, max_gaussians: 400_000, relocate: 0.02, noise: 0.0 }
     }
 }
 
@@ -65,6 +73,9 @@ impl Settings {
         let iteration = schedule.iteration;
         iteration > schedule.at(self.from) && iteration <= self.end(schedule) && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL))
     }
+    fn relocates(&self, schedule: &Schedule) -> bool {
+        schedule.stage == Stage::Main && self.relocate > 0.0
+    }
     /// How many Gaussians there may be now, where the stage began with `start`.
     fn budget(&self, start: usize, schedule: &Schedule) -> usize {
         let share = if schedule.stage == Stage::Coarse { self.coarse_share } else { 1.0 };
@@ -74,9 +85,50 @@ impl Settings {
     }
 }
 
+/// Decaying sums over the views that show a Gaussian.
+struct Weights {
+    /// Of its largest blending weight `[N]`.
+    sum: Tensor<1>,
+    /// Their number `[N]`.
+    views: Tensor<1>,
+    /// Rounds since the Gaussian was new `[N]`.
+    rounds: Vec<f32>,
+}
+
+impl Weights {
+    fn zeros(count: usize, device: &Device) -> Self {
+        Self { sum: Tensor::zeros([count], device), views: Tensor::zeros([count], device), rounds: vec![0.0; count] }
+    }
+    fn add(&mut self, view: &ViewStatistics) {
+        if let Some(weights) = &view.max_weights {
+            self.sum = self.sum.clone() + weights.clone();
+            self.views = self.views.clone() + view.radii.clone().greater_elem(0).float();
+        }
+    }
+    /// The rows that can be judged, those with the smallest mean weight first.
+    fn smallest(&self) -> Result<Vec<usize>> {
+        let (sums, views) = (to_vec(self.sum.clone(), "blending weights")?, to_vec(self.views.clone(), "counts of views")?);
+        let mut rows: Vec<usize> = (0..sums.len()).filter(|&row| self.rounds[row] >= LEAST_ROUNDS && views[row] > 0.0).collect();
+        rows.sort_by(|&a, &b| (sums[a] / views[a]).total_cmp(&(sums[b] / views[b])).then(a.cmp(&b)));
+        Ok(rows)
+    }
+    /// What the Gaussians of `plan` start the next round with; new ones with nothing.
+    fn after(&self, plan: &DensityPlan, device: &Device) -> Result<Self> {
+        let rows = || plan.parents().iter().zip(plan.fresh());
+        let of = |values: &Tensor<1>| {
+            let old = to_vec(values.clone(), "blending weights")?;
+            let new: Vec<f32> = rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { MEMORY * old[parent] }).collect();
+            Ok::<_, Error>(Tensor::from_data(TensorData::new(new, [plan.len()]), device))
+        };
+        let rounds = rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect();
+        Ok(Self { sum: of(&self.sum)?, views: of(&self.views)?, rounds })
+    }
+}
+
 struct Mcmc {
     settings: Settings,
     statistics: Statistics,
+    weights: Weights,
     /// Gaussians at the start of the stage.
     start: usize,
     /// Whether the last plan was a round.
@@ -85,14 +137,20 @@ struct Mcmc {
 
 impl DensityControl for Mcmc {
     fn begin_stage(&mut self, count: usize, device: &Device) {
-        self.statistics = Statistics::zeros(count, device);
+        (self.statistics, self.weights) = (Statistics::zeros(count, device), Weights::zeros(count, device));
         self.start = count;
     }
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic> {
-        if schedule.iteration <= self.settings.end(schedule) { vec![Statistic::AbsoluteScreenGradient] } else { Vec::new() }
+        let mut wanted = Vec::new();
+        if schedule.iteration <= self.settings.end(schedule) {
+            wanted.push(Statistic::AbsoluteScreenGradient);
+            wanted.extend(self.settings.relocates(schedule).then_some(Statistic::MaxWeight));
+        }
+        wanted
     }
     fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
         self.statistics.add(view);
+        self.weights.add(view);
         Ok(())
     }
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
@@ -101,12 +159,14 @@ impl DensityControl for Mcmc {
             return Ok(None);
         }
         let scores = self.statistics.mean_gradients()?;
-        Ok(Some(round(&self.settings, &gaussians.to_host()?, &scores, self.settings.budget(self.start, schedule), seed)))
+        let hidden = if self.settings.relocates(schedule) { self.weights.smallest()? } else { Vec::new() };
+        Ok(Some(round(&self.settings, &gaussians.to_host()?, &scores, &hidden, self.settings.budget(self.start, schedule), seed)))
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
         // A round starts over; so do the statistics when somebody else changed the rows.
         if self.round || !plan.keeps_all(self.statistics.seen.dims()[0]) {
             self.statistics = Statistics::zeros(plan.len(), device);
+            self.weights = self.weights.after(plan, device)?;
         }
         Ok(())
     }
@@ -129,23 +189,35 @@ impl DensityControl for Mcmc {
         let device = arrays[0].1.device();
         // Up to 16,777,216 a float32 is exact; beyond, the budget of a resumed run differs by a row or two.
         arrays.push(("start".into(), Tensor::from_floats([self.start as f32], &device)));
+        let rounds = Tensor::from_floats(self.weights.rounds.as_slice(), &device);
+        arrays.extend([("weight_sum".into(), self.weights.sum.clone()), ("weight_views".into(), self.weights.views.clone()), ("rounds".into(), rounds)]);
         arrays
     }
     fn restore(&mut self, mut state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()> {
-        let damaged = || Error::data("density state 'start'", "it is missing or not a count", "The checkpoint is damaged or of another density control");
-        let at = state.iter().position(|(name, _)| name == "start").ok_or_else(damaged)?;
-        let start = to_vec(state.swap_remove(at).1, "start")?;
-        match start[..] {
-            [start] if (0.0..1e9).contains(&start) => self.start = start as usize,
-            _ => return Err(damaged()),
+        let mut take = |name: &str, size: usize| {
+            let damaged = |problem: &str| {
+                let remedy = "The checkpoint is damaged or of another density control";
+                Error::data(format!("density state '{name}'"), problem, remedy)
+            };
+            let at = state.iter().position(|(n, _)| n == name).ok_or_else(|| damaged("it is missing"))?;
+            let values = state.swap_remove(at).1;
+            if values.dims() == [size] { Ok(values) } else { Err(damaged("it has another number of values")) }
+        };
+        let start = to_vec(take("start", 1)?, "start")?[0];
+        if !(0.0..1e9).contains(&start) {
+            return Err(Error::data("density state 'start'", format!("{start} is not a count"), "The checkpoint is damaged"));
         }
+        self.start = start as usize;
+        let rounds = to_vec(take("rounds", count)?, "rounds")?;
+        self.weights = Weights { sum: take("weight_sum", count)?, views: take("weight_views", count)?, rounds };
         self.statistics = Statistics::from_arrays(state, count)?;
         Ok(())
     }
 }
 
-/// The plan of one round: which of the Gaussians are removed, kept and split, so that there are at most `budget`. `scores` say who is split `[N]`.
-fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], budget: usize, seed: Seed) -> DensityPlan {
+/// The plan of one round: which of the Gaussians are removed, kept and split, so that there are at most `budget`. `scores` say who is split `[N]`; of the rows
+/// `hidden` the first are moved, as far as there are others to split in their place.
+fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], hidden: &[usize], budget: usize, seed: Seed) -> DensityPlan {
     let n = host.len();
     let opacity = |row: usize| 1.0 / (1.0 + (-host.opacity_logits[row]).exp());
     let alive: Vec<usize> = (0..n).filter(|&row| host.is_finite(row) && opacity(row) >= settings.min_opacity).collect();
@@ -153,18 +225,29 @@ fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], budget: usiz
     if alive.is_empty() {
         return DensityPlan::unchanged(n);
     }
-    let slots = budget.saturating_sub(alive.len()).min((settings.growth * n as f64).ceil() as usize);
+    let share = (settings.relocate * n as f64) as usize;
+    let hidden: Vec<usize> = hidden.iter().copied().filter(|row| alive.binary_search(row).is_ok()).take(share).collect();
+    let mut goes = vec![false; n];
+    hidden.iter().for_each(|&row| goes[row] = true);
+    let stays: Vec<usize> = alive.iter().copied().filter(|&row| !goes[row]).collect();
+    let slots = budget.saturating_sub(stays.len()).min((settings.growth * n as f64).ceil() as usize);
+    let drawn = drawn(&stays, scores, slots, seed);
     let mut splits = vec![false; n];
-    drawn(&alive, scores, slots, seed).into_iter().for_each(|row| splits[row] = true);
-    for &row in &alive {
+    drawn.iter().for_each(|&row| splits[row] = true);
+    // Where too few others can be split, the last of the hidden stay. What the trainer kept of earlier plans may be above the budget, and goes.
+    let missing = alive.len().min(budget).saturating_sub(stays.len() + drawn.len());
+    let moved = hidden.len().saturating_sub(missing);
+    hidden[moved..].iter().for_each(|&row| goes[row] = false);
+    for &row in alive.iter().filter(|&&row| !goes[row]) {
         if splits[row] {
             halves::split(&mut plan, host, row);
         } else {
             plan.keep(row);
         }
     }
-    plan.report.removed = n - alive.len();
-    plan.report.split = plan.len() - alive.len();
+    plan.report.moved = moved.min(drawn.len());
+    plan.report.removed = n - alive.len() + moved - plan.report.moved;
+    plan.report.split = drawn.len() - plan.report.moved;
     plan
 }
 
@@ -191,6 +274,7 @@ fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
     for (key, value, most) in [
         ("min_opacity", f64::from(settings.min_opacity), 0.999),
         ("growth", settings.growth, 1.0),
+        ("relocate", settings.relocate, 0.25),
         ("coarse_share", settings.coarse_share, 1.0),
         ("noise", f64::from(settings.noise), 100.0),
     ] {
@@ -198,7 +282,8 @@ fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
             return out_of_range(key, value, &format!("0..{most}"));
         }
     }
-    Ok(Box::new(Mcmc { settings, statistics: Statistics::zeros(0, &Device::flex()), start: 0, round: false }))
+    let (statistics, weights) = (Statistics::zeros(0, &Device::flex()), Weights::zeros(0, &Device::flex()));
+    Ok(Box::new(Mcmc { settings, statistics, weights, start: 0, round: false }))
 }
 
 inventory::submit! {
@@ -218,6 +303,7 @@ inventory::submit! {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use burn::tensor::Int;
 
     fn host_of(opacities: &[f32]) -> HostGaussians {
         let n = opacities.len();
@@ -236,14 +322,43 @@ mod tests {
     fn faded_gaussians_make_room_for_halves_of_those_with_gradients() {
         let mut host = host_of(&[0.5, 0.001, 0.5, 0.5, 0.5]);
         host.means[12] = f32::NAN;
-        let settings = Settings { growth: 1.0, ..Default::default() };
-        let plan = round(&settings, &host, &[0.0, 1.0, 1.0, 0.0, 1.0], 4, Seed::root(1));
+        let settings = Settings { growth: 1.0, relocate: 0.25, ..Default::default() };
+        let plan = round(&settings, &host, &[0.0, 1.0, 1.0, 0.0, 1.0], &[], 4, Seed::root(1));
         // Row 1 faded, row 4 is broken; of the others only row 2 has a gradient.
         assert_eq!((plan.parents(), plan.fresh()), (&[0, 2, 2, 3][..], &[false, true, true, false][..]));
         assert_eq!((plan.report.removed, plan.report.split), (2, 1));
-        let full = round(&settings, &host_of(&[0.5; 4]), &[1.0; 4], 4, Seed::root(1));
+        let full = round(&settings, &host_of(&[0.5; 4]), &[1.0; 4], &[], 4, Seed::root(1));
         assert!(full.keeps_all(4), "nothing happens at the budget");
-        assert!(round(&settings, &host_of(&[0.001; 3]), &[1.0; 3], 9, Seed::root(1)).keeps_all(3), "never all of them");
+        assert!(round(&settings, &host_of(&[0.001; 3]), &[1.0; 3], &[], 9, Seed::root(1)).keeps_all(3), "never all of them");
+        // At the budget, the hidden one makes room for halves of the only other with a gradient; without one, it stays.
+        let plan = round(&settings, &host_of(&[0.5; 4]), &[1.0, 0.0, 1.0, 0.0], &[2, 1], 4, Seed::root(1));
+        assert_eq!((plan.parents(), plan.report.moved, plan.report.split), (&[0, 0, 1, 3][..], 1, 0));
+        assert!(round(&settings, &host_of(&[0.5; 4]), &[0.0, 0.0, 1.0, 0.0], &[2, 1], 4, Seed::root(1)).keeps_all(4));
+    }
+
+    #[test]
+    fn who_is_hidden_is_judged_after_some_rounds() {
+        let device = Device::flex();
+        let mut weights = Weights::zeros(4, &device);
+        let view = |largest: [f32; 4], radii: [i32; 4]| ViewStatistics {
+            radii: Tensor::<1, Int>::from_ints(radii, &device),
+            screen_gradient: None,
+            absolute_screen_gradient: None,
+            max_weights: Some(Tensor::from_floats(largest, &device)),
+            size: (8, 8),
+            views: 1,
+        };
+        weights.add(&view([0.5, 0.1, 0.0, 0.9], [3, 3, 3, 0]));
+        assert!(weights.smallest().unwrap().is_empty(), "all are new");
+        weights.rounds = vec![3.0; 4];
+        // The last one was never shown, so nobody can tell.
+        assert_eq!(weights.smallest().unwrap(), [2, 1, 0]);
+        let mut plan = DensityPlan::new();
+        (plan.keep(1), plan.copy(0), plan.keep(0));
+        let mut after = weights.after(&plan, &device).unwrap();
+        assert_eq!((after.rounds.as_slice(), after.smallest().unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
+        (0..3).for_each(|_| after.add(&view([0.9, 0.0, 0.1, 0.0], [1, 1, 1, 0])));
+        assert_eq!(after.smallest().unwrap(), [2, 0]);
     }
 
     #[test]

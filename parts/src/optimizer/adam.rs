@@ -24,6 +24,9 @@ impl Default for Settings {
     }
 }
 
+/// The second moment of a new row over that of its parent: two copies share the gradient of one.
+const SHARED: f64 = 0.25;
+
 /// State of one array: first and second moment `[N,W]`, and the number of steps.
 struct Moments {
     first: Tensor<2>,
@@ -68,9 +71,10 @@ impl Optimizer for Adam {
             let rows = Tensor::<1, Int>::from_data(TensorData::new(rows.clone(), [count]), &device);
             let zero = Tensor::<1, Int>::from_data(TensorData::new(fresh.iter().map(|&f| i64::from(f)).collect::<Vec<_>>(), [count]), &device);
             let zero = zero.reshape([count, 1]).repeat_dim(1, width).equal_elem(1);
-            for moment in [&mut moments.first, &mut moments.second] {
-                *moment = moment.clone().select(0, rows.clone()).mask_fill(zero.clone(), 0.0);
-            }
+            moments.first = moments.first.clone().select(0, rows.clone()).mask_fill(zero.clone(), 0.0);
+            // Without a second moment, steps would be up to six times too large for a hundred iterations: the bias correction counts the steps of the array.
+            let second = moments.second.clone().select(0, rows.clone());
+            moments.second = second.clone().mask_where(zero, second.mul_scalar(SHARED));
         }
         Ok(())
     }

@@ -2,20 +2,23 @@
 
 use super::{guarded, matrix, settings_are_read};
 use crate::gaussians::to_vec;
-use crate::{Optimizer, OptimizerPlugin, Result, Seed, StepSettings};
+use crate::{Error, Optimizer, OptimizerPlugin, Result, Seed, StepSettings};
 use burn::tensor::{Device, Int, Tensor};
 
 /// Rows and width of the suite's array.
 const SHAPE: [usize; 2] = [12, 3];
 /// Number of steps in which a quadratic function must fall to a tenth or less.
 const STEPS: usize = 400;
+/// Steps after which fresh rows are compared with their parents, and how many times as far they may have moved.
+const FRESH_STEPS: usize = 20;
+const FRESH_MOVES: f64 = 2.0;
 
 /// Tests an optimizer on `device`. Each finding is a line; an empty list means that it passed.
 ///
 /// - Its schema is TOML and states the defaults; unknown settings are refused; nothing panics.
 /// - It minimises a quadratic function.
 /// - Rows that are not visible keep values and state.
-/// - Selected rows take over the state of their parents; fresh rows start with zero state.
+/// - Selected rows take over the state of their parents; fresh rows move about as fast as they.
 /// - After a restart it takes the same steps as a new optimizer; after storing and restoring state, the same steps as without.
 /// - Invalid state is an error.
 pub fn optimizer(plugin: &OptimizerPlugin, settings: &toml::Table, device: &Device) -> Vec<String> {
@@ -27,6 +30,7 @@ pub fn optimizer(plugin: &OptimizerPlugin, settings: &toml::Table, device: &Devi
             ("descent", Box::new(|| suite.lowers_a_quadratic())),
             ("visible rows", Box::new(|| suite.leaves_hidden_rows())),
             ("rows", Box::new(|| suite.rows_follow_their_parents())),
+            ("fresh rows", Box::new(|| suite.fresh_rows_keep_pace())),
             ("state", Box::new(|| suite.state_continues())),
         ],
     )
@@ -106,6 +110,25 @@ impl Suite<'_> {
             return Ok(Some("a row that does not exist was selected".into()));
         }
         Ok(None)
+    }
+    fn fresh_rows_keep_pace(&self) -> Result<Option<String>> {
+        let mut optimizer = self.build()?;
+        let gradient = self.start();
+        let walk = |optimizer: &mut dyn Optimizer, steps: usize| {
+            let mut value = self.start();
+            for _ in 0..steps {
+                value = optimizer.step(NAME, value, gradient.clone(), &StepSettings::new(0.001))?;
+            }
+            let moved = to_vec(value - self.start(), "values")?;
+            Ok::<_, Error>(moved.iter().map(|v| f64::from(v.abs())).sum::<f64>())
+        };
+        walk(optimizer.as_mut(), STEPS)?;
+        let mut renewed = self.build()?;
+        renewed.restore(optimizer.state())?;
+        renewed.select_rows("gaussians/", &(0..SHAPE[0]).collect::<Vec<_>>(), &[true; SHAPE[0]])?;
+        let (old, fresh) = (walk(optimizer.as_mut(), FRESH_STEPS)?, walk(renewed.as_mut(), FRESH_STEPS)?);
+        let found = || format!("with equal gradients, fresh rows move {:.1} times as far as their parents in {FRESH_STEPS} steps", fresh / old);
+        Ok((fresh > FRESH_MOVES * old).then(found))
     }
     fn state_continues(&self) -> Result<Option<String>> {
         let mut whole = self.build()?;

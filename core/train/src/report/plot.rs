@@ -6,8 +6,6 @@ use std::fmt::Write;
 /// Colours that stay apart for colour-blind readers and in print; beyond their number they repeat.
 pub const COLOURS: [&str; 12] =
     ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#5b3e96", "#8c510a", "#3f3f3f", "#b2182b", "#7a8c00", "#00796b"];
-/// Number of shapes of [`marker`].
-pub const MARKERS: usize = 8;
 
 /// Size in pixels of the drawing, which scales with the page.
 const WIDTH: f64 = 430.0;
@@ -156,20 +154,42 @@ pub(super) fn open_svg(width: f64, height: f64, name: &str) -> String {
     format!("<svg viewBox=\"0 0 {width:.0} {height:.0}\" role=\"img\" aria-label=\"{}\">", html(name))
 }
 
-/// A marker at a point: circle, square, triangle, diamond, inverted triangle, plus, cross, ring.
+/// Outlines of markers around their point, and how each is drawn: full, as lines, or hollow.
+const SHAPES: [(&str, Drawn); 16] = [
+    ("m-4.5 0a4.5 4.5 0 1 0 9 0a4.5 4.5 0 1 0 -9 0z", Drawn::Full),
+    ("m-4 -4h8v8h-8z", Drawn::Full),
+    ("m0 -5.5l5 9h-10z", Drawn::Full),
+    ("m0 -5.5l5.5 5.5l-5.5 5.5l-5.5 -5.5z", Drawn::Full),
+    ("m0 5.5l5 -9h-10z", Drawn::Full),
+    ("m-5 0h10m-5 -5v10", Drawn::Lines),
+    ("m-4 -4l8 8m0 -8l-8 8", Drawn::Lines),
+    ("m-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0z", Drawn::Hollow),
+    ("m-3.5 -3.5h7v7h-7z", Drawn::Hollow),
+    ("m0 -4.5l4 7.5h-8z", Drawn::Hollow),
+    ("m0 -4.8l4.8 4.8l-4.8 4.8l-4.8 -4.8z", Drawn::Hollow),
+    ("m0 4.5l4 -7.5h-8z", Drawn::Hollow),
+    ("m5.5 0l-9 5v-10z", Drawn::Full),
+    ("m-5.5 0l9 5v-10z", Drawn::Full),
+    ("m-5 0h10m-7.5 -4.3l5 8.6m0 -8.6l-5 8.6", Drawn::Lines),
+    ("m-4 -4.5h8l-8 9h8z", Drawn::Full),
+];
+
+#[derive(Clone, Copy)]
+enum Drawn {
+    Full,
+    Lines,
+    Hollow,
+}
+
+/// A marker at a point. Beyond the number of shapes they repeat.
 pub fn marker(kind: usize, x: f64, y: f64, colour: &str) -> String {
-    let path = |d: String| format!("<path d=\"{d}\" fill=\"{colour}\"/>");
-    let stroke = |d: String| format!("<path d=\"{d}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"2.4\"/>");
-    match kind % MARKERS {
-        0 => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4.5\" fill=\"{colour}\"/>"),
-        1 => format!("<rect x=\"{:.1}\" y=\"{:.1}\" width=\"8\" height=\"8\" fill=\"{colour}\"/>", x - 4.0, y - 4.0),
-        2 => path(format!("M{x:.1} {:.1}l5 9h-10z", y - 5.5)),
-        3 => path(format!("M{x:.1} {:.1}l5.5 5.5l-5.5 5.5l-5.5 -5.5z", y - 5.5)),
-        4 => path(format!("M{x:.1} {:.1}l5 -9h-10z", y + 5.5)),
-        5 => stroke(format!("M{:.1} {y:.1}h10M{x:.1} {:.1}v10", x - 5.0, y - 5.0)),
-        6 => stroke(format!("M{:.1} {:.1}l8 8m0 -8l-8 8", x - 4.0, y - 4.0)),
-        _ => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"#fff\" stroke=\"{colour}\" stroke-width=\"2.2\"/>"),
-    }
+    let (shape, drawn) = SHAPES[kind % SHAPES.len()];
+    let style = match drawn {
+        Drawn::Full => format!("fill=\"{colour}\""),
+        Drawn::Lines => format!("fill=\"none\" stroke=\"{colour}\" stroke-width=\"2.2\""),
+        Drawn::Hollow => format!("fill=\"#fff\" stroke=\"{colour}\" stroke-width=\"2\""),
+    };
+    format!("<path d=\"M{x:.1} {y:.1}{shape}\" {style}/>")
 }
 
 impl Plot {

@@ -38,9 +38,8 @@ impl Context<'_> {
         if !keeps_all {
             state.optimizer.select_rows("gaussians/", plan.parents(), plan.fresh())?;
         }
-        let rows: Vec<usize> = (0..state.set.len()).collect();
         for attribute in plan.restarted() {
-            state.optimizer.select_rows(&format!("gaussians/{attribute}"), &rows, &vec![true; rows.len()])?;
+            state.optimizer.restart(&format!("gaussians/{attribute}"));
         }
         if keeps_all {
             return Ok(());

@@ -190,8 +190,8 @@ impl Context<'_> {
         let count = logits.len();
         let higher: Vec<f32> = logits.iter().zip(&reset.logits).map(|(now, before)| now.max(*before)).collect();
         state.set.set("opacity_logits", Tensor::from_data(TensorData::new(higher, [count, 1]), &self.device))?;
-        let rows: Vec<usize> = (0..count).collect();
-        state.optimizer.select_rows("gaussians/opacity_logits", &rows, &vec![true; count])
+        state.optimizer.restart("gaussians/opacity_logits");
+        Ok(())
     }
 
     fn probes(&self, schedule: &Schedule) -> Vec<usize> {
