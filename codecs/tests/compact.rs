@@ -174,7 +174,7 @@ fn stored_streams_decode_to_the_same_bits() {
         out.extend(bytes);
     };
     let values = |g: &HostGaussians| g.columns().iter().flat_map(|(_, _, v)| v.iter().flat_map(|v| v.to_le_bytes())).collect::<Vec<u8>>();
-    for (name, layers) in [("compact-4", 1), ("compact-4-layers", 3)] {
+    for (name, layers) in [("compact-4", 1i64), ("compact-4-layers", 3)] {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/fixtures/{name}.bin"));
         let codec = (plugin().build)("", &toml::Table::from_iter([("layers".into(), layers.into())])).unwrap();
         if std::env::var_os("CC4DGS_WRITE_FIXTURES").is_some() {
@@ -199,7 +199,7 @@ fn stored_streams_decode_to_the_same_bits() {
         while let Some(name) = next() {
             streams.push(Stream { name: String::from_utf8(name).unwrap(), bytes: next().unwrap() });
         }
-        assert_eq!(streams.iter().filter(|s| s.name.starts_with("means")).count(), layers, "{name}");
+        assert_eq!(streams.iter().filter(|s| s.name.starts_with("means")).count() as i64, layers, "{name}");
         assert_eq!(values(&codec.decode(&streams, &context(None)).unwrap()), expected, "{name}");
     }
 }

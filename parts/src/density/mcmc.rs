@@ -194,6 +194,7 @@ impl DensityControl for Mcmc {
         arrays
     }
     fn restore(&mut self, mut state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()> {
+        let stored = state.iter().any(|(name, _)| name == "rounds");
         let mut take = |name: &str, size: usize| {
             let damaged = |problem: &str| {
                 let remedy = "The checkpoint is damaged or of another density control";
@@ -208,9 +209,15 @@ impl DensityControl for Mcmc {
             return Err(Error::data("density state 'start'", format!("{start} is not a count"), "The checkpoint is damaged"));
         }
         self.start = start as usize;
-        let rounds = to_vec(take("rounds", count)?, "rounds")?;
-        self.weights = Weights { sum: take("weight_sum", count)?, views: take("weight_views", count)?, rounds };
+        // Programs before relocation stored no weights.
+        let weights = if stored {
+            let rounds = to_vec(take("rounds", count)?, "rounds")?;
+            Some(Weights { sum: take("weight_sum", count)?, views: take("weight_views", count)?, rounds })
+        } else {
+            None
+        };
         self.statistics = Statistics::from_arrays(state, count)?;
+        self.weights = weights.unwrap_or_else(|| Weights::zeros(count, &self.statistics.seen.device()));
         Ok(())
     }
 }
@@ -340,15 +347,15 @@ mod tests {
     fn who_is_hidden_is_judged_after_some_rounds() {
         let device = Device::flex();
         let mut weights = Weights::zeros(4, &device);
-        let view = |largest: [f32; 4], radii: [i32; 4]| ViewStatistics {
-            radii: Tensor::<1, Int>::from_ints(radii, &device),
+        let view = |largest: &[f32], radii: &[i64]| ViewStatistics {
+            radii: Tensor::<1, Int>::from_data(TensorData::new(radii.to_vec(), [radii.len()]), &device),
             screen_gradient: None,
             absolute_screen_gradient: None,
             max_weights: Some(Tensor::from_floats(largest, &device)),
             size: (8, 8),
             views: 1,
         };
-        weights.add(&view([0.5, 0.1, 0.0, 0.9], [3, 3, 3, 0]));
+        weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0]));
         assert!(weights.smallest().unwrap().is_empty(), "all are new");
         weights.rounds = vec![3.0; 4];
         // The last one was never shown, so nobody can tell.
@@ -357,7 +364,7 @@ mod tests {
         (plan.keep(1), plan.copy(0), plan.keep(0));
         let mut after = weights.after(&plan, &device).unwrap();
         assert_eq!((after.rounds.as_slice(), after.smallest().unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
-        (0..3).for_each(|_| after.add(&view([0.9, 0.0, 0.1, 0.0], [1, 1, 1, 0])));
+        (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])));
         assert_eq!(after.smallest().unwrap(), [2, 0]);
     }
 

@@ -148,7 +148,7 @@ mod tests {
     #[test]
     fn an_empty_chart_is_still_a_chart() {
         let svg = Strips { title: "seeds".into(), axis: "dB".into(), lines: vec![("one".into(), 3, vec![30.0])] }.figure();
-        assert!(svg.contains("<circle") && !svg.contains("class=\"mean\"") && !svg.contains("NaN"));
+        assert!(svg.contains("<path d=") && !svg.contains("class=\"mean\"") && !svg.contains("NaN"));
         assert!(!Bars { title: String::new(), axis: String::new(), parts: vec![], lines: vec![] }.figure().contains("NaN"));
     }
 }
