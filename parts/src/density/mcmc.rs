@@ -3,7 +3,7 @@
 //! Faded Gaussians are removed, and as many others are split, drawn by their screen gradients. The budget grows with the root of the progress. The two halves of a
 //! split together draw nearly what the whole drew, so that a round costs little.
 //!
-//! In the main stage every round also moves a share of those that are hardly seen: hidden, faint or covered by others, they cost as much as any other.
+//! In the main stage every round also moves some of those that are hardly seen: hidden, faint or covered by others, they cost as much as any other.
 
 use super::halves;
 use super::statistics::Statistics;
@@ -25,7 +25,7 @@ min_opacity = 0.005      # fainter Gaussians are removed, and the budget is spen
 growth = 0.1             # most Gaussians split in a round, as a share of all
 coarse_share = 0.6       # share of max_gaussians that the coarse stage grows to
 max_gaussians = 400000   # the budget at the end
-relocate = 0.02          # Gaussians that a round of the main stage moves, those with the smallest blending weights, as a share of all; 0 is off
+relocate = 0.8           # Gaussians that the rounds of the main stage move, those with the smallest blending weights, as a share of all; 0 is off
 noise = 0.0              # random steps of faint Gaussians, as a share of their size per iteration; 0 is off
 ";
 
@@ -36,6 +36,8 @@ const COARSE_ROUNDS: f64 = 0.9;
 /// Opacity around which noise fades, and how steeply (3DGS-MCMC).
 const NOISE_OPACITY: f32 = 0.005;
 const NOISE_STEEPNESS: f32 = 100.0;
+/// Largest share of the Gaussians that one round moves.
+const MOST_MOVED: f64 = 0.05;
 /// Share of the sums of blending weights that a round leaves to the next: a round alone has not seen every view.
 const MEMORY: f32 = 0.7;
 /// Rounds after which a Gaussian is judged by its blending weights: until then, halves are still fainter than they will be.
@@ -57,7 +59,7 @@ struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { from: 500, until: 15_000, every: 100, min_opacity: 0.005, growth: 0.1, coarse_share: 0.6, max_gaussians: 400_000, relocate: 0.02, noise: 0.0 }
+        Self { from: 500, until: 15_000, every: 100, min_opacity: 0.005, growth: 0.1, coarse_share: 0.6, max_gaussians: 400_000, relocate: 0.8, noise: 0.0 }
     }
 }
 
@@ -71,10 +73,18 @@ impl Settings {
     }
     fn due(&self, schedule: &Schedule) -> bool {
         let iteration = schedule.iteration;
-        iteration > schedule.at(self.from) && iteration <= self.end(schedule) && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL))
+        iteration > schedule.at(self.from) && iteration <= self.end(schedule) && iteration.is_multiple_of(self.interval(schedule))
     }
-    fn relocates(&self, schedule: &Schedule) -> bool {
-        schedule.stage == Stage::Main && self.relocate > 0.0
+    fn interval(&self, schedule: &Schedule) -> usize {
+        schedule.interval(self.every, MIN_INTERVAL)
+    }
+    /// The share of the Gaussians that a round moves: equal ones add up to `relocate`.
+    fn moved(&self, schedule: &Schedule) -> f64 {
+        if schedule.stage != Stage::Main {
+            return 0.0;
+        }
+        let iterations = self.end(schedule).saturating_sub(schedule.at(self.from));
+        (self.relocate * self.interval(schedule) as f64 / iterations.max(1) as f64).min(MOST_MOVED)
     }
     /// How many Gaussians there may be now, where the stage began with `start`.
     fn budget(&self, start: usize, schedule: &Schedule) -> usize {
@@ -85,43 +95,40 @@ impl Settings {
     }
 }
 
-/// Decaying sums over the views that show a Gaussian.
+/// What is remembered of the blending weights of N Gaussians.
 struct Weights {
-    /// Of its largest blending weight `[N]`.
-    sum: Tensor<1>,
-    /// Their number `[N]`.
-    views: Tensor<1>,
+    /// Decaying sums over views: of the largest weight, of its square, of views that show the Gaussian `[N,3]`.
+    sums: Tensor<2>,
     /// Rounds since the Gaussian was new `[N]`.
     rounds: Vec<f32>,
 }
 
 impl Weights {
     fn zeros(count: usize, device: &Device) -> Self {
-        Self { sum: Tensor::zeros([count], device), views: Tensor::zeros([count], device), rounds: vec![0.0; count] }
+        Self { sums: Tensor::zeros([count, 3], device), rounds: vec![0.0; count] }
     }
     fn add(&mut self, view: &ViewStatistics) {
         if let Some(weights) = &view.max_weights {
-            self.sum = self.sum.clone() + weights.clone();
-            self.views = self.views.clone() + view.radii.clone().greater_elem(0).float();
+            let shown = view.radii.clone().greater_elem(0).float();
+            self.sums = self.sums.clone() + Tensor::stack::<2>(vec![weights.clone(), weights.clone() * weights.clone(), shown], 1);
         }
     }
-    /// The rows that can be judged, those with the smallest mean weight first.
-    fn smallest(&self) -> Result<Vec<usize>> {
-        let (sums, views) = (to_vec(self.sum.clone(), "blending weights")?, to_vec(self.views.clone(), "counts of views")?);
-        let mut rows: Vec<usize> = (0..sums.len()).filter(|&row| self.rounds[row] >= LEAST_ROUNDS && views[row] > 0.0).collect();
-        rows.sort_by(|&a, &b| (sums[a] / views[a]).total_cmp(&(sums[b] / views[b])).then(a.cmp(&b)));
+    /// Of the rows that can be judged, at most so many with the smallest weights, the smallest first. Weights are averaged with themselves as shares: what is bright
+    /// for a short time, or on one side, counts by that.
+    fn smallest(&self, most: usize) -> Result<Vec<usize>> {
+        let sums = to_vec(self.sums.clone(), "blending weights")?;
+        let weight = |row: usize| sums[3 * row + 1] / sums[3 * row].max(f32::MIN_POSITIVE);
+        let mut rows: Vec<usize> = (0..self.rounds.len()).filter(|&row| self.rounds[row] >= LEAST_ROUNDS && sums[3 * row + 2] > 0.0).collect();
+        rows.sort_by(|&a, &b| weight(a).total_cmp(&weight(b)).then(a.cmp(&b)));
+        rows.truncate(most);
         Ok(rows)
     }
     /// What the Gaussians of `plan` start the next round with; new ones with nothing.
     fn after(&self, plan: &DensityPlan, device: &Device) -> Result<Self> {
-        let rows = || plan.parents().iter().zip(plan.fresh());
-        let of = |values: &Tensor<1>| {
-            let old = to_vec(values.clone(), "blending weights")?;
-            let new: Vec<f32> = rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { MEMORY * old[parent] }).collect();
-            Ok::<_, Error>(Tensor::from_data(TensorData::new(new, [plan.len()]), device))
-        };
-        let rounds = rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect();
-        Ok(Self { sum: of(&self.sum)?, views: of(&self.views)?, rounds })
+        let (old, rows) = (to_vec(self.sums.clone(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
+        let of = |(&parent, &fresh): (&usize, &bool)| std::array::from_fn::<f32, 3, _>(|k| if fresh { 0.0 } else { MEMORY * old[3 * parent + k] });
+        let sums = Tensor::from_data(TensorData::new(rows().flat_map(of).collect(), [plan.len(), 3]), device);
+        Ok(Self { sums, rounds: rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect() })
     }
 }
 
@@ -144,7 +151,7 @@ impl DensityControl for Mcmc {
         let mut wanted = Vec::new();
         if schedule.iteration <= self.settings.end(schedule) {
             wanted.push(Statistic::AbsoluteScreenGradient);
-            wanted.extend(self.settings.relocates(schedule).then_some(Statistic::MaxWeight));
+            wanted.extend((self.settings.moved(schedule) > 0.0).then_some(Statistic::MaxWeight));
         }
         wanted
     }
@@ -159,7 +166,8 @@ impl DensityControl for Mcmc {
             return Ok(None);
         }
         let scores = self.statistics.mean_gradients()?;
-        let hidden = if self.settings.relocates(schedule) { self.weights.smallest()? } else { Vec::new() };
+        let most = (self.settings.moved(schedule) * gaussians.len() as f64) as usize;
+        let hidden = if most > 0 { self.weights.smallest(most)? } else { Vec::new() };
         Ok(Some(round(&self.settings, &gaussians.to_host()?, &scores, &hidden, self.settings.budget(self.start, schedule), seed)))
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
@@ -190,7 +198,7 @@ impl DensityControl for Mcmc {
         // Up to 16,777,216 a float32 is exact; beyond, the budget of a resumed run differs by a row or two.
         arrays.push(("start".into(), Tensor::from_floats([self.start as f32], &device)));
         let rounds = Tensor::from_floats(self.weights.rounds.as_slice(), &device);
-        arrays.extend([("weight_sum".into(), self.weights.sum.clone()), ("weight_views".into(), self.weights.views.clone()), ("rounds".into(), rounds)]);
+        arrays.extend([("weights".into(), self.weights.sums.clone().flatten(0, 1)), ("rounds".into(), rounds)]);
         arrays
     }
     fn restore(&mut self, mut state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()> {
@@ -211,8 +219,8 @@ impl DensityControl for Mcmc {
         self.start = start as usize;
         // Programs before relocation stored no weights.
         let weights = if stored {
-            let rounds = to_vec(take("rounds", count)?, "rounds")?;
-            Some(Weights { sum: take("weight_sum", count)?, views: take("weight_views", count)?, rounds })
+            let (sums, rounds) = (take("weights", 3 * count)?.reshape([count, 3]), to_vec(take("rounds", count)?, "rounds")?);
+            Some(Weights { sums, rounds })
         } else {
             None
         };
@@ -223,7 +231,7 @@ impl DensityControl for Mcmc {
 }
 
 /// The plan of one round: which of the Gaussians are removed, kept and split, so that there are at most `budget`. `scores` say who is split `[N]`; of the rows
-/// `hidden` the first are moved, as far as there are others to split in their place.
+/// `hidden` the first are moved, as far as others can be split in their place.
 fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], hidden: &[usize], budget: usize, seed: Seed) -> DensityPlan {
     let n = host.len();
     let opacity = |row: usize| 1.0 / (1.0 + (-host.opacity_logits[row]).exp());
@@ -232,8 +240,7 @@ fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], hidden: &[us
     if alive.is_empty() {
         return DensityPlan::unchanged(n);
     }
-    let share = (settings.relocate * n as f64) as usize;
-    let hidden: Vec<usize> = hidden.iter().copied().filter(|row| alive.binary_search(row).is_ok()).take(share).collect();
+    let hidden: Vec<usize> = hidden.iter().copied().filter(|row| alive.binary_search(row).is_ok()).collect();
     let mut goes = vec![false; n];
     hidden.iter().for_each(|&row| goes[row] = true);
     let stays: Vec<usize> = alive.iter().copied().filter(|&row| !goes[row]).collect();
@@ -281,7 +288,7 @@ fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
     for (key, value, most) in [
         ("min_opacity", f64::from(settings.min_opacity), 0.999),
         ("growth", settings.growth, 1.0),
-        ("relocate", settings.relocate, 0.25),
+        ("relocate", settings.relocate, 100.0),
         ("coarse_share", settings.coarse_share, 1.0),
         ("noise", f64::from(settings.noise), 100.0),
     ] {
@@ -329,7 +336,7 @@ mod tests {
     fn faded_gaussians_make_room_for_halves_of_those_with_gradients() {
         let mut host = host_of(&[0.5, 0.001, 0.5, 0.5, 0.5]);
         host.means[12] = f32::NAN;
-        let settings = Settings { growth: 1.0, relocate: 0.25, ..Default::default() };
+        let settings = Settings { growth: 1.0, ..Default::default() };
         let plan = round(&settings, &host, &[0.0, 1.0, 1.0, 0.0, 1.0], &[], 4, Seed::root(1));
         // Row 1 faded, row 4 is broken; of the others only row 2 has a gradient.
         assert_eq!((plan.parents(), plan.fresh()), (&[0, 2, 2, 3][..], &[false, true, true, false][..]));
@@ -338,9 +345,9 @@ mod tests {
         assert!(full.keeps_all(4), "nothing happens at the budget");
         assert!(round(&settings, &host_of(&[0.001; 3]), &[1.0; 3], &[], 9, Seed::root(1)).keeps_all(3), "never all of them");
         // At the budget, the hidden one makes room for halves of the only other with a gradient; without one, it stays.
-        let plan = round(&settings, &host_of(&[0.5; 4]), &[1.0, 0.0, 1.0, 0.0], &[2, 1], 4, Seed::root(1));
+        let plan = round(&settings, &host_of(&[0.5; 4]), &[1.0, 0.0, 1.0, 0.0], &[2], 4, Seed::root(1));
         assert_eq!((plan.parents(), plan.report.moved, plan.report.split), (&[0, 0, 1, 3][..], 1, 0));
-        assert!(round(&settings, &host_of(&[0.5; 4]), &[0.0, 0.0, 1.0, 0.0], &[2, 1], 4, Seed::root(1)).keeps_all(4));
+        assert!(round(&settings, &host_of(&[0.5; 4]), &[0.0, 0.0, 1.0, 0.0], &[2], 4, Seed::root(1)).keeps_all(4));
     }
 
     #[test]
@@ -356,16 +363,16 @@ mod tests {
             views: 1,
         };
         weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0]));
-        assert!(weights.smallest().unwrap().is_empty(), "all are new");
+        assert!(weights.smallest(9).unwrap().is_empty(), "all are new");
         weights.rounds = vec![3.0; 4];
         // The last one was never shown, so nobody can tell.
-        assert_eq!(weights.smallest().unwrap(), [2, 1, 0]);
+        assert_eq!((weights.smallest(9).unwrap(), weights.smallest(1).unwrap()), (vec![2, 1, 0], vec![2]));
         let mut plan = DensityPlan::new();
         (plan.keep(1), plan.copy(0), plan.keep(0));
         let mut after = weights.after(&plan, &device).unwrap();
-        assert_eq!((after.rounds.as_slice(), after.smallest().unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
+        assert_eq!((after.rounds.as_slice(), after.smallest(9).unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
         (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])));
-        assert_eq!(after.smallest().unwrap(), [2, 0]);
+        assert_eq!(after.smallest(9).unwrap(), [2, 0]);
     }
 
     #[test]
