@@ -368,7 +368,9 @@ mod tests {
         // The last one was never shown, so nobody can tell.
         assert_eq!((weights.smallest(9).unwrap(), weights.smallest(1).unwrap()), (vec![2, 1, 0], vec![2]));
         let mut plan = DensityPlan::new();
-        (plan.keep(1), plan.copy(0), plan.keep(0));
+        plan.keep(1);
+        plan.copy(0);
+        plan.keep(0);
         let mut after = weights.after(&plan, &device).unwrap();
         assert_eq!((after.rounds.as_slice(), after.smallest(9).unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
         (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])));
