@@ -1,20 +1,32 @@
 #!/usr/bin/env python3
 """Trains captures with `auto` and nothing else, beside other settings, and holds the results to floors.
 
-    python3 benches/captures.py OUT --bin BIN [--minutes 5] [--scene NAME=PATH ...] [--with none --with panoptic] [--only NAME,...]
+    python3 benches/captures.py OUT --bin BIN [--minutes 5] [--jobs 2 --threads 1] [--with none --with panoptic] [--fields cdf,free-time] [--scene NAME=PATH ...]
+                                [--only NAME,...] [--json FILE]
 
-Every scene is trained once per setting for the same wall time, evaluated once on its held-out views, and reported as one row: PSNR (whole images, moving pixels),
-SSIM, Gaussians, seconds, exit code, and the plan. `auto+METHOD` keeps the plan and exchanges the field; other names are presets, which run for as many iterations
-as take the same time. Finished rows are kept in OUT/rows.json and not run again. Floors are in benches/captures.json; a row below its floor makes the exit code 1.
+Every scene is trained once per setting, evaluated once on its held-out views, and reported as one row: PSNR (whole images, moving pixels) and its gain over `none`,
+SSIM, Gaussians, seconds, exit code, and the plan. `auto+FIELD` exchanges the deformer of the plan; `none` is `auto+none`. All of these get `--minutes`. Another name
+is a preset. It gets as many iterations as take about as long as `auto` took on the scene (`--minutes` with --without-auto): short trainings are timed first, which
+the column of seconds leaves out. Trainings that run side by side share the machine, so their seconds belong to that number of jobs.
+
+Finished rows are kept in OUT/rows.json and not run again. OUT/machine.json has the medians of `bench step`, measured before the first training. Floors are in
+benches/captures.json, for `auto`: `psnr_db` of whole images; `gain_db` over `none`, of whole images or of moving pixels, checked where `none` is trained too. A row
+below a floor makes the exit code 1.
 """
 import argparse
+import concurrent.futures
+import hashlib
 import json
 import pathlib
 import subprocess
 import sys
+import threading
 import time
+import tomllib
 
 CAPTURES = ["dome", "rig", "handheld", "photos", "turntable", "sparse", "long", "exposure", "lens", "units", "dark", "appear"]
+SCORES = ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians"]
+TRAINED = [0, 6]  # Exit codes of trainings that leave a model; 6 is one below simple baselines.
 
 
 def run(binary, arguments, log):
@@ -29,39 +41,69 @@ def last_line(log):
     return lines[-1][:400] if lines else ""
 
 
-def train(options, name, path, setting, minutes, extra):
-    """One row: what training and evaluation of `path` with `setting` give."""
+def is_planned(setting):
+    return setting == "none" or setting.split("+")[0] == "auto"
+
+
+def machine(options):
+    """What ran: the version and hash of the binary, and milliseconds of `bench step`, measured again for another binary."""
+    path, step = options.out / "machine.json", options.out / "step.json"
+    binary = hashlib.sha256(pathlib.Path(options.bin).read_bytes()).hexdigest()
+    kept = json.loads(path.read_text()) if path.exists() else {}
+    if kept.get("binary_sha256") == binary:
+        return kept
+    version = subprocess.run([options.bin, "--version"], capture_output=True, text=True).stdout.strip()
+    arguments = ["bench", "step", "--repeats", "5", "--quiet", f"--json={step}", "--threads", str(options.threads)]
+    code, _ = run(options.bin, arguments, options.out / "step.log")
+    found = {"version": version, "binary_sha256": binary, "bench_step": json.loads(step.read_text()) if code == 0 else None}
+    path.write_text(json.dumps(found, indent=1))
+    return found
+
+
+def iterations_for(seconds_of, target):
+    """Iterations that take `target` seconds. A training of a tenth of the time says what an iteration costs once Gaussians were added."""
+    first, length = seconds_of(20), 60
+    for share in [0.1, 1.0]:
+        each = max((seconds_of(length) - first) / (length - 20), 1e-4)
+        length = max(60, 20 + int((share * target - first) / each))
+    return length
+
+
+def train(options, name, path, setting, target):
+    """One row: what training and evaluation of `path` with `setting` give. `target` returns the seconds that presets get."""
     out = options.out / f"{name}-{setting.replace('+', '-')}"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    arguments = ["train", "--scene", path, "--out", str(out), "--overwrite", "--quiet"]
-    if setting == "none":
-        arguments += ["--preset", "auto+none"]
-    elif setting != "auto":
-        arguments += ["--preset", setting]
-    if setting == "none" or setting.startswith("auto"):
-        arguments += ["--minutes", str(minutes)]
-    if options.threads:
-        arguments += ["--threads", str(options.threads)]
-    for text in extra:
-        arguments += ["--set", text]
-    train_log = out.with_suffix(".train.log")
-    code, seconds = run(options.bin, arguments, train_log)
-    row = {"scene": name, "setting": setting, "minutes": minutes, "exit": code, "seconds": round(seconds, 1)}
+    shared = ["--quiet", "--threads", str(options.threads)]
+
+    def fit(out, arguments):
+        sets = [word for text in [*options.sets, *arguments] for word in ("--set", text)]
+        chosen = [] if setting == "auto" else ["--preset", "auto+none" if setting == "none" else setting]
+        planned = ["--minutes", str(options.minutes)] if is_planned(setting) else []
+        return run(options.bin, ["train", "--scene", path, "--out", str(out), "--overwrite", *shared, *chosen, *planned, *sets], out.with_suffix(".train.log"))
+
+    def seconds_of(iterations):
+        short = out.with_name(f"{out.name}-timed")
+        code, seconds = fit(short, [f"train.iterations={iterations}"])
+        if code not in TRAINED:
+            raise RuntimeError(f"a training of {iterations} iterations: {last_line(short.with_suffix('.train.log'))}")
+        return seconds
+
+    row = {"scene": name, "setting": setting, "minutes": options.minutes, "sets": options.sets, "threads": options.threads, "jobs": options.jobs}
+    if not is_planned(setting):
+        try:
+            row["iterations"] = iterations_for(seconds_of, target())
+        except RuntimeError as error:
+            return row | {"exit": 1, "seconds": 0.0, "said": str(error)}
+    code, seconds = fit(out, [f"train.iterations={row['iterations']}"] if "iterations" in row else [])
+    row |= {"exit": code, "seconds": round(seconds, 1)}
     if code != 0:
-        row["said"] = last_line(train_log)
-    config = out / "config.toml"
-    if config.exists():
-        text = config.read_text()
-        row["plan"] = [line.strip().strip('",') for line in text.splitlines() if line.strip().startswith('"')]
-    if (out / "checkpoint").exists():
-        report = out.with_suffix(".json")
-        eval_code, _ = run(options.bin, ["eval", str(out), "--scene", path, "--split", "test", f"--json={report}", "--quiet"], out.with_suffix(".eval.log"))
-        if eval_code == 0:
-            found = json.loads(report.read_text())
-            for key in ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians"]:
-                row[key] = found.get(key)
-        else:
-            row["said"] = last_line(out.with_suffix(".eval.log"))
+        row["said"] = last_line(out.with_suffix(".train.log"))
+    if (config := out / "config.toml").exists():
+        row["plan"] = tomllib.loads(config.read_text()).get("auto", {}).get("plan", [])
+    if code in TRAINED:
+        report, log = out.with_suffix(".json"), out.with_suffix(".eval.log")
+        eval_code, _ = run(options.bin, ["eval", str(out), "--scene", path, "--split", "test", f"--json={report}", *shared], log)
+        found = json.loads(report.read_text()) if eval_code == 0 else {}
+        row |= {key: found.get(key) for key in SCORES} if found else {"said": last_line(log)}
     return row
 
 
@@ -69,40 +111,85 @@ def shown(value, digits=2):
     return "-" if value is None else f"{value:.{digits}f}" if isinstance(value, float) else str(value)
 
 
+def gains(row, none):
+    """PSNR over that of the row of `none`, in dB: whole images, moving pixels."""
+    pairs = [(row.get(key), (none or {}).get(key)) for key in ["psnr_db", "psnr_dynamic_db"]]
+    return [None if a is None or b is None else a - b for a, b in pairs]
+
+
+def printed(row, none):
+    whole, moving = gains(row, none)
+    gain = "-" if row["setting"] == "none" else f"{shown(whole)} ({shown(moving)})"
+    scores = [shown(row.get("psnr_db")), shown(row.get("psnr_dynamic_db")), gain, shown(row.get("ssim"), 3)]
+    count = f"{shown(row.get('gaussians'))} ({shown(row.get('dynamic_gaussians'))})"
+    return f"| {row['scene']} | {row['setting']} | {' | '.join(scores)} | {count} | {row['seconds']:.0f} | {row['exit']} {row.get('said', '')} |"
+
+
+def missed(row, none, floors):
+    """The floors that a row of `auto` is below."""
+    found, (whole, moving), floor, gain = [], gains(row, none), floors.get("psnr_db"), floors.get("gain_db")
+    if floor is not None and (row["exit"] != 0 or (row.get("psnr_db") or 0.0) < floor):
+        found.append(f"{row['scene']}: {shown(row.get('psnr_db'))} dB, exit code {row['exit']}, floor {floor} dB")
+    if gain is not None and none is not None and max((g for g in [whole, moving] if g is not None), default=-1e9) < gain:
+        found.append(f"{row['scene']}: gain over none {shown(whole)} dB, on moving pixels {shown(moving)} dB, floor {gain} dB")
+    return found
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=pathlib.Path)
     parser.add_argument("--bin", required=True)
     parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at the same time")
     parser.add_argument("--threads", type=int, default=0, help="threads of each training; 0 takes all cores")
     parser.add_argument("--scene", action="append", default=[], metavar="NAME=PATH", help="a dataset beside the captures")
-    parser.add_argument("--with", dest="settings", action="append", default=[], help="another setting: none, auto+METHOD, a preset")
+    parser.add_argument("--with", dest="settings", action="append", default=[], help="another setting: none, auto+FIELD, a preset")
+    parser.add_argument("--fields", default="", help="deformers with commas: a setting auto+FIELD each")
     parser.add_argument("--without-auto", action="store_true")
     parser.add_argument("--only", default="", help="names of scenes, with commas")
     parser.add_argument("--set", dest="sets", action="append", default=[], help="handed to every training")
+    parser.add_argument("--json", type=pathlib.Path, help="a file for the rows with their plans, the machine and the floors")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     floors = json.loads((pathlib.Path(__file__).parent / "captures.json").read_text())
     scenes = [(name, f"procedural:captures/{name}") for name in CAPTURES] + [tuple(text.split("=", 1)) for text in options.scene]
     if options.only:
         scenes = [scene for scene in scenes if scene[0] in options.only.split(",")]
-    kept = options.out / "rows.json"
+    settings = [*([] if options.without_auto else ["auto"]), *options.settings, *(f"auto+{field}" for field in options.fields.split(",") if field)]
+    settings = list(dict.fromkeys(settings))
+    kept, lock = options.out / "rows.json", threading.Lock()
     rows = json.loads(kept.read_text()) if kept.exists() else []
-    below = []
-    print("| scene | setting | PSNR dB | moving pixels | SSIM | Gaussians (moving) | seconds | exit |\n| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name, path in scenes:
-        for setting in ([] if options.without_auto else ["auto"]) + options.settings:
-            row = next((r for r in rows if (r["scene"], r["setting"], r["minutes"]) == (name, setting, options.minutes)), None)
-            if row is None:
-                row = train(options, name, path, setting, options.minutes, options.sets)
+    found = machine(options)
+
+    def row_of(name, path, setting, auto):
+        wanted = (name, setting, options.minutes, options.sets)
+        with lock:
+            row = next((r for r in rows if (r["scene"], r["setting"], r["minutes"], r.get("sets", [])) == wanted), None)
+        if row is None:
+            trained = lambda: auto is not None and auto.result()["exit"] in TRAINED
+            row = train(options, name, path, setting, lambda: auto.result()["seconds"] if trained() else 60.0 * options.minutes)
+            with lock:
                 rows.append(row)
                 kept.write_text(json.dumps(rows, indent=1))
-            numbers = [shown(row.get("psnr_db")), shown(row.get("psnr_dynamic_db")), shown(row.get("ssim"), 3)]
-            count = f"{shown(row.get('gaussians'))} ({shown(row.get('dynamic_gaussians'))})"
-            print(f"| {name} | {setting} | {' | '.join(numbers)} | {count} | {row['seconds']:.0f} | {row['exit']} {row.get('said', '')} |", flush=True)
-            floor = floors.get(name, {}).get("psnr_db")
-            if setting == "auto" and floor is not None and (row["exit"] != 0 or (row.get("psnr_db") or 0.0) < floor):
-                below.append(f"{name}: {shown(row.get('psnr_db'))} dB, floor {floor}")
+        return row
+
+    below, finished = [], []
+    print("| scene | setting | PSNR dB | moving pixels | gain over none, dB (moving pixels) | SSIM | Gaussians (moving) | seconds | exit |" + "\n|" + " --- |" * 9)
+    with concurrent.futures.ThreadPoolExecutor(max(1, options.jobs)) as pool:
+        started = {}
+        for name, path in scenes:
+            # Presets come last: they wait for the seconds of `auto`.
+            for setting in sorted(settings, key=lambda setting: not is_planned(setting)):
+                started[name, setting] = pool.submit(row_of, name, path, setting, started.get((name, "auto")))
+        for name, _ in scenes:
+            of_scene = {setting: started[name, setting].result() for setting in settings}
+            finished += of_scene.values()
+            print("\n".join(printed(row, of_scene.get("none")) for row in of_scene.values()), flush=True)
+            if "auto" in of_scene:
+                below += missed(of_scene["auto"], of_scene.get("none"), floors.get(name, {}))
+    if options.json:
+        whole = {"minutes": options.minutes, "jobs": options.jobs, "threads": options.threads, "sets": options.sets, "machine": found, "rows": finished}
+        options.json.write_text(json.dumps(whole | {"floors": {name: floors[name] for name, _ in scenes if name in floors}, "below": below}, indent=1) + "\n")
     for text in below:
         print(f"below its floor: {text}", file=sys.stderr)
     return 1 if below else 0

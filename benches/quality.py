@@ -13,6 +13,7 @@ import pathlib
 import subprocess
 import sys
 import time
+import tomllib
 
 # Name, scene, minutes, settings, and the PSNR in dB it is meant to reach.
 RUNS = [
@@ -62,10 +63,10 @@ def train(options, name, scene, minutes, settings):
     with open(out.with_suffix(".eval.log"), "w") as file:
         if code == 0 and subprocess.run(evaluation, stdout=file, stderr=subprocess.STDOUT).returncode == 0:
             found = json.loads(report.read_text())
-            keys = ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "blocks"]
+            keys = ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "psnr_worst_block_db", "lost_blocks"]
             row |= {key: found.get(key) for key in keys}
     config = out / "config.toml"
-    row["plan"] = [line.strip().strip("',\"") for line in config.read_text().splitlines() if line.strip()[:1] in "\"'"] if config.exists() else []
+    row["plan"] = tomllib.loads(config.read_text()).get("auto", {}).get("plan", []) if config.exists() else []
     return row
 
 
