@@ -2,7 +2,7 @@
 
 use super::readers::common::{load, options, real};
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
-use cc4dgs_core::{Camera, Error, Event, FrameSource, Image8, Limits, Recorder, Registry, Result, Scene, SceneOptions, Similarity, Split, View};
+use cc4dgs_core::{Camera, Error, Event, EventSink, FrameSource, Image8, Limits, Recorder, Registry, Result, Scene, SceneOptions, Similarity, Split, View};
 use cc4dgs_play::Model;
 use cc4dgs_train::checks::{Finding, Judgement, Severity, Subject, check_scene};
 use cc4dgs_train::config::RunConfig;
@@ -10,7 +10,7 @@ use cc4dgs_train::data::{self, procedural::NAMES};
 use cc4dgs_train::train::{TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Images of another scene, changed.
 struct Changed<F>(Arc<Scene>, F);
@@ -156,15 +156,46 @@ fn images_cameras_and_times_without_sense_are_found() {
     found("frames out of order", &mixed, Subject::Times, Severity::Doubt);
 }
 
-/// A run of a thousand iterations at the smallest size.
-fn run(scene: &Arc<Scene>, sets: &[&str]) -> (Result<(Model, TrainReport)>, Vec<Event>) {
+/// A run of a thousand iterations at the smallest size, in the folder `out` if there is one; it is interrupted once `stops` says so of an event.
+fn run_in(scene: &Arc<Scene>, sets: &[&str], out: Option<&Path>, resume: bool, stops: fn(&Event) -> bool) -> (Result<(Model, TrainReport)>, Vec<Event>) {
     let base = ["train.iterations=1000", "init.count=200", "density={kind='none'}", "train.time_ramp=0.0", "device=flex"];
     let sets: Vec<String> = base.iter().chain(sets).map(ToString::to_string).collect();
     let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
-    let (registry, events, stop) = (Registry::collect().unwrap(), Recorder::default(), AtomicBool::new(false));
-    let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &events, stop: &stop, observer: None };
-    (train(&job), events.events())
+    let registry = Registry::collect().unwrap();
+    let listener = Listener { heard: Recorder::default(), stops, stop: AtomicBool::new(false) };
+    let (out, scene, events, stop) = (out.map(Path::to_path_buf), scene.clone(), &listener, &listener.stop);
+    let trained = train(&TrainJob { config: &config, scene, out, resume, registry: &registry, events, stop, observer: None });
+    (trained, listener.heard.events())
 }
+
+fn run(scene: &Arc<Scene>, sets: &[&str]) -> (Result<(Model, TrainReport)>, Vec<Event>) {
+    run_in(scene, sets, None, false, |_| false)
+}
+
+/// Remembers events, and interrupts the run at one of them.
+struct Listener {
+    heard: Recorder,
+    stops: fn(&Event) -> bool,
+    stop: AtomicBool,
+}
+
+impl EventSink for Listener {
+    fn emit(&self, event: &Event) {
+        self.heard.emit(event);
+        if (self.stops)(event) {
+            self.stop.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+/// What the notes of the verdict say.
+fn verdicts(events: &[Event]) -> Vec<&String> {
+    events.iter().filter_map(|e| if let Event::Note { object, message } = e { (object == "verdict").then_some(message) } else { None }).collect()
+}
+
+/// Nothing is learned with these rates, and random points show nothing.
+const LEARNS_NOTHING: [&str; 2] =
+    ["train.lr={means=0.0,means_end=0.0,log_scales=0.0,quaternions=0.0,opacity=0.0,sh_dc=0.0,sh_rest=0.0,score=0.0,extra=0.0}", "init.source=random"];
 
 #[test]
 fn a_run_ends_with_a_verdict_and_checks_do_not_change_it() {
@@ -175,7 +206,7 @@ fn a_run_ends_with_a_verdict_and_checks_do_not_change_it() {
     let verdict = report.verdict.unwrap();
     assert!(verdict.train_psnr_db > verdict.baselines.blur_db && verdict.baselines.blur_db > verdict.baselines.mean_colour_db, "{verdict:?}");
     assert!(verdict.validation_psnr_db.is_some() && verdict.judgement != Judgement::Doubtful, "{verdict:?}");
-    assert!(events.iter().any(|e| matches!(e, Event::Note { object, message } if object == "verdict" && *message == verdict.sentence)));
+    assert_eq!(verdicts(&events), [&verdict.sentence]);
     let (unchecked, _) = run(&scene, &["train.validation=3", "train.checks=false"]);
     let (same, report) = unchecked.unwrap();
     assert!(report.verdict.is_none() && same.gaussians == model.gaussians);
@@ -186,12 +217,85 @@ fn a_run_ends_with_a_verdict_and_checks_do_not_change_it() {
 }
 
 #[test]
-fn a_run_that_learns_nothing_fails() {
-    let scene = builtin("tiny");
-    let still = "train.lr={means=0.0,means_end=0.0,log_scales=0.0,quaternions=0.0,opacity=0.0,sh_dc=0.0,sh_rest=0.0,score=0.0,extra=0.0}";
-    let (failed, _) = run(&scene, &[still, "init.source=random"]);
+fn a_run_that_learns_nothing_stops_on_its_way() {
+    let (scene, folder) = (builtin("tiny"), tempfile::tempdir().unwrap());
+    let [whole, parts] = ["whole", "parts"].map(|name| folder.path().join(name));
+    // No score stage: the main stage has 800 iterations.
+    let sets = [&LEARNS_NOTHING[..], &["train.shares=[1,0,4]", "train.checkpoint_every=0", "train.log_every=10"]].concat();
+    let last_iteration =
+        |events: &[Event]| events.iter().filter_map(|e| if let Event::Iteration { iteration, .. } = e { Some(*iteration) } else { None }).next_back();
+
+    let (failed, events) = run_in(&scene, &sets, Some(&whole), false, |_| false);
     let error = failed.err().unwrap();
     assert!(matches!(error, Error::Failed { .. }) && error.exit_code() == 6, "{error}");
-    assert!(error.to_string().contains("less than") && error.to_string().contains("train.iterations = 3000"), "{error}");
-    assert!(run(&scene, &[still, "init.source=random", "train.checks=false"]).0.is_ok());
+    for words in ["stopped at iteration 680 of 800 of the main stage", "less than", "train.iterations = 3000"] {
+        assert!(error.to_string().contains(words), "{words}: {error}");
+    }
+    assert_eq!(last_iteration(&events), Some(680));
+    let bytes = |out: &Path| std::fs::read(out.join("checkpoint")).unwrap();
+    let stopped = bytes(&whole);
+
+    // Resumed, it fails with the same words and without an iteration.
+    let (again, events) = run_in(&scene, &sets, Some(&whole), true, |_| false);
+    assert_eq!((again.err().unwrap().to_string(), last_iteration(&events)), (error.to_string(), None));
+    assert!(bytes(&whole) == stopped);
+    // Interrupted between the scores, it ends in the same way.
+    let (interrupted, _) = run_in(&scene, &sets, Some(&parts), false, |e| matches!(e, Event::Iteration { stage, iteration: 500, .. } if stage == "main"));
+    assert!(matches!(interrupted, Err(Error::Interrupted(_))));
+    let (resumed, events) = run_in(&scene, &sets, Some(&parts), true, |_| false);
+    assert_eq!((resumed.err().unwrap().to_string(), last_iteration(&events)), (error.to_string(), Some(680)));
+    assert!(bytes(&parts) == stopped);
+    // Without checks it goes on from there.
+    let unchecked = [&sets[..], &["train.checks=false"]].concat();
+    let (finished, events) = run_in(&scene, &unchecked, Some(&whole), true, |_| false);
+    assert!(finished.unwrap().1.verdict.is_none());
+    assert_eq!(last_iteration(&events), Some(800));
+}
+
+#[test]
+fn short_runs_are_judged_at_their_end_and_shorter_ones_are_not() {
+    let scene = builtin("tiny");
+    let with = |sets: &[&str], iterations: &str| run(&scene, &[sets, &[iterations]].concat());
+    let (failed, _) = with(&LEARNS_NOTHING, "train.iterations=300");
+    let error = failed.err().unwrap();
+    assert!(matches!(error, Error::Failed { .. }) && error.to_string().contains("after 300 iterations training views reach"), "{error}");
+    let (sound, events) = with(&[], "train.iterations=300");
+    assert_eq!(verdicts(&events), [&sound.unwrap().1.verdict.unwrap().sentence]);
+
+    let (unjudged, events) = with(&LEARNS_NOTHING, "train.iterations=299");
+    assert!(unjudged.unwrap().1.verdict.is_none());
+    assert!(matches!(verdicts(&events)[..], [said] if said.contains("299 iterations are too few")), "{events:?}");
+    let (_, events) = with(&LEARNS_NOTHING[..1], "train.checks=false");
+    assert!(verdicts(&events).is_empty());
+}
+
+#[test]
+fn a_static_deformer_is_warned_once() {
+    let (trained, events) = run(&builtin("tiny"), &["deformer={kind='none'}"]);
+    let warned = events.iter().filter(|e| matches!(e, Event::Warning { message, .. } if message.contains("this run holds everything still"))).count();
+    assert!(trained.unwrap().1.verdict.is_some() && warned == 1, "{events:?}");
+}
+
+#[test]
+fn the_readers_validation_views_are_scored_without_being_asked_for() {
+    let tiny = builtin("tiny");
+    let names_them = |readable: bool| {
+        let mut views = tiny.views.clone();
+        views.iter_mut().filter(|view| view.split == Split::Test).for_each(|view| view.split = Split::Validation);
+        let mut scene = remade(&tiny, tiny.cameras.clone(), views, move |scene, view| match scene.views[view].split {
+            Split::Test if !readable => Err(Error::data(format!("view {view}"), "it is damaged", "None")),
+            _ => image(scene, view),
+        });
+        scene.points.clone_from(&tiny.points);
+        Arc::new(scene)
+    };
+    let sets = ["train.iterations=300", "train.validation=0"];
+    let (with, without) = (run(&names_them(true), &sets).0.unwrap(), run(&names_them(true), &[&sets[..], &["train.checks=false"]].concat()).0.unwrap());
+    let verdict = with.1.verdict.unwrap();
+    assert!(verdict.validation_psnr_db.is_some_and(|db| db > verdict.baselines.mean_colour_db), "{verdict:?}");
+    assert!(with.0.gaussians == without.0.gaussians, "scoring validation views changed the training");
+    // Nobody asked for them: damaged ones do not end the run.
+    let (trained, events) = run(&names_them(false), &sets);
+    assert_eq!(trained.unwrap().1.verdict.unwrap().validation_psnr_db, None);
+    assert!(events.iter().any(|e| matches!(e, Event::Warning { object, .. } if object == "validation views")));
 }

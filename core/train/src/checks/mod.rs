@@ -1,13 +1,14 @@
 //! Checks that make a run which cannot work, or did not work, say so.
 //!
 //! Before training, [`check_scene`] looks at images, cameras, times and poses: what cannot be reconstructed is refused, what looks wrong is a doubt. During
-//! the main stage a `Watch` compares the model with baselines that cost nothing; a run that stays below them fails. At the end a [`Verdict`] says in
-//! words how it went.
+//! the main stage a `Watch` compares the model with baselines that cost nothing; a run that stays below them fails, and stops at 85 % of the stage. At the
+//! end a [`Verdict`] says in words how it went.
 
 mod baselines;
 mod cameras;
 mod images;
 mod poses;
+mod rules;
 mod times;
 mod verdict;
 mod watch;

@@ -1,72 +1,80 @@
 //! Scores a model on its way and at its end, and decides whether the run has failed.
 
 use super::baselines::{MovingPixels, Yardstick, psnr_db};
+use super::rules::{GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, shortfall};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::sample::spread;
-use crate::train::{Context, Record, Score, TrainJob, TrainState};
+use crate::train::{Context, Score, TrainJob, TrainState};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
-/// Shorter runs are not judged.
-const LEAST_ITERATIONS: usize = 1000;
-/// Runs whose main stage shows each training camera less often are not judged.
-const LEAST_PASSES: usize = 5;
-/// Where the main stage is scored on its way, percent; its end is scored too.
+/// Where the main stage is scored, percent. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the scores at `HALF` and at `END` decide at the end.
 const HALF: usize = 50;
 const LATE: usize = 85;
-/// A score that is no failure whatever the baselines reach, dB: blurring hardly hurts images with little detail.
-const GOOD_ENOUGH_DB: f64 = 30.0;
-/// A field whose motion gains less than this on moving pixels, against its images of other times, does not follow the motion, dB.
-const MOTION_GAIN_DB: f64 = 0.3;
-/// What a model must gain on the blurred images where poses or times are in doubt, dB.
-const DOUBT_MARGIN_DB: f64 = 3.0;
+const END: usize = 100;
+/// The most views of the reader's own validation split that are scored where `train.validation` asks for none.
+const VALIDATION_VIEWS: usize = 24;
 
 /// Follows one run.
 pub(crate) struct Watch {
     doubts: Vec<Finding>,
-    judged: bool,
+    /// `None` for runs that are not judged.
+    rules: Option<Rules>,
     yardstick: Option<Yardstick>,
     scores: Vec<Score>,
 }
 
 impl Watch {
-    /// Watches the run of `context`, whose scene raised `doubts`, from where `record` ends.
-    pub fn new(context: &Context, doubts: Vec<Finding>, record: &Record) -> Self {
+    /// Watches the run of `context`, whose scene raised `doubts`, from `state` on.
+    ///
+    /// # Errors
+    /// [`Error::Failed`] again, where `state` comes from the checkpoint of a run that stopped because it had failed.
+    pub fn new(context: &Context, doubts: Vec<Finding>, state: &TrainState) -> Result<Self> {
         let train = &context.job.config.train;
-        let drawn = context.lengths.length(Stage::Main) * train.batch;
-        let judged = train.checks && train.iterations >= LEAST_ITERATIONS && drawn >= LEAST_PASSES * context.training_camera.len();
-        Self { doubts, judged, yardstick: None, scores: record.scores.clone() }
-    }
-    /// To be called after every iteration; scores the model at half and at 85 % of the main stage.
-    pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
-        if !self.judged || schedule.stage != Stage::Main {
-            return Ok(());
-        }
-        match [HALF, LATE].into_iter().find(|percent| schedule.iteration == schedule.length * percent / 100) {
-            Some(percent) => {
-                self.score(context, state, percent)?;
-                state.record.scores.clone_from(&self.scores);
-                Ok(())
+        let length = context.lengths.length(Stage::Main);
+        let rules = if train.checks { Rules::of(train.iterations, length * train.batch, context.training_camera.len()) } else { None };
+        let mut watch = Self { doubts, rules, yardstick: None, scores: state.record.scores.clone() };
+        if watch.rules == Some(Rules::All) && state.stage == Stage::Main && state.iteration == length * LATE / 100 && watch.at(LATE).is_some() {
+            watch.measure_baselines(context)?;
+            if let Some(failure) = watch.failure_at(LATE, context, state) {
+                return Err(failure);
             }
-            None => Ok(()),
         }
+        Ok(watch)
     }
-    /// The verdict of a finished run, as an event too; `None` for a run that is too short to be judged.
+    /// To be called after every iteration; scores the model at half and at 85 % of the main stage. Returns the error of a run that has failed at both: it is to
+    /// be stopped.
+    pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, schedule: &Schedule) -> Result<Option<Error>> {
+        if self.rules.is_none() || schedule.stage != Stage::Main {
+            return Ok(None);
+        }
+        let due = |percent: &usize| schedule.iteration == schedule.length * percent / 100;
+        let Some(percent) = [HALF, LATE].into_iter().find(due) else { return Ok(None) };
+        self.score(context, state, percent)?;
+        state.record.scores.clone_from(&self.scores);
+        Ok(if percent == LATE { self.failure_at(LATE, context, state) } else { None })
+    }
+    /// The verdict of a finished run, as an event too; `None` for a run that is too short to be judged, and an event that says so.
     ///
     /// # Errors
     /// [`Error::Failed`] for a model that is not better than what can be had without one.
     pub fn conclude(&mut self, context: &Context, state: &mut TrainState) -> Result<Option<Verdict>> {
-        if !self.judged {
+        let train = &context.job.config.train;
+        let note = |message: String| context.job.events.emit(&Event::Note { object: "verdict".into(), message });
+        if self.rules.is_none() {
+            if train.checks {
+                note(format!("none: {} iterations are too few to be judged, which needs at least {LEAST_ITERATIONS}", train.iterations));
+            }
             return Ok(None);
         }
-        self.score(context, state, 100)?;
-        let (Some(yardstick), Some(end)) = (&self.yardstick, self.scores.last()) else { return Ok(None) };
-        self.refuse_failure(context, state, yardstick)?;
+        self.score(context, state, END)?;
+        let (Some(yardstick), Some(end)) = (&self.yardstick, self.at(END)) else { return Ok(None) };
+        if let Some(failure) = self.failure_at(END, context, state) {
+            return Err(failure);
+        }
         let cap = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).and_then(|cap| usize::try_from(cap).ok());
-        let kept_out = spread(&context.job.scene.split(Split::Validation), context.job.config.train.validation);
-        let validation = if kept_out.is_empty() { None } else { Some(scored(context, state, &kept_out, &mut 0.0)?) };
         // A static scene may well state one time for all images; it is no cause of anything while the model is good.
         let mut doubts = self.doubts.clone();
         if let Some(warning) = same_time(context.job).filter(|_| end.psnr_db < GOOD_ENOUGH_DB) {
@@ -74,8 +82,8 @@ impl Watch {
         }
         let verdict = Evidence {
             train_psnr_db: end.psnr_db,
-            late_psnr_db: self.scores.iter().find(|s| s.percent == LATE).map(|s| s.psnr_db),
-            validation_psnr_db: validation,
+            late_psnr_db: self.at(LATE).map(|s| s.psnr_db),
+            validation_psnr_db: validation_psnr_db(context, state)?,
             moving_psnr_db: end.moving_db,
             detail: end.detail,
             gaussians: state.set.len(),
@@ -85,21 +93,29 @@ impl Watch {
             warnings: &context.job.scene.warnings,
         }
         .verdict();
-        context.job.events.emit(&Event::Note { object: "verdict".into(), message: verdict.sentence.clone() });
+        note(verdict.sentence.clone());
         Ok(Some(verdict))
+    }
+    fn at(&self, percent: usize) -> Option<&Score> {
+        self.scores.iter().find(|s| s.percent == percent)
+    }
+    fn measure_baselines(&mut self, context: &Context) -> Result<()> {
+        if self.yardstick.is_none() {
+            let config = context.job.config;
+            self.yardstick = Some(Yardstick::new(&context.job.scene, config.train.mask_threshold, config.background()?)?);
+        }
+        Ok(())
     }
     fn score(&mut self, context: &Context, state: &mut TrainState, percent: usize) -> Result<()> {
         let scene = &context.job.scene;
         let background = context.job.config.background()?;
-        if self.yardstick.is_none() {
-            self.yardstick = Some(Yardstick::new(scene, context.job.config.train.mask_threshold, background)?);
-        }
+        self.measure_baselines(context)?;
         let Some(yardstick) = &self.yardstick else { return Ok(()) };
         let mut detail = 0.0;
         let psnr = scored(context, state, &yardstick.views, &mut detail)?;
         // Each moving view at its own time and, for comparison, a third and two thirds of the sequence later.
         let mut sums = [0.0; 3];
-        let moving: &[MovingPixels] = if percent == LATE { &[] } else { &yardstick.moving };
+        let moving = &yardstick.moving;
         for (shift, sum) in [0.0, 1.0 / 3.0, 2.0 / 3.0].into_iter().zip(&mut sums) {
             let time = |view: usize| if shift == 0.0 { scene.views[view].time_norm } else { (scene.views[view].time_norm + shift).fract() };
             let requests: Vec<(usize, f32)> = moving.iter().map(|m| (m.view, time(m.view))).collect();
@@ -114,45 +130,36 @@ impl Watch {
             })?;
         }
         let mean = |sum: f64| (!moving.is_empty()).then(|| sum / moving.len() as f64);
+        // Iterations that the watchdog repeats are scored again.
+        self.scores.retain(|s| s.percent != percent);
         self.scores.push(Score { percent, psnr_db: psnr, moving_db: mean(sums[0]), frozen_db: mean(0.5 * (sums[1] + sums[2])), detail });
         Ok(())
     }
-    /// Whether all scores that decide (half of the main stage and its end) are below a baseline.
-    fn always(&self, below: impl Fn(&Score) -> bool) -> bool {
-        self.scores.iter().filter(|s| s.percent != LATE).all(below)
-    }
-    fn refuse_failure(&self, context: &Context, state: &TrainState, yardstick: &Yardstick) -> Result<()> {
-        let baselines = &yardstick.baselines;
-        let Some(end) = self.scores.last() else { return Ok(()) };
-        let reached = format!("after {} iterations training views reach {:.1} dB", context.job.config.train.iterations, end.psnr_db);
-        if self.always(|s| s.psnr_db < baselines.mean_colour_db) {
-            return Err(self.failure(context, format!("{reached}, less than the mean colour of each image ({:.1} dB)", baselines.mean_colour_db)));
-        }
-        let weak = self.always(|s| s.psnr_db < GOOD_ENOUGH_DB);
-        if weak && self.always(|s| s.psnr_db < baselines.blur_db) {
-            return Err(self.failure(context, format!("{reached}, less than the images blurred 16 times ({:.1} dB)", baselines.blur_db)));
-        }
-        let doubted = same_time(context.job).is_some() || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times));
-        if weak && doubted && end.psnr_db < baselines.blur_db + DOUBT_MARGIN_DB {
-            let problem = format!("{reached}, hardly more than the images blurred 16 times ({:.1} dB)", baselines.blur_db);
-            return Err(self.failure(context, problem));
-        }
-        let Some(mean_image) = baselines.mean_image_db else { return Ok(()) };
-        let behind = |s: &Score| match (s.moving_db, s.frozen_db) {
-            (Some(moving), Some(frozen)) => moving < mean_image.min(GOOD_ENOUGH_DB) && moving < frozen + MOTION_GAIN_DB,
-            _ => false,
+    /// The error of a run that has failed at `percent`, of which the baselines are measured. A deformer that is static by choice is warned of, at the end.
+    fn failure_at(&self, percent: usize, context: &Context, state: &TrainState) -> Option<Error> {
+        let (rules, yardstick, now) = (self.rules?, self.yardstick.as_ref()?, self.at(percent)?);
+        let deciding: Vec<Score> = match (self.at(HALF), rules, percent) {
+            (Some(half), Rules::All, _) => vec![*half, *now],
+            (_, _, END) => vec![*now],
+            _ => return None,
         };
-        if !self.always(behind) {
-            return Ok(());
-        }
-        let moving = end.moving_db.unwrap_or(f64::NAN);
-        let problem = format!("pixels that move reach {moving:.1} dB, less than the mean image over time ({mean_image:.1} dB), and motion does not help");
-        if state.moving == Moving::Nothing || state.deformer.as_ref().is_none_or(|d| d.field.is_static()) {
-            let message = format!("{problem}: the scene moves, and this run holds everything still. Choose a deformer and train.dynamic = \"auto\"");
-            context.job.events.emit(&Event::Warning { object: "deformer".into(), message });
-            return Ok(());
-        }
-        Err(self.failure(context, format!("{problem}: the deformer does not follow the motion")))
+        let doubted = same_time(context.job).is_some() || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times));
+        let place = match percent {
+            END => format!("after {} iterations", context.job.config.train.iterations),
+            _ => format!("stopped at iteration {} of {} of the main stage, where", state.iteration, context.lengths.length(Stage::Main)),
+        };
+        let problem = match shortfall(&deciding, &yardstick.baselines, rules, doubted)? {
+            Shortfall::Images(words) => format!("{place} {words}"),
+            Shortfall::Motion(words) if state.moving == Moving::Nothing || state.deformer.as_ref().is_none_or(|d| d.field.is_static()) => {
+                if percent == END {
+                    let remedy = "the scene moves, and this run holds everything still. Choose a deformer and train.dynamic = \"auto\"";
+                    context.job.events.emit(&Event::Warning { object: "deformer".into(), message: format!("{place} {words}: {remedy}") });
+                }
+                return None;
+            }
+            Shortfall::Motion(words) => format!("{place} {words}: the deformer does not follow the motion"),
+        };
+        Some(self.failure(context, problem))
     }
     /// The error of a run that is below a baseline, with the likely cause.
     fn failure(&self, context: &Context, problem: String) -> Error {
@@ -179,6 +186,23 @@ impl Watch {
 /// The reader's warning that all images state one time.
 fn same_time<'a>(job: &'a TrainJob) -> Option<&'a String> {
     job.scene.warnings.iter().find(|warning| warning.starts_with(SAME_TIME))
+}
+
+/// PSNR in dB of the validation views: those of `train.validation`, or else some of the reader's own. An image of the latter that cannot be read is a warning,
+/// because nobody asked for it.
+fn validation_psnr_db(context: &Context, state: &mut TrainState) -> Result<Option<f64>> {
+    let asked = context.job.config.train.validation;
+    let views = spread(&context.job.scene.split(Split::Validation), if asked == 0 { VALIDATION_VIEWS } else { asked });
+    if views.is_empty() {
+        return Ok(None);
+    }
+    match scored(context, state, &views, &mut 0.0) {
+        Err(error @ (Error::Data { .. } | Error::Io { .. })) if asked == 0 => {
+            context.job.events.emit(&Event::Warning { object: "validation views".into(), message: format!("not scored: {error}") });
+            Ok(None)
+        }
+        scored => scored.map(Some),
+    }
 }
 
 /// Mean PSNR in dB of the model on `views`; `detail` becomes the mean slope of its images over that of the true ones.

@@ -192,7 +192,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         let cameras: std::collections::BTreeSet<usize> = views.iter().map(|&view| job.scene.views[view].camera).collect();
         context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.views_per_iteration(stage)));
     }
-    let mut watch = Watch::new(&context, doubts, &state.record);
+    let mut watch = Watch::new(&context, doubts, &state)?;
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
         if stage < state.stage {
@@ -311,7 +311,11 @@ impl Context<'_> {
                 // Back at an earlier state.
                 continue;
             }
-            watch.after_iteration(self, state, &schedule)?;
+            if let Some(failure) = watch.after_iteration(self, state, &schedule)? {
+                state.record.log = log.record();
+                self.save(state)?;
+                return Err(failure);
+            }
             self.validate(state, &schedule)?;
             self.observe(state, &schedule)?;
             if saves {

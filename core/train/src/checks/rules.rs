@@ -1,0 +1,111 @@
+//! When a run has failed: its scores are compared with the baselines.
+
+use super::Baselines;
+use crate::train::Score;
+
+/// A score that is no failure whatever the baselines reach, dB: blurring hardly hurts images with little detail.
+pub(super) const GOOD_ENOUGH_DB: f64 = 30.0;
+/// A field whose motion gains less than this on moving pixels, against its images of other times, does not follow the motion, dB.
+const MOTION_GAIN_DB: f64 = 0.3;
+/// What a model must gain on the blurred images where poses or times are in doubt, dB.
+const DOUBT_MARGIN_DB: f64 = 3.0;
+/// Shorter runs are not judged, in iterations.
+pub(super) const LEAST_ITERATIONS: usize = 300;
+/// Shorter runs are judged by fewer rules, at the end only, in iterations.
+const LEAST_ITERATIONS_FOR_ALL: usize = 1000;
+/// So are runs whose main stage shows each training camera less often.
+const LEAST_PASSES: usize = 5;
+
+/// The rules that a run is long enough for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Rules {
+    /// The mean colour of each image, and the blurred images.
+    Baselines,
+    /// Doubts about poses and times, and motion, too.
+    All,
+}
+
+impl Rules {
+    /// The rules for a run of so many iterations, whose main stage draws `drawn` views of `cameras` cameras; `None` for one that is too short to be judged.
+    pub fn of(iterations: usize, drawn: usize, cameras: usize) -> Option<Self> {
+        let long = iterations >= LEAST_ITERATIONS_FOR_ALL && drawn >= LEAST_PASSES * cameras;
+        (iterations >= LEAST_ITERATIONS).then_some(if long { Self::All } else { Self::Baselines })
+    }
+}
+
+/// A rule that all deciding scores break; the words say what is reached and what is not.
+#[derive(Debug, PartialEq)]
+pub(super) enum Shortfall {
+    /// Whole images.
+    Images(String),
+    /// Pixels that move.
+    Motion(String),
+}
+
+/// The first of `rules` that every one of `scores` breaks; the last score is the present one. `doubted`: poses or times looked wrong before training.
+pub(super) fn shortfall(scores: &[Score], baselines: &Baselines, rules: Rules, doubted: bool) -> Option<Shortfall> {
+    let now = scores.last()?;
+    let always = |below: &dyn Fn(&Score) -> bool| scores.iter().all(below);
+    let images = |words: &str, db: f64| Some(Shortfall::Images(format!("training views reach {:.1} dB, {words} ({db:.1} dB)", now.psnr_db)));
+    if always(&|s| s.psnr_db < baselines.mean_colour_db) {
+        return images("less than the mean colour of each image", baselines.mean_colour_db);
+    }
+    let weak = always(&|s| s.psnr_db < GOOD_ENOUGH_DB);
+    if weak && always(&|s| s.psnr_db < baselines.blur_db) {
+        return images("less than the images blurred 16 times", baselines.blur_db);
+    }
+    if rules != Rules::All {
+        return None;
+    }
+    if weak && doubted && now.psnr_db < baselines.blur_db + DOUBT_MARGIN_DB {
+        return images("hardly more than the images blurred 16 times", baselines.blur_db);
+    }
+    let mean_image = baselines.mean_image_db?;
+    let behind = |s: &Score| match (s.moving_db, s.frozen_db) {
+        (Some(moving), Some(frozen)) => moving < mean_image.min(GOOD_ENOUGH_DB) && moving < frozen + MOTION_GAIN_DB,
+        _ => false,
+    };
+    let moving = now.moving_db.filter(|_| always(&behind))?;
+    let words = format!("pixels that move reach {moving:.1} dB, less than the mean image over time ({mean_image:.1} dB), and motion does not help");
+    Some(Shortfall::Motion(words))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn longer_runs_have_more_rules() {
+        let rules = |iterations, drawn| Rules::of(iterations, drawn, 10);
+        assert_eq!((rules(299, 9000), rules(300, 9000), rules(999, 9000)), (None, Some(Rules::Baselines), Some(Rules::Baselines)));
+        assert_eq!((rules(1000, 49), rules(1000, 50)), (Some(Rules::Baselines), Some(Rules::All)));
+    }
+
+    #[test]
+    fn every_deciding_score_must_break_the_rule() {
+        let baselines = Baselines { mean_colour_db: 12.0, blur_db: 20.0, mean_image_db: Some(18.0) };
+        let score = |psnr_db, [moving, frozen]: [f64; 2]| Score { percent: 0, psnr_db, moving_db: Some(moving), frozen_db: Some(frozen), detail: 1.0 };
+        let (follows, still) = ([24.0, 17.0], [16.0, 15.9]);
+        let of = |rules, doubted, scores: &[(f64, [f64; 2])]| {
+            let scores: Vec<Score> = scores.iter().map(|&(psnr, moving)| score(psnr, moving)).collect();
+            shortfall(&scores, &baselines, rules, doubted)
+        };
+        let images = |found: Option<Shortfall>, words: &str| matches!(&found, Some(Shortfall::Images(said)) if said.contains(words));
+        assert!(images(of(Rules::Baselines, false, &[(11.0, still)]), "reach 11.0 dB, less than the mean colour of each image (12.0 dB)"));
+        assert!(images(of(Rules::Baselines, false, &[(19.0, follows)]), "blurred 16 times (20.0 dB)"));
+        // One score above the baseline is enough.
+        assert!(images(of(Rules::All, false, &[(11.0, still), (11.5, still)]), "reach 11.5 dB"));
+        assert_eq!(of(Rules::All, false, &[(19.0, follows), (21.0, follows)]), None);
+        assert_eq!(of(Rules::All, false, &[(21.0, follows), (19.0, follows)]), None);
+        assert!(images(of(Rules::All, true, &[(19.0, follows), (22.9, follows)]), "hardly more"));
+        assert_eq!((of(Rules::All, true, &[(19.0, follows), (23.1, follows)]), of(Rules::Baselines, true, &[(22.9, follows)])), (None, None));
+        assert!(matches!(of(Rules::All, false, &[(25.0, still), (26.0, still)]), Some(Shortfall::Motion(said)) if said.contains("reach 16.0 dB")));
+        assert_eq!((of(Rules::All, false, &[(25.0, still), (26.0, follows)]), of(Rules::Baselines, false, &[(26.0, still)])), (None, None));
+        // Scores of older checkpoints have no moving pixels at 85 %.
+        let unknown = Score { moving_db: None, frozen_db: None, ..score(26.0, still) };
+        assert_eq!(shortfall(&[score(25.0, still), unknown], &baselines, Rules::All, false), None);
+        // Images without detail: the blurred ones are better than anything.
+        let smooth = Baselines { blur_db: 40.0, ..baselines };
+        assert_eq!(shortfall(&[score(31.0, follows)], &smooth, Rules::All, true), None);
+    }
+}
