@@ -18,6 +18,7 @@ mod golden_geometry;
 mod golden_metrics;
 mod golden_raster;
 mod golden_training;
+mod guard;
 mod image;
 mod lives;
 mod lookup;

@@ -162,6 +162,7 @@ impl Context<'_> {
             let gradient_of = |probe: Option<Tensor<2>>| probe.and_then(|probe| probe.grad(&gradients));
             let (screen_gradient, absolute_screen_gradient) = (gradient_of(screen_probe), gradient_of(absolute_screen_probe));
             let size = (camera.width, camera.height);
+            state.guard.saw(&radii);
             state.density.observe(&ViewStatistics { radii, screen_gradient, absolute_screen_gradient, max_weights, size, views: batch.len() })?;
         }
         let of_gaussians = leaves.gradients(&gradients);

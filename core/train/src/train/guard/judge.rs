@@ -1,0 +1,193 @@
+//! Judges plans by what they cost on training views.
+
+use super::super::{Context, TrainState};
+use super::{MAX_COST_DB, Removal, Reset, Standing, recovery};
+use crate::sample::spread;
+use burn::tensor::{Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{DensityPlan, Event, Result, Schedule};
+
+/// Training views that are rendered to find out.
+const PROBES: usize = 3;
+/// Removals of a smaller share of faint Gaussians are not probed.
+const PROBED_SHARE: f64 = 0.01;
+/// Opacity below which a Gaussian counts as faint.
+const FAINT: f32 = 0.02;
+/// An opacity that undoes a removal in a rendered image: the Gaussian is not drawn.
+const INVISIBLE_LOGIT: f32 = -30.0;
+/// The attribute that a reset sets.
+const OPACITIES: &str = "opacity_logits";
+
+impl Context<'_> {
+    /// Weakens what `plan` removes, and remembers what it resets. Call before the plan is carried out.
+    pub(crate) fn guard_plan(&self, plan: &mut DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        let count = state.set.len();
+        state.guard.read_views()?;
+        let removed = plan.removed(count);
+        if !removed.is_empty() {
+            let logits = to_vec(state.set.get(OPACITIES)?.clone(), OPACITIES)?;
+            let kept = self.kept_after_all(&removed, &logits, state, schedule)?;
+            plan.restore(&kept);
+        }
+        if plan.restarted().iter().any(|name| name == OPACITIES) && !self.begin_reset(state, schedule)? {
+            *plan = without_reset(plan);
+        }
+        state.guard.follow(plan, schedule.iteration);
+        Ok(())
+    }
+
+    /// Those of the rows `removed` that stay.
+    fn kept_after_all(&self, removed: &[usize], logits: &[f32], state: &mut TrainState, schedule: &Schedule) -> Result<Vec<usize>> {
+        let broken = broken_rows(state)?;
+        let (mut kept, mut going) = state.guard.divide(removed, logits, |row| broken[row], schedule);
+        let faint = (FAINT / (1.0 - FAINT)).ln();
+        let harmless = (going.len() as f64) < PROBED_SHARE * logits.len() as f64 && going.iter().all(|&row| logits[row] < faint);
+        if going.is_empty() || (harmless && state.guard.removal.is_none()) {
+            kept.sort_unstable();
+            return Ok(kept);
+        }
+        let probes = self.probes(schedule);
+        let gaussians = state.set.gaussians()?;
+        let psnr_db = self.mean_psnr(state, &gaussians, &probes, schedule.sh_degree)?;
+        match state.guard.standing(psnr_db, schedule) {
+            Standing::Back(from) if harmless => state.guard.removal = Some(from).filter(|from| from.iteration < schedule.iteration),
+            Standing::Back(from) => {
+                while !going.is_empty() {
+                    let mut without = logits.to_vec();
+                    going.iter().for_each(|&row| without[row] = INVISIBLE_LOGIT);
+                    let mut gaussians = gaussians.clone();
+                    gaussians.opacity_logits = Tensor::from_data(TensorData::new(without, [logits.len()]), &self.device);
+                    let cost = from.psnr_db - self.mean_psnr(state, &gaussians, &probes, schedule.sh_degree)?;
+                    if cost <= MAX_COST_DB {
+                        break;
+                    }
+                    let message =
+                        format!("removing {} of {} Gaussians would cost {cost:.1} dB on training views: half of them stay", going.len(), logits.len());
+                    self.note(message);
+                    kept.extend(going.split_off(going.len() / 2));
+                }
+                if !going.is_empty() {
+                    state.guard.removal = Some(from);
+                }
+            }
+            Standing::Waiting => kept.append(&mut going),
+            Standing::Overdue(last) => {
+                self.note(format!(
+                    "{psnr_db:.1} dB on training views {} iterations after Gaussians were removed, {:.1} dB before: none are removed until it is back",
+                    schedule.iteration - last.iteration,
+                    last.psnr_db
+                ));
+                state.guard.removal = Some(Removal { reported: true, ..last });
+                kept.append(&mut going);
+            }
+        }
+        kept.sort_unstable();
+        Ok(kept)
+    }
+
+    /// Remembers what an opacity reset must come back to. False where it is to be left out: one of the stage was undone, the last one is not back, or the time is
+    /// too short to judge it.
+    fn begin_reset(&self, state: &mut TrainState, schedule: &Schedule) -> Result<bool> {
+        if state.guard.resets_off || schedule.left() < recovery(schedule) {
+            return Ok(false);
+        }
+        let gaussians = state.set.gaussians()?;
+        let psnr_db = self.mean_psnr(state, &gaussians, &self.probes(schedule), schedule.sh_degree)?;
+        if state.guard.reset.as_ref().is_some_and(|last| psnr_db < last.psnr_db - MAX_COST_DB) {
+            return Ok(false);
+        }
+        let logits = to_vec(gaussians.opacity_logits.clone(), OPACITIES)?;
+        state.guard.reset = Some(Reset { iteration: schedule.iteration, psnr_db, logits });
+        Ok(true)
+    }
+
+    fn note(&self, message: String) {
+        self.job.events.emit(&Event::Note { object: "density control".into(), message });
+    }
+
+    /// Judges the last opacity reset once its time is over; at the end of the stage in any case.
+    pub(crate) fn guard_reset(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        let Some(reset) = &state.guard.reset else { return Ok(()) };
+        let due = reset.iteration + recovery(schedule);
+        if schedule.iteration >= due || schedule.left() == 0 { self.judge_reset(state, schedule) } else { Ok(()) }
+    }
+
+    fn judge_reset(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
+        let Some(reset) = state.guard.reset.take() else { return Ok(()) };
+        let gaussians = state.set.gaussians()?;
+        let now = self.mean_psnr(state, &gaussians, &self.probes(schedule), schedule.sh_degree)?;
+        if now >= reset.psnr_db - MAX_COST_DB {
+            return Ok(());
+        }
+        let message = format!(
+            "{:.1} dB on training views {} iterations after the opacity reset, {:.1} dB before it: the opacities return, and the stage has no more resets",
+            now,
+            schedule.iteration - reset.iteration,
+            reset.psnr_db
+        );
+        self.note(message);
+        state.guard.resets_off = true;
+        let logits = to_vec(gaussians.opacity_logits, OPACITIES)?;
+        let count = logits.len();
+        let higher: Vec<f32> = logits.iter().zip(&reset.logits).map(|(now, before)| now.max(*before)).collect();
+        state.set.set(OPACITIES, Tensor::from_data(TensorData::new(higher, [count, 1]), &self.device))?;
+        state.optimizer.restart("gaussians/opacity_logits");
+        Ok(())
+    }
+
+    fn probes(&self, schedule: &Schedule) -> Vec<usize> {
+        spread(&self.stage_views(schedule.stage), PROBES)
+    }
+}
+
+/// The Gaussians with a value that is not finite `[N]`.
+fn broken_rows(state: &TrainState) -> Result<Vec<bool>> {
+    let mut broken = vec![false; state.set.len()];
+    for (name, values) in state.set.iter() {
+        let width = values.dims()[1].max(1);
+        for (row, values) in broken.iter_mut().zip(to_vec(values.clone(), name)?.chunks_exact(width)) {
+            *row |= values.iter().any(|v| !v.is_finite());
+        }
+    }
+    Ok(broken)
+}
+
+/// `plan` with the opacities that the Gaussians, or the parents of new ones, have now.
+fn without_reset(plan: &DensityPlan) -> DensityPlan {
+    let mut other = DensityPlan::new();
+    for (&parent, &fresh) in plan.parents().iter().zip(plan.fresh()) {
+        if fresh {
+            other.copy(parent)
+        } else {
+            other.keep(parent)
+        };
+    }
+    for set in plan.values().iter().filter(|set| set.attribute != OPACITIES) {
+        let width = set.values.len() / set.rows.len().max(1);
+        for (&row, values) in set.rows.iter().zip(set.values.chunks_exact(width.max(1))) {
+            other.set(row, &set.attribute, values);
+        }
+    }
+    plan.restarted().iter().filter(|name| *name != OPACITIES).for_each(|name| other.restart(name));
+    other.report = plan.report;
+    other
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_reset_is_left_out_of_a_plan_and_nothing_else() {
+        let mut plan = DensityPlan::new();
+        let (kept, copy) = (plan.keep(2), plan.copy(1));
+        [kept, copy].iter().for_each(|&row| plan.set(row, OPACITIES, &[-4.0]));
+        plan.set(copy, "means", &[1.0, 2.0, 3.0]);
+        plan.restart(OPACITIES);
+        plan.restart("means");
+        plan.report.cloned = 1;
+        let other = without_reset(&plan);
+        assert_eq!((other.parents(), other.fresh(), other.report), (plan.parents(), plan.fresh(), plan.report));
+        assert_eq!((other.restarted(), other.values()), (&["means".to_string()][..], &plan.values()[1..]));
+    }
+}

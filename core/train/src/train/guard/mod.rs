@@ -1,0 +1,288 @@
+//! Keeps density control from destroying what is already fitted, whatever the control.
+//!
+//! - Gaussians with values that are not finite always go. Of the others:
+//! - Nothing is removed before the cameras of the stage had two passes to fit it: not in the first passes of a stage, and no Gaussian that is younger.
+//! - A Gaussian that was drawn in fewer than 16 views stays longer, up to a sixth of the stage.
+//! - One round removes at most a quarter of the Gaussians.
+//! - A removal that costs more than 0.3 dB on training views at once is halved, the most opaque Gaussians being kept, and then left out.
+//! - After such a removal, what training views lost must be back within a stated number of iterations. Until then removals together may cost no more than one;
+//!   where the PSNR is lower, the next ones are put off.
+//! - After an opacity reset, the PSNR of training views must be back within the same time; else the opacities return, and the stage has no more resets. A reset
+//!   is left out where this time is not left, and while the last one is not back.
+
+mod judge;
+
+use burn::tensor::{Int, Tensor};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{DensityPlan, Error, Result, Schedule};
+
+/// Passes over the cameras of a stage before a Gaussian may be removed.
+const PATIENCE_PASSES: usize = 2;
+/// The largest share of a stage that these passes, and the views below, may take.
+const PATIENCE_SHARE: usize = 6;
+/// The least iterations a Gaussian is given.
+const LEAST_PATIENCE: usize = 50;
+/// Views in which a Gaussian is drawn before it may be removed.
+const VIEWS: f32 = 16.0;
+/// Largest share of the Gaussians that one round removes.
+const MAX_REMOVED: f64 = 0.25;
+/// What one round may cost on training views, in dB.
+const MAX_COST_DB: f32 = 0.3;
+/// Iterations within which the PSNR must be back after an opacity reset or a removal, at least; and passes over the cameras.
+const RECOVERY: usize = 400;
+const RECOVERY_PASSES: usize = 4;
+
+/// What the guard remembers between iterations.
+#[derive(Clone, Debug, Default)]
+pub struct Guard {
+    /// Iteration of the stage in which each Gaussian was added; 0 for those it began with `[N]`.
+    born: Vec<f32>,
+    /// Views in which each Gaussian was drawn since then, up to the last plan `[N]`.
+    drawn: Vec<f32>,
+    /// Views since the last plan, on the device `[N]`.
+    drawn_since: Option<Tensor<1>>,
+    /// The last removal that was measured, until the PSNR is back.
+    removal: Option<Removal>,
+    /// The last opacity reset, until it is judged.
+    reset: Option<Reset>,
+    /// Whether an opacity reset of the stage was undone.
+    resets_off: bool,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct Reset {
+    iteration: usize,
+    psnr_db: f32,
+    /// Opacity logits before it `[N]`.
+    logits: Vec<f32>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct Removal {
+    /// Iteration and PSNR from which losses count.
+    iteration: usize,
+    psnr_db: f32,
+    /// Whether a message said that the PSNR is not back in time.
+    reported: bool,
+}
+
+/// What the last removal means for the next.
+#[derive(Debug, PartialEq)]
+enum Standing {
+    /// It may go; its loss counts from here.
+    Back(Removal),
+    /// It is put off.
+    Waiting,
+    /// It is put off, and the time is over: the removal that is not back, to be reported.
+    Overdue(Removal),
+}
+
+/// Iterations that the PSNR has to come back.
+fn recovery(schedule: &Schedule) -> usize {
+    RECOVERY.max(RECOVERY_PASSES * schedule.pass)
+}
+
+impl Guard {
+    /// A stage begins with `count` Gaussians.
+    pub fn begin_stage(&mut self, count: usize) {
+        *self = Self { born: vec![0.0; count], drawn: vec![0.0; count], ..Self::default() };
+    }
+    /// A training view drew the Gaussians with these radii, 0 where it did not `[N]`. Nothing is read from the device.
+    pub(super) fn saw(&mut self, radii: &Tensor<1, Int>) {
+        if radii.dims()[0] == self.born.len() {
+            let drawn = radii.clone().greater_elem(0).float();
+            self.drawn_since = Some(match self.drawn_since.take() {
+                Some(sum) => sum + drawn,
+                None => drawn,
+            });
+        }
+    }
+    /// Views in which each Gaussian was drawn `[N]`.
+    fn drawn_until_now(&self) -> Result<Vec<f32>> {
+        let Some(since) = &self.drawn_since else { return Ok(self.drawn.clone()) };
+        Ok(self.drawn.iter().zip(to_vec(since.clone(), "views of Gaussians")?).map(|(before, since)| before + since).collect())
+    }
+    /// Reads the count of views from the device.
+    fn read_views(&mut self) -> Result<()> {
+        self.drawn = self.drawn_until_now()?;
+        self.drawn_since = None;
+        Ok(())
+    }
+    /// Arrays for checkpoints, by name.
+    pub fn state(&self) -> Vec<(String, Vec<f32>)> {
+        // A device that cannot be read fails the checkpoint at its Gaussians.
+        let drawn = self.drawn_until_now().unwrap_or_else(|_| self.drawn.clone());
+        let mut arrays = vec![("born".to_string(), self.born.clone()), ("drawn".into(), drawn)];
+        if let Some(removal) = &self.removal {
+            arrays.push(("removal".into(), vec![removal.iteration as f32, removal.psnr_db, f32::from(removal.reported)]));
+        }
+        if let Some(reset) = &self.reset {
+            arrays.push(("reset".into(), vec![reset.iteration as f32, reset.psnr_db]));
+            arrays.push(("logits".into(), reset.logits.clone()));
+        }
+        if self.resets_off {
+            arrays.push(("resets_off".into(), vec![1.0]));
+        }
+        arrays
+    }
+    /// What [`Guard::state`] returned, for `count` Gaussians.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for arrays of another length or name.
+    pub fn restore(state: Vec<(String, Vec<f32>)>, count: usize) -> Result<Self> {
+        let damaged = |problem: String| Error::data("checkpoint: guard of density control", problem, "Use another checkpoint of the run");
+        let (mut born, mut drawn, mut removal, mut numbers, mut logits, mut resets_off) = (None, None, None, None, None, None);
+        for (name, values) in state {
+            let (slot, length) = match name.as_str() {
+                "born" => (&mut born, count),
+                "drawn" => (&mut drawn, count),
+                "removal" => (&mut removal, 3),
+                "reset" => (&mut numbers, 2),
+                "logits" => (&mut logits, count),
+                "resets_off" => (&mut resets_off, 1),
+                _ => return Err(damaged(format!("there is no array '{name}'"))),
+            };
+            if values.len() != length || values.iter().any(|v| !v.is_finite()) {
+                return Err(damaged(format!("'{name}' has {} values for {count} Gaussians, or some that are not finite", values.len())));
+            }
+            *slot = Some(values);
+        }
+        let iteration = |number: f32| number.max(0.0) as usize;
+        let reset = match (numbers.as_deref(), logits) {
+            (Some([at, psnr_db]), Some(logits)) => Some(Reset { iteration: iteration(*at), psnr_db: *psnr_db, logits }),
+            (None, None) => None,
+            _ => return Err(damaged("half of an opacity reset is missing".into())),
+        };
+        let removal = match removal.as_deref() {
+            Some([at, psnr_db, reported]) => Some(Removal { iteration: iteration(*at), psnr_db: *psnr_db, reported: *reported > 0.0 }),
+            _ => None,
+        };
+        // Older programs counted no views.
+        let drawn = drawn.unwrap_or_else(|| vec![0.0; count]);
+        let born = born.ok_or_else(|| damaged("'born' is missing".into()))?;
+        Ok(Self { born, drawn, drawn_since: None, removal, reset, resets_off: resets_off.is_some() })
+    }
+    /// The Gaussians are those of `plan` now. Call [`Guard::read_views`] first.
+    fn follow(&mut self, plan: &DensityPlan, iteration: usize) {
+        let of = |old: &[f32], new: f32| plan.parents().iter().zip(plan.fresh()).map(|(&parent, &fresh)| if fresh { new } else { old[parent] }).collect();
+        (self.born, self.drawn) = (of(&self.born, iteration as f32), of(&self.drawn, 0.0));
+        if let Some(reset) = &mut self.reset {
+            reset.logits = plan.parents().iter().map(|&parent| reset.logits[parent]).collect();
+        }
+    }
+    /// Divides the rows that a plan removes: those that stay because they are too young or too many, and those that may go, the faintest first. Broken rows
+    /// (`is_broken`) are in neither: they go in any case.
+    fn divide(&self, removed: &[usize], logits: &[f32], is_broken: impl Fn(usize) -> bool, schedule: &Schedule) -> (Vec<usize>, Vec<usize>) {
+        let whole = removed.iter().copied().filter(|&row| !is_broken(row));
+        let (mut kept, mut going): (Vec<usize>, Vec<usize>) = whole.partition(|&row| self.is_young(row, schedule));
+        going.sort_by(|&a, &b| logits[a].total_cmp(&logits[b]).then(a.cmp(&b)));
+        let most = (MAX_REMOVED * logits.len() as f64).ceil() as usize;
+        kept.extend(going.split_off(going.len().min(most)));
+        (kept, going)
+    }
+    /// Whether the Gaussian `row` is too young, or was drawn in too few views, to be judged.
+    fn is_young(&self, row: usize, schedule: &Schedule) -> bool {
+        let most = (schedule.length / PATIENCE_SHARE).max(LEAST_PATIENCE);
+        let patience = (PATIENCE_PASSES * schedule.pass).clamp(LEAST_PATIENCE, most);
+        let age = schedule.iteration.saturating_sub(self.born[row] as usize);
+        age < patience || (age < most && self.drawn[row] < VIEWS)
+    }
+    /// Whether the next removal may go, where training views have `psnr_db` now. Within the time that the last one has to come back, losses count from before it.
+    fn standing(&self, psnr_db: f32, schedule: &Schedule) -> Standing {
+        let now = Removal { iteration: schedule.iteration, psnr_db, reported: false };
+        let Some(last) = &self.removal else { return Standing::Back(now) };
+        let over = schedule.iteration >= last.iteration + recovery(schedule);
+        let near = psnr_db >= last.psnr_db - MAX_COST_DB;
+        match () {
+            () if psnr_db >= last.psnr_db || (near && over) => Standing::Back(now),
+            () if near => Standing::Back(last.clone()),
+            () if over && !last.reported => Standing::Overdue(last.clone()),
+            () => Standing::Waiting,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_young_are_spared_and_rows_are_followed() {
+        let mut guard = Guard::default();
+        guard.begin_stage(3);
+        guard.drawn = vec![VIEWS; 3];
+        let at = |iteration| Schedule { iteration, pass: 100, ..Schedule::main(6000) };
+        assert!(guard.is_young(0, &at(199)) && !guard.is_young(0, &at(200)));
+        let mut plan = DensityPlan::new();
+        plan.keep(2);
+        plan.copy(1);
+        guard.reset = Some(Reset { iteration: 250, psnr_db: 20.0, logits: vec![0.0, 1.0, 2.0] });
+        guard.follow(&plan, 300);
+        assert!(!guard.is_young(0, &at(320)) && guard.is_young(1, &at(320)));
+        assert_eq!(guard.drawn, [VIEWS, 0.0]);
+        assert_eq!(guard.reset.as_ref().unwrap().logits, [2.0, 1.0]);
+        guard.removal = Some(Removal { iteration: 290, psnr_db: 21.0, reported: true });
+        assert_eq!(Guard::restore(guard.state(), 2).unwrap().state(), guard.state());
+        assert!(Guard::restore(guard.state(), 3).is_err());
+        let half: Vec<_> = guard.state().into_iter().filter(|(name, _)| name != "logits").collect();
+        assert!(Guard::restore(half, 2).is_err());
+    }
+
+    #[test]
+    fn the_faintest_go_and_broken_ones_are_never_kept() {
+        let mut guard = Guard::default();
+        guard.begin_stage(8);
+        let at = |iteration| Schedule { iteration, pass: 1, ..Schedule::main(6000) };
+        let logits = [0.0, -1.0, -2.0, -3.0, f32::NAN, 1.0, 2.0, 3.0];
+        // Two of eight may go; row 4 goes whatever its age.
+        let divided = guard.divide(&[0, 1, 2, 3, 4], &logits, |row| row == 4, &at(5000));
+        assert_eq!(divided, (vec![1, 0], vec![3, 2]));
+        assert_eq!(guard.divide(&[0, 4], &logits, |row| row == 4, &at(1)), (vec![0], vec![]));
+    }
+
+    #[test]
+    fn short_stages_are_not_all_patience() {
+        let mut guard = Guard::default();
+        guard.begin_stage(1);
+        let at = |iteration| Schedule { iteration, pass: 810, ..Schedule::main(600) };
+        assert!(guard.is_young(0, &at(99)) && !guard.is_young(0, &at(100)));
+    }
+
+    #[test]
+    fn what_few_views_drew_stays_up_to_a_share_of_the_stage() {
+        let device = burn::tensor::Device::flex();
+        let mut guard = Guard::default();
+        guard.begin_stage(2);
+        let at = |iteration| Schedule { iteration, pass: 10, ..Schedule::main(6000) };
+        for view in 0..VIEWS as usize {
+            let radii = Tensor::<1, Int>::from_ints([3, i32::from(view > 0)], &device);
+            guard.saw(&radii);
+        }
+        // A checkpoint between two plans keeps what the device counted.
+        guard = Guard::restore(guard.state(), 2).unwrap();
+        assert!(guard.is_young(0, &at(49)) && !guard.is_young(0, &at(50)));
+        assert!(guard.is_young(1, &at(999)) && !guard.is_young(1, &at(1000)), "views that never draw it do not keep it for ever");
+        guard.saw(&Tensor::<1, Int>::from_ints([0, 7], &device));
+        guard.read_views().unwrap();
+        assert!(!guard.is_young(1, &at(50)) && guard.drawn == [VIEWS; 2]);
+    }
+
+    #[test]
+    fn losses_of_removals_do_not_add_up() {
+        let at = |iteration| Schedule { iteration, ..Schedule::main(30_000) };
+        let removal = |iteration, psnr_db| Removal { iteration, psnr_db, reported: false };
+        let mut guard = Guard::default();
+        assert_eq!(guard.standing(25.0, &at(1000)), Standing::Back(removal(1000, 25.0)));
+        guard.removal = Some(removal(1000, 25.0));
+        // Within the time, losses count from the PSNR before it.
+        assert_eq!(guard.standing(24.75, &at(1100)), Standing::Back(removal(1000, 25.0)));
+        assert_eq!(guard.standing(25.5, &at(1100)), Standing::Back(removal(1100, 25.5)));
+        assert_eq!(guard.standing(24.6, &at(1100)), Standing::Waiting);
+        assert_eq!(guard.standing(f32::NAN, &at(1100)), Standing::Waiting);
+        // Afterwards what is not back is reported once.
+        assert_eq!(guard.standing(24.75, &at(1400)), Standing::Back(removal(1400, 24.75)));
+        assert_eq!(guard.standing(24.6, &at(1400)), Standing::Overdue(removal(1000, 25.0)));
+        guard.removal = Some(Removal { reported: true, ..removal(1000, 25.0) });
+        assert_eq!(guard.standing(24.6, &at(9000)), Standing::Waiting);
+    }
+}
