@@ -6,8 +6,8 @@
 
 Every scene is trained once per setting, evaluated once on its held-out views, and reported as one row: PSNR (whole images, moving pixels) and its gain over `none`,
 SSIM, Gaussians, seconds, exit code, and the plan. `auto+FIELD` exchanges the deformer of the plan; `none` is `auto+none`. All of these get `--minutes`. Another name
-is a preset. It gets as many iterations as take about as long as `auto` took on the scene (`--minutes` with --without-auto): short trainings are timed first, which
-the column of seconds leaves out. Trainings that run side by side share the machine, so their seconds belong to that number of jobs.
+is a preset. It is trained again with other numbers of iterations until it takes as long as `auto` took on the scene (`--minutes` with --without-auto), to within a
+quarter; the seventh training counts, whatever it takes. The seconds are those of the training that counts. `--jobs` above 1 makes trainings slower.
 
 Finished rows are kept in OUT/rows.json and not run again. OUT/machine.json has the medians of `bench step`, measured before the first training. Floors are in
 benches/captures.json, for `auto`: `psnr_db` of whole images; `gain_db` over `none`, of whole images or of moving pixels, checked where `none` is trained too. A row
@@ -26,6 +26,7 @@ import tomllib
 
 CAPTURES = ["dome", "rig", "handheld", "photos", "turntable", "sparse", "long", "exposure", "lens", "units", "dark", "appear"]
 SCORES = ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians"]
+STATED = ["minutes", "jobs", "threads", "sets"]
 TRAINED = [0, 6]  # Exit codes of trainings that leave a model; 6 is one below simple baselines.
 
 
@@ -37,8 +38,7 @@ def run(binary, arguments, log):
 
 
 def last_line(log):
-    lines = [line.strip() for line in open(log, errors="replace").read().replace("\r", "\n").splitlines() if line.strip()]
-    return lines[-1][:400] if lines else ""
+    return open(log, errors="replace").read().replace("\r", "\n").strip().split("\n")[-1].strip()[:400]
 
 
 def is_planned(setting):
@@ -60,13 +60,20 @@ def machine(options):
     return found
 
 
-def iterations_for(seconds_of, target):
-    """Iterations that take `target` seconds. A training of a tenth of the time says what an iteration costs once Gaussians were added."""
-    first, length = seconds_of(20), 60
-    for share in [0.1, 1.0]:
-        each = max((seconds_of(length) - first) / (length - 20), 1e-4)
-        length = max(60, 20 + int((share * target - first) / each))
-    return length
+def train_for(target, train_with):
+    """Iterations, exit code and seconds of the last of at most seven trainings, which approach `target` seconds by the secant method."""
+    known, length = (20, train_with(20)[1]), 60
+    for _ in range(6):
+        trained, (code, seconds) = length, train_with(length)
+        if code not in TRAINED or abs(seconds - target) < 0.25 * target:
+            break
+        # Times of short trainings are uncertain: an iteration takes at least half of the mean, and at most ten times as many follow.
+        each = max((seconds - known[1]) / (trained - known[0]), 0.5 * seconds / trained)
+        length = min(max(60, trained + int((target - seconds) / each)), 10 * trained)
+        if length == trained:
+            break
+        known = (trained, seconds)
+    return trained, code, seconds
 
 
 def train(options, name, path, setting, target):
@@ -74,35 +81,28 @@ def train(options, name, path, setting, target):
     out = options.out / f"{name}-{setting.replace('+', '-')}"
     shared = ["--quiet", "--threads", str(options.threads)]
 
-    def fit(out, arguments):
-        sets = [word for text in [*options.sets, *arguments] for word in ("--set", text)]
+    def fit(*sets):
         chosen = [] if setting == "auto" else ["--preset", "auto+none" if setting == "none" else setting]
         planned = ["--minutes", str(options.minutes)] if is_planned(setting) else []
+        sets = [word for text in [*options.sets, *sets] for word in ("--set", text)]
         return run(options.bin, ["train", "--scene", path, "--out", str(out), "--overwrite", *shared, *chosen, *planned, *sets], out.with_suffix(".train.log"))
 
-    def seconds_of(iterations):
-        short = out.with_name(f"{out.name}-timed")
-        code, seconds = fit(short, [f"train.iterations={iterations}"])
-        if code not in TRAINED:
-            raise RuntimeError(f"a training of {iterations} iterations: {last_line(short.with_suffix('.train.log'))}")
-        return seconds
-
-    row = {"scene": name, "setting": setting, "minutes": options.minutes, "sets": options.sets, "threads": options.threads, "jobs": options.jobs}
-    if not is_planned(setting):
-        try:
-            row["iterations"] = iterations_for(seconds_of, target())
-        except RuntimeError as error:
-            return row | {"exit": 1, "seconds": 0.0, "said": str(error)}
-    code, seconds = fit(out, [f"train.iterations={row['iterations']}"] if "iterations" in row else [])
+    row = {"scene": name, "setting": setting} | {key: getattr(options, key) for key in STATED}
+    if is_planned(setting):
+        code, seconds = fit()
+    else:
+        wanted = target()
+        row["iterations"], code, seconds = train_for(wanted, lambda iterations: fit(f"train.iterations={iterations}"))
+        row["wanted_seconds"] = round(wanted, 1)
     row |= {"exit": code, "seconds": round(seconds, 1)}
     if code != 0:
         row["said"] = last_line(out.with_suffix(".train.log"))
-    if (config := out / "config.toml").exists():
-        row["plan"] = tomllib.loads(config.read_text()).get("auto", {}).get("plan", [])
+    config = out / "config.toml"
+    row["plan"] = tomllib.loads(config.read_text()).get("auto", {}).get("plan", []) if config.exists() else []
     if code in TRAINED:
         report, log = out.with_suffix(".json"), out.with_suffix(".eval.log")
         eval_code, _ = run(options.bin, ["eval", str(out), "--scene", path, "--split", "test", f"--json={report}", *shared], log)
-        found = json.loads(report.read_text()) if eval_code == 0 else {}
+        found = json.loads(report.read_text()) if eval_code == 0 else None
         row |= {key: found.get(key) for key in SCORES} if found else {"said": last_line(log)}
     return row
 
@@ -157,9 +157,8 @@ def main():
         scenes = [scene for scene in scenes if scene[0] in options.only.split(",")]
     settings = [*([] if options.without_auto else ["auto"]), *options.settings, *(f"auto+{field}" for field in options.fields.split(",") if field)]
     settings = list(dict.fromkeys(settings))
-    kept, lock = options.out / "rows.json", threading.Lock()
+    kept, lock, found = options.out / "rows.json", threading.Lock(), machine(options)
     rows = json.loads(kept.read_text()) if kept.exists() else []
-    found = machine(options)
 
     def row_of(name, path, setting, auto):
         wanted = (name, setting, options.minutes, options.sets)
@@ -188,10 +187,10 @@ def main():
             if "auto" in of_scene:
                 below += missed(of_scene["auto"], of_scene.get("none"), floors.get(name, {}))
     if options.json:
-        whole = {"minutes": options.minutes, "jobs": options.jobs, "threads": options.threads, "sets": options.sets, "machine": found, "rows": finished}
-        options.json.write_text(json.dumps(whole | {"floors": {name: floors[name] for name, _ in scenes if name in floors}, "below": below}, indent=1) + "\n")
-    for text in below:
-        print(f"below its floor: {text}", file=sys.stderr)
+        of_scenes = {name: floors[name] for name, _ in scenes if name in floors}
+        whole = {key: getattr(options, key) for key in STATED} | {"machine": found, "rows": finished, "floors": of_scenes, "below": below}
+        options.json.write_text(json.dumps(whole, indent=1) + "\n")
+    print("".join(f"below its floor: {text}\n" for text in below), end="", file=sys.stderr)
     return 1 if below else 0
 
 

@@ -43,6 +43,10 @@ pub struct PointCloud {
 pub trait FrameSource: Send + Sync {
     /// The image of `view`, undistorted and at the size of its camera.
     fn load(&self, view: usize) -> Result<Image8>;
+    /// Which pixels of that image see something that moves, where this is known: white (first channel over 127), at the size of the image.
+    fn motion_mask(&self, _view: usize) -> Result<Option<Image8>> {
+        Ok(None)
+    }
 }
 
 /// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes; clones share the cache.
@@ -118,6 +122,15 @@ impl Scene {
     /// The image of a view, from the cache or decoded now.
     pub fn frame(&self, view: usize) -> Result<Arc<Image8>> {
         self.frames.get(view)
+    }
+    /// Which pixels of a view see something that moves, row by row, where the dataset knows it (built-in captures do). `None` for a scene of one frame.
+    /// Computed at every call. For scores, not for training.
+    pub fn motion_mask(&self, view: usize) -> Result<Option<Vec<bool>>> {
+        if self.frame_count < 2 {
+            return Ok(None);
+        }
+        let white = |mask: Image8| mask.data.chunks_exact(mask.channels as usize).map(|pixel| pixel[0] > 127).collect();
+        Ok(self.frames.source.motion_mask(view)?.map(white))
     }
     /// 1.1 x the largest distance of a training camera from their mean, the scale of position learning rates (Inria's `cameras_extent`).
     pub fn extent(&self) -> f32 {

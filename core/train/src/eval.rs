@@ -63,7 +63,7 @@ pub struct ImageScore {
     pub frame: usize,
     /// Peak signal-to-noise ratio, 8-bit images, all pixels and channels.
     pub psnr_db: f64,
-    /// The same over the pixels that see something move; absent where the camera has no such pixel, or one frame only.
+    /// The same over the pixels that see something move ([`EvalReport::psnr_dynamic_db`]); absent where there is no such pixel.
     pub psnr_dynamic_db: Option<f64>,
     /// Structural similarity, Inria's convention.
     pub ssim: f64,
@@ -90,7 +90,9 @@ pub struct EvalReport {
     pub split: Split,
     /// Mean over images.
     pub psnr_db: f64,
-    /// Mean over the images that have it, of the pixels that see something move: temporal deviation over the training threshold (Swift4D's masks).
+    /// Mean over the images that have it, of the pixels that see something move. For a camera with two scored frames or more these are the pixels whose
+    /// temporal deviation is over the training threshold (Swift4D's masks), the same in all frames. For other cameras they are the pixels of the image that
+    /// show a moving object, where the dataset knows them ([`Scene::motion_mask`]: built-in scenes).
     pub psnr_dynamic_db: Option<f64>,
     /// Mean over images, Inria's convention.
     pub ssim: f64,
@@ -186,9 +188,8 @@ pub fn evaluate(
     let metric = |m: Metric| m.over(frames.clone());
     let psnr_metric = metric(Metric::psnr(Rounding::EightBit));
     let dynamic_metric = metric(Metric::psnr(Rounding::EightBit).masked());
-    let masks: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, PUBLISHED_SIGMA, background, events)?
+    let over_time: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, PUBLISHED_SIGMA, background, events)?
         .into_iter()
-        .filter(|m| m.mask.contains(&1.0))
         .map(|m| (scene.views[m.view].camera, m.mask.iter().map(|v| *v > 0.0).collect()))
         .collect();
     let usual = usual_images(scene, split, background)?;
@@ -220,7 +221,8 @@ pub fn evaluate(
             }
             Err(_) => None,
         };
-        let mask = masks.get(&scene.views[view].camera);
+        let known = if over_time.contains_key(&scene.views[view].camera) { None } else { scene.motion_mask(view)? };
+        let mask = over_time.get(&scene.views[view].camera).or(known.as_ref()).filter(|mask| mask.contains(&true));
         let shape = [3, camera.height as usize, camera.width as usize];
         let planes = mask.map(|mask| ([&truth, &render].map(|image| image.to_planes(background)), mask));
         let masked = |metric: &Metric| planes.as_ref().map(|([a, b], mask)| metric.score(a, b, shape, Some(mask))).transpose();

@@ -277,3 +277,31 @@ fn every_field_trains_resumes_plays_and_is_archived() {
         assert!(weightless || (deform[1] < deform[0] && deform[2] < deform[1]), "{method}: {deform:?} bytes of weights");
     }
 }
+
+/// Moving pixels of a moving camera are those that show something that moves; of fixed cameras those that change over time, in all frames alike.
+#[test]
+fn moving_pixels_are_scored_for_moving_cameras_too() {
+    let session = cc4dgs::Session::builder().device("flex").build().unwrap();
+    let scored = |name: &str, frames: &str| {
+        let config = session.config("demo", &["scene.width=40", frames, "train.iterations=12", "init.source=random", "init.count=200"]).unwrap();
+        let scene = Arc::new(session.read_scene(format!("procedural:captures/{name}"), &config.scene).unwrap());
+        let model = session.train(&config, scene.clone(), None).unwrap();
+        let mut by_hand = Vec::new();
+        let report = evaluate(&model, &scene, Scored::all(Split::Test), session.registry(), session.device(), &Silent, &mut |view, truth, render, score| {
+            let mask = scene.motion_mask(view)?;
+            let squares = mask.iter().flatten().zip(truth.data.chunks_exact(3).zip(render.data.chunks_exact(3))).filter(|(moves, _)| **moves);
+            let errors: Vec<f64> = squares.flat_map(|(_, (a, b))| (0..3).map(|k| (f64::from(a[k]) - f64::from(b[k])).powi(2)).collect::<Vec<_>>()).collect();
+            let mean = errors.iter().sum::<f64>() / errors.len() as f64;
+            by_hand.push(score.psnr_dynamic_db.map(|psnr| psnr - 10.0 * (255.0 * 255.0 / mean).log10()));
+            Ok(())
+        });
+        (report.unwrap(), by_hand)
+    };
+    let (handheld, differences) = scored("handheld", "scene.frames=[0,12,1]");
+    assert!(handheld.psnr_dynamic_db.is_some() && handheld.ssim_dynamic.is_some());
+    assert!(differences.len() == 2 && differences.iter().all(|difference| difference.unwrap().abs() < 1e-6), "{differences:?}");
+    let (dome, differences) = scored("dome", "scene.frames=[0,3,1]");
+    assert!(dome.psnr_dynamic_db.is_some() && differences.iter().any(|difference| difference.unwrap().abs() > 1e-3), "{differences:?}");
+    let (photos, _) = scored("photos", "scene.max_views=8");
+    assert!(photos.psnr_dynamic_db.is_none() && photos.ssim_dynamic.is_none());
+}

@@ -33,12 +33,31 @@ pub(super) struct SceneFrames {
     pub limits: Limits,
 }
 
+impl SceneFrames {
+    fn job(&self, view: usize) -> Result<&Job> {
+        let missing = || Error::parameter(format!("view {view}"), format!("the scene has {} views", self.jobs.len()), "Ask for a view that exists");
+        self.jobs.get(view).ok_or_else(missing)
+    }
+}
+
+/// `image`, called `name` in errors, without the lens and at its final size. Refuses one that has not the size `expected`.
+fn fitted(image: &Image8, name: &str, expected: [u32; 2], plan: &Plan) -> Result<Image8> {
+    if [image.width, image.height] != expected {
+        return Err(Error::data(
+            name,
+            format!("{}x{} pixels where {}x{} are expected", image.width, image.height, expected[0], expected[1]),
+            "All images of a camera must have one size; remove or replace this one",
+        ));
+    }
+    image.validate(name)?;
+    let undistorted = plan.undistort.as_ref().map(|undistort| undistort.apply(image));
+    Ok(resize(undistorted.as_ref().unwrap_or(image), plan.output.0, plan.output.1))
+}
+
 impl FrameSource for SceneFrames {
     fn load(&self, view: usize) -> Result<Image8> {
         let object = || format!("view {view}");
-        let Some(job) = self.jobs.get(view) else {
-            return Err(Error::parameter(object(), format!("the scene has {} views", self.jobs.len()), "Ask for a view that exists"));
-        };
+        let job = self.job(view)?;
         let plan = &self.plans[job.plan];
         let (name, image, expected) = match &job.image {
             Some(ImageSource::File { path, .. }) => (path.display().to_string(), read_png_or_jpeg(path, &self.limits)?, plan.native),
@@ -49,18 +68,12 @@ impl FrameSource for SceneFrames {
             Some(ImageSource::Frames { source, index }) => (object(), source.load(*index)?, plan.native),
             None => return Err(Error::unsupported(object(), "the dataset has no image of this kind for it", "Use another view")),
         };
-        if [image.width, image.height] != expected {
-            return Err(Error::data(
-                name,
-                format!("{}x{} pixels where {}x{} are expected", image.width, image.height, expected[0], expected[1]),
-                "All images of a camera must have one size; remove or replace this one",
-            ));
-        }
-        image.validate(&name)?;
-        let image = match &plan.undistort {
-            Some(undistort) => undistort.apply(&image),
-            None => image,
-        };
-        Ok(resize(&image, plan.output.0, plan.output.1))
+        fitted(&image, &name, expected, plan)
+    }
+    fn motion_mask(&self, view: usize) -> Result<Option<Image8>> {
+        let job = self.job(view)?;
+        let Some(ImageSource::Frames { source, index }) = &job.image else { return Ok(None) };
+        let plan = &self.plans[job.plan];
+        source.motion_mask(*index)?.map(|mask| fitted(&mask, &format!("motion mask of view {view}"), plan.native, plan)).transpose()
     }
 }

@@ -234,6 +234,47 @@ fn units_are_as_stated_and_cancel() {
     }
 }
 
+/// Where cameras move, masks cover what differs from the room without its cast, and nothing else.
+#[test]
+fn motion_masks_cover_what_moves() {
+    for name in ["handheld", "turntable"] {
+        let small = SceneOptions { width: 64, ..options() };
+        let full = ProceduralScene { width: 64, height: truth(name).height * 64 / truth(name).width, ..truth(name) };
+        let cast = full.bodies.iter().flat_map(|body| body.objects.clone()).collect::<BTreeSet<usize>>();
+        let room = (0..full.objects.len()).filter(|object| !cast.contains(object)).map(|object| full.objects[object]).collect();
+        let empty = ProceduralScene { objects: room, ..full.clone() };
+        let scene = open(Path::new(&format!("procedural:captures/{name}")), &small, &Limits::default()).unwrap();
+        let (mut both, mut moving, mut changed) = (0, 0, 0);
+        for view in scene.split(Split::Test).into_iter().step_by(5) {
+            let frame = scene.views[view].frame;
+            let mask = scene.motion_mask(view).unwrap().unwrap();
+            let camera = full.viewpoints().into_iter().find(|v| v.frame == Some(frame)).unwrap().camera;
+            let (image, alone) = (scene.frame(view).unwrap(), empty.render(&camera, full.time(frame)));
+            let differs = image.data.chunks_exact(3).zip(alone.data.chunks_exact(3)).map(|(a, b)| (0..3).any(|k| a[k].abs_diff(b[k]) > 12));
+            assert_eq!(mask.len(), (image.width * image.height) as usize);
+            for (moves, differs) in mask.into_iter().zip(differs) {
+                both += usize::from(moves && differs);
+                moving += usize::from(moves);
+                changed += usize::from(differs);
+            }
+        }
+        assert!(moving > 200 && 10 * both > 8 * moving.max(changed), "{name}: {moving} pixels move, {changed} differ, {both} do both");
+    }
+}
+
+#[test]
+fn nothing_moves_in_photos_and_no_mask_is_traced_through_a_lens() {
+    let photos = truth("photos");
+    assert!(photos.cameras().iter().all(|(camera, _)| !photos.moving_pixels(&camera.resized(40, 30), 0.0).contains(&true)));
+    assert!(whole("photos").motion_mask(0).unwrap().is_none());
+    // The objects of this scene move, but it has one frame.
+    let still = open(Path::new("procedural:static"), &SceneOptions { width: 40, ..options() }, &Limits::default()).unwrap();
+    assert!(still.motion_mask(view(&still, Split::Test)).unwrap().is_none());
+    let lens = open(Path::new("procedural:captures/lens"), &SceneOptions { width: 40, ..options() }, &Limits::default()).unwrap();
+    let masks = [Split::Train, Split::Test].map(|split| lens.motion_mask(view(&lens, split)).unwrap());
+    assert!(masks[0].is_none() && masks[1].as_ref().unwrap().contains(&true));
+}
+
 #[test]
 fn frames_can_be_finer_and_the_background_follows_the_option() {
     let finer = SceneOptions { frames: Some([0, 12, 1]), width: 40, ..options() };

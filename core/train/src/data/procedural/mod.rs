@@ -145,6 +145,11 @@ impl ProceduralScene {
     pub fn tracer(&self, time_norm: f64) -> Tracer {
         Tracer::new(&self.objects, self.background, self.unit, time_norm)
     }
+    /// Whether the ray through the centre of each pixel, row by row, meets an object that moves during the sequence.
+    pub fn moving_pixels(&self, camera: &Camera, time_norm: f64) -> Vec<bool> {
+        let moves = |object: usize| !self.objects[object].motion.is_still();
+        self.tracer(time_norm).objects_seen(camera).into_iter().map(|seen| seen.is_some_and(moves)).collect()
+    }
     /// Where the material point of object `object` that is at `point_world` at time `from` is at time `to` (both 0..1).
     pub fn advect(&self, object: usize, point_world: DVec3, from: f64, to: f64) -> DVec3 {
         let motion = &self.objects[object].motion;

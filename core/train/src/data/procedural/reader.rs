@@ -69,15 +69,31 @@ struct TracedFrames {
     images: Vec<(usize, usize)>,
 }
 
+impl TracedFrames {
+    /// Viewpoint and frame of an image.
+    fn taken(&self, index: usize) -> Result<(usize, usize)> {
+        let problem = || format!("the procedural scene has {}", self.images.len());
+        self.images.get(index).copied().ok_or_else(|| Error::parameter(format!("image {index}"), problem(), "Ask for an image that exists"))
+    }
+}
+
 impl FrameSource for TracedFrames {
     fn load(&self, index: usize) -> Result<Image8> {
-        let Some(&(viewpoint, frame)) = self.images.get(index) else {
-            let problem = format!("the procedural scene has {}", self.images.len());
-            return Err(Error::parameter(format!("image {index}"), problem, "Ask for an image that exists"));
-        };
+        let (viewpoint, frame) = self.taken(index)?;
         let noise = self.scene.seed.child("noise").index(viewpoint as u64).index(frame as u64);
         let tracer = self.scene.tracer(self.scene.time(frame));
         Ok(self.sensors[viewpoint].image(&tracer, &self.viewpoints[viewpoint].camera, self.scene.supersampling, noise))
+    }
+    /// Through a lens, which no held-out camera has, the mask is not traced.
+    fn motion_mask(&self, index: usize) -> Result<Option<Image8>> {
+        let (viewpoint, frame) = self.taken(index)?;
+        let camera = &self.viewpoints[viewpoint].camera;
+        let white = |moves: bool| [if moves { 255 } else { 0 }; 3];
+        let mask = || {
+            let data = self.scene.moving_pixels(camera, self.scene.time(frame)).into_iter().flat_map(white).collect();
+            Image8 { width: camera.width, height: camera.height, channels: 3, data }
+        };
+        Ok(self.sensors[viewpoint].distortion.is_identity().then(mask))
     }
 }
 
