@@ -32,6 +32,8 @@ const LEAST_SHARE: f64 = 0.4;
 const ITERATIONS: [f64; 2] = [500.0, 200_000.0];
 /// Share of moving pixels that is expected where no camera stands still.
 const UNKNOWN_MOTION: f32 = 0.1;
+/// What an iteration of the coarse and the score stage takes of one of the main stage where nothing moves: Gaussians are fewer, and colours simpler.
+const EARLY: f64 = 0.6;
 /// Views of an iteration take about twice as long as the pass through the field that they share, but are not more than these.
 const FIELD_VIEWS: f64 = 0.5;
 const MOST_VIEWS: f64 = 8.0;
@@ -181,7 +183,7 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spen
     let still = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
     let field = if still { 0.0 } else { moving * (timing.moving - timing.still) };
     let views = batch.map_or((field / (FIELD_VIEWS * timing.still)).round().clamp(1.0, MOST_VIEWS), |batch| batch as f64);
-    let ms = (1.0 - main) * timing.still + main * (field + views * timing.still);
+    let ms = (1.0 - main) * EARLY * timing.still + main * (field + views * timing.still);
     let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
     let count = (left * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
     let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
