@@ -2,8 +2,9 @@
 //! followed from the first frame.
 //!
 //! Where several cameras see each frame, the images of a key frame give points as those of the first frame do. How long a point is there is judged by its colour:
-//! it is alive at another key frame while most of the images that show it still have that colour there. The velocity is the one with which it is found
-//! again at the neighbouring key frames, searched at random and handed on between neighbours as in PatchMatch (Barnes et al. 2009).
+//! it is alive at another key frame while most of the images that show it have the same colour there. What the median images over time show stands still:
+//! it is alive where something passes before it, too. The velocity is the one with which a point is found again at the neighbouring key frames, searched at
+//! random and handed on between neighbours as in PatchMatch (Barnes et al. 2009).
 
 use super::choose::{Arrangement, Choice};
 use super::views::{WorkSet, WorkView};
@@ -15,10 +16,15 @@ use rayon::prelude::*;
 
 /// Mean difference of the channels, 0..1, up to which a pixel shows a point.
 const SIMILAR: f32 = 0.1;
+/// The same of one camera at two times, where its pixel shows the same.
+const UNCHANGED: f32 = 0.06;
 /// Images that must show a point at its own frame.
 const LEAST_IMAGES: usize = 2;
 /// Share of those images that must still show it at another.
 const ALIVE: f32 = 0.5;
+/// Fewest key frames whose median images say what stands still, and the share of them for which something may hide it at a time.
+const LEAST_FRAMES: usize = 5;
+const HIDDEN: f32 = 0.25;
 /// The farthest a point gets between two key frames, as a share of the width of the images.
 const FARTHEST: f32 = 0.12;
 /// Velocities tried at first, rounds in which neighbours hand theirs on, neighbours asked, and how much better another one must fit.
@@ -47,6 +53,8 @@ pub(crate) struct KeyFrames {
     pub times: Vec<f64>,
     sets: Vec<WorkSet>,
     found: Vec<Vec<Candidate>>,
+    /// The median over all key frames of each pixel of each view; empty where there are too few of them.
+    still: Vec<Vec<[f32; 3]>>,
 }
 
 impl KeyFrames {
@@ -61,7 +69,7 @@ impl KeyFrames {
             return Ok(None);
         }
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
-        let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new() };
+        let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new(), still: Vec::new() };
         for frame in (0..scene.frame_count).step_by(every) {
             let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera);
             let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else { return Ok(None) };
@@ -84,16 +92,17 @@ impl KeyFrames {
             loaded.sets.push(set);
             loaded.times.push(time);
         }
+        loaded.still = medians(&loaded.sets);
         Ok(Some(loaded))
     }
 
-    /// Up to `count` points that are not there at all key frames.
+    /// Up to `count` points that are not there at all key frames, or are hidden at the first.
     pub(crate) fn points(&self, count: usize, seed: Seed) -> Vec<KeyPoint> {
         let each = count / self.sets.len();
         let mut points = Vec::new();
         for (key, candidates) in self.found.iter().enumerate() {
             let judged = self.judge(candidates.iter().map(|c| (c.position, c.color)).collect(), key);
-            let new = |p: &KeyPoint| p.alive != [0, self.sets.len() - 1] && !points.iter().any(|other| self.same(other, p));
+            let new = |p: &KeyPoint| (!self.always(p) || !self.shows(0, p)) && !points.iter().any(|other| self.same(other, p));
             let mut own: Vec<KeyPoint> = judged.into_iter().flatten().filter(new).take(each).collect();
             self.set_in_motion(&mut own, seed.index(key as u64));
             points.extend(own);
@@ -111,10 +120,17 @@ impl KeyFrames {
         if images.len() < LEAST_IMAGES {
             return None;
         }
-        let there = |&other: &usize| self.share(&images, position, color, other) >= ALIVE;
-        let first = (0..key).rev().take_while(there).last().unwrap_or(key);
-        let last = (key + 1..self.sets.len()).take_while(there).last().unwrap_or(key);
-        Some(KeyPoint { position, color, key, alive: [first, last], velocity: Vec3::ZERO })
+        let count = self.sets.len();
+        let there: Vec<bool> = (0..count).map(|other| self.share(&images, position, key, Some(other)) >= ALIVE).collect();
+        let stands = !self.still.is_empty() && self.share(&images, position, key, None) >= ALIVE;
+        let hidden = if stands { (HIDDEN * count as f32) as usize } else { 0 };
+        let alive = reach(&there, key, hidden);
+        Some(KeyPoint { position, color, key, alive, velocity: Vec3::ZERO })
+    }
+
+    /// Whether a point is there at all key frames.
+    pub(crate) fn always(&self, point: &KeyPoint) -> bool {
+        point.alive == [0, self.sets.len() - 1]
     }
 
     /// Whether `a`, of an earlier key frame, is `b` as well.
@@ -129,10 +145,20 @@ impl KeyFrames {
         (0..views.len()).filter(|&v| shown(&views[v], position, color).is_some_and(|d| d < SIMILAR)).collect()
     }
 
-    /// The share of `images` that show a point at `key`.
-    fn share(&self, images: &[usize], position: Vec3, color: [f32; 3], key: usize) -> f32 {
-        let showing = images.iter().filter(|&&v| shown(&self.sets[key].views[v], position, color).is_some_and(|d| d < SIMILAR)).count();
-        showing as f32 / images.len().max(1) as f32
+    /// The share of `images` whose pixel at a point is the same at the key frames `own` and `other`, or at `own` and in the medians over time.
+    fn share(&self, images: &[usize], position: Vec3, own: usize, other: Option<usize>) -> f32 {
+        let colors = |v: usize| other.map_or_else(|| &self.still[v], |other| &self.sets[other].views[v].fine().rgb);
+        let same = |v: usize| {
+            let view = &self.sets[own].views[v];
+            view.pixel_of(position).is_some_and(|p| difference(colors(v)[p], view.fine().rgb[p]) < UNCHANGED)
+        };
+        images.iter().filter(|&&v| same(v)).count() as f32 / images.len().max(1) as f32
+    }
+
+    /// Whether most images that show a point at its own frame do so at `key`, too.
+    fn shows(&self, key: usize, point: &KeyPoint) -> bool {
+        let images = self.images_of(point.position, point.color, point.key);
+        self.share(&images, point.position, point.key, Some(key)) >= ALIVE
     }
 
     /// Finds the velocities of `points`, which are of one key frame, from those that are there at this one only.
@@ -194,6 +220,41 @@ fn candidates(set: &WorkSet, seed: Seed) -> Vec<Candidate> {
     fused.matched.append(&mut fused.between);
     let far = set.rig.distance.unwrap_or(f64::INFINITY) as f32;
     thin(fused.matched, set.cell_size(), far, seed.child("matched"))
+}
+
+/// The first and the last index up to which `there` reaches from `from`, over gaps of up to `hidden` each.
+fn reach(there: &[bool], from: usize, hidden: usize) -> [usize; 2] {
+    let along = |indices: &mut dyn Iterator<Item = usize>| {
+        let (mut end, mut gap, mut edge) = (from, 0, from);
+        for i in indices {
+            gap = if there[i] { 0 } else { gap + 1 };
+            if gap > hidden {
+                return end;
+            }
+            if gap == 0 {
+                end = i;
+            }
+            edge = i;
+        }
+        edge
+    };
+    [along(&mut (0..from).rev()), along(&mut (from + 1..there.len()))]
+}
+
+/// The median over all sets of each pixel of each view; none of too few sets.
+fn medians(sets: &[WorkSet]) -> Vec<Vec<[f32; 3]>> {
+    let views = if sets.len() < LEAST_FRAMES { 0 } else { sets[0].views.len() };
+    let of = |v: usize| {
+        let pixels = sets.iter().map(|set| set.views[v].fine().rgb.len()).min().unwrap_or(0);
+        let median = |p: usize| {
+            [0, 1, 2].map(|k| {
+                let mut values: Vec<f32> = sets.iter().map(|set| set.views[v].fine().rgb[p][k]).collect();
+                *values.select_nth_unstable_by(sets.len() / 2, f32::total_cmp).1
+            })
+        };
+        (0..pixels).into_par_iter().map(median).collect()
+    };
+    (0..views).map(of).collect()
 }
 
 /// The way from `point` to a candidate of a neighbouring key frame that looks like it, if one drawn at random does.
@@ -295,18 +356,22 @@ mod tests {
     }
 
     fn key_frames() -> KeyFrames {
-        let set = |key: usize| WorkSet {
-            views: [-1.0, -0.4, 0.4, 1.0].map(|x| view(x, ball(key))).into(),
+        let set = |key: usize| set_of(|x| view(x, ball(key)));
+        let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
+        let found = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
+        KeyFrames { times: vec![0.0, 0.5, 1.0], sets: (0..3).map(set).collect(), found, still: Vec::new() }
+    }
+
+    fn set_of(view: impl Fn(f64) -> WorkView) -> WorkSet {
+        WorkSet {
+            views: [-1.0, -0.4, 0.4, 1.0].map(view).into(),
             keys: 4,
             arrangement: Arrangement::OneTime,
             rig: Focus { point: DVec3::ZERO, distance: Some(4.0), half: 2.0 },
             foreground: Foreground::Unknown,
             box_low: Vec3::splat(-1.0),
             box_high: Vec3::splat(1.0),
-        };
-        let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
-        let found = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
-        KeyFrames { times: vec![0.0, 0.5, 1.0], sets: (0..3).map(set).collect(), found }
+        }
     }
 
     #[test]
@@ -316,6 +381,22 @@ mod tests {
         assert_eq!(judged[0].map(|p| p.alive), Some([0, 2]));
         assert_eq!(judged[1].map(|p| p.alive), Some([1, 1]));
         assert!(judged[2].is_none(), "no image shows green");
+    }
+
+    #[test]
+    fn what_stands_still_reaches_over_the_time_in_which_it_is_hidden() {
+        let (o, x) = (true, false);
+        assert_eq!(reach(&[o, o, x, o, x, x], 1, 0), [0, 1]);
+        assert_eq!(reach(&[o, o, x, o, x, x], 1, 1), [0, 3], "gone for longer than something hides it");
+        assert_eq!(reach(&[x, o, x, o, o, x], 3, 1), [0, 5], "hidden at both ends");
+        let mut frames = key_frames();
+        // The ball passes before what stands still at the middle one of seven key frames.
+        frames.sets = (0..7).map(|key| set_of(|x| view(x, if key == 3 { still() } else { ball(key) }))).collect();
+        frames.still = medians(&frames.sets);
+        let judged = frames.judge(vec![(still(), BLUE), (ball(1), RED)], 1);
+        assert_eq!(judged[0].map(|p| p.alive), Some([0, 6]));
+        assert_eq!(judged[1].map(|p| p.alive), Some([1, 1]));
+        assert!(medians(&frames.sets[..4]).is_empty());
     }
 
     #[test]
