@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Damages a dataset in eight ways, trains on each copy, and shows how each run ends.
 
-    benches/sabotage.py SCENE OUT [--bin FILE] [--preset NAME] [--device NAME] [--only NAME,NAME] [--set KEY=VALUE]...
+    benches/sabotage.py SCENE OUT [--bin FILE] [--preset NAME] [--device NAME] [--only NAME,NAME] [--floor DB]
+                        [--set KEY=VALUE]...
 
 SCENE is a nerfstudio folder (transforms.json), a D-NeRF/Blender folder (transforms_train.json) or a PanopticSports folder (train_meta.json). Copies hold changed
 metadata and links to the images. A damaged run should end with an error that names the cause; the unchanged one ("same") with exit code 0. OUT/sabotage.json holds
@@ -204,6 +205,7 @@ def main():
     parser.add_argument("--preset")
     parser.add_argument("--device", default="flex")
     parser.add_argument("--only", help="names of damages, separated by commas: " + ", ".join(DAMAGES))
+    parser.add_argument("--floor", type=float, default=20.0, help="dB that a model with exit code 0 must reach on the undamaged scene")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE")
     args = parser.parse_args()
     if not any((args.scene / name).is_file() for name in ("transforms.json", "transforms_train.json", "train_meta.json")):
@@ -235,16 +237,17 @@ def main():
             if subprocess.run(measure, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode == 0:
                 psnr = json.loads(report.read_text())["psnr_db"]
         results.append({"damage": name, "exit": ended.returncode, "last": last, "warnings": warnings, "psnr_db": psnr})
-        # Half of the images may be enough, and a static scene needs no times; the run must say so all the same.
+        # Half of the images may be enough, and a static scene needs no times; the run must say so all the same, and the model must be no blur.
         spoken = {"half-missing": "missing", "no-times": "time"}.get(name)
-        warned = spoken is not None and any(spoken in warning for warning in warnings)
+        warned = spoken is not None and any(spoken in warning for warning in warnings) and (psnr or 0.0) >= args.floor
         expected = ended.returncode == 0 if name == "same" else ended.returncode != 0 or warned
         wrong += not expected
         shown = "     -" if psnr is None else f"{psnr:6.2f}"
         print(f"{name:<13} exit {ended.returncode:>3} {shown} dB  {'' if expected else 'UNEXPECTED '}{last}", flush=True)
         for warning in warnings:
             print(f"{'':<30}{warning}")
-    document = {"scene": args.scene.name, "preset": args.preset, "device": args.device, "sets": args.sets, "results": results}
+    version = subprocess.run([args.bin, "--version"], capture_output=True, text=True).stdout.strip()
+    document = {"scene": args.scene.name, "version": version, "floor_db": args.floor, "preset": args.preset, "device": args.device, "sets": args.sets, "results": results}
     (args.out / "sabotage.json").write_text(json.dumps(document, indent=1) + "\n")
     sys.exit(wrong)
 

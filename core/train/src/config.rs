@@ -97,7 +97,7 @@ fn cdf() -> toml::Table {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum InitSource {
-    /// The dataset's points, else whatever the scene allows of the others, together.
+    /// The dataset's points; where they are few or there are none, whatever the scene allows of the others, together.
     #[default]
     Auto,
     /// The dataset's points.

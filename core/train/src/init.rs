@@ -10,12 +10,28 @@ use rand::seq::SliceRandom;
 /// The degree-0 basis function of spherical harmonics.
 pub const SH_C0: f32 = 0.282_094_8;
 
+/// The dataset's points are enough where they are at least this share of the wanted ones; else others are looked for beside them.
+const ENOUGH: f64 = 0.1;
+
 /// Gaussians for `scene` as `config.init` wants them, at most `init.count`. An [`Event::Note`] says where they come from.
+///
+/// # Errors
+/// [`Error::Parameter`] and [`Error::Data`] where the scene has no points of that kind, and whatever decoding its images meets.
 pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn EventSink) -> Result<HostGaussians> {
     let count = config.init.count.min(config.limits.max_gaussians as usize);
     let own = scene.points.as_ref().filter(|p| !p.positions.is_empty());
     let mut uncertain = 0..0;
+    let few = own.is_some_and(|points| (points.positions.len() as f64) < ENOUGH * count as f64);
     let (points, mut message) = match (config.init.source, own) {
+        (InitSource::Auto, Some(points)) if few => {
+            let found = find_points(scene, InitSource::Auto, count - points.positions.len(), seed)?;
+            let message = format!("{} points of the dataset are few for {count} Gaussians; beside them {}", points.positions.len(), found.describe());
+            let mut all = points.clone();
+            all.positions.extend(found.cloud.positions);
+            all.colors.extend(found.cloud.colors);
+            uncertain = all.positions.len() - found.random..all.positions.len();
+            (all, message)
+        }
         (InitSource::Auto | InitSource::Points, Some(points)) => {
             let points = thin(points.clone(), count, seed.child("thin"));
             let message = format!("{} points of the dataset", points.positions.len());

@@ -81,6 +81,8 @@ pub struct TrainConfig {
     pub dynamic: Dynamic,
     /// Step only the Gaussians that a view of the iteration shows.
     pub sparse_adam: bool,
+    /// Iterations between two steps of the higher colour coefficients; the others compute no gradient of them.
+    pub sh_every: usize,
     /// Learning rates of the Gaussians.
     pub lr: GaussianRates,
     /// Check the scene before training and the result afterwards. A scene that cannot be reconstructed is refused, and a run that stays below simple baselines
@@ -121,6 +123,7 @@ impl Default for TrainConfig {
             recover: false,
             dynamic: Dynamic::Auto,
             sparse_adam: true,
+            sh_every: 1,
             lr: GaussianRates::default(),
             checks: true,
             validation: 0,
@@ -189,6 +192,9 @@ impl TrainConfig {
         }
         if t.coarse_batch > 64 {
             return bad("coarse_batch", format!("{} is over 64", t.coarse_batch), "Choose the number of views per iteration; 0 is as many as train.batch");
+        }
+        if t.sh_every == 0 || t.sh_every > 1000 {
+            return bad("sh_every", format!("{} is not in 1..1,000", t.sh_every), "Choose the iterations between two steps of the higher colour coefficients");
         }
         if t.sh_degree > 4 {
             return bad("sh_degree", format!("{} is over 4", t.sh_degree), "Choose a degree of 0 to 4");

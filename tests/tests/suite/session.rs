@@ -61,6 +61,26 @@ fn a_session_trains_saves_opens_and_plays() {
 }
 
 #[test]
+fn higher_colour_coefficients_are_stepped_as_often_as_asked() {
+    let session = flex();
+    let rest = |every: &str| {
+        let config = session.config("demo", &["train.iterations=40", "train.sh_degree=1", "train.sh_interval=1", every]).unwrap();
+        let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
+        session.train(&config, scene, None).unwrap().gaussians.sh_rest.clone()
+    };
+    let learned = |rest: &[f32]| rest.iter().any(|v| *v != 0.0);
+    assert!(!learned(&rest("train.sh_every=1000")), "no iteration is the thousandth");
+    let (each, fourth) = (rest("train.sh_every=1"), rest("train.sh_every=4"));
+    assert!(learned(&each) && learned(&fourth) && each != fourth);
+    assert!(
+        session
+            .config("demo", &["train.sh_every=0"])
+            .and_then(|c| session.train(&c, Arc::new(session.read_scene("procedural:tiny", &c.scene)?), None))
+            .is_err()
+    );
+}
+
+#[test]
 fn a_stopped_training_leaves_a_checkpoint_and_resumes() {
     let session = flex();
     let stopper = session.clone();

@@ -1,7 +1,7 @@
 //! Scores a model on its way and at its end, and decides whether the run has failed.
 
 use super::baselines::{MovingPixels, Yardstick, psnr_db};
-use super::rules::{GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, shortfall};
+use super::rules::{Doubts, GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, shortfall};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::sample::spread;
@@ -143,12 +143,13 @@ impl Watch {
             (_, _, END) => vec![*now],
             _ => return None,
         };
-        let doubted = same_time(context.job).is_some() || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times));
+        let one_time = same_time(context.job).is_some();
+        let doubts = Doubts { any: one_time || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times)), one_time };
         let place = match percent {
             END => format!("after {} iterations", context.job.config.train.iterations),
             _ => format!("stopped at iteration {} of {} of the main stage, where", state.iteration, context.lengths.length(Stage::Main)),
         };
-        let problem = match shortfall(&deciding, &yardstick.baselines, rules, doubted)? {
+        let problem = match shortfall(&deciding, &yardstick.baselines, rules, doubts)? {
             Shortfall::Images(words) => format!("{place} {words}"),
             Shortfall::Motion(words) if state.moving == Moving::Nothing || state.deformer.as_ref().is_none_or(|d| d.field.is_static()) => {
                 if percent == END {
@@ -165,7 +166,7 @@ impl Watch {
     fn failure(&self, context: &Context, problem: String) -> Error {
         let iterations = context.job.config.train.iterations;
         let scene = &context.job.scene;
-        match (self.doubts.first(), scene.warnings.first()) {
+        match (self.doubts.first(), same_time(context.job).or(scene.warnings.first())) {
             (Some(doubt), _) => Error::failed("training", format!("{problem}. The likely cause: {}", doubt.problem), doubt.remedy.clone()),
             (None, Some(warning)) => {
                 let remedy = "Correct the dataset, or train longer (train.iterations). The checkpoint is kept, and train.checks = false accepts such models";

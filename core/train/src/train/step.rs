@@ -43,7 +43,12 @@ impl Context<'_> {
         self.decide_smoothness(state, schedule, moves)?;
 
         let neighbours = if moves && train.strain > 0.0 { state.current_neighbours(&self.device)? } else { None };
-        let leaves = state.rounded.as_ref().map_or(&state.set, |rounded| &rounded.gaussians).leaves(|name| name != "dynamic_scores");
+        let learns = |name: &str| match name {
+            "dynamic_scores" => false,
+            "sh_rest" => schedule.iteration.is_multiple_of(train.sh_every),
+            _ => true,
+        };
+        let leaves = state.rounded.as_ref().map_or(&state.set, |rounded| &rounded.gaussians).leaves(learns);
         let gaussians = leaves.gaussians()?;
         let autodiff = gaussians.means.device();
         let spatial = match &mut state.deformer {

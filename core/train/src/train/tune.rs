@@ -97,7 +97,7 @@ impl<'a> Tuner<'a> {
         let mut config: RunConfig = config::parse_section("configuration of the model", &model.provenance.config)?;
         (config.render, config.rasterizer) = (model.render.clone(), model.rasterizer.clone());
         (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
-        (config.density, config.appearance, config.train.image_growth) = (none(), none(), 0.0);
+        (config.density, config.appearance, config.train.image_growth, config.train.sh_every) = (none(), none(), 0.0, 1);
         (config.train.time_noise, config.train.dropout, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0);
         config.validate()?;
         let field_weights = FieldWeights::parse(field_weights, registry)?;

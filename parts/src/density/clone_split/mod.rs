@@ -16,6 +16,7 @@ from = 500               # first round, in reference iterations of the stage (co
 until = 10000            # last round, in reference iterations of the main stage; the coarse stage ends at 5,000
 every = 100              # reference iterations between two rounds
 gradient = 2e-4          # mean screen gradient, in normalised device units, from which a Gaussian is cloned or split
+corrected = false        # a clone and its original together draw what the original drew, instead of both having its opacity
 dense_share = 0.01       # largest size that is cloned instead of split, as a share of the extent of the cameras
 min_opacity = 0.005      # fainter Gaussians are removed
 max_scale_share = 0.0    # larger Gaussians are removed, as a share of the extent; 0 is off
@@ -43,6 +44,7 @@ struct Settings {
     until: usize,
     every: usize,
     gradient: f32,
+    corrected: bool,
     dense_share: f32,
     min_opacity: f32,
     max_scale_share: f32,
@@ -59,6 +61,7 @@ impl Default for Settings {
             until: 10_000,
             every: 100,
             gradient: 2e-4,
+            corrected: false,
             dense_share: 0.01,
             min_opacity: 0.005,
             max_scale_share: 0.0,

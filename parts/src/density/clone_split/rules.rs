@@ -52,7 +52,10 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
         if !grows {
             plan.keep(i);
         } else if largest(i) <= settings.dense_share * extent {
-            plan.keep(i);
+            let row = plan.keep(i);
+            if settings.corrected {
+                plan.set(row, "opacity_logits", &[shared_logit(opacity(i))]);
+            }
             children.push((i, None));
             plan.report.cloned += 1;
         } else {
@@ -68,7 +71,12 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
     }
     for &(parent, normal) in &children {
         let row = plan.copy(parent);
-        let Some(normal) = normal else { continue };
+        let Some(normal) = normal else {
+            if settings.corrected {
+                plan.set(row, "opacity_logits", &[shared_logit(opacity(parent))]);
+            }
+            continue;
+        };
         let (means, log_scales) = (&host.means[3 * parent..3 * parent + 3], &host.log_scales[3 * parent..3 * parent + 3]);
         let sample = glam::Vec3::from_array(std::array::from_fn(|a| normal[a] * log_scales[a].exp()));
         let mean = glam::Vec3::from_slice(means) + rotation(&host.quaternions[4 * parent..4 * parent + 4]) * sample;
@@ -77,6 +85,12 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
         plan.set(row, "log_scales", &[log_scales[0] - shrink, log_scales[1] - shrink, log_scales[2] - shrink]);
     }
     Ok(Some(plan))
+}
+
+/// The logit of the opacity p of each of two equal Gaussians that together have `opacity`: 1 - (1 - p)^2 (Rota Bulo et al. 2024, "Revising densification").
+fn shared_logit(opacity: f32) -> f32 {
+    let each = (1.0 - (1.0 - opacity).max(0.0).sqrt()).clamp(1e-6, 0.999);
+    (each / (1.0 - each)).ln()
 }
 
 fn standard_normal(rng: &mut impl Rng) -> f32 {
@@ -124,6 +138,27 @@ mod tests {
         assert_eq!(after.extra["label"].values, vec![0.0, 3.0, 0.0, 1.0, 1.0]);
         assert!((after.log_scales[9] + SPLIT_SHRINK.ln()).abs() < 1e-6);
         assert_ne!(after.means[9..12], after.means[12..15], "the two halves are different samples");
+    }
+
+    #[test]
+    fn corrected_clones_draw_what_the_original_drew() {
+        let device = Device::flex();
+        let mut host = host_of(1);
+        host.log_scales.fill(0.001f32.ln());
+        host.opacity_logits[0] = 1.5;
+        let mut statistics = Statistics::zeros(1, &device);
+        statistics.gradient_sum = Tensor::from_floats([1.0], &device);
+        statistics.seen = Tensor::ones([1], &device);
+        let due = Due { grow: true, ..Default::default() };
+        let passed = |corrected: bool| {
+            let plan = round(&Settings { corrected, ..Settings::default() }, &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
+            let after = plan.apply(&cc4dgs_core::Gaussians::from_host(&host, &device)).unwrap().to_host().unwrap();
+            assert_eq!(after.len(), 2);
+            after.opacity_logits.iter().map(|v| 1.0 - 1.0 / (1.0 + (-v).exp())).product::<f32>()
+        };
+        let original = 1.0 - 1.0 / (1.0 + (-1.5f32).exp());
+        assert!((passed(true) - original).abs() < 1e-5 && (passed(false) - original * original).abs() < 1e-5);
+        assert!(shared_logit(1.0).is_finite() && shared_logit(0.0).is_finite());
     }
 
     #[test]

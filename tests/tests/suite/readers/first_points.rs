@@ -117,6 +117,19 @@ fn one_moving_camera_finds_what_stands_still() {
 }
 
 #[test]
+fn a_handful_of_points_of_the_dataset_is_not_enough() {
+    let mut scene = film(&playground(), arc(6, 1.2), &(0..6).map(|camera| (camera, 0)).collect::<Vec<_>>());
+    let own = PointCloud { positions: vec![[0.0, 0.0, 0.5]; 3], colors: vec![[0.5; 3]; 3] };
+    scene.points = Some(own);
+    let count = |source: &str| initialise(&scene, &config(&[source, "init.count=2000"]), Seed::root(1), &Silent).unwrap().len();
+    assert_eq!(count("init.source=points"), 3, "what is asked for is what there is");
+    assert!((500..=2000).contains(&count("init.source=auto")));
+    let events = Recorder::default();
+    initialise(&scene, &config(&["init.count=2000"]), Seed::root(1), &events).unwrap();
+    assert!(events.events().iter().any(|e| matches!(e, Event::Note { message, .. } if message.contains("3 points of the dataset are few"))));
+}
+
+#[test]
 fn few_cameras_at_one_time_are_used() {
     let truth = playground();
     for cameras in [2, 3] {

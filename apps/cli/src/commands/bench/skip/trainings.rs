@@ -93,7 +93,7 @@ impl StepBench<'_> {
     fn switches(&self, base: &RunConfig, fixed: Option<&str>) -> Result<Vec<Switch<Vec<String>>>> {
         let (deformer, _) = split_kind("deformer", &base.deformer)?;
         let shares = self.context.registry.deformer(&deformer)?.info.capabilities.contains(&SHARES_VERTICES);
-        let TrainConfig { batch, sparse_adam, image_growth, sh_degree, dynamic, .. } = base.train;
+        let TrainConfig { batch, sparse_adam, sh_every, image_growth, sh_degree, dynamic, .. } = base.train;
         let unless = |used: bool| (!used).then(|| "the configuration does not use it".to_string());
         let switch = |name, missing, set: &[String]| Switch { name, off: set.to_vec(), missing };
         let single = ["train.batch=1".to_string(), "train.coarse_batch=0".into(), format!("train.iterations={}", self.iterations * batch)];
@@ -111,6 +111,7 @@ impl StepBench<'_> {
             switch("opacity early out", fixed.map(Into::into), &[format!("rasterizer.{}=false", EARLY_OUTS[0])]),
             switch("transmittance early out", fixed.map(Into::into), &[format!("rasterizer.{}=false", EARLY_OUTS[1])]),
             switch("sparse Adam", unless(sparse_adam), &["train.sparse_adam=false".into()]),
+            switch("higher SH degrees less often", unless(sh_every > 1), &["train.sh_every=1".into()]),
             switch("several views per spatial pass", unless(batch > 1), &single),
             switch("lower resolution early", unless(image_growth > 0.0), &["train.image_growth=0.0".into()]),
             switch("leaving out heads", unless(few_heads), &[format!("deformer.heads={HEADS:?}")]),
