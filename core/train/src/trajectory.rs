@@ -11,6 +11,8 @@ use serde::Serialize;
 const NEAR_SURFACE: [f64; 2] = [0.7, 1.2];
 /// Gaussians below this opacity count as invisible.
 const LEAST_OPACITY: f32 = 0.1;
+/// Displacements below this share of the coordinates are rounding errors of bodies that stand still.
+const LEAST_DISPLACEMENT: f64 = 1e-9;
 /// Times at which the pixels that a body covers are collected for cameras that take all frames.
 const MOMENTS: usize = 24;
 
@@ -26,7 +28,7 @@ pub struct MotionScore {
     /// Gaussians on its surface when it is first there.
     pub gaussians: usize,
     /// Root-mean-square distance of their displacements since then from the true ones, over all frames at which they can be seen, as a share of the
-    /// true displacement's root-mean-square: 0 follows exactly, 1 is as good as not moving. None without Gaussians.
+    /// true displacement's root-mean-square: 0 follows exactly, 1 is as good as not moving. None without Gaussians or true displacements.
     pub trajectory_error: Option<f64>,
     /// PSNR over the pixels that the body covers, all held-out images, 8-bit: those it ever covers for a camera that takes all frames, those of the
     /// image's own frame for a moving camera.
@@ -53,7 +55,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
     let held_out: Vec<Viewpoint> = scene.viewpoints().into_iter().filter(|v| v.split == Split::Test).collect();
     let masks: Vec<Vec<Vec<bool>>> = held_out.iter().map(|viewpoint| covered(scene, viewpoint)).collect();
 
-    let mut distances = vec![[0.0f64; 2]; scene.bodies.len()];
+    let mut distances = vec![[0.0f64; 3]; scene.bodies.len()];
     let mut errors = vec![(0.0f64, 0u64); scene.bodies.len()];
     for frame in 0..scene.frames {
         let time = scene.time(frame);
@@ -64,6 +66,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
                 let truth = scene.advect(object, start, followed.start, time) - start;
                 sums[0] += (point(&now, row) - start - truth).length_squared();
                 sums[1] += truth.length_squared();
+                sums[2] += start.length_squared();
             }
         }
         for (viewpoint, masks) in held_out.iter().zip(&masks).filter(|(v, _)| v.frame.is_none_or(|own| own == frame)) {
@@ -85,7 +88,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
         object: body.objects.start,
         cycles: body.cycles,
         gaussians: followed.rows.len(),
-        trajectory_error: (d[1] > 0.0).then(|| (d[0] / d[1]).sqrt()),
+        trajectory_error: (d[1] > LEAST_DISPLACEMENT.powi(2) * d[2]).then(|| (d[0] / d[1]).sqrt()),
         psnr_db: 10.0 * (255.0f64.powi(2) * count.max(1) as f64 / error.max(1e-9)).log10(),
     });
     Ok(scores.collect())

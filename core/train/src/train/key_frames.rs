@@ -42,7 +42,7 @@ impl Context<'_> {
         let mask_of = |camera: usize| self.masks.iter().find(|mask| scene.views[mask.view].camera == camera);
         let masks: Vec<Option<&DynamicMask>> = (0..scene.cameras.len()).map(mask_of).collect();
         let moves = |camera: usize, x: f32, y: f32| masks[camera].is_some_and(|mask| covers(mask, &scene.cameras[camera], x, y));
-        let Some(frames) = KeyFrames::load(scene, every, moves, seed)? else {
+        let Some(frames) = KeyFrames::load(scene, every, moves, self.job.config.train.mask_threshold, seed)? else {
             let message = "no two key frames are seen by the same cameras: none is used".to_string();
             self.job.events.emit(&Event::Note { object: "key frames".into(), message });
             return Ok(());

@@ -125,7 +125,7 @@ fn a_handful_of_points_of_the_dataset_is_not_enough() {
     assert_eq!(count("init.source=points"), 3, "what is asked for is what there is");
     assert!((500..=2000).contains(&count("init.source=auto")));
     let events = Recorder::default();
-    initialise(&scene, &config(&["init.count=2000"]), Seed::root(1), &events).unwrap();
+    initialise(&scene, &config(&["init.source=auto", "init.count=2000"]), Seed::root(1), &events).unwrap();
     assert!(events.events().iter().any(|e| matches!(e, Event::Note { message, .. } if message.contains("3 points of the dataset are few"))));
 }
 

@@ -17,7 +17,7 @@ use rayon::prelude::*;
 
 /// Mean difference of the channels, 0..1, up to which a pixel shows a point.
 const SIMILAR: f32 = 0.1;
-/// The same of one camera at two times, where its pixel shows the same.
+/// The same of one camera at two times, where its pixel shows the same and the images have little noise.
 const UNCHANGED: f32 = 0.06;
 /// Images that must show a point at its own frame.
 const LEAST_IMAGES: usize = 2;
@@ -49,21 +49,23 @@ pub(crate) struct KeyFrames {
     found: Vec<Vec<Candidate>>,
     /// The median over all key frames of each pixel of each view; empty where there are too few of them.
     still: Vec<Vec<[f32; 3]>>,
+    /// Mean difference of the channels up to which a pixel of one camera shows the same at two times.
+    unchanged: f32,
 }
 
 impl KeyFrames {
     /// Every `every`-th frame of `scene`, with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so;
-    /// `None` where cameras move, frames lack cameras, or there would be a single key frame.
+    /// `None` where cameras move, frames lack cameras, or there would be a single key frame. Differences up to `noise`, 0..1, are none.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
-    pub(crate) fn load(scene: &Scene, every: usize, moves: impl Fn(usize, f32, f32) -> bool, seed: Seed) -> Result<Option<Self>> {
+    pub(crate) fn load(scene: &Scene, every: usize, moves: impl Fn(usize, f32, f32) -> bool, noise: f32, seed: Seed) -> Result<Option<Self>> {
         let choice = Choice::new(scene);
         if choice.arrangement != Arrangement::OneTime || every == 0 || scene.frame_count <= every {
             return Ok(None);
         }
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
-        let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new(), still: Vec::new() };
+        let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new(), still: Vec::new(), unchanged: UNCHANGED.max(noise) };
         for frame in (0..scene.frame_count).step_by(every) {
             let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera);
             let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else { return Ok(None) };
@@ -144,7 +146,7 @@ impl KeyFrames {
         let colors = |v: usize| other.map_or_else(|| &self.still[v], |other| &self.sets[other].views[v].fine().rgb);
         let same = |v: usize| {
             let view = &self.sets[own].views[v];
-            view.pixel_of(position).is_some_and(|p| difference(colors(v)[p], view.fine().rgb[p]) < UNCHANGED)
+            view.pixel_of(position).is_some_and(|p| difference(colors(v)[p], view.fine().rgb[p]) < self.unchanged)
         };
         images.iter().filter(|&&v| same(v)).count() as f32 / images.len().max(1) as f32
     }
@@ -164,21 +166,19 @@ fn candidates(set: &WorkSet, seed: Seed) -> Vec<Candidate> {
     thin(fused.matched, set.cell_size(), far, seed.child("matched"))
 }
 
-/// The first and the last index up to which `there` reaches from `from`, over gaps of up to `hidden` each.
+/// The first and the last index up to which `there` reaches from `from`, over gaps of up to `hidden` each; a gap at either end is one, too.
 fn reach(there: &[bool], from: usize, hidden: usize) -> [usize; 2] {
     let along = |indices: &mut dyn Iterator<Item = usize>| {
-        let (mut end, mut gap, mut edge) = (from, 0, from);
+        let (mut end, mut last) = (from, from);
         for i in indices {
-            gap = if there[i] { 0 } else { gap + 1 };
-            if gap > hidden {
+            last = i;
+            if there[i] {
+                end = i;
+            } else if i.abs_diff(end) > hidden {
                 return end;
             }
-            if gap == 0 {
-                end = i;
-            }
-            edge = i;
         }
-        edge
+        last
     };
     [along(&mut (0..from).rev()), along(&mut (from + 1..there.len()))]
 }
@@ -260,7 +260,7 @@ mod tests {
         let set = |key: usize| set_of(|x| view(x, ball(key)));
         let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
         let found = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
-        KeyFrames { times: vec![0.0, 0.5, 1.0], sets: (0..3).map(set).collect(), found, still: Vec::new() }
+        KeyFrames { times: vec![0.0, 0.5, 1.0], sets: (0..3).map(set).collect(), found, still: Vec::new(), unchanged: UNCHANGED }
     }
 
     fn set_of(view: impl Fn(f64) -> WorkView) -> WorkSet {
