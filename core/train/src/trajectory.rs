@@ -88,10 +88,15 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
         object: body.objects.start,
         cycles: body.cycles,
         gaussians: followed.rows.len(),
-        trajectory_error: (d[1] > LEAST_DISPLACEMENT.powi(2) * d[2]).then(|| (d[0] / d[1]).sqrt()),
+        trajectory_error: trajectory_error(d),
         psnr_db: 10.0 * (255.0f64.powi(2) * count.max(1) as f64 / error.max(1e-9)).log10(),
     });
     Ok(scores.collect())
+}
+
+/// The trajectory error from sums of squares over Gaussians and frames: of differences, of true displacements, and of the coordinates at the start.
+fn trajectory_error([differences, displacements, coordinates]: [f64; 3]) -> Option<f64> {
+    (displacements > LEAST_DISPLACEMENT.powi(2) * coordinates).then(|| (differences / displacements).sqrt())
 }
 
 /// The Gaussians of one body.
@@ -161,6 +166,12 @@ mod tests {
         g.means.extend([1e7; 3]);
         g.opacity_logits.push(2.0);
         g
+    }
+
+    #[test]
+    fn what_stands_still_has_no_trajectory() {
+        assert_eq!(trajectory_error([4.0, 16.0, 100.0]), Some(0.5));
+        assert_eq!((trajectory_error([1e-3, 1e-30, 100.0]), trajectory_error([0.0; 3])), (None, None));
     }
 
     #[test]

@@ -70,9 +70,10 @@ impl Context<'_> {
                     plan.set(row, "sh_rest", &vec![0.0; coefficients]);
                 }
                 plan.set(row, "dynamic_scores", &[2.0 * zeta + 1.0]);
-                match frames.always(point) {
-                    true => times.last(&mut plan, row),
-                    false => times.live(&mut plan, row, point),
+                if frames.always(point) {
+                    times.last(&mut plan, row);
+                } else {
+                    times.live(&mut plan, row, point);
                 }
             }
         }

@@ -36,6 +36,12 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
         !host.is_finite(i) || opacity(i) < settings.min_opacity || (settings.max_scale_share > 0.0 && largest(i) > settings.max_scale_share * extent)
     };
 
+    let correct = |plan: &mut DensityPlan, row: usize, of: usize| {
+        if settings.corrected {
+            plan.set(row, "opacity_logits", &[shared_logit(opacity(of))]);
+        }
+    };
+
     let mut plan = DensityPlan::new();
     let mut children: Vec<Child> = Vec::new();
     let capacity = settings.max_gaussians.saturating_sub(n);
@@ -53,9 +59,7 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
             plan.keep(i);
         } else if largest(i) <= settings.dense_share * extent {
             let row = plan.keep(i);
-            if settings.corrected {
-                plan.set(row, "opacity_logits", &[shared_logit(opacity(i))]);
-            }
+            correct(&mut plan, row, i);
             children.push((i, None));
             plan.report.cloned += 1;
         } else {
@@ -72,9 +76,7 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
     for &(parent, normal) in &children {
         let row = plan.copy(parent);
         let Some(normal) = normal else {
-            if settings.corrected {
-                plan.set(row, "opacity_logits", &[shared_logit(opacity(parent))]);
-            }
+            correct(&mut plan, row, parent);
             continue;
         };
         let (means, log_scales) = (&host.means[3 * parent..3 * parent + 3], &host.log_scales[3 * parent..3 * parent + 3]);

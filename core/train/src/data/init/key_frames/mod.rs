@@ -146,7 +146,8 @@ impl KeyFrames {
         let colors = |v: usize| other.map_or_else(|| &self.still[v], |other| &self.sets[other].views[v].fine().rgb);
         let same = |v: usize| {
             let view = &self.sets[own].views[v];
-            view.pixel_of(position).is_some_and(|p| difference(colors(v)[p], view.fine().rgb[p]) < self.unchanged)
+            let own = view.pixel_of(position).map(|p| (colors(v).get(p), view.fine().rgb[p]));
+            own.is_some_and(|(other, own)| other.is_some_and(|other| difference(*other, own) < self.unchanged))
         };
         images.iter().filter(|&&v| same(v)).count() as f32 / images.len().max(1) as f32
     }
