@@ -75,37 +75,64 @@ fn sound_ply() -> Vec<u8> {
     ply::to_bytes(&gaussians(), true).unwrap()
 }
 
-/// Where the header's parts lie in [`sound`]: (manifest length, manifest, directory), as in the layout of the archive module.
-fn directory_at(bytes: &[u8]) -> usize {
-    28 + u32::from_le_bytes(bytes[24..28].try_into().unwrap()) as usize
+/// The decoded header of an archive, and what follows it.
+fn header_and_streams(bytes: &[u8]) -> (Vec<u8>, &[u8]) {
+    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+    let end = 24 + word(12);
+    (zstd::bulk::decompress(&bytes[28..end], word(24)).unwrap(), &bytes[end..])
 }
 
-/// Mends the header's length and checksum after `edit`, as a forger would.
+/// Where the directory begins in a decoded header, as in the layout of the archive module.
+fn directory_at(header: &[u8]) -> usize {
+    4 + u32::from_le_bytes(header[..4].try_into().unwrap()) as usize
+}
+
+/// An archive with this decoded header and sound lengths and checksum, as a forger would make it.
+fn with_header(header: &[u8], streams: &[u8]) -> Vec<u8> {
+    with_stored_header(&[(header.len() as u32).to_le_bytes().to_vec(), zstd::bulk::compress(header, 19).unwrap()].concat(), streams)
+}
+
+/// An archive with this header as it is stored.
+fn with_stored_header(stored: &[u8], streams: &[u8]) -> Vec<u8> {
+    let mut out = sound()[..12].to_vec();
+    out.extend((stored.len() as u32).to_le_bytes());
+    out.extend(xxhash_rust::xxh3::xxh3_64(stored).to_le_bytes());
+    out.extend(stored);
+    out.extend(streams);
+    out
+}
+
+/// [`sound`] with an edited header.
 fn forged(edit: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
     let bytes = sound();
-    let header_len = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
-    let (mut header, body) = (bytes[24..24 + header_len].to_vec(), &bytes[24 + header_len..]);
+    let (mut header, streams) = header_and_streams(&bytes);
     edit(&mut header);
-    let mut out = bytes[..12].to_vec();
-    out.extend((header.len() as u32).to_le_bytes());
-    out.extend(xxhash_rust::xxh3::xxh3_64(&header).to_le_bytes());
-    out.extend(header);
-    out.extend(body);
-    out
+    with_header(&header, streams)
+}
+
+/// [`sound`] with a stored header of which `claimed` decoded bytes are claimed.
+fn with_claim(claimed: u32) -> Vec<u8> {
+    let bytes = sound();
+    let (_, streams) = header_and_streams(&bytes);
+    let mut stored = bytes[24..bytes.len() - streams.len()].to_vec();
+    stored[..4].copy_from_slice(&claimed.to_le_bytes());
+    with_stored_header(&stored, streams)
 }
 
 /// Replaces the manifest in a forged header.
 fn with_manifest(json: &[u8]) -> Vec<u8> {
     forged(|header| {
-        let end = 4 + u32::from_le_bytes(header[..4].try_into().unwrap()) as usize;
+        let end = directory_at(header);
         header.splice(..end, (json.len() as u32).to_le_bytes().into_iter().chain(json.iter().copied()));
     })
 }
 
 /// Overwrites bytes of the first directory entry ("means") in a forged header.
 fn with_entry(offset: usize, value: &[u8]) -> Vec<u8> {
-    let at = directory_at(&sound()) - 24 + 4 + offset;
-    forged(|header| header[at..at + value.len()].copy_from_slice(value))
+    forged(|header| {
+        let at = directory_at(header) + 4 + offset;
+        header[at..at + value.len()].copy_from_slice(value);
+    })
 }
 
 fn ply_with(from: &str, to: &str) -> Vec<u8> {
@@ -152,6 +179,9 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
         ("flipped_stream.cc4d", flipped_stream, "checksum"),
         ("flipped_header.cc4d", flipped_header, "checksum of the header"),
         ("header_claims_4gb.cc4d", header_claim, "4294967295 bytes is claimed"),
+        ("header_decodes_to_4gb.cc4d", with_claim(u32::MAX), "4294967295 decoded bytes were declared"),
+        ("header_decodes_to_more.cc4d", with_claim(99), "99 decoded bytes were declared"),
+        ("header_is_no_frame.cc4d", with_stored_header(&[9; 40], &[]), "Zstandard frame"),
         ("manifest_deep.cc4d", with_manifest(deep.as_bytes()), "limit of 64"),
         ("manifest_not_json.cc4d", with_manifest(b"{\"format_version\":"), "manifest"),
         ("manifest_huge_count.cc4d", with_manifest(huge.as_bytes()), "max_gaussians"),
@@ -163,7 +193,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
         (
             "stream_count_4g.cc4d",
             forged(|h| {
-                let at = 4 + u32::from_le_bytes(h[..4].try_into().unwrap()) as usize;
+                let at = directory_at(h);
                 h[at..at + 4].copy_from_slice(&u32::MAX.to_le_bytes());
             }),
             "expected",
@@ -364,16 +394,14 @@ proptest! {
     #[test]
     fn forged_streams_never_panic(at in any::<u16>(), value in any::<u8>()) {
         // The stream's checksum is mended too, so that the damage reaches Zstandard.
-        let mut bytes = sound();
-        let archive = Archive::from_bytes("t", bytes.clone(), &Limits::default()).unwrap();
-        let stored = archive.stream_sizes()[0].stored_bytes as usize;
-        let start = bytes.len() - archive.stream_sizes().iter().map(|s| s.stored_bytes as usize).sum::<usize>();
-        bytes[start + usize::from(at) % stored] = value;
-        let checksum = xxhash_rust::xxh3::xxh3_64(&bytes[start..start + stored]);
-        let entry = directory_at(&bytes) + 4 + 4 + 5 + 16;
-        bytes[entry..entry + 8].copy_from_slice(&checksum.to_le_bytes());
-        let header = xxhash_rust::xxh3::xxh3_64(&bytes[24..start]);
-        bytes[16..24].copy_from_slice(&header.to_le_bytes());
+        let bytes = sound();
+        let stored = Archive::from_bytes("t", bytes.clone(), &Limits::default()).unwrap().stream_sizes()[0].stored_bytes as usize;
+        let (mut header, streams) = header_and_streams(&bytes);
+        let mut streams = streams.to_vec();
+        streams[usize::from(at) % stored] = value;
+        let entry = directory_at(&header) + 4 + 4 + 5 + 16;
+        header[entry..entry + 8].copy_from_slice(&xxhash_rust::xxh3::xxh3_64(&streams[..stored]).to_le_bytes());
+        let bytes = with_header(&header, &streams);
         let archive = Archive::from_bytes("t", bytes, &Limits::default()).unwrap();
         if let Ok(decoded) = archive.read_stream("means") {
             prop_assert_eq!(decoded.len(), 360);

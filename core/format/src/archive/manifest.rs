@@ -5,7 +5,7 @@ use crate::{BLUR, DeformerContext, Error, Limits, Result, Rules, Similarity};
 use serde::{Deserialize, Serialize};
 
 /// The archive version this build writes and reads.
-pub const FORMAT_VERSION: u32 = 2;
+pub const FORMAT_VERSION: u32 = 3;
 
 /// The codec of some of the streams.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

@@ -4,10 +4,11 @@
 //!
 //! ```text
 //!  0  magic      8 bytes   89 'C' 'C' '4' 'D' 0D 0A 1A
-//!  8  version    u32       2
+//!  8  version    u32       3
 //! 12  header     u32       bytes of the header
 //! 16  checksum   u64       XXH3-64 of the header
-//! 24  header:    u32 + JSON manifest, u32 stream count, then per stream
+//! 24  header     u32       decoded bytes, and a Zstandard frame of
+//!                u32 + JSON manifest, u32 stream count, then per stream
 //!                u8 kind, u8 shuffle (0, 2 or 4), u8 encoding (0 stored, 1 Zstandard), u8 + name,
 //!                u64 decoded bytes, u64 stored bytes, u64 XXH3-64 of the stored bytes
 //!     streams, one after the other, in the order of the directory; nothing follows the last

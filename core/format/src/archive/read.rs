@@ -136,7 +136,11 @@ impl Archive {
         if xxh3_64(&header) != checksum {
             return Err(damaged(&object, "the checksum of the header does not match".into()));
         }
-        let mut reader = ByteReader::new(format!("header of {object}"), &header);
+        let what = format!("header of {object}");
+        let mut reader = ByteReader::new(&what, &header);
+        let plain_len = u64::from(reader.u32()?);
+        let plain = unpack(&what, reader.rest().to_vec(), Encoding::Zstd, 0, plain_len, limits)?;
+        let mut reader = ByteReader::new(what, &plain);
         let manifest_len = reader.u32()? as usize;
         let manifest = Manifest::from_json(&object, reader.take(manifest_len)?, limits)?;
         let entries = read_directory(&mut reader, PREFIX_BYTES as u64 + header_len, total)?;

@@ -1,6 +1,7 @@
 //! Writing of an archive, deterministically and atomically.
 
 use super::packing::pack;
+use super::zstandard::compress;
 use super::{FORMAT_VERSION, MAGIC, Manifest, StreamKind};
 use crate::{Error, Result, Stream};
 use rayon::prelude::*;
@@ -41,23 +42,24 @@ impl ArchiveWriter {
         }
         let packed = self.streams.par_iter().map(|(_, s)| pack(&s.bytes)).collect::<Result<Vec<_>>>()?;
         let manifest = self.manifest.to_json()?;
-        let mut header = Vec::with_capacity(manifest.len() + 64 * packed.len());
-        header.extend((manifest.len() as u32).to_le_bytes());
-        header.extend(&manifest);
-        header.extend((packed.len() as u32).to_le_bytes());
+        let mut plain = Vec::with_capacity(manifest.len() + 64 * packed.len());
+        plain.extend((manifest.len() as u32).to_le_bytes());
+        plain.extend(&manifest);
+        plain.extend((packed.len() as u32).to_le_bytes());
         for ((kind, stream), packed) in self.streams.iter().zip(&packed) {
-            header.extend([kind.code(), packed.shuffle, packed.encoding.code(), stream.name.len() as u8]);
-            header.extend(stream.name.as_bytes());
-            header.extend((stream.bytes.len() as u64).to_le_bytes());
-            header.extend((packed.bytes.len() as u64).to_le_bytes());
-            header.extend(xxh3_64(&packed.bytes).to_le_bytes());
+            plain.extend([kind.code(), packed.shuffle, packed.encoding.code(), stream.name.len() as u8]);
+            plain.extend(stream.name.as_bytes());
+            plain.extend((stream.bytes.len() as u64).to_le_bytes());
+            plain.extend((packed.bytes.len() as u64).to_le_bytes());
+            plain.extend(xxh3_64(&packed.bytes).to_le_bytes());
         }
-        let header_len = u32::try_from(header.len())
-            .map_err(|_| Error::limit("archive header", header.len() as u64, u64::from(u32::MAX), "Shorten the manifest's configuration and extras"))?;
+        let plain_len = u32::try_from(plain.len())
+            .map_err(|_| Error::limit("archive header", plain.len() as u64, u64::from(u32::MAX), "Shorten the manifest's configuration and extras"))?;
+        let header = [plain_len.to_le_bytes().to_vec(), compress(&plain)?].concat();
         let mut out = Vec::with_capacity(super::PREFIX_BYTES + header.len() + packed.iter().map(|p| p.bytes.len()).sum::<usize>());
         out.extend(MAGIC);
         out.extend(FORMAT_VERSION.to_le_bytes());
-        out.extend(header_len.to_le_bytes());
+        out.extend((header.len() as u32).to_le_bytes());
         out.extend(xxh3_64(&header).to_le_bytes());
         out.extend(header);
         for packed in packed {
