@@ -1,7 +1,7 @@
 //! How long an iteration takes, found by training for a few.
 
 use crate::config::{Dynamic, RunConfig};
-use crate::train::{TrainJob, train};
+use crate::train::{TrainJob, share_per_view, train};
 use cc4dgs_core::{Event, Recorder, Registry, Result, Scene, Split};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -17,14 +17,19 @@ const MEAN_GAUSSIANS: f64 = 0.9;
 const OPACITY: f32 = 0.5;
 /// The time of an iteration grows with the number of Gaussians to this power: images have the same number of pixels.
 const GROWTH_POWER: f64 = 0.7;
+/// Views of the iterations that tell what views share, and from which cost of motion on, as a multiple of an iteration without, they are worth their time.
+const VIEWS: usize = 3;
+const WORTH_SHARING: f64 = 1.2;
 
-/// Milliseconds: of an iteration, and of what comes before them.
+/// Milliseconds: of an iteration of one view, and of what comes before all of them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Timing {
     /// Where nothing moves.
     pub still: f64,
-    /// Where everything moves.
-    pub moving: f64,
+    /// More where everything moves, however many views there are.
+    pub shared: f64,
+    /// More for each view where everything moves: what a deformer does for each time.
+    pub per_time: f64,
     /// All that comes before the first iteration.
     pub start: f64,
 }
@@ -72,5 +77,11 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     };
     let grown = (MEAN_GAUSSIANS * most as f64 / model.gaussians.len().max(1) as f64).max(1.0).powf(GROWTH_POWER);
     let still = grown * typical("coarse").unwrap_or(1.0).max(0.01);
-    Ok(Timing { still, moving: (grown * typical("main").unwrap_or(still)).max(still), start: (all_ms - iterations_ms).max(0.0) })
+    let start = (all_ms - iterations_ms).max(0.0);
+    let moving = (grown * typical("main").unwrap_or(still)).max(still);
+    if moving < WORTH_SHARING * still {
+        return Ok(Timing { still, shared: moving - still, per_time: 0.0, start });
+    }
+    let per_time = (moving * share_per_view(&model, scene, VIEWS, registry)? - still).clamp(0.0, moving - still);
+    Ok(Timing { still, shared: moving - still - per_time, per_time, start })
 }

@@ -82,6 +82,9 @@ pub struct Facts {
     pub detail: f32,
     /// Share of pixels that see something move, where a camera has several frames.
     pub moving: Option<f32>,
+    /// Share of the frames in which a pixel that sees something move differs from its median over time, where a camera has several frames: small where things
+    /// pass, up to a half where they move on the spot.
+    pub occupied: Option<f32>,
     /// Standard deviation of the noise, of values in 0..1, where a camera has several frames.
     pub noise: Option<f32>,
     /// Median ratio of mean brightness between neighbouring cameras of one time, as |ln|.
@@ -115,6 +118,7 @@ impl Facts {
             mean: scene.background.is_none().then(|| mean_colour(&images)),
             detail: mean(images.iter().map(detail)).unwrap_or(0.0),
             moving: motion.as_ref().map(|m| m.moving),
+            occupied: motion.as_ref().and_then(|m| m.occupied),
             noise: motion.as_ref().map(|m| m.noise),
             exposure: exposure(scene, &views)?,
         })
@@ -226,6 +230,7 @@ fn detail(image: &Image8) -> f32 {
 /// What differs over time in the images of fixed cameras.
 struct Motion {
     moving: f32,
+    occupied: Option<f32>,
     noise: f32,
 }
 
@@ -234,26 +239,35 @@ impl Motion {
         let mut of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         views.iter().for_each(|&v| of_camera.entry(scene.views[v].camera).or_default().push(v));
         let sequences: Vec<&Vec<usize>> = of_camera.values().filter(|v| v.len() >= 2).collect();
-        let (mut noises, mut shares) = (Vec::new(), Vec::new());
+        let (mut noises, mut shares, mut occupied) = (Vec::new(), Vec::new(), Vec::new());
         for sequence in spread_from_first(&sequences, MOTION_LOOKS[0]) {
             let looked = spread_from_first(sequence, MOTION_LOOKS[1]);
             let frames = looked.into_iter().map(|view| small(scene, view).map(|image| grey(&image))).collect::<Result<Vec<_>>>()?;
             let n = frames.len() as f32;
-            let mut deviations: Vec<f32> = (0..frames[0].len())
+            let deviations: Vec<f32> = (0..frames[0].len())
                 .map(|p| {
                     let (sum, squares) = frames.iter().fold((0.0, 0.0), |(s, q), f| (s + f[p], q + f[p] * f[p]));
                     (squares / n - (sum / n) * (sum / n)).max(0.0).sqrt()
                 })
                 .collect();
-            deviations.sort_by(f32::total_cmp);
+            let mut sorted = deviations.clone();
+            sorted.sort_by(f32::total_cmp);
             // Most pixels of a fixed camera see nothing move, so the lower quartile is noise; averaging on the way to small images has lowered it.
-            let noise = deviations[deviations.len() / 4];
+            let noise = sorted[sorted.len() / 4];
             let threshold = MOTION.max(MOTION_OVER_NOISE * noise);
             noises.push(noise);
-            shares.push(1.0 - deviations.partition_point(|d| *d <= threshold) as f32 / deviations.len() as f32);
+            let moving: Vec<usize> = (0..deviations.len()).filter(|&p| deviations[p] > threshold).collect();
+            shares.push(moving.len() as f32 / deviations.len() as f32);
+            occupied.extend(moving.into_iter().map(|p| {
+                let mut values: Vec<f32> = frames.iter().map(|f| f[p]).collect();
+                values.sort_by(f32::total_cmp);
+                let median = values[values.len() / 2];
+                values.iter().filter(|v| (*v - median).abs() > threshold).count() as f32 / n
+            }));
         }
         noises.sort_by(f32::total_cmp);
-        Ok(mean(shares.into_iter()).map(|moving| Self { moving, noise: noises[noises.len() / 2] }))
+        let occupied = mean(occupied.into_iter());
+        Ok(mean(shares.into_iter()).map(|moving| Self { moving, occupied, noise: noises[noises.len() / 2] }))
     }
 }
 

@@ -180,16 +180,17 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spen
     let main = config.train.shares[2] / total;
     let scored = config.train.dynamic != Dynamic::All;
     let moving = if scored { (2.0 * f64::from(facts.moving.unwrap_or(UNKNOWN_MOTION))).min(1.0) } else { 1.0 };
-    let still = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
-    let field = if still { 0.0 } else { moving * (timing.moving - timing.still) };
-    let views = batch.map_or((field / (FIELD_VIEWS * timing.still)).round().clamp(1.0, MOST_VIEWS), |batch| batch as f64);
-    let ms = (1.0 - main) * EARLY * timing.still + main * (field + views * timing.still);
+    let none = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
+    let moving = if none { 0.0 } else { moving };
+    let (field, view) = (moving * timing.shared, timing.still + moving * timing.per_time);
+    let views = batch.map_or((field / (FIELD_VIEWS * view)).round().clamp(1.0, MOST_VIEWS), |batch| batch as f64);
+    let ms = (1.0 - main) * EARLY * timing.still + main * (field + views * view);
     let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
     let count = (left * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
     let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
     let rates = [("train.batch", toml::Value::Integer(views as i64)), ("train.coarse_batch", 1.into()), ("train.lr.batch_power", 0.5.into())];
     let mut choices = vec![
-        Choice { settings: rates.to_vec(), reason: format!("a pass through the deformer takes {field:.0} ms, a view {:.0} ms", timing.still) },
+        Choice { settings: rates.to_vec(), reason: format!("what views share of the deformer takes {field:.0} ms, a view {view:.0} ms") },
         Choice {
             settings: vec![("train.iterations", toml::Value::Integer(count as i64))],
             reason: format!("{left:.1} of {minutes} minutes at about {ms:.0} ms per iteration on this machine"),

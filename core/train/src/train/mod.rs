@@ -1,6 +1,7 @@
 //! The three-stage trainer (paper Section V): coarse, dynamic score, main. It is composed of parts that are found by name: deformer, rasterizer, density control, loss terms,
 //! appearance model and optimizer.
 
+mod cost;
 mod density;
 mod dropout;
 mod folder;
@@ -28,6 +29,7 @@ mod tune;
 mod validate;
 mod watchdog;
 
+pub(crate) use cost::share_per_view;
 pub use folder::CONFIG;
 pub use guard::Guard;
 pub use observe::{Observer, Snapshot, Standing};
