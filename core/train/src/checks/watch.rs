@@ -139,12 +139,17 @@ impl Watch {
     fn failure_at(&self, percent: usize, context: &Context, state: &TrainState) -> Option<Error> {
         let (rules, yardstick, now) = (self.rules?, self.yardstick.as_ref()?, self.at(percent)?);
         let deciding: Vec<Score> = match (self.at(HALF), rules, percent) {
-            (Some(half), Rules::All, _) => vec![*half, *now],
+            (Some(half), Rules::All, END) => vec![*half, *now],
+            (Some(half), Rules::All, _) if !self.grows_late(context) => vec![*half, *now],
             (_, _, END) => vec![*now],
             _ => return None,
         };
         let one_time = same_time(context.job).is_some();
-        let doubts = Doubts { any: one_time || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times)), one_time };
+        // On the way only by clear margins: learning rates that fall at the end gain a decibel.
+        let doubts = match percent {
+            END => Doubts { any: one_time || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times)), one_time },
+            _ => Doubts::default(),
+        };
         let place = match percent {
             END => format!("after {} iterations", context.job.config.train.iterations),
             _ => format!("stopped at iteration {} of {} of the main stage, where", state.iteration, context.lengths.length(Stage::Main)),
@@ -162,20 +167,26 @@ impl Watch {
         };
         Some(self.failure(context, problem))
     }
+    /// Whether frames or pixels are still added after the score on the way.
+    fn grows_late(&self, context: &Context) -> bool {
+        let train = &context.job.config.train;
+        train.time_ramp.max(train.image_growth) > LATE as f64 / 100.0
+    }
     /// The error of a run that is below a baseline, with the likely cause.
     fn failure(&self, context: &Context, problem: String) -> Error {
         let iterations = context.job.config.train.iterations;
+        let kept = if context.checkpoint.is_some() { "The checkpoint is kept, and train.checks" } else { "train.checks" };
         let scene = &context.job.scene;
         match (self.doubts.first(), same_time(context.job).or(scene.warnings.first())) {
             (Some(doubt), _) => Error::failed("training", format!("{problem}. The likely cause: {}", doubt.problem), doubt.remedy.clone()),
             (None, Some(warning)) => {
-                let remedy = "Correct the dataset, or train longer (train.iterations). The checkpoint is kept, and train.checks = false accepts such models";
+                let remedy = format!("Correct the dataset, or train longer (train.iterations). {kept} = false accepts such models");
                 Error::failed("training", format!("{problem}. The likely cause: {warning}"), remedy)
             }
             (None, None) => {
                 let remedy = format!(
                     "Likely causes are wrong poses or axes, wrong times, another background than that of the images (render.background), or too few iterations: \
-                     check the first three, then try train.iterations = {}. The checkpoint is kept, and train.checks = false accepts such models",
+                     check the first three, then try train.iterations = {}. {kept} = false accepts such models",
                     3 * iterations
                 );
                 Error::failed("training", problem, remedy)

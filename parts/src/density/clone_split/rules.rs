@@ -37,7 +37,8 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
     };
 
     let correct = |plan: &mut DensityPlan, row: usize, of: usize| {
-        if settings.corrected {
+        // A reset sets all opacities, and the trainer may leave it out.
+        if settings.corrected && !due.reset {
             plan.set(row, "opacity_logits", &[shared_logit(opacity(of))]);
         }
     };

@@ -73,7 +73,7 @@ impl Context<'_> {
             Standing::Waiting => kept.append(&mut going),
             Standing::Overdue(last) => {
                 self.note(format!(
-                    "{psnr_db:.1} dB on training views {} iterations after Gaussians were removed, {:.1} dB before: none are removed until it is back",
+                    "{psnr_db:.1} dB on training views {} iterations after Gaussians were removed, {:.1} dB before: removals are put off",
                     schedule.iteration - last.iteration,
                     last.psnr_db
                 ));
@@ -98,6 +98,8 @@ impl Context<'_> {
         }
         let logits = to_vec(gaussians.opacity_logits.clone(), OPACITIES)?;
         state.guard.reset = Some(Reset { iteration: schedule.iteration, psnr_db, logits });
+        // What the reset costs is no loss by removals, and has its own time to come back.
+        state.guard.removal = None;
         Ok(true)
     }
 

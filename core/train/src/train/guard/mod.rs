@@ -1,12 +1,12 @@
 //! Keeps density control from destroying what is already fitted, whatever the control.
 //!
 //! - Gaussians with values that are not finite always go. Of the others:
-//! - Nothing is removed before the cameras of the stage had two passes to fit it: not in the first passes of a stage, and no Gaussian that is younger.
+//! - Nothing is removed before the cameras of the stage had two passes to fit it, or a sixth of the stage: not at its beginning, and no Gaussian that is younger.
 //! - A Gaussian that was drawn in fewer than 16 views stays longer, up to a sixth of the stage.
 //! - One round removes at most a quarter of the Gaussians.
 //! - A removal that costs more than 0.3 dB on training views at once is halved, the most opaque Gaussians being kept, and then left out.
-//! - After such a removal, what training views lost must be back within a stated number of iterations. Until then removals together may cost no more than one;
-//!   where the PSNR is lower, the next ones are put off.
+//! - After a removal that was measured, what training views lost must be back within a stated number of iterations, to within 0.3 dB. Until then removals
+//!   together may cost no more than one; where the PSNR is lower, the next ones are put off. What is not back after three times as long has other causes.
 //! - After an opacity reset, the PSNR of training views must be back within the same time; else the opacities return, and the stage has no more resets. A reset
 //!   is left out where this time is not left, and while the last one is not back.
 
@@ -31,6 +31,8 @@ const MAX_COST_DB: f32 = 0.3;
 /// Iterations within which the PSNR must be back after an opacity reset or a removal, at least; and passes over the cameras.
 const RECOVERY: usize = 400;
 const RECOVERY_PASSES: usize = 4;
+/// Multiple of that time after which a PSNR that is lower is not blamed on removals.
+const GIVE_UP: usize = 3;
 
 /// What the guard remembers between iterations.
 #[derive(Clone, Debug, Default)]
@@ -41,7 +43,7 @@ pub struct Guard {
     drawn: Vec<f32>,
     /// Views since the last plan, on the device `[N]`.
     drawn_since: Option<Tensor<1>>,
-    /// The last removal that was measured, until the PSNR is back.
+    /// The last removal that was measured, until the next one or a reset.
     removal: Option<Removal>,
     /// The last opacity reset, until it is judged.
     reset: Option<Reset>,
@@ -147,7 +149,7 @@ impl Guard {
             }
             *slot = Some(values);
         }
-        let iteration = |number: f32| number.max(0.0) as usize;
+        let iteration = |number: f32| number.clamp(0.0, 1e9) as usize;
         let reset = match (numbers.as_deref(), logits) {
             (Some([at, psnr_db]), Some(logits)) => Some(Reset { iteration: iteration(*at), psnr_db: *psnr_db, logits }),
             (None, None) => None,
@@ -197,6 +199,8 @@ impl Guard {
             () if psnr_db >= last.psnr_db || (near && over) => Standing::Back(now),
             () if near => Standing::Back(last.clone()),
             () if over && !last.reported => Standing::Overdue(last.clone()),
+            // Other causes last: smoothness that was switched on, say.
+            () if schedule.iteration >= last.iteration + GIVE_UP * recovery(schedule) && psnr_db.is_finite() => Standing::Back(now),
             () => Standing::Waiting,
         }
     }
@@ -283,6 +287,9 @@ mod tests {
         assert_eq!(guard.standing(24.75, &at(1400)), Standing::Back(removal(1400, 24.75)));
         assert_eq!(guard.standing(24.6, &at(1400)), Standing::Overdue(removal(1000, 25.0)));
         guard.removal = Some(Removal { reported: true, ..removal(1000, 25.0) });
-        assert_eq!(guard.standing(24.6, &at(9000)), Standing::Waiting);
+        assert_eq!(guard.standing(24.6, &at(2100)), Standing::Waiting);
+        // What does not come back has other causes.
+        assert_eq!(guard.standing(24.6, &at(2200)), Standing::Back(removal(2200, 24.6)));
+        assert_eq!(guard.standing(f32::NAN, &at(2200)), Standing::Waiting);
     }
 }
