@@ -76,7 +76,7 @@ fn mistakes_end_with_their_own_exit_code() {
     let absent = fail(&["train", "--scene", "procedural:tiny", "--resume", "--out", text(&out)], 2);
     assert!(absent.contains("nothing to resume") && absent.contains("--overwrite"), "{absent}");
     assert!(!out.exists(), "a refused command leaves nothing behind");
-    std::fs::write(&broken, b"\x89CC4D\r\n\x1a\x02\0\0\0\x10\0\0\0 and then nothing that makes sense as a header").unwrap();
+    std::fs::write(&broken, b"\x89CC4D\r\n\x1a\x03\0\0\0\x10\0\0\0 and then nothing that makes sense as a header").unwrap();
     fail(&["info", text(&broken)], 3);
     fail(&["eval", text(&broken), "--scene", "procedural:tiny"], 3);
     let missing = fail(&["decompress", text(&folder.path().join("missing.cc4d")), "--out", text(&out)], 2);

@@ -244,8 +244,8 @@ fn round(settings: &Settings, host: &HostGaussians, scores: &[f32], hidden: &[us
     let mut goes = vec![false; n];
     hidden.iter().for_each(|&row| goes[row] = true);
     let stays: Vec<usize> = alive.iter().copied().filter(|&row| !goes[row]).collect();
-    // The trainer may keep rows that are not alive; they count where there are more than the budget.
-    let over = n.saturating_sub(budget);
+    // The trainer may keep faded rows; they count where there are more than the budget.
+    let over = (0..n).filter(|&row| host.is_finite(row)).count().saturating_sub(budget);
     let slots = budget.saturating_sub(stays.len() + over).min((settings.growth * n as f64).ceil() as usize);
     let drawn = drawn(&stays, scores, slots, seed);
     let mut splits = vec![false; n];

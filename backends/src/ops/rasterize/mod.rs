@@ -205,20 +205,20 @@ pub struct RasterInputs {
 
 /// An error for a device without the operation, or without what its settings ask for.
 fn check_device(device: &Device, method: Method, shortcuts: Shortcuts) -> Result<()> {
-    match (device.clone().without_autodiff().as_dispatch(), method) {
-        (DispatchDevice::Flex(_), _) => Ok(()),
+    match (device.clone().without_autodiff().as_dispatch(), method, shortcuts == Shortcuts::default()) {
+        (DispatchDevice::Flex(_), ..) => Ok(()),
         #[cfg(feature = "ndarray")]
-        (DispatchDevice::NdArray(_), _) => Ok(()),
+        (DispatchDevice::NdArray(_), ..) => Ok(()),
         #[cfg(feature = "cube")]
-        (DispatchDevice::Cube(_), Method::Tiles) if shortcuts == Shortcuts::default() => Ok(()),
+        (DispatchDevice::Cube(_), Method::Tiles, true) => Ok(()),
         #[cfg(feature = "cube")]
-        (DispatchDevice::Cube(_), Method::Tiles) => Err(Error::unsupported(
+        (DispatchDevice::Cube(_), Method::Tiles, false) => Err(Error::unsupported(
             format!("rasterizer tile with opacity_shortcut = {}, transmittance_shortcut = {} on {device:?}", shortcuts.opacity, shortcuts.transmittance),
             "its kernels for GPUs always take both shortcuts",
             "Leave both settings at true, or use --device flex or ndarray",
         )),
         #[cfg(feature = "cube")]
-        (DispatchDevice::Cube(_), Method::Reference(_)) => Err(Error::unsupported(
+        (DispatchDevice::Cube(_), Method::Reference(_), _) => Err(Error::unsupported(
             format!("rasterizer reference on {device:?}"),
             "it computes in float64 on the processor",
             "Use --device flex, or the rasterizer tile",

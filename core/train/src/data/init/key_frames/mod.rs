@@ -112,15 +112,14 @@ impl KeyFrames {
     }
 
     fn judge_one(&self, position: Vec3, color: [f32; 3], key: usize) -> Option<KeyPoint> {
-        let images = self.images_of(position, color, key);
-        if images.len() < LEAST_IMAGES {
+        let sightings = self.sightings(position, color, key);
+        if sightings.len() < LEAST_IMAGES {
             return None;
         }
         let count = self.sets.len();
-        let there: Vec<bool> = (0..count).map(|other| self.share(&images, position, key, Some(other)) >= ALIVE).collect();
-        let stands = !self.still.is_empty() && self.share(&images, position, key, None) >= ALIVE;
+        let stands = !self.still.is_empty() && self.share(&sightings, None) >= ALIVE;
         let hidden = if stands { (HIDDEN * count as f32) as usize } else { 0 };
-        let alive = reach(&there, key, hidden);
+        let alive = reach(|other| self.share(&sightings, Some(other)) >= ALIVE, count, key, hidden);
         Some(KeyPoint { position, color, key, alive, velocity: Vec3::ZERO })
     }
 
@@ -135,28 +134,37 @@ impl KeyFrames {
         near && (a.alive[0]..=a.alive[1]).contains(&b.key) && difference(a.color, b.color) < SIMILAR
     }
 
-    /// The images of `key` that show a point.
-    fn images_of(&self, position: Vec3, color: [f32; 3], key: usize) -> Vec<usize> {
-        let views = &self.sets[key].views;
-        (0..views.len()).filter(|&v| shown(&views[v], position, color).is_some_and(|d| d < SIMILAR)).collect()
+    /// The pixels of `key` that show a point.
+    fn sightings(&self, position: Vec3, color: [f32; 3], key: usize) -> Vec<Sighting> {
+        let of = |(view, drawn): (usize, &WorkView)| {
+            let pixel = drawn.pixel_of(position)?;
+            let seen = drawn.fine().rgb[pixel];
+            (difference(seen, color) < SIMILAR).then_some(Sighting { view, pixel, color: seen })
+        };
+        self.sets[key].views.iter().enumerate().filter_map(of).collect()
     }
 
-    /// The share of `images` whose pixel at a point is the same at the key frames `own` and `other`, or at `own` and in the medians over time.
-    fn share(&self, images: &[usize], position: Vec3, own: usize, other: Option<usize>) -> f32 {
-        let colors = |v: usize| other.map_or_else(|| &self.still[v], |other| &self.sets[other].views[v].fine().rgb);
-        let same = |v: usize| {
-            let view = &self.sets[own].views[v];
-            let own = view.pixel_of(position).map(|p| (colors(v).get(p), view.fine().rgb[p]));
-            own.is_some_and(|(other, own)| other.is_some_and(|other| difference(*other, own) < self.unchanged))
+    /// The share of `sightings` whose pixels are the same at the key frame `other`, or in the medians over time.
+    fn share(&self, sightings: &[Sighting], other: Option<usize>) -> f32 {
+        let same = |s: &&Sighting| {
+            let colors = other.map_or_else(|| &self.still[s.view], |other| &self.sets[other].views[s.view].fine().rgb);
+            colors.get(s.pixel).is_some_and(|other| difference(*other, s.color) < self.unchanged)
         };
-        images.iter().filter(|&&v| same(v)).count() as f32 / images.len().max(1) as f32
+        sightings.iter().filter(same).count() as f32 / sightings.len().max(1) as f32
     }
 
     /// Whether most images that show a point at its own frame do so at `key`, too.
     fn shows(&self, key: usize, point: &KeyPoint) -> bool {
-        let images = self.images_of(point.position, point.color, point.key);
-        self.share(&images, point.position, point.key, Some(key)) >= ALIVE
+        self.share(&self.sightings(point.position, point.color, point.key), Some(key)) >= ALIVE
     }
+}
+
+/// A pixel that shows a point at its own key frame.
+struct Sighting {
+    view: usize,
+    pixel: usize,
+    /// RGB in 0..1.
+    color: [f32; 3],
 }
 
 /// The points that match at one key frame.
@@ -167,13 +175,14 @@ fn candidates(set: &WorkSet, seed: Seed) -> Vec<Candidate> {
     thin(fused.matched, set.cell_size(), far, seed.child("matched"))
 }
 
-/// The first and the last index up to which `there` reaches from `from`, over gaps of up to `hidden` each; a gap at either end is one, too.
-fn reach(there: &[bool], from: usize, hidden: usize) -> [usize; 2] {
+/// The first and the last of `count` indices up to which `there` reaches from `from`, over gaps of up to `hidden` each; a gap at either end is one, too. Nothing
+/// is asked beyond a longer gap.
+fn reach(there: impl Fn(usize) -> bool, count: usize, from: usize, hidden: usize) -> [usize; 2] {
     let along = |indices: &mut dyn Iterator<Item = usize>| {
         let (mut end, mut last) = (from, from);
         for i in indices {
             last = i;
-            if there[i] {
+            if there(i) {
                 end = i;
             } else if i.abs_diff(end) > hidden {
                 return end;
@@ -181,7 +190,7 @@ fn reach(there: &[bool], from: usize, hidden: usize) -> [usize; 2] {
         }
         last
     };
-    [along(&mut (0..from).rev()), along(&mut (from + 1..there.len()))]
+    [along(&mut (0..from).rev()), along(&mut (from + 1..count))]
 }
 
 /// The median over all sets of each pixel of each view; none of too few sets.
@@ -288,9 +297,10 @@ mod tests {
     #[test]
     fn what_stands_still_reaches_over_the_time_in_which_it_is_hidden() {
         let (o, x) = (true, false);
-        assert_eq!(reach(&[o, o, x, o, x, x], 1, 0), [0, 1]);
-        assert_eq!(reach(&[o, o, x, o, x, x], 1, 1), [0, 3], "gone for longer than something hides it");
-        assert_eq!(reach(&[x, o, x, o, o, x], 3, 1), [0, 5], "hidden at both ends");
+        let reach = |there: [bool; 6], from: usize, hidden: usize| reach(|i| there[i], 6, from, hidden);
+        assert_eq!(reach([o, o, x, o, x, x], 1, 0), [0, 1]);
+        assert_eq!(reach([o, o, x, o, x, x], 1, 1), [0, 3], "gone for longer than something hides it");
+        assert_eq!(reach([x, o, x, o, o, x], 3, 1), [0, 5], "hidden at both ends");
         let mut frames = key_frames();
         // The ball passes before what stands still at the middle one of seven key frames.
         frames.sets = (0..7).map(|key| set_of(|x| view(x, if key == 3 { still() } else { ball(key) }))).collect();

@@ -1,7 +1,7 @@
 //! The velocities of points of key frames.
 
 use super::super::Candidate;
-use super::{KeyFrames, KeyPoint, SIMILAR, difference, shown};
+use super::{KeyFrames, KeyPoint, SIMILAR, Sighting, difference, shown};
 use cc4dgs_core::Seed;
 use glam::Vec3;
 use rand::Rng;
@@ -22,13 +22,16 @@ impl KeyFrames {
         let around: Vec<usize> = [key.checked_sub(1), Some(key + 1)].into_iter().flatten().filter(|&k| k < self.sets.len()).collect();
         let set = &self.sets[key];
         let farthest = set.views.first().map_or(0.0, |v| FARTHEST * v.fine().width as f32) * 0.5 * set.cell_size();
-        let images: Vec<Vec<usize>> = points.par_iter().map(|p| self.images_of(p.position, p.color, key)).collect();
+        let sightings: Vec<Vec<Sighting>> = points.par_iter().map(|p| self.sightings(p.position, p.color, key)).collect();
         // The mean similarity over the images that show the point at its own frame.
         let fit = |i: usize, point: &KeyPoint, velocity: Vec3| {
             let at = |&other: &usize| {
                 let position = point.position + velocity * (other as f32 - key as f32);
-                let similar = |&v: &usize| shown(&self.sets[other].views[v], position, point.color).map_or(0.0, |d| (1.0 - d / (2.0 * SIMILAR)).max(0.0));
-                images[i].iter().map(similar).sum::<f32>() / images[i].len().max(1) as f32
+                let similar = |s: &Sighting| {
+                    let difference = shown(&self.sets[other].views[s.view], position, point.color);
+                    difference.map_or(0.0, |d| (1.0 - d / (2.0 * SIMILAR)).max(0.0))
+                };
+                sightings[i].iter().map(similar).sum::<f32>() / sightings[i].len().max(1) as f32
             };
             around.iter().map(at).sum::<f32>() / around.len().max(1) as f32
         };
