@@ -345,6 +345,8 @@ mod tests {
         assert_eq!((plan.report.removed, plan.report.split), (2, 1));
         let full = round(&settings, &host_of(&[0.5; 4]), &[1.0; 4], &[], 4, Seed::root(1));
         assert!(full.keeps_all(4), "nothing happens at the budget");
+        let above = round(&settings, &host_of(&[0.5, 0.5, 0.5, 0.001, 0.001]), &[1.0; 5], &[], 4, Seed::root(1));
+        assert_eq!((above.parents(), above.report.split), (&[0, 1, 2][..], 0), "faded rows that the trainer may keep are above the budget");
         assert!(round(&settings, &host_of(&[0.001; 3]), &[1.0; 3], &[], 9, Seed::root(1)).keeps_all(3), "never all of them");
         // At the budget, the hidden one makes room for halves of the only other with a gradient; without one, it stays.
         let plan = round(&settings, &host_of(&[0.5; 4]), &[1.0, 0.0, 1.0, 0.0], &[2], 4, Seed::root(1));
