@@ -34,7 +34,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         for (kind, n) in kinds.into_iter().filter(|k| k.1 > 0) {
             let errors = errors(&scene, &truth, &found, first..first + n);
             let share = |most: f64| 100.0 * errors.iter().filter(|e| **e < most).count() as f64 / n as f64;
-            println!("  {kind}: within 1 % {:.1}, 2 % {:.1}, 5 % {:.1} % of {n}", share(0.01), share(0.02), share(0.05));
+            let shares = [0.002, 0.005, 0.01, 0.02, 0.05].map(|most| format!("{} % {:.1}", 100.0 * most, share(most)));
+            println!("  {kind}: within {} % of {n}", shares.join(", "));
             first += n;
         }
     }
