@@ -67,9 +67,13 @@ fn still_scores(scene: &Scene, view: usize, background: [f32; 3]) -> Result<[f64
     let n = planes.len() / 3;
     let flat: Vec<f32> =
         planes.chunks_exact(n.max(1)).flat_map(|plane| vec![(plane.iter().map(|&v| f64::from(v)).sum::<f64>() / n as f64) as f32; n]).collect();
-    let opaque = Image8::from_planes(&planes, w, h);
-    let blurred = resize(&resize(&opaque, w.div_ceil(BLUR), h.div_ceil(BLUR)), w, h).to_planes(background);
-    Ok([psnr_db(&planes, &flat, [w, h], None)?, psnr_db(&planes, &blurred, [w, h], None)?])
+    Ok([psnr_db(&planes, &flat, [w, h], None)?, psnr_db(&planes, &blurred(&planes, [w, h]), [w, h], None)?])
+}
+
+/// Planes `[3,H,W]` of an image at a sixteenth of its size, scaled up again.
+pub(super) fn blurred(planes: &[f32], [w, h]: [u32; 2]) -> Vec<f32> {
+    let opaque = Image8::from_planes(planes, w, h);
+    resize(&resize(&opaque, w.div_ceil(BLUR), h.div_ceil(BLUR)), w, h).to_planes([0.0; 3])
 }
 
 /// Views of fixed cameras with the pixels that move there, and the PSNR of the mean images on those.

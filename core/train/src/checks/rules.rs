@@ -9,8 +9,10 @@ pub(super) const GOOD_ENOUGH_DB: f64 = 30.0;
 const MOTION_GAIN_DB: f64 = 0.3;
 /// What a model must gain on the blurred images where poses or times are in doubt, dB.
 const DOUBT_MARGIN_DB: f64 = 3.0;
-/// What a model of images that all state one time must reach, dB: static scenes that were tried reach 28 and more, things that move are blurred at 24.
+/// What a model of images that all state one time must reach, dB, whole and blurred. Static scenes that are hardly trained reach 24 with 41 to 42 where they are blurred,
+/// because what is missing is detail; of things that move the blurred images differ, too: 23 with 32.
 const ONE_TIME_DB: f64 = 26.0;
+const ONE_TIME_BLURRED_DB: f64 = 37.0;
 /// Shorter runs are not judged, in iterations.
 pub(super) const LEAST_ITERATIONS: usize = 300;
 /// Shorter runs are judged by fewer rules, at the end only, in iterations.
@@ -71,7 +73,7 @@ pub(super) fn shortfall(scores: &[Score], baselines: &Baselines, rules: Rules, d
     if weak && doubts.any && now.psnr_db < baselines.blur_db + DOUBT_MARGIN_DB {
         return images("hardly more than the images blurred 16 times", baselines.blur_db);
     }
-    if doubts.one_time && always(&|s| s.psnr_db < ONE_TIME_DB) {
+    if doubts.one_time && always(&|s| s.psnr_db < ONE_TIME_DB && s.blurred_db.is_none_or(|db| db < ONE_TIME_BLURRED_DB)) {
         return images("less than static scenes do", ONE_TIME_DB);
     }
     let mean_image = baselines.mean_image_db?;
@@ -98,7 +100,14 @@ mod tests {
     #[test]
     fn every_deciding_score_must_break_the_rule() {
         let baselines = Baselines { mean_colour_db: 12.0, blur_db: 20.0, mean_image_db: Some(18.0) };
-        let score = |psnr_db, [moving, frozen]: [f64; 2]| Score { percent: 0, psnr_db, moving_db: Some(moving), frozen_db: Some(frozen), detail: 1.0 };
+        let score = |psnr_db, [moving, frozen]: [f64; 2]| Score {
+            percent: 0,
+            psnr_db,
+            moving_db: Some(moving),
+            frozen_db: Some(frozen),
+            detail: 1.0,
+            blurred_db: None,
+        };
         let (follows, still) = ([24.0, 17.0], [16.0, 15.9]);
         let of = |rules, any, scores: &[(f64, [f64; 2])]| {
             let scores: Vec<Score> = scores.iter().map(|&(psnr, moving)| score(psnr, moving)).collect();
@@ -122,6 +131,10 @@ mod tests {
         let at_one_time = |rules, last| shortfall(&[score(24.0, follows), score(last, follows)], &baselines, rules, one_time);
         assert!(images(at_one_time(Rules::All, 25.0), "reach 25.0 dB, less than static scenes do (26.0 dB)"));
         assert_eq!((at_one_time(Rules::All, 26.5), at_one_time(Rules::Baselines, 25.0)), (None, None));
+        let lacks_detail = Score { blurred_db: Some(41.0), ..score(25.0, follows) };
+        let moved = Score { blurred_db: Some(32.0), ..lacks_detail };
+        assert_eq!(shortfall(&[lacks_detail, lacks_detail], &baselines, Rules::All, one_time), None);
+        assert!(images(shortfall(&[moved, moved], &baselines, Rules::All, one_time), "less than static scenes do"));
         // Images without detail: the blurred ones are better than anything.
         let smooth = Baselines { blur_db: 40.0, ..baselines };
         assert_eq!(shortfall(&[score(31.0, follows)], &smooth, Rules::All, one_time), None);

@@ -1,6 +1,6 @@
 //! Scores a model on its way and at its end, and decides whether the run has failed.
 
-use super::baselines::{MovingPixels, Yardstick, psnr_db};
+use super::baselines::{MovingPixels, Yardstick, blurred, psnr_db};
 use super::rules::{Doubts, GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, shortfall};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
@@ -111,8 +111,7 @@ impl Watch {
         let background = context.job.config.background()?;
         self.measure_baselines(context)?;
         let Some(yardstick) = &self.yardstick else { return Ok(()) };
-        let mut detail = 0.0;
-        let psnr = scored(context, state, &yardstick.views, &mut detail)?;
+        let whole = scored(context, state, &yardstick.views)?;
         // Each moving view at its own time and, for comparison, a third and two thirds of the sequence later.
         let mut sums = [0.0; 3];
         let moving = &yardstick.moving;
@@ -132,7 +131,14 @@ impl Watch {
         let mean = |sum: f64| (!moving.is_empty()).then(|| sum / moving.len() as f64);
         // Iterations that the watchdog repeats are scored again.
         self.scores.retain(|s| s.percent != percent);
-        self.scores.push(Score { percent, psnr_db: psnr, moving_db: mean(sums[0]), frozen_db: mean(0.5 * (sums[1] + sums[2])), detail });
+        self.scores.push(Score {
+            percent,
+            psnr_db: whole.psnr_db,
+            moving_db: mean(sums[0]),
+            frozen_db: mean(0.5 * (sums[1] + sums[2])),
+            detail: whole.detail,
+            blurred_db: Some(whole.blurred_db),
+        });
         Ok(())
     }
     /// The error of a run that has failed at `percent`, of which the baselines are measured. A deformer that is static by choice is warned of, at the end.
@@ -208,33 +214,43 @@ fn validation_psnr_db(context: &Context, state: &mut TrainState) -> Result<Optio
     if views.is_empty() {
         return Ok(None);
     }
-    match scored(context, state, &views, &mut 0.0) {
+    match scored(context, state, &views) {
         Err(error @ (Error::Data { .. } | Error::Io { .. })) if asked == 0 => {
             context.job.events.emit(&Event::Warning { object: "validation views".into(), message: format!("not scored: {error}") });
             Ok(None)
         }
-        scored => scored.map(Some),
+        scored => scored.map(|s| Some(s.psnr_db)),
     }
 }
 
-/// Mean PSNR in dB of the model on `views`; `detail` becomes the mean slope of its images over that of the true ones.
-fn scored(context: &Context, state: &mut TrainState, views: &[usize], detail: &mut f64) -> Result<f64> {
+/// Whole images of a model, means over views.
+struct Whole {
+    psnr_db: f64,
+    /// Mean slope of the drawn images over that of the true ones.
+    detail: f64,
+    /// PSNR between the blurred images and the blurred truth.
+    blurred_db: f64,
+}
+
+fn scored(context: &Context, state: &mut TrainState, views: &[usize]) -> Result<Whole> {
     let scene = &context.job.scene;
     let background = context.job.config.background()?;
     let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
-    let (mut sum, mut drawn_slope, mut true_slope) = (0.0, 0.0, 0.0);
+    let (mut sum, mut sum_blurred, mut drawn_slope, mut true_slope) = (0.0, 0.0, 0.0, 0.0);
     let gaussians = state.set.gaussians()?;
     context.draw(state, &gaussians, &requests, gaussians.sh_degree, |index, image| {
         let image = to_vec(image, "drawn view")?;
         let camera = scene.camera(views[index]);
+        let size = [camera.width, camera.height];
         let truth = scene.frame(views[index])?.to_planes(background);
-        sum += psnr_db(&truth, &image, [camera.width, camera.height], None)?;
+        sum += psnr_db(&truth, &image, size, None)?;
+        sum_blurred += psnr_db(&blurred(&truth, size), &blurred(&image, size), size, None)?;
         drawn_slope += slope(&image, camera.width as usize);
         true_slope += slope(&truth, camera.width as usize);
         Ok(())
     })?;
-    *detail = if true_slope > 0.0 { drawn_slope / true_slope } else { 1.0 };
-    Ok(sum / views.len().max(1) as f64)
+    let n = views.len().max(1) as f64;
+    Ok(Whole { psnr_db: sum / n, detail: if true_slope > 0.0 { drawn_slope / true_slope } else { 1.0 }, blurred_db: sum_blurred / n })
 }
 
 /// Mean absolute difference of neighbours along the rows of planes.

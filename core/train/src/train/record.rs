@@ -34,4 +34,7 @@ pub(crate) struct Score {
     pub frozen_db: Option<f64>,
     /// Mean slope over that of the truth.
     pub detail: f64,
+    /// PSNR between the blurred images and the blurred truth; absent in older checkpoints.
+    #[serde(default)]
+    pub blurred_db: Option<f64>,
 }
