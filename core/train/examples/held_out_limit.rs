@@ -60,7 +60,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let moving = viewpoints.iter().any(|v| v.frame.is_some());
     let count = if moving { scene.frames } else { OTHER_TIMES.min(scene.frames) };
     let others: Vec<Instant> = (0..count).map(|i| instant(every(count, i))).collect();
-    println!("{name}: PSNR in dB of pixels from known surfaces: mean of {BLENDED} cameras / nearest camera / without unseen pixels; share of pixels unseen, seen from over 30 and 60 degrees away only");
+    println!("{name}: PSNR in dB with known surfaces: mean of {BLENDED} cameras / nearest camera / mean, without unseen pixels;");
+    println!("  share of the pixels unseen, seen from over 30, and over 60 degrees away only");
     let mut all = Vec::new();
     for viewpoint in viewpoints.iter().filter(|v| v.split == Split::Test) {
         let taken: Vec<usize> = match viewpoint.frame {
