@@ -15,8 +15,10 @@ const SPARE: f64 = 1.4;
 const LEAST_PIXELS: f64 = 2.0e4;
 /// Gaussians per pixel with detail.
 const PER_DETAIL: f64 = 0.8;
-/// Cameras around a scene that bear as many Gaussians as one image has: with four, 12,000 were 0.9 dB better than 20,000.
-const CAMERAS_PER_PART: f64 = 10.0;
+/// Cameras around a scene beyond the first two that bear as many Gaussians as one image has: with four cameras in all, 12,000 were 0.9 dB better than 20,000.
+const CAMERAS_PER_PART: f64 = 6.0;
+/// Frames that do: what moves has Gaussians of its own at many times. A capture of 300 frames lost a decibel on moving pixels with half as many.
+const FRAMES_PER_PART: f64 = 150.0;
 /// Fewest Gaussians at most.
 const LEAST_GAUSSIANS: f64 = 4000.0;
 /// Gaussians that a thread can train in a minute: on five captures 0.05 to 0.9 dB better than 4,000; 10,000 are no better.
@@ -234,7 +236,10 @@ fn most_gaussians(facts: &Facts, machine: Machine, minutes: f64) -> f64 {
     let parts = match facts.arrangement {
         Arrangement::Rig | Arrangement::OneCameraAnywhere => 1.0,
         _ if stands_alone(facts) => 1.0,
-        Arrangement::Photos | Arrangement::OneMovingCamera | Arrangement::Dome => (facts.cameras as f64 / CAMERAS_PER_PART).min(2.0),
+        Arrangement::Photos | Arrangement::OneMovingCamera | Arrangement::Dome => {
+            let cameras = facts.cameras.saturating_sub(2) as f64 / CAMERAS_PER_PART;
+            cameras.max(facts.frames as f64 / FRAMES_PER_PART).min(2.0)
+        }
     };
     let (detail, per_minute) = if all_move(facts) { (ALL_MOVE_DETAIL, ALL_MOVE_PER_THREAD_MINUTE) } else { (1.0, PER_THREAD_MINUTE) };
     let wanted = detail * parts * PER_DETAIL * facts.pixels() * f64::from(facts.detail);
@@ -364,7 +369,7 @@ mod tests {
         let few = choose(&Facts { cameras: 6, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
         assert!(value(&few, "train.dropout").is_some() && value(&dome, "train.dropout").is_none());
         let most = |cameras: usize| value(&choose(&Facts { cameras, ..facts(Arrangement::Dome) }, MACHINE, 10.0, true), "density.max_gaussians");
-        assert_eq!([4, 16, 60].map(most), [7500, 29_500, 37_000].map(|n: i64| Some(n.into())));
+        assert_eq!([4, 9, 60].map(most), [6500, 22_000, 37_000].map(|n: i64| Some(n.into())));
         let photos = choose(&Facts { frames: 1, moving: None, noise: None, ..facts(Arrangement::Photos) }, MACHINE, 5.0, true);
         assert_eq!(value(&photos, "deformer.kind"), Some("none".into()));
         let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
