@@ -359,7 +359,7 @@ mod tests {
         assert_eq!((value(&long, "deformer.kind"), value(&long, "deformer.width")), (Some("cdf-basis".into()), Some(64.into())));
         let sparse = Facts { cameras: 8, frames: 300, size: [160, 90], ..facts(Arrangement::Dome) };
         assert!(value(&choose(&sparse, MACHINE, 5.0, true), "train.key_frames").is_none(), "too few points for each");
-        let sharp = Facts { size: [320, 180], detail: 1.0, ..sparse };
+        let sharp = Facts { size: [320, 180], ..sparse };
         assert_eq!(value(&choose(&sharp, MACHINE, 20.0, true), "train.key_frames"), Some(9.into()), "37 key frames of 400 points");
         let patient = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 25.0, true);
         assert_eq!(value(&patient, "deformer.width"), Some(128.into()));
