@@ -79,6 +79,8 @@ impl Checkpoint {
             let mut run = run.completed(registry)?;
             // What a run says about itself does not change its result.
             (run.train.log_every, run.train.checkpoint_every, run.train.checks) = (0, 0, true);
+            // A checkpoint may be older than what the run found.
+            run.train.stretch = 1.0;
             config::parse_table("configuration", &run.to_toml()?)
         };
         if let Some(difference) = first_difference("", &comparable(&stored)?, &comparable(run)?) {

@@ -6,10 +6,16 @@ use cc4dgs_core::{Schedule, Stage};
 /// Sizes per axis that images have before they have their full one, ascending; each for an equal part of the time.
 pub const IMAGE_SCALES: [f32; 3] = [0.25, 0.354, 0.5];
 
+/// The share of the main stage after which its length is settled ([`TrainConfig::stretch`]).
+const SETTLED: f64 = 0.2;
+
 /// Iterations of a run's stages.
 #[derive(Clone, Debug)]
 pub struct StageLengths {
+    /// By the shares alone.
     lengths: [usize; 3],
+    /// The main stage once its length is settled.
+    settled: usize,
     total: usize,
     passes: [usize; 3],
     sh_degree: usize,
@@ -29,42 +35,58 @@ impl StageLengths {
         let mut lengths = shares.map(|s| (config.iterations as f64 * s / sum).round() as usize);
         // Rounding goes to the longest stage, so that the stages add up to the number asked for.
         lengths[2] = config.iterations.saturating_sub(lengths[0] + lengths[1]);
-        Self {
+        let mut all = Self {
             lengths,
+            settled: lengths[2],
             total: config.iterations,
             passes: [1; 3],
             sh_degree: config.sh_degree,
             sh_interval: config.sh_interval,
             extent,
             image_growth: config.image_growth,
-        }
+        };
+        all.stretch_main(config.stretch);
+        all
     }
     /// Iterations of `stage`.
     pub fn length(&self, stage: Stage) -> usize {
-        self.lengths[stage as usize]
+        if stage == Stage::Main { self.settled } else { self.lengths[stage as usize] }
+    }
+    /// Iterations of all stages.
+    pub fn total(&self) -> usize {
+        self.total - self.lengths[2] + self.settled
+    }
+    /// The last iteration of the main stage whose schedule does not know the settled length.
+    pub fn settles_at(&self) -> usize {
+        (SETTLED * self.lengths[2] as f64) as usize
+    }
+    /// Makes the main stage `factor` times as long as its share, from [`StageLengths::settles_at`] on.
+    pub fn stretch_main(&mut self, factor: f64) {
+        self.settled = (factor * self.lengths[2] as f64).round() as usize;
     }
     /// States in how many iterations every camera of `stage` is drawn once.
     pub fn set_pass(&mut self, stage: Stage, iterations: usize) {
         self.passes[stage as usize] = iterations.max(1);
     }
     /// Size per axis of the images of an iteration (from 1), as a share of their full one. Scores are always fitted to full ones.
-    fn image_scale(&self, stage: Stage, iteration: usize) -> f32 {
+    fn image_scale(&self, stage: Stage, iteration: usize, settled: bool) -> f32 {
         let before = if stage == Stage::Main { self.lengths[Stage::Coarse as usize] } else { 0 };
-        let all = self.lengths[Stage::Coarse as usize] + self.lengths[Stage::Main as usize];
+        let all = self.lengths[Stage::Coarse as usize] + if settled { self.settled } else { self.lengths[Stage::Main as usize] };
         let share = (before + iteration.saturating_sub(1)) as f64 / (self.image_growth * all as f64);
         if stage == Stage::Score || share.is_nan() || share >= 1.0 { 1.0 } else { IMAGE_SCALES[(share * IMAGE_SCALES.len() as f64) as usize] }
     }
     /// Where iteration `iteration` (from 1) of `stage` stands.
     pub fn schedule(&self, stage: Stage, iteration: usize) -> Schedule {
-        let length = self.length(stage);
+        let settled = stage == Stage::Main && iteration > self.settles_at();
+        let (length, total) = if settled { (self.settled, self.total()) } else { (self.lengths[stage as usize], self.total) };
         let mut schedule = Schedule {
             stage,
             iteration,
             length,
-            total: self.total,
+            total,
             pass: self.passes[stage as usize],
             sh_degree: self.sh_degree,
-            image_scale: self.image_scale(stage, iteration),
+            image_scale: self.image_scale(stage, iteration, settled),
             extent: self.extent,
         };
         if stage == Stage::Coarse {
@@ -77,6 +99,20 @@ impl StageLengths {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_stretched_main_stage_is_longer_from_its_first_fifth_on() {
+        let plain = StageLengths::new(&TrainConfig { iterations: 2800, ..Default::default() }, true, 1.0);
+        let mut lengths = StageLengths::new(&TrainConfig { iterations: 2800, stretch: 1.31, ..Default::default() }, true, 1.0);
+        assert_eq!((lengths.settles_at(), lengths.length(Stage::Main), lengths.length(Stage::Coarse), lengths.total()), (400, 2620, 500, 3420));
+        for (stage, iteration) in [(Stage::Coarse, 500), (Stage::Score, 7), (Stage::Main, 400)] {
+            assert_eq!(lengths.schedule(stage, iteration), plain.schedule(stage, iteration));
+        }
+        let after = lengths.schedule(Stage::Main, 401);
+        assert_eq!((after.length, after.total), (2620, 3420));
+        lengths.stretch_main(1.0);
+        assert_eq!(lengths.schedule(Stage::Main, 401), plain.schedule(Stage::Main, 401));
+    }
 
     #[test]
     fn stages_add_up() {

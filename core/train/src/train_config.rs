@@ -4,6 +4,10 @@ use crate::masks::PUBLISHED_SIGMA;
 use cc4dgs_core::{Error, Result, Schedule, Stage};
 use serde::{Deserialize, Serialize};
 
+/// Bounds of `train.stretch`. What happens at a third of the main stage still lies after its first fifth.
+pub(crate) const LEAST_STRETCH: f64 = 0.7;
+pub(crate) const MOST_STRETCH: f64 = 4.0;
+
 /// The frames that the coarse stage sees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -37,6 +41,8 @@ pub struct TrainConfig {
     pub iterations: usize,
     /// Shares of coarse, score and main stage.
     pub shares: [f64; 3],
+    /// Length of the main stage from its first fifth on, as a multiple of its share: runs that `auto` plans for a time find it when they have timed that fifth.
+    pub stretch: f64,
     /// Views per iteration.
     pub batch: usize,
     /// Views per iteration of the coarse stage, where no spatial pass is shared; 0 is as many as `batch`.
@@ -101,6 +107,7 @@ impl Default for TrainConfig {
         Self {
             iterations: 28_000,
             shares: [5.0, 3.0, 20.0],
+            stretch: 1.0,
             batch: 2,
             coarse_batch: 0,
             coarse_frames: CoarseFrames::First,
@@ -189,6 +196,9 @@ impl TrainConfig {
         }
         if t.batch == 0 || t.batch > 64 {
             return bad("batch", format!("{} is not in 1..64", t.batch), "Choose the number of views per iteration");
+        }
+        if !(LEAST_STRETCH..=MOST_STRETCH).contains(&t.stretch) {
+            return bad("stretch", format!("{} is not in {LEAST_STRETCH}..{MOST_STRETCH}", t.stretch), "1 is the share; train.iterations scales all stages");
         }
         if t.coarse_batch > 64 {
             return bad("coarse_batch", format!("{} is over 64", t.coarse_batch), "Choose the number of views per iteration; 0 is as many as train.batch");

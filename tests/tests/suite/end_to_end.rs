@@ -9,7 +9,7 @@ use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::agreement::agreement;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
-use cc4dgs_train::train::{TrainJob, TrainReport, train};
+use cc4dgs_train::train::{CONFIG, TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, LazyLock};
@@ -108,6 +108,35 @@ fn same_seed_gives_the_same_bytes_and_resuming_does_too() {
     let (before, after) = (score(&load(&a), &config), score(&load(&folder.path().join("a.cc4d")), &config));
     assert!((before.psnr_db - after.psnr_db).abs() < 0.5, "{} dB became {} dB", before.psnr_db, after.psnr_db);
     assert!(after.size_mb.total < before.size_mb.total);
+}
+
+#[test]
+fn a_run_that_has_time_left_is_longer_and_its_settings_repeat_it() {
+    let mut config = tiny(&["train.iterations=60"]);
+    let planned = config.train.iterations;
+    config.auto.ends = std::time::Instant::now().checked_add(std::time::Duration::from_secs(36_000));
+    let folder = tempfile::tempdir().unwrap();
+    let [a, b, c] = ["a", "b", "c"].map(|name| folder.path().join(name));
+    let never = AtomicBool::new(false);
+    let report = run(&config, &a, false, &Silent, &never).unwrap();
+    let settled = RunConfig::resolve(None, Some(&a.join(CONFIG)), &[]).unwrap();
+    assert_eq!(settled.train.stretch, 4.0, "the largest factor");
+    assert!(report.iterations > 3 * planned && settled.train.iterations == planned && settled.auto.ends.is_none(), "{}", report.iterations);
+    run(&settled, &b, false, &Silent, &never).unwrap();
+    let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
+    assert!(bytes(&a) == bytes(&b), "the settings of a run that settled its length do not repeat it");
+
+    // Interrupted after the length was settled, and before.
+    for (events_before_stop, stretch) in [(16, 4.0), (5, 1.0)] {
+        let stop = AtomicBool::new(false);
+        let listener = StopAfter { left: AtomicUsize::new(events_before_stop), stop: &stop };
+        let _ = std::fs::remove_dir_all(&c);
+        assert!(matches!(run(&config, &c, false, &listener, &stop), Err(Error::Interrupted(_))));
+        let left = RunConfig::resolve(None, Some(&c.join(CONFIG)), &[]).unwrap();
+        assert_eq!(left.train.stretch, stretch);
+        run(&left, &c, true, &Silent, &never).unwrap();
+        assert_eq!(bytes(&a) == bytes(&c), stretch == 4.0);
+    }
 }
 
 #[test]

@@ -53,7 +53,7 @@ pub fn run(context: &Context, args: &Train, observer: Option<&dyn Observer>) -> 
     let trained = train_into(context, &layers, &args.scene, &args.out, existing, observer)?;
     let Trained { scene, config, report } = &trained;
     let (preset, device) = (config.preset.clone(), config.device.clone());
-    let shown = Report { scene: scene.clone(), preset, device, seed: config.seed, iterations: config.train.iterations, plan: &config.auto.plan, train: report };
+    let shown = Report { scene: scene.clone(), preset, device, seed: config.seed, iterations: report.iterations, plan: &config.auto.plan, train: report };
     context.output.result(&shown, || text(report))
 }
 

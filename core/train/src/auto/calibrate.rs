@@ -1,7 +1,7 @@
 //! How long an iteration takes, found by training for a few.
 
 use crate::config::{Dynamic, RunConfig};
-use crate::train::{TrainJob, share_per_view, train};
+use crate::train::{TrainJob, growth, share_per_view, train};
 use cc4dgs_core::{Event, Recorder, Registry, Result, Scene, Split};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -11,12 +11,8 @@ use std::time::{Duration, Instant};
 /// Iterations of each stage that are timed, and how many one measurement takes.
 const ITERATIONS: usize = 36;
 const PER_MEASUREMENT: usize = 4;
-/// Share of the largest number of Gaussians that a run has on average.
-const MEAN_GAUSSIANS: f64 = 0.9;
 /// Opacity of the Gaussians that are timed.
 const OPACITY: f32 = 0.5;
-/// The time of an iteration grows with the number of Gaussians to this power: images have the same number of pixels.
-const GROWTH_POWER: f64 = 0.7;
 /// Views of the iterations that tell what views share, and from which cost of motion on, as a multiple of an iteration without, they are worth their time.
 const VIEWS: usize = 3;
 const WORTH_SHARING: f64 = 1.2;
@@ -75,7 +71,7 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
         times.sort_by(f32::total_cmp);
         times.get(times.len() / 4).copied().map(f64::from)
     };
-    let grown = (MEAN_GAUSSIANS * most as f64 / model.gaussians.len().max(1) as f64).max(1.0).powf(GROWTH_POWER);
+    let grown = growth(model.gaussians.len(), most);
     let still = grown * typical("coarse").unwrap_or(1.0).max(0.01);
     let start = (all_ms - iterations_ms).max(0.0);
     let moving = (grown * typical("main").unwrap_or(still)).max(still);

@@ -55,6 +55,9 @@ pub struct AutoConfig {
     /// The plan, a line per choice. Where it is stated, the settings are those of the file and none is chosen anew.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub plan: Vec<String>,
+    /// When the iterations are to end, in a process that has planned them: `train` then settles `train.stretch`. Never in a file.
+    #[serde(skip)]
+    pub ends: Option<Instant>,
 }
 
 impl AutoConfig {
@@ -129,12 +132,15 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
     for choice in choose::choose(&facts, machine, minutes, free) {
         plan.add(for_density_of(layers, &asked, choice, registry)?)?;
     }
+    let mut ends = None;
     if !layers.state("train.iterations") {
         let patience = Duration::from_secs_f64(DECODING_SHARE * 60.0 * minutes);
         let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &scene, registry, patience)?;
         let config = layers.over(&plan.table).config()?;
         let spent = began.elapsed().as_secs_f64() / 60.0;
-        for choice in lengths(&facts, &config, timing, minutes, spent, layers.state("train.batch").then_some(config.train.batch)) {
+        let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
+        ends = (!layers.state("train.stretch")).then(|| Instant::now() + Duration::from_secs_f64(60.0 * left + timing.start / 1000.0));
+        for choice in lengths(&facts, &config, timing, minutes, left, layers.state("train.batch").then_some(config.train.batch)) {
             plan.add(choice)?;
         }
     } else {
@@ -150,6 +156,7 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
         plan.add(Choice { settings: vec![("train.zeta", toml::Value::Float((100.0 * zeta).round() / 100.0))], reason })?;
     }
     let mut config = layers.over(&plan.table).config()?;
+    config.auto.ends = ends;
     let [width, height] = facts.size;
     let seen = format!("{}: {} training images of {width}x{height} pixels, {} frames", facts.arrangement.describe(), facts.views, facts.frames);
     config.auto.plan = [vec![seen], plan.lines(layers)].concat();
@@ -174,8 +181,8 @@ fn for_density_of(layers: &Layers, asked: &RunConfig, mut choice: Choice, regist
     Ok(choice)
 }
 
-/// How many views share a pass through the field, and the iterations that `minutes` allow, of which the plan has `spent` some. `batch` is the number that the user stated.
-fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spent: f64, batch: Option<usize>) -> Vec<Choice> {
+/// How many views share a pass through the field, and the iterations for which the plan has `left` some of its `minutes`. `batch` is the number that the user stated.
+fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left: f64, batch: Option<usize>) -> Vec<Choice> {
     let total: f64 = config.train.shares.iter().sum::<f64>().max(1e-9);
     let main = config.train.shares[2] / total;
     let scored = config.train.dynamic != Dynamic::All;
@@ -185,7 +192,6 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, spen
     let (field, view) = (moving * timing.shared, timing.still + moving * timing.per_time);
     let views = batch.map_or((field / (FIELD_VIEWS * view)).round().clamp(1.0, MOST_VIEWS), |batch| batch as f64);
     let ms = (1.0 - main) * EARLY * timing.still + main * (field + views * view);
-    let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
     let count = (left * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
     let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
     let rates = [("train.batch", toml::Value::Integer(views as i64)), ("train.coarse_batch", 1.into()), ("train.lr.batch_power", 0.5.into())];

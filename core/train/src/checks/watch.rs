@@ -157,7 +157,7 @@ impl Watch {
             _ => Doubts::default(),
         };
         let place = match percent {
-            END => format!("after {} iterations", context.job.config.train.iterations),
+            END => format!("after {} iterations", context.lengths.total()),
             _ => format!("stopped at iteration {} of {} of the main stage, where", state.iteration, context.lengths.length(Stage::Main)),
         };
         let problem = match shortfall(&deciding, &yardstick.baselines, rules, doubts)? {

@@ -92,10 +92,10 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     };
     let job =
         TrainJob { config: &config, scene, out: Some(run.clone()), resume, registry: worker.registry, events: &events, stop: worker.stop, observer: None };
-    let (outcome, message, verdict) = match train(&job) {
-        Ok((_, report)) => (Outcome::Done, None, report.verdict),
+    let (outcome, message, verdict, iterations) = match train(&job) {
+        Ok((_, report)) => (Outcome::Done, None, report.verdict, report.iterations),
         // The checkpoint is there, so the cells can be scored all the same.
-        Err(error @ Error::Failed { .. }) => (Outcome::Hopeless, Some(error.to_string()), None),
+        Err(error @ Error::Failed { .. }) => (Outcome::Hopeless, Some(error.to_string()), None, config.train.iterations),
         Err(other) => return Err(other),
     };
     let history = read_history(&run.join(EVENTS))?;
@@ -103,7 +103,7 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let finished = FinishedTraining {
         outcome,
         message,
-        iterations: config.train.iterations,
+        iterations,
         verdict,
         curve,
         curve_seconds,

@@ -2,6 +2,7 @@
 
 use super::{Parts, TrainJob, TrainState};
 use crate::checkpoint;
+use crate::config::RunConfig;
 use burn::tensor::Device;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Result};
@@ -19,7 +20,12 @@ pub(super) fn write_config(job: &TrainJob) -> Result<()> {
     if !job.resume && old.exists() {
         std::fs::remove_file(&old).map_err(|e| Error::io(&old, e))?;
     }
-    write_atomically(out.join(CONFIG), job.config.to_toml()?.as_bytes())
+    write_settings(out, job.config)
+}
+
+/// Writes settings into the folder `out`, which exists.
+pub(super) fn write_settings(out: &Path, config: &RunConfig) -> Result<()> {
+    write_atomically(out.join(CONFIG), config.to_toml()?.as_bytes())
 }
 
 /// The state that the checkpoint at `path` holds. A continuation that is refused leaves the settings of the run as they were.

@@ -27,6 +27,10 @@ impl Log {
         self.since.1 = iteration;
         self
     }
+    /// The stage is to have `length` iterations.
+    pub(crate) fn set_length(&mut self, length: usize) {
+        self.length = length;
+    }
     /// What a checkpoint keeps of it.
     pub(crate) fn record(&self) -> LogRecord {
         LogRecord {

@@ -10,6 +10,7 @@ mod key_frames;
 mod log;
 mod losses;
 mod observe;
+mod pace;
 mod parameters;
 mod probe;
 mod pyramid;
@@ -33,6 +34,7 @@ pub(crate) use cost::share_per_view;
 pub use folder::CONFIG;
 pub use guard::Guard;
 pub use observe::{Observer, Snapshot, Standing};
+pub(crate) use pace::growth;
 pub use record::Record;
 pub(crate) use record::Score;
 pub use refit::{RefitJob, prune_and_refit};
@@ -55,6 +57,7 @@ use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, Moving};
 use losses::LossTerms;
+use pace::Pace;
 use pyramid::Pyramid;
 use sampler::{Prefetcher, Sampler};
 use serde::Serialize;
@@ -92,6 +95,8 @@ pub struct TrainReport {
     pub seconds: f64,
     /// Wall seconds per stage of this call.
     pub stage_seconds: BTreeMap<String, f64>,
+    /// Iterations of all stages.
+    pub iterations: usize,
     /// Gaussians at the end.
     pub gaussians: usize,
     /// Of which the deformer moves.
@@ -105,6 +110,8 @@ pub struct TrainReport {
 /// What stays fixed during a run.
 pub(crate) struct Context<'a> {
     pub job: &'a TrainJob<'a>,
+    /// The configuration with what the run has settled: what is stored.
+    pub settings: RunConfig,
     pub lengths: StageLengths,
     pub pyramid: Pyramid,
     pub device: Device,
@@ -177,6 +184,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     };
     let mut context = Context {
         job,
+        settings: config.clone(),
         pyramid: Pyramid::new(&job.scene, config)?,
         lengths: StageLengths::new(&config.train, matches!(moving, Moving::Scored { .. }), job.scene.extent()),
         rasterizer: job.registry.build_rasterizer(&config.rasterizer)?,
@@ -218,12 +226,13 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let report = TrainReport {
         seconds: began.elapsed().as_secs_f64(),
         stage_seconds,
+        iterations: context.lengths.total(),
         gaussians: state.set.len(),
         dynamic_gaussians,
         checkpoint: context.checkpoint.clone(),
         verdict,
     };
-    Ok((checkpoint::trained_model(state, config)?, report))
+    Ok((checkpoint::trained_model(state, &context.settings)?, report))
 }
 
 /// Index among the training cameras, by index in the scene.
@@ -252,10 +261,9 @@ fn decide_moving(job: &TrainJob) -> Moving {
 }
 
 impl Context<'_> {
-    fn run_stage(&self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
-        let length = self.lengths.length(stage);
+    fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
         let events = self.job.events;
-        if length == 0 || (stage == Stage::Score && self.masks.is_empty()) {
+        if self.lengths.length(stage) == 0 || (stage == Stage::Score && self.masks.is_empty()) {
             if stage == Stage::Main {
                 self.begin_main(state)?;
             }
@@ -268,19 +276,16 @@ impl Context<'_> {
                 self.add_key_frames(state)?;
             }
         }
+        let mut length = self.lengths.schedule(stage, state.iteration + 1).length;
         events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
         let began = Instant::now();
-        let mut sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), self.job.config.train.views_per_iteration(stage));
-        // Only a canonical space that is the first frame can be left frame by frame.
-        if stage == Stage::Main && self.stage_views(Stage::Coarse).len() < self.stage_views(Stage::Main).len() {
-            let ramp = (self.job.config.train.time_ramp * length as f64).round() as usize;
-            sampler = sampler.with_ramp(ramp, |view| self.job.scene.views[view].time_norm);
-        }
+        let mut sampler = self.sampler(stage, length);
+        let mut pace = Pace::new(self, stage, state);
         let prefetcher = Prefetcher::new();
         let resumed_at = state.iteration;
         let mut watchdog = Watchdog::new(state);
         let mut log = log::Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
-        while state.iteration < length {
+        while state.iteration < self.lengths.length(stage) {
             if self.job.stop.load(Ordering::Relaxed) {
                 state.record.log = log.record();
                 self.save(state)?;
@@ -290,8 +295,13 @@ impl Context<'_> {
                     None => at,
                 }));
             }
-            let batch = sampler.batch(state.iteration);
             let schedule = self.lengths.schedule(stage, state.iteration + 1);
+            if schedule.length != length {
+                length = schedule.length;
+                sampler = self.sampler(stage, length);
+                log.set_length(length);
+            }
+            let batch = sampler.batch(state.iteration);
             prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
             let check = watchdog.checks(schedule.iteration);
             let trouble = match stage {
@@ -307,11 +317,14 @@ impl Context<'_> {
             }
             state.iteration = schedule.iteration;
             let every = self.job.config.train.checkpoint_every;
-            let saves = every > 0 && state.iteration.is_multiple_of(every) && state.iteration < length;
+            let saves = every > 0 && state.iteration.is_multiple_of(every) && state.iteration < self.lengths.length(stage);
             watchdog.after_iteration(self, state, trouble, length, saves)?;
             if state.iteration < schedule.iteration {
                 // Back at an earlier state.
                 continue;
+            }
+            if let Some(factor) = pace.as_mut().and_then(|pace| pace.after_iteration(self, &schedule, state.set.len())) {
+                self.stretch_main(factor)?;
             }
             if let Some(failure) = watch.after_iteration(self, state, &schedule)? {
                 state.record.log = log.record();
@@ -337,6 +350,17 @@ impl Context<'_> {
             events.emit(&Event::Work { stage: "score".into(), counter: "Gaussians that move".into(), done: moving, skipped: all - moving });
         }
         Ok(())
+    }
+
+    /// Which views the iterations of a stage of `length` iterations see.
+    fn sampler(&self, stage: Stage, length: usize) -> Sampler {
+        let train = &self.job.config.train;
+        let sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), train.views_per_iteration(stage));
+        // Only a canonical space that is the first frame can be left frame by frame.
+        if stage != Stage::Main || self.stage_views(Stage::Coarse).len() == self.stage_views(Stage::Main).len() {
+            return sampler;
+        }
+        sampler.with_ramp((train.time_ramp * length as f64).round() as usize, |view| self.job.scene.views[view].time_norm)
     }
 
     /// The training views a stage draws from.
@@ -387,7 +411,7 @@ impl Context<'_> {
 
     fn save(&self, state: &TrainState) -> Result<()> {
         let Some(path) = &self.checkpoint else { return Ok(()) };
-        let bytes = checkpoint::save(path, state, self.job.config)?;
+        let bytes = checkpoint::save(path, state, &self.settings)?;
         self.job.events.emit(&Event::Saved { path: path.display().to_string(), bytes });
         Ok(())
     }

@@ -127,6 +127,7 @@ impl<'a> Tuner<'a> {
         let context = Context {
             job: &job,
             pyramid: Pyramid::new(scene, config)?,
+            settings: config.clone(),
             lengths: StageLengths::new(&config.train, false, scene.extent()),
             rasterizer: registry.build_rasterizer(&config.rasterizer)?,
             losses: LossTerms::build(registry, &config.loss)?,
