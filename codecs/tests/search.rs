@@ -133,8 +133,19 @@ fn the_loss_is_kept_and_measured_steps_save_bytes() {
     let (plain, plain_drop) = encode("max-drop=0.5dB", "allocate = false");
     println!("{loose} bytes with measured steps, {plain} without");
     assert!(plain_drop <= 0.5 && 100 * loose < 98 * plain, "{loose} bytes with measured steps, {plain} without");
-    let (sized, _) = encode(&format!("max-size={}MB", loose as f64 / 1e6), "");
-    assert!(sized <= loose);
+    let bounded = format!("max-size={}MB", tight as f64 / 1e6);
+    let (sized, _) = encode(&bounded, "");
+    assert!(sized <= tight);
+    // A bound is one of the whole file.
+    let rest = |bytes: u64| {
+        let of_file = move || Ok(bytes);
+        let codec = (plugin.build)(&bounded, &toml::Table::new()).unwrap();
+        codec.encode(&g, &CodecContext { rest_bytes: Some(&of_file), ..context }).map(|streams| streams.iter().map(|s| s.bytes.len()).sum::<usize>())
+    };
+    let beside = tight as u64 / 4;
+    assert!(rest(beside).unwrap() + (beside as usize) < tight);
+    let message = rest(tight as u64).unwrap_err().to_string();
+    assert!(message.contains("weights of the deformer") && message.contains("--field-weights"), "{message}");
 }
 
 #[test]

@@ -22,6 +22,9 @@ const AIM: f64 = 0.985;
 /// Octaves of the step factor by which attempts differ, at most, and the share of a known interval that they stay away from its ends.
 const FARTHEST: f64 = 2.0;
 const MARGIN: f64 = 0.08;
+/// Fine-tuned weights of a deformer take up to so many times the bytes of those before; bytes that the header has more where there are streams of Gaussians.
+const REST_WHEN_TUNED: f64 = 1.02;
+const STREAM_TABLE: f64 = 1500.0;
 /// Least share from which a loss is extrapolated: smaller ones are noise.
 const LEAST: f64 = 0.05;
 
@@ -123,7 +126,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     }
     let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !job.gaussians.is_empty());
     let allowance = match services {
-        _ if settings.max_size_mb > 0.0 => Allowance::Bytes(1e6 * settings.max_size_mb),
+        _ if settings.max_size_mb > 0.0 => Allowance::Bytes(bytes_of_gaussians(settings, context)?),
         None if settings.drop_wanted && !job.gaussians.is_empty() => {
             let problem = "a loss of PSNR is measured on training views, and there are none";
             return Err(Error::parameter(object, problem, "Give the dataset with --scene, or choose compact:psnr=50dB or compact:max-size=5MB"));
@@ -169,17 +172,34 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     Ok(found.attempt)
 }
 
+/// What of the allowed size of the file is left for the Gaussians: all of it where the rest is not known.
+fn bytes_of_gaussians(settings: &Settings, context: &CodecContext) -> Result<f64> {
+    let allowed = 1e6 * settings.max_size_mb;
+    let Some(rest) = context.rest_bytes else { return Ok(allowed) };
+    let rest = rest()? as f64;
+    let left = allowed - rest * if context.tuner.is_some() { REST_WHEN_TUNED } else { 1.0 } - STREAM_TABLE;
+    if left <= 0.0 {
+        let problem = format!("{} MB are allowed, and header and weights of the deformer take {:.4} MB", settings.max_size_mb, rest / 1e6);
+        return Err(Error::parameter(
+            "codec compact.max_size_mb",
+            problem,
+            "Allow more, or store the weights in fewer bits, such as --field-weights compact:bits=6",
+        ));
+    }
+    Ok(left)
+}
+
 /// Says what was chosen; a loss or size over what the user allowed is an error.
 fn report(found: &Tried, allowance: &Allowance, start: f64, settings: &Settings, context: &CodecContext) -> Result<()> {
     let object = "codec compact";
     let (megabytes, steps) = (found.attempt.bytes as f64 / 1e6, found.attempt.quality / start);
     match allowance {
         Allowance::Bytes(_) if !found.allowed() => {
-            let problem = format!("{} bytes are the least that it reached", found.attempt.bytes);
+            let problem = format!("{} bytes of Gaussians are the least that it reached", found.attempt.bytes);
             return Err(Error::parameter(object, problem, "Allow more, or remove Gaussians with `cc4dgs prune`"));
         }
         Allowance::Bytes(_) => {
-            note(context, format!("{megabytes:.4} MB of Gaussians of {} MB allowed, steps {steps:.3} times the estimated ones", settings.max_size_mb));
+            note(context, format!("{megabytes:.4} MB of Gaussians, the file at most {} MB, steps {steps:.3} times the estimated ones", settings.max_size_mb));
         }
         Allowance::Drop { limit, chosen, .. } => {
             let drop = found.share * limit;

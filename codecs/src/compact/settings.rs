@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 pub(super) const SCHEMA: &str = "\
 max_drop_db = 0.05       # with --scene: the smallest file whose PSNR on training views is at most so much lower; `compact:max-drop=0.05dB` for short. Without fine-tuning the deformer's weights are not counted. 0: psnr_db
-max_size_mb = 0.0        # the best Gaussians in at most so many MB; `compact:max-size=5MB` for short. The deformer's weights come on top. 0: no limit
+max_size_mb = 0.0        # the best Gaussians in a file of at most so many MB, all included; `compact:max-size=5MB` for short. 0: no limit
 finetune = 500           # with --scene: iterations in which Gaussians and deformer are trained further with rounded values, in larger steps; 0: none
 size_weight = 4.0        # how much bits count in fine-tuning; 0 trains for accuracy alone
 psnr_db = 50.0           # without --scene: estimated PSNR between images before and after; `compact:psnr=50dB` for short

@@ -21,12 +21,14 @@ pub struct CodecContext<'a> {
     pub tuner: Option<&'a dyn TuneModel>,
     /// A Gaussian may move if and only if its dynamic score is above this: minus infinity if all may, infinity if none does. `None` if that is not known.
     pub dynamic_threshold: Option<f32>,
+    /// Bytes of everything else in the file, for codecs whose user bounds its size: header and weights of the deformer, before any fine-tuning.
+    pub rest_bytes: Option<&'a dyn Fn() -> Result<u64>>,
 }
 
 impl<'a> CodecContext<'a> {
     /// A context without scene, renderer and deformer, as for decoding.
     pub fn new(seed: Seed, limits: Limits, events: &'a dyn EventSink) -> Self {
-        Self { seed, limits, events, views: None, renderer: None, deformer: None, tuner: None, dynamic_threshold: None }
+        Self { seed, limits, events, views: None, renderer: None, deformer: None, tuner: None, dynamic_threshold: None, rest_bytes: None }
     }
 }
 

@@ -1,20 +1,21 @@
 //! A model as a `.cc4d` archive.
 
 use crate::codec_services::{ModelServices, SceneViews};
-use crate::field_weights::FieldWeights;
+use crate::field_weights::{EncodedWeights, StoredField};
 use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, DeformerEntry, Manifest, StreamKind};
+use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamKind};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, Deformer, Error, EventSink, FIELD_STREAMS, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream,
-    StreamStage, TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
+    AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, StreamStage,
+    TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
 };
 use serde::Serialize;
 use serde_json::Value;
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -150,27 +151,7 @@ impl Model {
             let problem = "its deformer was left out, and a playback layer belongs to the stored Gaussians of its archive";
             return Err(Error::unsupported("the model", problem, "Compress the run, or an archive that was baked without --without-field"));
         }
-        let mut streams = codec.encode(&self.for_codec(codec.as_ref()), &context(codec_seed(self.provenance.seed)))?;
-        streams.sort_by_key(|s| codec.stage(&s.name));
-        let harmonics = streams.split_off(streams.partition_point(|s| codec.stage(&s.name) < StreamStage::Harmonics));
-        let mut field_streams = Vec::new();
-        let deformer = match field {
-            None => None,
-            Some(f) => {
-                let (name, settings) = split_kind("deformer", &f.section)?;
-                let version = registry.deformer(&name)?.info.version.to_string();
-                let chosen = FieldWeights::parse(field_weights, registry)?;
-                let weight_version = registry.weight_codec(&chosen.name)?.info.version.to_string();
-                let (seed, device) = (weight_seed(self.provenance.seed), scene.map(|(_, device)| device));
-                let (streams, weight_settings) = match tuner.map(TuneModel::adopted).transpose()?.flatten() {
-                    Some((weights, settings)) => (registry.build_weight_codec(&chosen.name, &settings)?.encode(&weights, &context(seed))?, settings),
-                    None => chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context(seed), registry)?,
-                };
-                field_streams.extend(streams.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s }));
-                let weights = CodecEntry { name: chosen.name, version: weight_version, settings: weight_settings, ..Default::default() };
-                Some(DeformerEntry { name, version, settings, context: f.context.clone(), weights })
-            }
-        };
+        let weights = field.map(|f| StoredField::new(f, field_weights, registry)).transpose()?;
         let (rasterizer, rasterizer_settings) = split_kind("rasterizer", &self.rasterizer)?;
         let moving = if movable { self.moving } else { Moving::Nothing };
         let mut extra = serde_json::Map::from_iter([(MOVING.to_string(), json(&moving)?)]);
@@ -181,7 +162,6 @@ impl Model {
         let (lower, upper) = self.bounds();
         let manifest = Manifest {
             codec: CodecEntry { name: name.into(), profile: profile.into(), version: registry.codec(name)?.info.version.into(), settings: settings.clone() },
-            deformer,
             rasterizer: self.render.entry(rasterizer, rasterizer_settings),
             frame_count: self.frame_count,
             normalisation: self.normalisation,
@@ -195,9 +175,40 @@ impl Model {
             extra,
             ..Default::default()
         };
+        let writer = |found: &Option<EncodedWeights>| {
+            let deformer = weights.as_ref().zip(found.as_ref()).map(|(w, (_, settings))| w.entry(settings.clone()));
+            ArchiveWriter::new(Manifest { deformer, ..manifest.clone() })
+        };
+        let (seed, device) = (weight_seed(self.provenance.seed), scene.map(|(_, device)| device));
+        let untuned = OnceCell::new();
+        let encode_weights = || -> Result<Option<EncodedWeights>> {
+            let Some((stored, f)) = weights.as_ref().zip(field) else { return Ok(None) };
+            stored.chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context(seed), registry).map(Some)
+        };
+        // A codec whose size is bounded asks for this.
+        let rest = || -> Result<u64> {
+            if untuned.get().is_none() {
+                let _ = untuned.set(encode_weights()?);
+            }
+            let found = untuned.get().cloned().flatten();
+            let streams: Vec<_> = found.iter().flat_map(|(streams, _)| streams.iter().map(StoredField::stream)).collect();
+            Ok(writer(&found).add_all(StreamKind::Field, streams).to_bytes()?.len() as u64)
+        };
+        let gaussians = self.for_codec(codec.as_ref());
+        let mut streams = codec.encode(&gaussians, &CodecContext { rest_bytes: Some(&rest), ..context(codec_seed(self.provenance.seed)) })?;
+        streams.sort_by_key(|s| codec.stage(&s.name));
+        let harmonics = streams.split_off(streams.partition_point(|s| codec.stage(&s.name) < StreamStage::Harmonics));
+        let adopted = tuner.filter(|_| weights.is_some()).map(TuneModel::adopted).transpose()?.flatten();
+        let found = match (adopted, &weights) {
+            (Some((tuned, settings)), Some(stored)) => {
+                Some((registry.build_weight_codec(&stored.chosen.name, &settings)?.encode(&tuned, &context(seed))?, settings))
+            }
+            _ => untuned.into_inner().map_or_else(encode_weights, Ok)?,
+        };
+        let field_streams: Vec<_> = found.iter().flat_map(|(streams, _)| streams.iter().map(StoredField::stream)).collect();
         // In the order in which a player needs them.
-        let writer = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams);
-        Ok(writer.add_all(StreamKind::Canonical, harmonics))
+        let all = writer(&found).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams);
+        Ok(all.add_all(StreamKind::Canonical, harmonics))
     }
     /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
     fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {

@@ -2,10 +2,13 @@
 
 use crate::archive::{load_weights, weights_of};
 use crate::codec_services::{ModelServices, SceneViews};
-use crate::model::Model;
+use crate::model::{Model, ModelDeformer};
 use burn::tensor::Device;
-use cc4dgs_core::weight_seed;
-use cc4dgs_core::{CodecContext, Error, Event, EventSink, Limits, Plugin, Registry, Result, Scene, Stream, WeightArray, config, psnr_on_views};
+use cc4dgs_core::archive::{CodecEntry, DeformerEntry};
+use cc4dgs_core::{
+    CodecContext, DeformerContext, Error, Event, EventSink, FIELD_STREAMS, Limits, Plugin, Registry, Result, Scene, Stream, WeightArray, config, psnr_on_views,
+    split_kind, weight_seed,
+};
 use std::ops::RangeInclusive;
 
 /// Views on which the loss is measured.
@@ -61,7 +64,7 @@ impl FieldWeights {
         scene: Option<&Device>,
         context: &CodecContext,
         registry: &Registry,
-    ) -> Result<(Vec<Stream>, toml::Table)> {
+    ) -> Result<EncodedWeights> {
         let Some(limit) = self.max_drop_db else {
             return Ok((registry.build_weight_codec(&self.name, &self.settings)?.encode(weights, context)?, self.settings.clone()));
         };
@@ -93,6 +96,39 @@ impl FieldWeights {
         let message = format!("{} bits, PSNR {:.4} dB lower on {} training views ({limit} dB allowed)", text.join(", "), found.drop, views.len().min(VIEWS));
         context.events.emit(&if found.drop > limit { Event::Warning { object, message } } else { Event::Note { object, message } });
         Ok((found.streams, found.settings))
+    }
+}
+
+/// Streams, and the settings that they were encoded with.
+pub(crate) type EncodedWeights = (Vec<Stream>, toml::Table);
+
+/// How an archive describes the weights of its deformer.
+pub(crate) struct StoredField<'a> {
+    /// The weight codec.
+    pub chosen: FieldWeights,
+    context: &'a DeformerContext,
+    name: String,
+    settings: toml::Table,
+    versions: [String; 2],
+}
+
+impl<'a> StoredField<'a> {
+    /// Of `deformer`, whose weights are stored as [`FieldWeights::parse`] reads `spec`.
+    pub fn new(deformer: &'a ModelDeformer, spec: &str, registry: &Registry) -> Result<Self> {
+        let chosen = FieldWeights::parse(spec, registry)?;
+        let (name, settings) = split_kind("deformer", &deformer.section)?;
+        let versions = [registry.deformer(&name)?.info.version.to_string(), registry.weight_codec(&chosen.name)?.info.version.to_string()];
+        Ok(Self { chosen, context: &deformer.context, name, settings, versions })
+    }
+    /// The entry of the manifest for weights that were encoded with `settings`.
+    pub fn entry(&self, settings: toml::Table) -> DeformerEntry {
+        let [version, weight_version] = self.versions.clone();
+        let weights = CodecEntry { name: self.chosen.name.clone(), version: weight_version, settings, ..Default::default() };
+        DeformerEntry { name: self.name.clone(), version, settings: self.settings.clone(), context: self.context.clone(), weights }
+    }
+    /// A stream of the weight codec as one of the archive.
+    pub fn stream(stream: &Stream) -> Stream {
+        Stream { name: format!("{FIELD_STREAMS}{}", stream.name), ..stream.clone() }
     }
 }
 

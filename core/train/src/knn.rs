@@ -1,4 +1,4 @@
-//! Nearest neighbours, for initial scales and for strain.
+//! Nearest neighbours, for initial scales, for strain and for velocities.
 
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -18,11 +18,11 @@ pub fn mean_squared_distance_3nn(points: &[[f32; 3]]) -> Vec<f32> {
         let (sum, count) = found.iter().filter(|n| n.squared.is_finite()).fold((0.0, 0), |(sum, count), n| (sum + n.squared, count + 1));
         if count > 0 { sum / count as f32 } else { 1.0 }
     };
-    three_nearest(points).into_iter().map(mean).collect()
+    nearest(points).into_iter().map(mean).collect()
 }
 
-/// The three nearest other points of every point, nearest first. Exact: a uniform grid searched ring by ring.
-pub fn three_nearest(points: &[[f32; 3]]) -> Vec<[Neighbour; 3]> {
+/// The `K` nearest other points of every point, nearest first. Exact: a uniform grid searched ring by ring.
+pub fn nearest<const K: usize>(points: &[[f32; 3]]) -> Vec<[Neighbour; K]> {
     let n = points.len();
     let low: [f32; 3] = std::array::from_fn(|k| points.iter().map(|p| p[k]).fold(f32::INFINITY, f32::min));
     let high: [f32; 3] = std::array::from_fn(|k| points.iter().map(|p| p[k]).fold(f32::NEG_INFINITY, f32::max));
@@ -40,11 +40,11 @@ pub fn three_nearest(points: &[[f32; 3]]) -> Vec<[Neighbour; 3]> {
         .enumerate()
         .map(|(i, p)| {
             let home = key(p);
-            let mut best = [Neighbour { index: 0, squared: f32::INFINITY }; 3];
+            let mut best = [Neighbour { index: 0, squared: f32::INFINITY }; K];
             for ring in 0..=(cells as i32) {
                 // Everything nearer than (ring - 1) cells has been seen, because the point sits somewhere inside its own cell.
                 let safe = (ring - 1).max(0) as f32 * cell;
-                if ring > 0 && best[2].squared <= safe * safe {
+                if ring > 0 && best[K - 1].squared <= safe * safe {
                     break;
                 }
                 for_ring(home, ring, |c| {
@@ -61,9 +61,9 @@ pub fn three_nearest(points: &[[f32; 3]]) -> Vec<[Neighbour; 3]> {
         .collect()
 }
 
-fn insert(best: &mut [Neighbour; 3], found: Neighbour) {
-    if found.squared < best[2].squared {
-        best[2] = found;
+fn insert<const K: usize>(best: &mut [Neighbour; K], found: Neighbour) {
+    if found.squared < best[K - 1].squared {
+        best[K - 1] = found;
         best.sort_by(|a, b| a.squared.total_cmp(&b.squared));
     }
 }
@@ -100,6 +100,8 @@ mod tests {
                 assert!((fast[i] - (d[0] + d[1] + d[2]) / 3.0).abs() < 1e-6);
             }
         }
+        let few = nearest::<6>(&[[0.0; 3], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])[0];
+        assert_eq!(few.map(|n| n.squared)[..3], [1.0, 9.0, f32::INFINITY]);
         assert_eq!(mean_squared_distance_3nn(&[[1.0; 3]]), vec![1.0]);
         assert_eq!(mean_squared_distance_3nn(&[[1.0; 3]; 5]), vec![0.0; 5]);
     }

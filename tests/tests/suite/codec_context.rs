@@ -141,6 +141,17 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "compact:max-drop=0.1dB", scene: None, tuner: None };
     let refused = model.save_archive(&path, &options, &registry, &Limits::default(), &Silent).unwrap_err();
     assert!(refused.to_string().contains("--scene"), "{refused}");
+
+    // A bound on the size is one of the whole file.
+    let size = |codec: &str, field_weights: &str| {
+        let options = ArchiveOptions { codec, settings: &settings, field_weights, scene: None, tuner: None };
+        model.save_archive(&path, &options, &registry, &Limits::default(), &Silent)
+    };
+    let most = size("compact:psnr=60dB", "fp16").unwrap();
+    let bounded = format!("compact:max-size={}MB", most as f64 / 1e6);
+    assert!(size(&bounded, "fp16").unwrap() <= most);
+    let refused = size(&bounded, "fp32").unwrap_err().to_string();
+    assert!(refused.contains("weights of the deformer"), "{refused}");
 }
 
 #[test]

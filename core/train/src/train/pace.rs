@@ -10,8 +10,12 @@ use crate::train_config::{LEAST_STRETCH, MOST_STRETCH};
 use cc4dgs_core::{Event, Result, Schedule, Stage};
 use std::time::Instant;
 
-/// Share of the timed iterations that are not counted, because what happens once happens in them.
-const FIRST: f64 = 0.25;
+/// The share of the first fifth before timing begins: Gaussians that have just begun to learn cover more pixels.
+const FIRST: f64 = 0.5;
+/// The most iterations that are timed together: a graphics card works on several at a time.
+const TOGETHER: usize = 10;
+/// What takes so many times the median of its stage happens once, and is not counted.
+const ONCE: f64 = 3.0;
 /// Share of the largest number of Gaussians that a run has on average.
 const MEAN_GAUSSIANS: f64 = 0.9;
 /// The time of an iteration grows with the number of Gaussians to this power: images have the same number of pixels.
@@ -27,7 +31,9 @@ pub(crate) fn growth(now: usize, most: usize) -> f64 {
 /// Times the first fifth of a main stage.
 pub(super) struct Pace {
     ends: Instant,
-    began: Option<(usize, Instant)>,
+    since: Option<Instant>,
+    /// Seconds of so many iterations each as are timed together.
+    seconds: Vec<f64>,
 }
 
 impl Pace {
@@ -35,26 +41,33 @@ impl Pace {
     pub fn new(context: &Context, stage: Stage, state: &TrainState) -> Option<Self> {
         let config = context.job.config;
         let ends = config.auto.ends.filter(|_| stage == Stage::Main && state.iteration == 0 && config.train.stretch == 1.0)?;
-        Some(Self { ends, began: None })
+        Some(Self { ends, since: None, seconds: Vec::new() })
     }
     /// To be called after every iteration: the factor by which the main stage is to be stretched, once it is known.
     pub fn after_iteration(&mut self, context: &Context, schedule: &Schedule, gaussians: usize) -> Option<f64> {
         let (last, iteration) = (context.lengths.settles_at(), schedule.iteration);
-        let Some((first, began)) = self.began else {
-            if iteration >= (FIRST * last as f64) as usize {
-                self.began = Some((iteration, Instant::now()));
+        let together = (last / 6).clamp(1, TOGETHER);
+        if iteration.is_multiple_of(together) && iteration <= last {
+            let now = Instant::now();
+            if let Some(since) = self.since.replace(now).filter(|_| iteration as f64 > FIRST * last as f64) {
+                self.seconds.push(now.duration_since(since).as_secs_f64());
             }
-            return None;
-        };
-        if iteration != last || first == last {
-            return None;
         }
+        let each = usual(&self.seconds).filter(|_| iteration == last)? / together as f64;
         let most = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(gaussians, |most| most.max(1) as usize);
-        let seconds = growth(gaussians, most) * began.elapsed().as_secs_f64() / (last - first) as f64;
-        let left = self.ends.saturating_duration_since(Instant::now()).as_secs_f64() / seconds;
+        let left = self.ends.saturating_duration_since(Instant::now()).as_secs_f64() / (growth(gaussians, most) * each);
         let least = if context.lengths.total() <= LEAST_ITERATIONS { 1.0 } else { LEAST_STRETCH };
         Some(((last as f64 + left) / schedule.length as f64).clamp(least, MOST_STRETCH))
     }
+}
+
+/// The mean of `values` without those that are far over the median; `None` for no values.
+fn usual(values: &[f64]) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let most = ONCE * sorted.get(sorted.len() / 2)?;
+    sorted.retain(|value| *value <= most);
+    Some(sorted.iter().sum::<f64>() / sorted.len().max(1) as f64).filter(|mean| *mean > 0.0)
 }
 
 impl Context<'_> {
@@ -68,5 +81,23 @@ impl Context<'_> {
         let message = format!("{} iterations fit into the time, where {planned} were planned: train.stretch = {factor}", self.lengths.length(Stage::Main));
         self.job.events.emit(&Event::Note { object: "main stage".into(), message });
         self.job.out.as_deref().map_or(Ok(()), |out| write_settings(out, &self.settings))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_happens_once_is_not_counted() {
+        assert_eq!(usual(&[]), None);
+        assert_eq!(usual(&[2.0, 1.0, 3.0]), Some(2.0));
+        assert_eq!(usual(&[1.0, 1.0, 40.0, 1.0, 1.0]), Some(1.0));
+    }
+
+    #[test]
+    fn more_gaussians_take_longer_and_fewer_never_less() {
+        assert_eq!(growth(1000, 500), 1.0);
+        assert!(growth(500, 1000) > 1.4 && growth(0, 10).is_finite());
     }
 }

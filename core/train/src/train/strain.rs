@@ -1,7 +1,7 @@
 //! Strain: neighbouring Gaussians should keep their distance while they move. Normalised by the canonical distance, as in "Incoherent Deformation"
 //! (arXiv 2604.16747), where the plain difference of distances gained nothing. Rotations and translations cost nothing.
 
-use crate::knn::three_nearest;
+use crate::knn::nearest;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use std::sync::Arc;
 
@@ -30,7 +30,7 @@ impl Neighbours {
         if points.len() < 2 || points.iter().flatten().any(|v| !v.is_finite()) {
             return None;
         }
-        let pairs: Vec<(usize, usize, f32)> = three_nearest(&points)
+        let pairs: Vec<(usize, usize, f32)> = nearest::<3>(&points)
             .iter()
             .enumerate()
             .flat_map(|(i, found)| found.iter().map(move |n| (i, n.index as usize, n.squared.sqrt())))

@@ -14,6 +14,7 @@ use super::{Candidate, fuse, sweep, thin};
 use cc4dgs_core::{Result, Scene, Seed};
 use glam::Vec3;
 use rayon::prelude::*;
+use std::collections::HashMap;
 
 /// Mean difference of the channels, 0..1, up to which a pixel shows a point.
 const SIMILAR: f32 = 0.1;
@@ -97,8 +98,9 @@ impl KeyFrames {
         let each = count / self.sets.len();
         let mut points = Vec::new();
         for (key, candidates) in self.found.iter().enumerate() {
+            let known = Grid::new(self.sets[key].cell_size(), &points);
             let judged = self.judge(candidates.iter().map(|c| (c.position, c.color)).collect(), key);
-            let new = |p: &KeyPoint| (!self.always(p) || !self.shows(0, p)) && !points.iter().any(|other| self.same(other, p));
+            let new = |p: &KeyPoint| (!self.always(p) || !self.shows(0, p)) && !known.has(p);
             let mut own: Vec<KeyPoint> = judged.into_iter().flatten().filter(new).take(each).collect();
             self.set_in_motion(&mut own, seed.index(key as u64));
             points.extend(own);
@@ -128,12 +130,6 @@ impl KeyFrames {
         point.alive == [0, self.sets.len() - 1]
     }
 
-    /// Whether `a`, of an earlier key frame, is `b` as well.
-    fn same(&self, a: &KeyPoint, b: &KeyPoint) -> bool {
-        let near = a.position.distance(b.position) < self.sets[b.key].cell_size();
-        near && (a.alive[0]..=a.alive[1]).contains(&b.key) && difference(a.color, b.color) < SIMILAR
-    }
-
     /// The pixels of `key` that show a point.
     fn sightings(&self, position: Vec3, color: [f32; 3], key: usize) -> Vec<Sighting> {
         let of = |(view, drawn): (usize, &WorkView)| {
@@ -156,6 +152,33 @@ impl KeyFrames {
     /// Whether most images that show a point at its own frame do so at `key`, too.
     fn shows(&self, key: usize, point: &KeyPoint) -> bool {
         self.share(&self.sightings(point.position, point.color, point.key), Some(key)) >= ALIVE
+    }
+}
+
+/// Points by the cube that they are in.
+struct Grid {
+    cell: f32,
+    points: HashMap<[i32; 3], Vec<KeyPoint>>,
+}
+
+impl Grid {
+    fn new(cell: f32, points: &[KeyPoint]) -> Self {
+        let mut grid = Self { cell, points: HashMap::new() };
+        for point in points {
+            grid.points.entry(grid.cube(point.position)).or_default().push(*point);
+        }
+        grid
+    }
+    fn cube(&self, position: Vec3) -> [i32; 3] {
+        (position / self.cell).floor().to_array().map(|v| v as i32)
+    }
+    /// Whether a point of an earlier key frame is `point` as well: within a cell of it, there at its time, and of its colour.
+    fn has(&self, point: &KeyPoint) -> bool {
+        let near = |other: &KeyPoint| other.position.distance(point.position) < self.cell;
+        let same = |other: &KeyPoint| near(other) && (other.alive[0]..=other.alive[1]).contains(&point.key) && difference(other.color, point.color) < SIMILAR;
+        let home = self.cube(point.position);
+        let around = (0..27).map(|k| [home[0].saturating_add(k % 3 - 1), home[1].saturating_add(k / 3 % 3 - 1), home[2].saturating_add(k / 9 - 1)]);
+        around.flat_map(|cube| self.points.get(&cube).into_iter().flatten()).any(same)
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::super::Candidate;
 use super::{KeyFrames, KeyPoint, SIMILAR, Sighting, difference, shown};
+use crate::knn::{Neighbour, nearest};
 use cc4dgs_core::Seed;
 use glam::Vec3;
 use rand::Rng;
@@ -35,7 +36,7 @@ impl KeyFrames {
             };
             around.iter().map(at).sum::<f32>() / around.len().max(1) as f32
         };
-        let neighbours = nearest(points);
+        let neighbours = neighbours_of(points);
         let moving = |p: &KeyPoint| p.alive == [key, key];
         let mut best: Vec<(f32, Vec3)> = points.iter().enumerate().map(|(i, p)| (fit(i, p, Vec3::ZERO), Vec3::ZERO)).collect();
         for round in 0..=ROUNDS {
@@ -90,17 +91,10 @@ fn jump(point: &KeyPoint, around: &[usize], found: &[Vec<Candidate>], farthest: 
 }
 
 /// The indices of the nearest other points of each.
-fn nearest(points: &[KeyPoint]) -> Vec<Vec<usize>> {
-    let of = |i: usize| {
-        let mut all: Vec<(f32, usize)> = (0..points.len()).filter(|&j| j != i).map(|j| (points[i].position.distance_squared(points[j].position), j)).collect();
-        let count = NEIGHBOURS.min(all.len());
-        if count < all.len() {
-            all.select_nth_unstable_by(count, |a, b| a.partial_cmp(b).unwrap_or(std::cmp::Ordering::Equal));
-        }
-        all.truncate(count);
-        all.into_iter().map(|(_, j)| j).collect()
-    };
-    (0..points.len()).into_par_iter().map(of).collect()
+fn neighbours_of(points: &[KeyPoint]) -> Vec<Vec<usize>> {
+    let positions: Vec<[f32; 3]> = points.iter().map(|p| p.position.to_array()).collect();
+    let of = |found: [Neighbour; NEIGHBOURS]| found.into_iter().filter(|n| n.squared.is_finite()).map(|n| n.index as usize).collect();
+    nearest(&positions).into_iter().map(of).collect()
 }
 
 /// The median of each coordinate.

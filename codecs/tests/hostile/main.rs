@@ -1,13 +1,18 @@
 //! Damaged streams of every codec, weight codec and playback layer: an error or a sound result, never a panic, and no allocation that the limits do not allow.
 //!
-//! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test; by default it is a second per codec. A program
-//! of its own, because it watches every allocation.
+//! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test; by default it is a second per codec. With
+//! `CC4DGS_HOSTILE_CORPUS=1` it adds a case to the corpus for every outcome that the corpus does not have. A program of its own, because it watches every allocation.
+
+mod corpus;
+mod damage;
 
 use cc4dgs_format::playback::{CodedTrack, Head, PlaybackLayer};
 use cc4dgs_format::{
     AttributeCodec, Camera, CodecContext, CodecPlugin, Entries, Error, EvaluateDeformer, ExtraAttribute, HostGaussians, Image8, Limits, RenderModel,
     RenderedPlanes, Result, Seed, Silent, Stream, TrainingViews, WeightArray, WeightCodec, WeightCodecPlugin, toml,
 };
+use corpus::{Corpus, Growing, class, harmed};
+use damage::damage;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -81,86 +86,6 @@ impl TrainingViews for Sums {
     }
 }
 
-/// A damage to one stream. Places are fractions of its length.
-#[derive(Clone, Debug)]
-enum Damage {
-    Flip(f64, u8),
-    Set(f64, Vec<u8>),
-    Cut(f64),
-    Insert(f64, Vec<u8>),
-    Remove(f64, usize),
-    /// Copies bytes from another stream.
-    Splice(f64, usize, usize),
-    Swap(usize),
-    Drop,
-}
-
-fn damage() -> impl Strategy<Value = Damage> {
-    // Numbers that are often special: zero, largest, sign bits, infinities.
-    let bytes = prop_oneof![
-        prop::collection::vec(any::<u8>(), 1..9),
-        prop::sample::select(vec![vec![0; 4], vec![255; 4], vec![0, 0, 128, 127], vec![255, 255, 255, 127], vec![0, 0, 0, 128], vec![255; 8]]),
-    ];
-    // Half of the damages hit the first bytes, where counts are.
-    let place = || prop_oneof![0.0..1.0f64, (0.0..1.0f64).prop_map(|v| 0.05 * v * v)];
-    prop_oneof![
-        4 => (place(), 0..8u8).prop_map(|(at, bit)| Damage::Flip(at, bit)),
-        4 => (place(), bytes.clone()).prop_map(|(at, bytes)| Damage::Set(at, bytes)),
-        1 => place().prop_map(Damage::Cut),
-        1 => (place(), bytes).prop_map(|(at, bytes)| Damage::Insert(at, bytes)),
-        1 => (place(), 1..64usize).prop_map(|(at, count)| Damage::Remove(at, count)),
-        1 => (place(), 0..16usize, 1..64usize).prop_map(|(at, other, count)| Damage::Splice(at, other, count)),
-        1 => (0..16usize).prop_map(Damage::Swap),
-        1 => Just(Damage::Drop),
-    ]
-}
-
-fn harm(streams: &mut Vec<Stream>, which: usize, damage: &Damage) {
-    if streams.is_empty() {
-        return;
-    }
-    let (which, count) = (which % streams.len(), streams.len());
-    let other = |k: usize| streams[k % count].bytes.clone();
-    let place = |at: &f64, len: usize| ((at * len as f64) as usize).min(len.saturating_sub(1));
-    match damage {
-        Damage::Splice(at, k, length) => {
-            let from = other(*k);
-            let bytes = &mut streams[which].bytes;
-            let at = place(at, bytes.len());
-            bytes.iter_mut().skip(at).take(*length).zip(from).for_each(|(to, from)| *to = from);
-        }
-        Damage::Swap(k) => {
-            let (a, b) = (streams[which].bytes.clone(), other(*k));
-            streams[which].bytes = b;
-            streams[k % count].bytes = a;
-        }
-        Damage::Drop => drop(streams.remove(which)),
-        _ => {
-            let bytes = &mut streams[which].bytes;
-            match damage {
-                Damage::Flip(at, bit) if !bytes.is_empty() => {
-                    let at = place(at, bytes.len());
-                    bytes[at] ^= 1 << bit;
-                }
-                Damage::Set(at, new) => {
-                    let at = place(at, bytes.len());
-                    bytes.iter_mut().skip(at).zip(new).for_each(|(to, from)| *to = *from);
-                }
-                Damage::Cut(at) => bytes.truncate(place(at, bytes.len())),
-                Damage::Insert(at, new) => {
-                    let at = place(at, bytes.len());
-                    bytes.splice(at..at, new.iter().copied());
-                }
-                Damage::Remove(at, length) => {
-                    let at = place(at, bytes.len());
-                    bytes.drain(at..(at + length).min(bytes.len()));
-                }
-                _ => {}
-            }
-        }
-    }
-}
-
 fn scene(count: usize, sh_degree: usize) -> HostGaussians {
     let draw = |i: usize, k: usize| (Seed::root(23).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
     let mut g = HostGaussians { sh_degree, opacity_logits: vec![0.0; count], ..Default::default() };
@@ -180,10 +105,35 @@ fn seconds(of: usize) -> Duration {
     Duration::from_secs_f64(wanted)
 }
 
-/// Tries damages until time is up. `decode` says what is wrong with a result, if anything is.
-fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream]) -> Option<String>) -> u64 {
+/// What came of decoding: a word for what happened, or what is wrong with the result.
+type Outcome = std::result::Result<String, String>;
+
+fn happened<T>(found: &Result<T>) -> String {
+    found.as_ref().map_or_else(|e: &Error| class(&e.to_string()), |_| "sound".into())
+}
+
+/// Repeats the damages of the corpus, then tries others until time is up, half of them on top of those. How many, and what is new in the corpus.
+fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream]) -> Outcome) -> (u64, String) {
+    let corpus = Corpus::read(name);
+    let limits = |name: &str| {
+        let largest = LARGEST.load(Ordering::Relaxed) as u64;
+        assert!(largest <= LIMITS.max_bytes, "{name}: {largest} bytes at once, {} are allowed", LIMITS.max_bytes);
+    };
+    if let Some(corpus) = &corpus {
+        // Streams of an earlier encoder are decoded still.
+        assert_eq!(decode(&corpus.sound), Ok("sound".into()), "{name}: the sound streams of the corpus");
+        for case in &corpus.cases {
+            if let Err(problem) = decode(&harmed(&corpus.sound, &case.damages)) {
+                panic!("{name}: {problem} after {:?}", case.damages);
+            }
+            limits(name);
+        }
+    }
+    let known = corpus.as_ref().map_or(&[][..], |corpus| &corpus.cases);
+    let base = corpus.as_ref().map_or(sound, |corpus| &corpus.sound);
+    let growing = std::cell::RefCell::new(Growing::new(name, sound, known, base));
     let began = Instant::now();
-    let strategy = prop::collection::vec((any::<usize>(), damage()), 1..4);
+    let strategy = (any::<prop::sample::Index>(), any::<bool>(), prop::collection::vec((any::<usize>(), damage()), 1..4));
     let tried = std::cell::Cell::new(0);
     for round in 0.. {
         if began.elapsed() >= time {
@@ -194,22 +144,25 @@ fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream
         seed[..8].copy_from_slice(&Seed::root(round).value().to_le_bytes());
         let rng = proptest::test_runner::TestRng::from_seed(proptest::test_runner::RngAlgorithm::ChaCha, &seed);
         let mut runner = TestRunner::new_with_rng(Config { cases: 64, failure_persistence: None, ..Config::default() }, rng);
-        let outcome = runner.run(&strategy, |damages| {
+        let outcome = runner.run(&strategy, |(from, fresh, damages)| {
             tried.set(tried.get() + 1);
-            let mut streams = sound.to_vec();
-            damages.iter().for_each(|(which, damage)| harm(&mut streams, *which, damage));
-            match decode(&streams) {
-                None => Ok(()),
-                Some(problem) => Err(TestCaseError::fail(problem)),
+            let mut growing = growing.borrow_mut();
+            let before = if fresh { Vec::new() } else { growing.pick(from) };
+            let damages = [before, damages].concat();
+            match decode(&harmed(growing.sound(fresh), &damages)) {
+                Ok(class) => {
+                    growing.keep(fresh, class, damages);
+                    Ok(())
+                }
+                Err(problem) => Err(TestCaseError::fail(problem)),
             }
         });
         if let Err(e) = outcome {
             panic!("{name}: {e}");
         }
-        let largest = LARGEST.load(Ordering::Relaxed) as u64;
-        assert!(largest <= LIMITS.max_bytes, "{name}: {largest} bytes at once, {} are allowed", LIMITS.max_bytes);
+        limits(name);
     }
-    tried.get()
+    (tried.get(), growing.into_inner().write().unwrap_or_default())
 }
 
 #[test]
@@ -231,12 +184,13 @@ fn damaged_gaussians_give_errors() {
             let without = context(threshold);
             let context_of_scene = CodecContext { views: Some(&drawn), renderer: Some(&drawn), deformer: Some(&drawn), ..without };
             let sound = codec.encode(&scene(count, degree), if seen { &context_of_scene } else { &without }).unwrap();
-            let wrong = |found: HostGaussians| found.validate("decoded", &LIMITS).err().map(|e: Error| e.to_string());
-            let tried = attack(plugin.info.name, &sound, time, &|streams| {
+            let (tried, new) = attack(&format!("{}-{count}", plugin.info.name), &sound, time, &|streams| {
                 let found = [codec.decode(streams, &context(None)), codec.decode_stage(streams, &context(None))];
-                found.into_iter().flatten().find_map(wrong)
+                let classes = found.each_ref().map(happened);
+                let wrong = found.into_iter().flatten().find_map(|found| found.validate("decoded", &LIMITS).err());
+                wrong.map_or_else(|| Ok(if classes[0] == classes[1] { classes[0].clone() } else { classes.join("; by stage: ") }), |e| Err(e.to_string()))
             });
-            println!("{}: {tried} damaged versions of {count} Gaussians, {:.1} s", plugin.info.name, time.as_secs_f64());
+            println!("{}: {tried} damaged versions of {count} Gaussians, {:.1} s. {new}", plugin.info.name, time.as_secs_f64());
         }
     }
 }
@@ -260,11 +214,12 @@ fn damaged_playback_layers_give_errors() {
     let segments = [(3, vec![track(Head::ALL[0], 0, 3), track(Head::ALL[2], 0, 3)]), (5, vec![track(Head::ALL[0], 3, 5)])];
     let sound = PlaybackLayer::encode(&rows, degree, samples, &segments).unwrap();
     PlaybackLayer::decode(&sound, 40, degree, &LIMITS).unwrap();
-    let tried = attack("playback layer", &sound, seconds(1), &|streams| {
-        let found = PlaybackLayer::decode(streams, 40, degree, &LIMITS).ok()?;
-        found.rows.iter().any(|row| *row >= 40).then(|| "a row beyond the Gaussians".to_string())
+    let (tried, new) = attack("playback-layer", &sound, seconds(1), &|streams| {
+        let found = PlaybackLayer::decode(streams, 40, degree, &LIMITS);
+        let class = happened(&found);
+        if found.is_ok_and(|layer| layer.rows.iter().any(|row| *row >= 40)) { Err("a row beyond the Gaussians".into()) } else { Ok(class) }
     });
-    println!("playback layer: {tried} damaged versions");
+    println!("playback layer: {tried} damaged versions. {new}");
 }
 
 #[test]
@@ -280,13 +235,12 @@ fn damaged_weights_give_errors() {
     for plugin in plugins {
         let codec: Box<dyn WeightCodec> = (plugin.build)(&toml::Table::new()).unwrap();
         let sound = codec.encode(&weights, &context(None)).unwrap();
-        let tried = attack(plugin.info.name, &sound, time, &|streams| match codec.decode(streams, &context(None)) {
-            Ok(found) => {
-                let wrong = found.iter().find(|a| a.shape.iter().product::<usize>() != a.values.len() || a.values.iter().any(|v| !v.is_finite()));
-                wrong.map(|a| format!("'{}' is not sound", a.name))
-            }
-            Err(_) => None,
+        let (tried, new) = attack(&format!("weights-{}", plugin.info.name), &sound, time, &|streams| {
+            let found = codec.decode(streams, &context(None));
+            let class = happened(&found);
+            let unsound = |a: &WeightArray| a.shape.iter().product::<usize>() != a.values.len() || a.values.iter().any(|v| !v.is_finite());
+            found.ok().and_then(|arrays| arrays.into_iter().find(unsound)).map_or(Ok(class), |a| Err(format!("'{}' is not sound", a.name)))
         });
-        println!("{}: {tried} damaged versions of weights", plugin.info.name);
+        println!("{}: {tried} damaged versions of weights. {new}", plugin.info.name);
     }
 }
