@@ -9,9 +9,10 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 /// Streams larger than this have no corpus, so that the repository stays small.
-const MOST_BYTES: usize = 6000;
-/// Damages of a case, at most.
+const MOST_BYTES: usize = 12_000;
+/// Damages of a case, and cases of a file, at most.
 const MOST_DAMAGES: usize = 4;
+const MOST_CASES: usize = 80;
 
 /// Damages, each with the stream that it is done to.
 pub type Damages = Vec<(usize, Damage)>;
@@ -35,15 +36,13 @@ pub fn harmed(sound: &[Stream], damages: &[(usize, Damage)]) -> Vec<Stream> {
     streams
 }
 
-/// A message without its numbers and with quoted names left out.
-pub fn class(message: &str) -> String {
-    let mut out = String::new();
-    for c in message.chars().map(|c| if c.is_ascii_digit() { '#' } else { c }).take(160) {
-        if !(c == '#' && out.ends_with(['#', '.'])) {
-            out.push(c);
-        }
-    }
-    out
+/// A message without its numbers, and without names that are none of the sound `streams`.
+pub fn class(message: &str, streams: &[Stream]) -> String {
+    let known = |name: &str| streams.iter().any(|s| s.name == name);
+    let parts = message.split('\'').enumerate().map(|(k, part)| if k % 2 == 0 || known(part) { part } else { "..." });
+    let text = parts.collect::<Vec<_>>().join("'");
+    let words = text.split_whitespace().map(|word| if word.contains(|c: char| c.is_ascii_digit()) { "#" } else { word });
+    words.collect::<Vec<_>>().join(" ")
 }
 
 fn path(name: &str) -> PathBuf {
@@ -93,7 +92,9 @@ impl Growing {
     }
     /// Remembers damages to the streams of the corpus that had an outcome not seen before.
     pub fn keep(&mut self, fresh: bool, outcome: String, damages: Damages) {
-        if (!fresh || self.sound[0] == self.sound[1]) && damages.len() <= MOST_DAMAGES && self.outcomes.insert(outcome.clone()) {
+        let of_corpus = !fresh || self.sound[0] == self.sound[1];
+        let small = damages.len() <= MOST_DAMAGES && self.cases.len() < MOST_CASES;
+        if of_corpus && small && self.outcomes.insert(outcome.clone()) {
             self.cases.push(Case { outcome, damages });
         }
     }

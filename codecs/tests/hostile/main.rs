@@ -108,8 +108,8 @@ fn seconds(of: usize) -> Duration {
 /// What came of decoding: a word for what happened, or what is wrong with the result.
 type Outcome = std::result::Result<String, String>;
 
-fn happened<T>(found: &Result<T>) -> String {
-    found.as_ref().map_or_else(|e: &Error| class(&e.to_string()), |_| "sound".into())
+fn happened<T>(found: &Result<T>, sound: &[Stream]) -> String {
+    found.as_ref().map_or_else(|e: &Error| class(&e.to_string(), sound), |_| "sound".into())
 }
 
 /// Repeats the damages of the corpus, then tries others until time is up, half of them on top of those. How many, and what is new in the corpus.
@@ -186,7 +186,7 @@ fn damaged_gaussians_give_errors() {
             let sound = codec.encode(&scene(count, degree), if seen { &context_of_scene } else { &without }).unwrap();
             let (tried, new) = attack(&format!("{}-{count}", plugin.info.name), &sound, time, &|streams| {
                 let found = [codec.decode(streams, &context(None)), codec.decode_stage(streams, &context(None))];
-                let classes = found.each_ref().map(happened);
+                let classes = found.each_ref().map(|found| happened(found, &sound));
                 let wrong = found.into_iter().flatten().find_map(|found| found.validate("decoded", &LIMITS).err());
                 wrong.map_or_else(|| Ok(if classes[0] == classes[1] { classes[0].clone() } else { classes.join("; by stage: ") }), |e| Err(e.to_string()))
             });
@@ -216,7 +216,7 @@ fn damaged_playback_layers_give_errors() {
     PlaybackLayer::decode(&sound, 40, degree, &LIMITS).unwrap();
     let (tried, new) = attack("playback-layer", &sound, seconds(1), &|streams| {
         let found = PlaybackLayer::decode(streams, 40, degree, &LIMITS);
-        let class = happened(&found);
+        let class = happened(&found, &sound);
         if found.is_ok_and(|layer| layer.rows.iter().any(|row| *row >= 40)) { Err("a row beyond the Gaussians".into()) } else { Ok(class) }
     });
     println!("playback layer: {tried} damaged versions. {new}");
@@ -237,7 +237,7 @@ fn damaged_weights_give_errors() {
         let sound = codec.encode(&weights, &context(None)).unwrap();
         let (tried, new) = attack(&format!("weights-{}", plugin.info.name), &sound, time, &|streams| {
             let found = codec.decode(streams, &context(None));
-            let class = happened(&found);
+            let class = happened(&found, &sound);
             let unsound = |a: &WeightArray| a.shape.iter().product::<usize>() != a.values.len() || a.values.iter().any(|v| !v.is_finite());
             found.ok().and_then(|arrays| arrays.into_iter().find(unsound)).map_or(Ok(class), |a| Err(format!("'{}' is not sound", a.name)))
         });

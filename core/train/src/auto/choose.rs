@@ -36,7 +36,7 @@ const STATIC: f32 = 2e-4;
 const PUBLISHED_WIDTH: f64 = 1352.0;
 /// Share of the time for matching key frames, seconds of one thread per matched pixel, and the most pixels of an image that are matched.
 const MATCHING_SHARE: f64 = 0.08;
-const SECONDS_PER_MATCHED_PIXEL: f64 = 4.3e-6;
+const SECONDS_PER_MATCHED_PIXEL: f64 = 1.6e-6;
 const MOST_MATCHED_PIXELS: f64 = 96_000.0;
 /// Least and most frames between key frames: in fewer hardly anything moves; in more, straight lines do not follow.
 const LEAST_KEY_INTERVAL: f64 = 3.0;
