@@ -22,7 +22,8 @@ const AIM: f64 = 0.985;
 /// Octaves of the step factor by which attempts differ, at most, and the share of a known interval that they stay away from its ends.
 const FARTHEST: f64 = 2.0;
 const MARGIN: f64 = 0.08;
-/// Fine-tuned weights of a deformer take up to so many times the bytes of those before; bytes that the header has more where there are streams of Gaussians.
+/// Allowances for what is not known before encoding: how much more bytes fine-tuned weights of a deformer take than those before, as a factor, and the bytes of the
+/// header that describe the streams of Gaussians.
 const REST_WHEN_TUNED: f64 = 1.02;
 const STREAM_TABLE: f64 = 1500.0;
 /// Least share from which a loss is extrapolated: smaller ones are noise.
