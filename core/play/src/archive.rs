@@ -38,7 +38,7 @@ pub struct ArchiveOptions<'a> {
     pub codec: &'a str,
     /// Settings of that codec.
     pub settings: &'a toml::Table,
-    /// Weight codec of the field: see [`FieldWeights::parse`].
+    /// Weight codec of the field: see [`FieldWeights::parse`](crate::field_weights::FieldWeights::parse).
     pub field_weights: &'a str,
     /// The scene that the model was trained on and the device that its field is on, for codecs that make use of the training views, of renders and of the
     /// field. Every codec works without.
