@@ -7,7 +7,7 @@ use cc4dgs_core::{Schedule, Stage};
 pub const IMAGE_SCALES: [f32; 3] = [0.25, 0.354, 0.5];
 
 /// The share of the main stage after which its length is settled ([`TrainConfig::stretch`]).
-const SETTLED: f64 = 0.2;
+pub(crate) const SETTLED: f64 = 0.2;
 
 /// Iterations of a run's stages.
 #[derive(Clone, Debug)]

@@ -93,9 +93,9 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let job =
         TrainJob { config: &config, scene, out: Some(run.clone()), resume, registry: worker.registry, events: &events, stop: worker.stop, observer: None };
     let (outcome, message, verdict, iterations) = match train(&job) {
-        Ok((_, report)) => (Outcome::Done, None, report.verdict, report.iterations),
+        Ok((_, report)) => (Outcome::Done, None, report.verdict, Some(report.iterations)),
         // The checkpoint is there, so the cells can be scored all the same.
-        Err(error @ Error::Failed { .. }) => (Outcome::Hopeless, Some(error.to_string()), None, config.train.iterations),
+        Err(error @ Error::Failed { .. }) => (Outcome::Hopeless, Some(error.to_string()), None, None),
         Err(other) => return Err(other),
     };
     let history = read_history(&run.join(EVENTS))?;
@@ -103,7 +103,8 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let finished = FinishedTraining {
         outcome,
         message,
-        iterations,
+        // One that gave up: as far as its log goes.
+        iterations: iterations.or(history.points.last().map(|point| point.iteration)).unwrap_or(0),
         verdict,
         curve,
         curve_seconds,

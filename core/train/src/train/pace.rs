@@ -20,6 +20,8 @@ const ONCE: f64 = 3.0;
 const MEAN_GAUSSIANS: f64 = 0.9;
 /// The time of an iteration grows with the number of Gaussians to this power: images have the same number of pixels.
 const GROWTH_POWER: f64 = 0.7;
+/// What an iteration takes after the first fifth, as a share of one in its second half: 0.87 to 0.95 in seven runs of two to ten minutes.
+const LATER: f64 = 0.94;
 /// Iterations of a run that is not made shorter.
 const LEAST_ITERATIONS: usize = 500;
 
@@ -55,7 +57,7 @@ impl Pace {
         }
         let each = usual(&self.seconds).filter(|_| iteration == last)? / together as f64;
         let most = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(gaussians, |most| most.max(1) as usize);
-        let left = self.ends.saturating_duration_since(Instant::now()).as_secs_f64() / (growth(gaussians, most) * each);
+        let left = self.ends.saturating_duration_since(Instant::now()).as_secs_f64() / (LATER * growth(gaussians, most) * each);
         let least = if context.lengths.total() <= LEAST_ITERATIONS { 1.0 } else { LEAST_STRETCH };
         Some(((last as f64 + left) / schedule.length as f64).clamp(least, MOST_STRETCH))
     }
