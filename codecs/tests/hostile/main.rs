@@ -3,9 +3,12 @@
 //! `CC4DGS_HOSTILE_SECONDS=600 cargo test --release -p cc4dgs-codecs --test hostile` tries for so long per test; by default it is a second per codec. With
 //! `CC4DGS_HOSTILE_CORPUS=1` it adds a case to the corpus for every outcome that the corpus does not have. A program of its own, because it watches every allocation.
 
+#[path = "../../../core/format/tests/support/allocations.rs"]
+mod allocations;
 mod corpus;
 mod damage;
 
+use allocations::{LARGEST, Watching};
 use cc4dgs_format::playback::{CodedTrack, Head, PlaybackLayer};
 use cc4dgs_format::{
     AttributeCodec, Camera, CodecContext, CodecPlugin, Entries, Error, EvaluateDeformer, ExtraAttribute, HostGaussians, Image8, Limits, RenderModel,
@@ -15,30 +18,9 @@ use corpus::{Corpus, Growing, class, harmed};
 use damage::damage;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-/// Remembers the largest single allocation.
-struct Watching;
-static LARGEST: AtomicUsize = AtomicUsize::new(0);
-// SAFETY: every call is passed on to the system allocator unchanged.
-unsafe impl GlobalAlloc for Watching {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        LARGEST.fetch_max(size, Ordering::Relaxed);
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
 #[global_allocator]
 static ALLOCATOR: Watching = Watching;
 

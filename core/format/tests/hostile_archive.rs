@@ -5,33 +5,16 @@
 //! own, because it watches every allocation.
 #![allow(clippy::unwrap_used, reason = "tests: a failed helper is a failed test")]
 
+#[path = "support/allocations.rs"]
+mod allocations;
+
+use allocations::{LARGEST, Watching};
 use cc4dgs_format::archive::{Archive, ArchiveWriter, CodecEntry, FORMAT_VERSION, Manifest, StreamKind, write_atomically};
 use cc4dgs_format::{Error, HostGaussians, Limits, Result, Stream, ply};
 use proptest::prelude::*;
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::Ordering;
 
-/// Remembers the largest single allocation.
-struct Watching;
-static LARGEST: AtomicUsize = AtomicUsize::new(0);
-// SAFETY: every call is passed on to the system allocator unchanged.
-unsafe impl GlobalAlloc for Watching {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        LARGEST.fetch_max(size, Ordering::Relaxed);
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
 #[global_allocator]
 static ALLOCATOR: Watching = Watching;
 
