@@ -27,7 +27,7 @@ pub struct Cli {
     /// Print results and errors only.
     #[arg(long, short, global = true)]
     pub quiet: bool,
-    /// Threads to compute with; 0 uses all cores. Results do not depend on it.
+    /// Threads to compute with; 0 uses all cores. Plans of the preset auto depend on it, other results do not.
     #[arg(long, global = true, value_name = "N", default_value_t = 0)]
     pub threads: usize,
     /// Raise or lower what readers accept of a file, such as max_gaussians=50000000; may be given several times.

@@ -198,6 +198,9 @@ impl AttributeCodec for Compact {
     fn keeps_motion(&self) -> bool {
         true
     }
+    fn most_bytes(&self) -> Option<u64> {
+        (self.settings.max_size_mb > 0.0).then_some((1e6 * self.settings.max_size_mb) as u64)
+    }
 }
 
 pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn AttributeCodec>> {

@@ -2,9 +2,9 @@
 
 use super::importance::{Importance, budget};
 use super::settings::Settings;
-use super::tune::{self, Goal};
+use super::tune::{self, Goal, Tuned};
 use super::{Attempt, Job, allocate};
-use cc4dgs_format::{CodecContext, Error, Event, RenderModel, Result, TrainingViews, psnr_on_views};
+use cc4dgs_format::{CodecContext, Error, Event, RenderModel, Result, TrainingViews, WeightArray, psnr_on_views};
 use std::ops::RangeInclusive;
 
 /// Views on which the loss is measured, by [`budget`].
@@ -22,10 +22,6 @@ const AIM: f64 = 0.985;
 /// Octaves of the step factor by which attempts differ, at most, and the share of a known interval that they stay away from its ends.
 const FARTHEST: f64 = 2.0;
 const MARGIN: f64 = 0.08;
-/// Allowances for what is not known before encoding: how much more bytes fine-tuned weights of a deformer take than those before, as a factor, and the bytes of the
-/// header that describe the streams of Gaussians.
-const REST_WHEN_TUNED: f64 = 1.02;
-const STREAM_TABLE: f64 = 1500.0;
 /// Least share from which a loss is extrapolated: smaller ones are noise.
 const LEAST: f64 = 0.05;
 
@@ -37,8 +33,8 @@ pub fn estimate(psnr_db: f64, importance: &Importance) -> f64 {
 
 /// What attempts use up.
 enum Allowance<'a> {
-    /// Bytes of all streams. Larger steps use fewer.
-    Bytes(f64),
+    /// Bytes of the file ([`file_bytes`]). Larger steps use fewer.
+    Bytes { limit: f64, context: &'a CodecContext<'a> },
     /// PSNR on the views, in dB below `before`. Larger steps lose more.
     Drop { before: f64, limit: f64, views: &'a dyn TrainingViews, renderer: &'a dyn RenderModel, chosen: usize },
 }
@@ -47,7 +43,7 @@ impl Allowance<'_> {
     /// What an attempt uses, as a share of what is allowed.
     fn share(&self, attempt: &Attempt) -> Result<f64> {
         match self {
-            Self::Bytes(limit) => Ok(attempt.bytes as f64 / limit),
+            Self::Bytes { limit, context } => Ok(file_bytes(context, attempt, None)? / limit),
             Self::Drop { before, limit, views, renderer, chosen } => Ok((before - psnr_on_views(&attempt.decoded, *views, *renderer, *chosen)?) / limit),
         }
     }
@@ -55,14 +51,14 @@ impl Allowance<'_> {
     fn octaves(&self, attempt: &Attempt, share: f64) -> f64 {
         match self {
             // An octave of all steps is a bit of every value that is not zero.
-            Self::Bytes(limit) => (share - AIM) * limit / (PARAMETERS / 8.0 * attempt.decoded.len().max(1) as f64),
+            Self::Bytes { limit, .. } => (share - AIM) * limit / (PARAMETERS / 8.0 * attempt.decoded.len().max(1) as f64),
             // Squared errors of images, small beside what a model leaves, add to the loss in proportion.
             Self::Drop { .. } => 0.5 * libm::log2(AIM / share.max(LEAST)),
         }
     }
     /// 1 where larger steps use more, else -1.
     fn direction(&self) -> f64 {
-        if matches!(self, Self::Bytes(_)) { -1.0 } else { 1.0 }
+        if matches!(self, Self::Bytes { .. }) { -1.0 } else { 1.0 }
     }
 }
 
@@ -127,7 +123,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     }
     let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !job.gaussians.is_empty());
     let allowance = match services {
-        _ if settings.max_size_mb > 0.0 => Allowance::Bytes(bytes_of_gaussians(settings, context)?),
+        _ if settings.max_size_mb > 0.0 => Allowance::Bytes { limit: bytes_of_file(settings, context)?, context },
         None if settings.drop_wanted && !job.gaussians.is_empty() => {
             let problem = "a loss of PSNR is measured on training views, and there are none";
             return Err(Error::parameter(object, problem, "Give the dataset with --scene, or choose compact:psnr=50dB or compact:max-size=5MB"));
@@ -137,11 +133,16 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             let before = psnr_on_views(job.gaussians, views, renderer, chosen)?;
             Allowance::Drop { before, limit: settings.max_drop_db, views, renderer, chosen }
         }
+        _ if settings.finetune_wanted && settings.finetune > 0 => {
+            let problem = "fine-tuning belongs to the search for a loss or a size, and neither is bounded";
+            return Err(Error::parameter("codec compact.finetune", problem, "Choose compact:max-drop=0.05dB or compact:max-size=5MB, or leave it out"));
+        }
         _ => return job.attempt(start),
     };
     let corrected = services.filter(|_| settings.allocate);
     let mut found = seek(job, start, &allowance, if corrected.is_some() { ROUGH } else { GOOD })?;
     if let Some((views, renderer)) = corrected {
+        let plain = job.factors;
         job.factors = allocate::allocate(job, found.attempt.quality, views, renderer)?;
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
         let second = seek(job, found.attempt.quality, &allowance, GOOD)?;
@@ -149,11 +150,11 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         // The corrections may be worth nothing in small models.
         let worse = matches!(allowance, Allowance::Drop { .. }) && found.attempt.bytes >= first.attempt.bytes;
         if first.allowed() && (worse || !found.allowed()) {
-            found = first;
+            (found, job.factors) = (first, plain);
         }
     }
     let goal = match &allowance {
-        Allowance::Bytes(limit) => Goal::Bytes(*limit),
+        Allowance::Bytes { limit, .. } => Goal::Bytes(*limit),
         Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
     let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
@@ -164,30 +165,32 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         }
         context.events.emit(&Event::Warning { object: object.into(), message: format!("the model is not fine-tuned: {why}") });
     }
-    if let Some(tuner) = tuner.filter(|_| refusal.is_none())
-        && let Some(tuned) = tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)?
-    {
-        return Ok(tuned);
+    if let Some(tuner) = tuner.filter(|_| refusal.is_none()) {
+        match tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)? {
+            Tuned::Better(attempt) => return Ok(*attempt),
+            // It was measured on more views, and with the deformer's weights as they are stored.
+            Tuned::Nothing { lost } if let Allowance::Drop { limit, .. } = &allowance => found.share = found.share.max(lost / limit),
+            Tuned::Nothing { .. } => {}
+        }
     }
     report(&found, &allowance, start, settings, context)?;
     Ok(found.attempt)
 }
 
-/// What of the allowed size of the file is left for the Gaussians: all of it where the rest is not known.
-fn bytes_of_gaussians(settings: &Settings, context: &CodecContext) -> Result<f64> {
-    let allowed = 1e6 * settings.max_size_mb;
-    let Some(rest) = context.rest_bytes else { return Ok(allowed) };
-    let rest = rest()? as f64;
-    let left = allowed - rest * if context.tuner.is_some() { REST_WHEN_TUNED } else { 1.0 } - STREAM_TABLE;
-    if left <= 0.0 {
-        let problem = format!("{} MB are allowed, and header and weights of the deformer take {:.4} MB", settings.max_size_mb, rest / 1e6);
-        return Err(Error::parameter(
-            "codec compact.max_size_mb",
-            problem,
-            "Allow more, or store the weights in fewer bits, such as --field-weights compact:bits=6",
-        ));
+/// The bytes of the file with the streams of `attempt`, and with other weights of the deformer where they are given; of the streams alone where nothing else is known.
+pub fn file_bytes(context: &CodecContext, attempt: &Attempt, weights: Option<(&[WeightArray], f64)>) -> Result<f64> {
+    Ok(context.file_bytes.map_or(Ok(attempt.bytes as u64), |of| of(&attempt.streams, weights))? as f64)
+}
+
+/// The allowed bytes of the file, if there is room for Gaussians.
+fn bytes_of_file(settings: &Settings, context: &CodecContext) -> Result<f64> {
+    let limit = 1e6 * settings.max_size_mb;
+    let rest = context.file_bytes.map_or(Ok(0), |of| of(&[], None))? as f64;
+    if rest < limit {
+        return Ok(limit);
     }
-    Ok(left)
+    let problem = format!("{} MB are allowed, and header and weights of the deformer take {:.4} MB", settings.max_size_mb, rest / 1e6);
+    Err(Error::parameter("codec compact.max_size_mb", problem, "Allow more, or store the weights in fewer bits, such as --field-weights compact:bits=6"))
 }
 
 /// Says what was chosen; a loss or size over what the user allowed is an error.
@@ -195,19 +198,24 @@ fn report(found: &Tried, allowance: &Allowance, start: f64, settings: &Settings,
     let object = "codec compact";
     let (megabytes, steps) = (found.attempt.bytes as f64 / 1e6, found.attempt.quality / start);
     match allowance {
-        Allowance::Bytes(_) if !found.allowed() => {
-            let problem = format!("{} bytes of Gaussians are the least that it reached", found.attempt.bytes);
+        Allowance::Bytes { limit, .. } if !found.allowed() => {
+            let problem = format!("the smallest file it reached has {:.0} bytes, {} of them of Gaussians", found.share * limit, found.attempt.bytes);
             return Err(Error::parameter(object, problem, "Allow more, or remove Gaussians with `cc4dgs prune`"));
         }
-        Allowance::Bytes(_) => {
-            note(context, format!("{megabytes:.4} MB of Gaussians, the file at most {} MB, steps {steps:.3} times the estimated ones", settings.max_size_mb));
+        Allowance::Bytes { limit, .. } => {
+            let file = found.share * limit / 1e6;
+            note(
+                context,
+                format!("{megabytes:.4} MB of Gaussians, {file:.4} MB in all ({} MB allowed), steps {steps:.3} times the estimated ones", settings.max_size_mb),
+            );
         }
         Allowance::Drop { limit, chosen, .. } => {
             let drop = found.share * limit;
             if !found.allowed() {
-                let problem = format!("the finest steps tried lose {drop:.3} dB on training views, {limit} dB are allowed");
+                let problem = format!("the best of all attempts loses {drop:.3} dB on training views, {limit} dB are allowed");
                 if settings.drop_wanted {
-                    return Err(Error::parameter(object, problem, "Allow more, or choose compact:psnr=70dB or the codec raw"));
+                    let remedy = "Allow more, store the deformer's weights in more bits, give more iterations of fine-tuning, or choose compact:psnr=70dB";
+                    return Err(Error::parameter(object, problem, remedy));
                 }
                 context.events.emit(&Event::Warning { object: object.into(), message: problem });
             }

@@ -26,7 +26,7 @@ layers = 0               # sets of Gaussians by falling weight, which a player d
 pub struct Settings {
     /// Largest loss of PSNR on training views in dB; 0 chooses by `psnr_db`.
     pub max_drop_db: f64,
-    /// Largest size of all streams of Gaussians in MB; 0 is no limit.
+    /// Largest size of the file in MB; 0 is no limit.
     pub max_size_mb: f64,
     /// Iterations of fine-tuning.
     pub finetune: usize,
@@ -114,6 +114,10 @@ impl Settings {
             ("size_weight", settings.size_weight, 0.0..=100.0),
             ("layers", settings.layers as f64, 0.0..=MOST_LAYERS as f64),
         ];
+        if settings.max_size_mb > 0.0 && settings.drop_wanted && settings.max_drop_db > 0.0 {
+            let problem = format!("a loss of {} dB and a size of {} MB are both bounded", settings.max_drop_db, settings.max_size_mb);
+            return Err(Error::parameter("codec compact", problem, "Bound one of them: max_drop_db or max_size_mb"));
+        }
         match bounds.into_iter().find(|(_, value, range)| !range.contains(value)) {
             Some((name, value, range)) => {
                 Err(Error::parameter(format!("codec compact.{name}"), value.to_string(), format!("Choose {} to {}", range.start(), range.end())))
@@ -137,6 +141,7 @@ mod tests {
         for bad in ["max-drop", "max-drop=x", "max-size=-1MB", "max-size=nanMB", "psnr=1000dB", "lowest"] {
             assert!(parse(bad).is_err(), "{bad}");
         }
+        assert!(Settings::parse("max-size=5MB", &"max_drop_db = 0.1".parse().unwrap()).unwrap_err().to_string().contains("both"));
         assert!(parse("max-dorp=1dB").unwrap_err().to_string().contains("max-drop"));
         let schema: toml::Table = SCHEMA.parse().unwrap();
         let (read, default) = (Settings::parse("", &schema).unwrap(), parse("").unwrap());

@@ -5,7 +5,7 @@
 
 use super::encode::canonical;
 use super::rounding::Rounder;
-use super::search::note;
+use super::search::{file_bytes, note};
 use super::settings::Settings;
 use super::{Attempt, Job};
 use cc4dgs_format::{CodecContext, Result, TuneModel, TunedModel, Tuning};
@@ -23,14 +23,23 @@ const FARTHEST: f64 = 1.0;
 /// The share of what is allowed that rounds aim at, and the last one, less what a round differs from what is expected, in dB.
 const AIM: f64 = 0.95;
 const LAST_AIM: f64 = 0.8;
+const SIZE_AIM: f64 = 0.99;
 const SPREAD: f64 = 0.03;
 
 /// What is allowed.
 pub enum Goal {
     /// A loss of PSNR in dB; the fewest bytes are best.
     Drop(f64),
-    /// Bytes of Gaussians; the highest PSNR is best. Weights of the deformer keep their steps.
+    /// Bytes of the file; the highest PSNR is best. Weights of the deformer keep their steps.
     Bytes(f64),
+}
+
+/// What training came to.
+pub enum Tuned {
+    /// Streams that are better than those without training.
+    Better(Box<Attempt>),
+    /// Nothing better: those without training lose `lost` dB of PSNR.
+    Nothing { lost: f64 },
 }
 
 /// What a round came to.
@@ -38,8 +47,9 @@ struct Outcome {
     attempt: Attempt,
     model: TunedModel,
     weight_steps: f64,
-    /// Bytes with the deformer's weights.
+    /// Bytes with the deformer's weights, and of the whole file where it is known.
     bytes: usize,
+    file: f64,
     /// PSNR in dB below that of the model before compression.
     drop: f64,
 }
@@ -48,7 +58,7 @@ impl Goal {
     fn is_better(&self, outcome: &Outcome, bytes: usize, drop: f64) -> bool {
         match self {
             Self::Drop(limit) => outcome.drop <= *limit && outcome.bytes < bytes,
-            Self::Bytes(limit) => outcome.attempt.bytes as f64 <= *limit && outcome.drop < drop,
+            Self::Bytes(limit) => outcome.file <= *limit && outcome.drop < drop,
         }
     }
     /// Octaves by which the steps of the first round are larger than those that need no training.
@@ -66,22 +76,14 @@ impl Goal {
                 let cost = REMAINS * limit * libm::exp2(2.0 * octaves);
                 0.5 * libm::log2(((cost + aim * limit - SPREAD - outcome.drop) / cost).max(1e-3))
             }
-            Self::Bytes(limit) => 8.0 * (outcome.attempt.bytes as f64 - limit) / bits_per_octave,
+            Self::Bytes(limit) => 8.0 * (outcome.file - SIZE_AIM * limit) / bits_per_octave,
         };
         more.clamp(-FARTHEST, FARTHEST)
     }
 }
 
-/// The best streams that `goal` allows, after training; `found` are those that do without, which may be `allowed`. `None` if training finds nothing better.
-pub fn tune(
-    job: &Job,
-    found: &Attempt,
-    allowed: bool,
-    goal: &Goal,
-    settings: &Settings,
-    tuner: &dyn TuneModel,
-    context: &CodecContext,
-) -> Result<Option<Attempt>> {
+/// The best streams that `goal` allows, after training; `found` are those that do without, which may be `allowed`.
+pub fn tune(job: &Job, found: &Attempt, allowed: bool, goal: &Goal, settings: &Settings, tuner: &dyn TuneModel, context: &CodecContext) -> Result<Tuned> {
     let megabytes = |bytes: usize| bytes as f64 / 1e6;
     let mut model = tuner.start(job.gaussians)?;
     let before = tuner.psnr(&model.gaussians, &model.weights, None)?;
@@ -118,7 +120,8 @@ pub fn tune(
                 megabytes(bytes)
             ),
         );
-        let outcome = Outcome { attempt, model: model.clone(), weight_steps, bytes, drop };
+        let file = file_bytes(context, &attempt, Some((&model.weights, weight_steps)))?;
+        let outcome = Outcome { attempt, model: model.clone(), weight_steps, bytes, file, drop };
         let aim = if round + 2 == shares.len() { LAST_AIM } else { AIM };
         octaves += goal.octaves(&outcome, aim, octaves, bits_per_octave);
         let (bytes, drop) = best.as_ref().map_or(if allowed { (first_bytes, untuned) } else { (usize::MAX, f64::INFINITY) }, |b| (b.bytes, b.drop));
@@ -128,11 +131,11 @@ pub fn tune(
     }
     let Some(best) = best else {
         note(context, "fine-tuning found nothing better".into());
-        return Ok(None);
+        return Ok(Tuned::Nothing { lost: untuned });
     };
     note(context, format!("fine-tuned: {:.4} MB with the deformer's weights, PSNR {:.3} dB lower", megabytes(best.bytes), best.drop));
     tuner.adopt(best.model.weights, best.weight_steps);
-    Ok(Some(best.attempt))
+    Ok(Tuned::Better(Box::new(best.attempt)))
 }
 
 /// Iterations of each round, which add up to `iterations`.

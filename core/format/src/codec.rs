@@ -59,6 +59,10 @@ pub trait AttributeCodec: Send + Sync {
     fn keeps_motion(&self) -> bool {
         false
     }
+    /// The bytes that the whole file may have at most, where the user bounded them ([`CodecContext::file_bytes`]).
+    fn most_bytes(&self) -> Option<u64> {
+        None
+    }
 }
 
 /// An attribute codec in the registry.

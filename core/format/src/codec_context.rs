@@ -1,6 +1,6 @@
 //! The context of a codec: everything but the Gaussians or weights.
 
-use crate::{Camera, EventSink, HostGaussians, Image8, Limits, Result, Seed, TuneModel};
+use crate::{Camera, EventSink, HostGaussians, Image8, Limits, Result, Seed, Stream, TuneModel, WeightArray};
 
 /// The context of a codec. The optional parts are set if a model is encoded together with its scene. A codec may use them for a better result, but must work
 /// without them. They are never set for decoding.
@@ -21,14 +21,18 @@ pub struct CodecContext<'a> {
     pub tuner: Option<&'a dyn TuneModel>,
     /// A Gaussian may move if and only if its dynamic score is above this: minus infinity if all may, infinity if none does. `None` if that is not known.
     pub dynamic_threshold: Option<f32>,
-    /// Bytes of everything else in the file, for codecs whose user bounds its size: header and weights of the deformer, before any fine-tuning.
-    pub rest_bytes: Option<&'a dyn Fn() -> Result<u64>>,
+    /// Measures the file that the encoded Gaussians will be in, for codecs whose user bounds its size.
+    pub file_bytes: Option<&'a FileBytes<'a>>,
 }
+
+/// The bytes of the whole file that has these streams of Gaussians: header and weights of the deformer included. The weights are those of the model as they are
+/// stored, or others, in steps so many times larger ([`TuneModel::weight_settings`]).
+pub type FileBytes<'a> = dyn Fn(&[Stream], Option<(&[WeightArray], f64)>) -> Result<u64> + 'a;
 
 impl<'a> CodecContext<'a> {
     /// A context without scene, renderer and deformer, as for decoding.
     pub fn new(seed: Seed, limits: Limits, events: &'a dyn EventSink) -> Self {
-        Self { seed, limits, events, views: None, renderer: None, deformer: None, tuner: None, dynamic_threshold: None, rest_bytes: None }
+        Self { seed, limits, events, views: None, renderer: None, deformer: None, tuner: None, dynamic_threshold: None, file_bytes: None }
     }
 }
 
@@ -75,9 +79,14 @@ pub fn psnr_on_views(gaussians: &HostGaussians, views: &dyn TrainingViews, rende
         let drawn = renderer.render(gaussians, camera, time_norm)?;
         let truth = views.image(index)?.to_planes(renderer.background());
         let error: f64 = truth.iter().zip(&drawn.planes).map(|(a, b)| f64::from(a - b.clamp(0.0, 1.0)).powi(2)).sum();
-        sum -= 10.0 * libm::log10((error / truth.len().max(1) as f64).max(1e-12));
+        sum += psnr_of(error / truth.len().max(1) as f64);
     }
     Ok(sum / chosen.max(1) as f64)
+}
+
+/// PSNR in dB of a mean squared error, 120 at most; of one that is not a number, minus infinity.
+pub fn psnr_of(mean_squared_error: f64) -> f64 {
+    if mean_squared_error.is_nan() { f64::NEG_INFINITY } else { -10.0 * libm::log10(mean_squared_error.max(1e-12)) }
 }
 
 /// A deformer as a function from canonical Gaussians to deformed ones.

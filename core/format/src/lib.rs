@@ -33,7 +33,7 @@ mod weight_codec;
 
 pub use camera::Camera;
 pub use codec::{AttributeCodec, CodecPlugin, DeclaredLoss, Stream, StreamStage};
-pub use codec_context::{CodecContext, EvaluateDeformer, RenderModel, RenderedPlanes, TrainingViews, psnr_on_views};
+pub use codec_context::{CodecContext, EvaluateDeformer, FileBytes, RenderModel, RenderedPlanes, TrainingViews, psnr_of, psnr_on_views};
 pub use deformer_context::DeformerContext;
 pub use error::{Error, Result};
 pub use events::{Event, EventSink, Fanout, Recorder, Silent};

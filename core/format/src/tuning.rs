@@ -79,6 +79,11 @@ pub trait TuneModel {
     /// # Errors
     /// What the weight codec reports.
     fn weight_bytes(&self, weights: &[WeightArray], weight_steps: f64) -> Result<usize>;
+    /// Settings of the weight codec for steps that are `weight_steps` times those chosen without training.
+    ///
+    /// # Errors
+    /// What the weight codec reports.
+    fn weight_settings(&self, weight_steps: f64) -> Result<toml::Table>;
     /// States that the codec's streams hold Gaussians that were trained with `weights`, which are to be stored in such steps.
     fn adopt(&self, weights: Vec<WeightArray>, weight_steps: f64);
     /// The weights that were adopted and the settings of their codec; `None` if none were.

@@ -10,7 +10,7 @@ use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamK
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, StreamStage,
+    AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream, StreamStage,
     TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
 };
 use serde::Serialize;
@@ -179,36 +179,44 @@ impl Model {
             let deformer = weights.as_ref().zip(found.as_ref()).map(|(w, (_, settings))| w.entry(settings.clone()));
             ArchiveWriter::new(Manifest { deformer, ..manifest.clone() })
         };
+        // Streams in the order in which a player needs them.
+        let assembled = |mut streams: Vec<Stream>, found: &Option<EncodedWeights>| {
+            streams.sort_by_key(|s| codec.stage(&s.name));
+            let harmonics = streams.split_off(streams.partition_point(|s| codec.stage(&s.name) < StreamStage::Harmonics));
+            let field_streams = found.iter().flat_map(|(streams, _)| streams.iter().map(StoredField::stream));
+            let first = writer(found).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams.collect::<Vec<_>>());
+            first.add_all(StreamKind::Canonical, harmonics)
+        };
         let (seed, device) = (weight_seed(self.provenance.seed), scene.map(|(_, device)| device));
+        let encode_tuned = |tuned: &[WeightArray], settings: toml::Table| -> Result<Option<EncodedWeights>> {
+            let Some(stored) = &weights else { return Ok(None) };
+            Ok(Some((registry.build_weight_codec(&stored.chosen.name, &settings)?.encode(tuned, &context(seed))?, settings)))
+        };
         let untuned = OnceCell::new();
         let encode_weights = || -> Result<Option<EncodedWeights>> {
             let Some((stored, f)) = weights.as_ref().zip(field) else { return Ok(None) };
             stored.chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context(seed), registry).map(Some)
         };
         // A codec whose size is bounded asks for this.
-        let rest = || -> Result<u64> {
-            if untuned.get().is_none() {
-                let _ = untuned.set(encode_weights()?);
-            }
-            let found = untuned.get().cloned().flatten();
-            let streams: Vec<_> = found.iter().flat_map(|(streams, _)| streams.iter().map(StoredField::stream)).collect();
-            Ok(writer(&found).add_all(StreamKind::Field, streams).to_bytes()?.len() as u64)
+        let file_bytes = |streams: &[Stream], tuned: Option<(&[WeightArray], f64)>| -> Result<u64> {
+            let found = match tuned.zip(tuner) {
+                Some(((weights, steps), tuner)) => encode_tuned(weights, tuner.weight_settings(steps)?)?,
+                None => {
+                    if untuned.get().is_none() {
+                        let _ = untuned.set(encode_weights()?);
+                    }
+                    untuned.get().cloned().flatten()
+                }
+            };
+            Ok(assembled(streams.to_vec(), &found).to_bytes()?.len() as u64)
         };
         let gaussians = self.for_codec(codec.as_ref());
-        let mut streams = codec.encode(&gaussians, &CodecContext { rest_bytes: Some(&rest), ..context(codec_seed(self.provenance.seed)) })?;
-        streams.sort_by_key(|s| codec.stage(&s.name));
-        let harmonics = streams.split_off(streams.partition_point(|s| codec.stage(&s.name) < StreamStage::Harmonics));
-        let adopted = tuner.filter(|_| weights.is_some()).map(TuneModel::adopted).transpose()?.flatten();
-        let found = match (adopted, &weights) {
-            (Some((tuned, settings)), Some(stored)) => {
-                Some((registry.build_weight_codec(&stored.chosen.name, &settings)?.encode(&tuned, &context(seed))?, settings))
-            }
-            _ => untuned.into_inner().map_or_else(encode_weights, Ok)?,
+        let streams = codec.encode(&gaussians, &CodecContext { file_bytes: Some(&file_bytes), ..context(codec_seed(self.provenance.seed)) })?;
+        let found = match tuner.filter(|_| weights.is_some()).map(TuneModel::adopted).transpose()?.flatten() {
+            Some((tuned, settings)) => encode_tuned(&tuned, settings)?,
+            None => untuned.into_inner().map_or_else(encode_weights, Ok)?,
         };
-        let field_streams: Vec<_> = found.iter().flat_map(|(streams, _)| streams.iter().map(StoredField::stream)).collect();
-        // In the order in which a player needs them.
-        let all = writer(&found).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams);
-        Ok(all.add_all(StreamKind::Canonical, harmonics))
+        Ok(assembled(streams, &found))
     }
     /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
     fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {

@@ -8,7 +8,7 @@ use crate::archive::linked;
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::archive::{Provenance, write_atomically};
+use cc4dgs_core::archive::{MOST_FRAMES, Provenance, write_atomically};
 use cc4dgs_core::gaussians::{CORE_ATTRIBUTES, to_vec};
 use cc4dgs_core::{DeformerContext, Error, ExtraAttribute, HostGaussians, Limits, Registry, Result, Similarity, split_kind};
 use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo, TensorView};
@@ -43,7 +43,7 @@ impl CheckpointArrays {
             return Err(Error::backend(
                 format!("checkpoint array {name}"),
                 "it holds a value that is not finite",
-                "Resume from the checkpoint on disk with lower learning rates",
+                "Start again in another folder with lower learning rates (train.lr)",
             ));
         }
         self.0.push((name, shape, values));
@@ -232,7 +232,7 @@ impl ModelHeader {
                 Some(ModelDeformer { field, section, context })
             }
         };
-        if !self.background.iter().all(|v| v.is_finite()) || self.frame_count == 0 {
+        if !self.background.iter().all(|v| v.is_finite()) || !(1..=MOST_FRAMES).contains(&self.frame_count) {
             return Err(file.damaged(format!("the background is {:?}, frame_count {}", self.background, self.frame_count)));
         }
         Ok(Model {

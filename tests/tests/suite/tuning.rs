@@ -41,8 +41,11 @@ impl Bench {
         Tuner::new(TuneJob { model, scene: scene.clone(), field_weights: FIELD_WEIGHTS, registry, device, limits, events: &Silent, stop })
     }
     fn archive(&self, model: &Model, finetune: usize, tuner: Option<&dyn TuneModel>) -> Result<Vec<u8>> {
+        self.archive_as(&format!("max-drop={LIMIT_DB}dB"), model, finetune, tuner)
+    }
+    fn archive_as(&self, profile: &str, model: &Model, finetune: usize, tuner: Option<&dyn TuneModel>) -> Result<Vec<u8>> {
         let settings: toml::Table = format!("finetune = {finetune}").parse().unwrap();
-        let codec = format!("compact:max-drop={LIMIT_DB}dB");
+        let codec = format!("compact:{profile}");
         let options = ArchiveOptions { codec: &codec, settings: &settings, field_weights: FIELD_WEIGHTS, scene: Some((&self.scene, &self.device)), tuner };
         model.to_archive(&options, &self.registry, &self.limits, &Silent)
     }
@@ -85,6 +88,22 @@ fn fine_tuning_saves_bytes_at_the_same_loss() {
     let stopped = AtomicBool::new(true);
     let error = bench.archive(&model, ITERATIONS, Some(&bench.tuner(&model, &stopped))).unwrap_err();
     assert!(matches!(error, Error::Interrupted(_)), "{error}");
+}
+
+#[test]
+fn a_bound_on_the_file_holds_after_fine_tuning() {
+    let config = tiny(&[]);
+    let bench = Bench::new(&config);
+    let model = bench.train(&config);
+    let plain = bench.archive(&model, 0, None).unwrap().len();
+    for share in [90, 75] {
+        let most = share * plain / 100;
+        let tuner = bench.tuner(&model, &bench.never);
+        let bytes = bench.archive_as(&format!("max-size={}MB", most as f64 / 1e6), &model, 60, Some(&tuner)).unwrap();
+        println!("{} of {most} bytes", bytes.len());
+        assert!(bytes.len() <= most && 100 * bytes.len() > 93 * most, "{} of {most} bytes", bytes.len());
+        assert!(tuner.adopted().unwrap().is_some(), "training was worth nothing");
+    }
 }
 
 #[test]

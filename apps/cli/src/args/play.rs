@@ -23,12 +23,12 @@ pub struct Bake {
     /// The dataset that the model was trained on: its cameras are those of --max-error, and players offer them. Without it, an orbit round the model.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
-    /// Codec of the Gaussians, where MODEL is no archive yet.
-    #[arg(long, value_name = "NAME[:PROFILE]", default_value = "quantize:high")]
-    pub codec: String,
-    /// Weight codec of the deformer, where MODEL is no archive yet.
-    #[arg(long, value_name = "NAME", default_value = "fp16")]
-    pub field_weights: String,
+    /// Codec of the Gaussians, where MODEL is no archive yet [default: quantize:high].
+    #[arg(long, value_name = "NAME[:PROFILE]")]
+    pub codec: Option<String>,
+    /// Weight codec of the deformer, where MODEL is no archive yet [default: fp16].
+    #[arg(long, value_name = "NAME")]
+    pub field_weights: Option<String>,
     /// Leave the deformer's weights out. The archive is smaller and moves by its layer; it cannot be compressed again.
     #[arg(long)]
     pub without_field: bool,

@@ -6,11 +6,16 @@ use crate::shots::capture_cameras;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use cc4dgs_core::archive::{Archive, Presentation, StreamKind, write_atomically};
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Camera, Event, EventSink, Result, parse_device};
+use cc4dgs_core::{Camera, Error, Event, EventSink, Result, parse_device, toml};
 use cc4dgs_play::bake::{BakeReport, MaxError};
+use cc4dgs_play::source::{Source, SourceKind};
 use serde::Serialize;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Instant;
+
+/// Frames per second of a recording.
+const RATES: RangeInclusive<f32> = 0.01..=1000.0;
 
 #[derive(Serialize)]
 struct Report {
@@ -30,10 +35,14 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
     let began = Instant::now();
     refuse_existing(&args.out, args.overwrite)?;
     let max_error: MaxError = args.max_error.parse()?;
+    if let Some(rate) = args.fps.filter(|rate| !RATES.contains(rate)) {
+        return Err(Error::parameter("--fps", format!("{rate} frames per second"), format!("Choose {} to {}", RATES.start(), RATES.end())));
+    }
     let (events, device) = (context.listeners(None)?, parse_device(&args.device)?);
     create_parent(&args.out)?;
     let around = Surroundings { registry: &context.registry, device: &device, limits: &context.limits, events: &events };
-    let stored = Stored::open(&args.model, Storage { codec: &args.codec, field_weights: &args.field_weights }, around)?;
+    let storage = storage(args)?;
+    let stored = Stored::open(&args.model, storage.unwrap_or_default(), around)?;
     let cameras = match &args.scene {
         Some(scene) => capture_cameras(context, scene, &[], &stored.model)?,
         None => stored.archive.manifest().presentation.cameras.clone(),
@@ -48,6 +57,11 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
         baked: true,
     };
     let playable = stored.playable(options, around)?;
+    let codec = storage.map(|storage| context.registry.build_codec(storage.codec, &toml::Table::new())).transpose()?;
+    if let Some(most) = codec.and_then(|codec| codec.most_bytes()).filter(|most| playable.bytes.len() as u64 > *most) {
+        let problem = format!("with playback layer and poster the file has {} bytes, {most} are allowed", playable.bytes.len());
+        return Err(Error::parameter("--codec", problem, "Bound the model lower, allow a larger --max-error, or leave the poster out (--no-poster)"));
+    }
     write_atomically(&args.out, &playable.bytes)?;
     let bytes = playable.bytes.len() as u64;
     events.emit(&Event::Saved { path: args.out.display().to_string(), bytes });
@@ -63,6 +77,18 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
         layer: playable.report,
     };
     context.output.result(&report, || text(&report))
+}
+
+/// How the model is to be stored; `None` where it is an archive, whose streams are kept.
+fn storage(args: &Bake) -> Result<Option<Storage<'_>>> {
+    if Source::expect(&args.model)?.kind == SourceKind::Archive {
+        let stated = args.codec.as_ref().map(|_| "--codec").or(args.field_weights.as_ref().map(|_| "--field-weights"));
+        let problem = "the model is an archive, whose Gaussians and weights are kept as they are";
+        return stated.map_or(Ok(None), |option| Err(Error::parameter(option, problem, "Leave it out, or bake the run that the archive was made of")));
+    }
+    let default = Storage::default();
+    let codec = args.codec.as_deref().unwrap_or(default.codec);
+    Ok(Some(Storage { codec, field_weights: args.field_weights.as_deref().unwrap_or(default.field_weights) }))
 }
 
 /// What the archive said already, what the cameras say, and what the options say, the last first.

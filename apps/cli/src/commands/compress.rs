@@ -4,9 +4,9 @@ use super::{Context, create_parent, megabytes};
 use crate::args::Compress;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind};
+use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind, write_atomically};
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Event, EventSink, Result, TuneModel, config, read_gaussians};
+use cc4dgs_core::{Event, EventSink, Result, TuneModel, config, read_gaussians, read_weights};
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::{ArchiveOptions, Model};
@@ -63,12 +63,14 @@ static NEVER: AtomicBool = AtomicBool::new(false);
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
     refuse_existing(&args.out, args.overwrite)?;
     let events = context.listeners(None)?;
-    let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let mut settings = toml::Table::new();
     config::set_all(&mut settings, &args.sets)?;
     // An unknown name is refused before the scene is read.
     FieldWeights::parse(&args.field_weights, &context.registry)?;
     let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?.map(Arc::new);
+    // A PLY says nothing of what is behind it.
+    loaded.model.background = loaded.model.background.or(scene.as_ref().and_then(|scene| scene.background));
     let tuner = scene.as_ref().map(|scene| {
         let (registry, limits, events) = (&context.registry, &context.limits, &events);
         // Ctrl-C ends the process: the archive is not there before it is complete.
@@ -94,17 +96,22 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     context.output.result(&report, || text(&report))
 }
 
-/// Writes `model` to the archive `out` and reads it back, so that a file that cannot be decoded is an error here and not at its reader.
+/// Writes `model` to the archive `out` after decoding it, so that what cannot be decoded is an error here and not at its reader, and replaces no file.
 pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out: &Path, events: &dyn EventSink) -> Result<CompressReport> {
     let began = Instant::now();
     create_parent(out)?;
-    let bytes = model.save_archive(out, options, &context.registry, &context.limits, events)?;
-    events.emit(&Event::Saved { path: out.display().to_string(), bytes });
-    let seconds = began.elapsed().as_secs_f64();
-    let archive = Archive::open(out, &context.limits)?;
+    let object = out.display().to_string();
+    let file = model.to_archive(options, &context.registry, &context.limits, events)?;
+    let (bytes, seconds) = (file.len() as u64, began.elapsed().as_secs_f64());
+    let archive = Archive::from_bytes(object.clone(), file.clone(), &context.limits)?;
     let began = Instant::now();
-    read_gaussians(&out.display().to_string(), &archive, &context.limits, events)?;
+    read_gaussians(&object, &archive, &context.limits, events)?;
     let decode_seconds = began.elapsed().as_secs_f64();
+    if let Some(deformer) = &archive.manifest().deformer {
+        read_weights(&object, &archive, &deformer.weights, &context.limits, events)?;
+    }
+    write_atomically(out, &file)?;
+    events.emit(&Event::Saved { path: object, bytes });
     let stored = archive.stream_sizes();
     let of_kind = |kind| stored.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum();
     let size = ModelSize { deform: of_kind(StreamKind::Field), point_cloud: of_kind(StreamKind::Canonical), total: bytes, ..model.float32_size() };

@@ -33,6 +33,8 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
     create_parent(&args.out)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let scene = open_as_trained(&args.scene, &loaded.model, &[], &context.registry, &context.limits)?;
+    // A PLY says nothing of what is behind it.
+    loaded.model.background = loaded.model.background.or(scene.background);
     let (registry, limits, events) = (&context.registry, &context.limits, &events);
     let found = match args.refit {
         0 => prune(&mut loaded.model, &scene, args.max_drop, registry, &loaded.device, events)?,

@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 
 /// The archive version this build writes and reads.
 pub const FORMAT_VERSION: u32 = 3;
+/// The most frames of a sequence.
+pub const MOST_FRAMES: usize = 1 << 20;
 
 /// The codec of some of the streams.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -158,8 +160,8 @@ impl Manifest {
         if self.sh_degree > 4 {
             return Err(damaged(object, format!("spherical-harmonics degree {} is over 4", self.sh_degree)));
         }
-        if self.frame_count == 0 {
-            return Err(damaged(object, "frame_count is 0".into()));
+        if !(1..=MOST_FRAMES).contains(&self.frame_count) {
+            return Err(damaged(object, format!("frame_count {} is not in 1..{MOST_FRAMES}", self.frame_count)));
         }
         let context = self.deformer.iter().flat_map(|d| d.context.box_min.iter().chain(&d.context.box_max));
         let mut numbers = self.time_range.iter().chain(self.box_world.iter().flatten()).chain(&self.background).chain([&self.dynamic_threshold]).chain(context);
@@ -215,6 +217,13 @@ mod tests {
         let sound = Manifest { format_version: FORMAT_VERSION, frame_count: 1, ..Default::default() };
         assert!(sound.to_json().is_ok());
         assert!(Manifest { dynamic_threshold: f32::NAN, ..sound }.to_json().is_err());
+    }
+
+    #[test]
+    fn a_sequence_has_frames_and_not_too_many() {
+        let of = |frame_count| Manifest { format_version: FORMAT_VERSION, frame_count, ..Default::default() }.validate("m", &Limits::default());
+        assert!(of(1).is_ok() && of(MOST_FRAMES).is_ok());
+        assert!(of(0).is_err() && of(MOST_FRAMES + 1).is_err() && of(usize::MAX).is_err());
     }
 
     #[test]

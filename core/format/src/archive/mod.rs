@@ -26,7 +26,7 @@ mod write;
 pub(crate) mod zstandard;
 
 pub use bytes::ByteReader;
-pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, Manifest, Provenance, RasterizerEntry};
+pub use manifest::{CodecEntry, DeformerEntry, FORMAT_VERSION, MOST_FRAMES, Manifest, Provenance, RasterizerEntry};
 pub use packing::estimate_stored_len;
 pub use presentation::{MAX_CAMERAS, Presentation};
 pub use read::{Archive, StreamInfo};

@@ -28,7 +28,7 @@ pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn Ex
     let mut bytes = 0;
     for file in &files {
         // On the disk before it has its name.
-        let synced = std::fs::File::open(file).and_then(|f| f.sync_all().and_then(|()| f.metadata()));
+        let synced = std::fs::OpenOptions::new().read(true).write(true).open(file).and_then(|f| f.sync_all().and_then(|()| f.metadata()));
         bytes += synced.map_err(|e| Error::io(path, e))?.len();
     }
     // The folder was empty so far, so its old content can wait there; it goes with the temporary folder.

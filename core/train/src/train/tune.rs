@@ -14,7 +14,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
     AppearanceContext, CodecContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, Stream, TuneModel,
-    TunedModel, Tuning, WeightArray, WeightCodec, config,
+    TunedModel, Tuning, WeightArray, WeightCodec, config, psnr_of,
 };
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelDeformer;
@@ -147,11 +147,6 @@ impl<'a> Tuner<'a> {
         }
         state.stage = Stage::Main;
         work(&context, &mut state)
-    }
-    /// The settings of the weight codec with steps `factor` times as large.
-    fn weight_settings(&self, factor: f64) -> Result<toml::Table> {
-        let Choices { field_weights, weight_settings, .. } = self.choices()?;
-        field_weights.coarser(weight_settings, factor, self.job.registry)
     }
     /// The streams of `weights`.
     fn encoded_weights(&self, weights: &[WeightArray], settings: &toml::Table) -> Result<(Box<dyn WeightCodec>, Vec<Stream>)> {
@@ -313,7 +308,7 @@ impl TuneModel for Tuner<'_> {
                 let target = context.rasterizer.upload(&scene.frame(views[index])?, background, self.job.device);
                 let difference = image.clamp(0.0, 1.0) - target;
                 let error = to_vec((difference.clone() * difference).mean(), "mean squared error")?.first().copied().unwrap_or(f32::NAN);
-                sum -= 10.0 * f64::from(error.max(1e-12)).log10();
+                sum += psnr_of(f64::from(error));
                 Ok(())
             })
         })?;
@@ -325,6 +320,10 @@ impl TuneModel for Tuner<'_> {
         }
         let (_, streams) = self.encoded_weights(weights, &self.weight_settings(weight_steps)?)?;
         Ok(streams.iter().map(|s| s.bytes.len()).sum())
+    }
+    fn weight_settings(&self, weight_steps: f64) -> Result<toml::Table> {
+        let Choices { field_weights, weight_settings, .. } = self.choices()?;
+        field_weights.coarser(weight_settings, weight_steps, self.job.registry)
     }
     fn adopt(&self, weights: Vec<WeightArray>, weight_steps: f64) {
         *self.adopted.borrow_mut() = Some((weights, weight_steps));
