@@ -38,6 +38,15 @@ impl Stage {
     }
 }
 
+/// How the length of a stage was changed while it ran.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settled {
+    /// The last iteration of the stage before.
+    pub after: usize,
+    /// Iterations that the stage was to have until then; more than `after`.
+    pub planned: usize,
+}
+
 /// One iteration of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Schedule {
@@ -47,6 +56,8 @@ pub struct Schedule {
     pub iteration: usize,
     /// Iterations of the stage.
     pub length: usize,
+    /// Set where `length` is not what it was when the stage began.
+    pub settled: Option<Settled>,
     /// Iterations of all stages together.
     pub total: usize,
     /// Iterations in which every training camera (pose) of the stage is drawn once. At least 1.
@@ -62,11 +73,23 @@ pub struct Schedule {
 impl Schedule {
     /// The first iteration of a main stage of `length` iterations, for tests and tools.
     pub fn main(length: usize) -> Self {
-        Self { stage: Stage::Main, iteration: 1, length, total: length, pass: 1, sh_degree: 3, image_scale: 1.0, extent: 1.0 }
+        Self { stage: Stage::Main, iteration: 1, length, settled: None, total: length, pass: 1, sh_degree: 3, image_scale: 1.0, extent: 1.0 }
     }
-    /// Share of the stage done after this iteration, above 0 and at most 1.
+    /// Share of the stage done after this iteration, above 0 and at most 1. It grows steadily where the length of the stage changes, too.
     pub fn progress(&self) -> f64 {
-        self.iteration as f64 / self.length as f64
+        let (iteration, length) = (self.iteration as f64, self.length as f64);
+        let Some((after, share, planned)) = self.knee() else { return iteration / length };
+        if iteration <= after { iteration / planned } else { share + (1.0 - share) * (iteration - after) / (length - after) }
+    }
+    /// The iteration, not rounded, after which `share` of the stage is done: the inverse of [`Schedule::progress`].
+    pub fn iteration_at(&self, share: f64) -> f64 {
+        let length = self.length as f64;
+        let Some((after, known, planned)) = self.knee() else { return share * length };
+        if share <= known { share * planned } else { after + (share - known) / (1.0 - known) * (length - after) }
+    }
+    /// Where the length changed: iteration, progress, and the length before.
+    fn knee(&self) -> Option<(f64, f64, f64)> {
+        self.settled.map(|s| (s.after as f64, s.after as f64 / s.planned as f64, s.planned as f64))
     }
     /// Iterations left in the stage after this one.
     pub fn left(&self) -> usize {
@@ -74,7 +97,7 @@ impl Schedule {
     }
     /// Converts `reference` iterations of the stage to iterations of this run.
     pub fn at(&self, reference: usize) -> usize {
-        (reference as f64 / self.stage.reference_length() as f64 * self.length as f64).round() as usize
+        self.iteration_at(reference as f64 / self.stage.reference_length() as f64).round() as usize
     }
     /// An interval of `reference` iterations. It shrinks in short runs, but not below `least`, and does not grow in long ones.
     pub fn interval(&self, reference: usize, least: usize) -> usize {
@@ -94,5 +117,19 @@ mod tests {
         let short = Schedule::main(100);
         assert_eq!((short.at(10_000), short.interval(100, 20)), (50, 20));
         assert_eq!(Schedule { iteration: 100, ..short }.left(), 0);
+    }
+
+    #[test]
+    fn progress_is_steady_where_the_length_changes() {
+        for length in [700, 1500, 4000] {
+            let at = |iteration| Schedule { iteration, settled: Some(Settled { after: 200, planned: 1000 }), ..Schedule::main(length) };
+            assert_eq!((at(100).progress(), at(200).progress(), at(length).progress()), (0.1, 0.2, 1.0));
+            for iteration in 1..=length {
+                assert!((at(1).iteration_at(at(iteration).progress()) - iteration as f64).abs() < 1e-6);
+            }
+            let step = 0.8 / (length - 200) as f64;
+            assert!((at(201).progress() - 0.2 - step).abs() < 1e-12);
+            assert_eq!(at(1).at(3000), 150, "what lies before stays where it was");
+        }
     }
 }

@@ -5,7 +5,7 @@ use crate::gaussian_set::GaussianSet;
 use crate::train::{Guard, Neighbours, Parts, RateFactors, Record, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
-use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, Similarity, Stage, config};
+use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, SceneOptions, Similarity, Stage, config};
 use cc4dgs_play::Model;
 use cc4dgs_play::checkpoint::{CheckpointArrays, CheckpointFile, DeformerHeader, FORMAT, ModelHeader};
 use cc4dgs_play::model::ModelSize;
@@ -79,8 +79,13 @@ impl Checkpoint {
             let mut run = run.completed(registry)?;
             // What a run says about itself does not change its result.
             (run.train.log_every, run.train.checkpoint_every, run.train.checks) = (0, 0, true);
+            // Neither do limits, the memory for images, and where films are decoded.
+            let other = SceneOptions::default();
+            (run.limits, run.scene.cache_mb, run.scene.ffmpeg, run.scene.video_cache) = (Default::default(), other.cache_mb, other.ffmpeg, other.video_cache);
             // A checkpoint may be older than what the run found.
-            run.train.stretch = 1.0;
+            if stored.train.stretch == 1.0 {
+                run.train.stretch = 1.0;
+            }
             config::parse_table("configuration", &run.to_toml()?)
         };
         if let Some(difference) = first_difference("", &comparable(&stored)?, &comparable(run)?) {

@@ -41,7 +41,13 @@ impl Layers {
     pub fn config(&self) -> Result<RunConfig> {
         let resolved: RunConfig = config::parse_section("configuration", &self.table)?;
         resolved.validate()?;
-        Ok(resolved)
+        match not_finite(&self.table) {
+            // Checkpoints state numbers as JSON, which has neither.
+            Some((key, value)) => {
+                Err(Error::parameter(key, format!("{value} is no finite number"), "Give a finite number; a large one where nothing is to be bounded"))
+            }
+            None => Ok(resolved),
+        }
     }
     /// These layers over `base`.
     pub fn over(&self, base: &toml::Table) -> Self {
@@ -64,6 +70,19 @@ impl Layers {
         let preset = self.table.get("preset").and_then(|p| p.as_str()).unwrap_or_default();
         preset.split('+').next() == Some(AUTO) && !self.state("auto.plan")
     }
+}
+
+/// The path of a number that is not finite, also as the float32 that most settings are, and its value.
+fn not_finite(table: &toml::Table) -> Option<(String, f64)> {
+    fn within(value: &toml::Value) -> Option<(String, f64)> {
+        match value {
+            toml::Value::Float(v) if !(*v as f32).is_finite() => Some((String::new(), *v)),
+            toml::Value::Array(values) => values.iter().find_map(within),
+            toml::Value::Table(table) => not_finite(table),
+            _ => None,
+        }
+    }
+    table.iter().find_map(|(key, value)| within(value).map(|(rest, v)| (if rest.is_empty() { key.clone() } else { format!("{key}.{rest}") }, v)))
 }
 
 /// Keys of earlier versions and what replaces them.

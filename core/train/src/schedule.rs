@@ -1,13 +1,13 @@
 //! Lengths of the stages of one run, and the [`Schedule`] of every iteration.
 
 use crate::config::TrainConfig;
-use cc4dgs_core::{Schedule, Stage};
+use cc4dgs_core::{Schedule, Settled, Stage};
 
 /// Sizes per axis that images have before they have their full one, ascending; each for an equal part of the time.
 pub const IMAGE_SCALES: [f32; 3] = [0.25, 0.354, 0.5];
 
 /// The share of the main stage after which its length is settled ([`TrainConfig::stretch`]).
-pub(crate) const SETTLED: f64 = 0.2;
+const SETTLED: f64 = 0.2;
 
 /// Iterations of a run's stages.
 #[derive(Clone, Debug)]
@@ -52,6 +52,10 @@ impl StageLengths {
     pub fn length(&self, stage: Stage) -> usize {
         if stage == Stage::Main { self.settled } else { self.lengths[stage as usize] }
     }
+    /// Iterations of the main stage by its share.
+    pub fn planned(&self) -> usize {
+        self.lengths[Stage::Main as usize]
+    }
     /// Iterations of all stages.
     pub fn total(&self) -> usize {
         self.total - self.lengths[2] + self.settled
@@ -68,11 +72,11 @@ impl StageLengths {
     pub fn set_pass(&mut self, stage: Stage, iterations: usize) {
         self.passes[stage as usize] = iterations.max(1);
     }
-    /// Size per axis of the images of an iteration (from 1), as a share of their full one. Scores are always fitted to full ones.
-    fn image_scale(&self, stage: Stage, iteration: usize, settled: bool) -> f32 {
-        let before = if stage == Stage::Main { self.lengths[Stage::Coarse as usize] } else { 0 };
-        let all = self.lengths[Stage::Coarse as usize] + if settled { self.settled } else { self.lengths[Stage::Main as usize] };
-        let share = (before + iteration.saturating_sub(1)) as f64 / (self.image_growth * all as f64);
+    /// Size per axis of the images of an iteration, as a share of their full one, where `before` is the iteration before. Scores are always fitted to full ones.
+    fn image_scale(&self, before: Schedule) -> f32 {
+        let (stage, [coarse, _, main]) = (before.stage, self.lengths);
+        let done = if stage == Stage::Main { coarse as f64 + main as f64 * before.progress() } else { before.iteration as f64 };
+        let share = done / (self.image_growth * (coarse + main) as f64);
         if stage == Stage::Score || share.is_nan() || share >= 1.0 { 1.0 } else { IMAGE_SCALES[(share * IMAGE_SCALES.len() as f64) as usize] }
     }
     /// Where iteration `iteration` (from 1) of `stage` stands.
@@ -83,12 +87,14 @@ impl StageLengths {
             stage,
             iteration,
             length,
+            settled: (settled && self.settled != self.planned()).then(|| Settled { after: self.settles_at(), planned: self.planned() }),
             total,
             pass: self.passes[stage as usize],
             sh_degree: self.sh_degree,
-            image_scale: self.image_scale(stage, iteration, settled),
+            image_scale: 1.0,
             extent: self.extent,
         };
+        schedule.image_scale = self.image_scale(Schedule { iteration: iteration.saturating_sub(1), ..schedule });
         if stage == Stage::Coarse {
             schedule.sh_degree = (iteration.saturating_sub(1) / schedule.interval(self.sh_interval, 100)).min(self.sh_degree);
         }
@@ -110,6 +116,7 @@ mod tests {
         }
         let after = lengths.schedule(Stage::Main, 401);
         assert_eq!((after.length, after.total), (2620, 3420));
+        assert!((after.progress() - 0.2).abs() < 1e-3 && lengths.schedule(Stage::Main, 2620).progress() == 1.0);
         lengths.stretch_main(1.0);
         assert_eq!(lengths.schedule(Stage::Main, 401), plain.schedule(Stage::Main, 401));
     }

@@ -215,6 +215,12 @@ impl TrainConfig {
         if !(t.settle >= 0.0 && t.settle.is_finite() && t.strain >= 0.0 && t.strain.is_finite()) {
             return bad("settle, train.strain", format!("{} and {}", t.settle, t.strain), "Give finite numbers of 0 or more");
         }
+        if !(t.lambda_r >= 0.0 && t.lambda_r.is_finite()) {
+            return bad("lambda_r", t.lambda_r.to_string(), "Give a finite number of 0 or more; 0 is off");
+        }
+        if !(0.0..=1.0).contains(&t.smooth_delta) {
+            return bad("smooth_delta", format!("{} is not in 0..1", t.smooth_delta), "It is a share of the box and of the sequence; 0.005 is usual");
+        }
         if !(0.1..=100.0).contains(&t.mask_sigma) {
             return bad("mask_sigma", format!("{} pixels", t.mask_sigma), "Give 0.1 to 100 pixels");
         }

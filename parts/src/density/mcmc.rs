@@ -64,12 +64,15 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// The iteration of the stage at which rounds end.
-    fn end(&self, schedule: &Schedule) -> usize {
+    /// The share of the stage, and its iteration, at which rounds end.
+    fn end_share(&self, schedule: &Schedule) -> f64 {
         match schedule.stage {
-            Stage::Coarse => (COARSE_ROUNDS * schedule.length as f64) as usize,
-            _ => schedule.at(self.until),
+            Stage::Coarse => COARSE_ROUNDS,
+            stage => self.until as f64 / stage.reference_length() as f64,
         }
+    }
+    fn end(&self, schedule: &Schedule) -> usize {
+        schedule.iteration_at(self.end_share(schedule)).round() as usize
     }
     fn due(&self, schedule: &Schedule) -> bool {
         let iteration = schedule.iteration;
@@ -90,7 +93,7 @@ impl Settings {
     fn budget(&self, start: usize, schedule: &Schedule) -> usize {
         let share = if schedule.stage == Stage::Coarse { self.coarse_share } else { 1.0 };
         let most = share * self.max_gaussians as f64;
-        let done = (schedule.iteration as f64 / self.end(schedule).max(1) as f64).min(1.0);
+        let done = (schedule.progress() / self.end_share(schedule).max(f64::MIN_POSITIVE)).min(1.0);
         (start as f64 + (most - start as f64).max(0.0) * done.sqrt()) as usize
     }
 }

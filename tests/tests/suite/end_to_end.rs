@@ -139,6 +139,44 @@ fn a_run_that_has_time_left_is_longer_and_its_settings_repeat_it() {
     }
 }
 
+/// Sets the stop flag when scores are fitted.
+struct StopAfterScores<'a>(&'a AtomicBool);
+
+impl EventSink for StopAfterScores<'_> {
+    fn emit(&self, event: &Event) {
+        if matches!(event, Event::StageFinished { stage, .. } if stage == "score") {
+            self.0.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+#[test]
+fn key_frames_are_added_once_however_a_run_is_interrupted() {
+    let config = tiny_of("demo+free-time", &["train.key_frames=4", "train.dynamic=score", "train.iterations=60", "scene.width=96", "scene.height=96"]);
+    let folder = tempfile::tempdir().unwrap();
+    let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
+    let (recorder, never, stop) = (Recorder::default(), AtomicBool::new(false), AtomicBool::new(false));
+    run(&config, &a, false, &recorder, &never).unwrap();
+    let added = |e: &Event| matches!(e, Event::Note { message, .. } if message.contains("points of") && message.contains("key frames"));
+    assert!(recorder.events().iter().any(added), "no key frames: {:?}", recorder.events());
+    assert!(matches!(run(&config, &b, false, &StopAfterScores(&stop), &stop), Err(Error::Interrupted(_))));
+    run(&config, &b, true, &Silent, &never).unwrap();
+    let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
+    assert!(bytes(&a) == bytes(&b), "an interruption changed the run");
+}
+
+#[test]
+fn a_training_that_is_refused_leaves_the_run_before() {
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    run(&tiny(&["train.iterations=12", "train.shares=[1,0,0]"]), folder.path(), false, &Silent, &never).unwrap();
+    let before = std::fs::read(folder.path().join(CHECKPOINT)).unwrap();
+    for wrong in ["init.source=points", "loss=[{kind='l1',weight=0}]"] {
+        assert!(run(&tiny(&["train.iterations=12", wrong]), folder.path(), false, &Silent, &never).is_err(), "{wrong}");
+        assert!(std::fs::read(folder.path().join(CHECKPOINT)).unwrap() == before, "{wrong} removed the checkpoint");
+    }
+}
+
 #[test]
 fn resuming_with_another_configuration_is_refused() {
     let folder = tempfile::tempdir().unwrap();

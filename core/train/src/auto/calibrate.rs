@@ -42,7 +42,7 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     trial.train.batch = 1;
     trial.train.shares = [1.0, 0.0, 1.0];
     trial.train.dynamic = Dynamic::All;
-    trial.train.lambda_r = 0.0;
+    (trial.train.lambda_r, trial.train.recover) = (0.0, false);
     trial.train.log_every = PER_MEASUREMENT;
     trial.train.checkpoint_every = 0;
     // Trained Gaussians are mostly opaque, and pixels behind them cost nothing.

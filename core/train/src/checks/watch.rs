@@ -34,7 +34,7 @@ impl Watch {
     pub fn new(context: &Context, doubts: Vec<Finding>, state: &TrainState) -> Result<Self> {
         let train = &context.job.config.train;
         let length = context.lengths.length(Stage::Main);
-        let rules = if train.checks { Rules::of(train.iterations, length * train.batch, context.training_camera.len()) } else { None };
+        let rules = if train.checks { Rules::of(train.iterations, context.lengths.planned() * train.batch, context.training_camera.len()) } else { None };
         let mut watch = Self { doubts, rules, yardstick: None, scores: state.record.scores.clone() };
         if watch.rules == Some(Rules::All) && state.stage == Stage::Main && state.iteration == length * LATE / 100 && watch.at(LATE).is_some() {
             watch.measure_baselines(context)?;

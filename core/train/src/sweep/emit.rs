@@ -63,7 +63,7 @@ pub fn emit(scheduler: Scheduler, plan: &Plan, options: &EmitOptions) -> Result<
         }
     }
     if o.threads == 0 || o.memory_gb == 0 || o.minutes == 0 {
-        return Err(Error::parameter("sweep emit", "threads, memory and minutes are positive", "Give --threads, --memory-gb and --minutes"));
+        return Err(Error::parameter("sweep emit", "threads, memory and minutes are positive", "Give --threads, --memory-gb and --time-limit"));
     }
     Ok(match scheduler {
         Scheduler::Slurm => slurm(plan, o),

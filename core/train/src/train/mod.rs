@@ -52,7 +52,9 @@ use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
 use crate::schedule::StageLengths;
 use burn::tensor::Device;
-use cc4dgs_core::{AppearanceContext, Error, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, check_attributes, parse_device};
+use cc4dgs_core::{
+    AppearanceContext, Error, Event, EventSink, Rasterizer, Registry, Result, Scene, Schedule, Seed, Split, Stage, check_attributes, parse_device,
+};
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, Moving};
@@ -151,11 +153,6 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         job.events.emit(&Event::Warning { object: job.scene.name.clone(), message: message.clone() });
     }
     let doubts = if config.train.checks { examine(&job.scene, config.background()?, job.events)? } else { Vec::new() };
-    // A device or a scene that is refused leaves the run that was to be overwritten.
-    if !job.resume {
-        folder::write_config(job)?;
-    }
-
     let moving = decide_moving(job);
     let training_camera = training_cameras(&job.scene);
     let parts = Parts {
@@ -174,11 +171,18 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         }
         _ => Vec::new(),
     };
+    let rasterizer = job.registry.build_rasterizer(&config.rasterizer)?;
+    let losses = LossTerms::build(job.registry, &config.loss)?;
+    let score_loss = LossTerms::build(job.registry, std::slice::from_ref(&config.score_loss))?;
     let checkpoint = job.out.as_ref().map(|out| out.join(CHECKPOINT));
     let mut state = match &checkpoint {
         Some(path) if job.resume => folder::resumed(job, path, &device, parts)?,
         _ => {
             let host = initialise(&job.scene, config, seed.child("init"), job.events)?;
+            // What is refused until here leaves the run that was to be overwritten.
+            if !job.resume {
+                folder::write_config(job)?;
+            }
             TrainState::new(GaussianSet::new(&host, &device), moving, job.scene.normalisation, state::longest_focal(&job.scene), parts)
         }
     };
@@ -187,9 +191,9 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         settings: config.clone(),
         pyramid: Pyramid::new(&job.scene, config)?,
         lengths: StageLengths::new(&config.train, matches!(moving, Moving::Scored { .. }), job.scene.extent()),
-        rasterizer: job.registry.build_rasterizer(&config.rasterizer)?,
-        losses: LossTerms::build(job.registry, &config.loss)?,
-        score_loss: LossTerms::build(job.registry, std::slice::from_ref(&config.score_loss))?,
+        rasterizer,
+        losses,
+        score_loss,
         device,
         seed,
         masks,
@@ -276,17 +280,19 @@ impl Context<'_> {
                 self.add_key_frames(state)?;
             }
         }
-        let mut length = self.lengths.schedule(stage, state.iteration + 1).length;
+        let first = self.lengths.schedule(stage, state.iteration + 1);
+        let mut length = first.length;
         events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
         let began = Instant::now();
-        let mut sampler = self.sampler(stage, length);
+        let mut sampler = self.sampler(&first);
         let mut pace = Pace::new(self, stage, state);
         let prefetcher = Prefetcher::new();
         let resumed_at = state.iteration;
         let mut watchdog = Watchdog::new(state);
         let mut log = log::Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
         while state.iteration < self.lengths.length(stage) {
-            if self.job.stop.load(Ordering::Relaxed) {
+            // A main stage that has begun and has no iteration would begin again, key frames included, when it is resumed.
+            if (state.iteration > 0 || stage != Stage::Main) && self.job.stop.load(Ordering::Relaxed) {
                 state.record.log = log.record();
                 self.save(state)?;
                 let at = format!("at iteration {} of stage {}", state.iteration, stage.name());
@@ -298,11 +304,14 @@ impl Context<'_> {
             let schedule = self.lengths.schedule(stage, state.iteration + 1);
             if schedule.length != length {
                 length = schedule.length;
-                sampler = self.sampler(stage, length);
+                sampler = self.sampler(&schedule);
                 log.set_length(length);
             }
             let batch = sampler.batch(state.iteration);
-            prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
+            // Scores are fitted to masks.
+            if stage != Stage::Score {
+                prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
+            }
             let check = watchdog.checks(schedule.iteration);
             let trouble = match stage {
                 Stage::Score => self.score_step(state, &schedule, check, &mut log)?,
@@ -324,6 +333,7 @@ impl Context<'_> {
                 continue;
             }
             if let Some(factor) = pace.as_mut().and_then(|pace| pace.after_iteration(self, &schedule, state.set.len())) {
+                pace = None;
                 self.stretch_main(factor)?;
             }
             if let Some(failure) = watch.after_iteration(self, state, &schedule)? {
@@ -352,15 +362,15 @@ impl Context<'_> {
         Ok(())
     }
 
-    /// Which views the iterations of a stage of `length` iterations see.
-    fn sampler(&self, stage: Stage, length: usize) -> Sampler {
-        let train = &self.job.config.train;
+    /// Which views the iterations of the stage of `schedule` see.
+    fn sampler(&self, schedule: &Schedule) -> Sampler {
+        let (train, stage) = (&self.job.config.train, schedule.stage);
         let sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), train.views_per_iteration(stage));
         // Only a canonical space that is the first frame can be left frame by frame.
         if stage != Stage::Main || self.stage_views(Stage::Coarse).len() == self.stage_views(Stage::Main).len() {
             return sampler;
         }
-        sampler.with_ramp((train.time_ramp * length as f64).round() as usize, |view| self.job.scene.views[view].time_norm)
+        sampler.with_ramp(|share| schedule.iteration_at(share * train.time_ramp), |view| self.job.scene.views[view].time_norm)
     }
 
     /// The training views a stage draws from.

@@ -24,13 +24,14 @@ impl Sampler {
     pub fn new(views: Vec<usize>, seed: Seed, batch: usize) -> Self {
         Self { opens: vec![0; views.len()], views, seed, batch, epoch: None }
     }
-    /// Views of later frames open over the first `ramp` iterations; `time_norm` tells the time of a view.
-    pub fn with_ramp(mut self, ramp: usize, time_norm: impl Fn(usize) -> f32) -> Self {
+    /// Views of later frames open one after another: `opens` tells the iteration from which those after a share of the time may be drawn, `time_norm` the time of
+    /// a view.
+    pub fn with_ramp(mut self, opens: impl Fn(f64) -> f64, time_norm: impl Fn(usize) -> f32) -> Self {
         self.views.sort_by(|&a, &b| time_norm(a).total_cmp(&time_norm(b)));
         if let (Some(&first), Some(&last)) = (self.views.first(), self.views.last()) {
             let (from, to) = (time_norm(first), time_norm(last));
             let share = |v: usize| if to > from { (time_norm(v) - from) / (to - from) } else { 0.0 };
-            self.opens = self.views.iter().map(|&v| (f64::from(share(v)) * ramp as f64).floor() as usize).collect();
+            self.opens = self.views.iter().map(|&v| opens(f64::from(share(v))).floor() as usize).collect();
         }
         self
     }
@@ -103,7 +104,7 @@ mod tests {
     fn a_ramp_lets_frames_in_one_after_another() {
         // Three cameras, four frames: view = 3 * frame + camera.
         let time = |view: usize| (view / 3) as f32 / 3.0;
-        let mut sampler = Sampler::new((0..12).rev().collect(), Seed::root(1), 1).with_ramp(300, time);
+        let mut sampler = Sampler::new((0..12).rev().collect(), Seed::root(1), 1).with_ramp(|share| 300.0 * share, time);
         for index in 0..300 {
             let view = sampler.batch(index)[0];
             assert!(view / 3 <= index / 100, "view {view} at iteration {index}");
@@ -111,7 +112,7 @@ mod tests {
         let mut epoch: Vec<usize> = (300..312).map(|i| sampler.batch(i)[0]).collect();
         epoch.sort_unstable();
         assert_eq!(epoch, (0..12).collect::<Vec<_>>());
-        let early = Sampler::new((0..12).collect(), Seed::root(1), 5).with_ramp(300, time).batch(0);
+        let early = Sampler::new((0..12).collect(), Seed::root(1), 5).with_ramp(|share| 300.0 * share, time).batch(0);
         assert_eq!(early.len(), 3, "no more views than are open");
     }
 }

@@ -255,7 +255,7 @@ impl Context<'_> {
             state.smooth = true;
             return Ok(());
         }
-        if ![4, 2].iter().any(|&share| schedule.length >= share && schedule.iteration == schedule.length / share) {
+        if ![0.25, 0.5].iter().any(|&share| schedule.iteration == schedule.iteration_at(share) as usize) {
             return Ok(());
         }
         let rows = state.moving_rows(&self.device)?;

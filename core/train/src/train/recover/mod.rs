@@ -11,7 +11,6 @@ mod tracks;
 use super::{Context, TrainState};
 use crate::masks::blur;
 use crate::sample::spread;
-use crate::schedule::SETTLED;
 use blobs::blobs;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage};
@@ -48,9 +47,7 @@ struct Lost {
 impl Context<'_> {
     /// Adds Gaussians for what the model does not draw, when the iteration is due and `train.recover` is on.
     pub(crate) fn recover(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
-        // What was due before the length was settled is not due again in a longer stage.
-        let settled = schedule.iteration > self.lengths.settles_at();
-        let due = SHARES.iter().any(|&share| schedule.iteration == (share * schedule.length as f64).round() as usize && (share > SETTLED) == settled);
+        let due = SHARES.iter().any(|&share| schedule.iteration == schedule.iteration_at(share).round() as usize);
         if !(self.job.config.train.recover && schedule.stage == Stage::Main && due && self.can_live(state)) {
             return Ok(());
         }
