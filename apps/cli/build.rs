@@ -1,5 +1,6 @@
 //! Finds the commit that the program is built from, for the provenance in checkpoints and archives.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::Path;
 use std::process::Command;
 
@@ -26,7 +27,13 @@ fn described(sources: &[String]) -> Option<String> {
     let commit = git(&["describe", "--always", "--abbrev=12", "--exclude=*"])?;
     let paths: Vec<&str> = sources.iter().map(String::as_str).collect();
     let changes = git(&[&["status", "--porcelain", "--untracked-files=no", "--"], &paths[..]].concat())?;
-    Some(if changes.is_empty() { commit } else { format!("{commit}-dirty") })
+    if changes.is_empty() {
+        return Some(commit);
+    }
+    // Two changes of one commit are two programs.
+    let mut hash = DefaultHasher::new();
+    git(&[&["diff", "HEAD", "--"], &paths[..]].concat())?.hash(&mut hash);
+    Some(format!("{commit}-dirty-{:08x}", hash.finish() as u32))
 }
 
 fn main() {

@@ -145,18 +145,36 @@ pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
     Ok(Image8 { width, height, channels, data })
 }
 
-/// Whether the end marker of a JPEG is missing. A truncated JPEG still decodes, with grey for missing data. Entropy-coded data cannot contain the end marker.
+/// Whether a JPEG ends before its end marker. A truncated one still decodes, with grey for missing data. What follows the end marker, such as the film of a
+/// photo that moves, does not count; nor do thumbnails, which lie within a segment.
 fn jpeg_is_cut(bytes: &[u8]) -> bool {
-    let last = |marker: u8| bytes.windows(2).rposition(|w| w == [0xff, marker]);
-    match (last(0xda), last(0xd9)) {
-        (Some(scan), Some(end)) => end < scan,
-        _ => true,
+    let mut at = 2;
+    loop {
+        // The next marker: no escaped 0xff, restart of the entropy-coded data or fill byte.
+        let is_marker = |pair: &[u8]| pair[0] == 0xff && !matches!(pair[1], 0 | 0xff | 0xd0..=0xd7);
+        let Some(next) = bytes.get(at..).and_then(|rest| rest.windows(2).position(is_marker)) else { return true };
+        at += next + 2;
+        if bytes[at - 1] == 0xd9 {
+            return false;
+        }
+        let Some(length) = bytes.get(at..at + 2) else { return true };
+        at += usize::from(u16::from_be_bytes([length[0], length[1]])).max(2);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_jpeg_ends_at_its_own_end_marker() {
+        // A segment with a thumbnail, whose markers do not count; a scan with an escaped 0xff; the end.
+        let whole = [&[0xff, 0xd8, 0xff, 0xe1, 0, 8, 0xff, 0xd8, 9, 9, 0xff, 0xd9][..], &[0xff, 0xda, 0, 3, 1, 7, 0xff, 0, 5, 0xff, 0xd9]].concat();
+        assert!(!jpeg_is_cut(&whole));
+        assert!((2..whole.len()).all(|end| jpeg_is_cut(&whole[..end])));
+        let followed = [&whole[..], &[0, 1, 0xff, 0xda, 0, 0, 0xff]].concat();
+        assert!(!jpeg_is_cut(&followed), "what follows is not of the image");
+    }
 
     #[test]
     fn depth_ignores_brackets_in_strings() {

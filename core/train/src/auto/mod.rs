@@ -216,11 +216,17 @@ fn native_size(scene: &Scene) -> [u32; 2] {
     sizes.get(sizes.len() / 2).copied().unwrap_or([1, 1])
 }
 
-/// Memory of the machine in bytes, where the system says.
+/// Files with the limit of memory of a container, of both versions of control groups.
+const MEMORY_LIMITS: [&str; 2] = ["/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"];
+
+/// Memory in bytes that this process may use, where the system says: that of the machine, or of its container.
 fn memory() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
-    line.split_whitespace().next()?.parse::<u64>().ok().map(|kb| kb * 1024)
+    let machine = line.split_whitespace().next()?.parse::<u64>().ok()?.saturating_mul(1024);
+    // Where there is no limit they say so in words or by a huge number.
+    let limits = MEMORY_LIMITS.iter().filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse::<u64>().ok());
+    limits.chain([machine]).min()
 }
 
 #[cfg(test)]

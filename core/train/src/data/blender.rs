@@ -1,22 +1,22 @@
 //! D-NeRF and Blender scenes: `transforms_train.json` and friends, RGBA images, times in 0..1.
 
-use super::nerfstudio::image_path;
+use super::nerfstudio::{Intrinsics, camera, image_path};
 use cc4dgs_core::reader::files::{file_name, image_size, read_json};
-use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
-use cc4dgs_core::{
-    Distortion, Error, ImageSource, InitBox, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
-};
+use cc4dgs_core::{Error, ImageSource, InitBox, Limits, Plugin, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
 use std::path::Path;
 
 #[derive(Deserialize)]
 struct Transforms {
-    camera_angle_x: f64,
+    #[serde(flatten)]
+    shared: Intrinsics,
     frames: Vec<Frame>,
 }
 
 #[derive(Deserialize)]
 struct Frame {
+    #[serde(flatten)]
+    own: Intrinsics,
     file_path: String,
     time: Option<f64>,
     transform_matrix: Vec<Vec<f64>>,
@@ -67,28 +67,17 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
     let file = folder.join(format!("transforms_{name}.json"));
     let object = file.display().to_string();
     let transforms: Transforms = read_json(&file, limits)?;
-    let angle = transforms.camera_angle_x;
-    if !(angle > 0.0 && angle < std::f64::consts::PI) {
-        return Err(Error::data(object, format!("camera_angle_x is {angle}, not an angle below pi"), "Write the horizontal field of view in radians"));
-    }
     let paths: Vec<_> = transforms.frames.iter().map(|f| image_path(folder, &f.file_path)).collect();
     let Some(present) = paths.iter().find(|p| p.is_file()) else {
         let first = paths.first().map(|p| p.display().to_string()).unwrap_or_else(|| "any".into());
         return Err(Error::data(object, format!("none of its {} images exist ({first})", paths.len()), "Check that the images lie beside the JSON"));
     };
     let (w, h) = image_size(present, limits)?;
-    let focal = 0.5 * f64::from(w) / (0.5 * angle).tan();
     for (frame, path) in transforms.frames.iter().zip(paths) {
         let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
-        let world_to_camera = matrix4(&frame.transform_matrix).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
-        scene.cameras.push(RawCamera {
-            name: frame.file_path.trim_start_matches("./").to_string(),
-            size: [w, h],
-            focal: [focal; 2],
-            principal: [0.5 * f64::from(w), 0.5 * f64::from(h)],
-            distortion: Distortion::None,
-            world_to_camera,
-        });
+        // Files that other programs have split name the lens, too.
+        let intrinsics = frame.own.over(&transforms.shared);
+        scene.cameras.push(camera(&frame.file_path, &frame.transform_matrix, &intrinsics, &|| Ok((w, h)), &bad)?);
         scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, image: ImageSource::File { path, mask: None } });
         times.push(frame.time);
     }

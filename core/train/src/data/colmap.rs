@@ -178,9 +178,18 @@ fn videos(path: &Path, images: &[ColmapImage], options: &SceneOptions, limits: &
             by_stem.insert(stem, file);
         }
     }
+    let available = by_stem.len();
     let of = |image: &ColmapImage| by_stem.remove(Path::new(&image.name).file_stem()?.to_str()?);
-    let found: Option<Vec<PathBuf>> = images.iter().map(of).collect();
-    found.map_or(Ok(Vec::new()), |found| video::footage(&found, options, limits, warnings))
+    let found: Vec<Option<PathBuf>> = images.iter().map(of).collect();
+    if let Some(lacking) = found.iter().position(Option::is_none) {
+        if available > 0 {
+            let (count, name) = (found.iter().filter(|f| f.is_none()).count(), &images[lacking].name);
+            let problem = format!("{count} of {} images have no video of their name ({name})", images.len());
+            warnings.push(format!("{problem}: the {available} videos are not used, and the scene is read as one instant"));
+        }
+        return Ok(Vec::new());
+    }
+    video::footage(&found.into_iter().flatten().collect::<Vec<_>>(), options, limits, warnings)
 }
 
 /// The points of a COLMAP model beside another calibration, if both use the same world: every camera must have an image of its name whose

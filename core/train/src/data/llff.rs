@@ -74,7 +74,11 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             scene.views.extend(image.map(|image| RawView { camera: index, frame, time: None, split, image }));
         }
     }
-    scene.points = colmap::points_in_same_world(path, &scene.cameras, limits)?;
+    match colmap::points_in_same_world(path, &scene.cameras, limits) {
+        Ok(points) => scene.points = points,
+        // The cameras do not need it.
+        Err(error) => scene.warnings.push(format!("the points of the COLMAP model beside poses_bounds.npy are not used: {error}")),
+    }
     scene.init_box = frustum_box(&scene.cameras, &depths);
     Ok(scene)
 }
@@ -114,10 +118,10 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     for root in [path.to_path_buf(), path.join("frames")] {
         for folder in list_if(&root, is_camera_folder)? {
             let inner = folder.join("images");
-            let frames = list(if inner.is_dir() { &inner } else { &folder }, is_image)?;
-            if let Some(first) = frames.first() {
+            let files = list(if inner.is_dir() { &inner } else { &folder }, is_image)?;
+            if let Some(first) = files.first() {
                 let (w, h) = image_size(first, limits)?;
-                found.push(Footage { name: file_name(&folder), size: [w, h], images: files(frames) });
+                found.push(Footage { name: file_name(&folder), size: [w, h], images: frames(files, warnings) });
             }
         }
         if !found.is_empty() {
@@ -135,7 +139,7 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     let images = path.join("images");
     for file in list_if(&images, is_image)? {
         let (w, h) = image_size(&file, limits)?;
-        found.push(Footage { name: stem(&file), size: [w, h], images: files(vec![file]) });
+        found.push(Footage { name: stem(&file), size: [w, h], images: frames(vec![file], warnings) });
     }
     if found.is_empty() {
         let remedy = "Put cam00.mp4 …, folders cam00/ … of frames, or images/ beside poses_bounds.npy";
@@ -144,8 +148,37 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     Ok(found)
 }
 
-fn files(paths: Vec<PathBuf>) -> Vec<Option<ImageSource>> {
-    paths.into_iter().map(|path| Some(ImageSource::File { path, mask: None })).collect()
+/// The images of a camera, one per instant. Files whose names end in numbers come in the order of these, `frame_2` before `frame_10`, and a number that is missing
+/// is an instant without an image.
+fn frames(mut files: Vec<PathBuf>, warnings: &mut Vec<String>) -> Vec<Option<ImageSource>> {
+    let image = |path| Some(ImageSource::File { path, mask: None });
+    if files.iter().all(|path| frame_number(path).is_some()) {
+        files.sort_by_key(|path| frame_number(path));
+    }
+    let numbers: Vec<u64> = files.iter().filter_map(|path| frame_number(path)).collect();
+    let steps = || numbers.windows(2).map(|pair| pair[1] - pair[0]);
+    let (Some(&first), Some(step)) = (numbers.first(), steps().min().filter(|step| *step > 0)) else { return files.into_iter().map(image).collect() };
+    let slot = |number: u64| ((number - first) / step) as usize;
+    let count = numbers.last().map_or(0, |&last| slot(last).saturating_add(1));
+    // Numbers of another meaning, such as times, have no steps or leave most of them out.
+    if numbers.len() < files.len() || steps().any(|s| !s.is_multiple_of(step)) || count > 4 * files.len() {
+        return files.into_iter().map(image).collect();
+    }
+    if count > files.len() {
+        let folder = files.first().and_then(|f| f.parent()).map(|f| f.display().to_string()).unwrap_or_default();
+        warnings.push(format!("{folder}: {} of {count} frames are missing", count - files.len()));
+    }
+    let mut images = vec![None; count];
+    for (path, &number) in files.into_iter().zip(&numbers) {
+        images[slot(number)] = image(path);
+    }
+    images
+}
+
+/// The number at the end of a file's name.
+fn frame_number(path: &Path) -> Option<u64> {
+    let stem = stem(path);
+    stem[stem.trim_end_matches(|c: char| c.is_ascii_digit()).len()..].parse().ok()
 }
 
 fn list_if(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {

@@ -13,8 +13,9 @@ use std::path::{Path, PathBuf};
 /// Where the file names no split, every eighth image is held out, as is usual for static scenes.
 pub(crate) const HOLD_OUT_EVERY: usize = 8;
 
+/// What a file says of a lens: of all images, or of one.
 #[derive(Clone, Default, Deserialize)]
-struct Intrinsics {
+pub(crate) struct Intrinsics {
     camera_angle_x: Option<f64>,
     camera_angle_y: Option<f64>,
     fl_x: Option<f64>,
@@ -57,7 +58,7 @@ struct Frame {
 
 impl Intrinsics {
     /// Own values first, then the shared ones.
-    fn over(&self, shared: &Self) -> Self {
+    pub(crate) fn over(&self, shared: &Self) -> Self {
         macro_rules! first {
             ($($field:ident),*) => { Self { $($field: self.$field.clone().or_else(|| shared.$field.clone())),* } };
         }
@@ -75,6 +76,9 @@ impl Intrinsics {
     }
     /// Focal lengths from pixels, or from the angles of view.
     fn focal(&self, w: f64, h: f64) -> Result<[f64; 2], String> {
+        if let Some(angle) = [self.camera_angle_x, self.camera_angle_y].into_iter().flatten().find(|a| !(*a > 0.0 && *a < std::f64::consts::PI)) {
+            return Err(format!("camera_angle_x or camera_angle_y is {angle}, not an angle below pi in radians"));
+        }
         let from_angle = |size: f64, angle: f64| 0.5 * size / (0.5 * angle).tan();
         let fx = self.fl_x.or_else(|| self.camera_angle_x.map(|a| from_angle(w, a))).or(self.fl_y);
         let fx = fx.or_else(|| self.camera_angle_y.map(|a| from_angle(h, a))).ok_or("it has neither fl_x nor camera_angle_x")?;
@@ -123,10 +127,14 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
     let mut videos = videos(&object, &frames, folder, options, limits, &mut scene.warnings)?;
     let has_times = videos.is_empty();
-    let named_split = !transforms.train_filenames.is_empty() || !transforms.test_filenames.is_empty();
-    let mut missing = Vec::new();
-    let mut seen = 0;
+    let named = |names: &[String]| names.iter().map(|name| plain(name).to_string()).collect::<BTreeSet<_>>();
+    let [train, test, validation] = [&transforms.train_filenames, &transforms.test_filenames, &transforms.val_filenames].map(|names| named(names));
+    let named_split = !(train.is_empty() && test.is_empty());
+    let (mut missing, mut unlisted, mut seen) = (Vec::new(), 0, 0);
     let mut times = Vec::new();
+    let of_frame = |frame: &Frame, image_size: &dyn Fn() -> Result<(u32, u32)>, bad: &dyn Fn(String) -> Error| {
+        camera(&frame.file_path, &frame.transform_matrix, &frame.own.over(&transforms.shared), image_size, bad)
+    };
     for frame in frames {
         let path = image_path(folder, &frame.file_path);
         if !path.is_file() {
@@ -134,12 +142,15 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             continue;
         }
         let split = if named_split {
-            let held_out = transforms.test_filenames.contains(&frame.file_path);
-            let listed = held_out || transforms.train_filenames.is_empty() || transforms.train_filenames.contains(&frame.file_path);
-            if !listed && transforms.val_filenames.contains(&frame.file_path) {
-                continue;
+            match plain(&frame.file_path) {
+                name if test.contains(name) => Split::Test,
+                name if validation.contains(name) => Split::Validation,
+                name if train.is_empty() || train.contains(name) => Split::Train,
+                _ => {
+                    unlisted += 1;
+                    continue;
+                }
             }
-            if held_out { Split::Test } else { Split::Train }
         } else if seen % HOLD_OUT_EVERY == 0 && transforms.frames.len() > 1 {
             Split::Test
         } else {
@@ -148,14 +159,14 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         seen += 1;
         let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
         if let Some(footage) = videos.remove(&path) {
-            let mut camera = camera(frame, &transforms.shared, &|| Ok((footage.size[0], footage.size[1])), &bad)?;
+            let mut camera = of_frame(frame, &|| Ok((footage.size[0], footage.size[1])), &bad)?;
             fit_to_image(&mut camera, (footage.size[0], footage.size[1]), &mut scene.warnings)?;
             let images = footage.images.into_iter().enumerate().filter_map(|(index, image)| image.map(|image| (index, image)));
             scene.views.extend(images.map(|(index, image)| RawView { camera: scene.cameras.len(), frame: index, time: None, split, image }));
             scene.cameras.push(camera);
             continue;
         }
-        scene.cameras.push(camera(frame, &transforms.shared, &|| image_size(&path, limits), &bad)?);
+        scene.cameras.push(of_frame(frame, &|| image_size(&path, limits), &bad)?);
         times.push(frame.time);
         scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: Some(0.0), split, image: ImageSource::File { path, mask: None } });
     }
@@ -168,10 +179,43 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             if missing.len() > 3 { ", …" } else { "" }
         ));
     }
+    if unlisted > 0 {
+        scene.warnings.push(format!("{unlisted} images are in none of train_filenames, test_filenames and val_filenames, and were skipped"));
+    }
     if has_times {
         scene.rank_times(&times, &object)?;
+        if merge_fixed_cameras(&mut scene, &times) && !named_split && scene.cameras.len() > 1 {
+            // Another instant of a camera that is trained on says nothing of new views.
+            scene.views.iter_mut().for_each(|view| view.split = if view.camera.is_multiple_of(HOLD_OUT_EVERY) { Split::Test } else { Split::Train });
+        }
     }
     Ok(scene)
+}
+
+/// The name of a file without what does not tell it apart.
+fn plain(name: &str) -> &str {
+    name.trim_start_matches("./")
+}
+
+/// Where most entries are further instants of a camera that stands still, `scene` gets one camera for each; `times` are those of its views. Returns whether it did.
+fn merge_fixed_cameras(scene: &mut RawScene, times: &[Option<f64>]) -> bool {
+    let mut groups: BTreeMap<String, Vec<usize>> = BTreeMap::new();
+    for (index, c) in scene.cameras.iter().enumerate() {
+        groups.entry(format!("{:?}", (c.size, c.focal, c.principal, &c.distortion, c.world_to_camera))).or_default().push(index);
+    }
+    let instants = |of: &[usize]| of.iter().filter_map(|&view| times[view].map(f64::to_bits)).collect::<BTreeSet<_>>().len();
+    // A moving camera may rest for a moment.
+    if 2 * groups.len() > scene.views.len() || groups.values().any(|of| instants(of) < of.len()) {
+        return false;
+    }
+    let mut groups: Vec<Vec<usize>> = groups.into_values().collect();
+    groups.sort();
+    let cameras = groups.iter().map(|of| scene.cameras[of[0]].clone()).collect();
+    for (camera, views) in groups.iter().enumerate() {
+        views.iter().for_each(|&view| scene.views[view].camera = camera);
+    }
+    scene.cameras = cameras;
+    true
 }
 
 /// The videos that the frames name, if they do, by path.
@@ -196,8 +240,14 @@ fn videos(
     Err(Error::data(object, problem, "Write one entry per camera with its video, or one per image"))
 }
 
-fn camera(frame: &Frame, shared: &Intrinsics, image_size: &dyn Fn() -> Result<(u32, u32)>, bad: &dyn Fn(String) -> Error) -> Result<RawCamera> {
-    let intrinsics = frame.own.over(shared);
+/// The camera of the image `name`: its pose is a camera-to-world matrix with OpenGL axes. `image_size` is asked where the file says none.
+pub(crate) fn camera(
+    name: &str,
+    pose: &[Vec<f64>],
+    intrinsics: &Intrinsics,
+    image_size: &dyn Fn() -> Result<(u32, u32)>,
+    bad: &dyn Fn(String) -> Error,
+) -> Result<RawCamera> {
     let (w, h) = match (intrinsics.w, intrinsics.h) {
         (Some(w), Some(h)) if w >= 1.0 && h >= 1.0 && w <= 1e6 && h <= 1e6 => (w, h),
         (None, None) => {
@@ -206,9 +256,9 @@ fn camera(frame: &Frame, shared: &Intrinsics, image_size: &dyn Fn() -> Result<(u
         }
         (w, h) => return Err(bad(format!("image size w {w:?}, h {h:?} is not a size"))),
     };
-    let world_to_camera = matrix4(&frame.transform_matrix).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
+    let world_to_camera = matrix4(pose).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
     Ok(RawCamera {
-        name: frame.file_path.trim_start_matches("./").to_string(),
+        name: plain(name).to_string(),
         size: [w as u32, h as u32],
         focal: intrinsics.focal(w, h).map_err(bad)?,
         principal: [intrinsics.cx.unwrap_or(0.5 * w), intrinsics.cy.unwrap_or(0.5 * h)],

@@ -94,15 +94,16 @@ fn cap_training_views(raw: &mut RawScene, cap: usize) {
     if cap == 0 || train <= cap {
         return;
     }
-    let mut seen = 0;
-    raw.views.retain(|v| {
-        if v.split == Split::Test {
-            return true;
-        }
-        seen += 1;
-        // Keeps the views at which the running share of `cap` passes a whole number: evenly spread.
-        (seen * cap) / train != ((seen - 1) * cap) / train
-    });
+    // Camera by camera, so that each keeps its share: of views by frame, every so many would always be of the same cameras.
+    let mut order: Vec<usize> = (0..raw.views.len()).filter(|&v| raw.views[v].split == Split::Train).collect();
+    order.sort_by_key(|&v| (raw.views[v].camera, raw.views[v].frame));
+    let mut keep = vec![true; raw.views.len()];
+    for (k, view) in order.into_iter().enumerate() {
+        // Those at which the running share of `cap` passes a whole number: evenly spread.
+        keep[view] = ((k + 1) * cap) / train != (k * cap) / train;
+    }
+    let mut keep = keep.into_iter();
+    raw.views.retain(|_| keep.next().unwrap_or(true));
 }
 
 fn drop_unused_cameras(raw: &mut RawScene) {

@@ -88,8 +88,8 @@ impl<'a> Trained<'a> {
                 return Err(Error::Interrupted(format!("scoring of cell {}; the next run scores it again", cell.id)));
             }
             let index = images.len();
-            let keep = |owner: &str, image| {
-                let name = format!("images/{owner}/{index:05}.png");
+            let keep = |owner: &str, number: usize, image| {
+                let name = format!("images/{owner}/{number:05}.png");
                 write_png(folder.root().join(&name), image).map(|()| name)
             };
             let keeps = kept.contains(&index);
@@ -104,8 +104,8 @@ impl<'a> Trained<'a> {
                 // All numbers for now; those without a protocol are left out below.
                 scores: numbers(score)?,
                 blocks: score.blocks.map(|b| (b.moving, b.lost, b.worst_psnr_db)),
-                truth: if keeps { Some(keep(&format!("{}/truth", self.training.id), truth)?) } else { None },
-                render: if keeps { Some(keep(&cell.id, render)?) } else { None },
+                truth: if keeps { Some(keep(&format!("{}/truth", self.training.id), view, truth)?) } else { None },
+                render: if keeps { Some(keep(&cell.id, index, render)?) } else { None },
             });
             Ok(())
         })?;
@@ -209,11 +209,8 @@ fn scores(report: &EvalReport) -> Result<(BTreeMap<String, Score>, BTreeMap<Stri
             None => _ = absent.insert(name.to_string(), "it was not computed".to_string()),
         }
     }
-    // Reasons that the evaluation itself states come first.
-    for (name, reason) in fields.get("absent").and_then(Value::as_object).into_iter().flatten() {
-        if !metrics.contains_key(name) {
-            absent.insert(name.clone(), reason.as_str().map_or_else(|| reason.to_string(), str::to_string));
-        }
+    if let Some(reason) = &report.lpips_absent {
+        absent.insert("lpips".into(), reason.clone());
     }
     Ok((metrics, absent))
 }

@@ -217,7 +217,16 @@ fn codecs(grid: &Grid, registry: &Registry) -> Result<Vec<(String, CodecChoice)>
         FieldWeights::parse(&choice.field_weights, registry)?;
         Ok((axis.name.clone(), choice))
     };
-    grid.codec.iter().map(|axis| of(axis).map_err(|error| within(&format!("grid {}, codec '{}'", grid.name, axis.name), error))).collect()
+    let mut found: Vec<(String, CodecChoice)> = Vec::new();
+    for axis in &grid.codec {
+        let (name, choice) = of(axis).map_err(|error| within(&format!("grid {}, codec '{}'", grid.name, axis.name), error))?;
+        if let Some((same, _)) = found.iter().find(|(_, other)| *other == choice) {
+            let problem = format!("the codecs '{name}' and '{same}' are the same");
+            return Err(Error::parameter(format!("grid {}", grid.name), problem, "Remove one, or change its settings"));
+        }
+        found.push((name, choice));
+    }
+    Ok(found)
 }
 
 /// Everything about a training but its name.

@@ -84,6 +84,36 @@ fn llff_with_frame_folders() {
 }
 
 #[test]
+fn frames_are_numbered_by_their_names() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[3, 17], &llff_rows(&ring(3, 16, 12)))).unwrap();
+    // Not padded, so that text order is 1, 10, 11, 2; one frame of one camera is lost.
+    for c in 0..3 {
+        for t in (1..=11).filter(|t| (c, *t) != (1, 4)) {
+            write_image(&dir.path().join(format!("cam{c}/frame_{t}.png")), 16, 12, (20 * c + t) as u8);
+        }
+    }
+    let scene = load(dir.path()).unwrap();
+    assert_eq!((scene.frame_count, train_count(&scene)), (11, (21, 11)));
+    for (view, v) in scene.views.iter().enumerate() {
+        assert_eq!(scene.frame(view).unwrap().data[2], (20 * v.camera + v.frame + 1) as u8);
+    }
+    assert!(scene.warnings.iter().any(|w| w.contains("cam1") && w.contains("1 of 11 frames")), "{:?}", scene.warnings);
+}
+
+#[test]
+fn a_model_beside_the_poses_that_cannot_be_read_is_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    write_llff(dir.path());
+    std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+    for name in ["cameras.bin", "images.bin", "points3D.bin"] {
+        std::fs::write(dir.path().join("sparse/0").join(name), [9; 40]).unwrap();
+    }
+    let scene = load(dir.path()).unwrap();
+    assert!(scene.points.is_none() && scene.warnings.iter().any(|w| w.contains("COLMAP")), "{:?}", scene.warnings);
+}
+
+#[test]
 fn llff_refuses_a_camera_too_many() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[2, 17], &llff_rows(&ring(2, 16, 12)))).unwrap();
@@ -255,6 +285,61 @@ fn nerfstudio_with_shared_and_own_intrinsics_and_gaps() {
     let camera = |name: &str| scene.cameras.iter().find(|c| c.name == name).unwrap();
     same_pose(&scene.normalisation.inverse().apply_camera(camera("images/0005.jpg")), &cameras[5]);
     assert_eq!((camera("images/0005.jpg").fx, camera("images/0006.jpg").fx, camera("images/0006.jpg").fy), (55.0, 50.0, 51.0));
+}
+
+#[test]
+fn a_lens_beside_the_angle_of_view_counts_in_split_files_too() {
+    let dir = tempfile::tempdir().unwrap();
+    write_dnerf(dir.path(), 3, 1, 16);
+    let file = dir.path().join("transforms_train.json");
+    let mut document: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    for (key, value) in [("fl_x", 21.0), ("fl_y", 22.0), ("cx", 7.0), ("cy", 9.0)] {
+        document[key] = value.into();
+    }
+    std::fs::write(&file, document.to_string()).unwrap();
+    let scene = load(dir.path()).unwrap();
+    let of = |split: Split| scene.camera(scene.split(split)[0]);
+    let (train, test) = (of(Split::Train), of(Split::Test));
+    assert_eq!((train.fx, train.fy, train.cx, train.cy), (21.0, 22.0, 7.0, 9.0));
+    assert!((test.fx - 8.0 / 0.4f64.tan()).abs() < 1e-9 && test.cx == 8.0);
+}
+
+#[test]
+fn images_of_a_camera_that_stands_still_are_its_frames() {
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = ring(9, 16, 12);
+    let mut frames = Vec::new();
+    for (c, camera) in cameras.iter().enumerate() {
+        for t in 0..4 {
+            let name = format!("images/{c}_{t}.png");
+            write_image(&dir.path().join(&name), 16, 12, (10 * c + t) as u8);
+            frames.push(serde_json::json!({"file_path": name, "time": t as f64 / 3.0, "transform_matrix": opengl_camera_to_world(camera)}));
+        }
+    }
+    let document = serde_json::json!({"fl_x": 20.0, "w": 16, "h": 12, "frames": frames});
+    std::fs::write(dir.path().join("transforms.json"), document.to_string()).unwrap();
+    let scene = load(dir.path()).unwrap();
+    assert_eq!((scene.cameras.len(), scene.frame_count, train_count(&scene)), (9, 4, (28, 8)));
+    for (view, v) in scene.views.iter().enumerate() {
+        assert_eq!(scene.frame(view).unwrap().data[2], (10 * v.camera + v.frame) as u8);
+        assert_eq!(v.split == Split::Test, v.camera % 8 == 0, "whole cameras are held out");
+    }
+}
+
+#[test]
+fn names_of_a_split_may_begin_with_a_dot() {
+    let dir = tempfile::tempdir().unwrap();
+    write_nerfstudio(dir.path(), 6);
+    let file = dir.path().join("transforms.json");
+    let mut document: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    let names = |of: &[usize]| serde_json::json!(of.iter().map(|i| format!("./images/{i:04}.png")).collect::<Vec<_>>());
+    (document["train_filenames"], document["test_filenames"], document["val_filenames"]) = (names(&[0, 1, 2]), names(&[3]), names(&[4]));
+    std::fs::write(&file, document.to_string()).unwrap();
+    let scene = load(dir.path()).unwrap();
+    let of = |split: Split| scene.split(split).iter().map(|&v| scene.camera(v).name.clone()).collect::<Vec<_>>();
+    assert_eq!((of(Split::Test), of(Split::Validation)), (vec!["images/0003.png".to_string()], vec!["images/0004.png".into()]));
+    assert_eq!(of(Split::Train).len(), 3);
+    assert!(scene.warnings.iter().any(|w| w.starts_with("1 images are in none of")), "{:?}", scene.warnings);
 }
 
 #[test]
