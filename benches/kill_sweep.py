@@ -86,7 +86,8 @@ def main():
     draw = random.Random(options.seed)
     whole, killed = options.out / "whole", options.out / "killed"
     size = ["--iterations", options.iterations] if options.iterations else []
-    shutil.rmtree(options.out, ignore_errors=True)
+    for folder in (whole, killed):
+        shutil.rmtree(folder, ignore_errors=True)
     subprocess.run(command(options, "plan", options.grid, "--out", whole, *size), check=True, stdout=subprocess.DEVNULL)
     began = time.time()
     subprocess.run(command(options, "run", whole, "--jobs", options.jobs), check=True, stdout=subprocess.DEVNULL)

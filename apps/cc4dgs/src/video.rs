@@ -38,12 +38,17 @@ pub fn encode(frames: &Path, count: usize, fps: u32, out: &Path) -> Result<()> {
     part.persist(out).map_err(|e| Error::io(out, e.error))
 }
 
-/// Encoding that players agree on: 4:2:0 colour, which needs even sides, and the index in front. Nothing of the day or the program is written.
-const CODEC: [&str; 12] = [
+/// Encoding that players agree on: 4:2:0 colour, which needs even sides, by the matrix of BT.709 whatever the size, and the index in front. Nothing of the day or
+/// the program is written.
+const CODEC: [&str; 16] = [
     "-vf",
-    "pad=ceil(iw/2)*2:ceil(ih/2)*2",
-    "-pix_fmt",
-    "yuv420p",
+    "pad=ceil(iw/2)*2:ceil(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv,format=yuv420p",
+    "-colorspace",
+    "bt709",
+    "-color_primaries",
+    "bt709",
+    "-color_trc",
+    "bt709",
     "-movflags",
     "+faststart",
     "-fflags",
@@ -156,14 +161,21 @@ impl Running {
 fn ffmpeg() -> Command {
     let mut command = Command::new("ffmpeg");
     command.args(["-y", "-loglevel", "error"]);
+    // Ctrl-C is for this program, which then ends the video.
+    #[cfg(unix)]
+    std::os::unix::process::CommandExt::process_group(&mut command, 0);
     command
 }
 
 /// A temporary name beside `out`.
 fn temporary(out: &Path) -> Result<tempfile::TempPath> {
     let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let part = tempfile::Builder::new().prefix(".cc4dgs-").suffix(".mp4").tempfile_in(folder).map_err(|e| Error::io(folder, e))?;
-    Ok(part.into_temp_path())
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".cc4dgs-").suffix(".mp4");
+    // As any other file, and not for its owner alone.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    Ok(builder.tempfile_in(folder).map_err(|e| Error::io(folder, e))?.into_temp_path())
 }
 
 fn absent(error: std::io::Error) -> Error {

@@ -11,8 +11,8 @@ use std::path::Path;
 /// Cameras and normalised times, and the background of the scene they are from.
 pub type Chosen = (Vec<(Camera, f32)>, Option<[f32; 3]>);
 
-/// What to render of `model`; `sets` are scene options.
-pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model) -> Result<Chosen> {
+/// What to render of `model`; `sets` are scene options. A split without views is an error where `images` are wanted.
+pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model, images: bool) -> Result<Chosen> {
     let Some(path) = &args.scene else {
         if !sets.is_empty() {
             return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset whose cameras are wanted"));
@@ -25,7 +25,7 @@ pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model) -
     };
     let scene = open_as_trained(path, model, sets, &context.registry, &context.limits)?;
     let views = scene.split(args.split.into());
-    if views.is_empty() {
+    if views.is_empty() && images {
         return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));
     }
     let wanted = args.frames.map_or(views.len(), |n| n as usize);

@@ -102,8 +102,10 @@ export function build(container, player) {
             bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = still; });
             time.step = still ? 1 : 0.0005;
             camera.replaceChildren(element("option", { value: -1, textContent: "Home" }), ...facts.cameras.map((name, i) => element("option", { value: i, textContent: name })));
-            controls.shDegree.input.max = facts.shDegree;
-            player.settings.shDegree = Math.min(player.settings.shDegree, facts.shDegree);
+            // All degrees of one model mean all degrees of the next.
+            const { input } = controls.shDegree, all = player.settings.shDegree >= Number(input.max);
+            input.max = facts.shDegree;
+            player.settings.shDegree = all ? facts.shDegree : Math.min(player.settings.shDegree, facts.shDegree);
             ui.settings({ ...player.settings, flying: player.flying });
             ui.time({ time: player.time, frame: player.gpu.frame, seconds: player.time * facts.seconds }, facts);
         },

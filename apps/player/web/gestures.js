@@ -33,7 +33,10 @@ export function addGestures(canvas, act) {
             act.orbit(-4 * dx / height, 4 * dy / height);
         }
     });
-    const up = e => pointers.delete(e.pointerId);
+    const up = e => {
+        pointers.delete(e.pointerId);
+        if (pointers.size === 2) ({ spread, middle } = measure());
+    };
     canvas.addEventListener("pointerup", up);
     canvas.addEventListener("pointercancel", up);
     canvas.addEventListener("contextmenu", e => e.preventDefault());
@@ -50,7 +53,7 @@ const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -
 export function addKeys(element, act, commands) {
     const held = new Set();
     element.addEventListener("keydown", e => {
-        if (e.ctrlKey || e.metaKey || e.altKey || e.target.closest("select, input:not([type=range]):not([type=checkbox])")) return;
+        if (e.ctrlKey || e.metaKey || e.altKey || e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
         const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
         if (FLY[key]) { held.add(key); e.preventDefault(); return; }
         // Buttons and sliders keep the keys they know.

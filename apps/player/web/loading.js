@@ -98,7 +98,12 @@ export async function loadUrl(wasm, url, show, signal) {
     };
     const first = await get({ Range: `bytes=0-${FIRST - 1}` });
     const range = first.status === 206 && /\/(\d+)$/.exec(first.headers.get("Content-Range") || "");
-    if (!range) return loadBody(wasm, name, first, show);
+    if (!range) {
+        if (first.status !== 206) return loadBody(wasm, name, first, show);
+        // Another site need not tell how long the file is, and a part of unknown length is no file.
+        await first.body?.cancel();
+        return loadBody(wasm, name, await get({}), show);
+    }
     const total = Number(range[1]);
     const start = new Uint8Array(await first.arrayBuffer());
     if (!isArchive(start)) {

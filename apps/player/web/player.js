@@ -76,7 +76,7 @@ class Page {
             }
         }
         // A lost context stays that of its canvas until the browser restores it.
-        if (this.gl?.lost) await new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
+        if (this.gl?.gl.isContextLost()) await new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
         this.gl?.free();
         this.gl = new WebGl(this.ui.canvas, () => { this.dirty = true; });
         this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height);
@@ -135,7 +135,13 @@ class Page {
             return this.facts;
         } catch (e) {
             if (signal.aborted) return null;
-            this.source = null;
+            // The model before is still there.
+            Object.assign(this, this.shown ?? { source: null });
+            this.ui.poster(null);
+            if (this.facts) {
+                this.ui.facts(this.facts);
+                this.ui.title(this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source.name ?? "model"));
+            }
             this.fail(e);
             throw e;
         } finally {
@@ -145,8 +151,10 @@ class Page {
     }
     loaded(facts) {
         this.facts = facts;
+        this.shown = { source: this.source, name: this.name, facts };
         this.gl?.load(this.gpu, facts.moving);
         this.ui.facts(facts);
+        this.ui.playing(this.gpu.playing);
         this.apply();
         const { first } = this;
         if (first && !first.followed) { first.followed = true; this.followLink(); }
@@ -224,7 +232,7 @@ class Page {
             old.free();
             await this.start();
             if (source) {
-                this.facts = null;
+                [this.facts, this.shown] = [null, null];
                 await this.load(source, name);
                 this.gpu.pose = kept.pose;
                 this.seek(kept.time);

@@ -159,6 +159,8 @@ export class WebGl {
         }
         this.gl = gl;
         this.canvas = canvas;
+        // A browser may restore a lost context before anybody looks; what was made in it is gone all the same.
+        canvas.addEventListener("webglcontextlost", () => { this.wasLost = true; }, { once: true });
         this.changed = changed;
         this.draws = this.program(VERTEX, FRAGMENT);
         this.presents = this.program(COVER, PRESENT);
@@ -183,7 +185,7 @@ export class WebGl {
         const info = this.gl.getExtension("WEBGL_debug_renderer_info");
         return `WebGL2 ${info ? this.gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""}`;
     }
-    get lost() { return this.gl.isContextLost(); }
+    get lost() { return !!this.wasLost || this.gl.isContextLost(); }
     program(vertex, fragment) {
         const { gl } = this, program = gl.createProgram();
         for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {

@@ -48,7 +48,11 @@ fn document(title: &str, head: &str, body: &str) -> String {
 pub(super) fn of_folder(title: &str, model: &str, autoplay: bool) -> String {
     let options = script_json(&json!({ "autoplay": autoplay, "src": model }));
     let body = format!(
-        r#"<script type="module">
+        r#"<script>
+if (location.protocol === "file:") document.getElementById("player").textContent =
+    "This folder needs a web server: python3 -m http.server. Export with a name that ends in .html for a page that opens from disk.";
+</script>
+<script type="module">
 import {{ createPlayer }} from "./player.js";
 const options = {options};
 options.src = new URLSearchParams(location.search).get("src") ?? options.src;
@@ -127,6 +131,6 @@ mod tests {
     #[test]
     fn names_cannot_leave_their_script() {
         let html = of_folder("</script><script>alert(1)</script>", "</script>x", true);
-        assert_eq!(html.matches("</script>").count(), 1, "{html}");
+        assert_eq!(html.matches("</script>").count(), 2, "{html}");
     }
 }

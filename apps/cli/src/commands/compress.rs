@@ -4,11 +4,12 @@ use super::{Context, create_parent, megabytes};
 use crate::args::Compress;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs_core::archive::{Archive, StreamInfo, StreamKind, write_atomically};
+use cc4dgs_core::archive::{Archive, Presentation, StreamInfo, StreamKind, write_atomically};
 use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Event, EventSink, Result, TuneModel, config, read_gaussians, read_weights};
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
+use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::eval::SizeMb;
 use cc4dgs_train::train::{TuneJob, Tuner};
@@ -64,6 +65,7 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     refuse_existing(&args.out, args.overwrite)?;
     let events = context.listeners(None)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    say_what_is_lost(context, &args.model, &events)?;
     let mut settings = toml::Table::new();
     config::set_all(&mut settings, &args.sets)?;
     // An unknown name is refused before the scene is read.
@@ -94,6 +96,16 @@ pub fn run(context: &Context, args: &Compress) -> Result<()> {
     };
     let report = compress(context, &loaded.model, &options, &args.out, &events)?;
     context.output.result(&report, || text(&report))
+}
+
+/// Warns where `model` is an archive that was baked: a new one plays at another rate and from another camera.
+pub fn say_what_is_lost(context: &Context, model: &Path, events: &dyn EventSink) -> Result<()> {
+    let source = Source::expect(model)?;
+    if source.kind == SourceKind::Archive && Archive::open(&source.file, &context.limits)?.manifest().presentation != Presentation::default() {
+        let message = "frame rate, cameras, poster and playback layer are left out: bake the new archive again".into();
+        events.emit(&Event::Warning { object: model.display().to_string(), message });
+    }
+    Ok(())
 }
 
 /// Writes `model` to the archive `out` after decoding it, so that what cannot be decoded is an error here and not at its reader, and replaces no file.

@@ -20,7 +20,8 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
     check_time(&context.registry, plugin, args.time)?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    let (shots, background) = match shots::choose(context, &args.shots, &scene_sets, &loaded.model) {
+    let images = plugin.info.capabilities.contains(&"images");
+    let (shots, background) = match shots::choose(context, &args.shots, &scene_sets, &loaded.model, images) {
         // Formats of Gaussians are written for models that no orbit can look at, too.
         Err(Error::Data { .. }) if args.shots.scene.is_none() => (Vec::new(), None),
         chosen => chosen?,

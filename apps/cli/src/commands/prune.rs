@@ -1,6 +1,6 @@
 //! `cc4dgs prune`.
 
-use super::compress::compress;
+use super::compress::{compress, say_what_is_lost};
 use super::{Context, create_parent};
 use crate::args::Prune;
 use crate::interrupt;
@@ -32,6 +32,7 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
     let events = context.listeners(None)?;
     create_parent(&args.out)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
+    say_what_is_lost(context, &args.model, &events)?;
     let scene = open_as_trained(&args.scene, &loaded.model, &[], &context.registry, &context.limits)?;
     // A PLY says nothing of what is behind it.
     loaded.model.background = loaded.model.background.or(scene.background);

@@ -36,7 +36,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     let stop = interrupt::stop_flag()?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
-    let (shots, background) = shots::choose(context, &args.shots, &args.sets, &loaded.model)?;
+    let (shots, background) = shots::choose(context, &args.shots, &args.sets, &loaded.model, true)?;
     std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
     let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(background);
     let mut video = match &args.mp4 {

@@ -102,9 +102,12 @@ impl Window {
             ui.toggle_value(&mut self.flying, "Fly (F)").on_hover_text("W A S D Q E, drag to look");
         });
         let degree = self.renderer.scene().map_or(0, |s| s.sh_degree);
-        self.look.sh_degree = self.look.sh_degree.min(degree);
         ui.add(egui::Slider::new(&mut self.look.scale, 0.1..=2.0).text("Size"));
-        ui.add(egui::Slider::new(&mut self.look.sh_degree, 0..=degree).text("SH degree"));
+        // A wish for more than this model has is kept for the next one.
+        let mut shown = self.look.sh_degree.min(degree);
+        if ui.add(egui::Slider::new(&mut shown, 0..=degree).text("SH degree")).changed() {
+            self.look.sh_degree = shown;
+        }
         ui.add(egui::Slider::new(&mut self.resolution, 0.25..=2.0).text("Resolution"));
         let mut depth = self.look.mode == Mode::Depth;
         ui.add_enabled_ui(!self.exact.is_on(), |ui| {
