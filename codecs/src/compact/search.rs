@@ -74,13 +74,13 @@ impl Tried {
     }
 }
 
-/// The attempt that uses most of what is allowed, from the step factor `start`; one that uses more if none is allowed. A share of `good` ends the search.
+/// The attempt that uses most of what is allowed, from the step factor `start`; the one that uses least if none is allowed. A share of `good` ends the search.
 fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried> {
     let direction = allowance.direction();
     // Octaves over `start` in the direction in which more is used.
     let (mut at, mut refused) = (0.0, f64::INFINITY);
     let mut best: Option<(f64, Tried)> = None;
-    let mut last = None;
+    let mut least = None;
     for _ in 0..ATTEMPTS {
         let attempt = job.attempt(start * libm::exp2(direction * at))?;
         let share = allowance.share(&attempt)?;
@@ -95,7 +95,7 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
             }
         } else {
             refused = refused.min(at);
-            last = Some(tried);
+            least = least.filter(|known: &Tried| known.share <= tried.share).or(Some(tried));
         }
         let next = at + step.clamp(-FARTHEST, FARTHEST);
         at = match &best {
@@ -107,7 +107,7 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
             None => next.min(refused - MARGIN),
         };
     }
-    match best.map(|(_, tried)| tried).or(last) {
+    match best.map(|(_, tried)| tried).or(least) {
         Some(tried) => Ok(tried),
         None => Err(Error::backend("codec compact", "no step factor was tried", "Report this")),
     }
@@ -133,7 +133,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             let before = psnr_on_views(job.gaussians, views, renderer, chosen)?;
             Allowance::Drop { before, limit: settings.max_drop_db, views, renderer, chosen }
         }
-        _ if settings.finetune_wanted && settings.finetune > 0 => {
+        _ if settings.finetune_wanted && settings.finetune > 0 && !job.gaussians.is_empty() => {
             let problem = "fine-tuning belongs to the search for a loss or a size, and neither is bounded";
             return Err(Error::parameter("codec compact.finetune", problem, "Choose compact:max-drop=0.05dB or compact:max-size=5MB, or leave it out"));
         }
