@@ -21,7 +21,7 @@ RUNS = [
     ("mutant-30", "dnerf_mutant", 30, ["scene.width=400"], 40.0),
     ("basketball-6", "panoptic_basketball", 6, ["scene.width=640", "scene.frames=[0,30,1]"], 26.2),
     ("basketball-25", "panoptic_basketball", 25, ["scene.width=640", "scene.frames=[0,30,1]"], 27.0),
-    ("basketball-all-30", "panoptic_basketball", 30, ["scene.width=640"], 28.0),
+    ("basketball-all-40", "panoptic_basketball", 40, ["scene.width=640"], 28.0),
     ("mutant-800-90", "dnerf_mutant", 90, ["scene.width=800"], 40.5),
     ("basketball-all-180", "panoptic_basketball", 180, ["scene.width=640"], 28.0),
 ]
