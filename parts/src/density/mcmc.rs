@@ -27,6 +27,7 @@ coarse_share = 0.6       # share of max_gaussians that the coarse stage grows to
 max_gaussians = 400000   # the budget at the end
 relocate = 0.8           # Gaussians that the rounds of the main stage move, those with the smallest blending weights, as a share of all; 0 is off
 noise = 0.0              # random steps of faint Gaussians, as a share of their size per iteration; 0 is off
+decay = 0.0              # share by which the opacity of what a view shows falls, while there are rounds (after Binocular3DGS); 0 is off
 ";
 
 /// Least number of iterations between two rounds.
@@ -36,6 +37,8 @@ const COARSE_ROUNDS: f64 = 0.9;
 /// Opacity around which noise fades, and how steeply (3DGS-MCMC).
 const NOISE_OPACITY: f32 = 0.005;
 const NOISE_STEEPNESS: f32 = 100.0;
+/// Logits of opacities that fade are taken to lie within this.
+const MOST_LOGIT: f32 = 30.0;
 /// Largest share of the Gaussians that one round moves.
 const MOST_MOVED: f64 = 0.05;
 /// Share of the sums of blending weights that a round leaves to the next: a round alone has not seen every view.
@@ -55,11 +58,23 @@ struct Settings {
     max_gaussians: usize,
     relocate: f64,
     noise: f32,
+    decay: f32,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { from: 500, until: 15_000, every: 100, min_opacity: 0.005, growth: 0.1, coarse_share: 0.6, max_gaussians: 400_000, relocate: 0.8, noise: 0.0 }
+        Self {
+            from: 500,
+            until: 15_000,
+            every: 100,
+            min_opacity: 0.005,
+            growth: 0.1,
+            coarse_share: 0.6,
+            max_gaussians: 400_000,
+            relocate: 0.8,
+            noise: 0.0,
+            decay: 0.0,
+        }
     }
 }
 
@@ -96,6 +111,13 @@ impl Settings {
         let done = (schedule.progress() / self.end_share(schedule).max(f64::MIN_POSITIVE)).min(1.0);
         (start as f64 + (most - start as f64).max(0.0) * done.sqrt()) as usize
     }
+}
+
+/// The logits of opacities that are smaller by the shares `decay`.
+fn faded(logits: Tensor<1>, decay: Tensor<1>) -> Tensor<1> {
+    // o' / (1 - o') = (1 - decay) / (e^-l + decay), where o' = (1 - decay) o.
+    let kept = decay.clone().neg().add_scalar(1.0);
+    (kept / (logits.clamp(-MOST_LOGIT, MOST_LOGIT).neg().exp() + decay)).log()
 }
 
 /// What is remembered of the blending weights of N Gaussians.
@@ -143,12 +165,14 @@ struct Mcmc {
     start: usize,
     /// Whether the last plan was a round.
     round: bool,
+    /// 1 for the Gaussians that views of this iteration show, 0 for the others `[N]`.
+    shown: Option<Tensor<1>>,
 }
 
 impl DensityControl for Mcmc {
     fn begin_stage(&mut self, count: usize, device: &Device) {
         (self.statistics, self.weights) = (Statistics::zeros(count, device), Weights::zeros(count, device));
-        self.start = count;
+        (self.start, self.shown) = (count, None);
     }
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic> {
         let mut wanted = Vec::new();
@@ -161,6 +185,14 @@ impl DensityControl for Mcmc {
     fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
         self.statistics.add(view);
         self.weights.add(view);
+        if self.settings.decay > 0.0 {
+            let shown = view.radii.clone().greater_elem(0).float();
+            // Of several views one is enough.
+            self.shown = Some(match self.shown.take() {
+                Some(before) => before.max_pair(shown),
+                None => shown,
+            });
+        }
         Ok(())
     }
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
@@ -182,8 +214,13 @@ impl DensityControl for Mcmc {
         Ok(())
     }
     fn after_step(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
+        let mut changed = Vec::new();
+        if let Some(shown) = self.shown.take().filter(|_| schedule.iteration <= self.settings.end(schedule)) {
+            let faded = faded(gaussians.opacity_logits.clone(), shown.mul_scalar(self.settings.decay));
+            changed.push(("opacity_logits".into(), faded.reshape([-1, 1])));
+        }
         if self.settings.noise == 0.0 {
-            return Ok(Vec::new());
+            return Ok(changed);
         }
         let (n, mut random) = (gaussians.len(), seed.rng());
         // The sum of twelve uniform numbers, minus six, is nearly standard normal.
@@ -193,7 +230,8 @@ impl DensityControl for Mcmc {
         let faint = sigmoid(above.mul_scalar(-NOISE_STEEPNESS)).reshape([n, 1]);
         let size = gaussians.log_scales.clone().mean_dim(1).exp();
         let share = self.settings.noise * (1.0 - schedule.progress() as f32);
-        Ok(vec![("means".into(), gaussians.means.clone() + normal * faint * size * share)])
+        changed.push(("means".into(), gaussians.means.clone() + normal * faint * size * share));
+        Ok(changed)
     }
     fn state(&self) -> Vec<(String, Tensor<1>)> {
         let mut arrays = self.statistics.arrays();
@@ -219,7 +257,7 @@ impl DensityControl for Mcmc {
         if !(0.0..1e9).contains(&start) {
             return Err(Error::data("density state 'start'", format!("{start} is not a count"), "The checkpoint is damaged"));
         }
-        self.start = start as usize;
+        (self.start, self.shown) = (start as usize, None);
         // Programs before relocation stored no weights.
         let weights = if stored {
             let (sums, rounds) = (take("weights", 3 * count)?.reshape([count, 3]), to_vec(take("rounds", count)?, "rounds")?);
@@ -296,13 +334,14 @@ fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
         ("relocate", settings.relocate, 100.0),
         ("coarse_share", settings.coarse_share, 1.0),
         ("noise", f64::from(settings.noise), 100.0),
+        ("decay", f64::from(settings.decay), 0.5),
     ] {
         if !(0.0..=most).contains(&value) {
             return out_of_range(key, value, &format!("0..{most}"));
         }
     }
     let (statistics, weights) = (Statistics::zeros(0, &Device::flex()), Weights::zeros(0, &Device::flex()));
-    Ok(Box::new(Mcmc { settings, statistics, weights, start: 0, round: false }))
+    Ok(Box::new(Mcmc { settings, statistics, weights, start: 0, round: false, shown: None }))
 }
 
 inventory::submit! {
@@ -391,6 +430,19 @@ mod tests {
         let drawn = drawn(&rows, &scores, 100, Seed::root(5));
         let heavy = drawn.iter().filter(|&&row| row < 500).count();
         assert!(drawn.len() == 100 && (60..90).contains(&heavy), "{heavy} of 100");
+    }
+
+    #[test]
+    fn what_is_shown_fades_by_its_share_alone() {
+        let device = Device::flex();
+        let tensor = |values: &[f32]| Tensor::<1>::from_floats(values, &device);
+        let logits = [0.0, 3.0, -4.0, 1e30, -1e30, 2.0];
+        let after = sigmoid(faded(tensor(&logits), tensor(&[0.1, 0.1, 0.1, 0.1, 0.1, 0.0])));
+        for (logit, after) in logits.iter().zip(to_vec(after, "opacities").unwrap()) {
+            let before = 1.0 / (1.0 + (-logit.clamp(-30.0, 30.0)).exp());
+            let expected = if *logit == 2.0 { before } else { 0.9 * before };
+            assert!((after - expected).abs() < 1e-6, "{logit}: {after}, expected {expected}");
+        }
     }
 
     #[test]

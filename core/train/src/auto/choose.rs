@@ -52,6 +52,10 @@ const AT_START: f64 = 0.6;
 const FEW_CAMERAS: usize = 8;
 /// The share of Gaussians that views are drawn without then, at the end.
 const DROPOUT: f64 = 0.2;
+/// Share of its opacity that a Gaussian loses in every image that shows it.
+const DECAY: f64 = 0.005;
+/// The most cameras for which that is better: 16 gain, 27 lose.
+const DECAY_CAMERAS: usize = 20;
 /// What a pixel adds to a footprint, square pixels: little more than the 1/12 of its own area. Held-out views gain 0.0 to 0.34 dB over 0.3.
 const BLUR: f64 = 0.1;
 /// Share of transparent pixels from which a scene is an object without surroundings.
@@ -132,6 +136,7 @@ pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, free: bool) 
     choices.extend(exposure(facts));
     choices.extend(colour(facts));
     choices.extend(dropout(facts));
+    choices.extend(decay(facts));
     choices
 }
 
@@ -161,10 +166,7 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
         return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
     }
     if let Some(every) = key_frames {
-        let reason = format!(
-            "{} cameras see each frame: what moves starts with points of key frames, {every} frames apart, each with a velocity and a life",
-            facts.cameras
-        );
+        let reason = format!("{} cameras see each frame: what moves starts with points of key frames, each with a velocity and a life", facts.cameras);
         return choice([("deformer.kind", "free-time".into()), ("train.key_frames", integer(every as f64))], reason);
     }
     // Where poses have nothing to do with each other, higher bands would learn every training time by itself and the times between not at all.
@@ -318,6 +320,13 @@ fn dropout(facts: &Facts) -> Option<Choice> {
     few.then(|| choice([("train.dropout", Value::Float(DROPOUT))], reason))
 }
 
+/// What no image holds up fades, and its place is taken by what they do hold up.
+fn decay(facts: &Facts) -> Option<Choice> {
+    let fixed = matches!(facts.arrangement, Arrangement::Dome | Arrangement::Photos | Arrangement::Rig) && !stands_alone(facts);
+    let reason = format!("{} cameras fit their own images: what they do not keep visible fades", facts.cameras);
+    (fixed && facts.cameras <= DECAY_CAMERAS).then(|| choice([("density.decay", Value::Float(DECAY))], reason))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -367,6 +376,10 @@ mod tests {
         assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none());
         assert_eq!(value(&dome, "render.background"), Some(vec![0.4, 0.5, 0.6].into()));
         let few = choose(&Facts { cameras: 6, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
+        assert!(
+            value(&few, "density.decay").is_some()
+                && value(&choose(&Facts { cameras: 27, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true), "density.decay").is_none()
+        );
         assert!(value(&few, "train.dropout").is_some() && value(&dome, "train.dropout").is_none());
         let most = |cameras: usize| value(&choose(&Facts { cameras, ..facts(Arrangement::Dome) }, MACHINE, 10.0, true), "density.max_gaussians");
         assert_eq!([4, 9, 60].map(most), [6500, 22_000, 37_000].map(|n: i64| Some(n.into())));
