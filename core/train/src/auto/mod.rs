@@ -45,9 +45,6 @@ const SHORT: f64 = 2000.0;
 /// Iterations of the score stage per unit of the score that a Gaussian can reach in them.
 const ITERATIONS_PER_SCORE: f64 = 400.0;
 
-/// Iterations of the main stage that the Gaussians of a key frame need: with 400, 150 frames of basketball fell apart; with 900 they did not.
-const ITERATIONS_PER_KEY_FRAME: f64 = 1000.0;
-
 /// The section `[auto]`: what was asked, and what came of it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -87,9 +84,6 @@ impl Plan {
         for (key, value) in &choice.settings {
             config::set(&mut self.table, &format!("{key}={value}"))?;
         }
-        // A later choice replaces an earlier one.
-        let is_new = |(key, _): &(&str, toml::Value)| choice.settings.iter().all(|(new, _)| new != key);
-        self.choices.iter_mut().for_each(|earlier| earlier.settings.retain(is_new));
         self.choices.push(choice);
         Ok(())
     }
@@ -147,9 +141,6 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
         let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
         ends = (!layers.state("train.stretch")).then(|| Instant::now() + Duration::from_secs_f64(60.0 * left + timing.start / 1000.0));
         for choice in lengths(&facts, &config, timing, minutes, left, layers.state("train.batch").then_some(config.train.batch)) {
-            plan.add(choice)?;
-        }
-        if let Some(choice) = farther_key_frames(&facts, &layers.over(&plan.table).config()?) {
             plan.add(choice)?;
         }
     } else {
@@ -218,15 +209,6 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
     choices
 }
 
-/// Key frames that are farther apart, where the iterations of `config` are too few for those it has: each has Gaussians of its own to train.
-fn farther_key_frames(facts: &Facts, config: &RunConfig) -> Option<Choice> {
-    let train = &config.train;
-    let main = train.iterations as f64 * train.shares[2] / train.shares.iter().sum::<f64>().max(1e-9);
-    let apart = (facts.frames as f64 * ITERATIONS_PER_KEY_FRAME / main.max(1.0)).ceil().min(facts.frames as f64) as usize;
-    let reason = format!("{main:.0} iterations of the main stage train the Gaussians of {:.0} key frames", main / ITERATIONS_PER_KEY_FRAME);
-    (train.key_frames > 0 && apart > train.key_frames).then(|| Choice { settings: vec![("train.key_frames", toml::Value::Integer(apart as i64))], reason })
-}
-
 /// Width and height in pixels of the median training camera.
 fn native_size(scene: &Scene) -> [u32; 2] {
     let mut sizes: Vec<[u32; 2]> = scene.cameras.iter().map(|c| [c.width, c.height]).collect();
@@ -260,18 +242,6 @@ mod tests {
         assert_eq!(plan.lines(&layers), ["train.zeta = 2.5 (because)"]);
         let config = layers.over(&plan.table).config().unwrap();
         assert_eq!((config.train.batch, config.train.zeta), (3, 2.5));
-    }
-
-    #[test]
-    fn a_later_choice_replaces_an_earlier_one() {
-        let registry = Registry::collect().unwrap();
-        let layers = Layers::collect(&registry, Some(PRESET), None, &[]).unwrap();
-        let mut plan = Plan::default();
-        for (key_frames, reason) in [(4, "few"), (9, "many")] {
-            plan.add(Choice { settings: vec![("train.key_frames", key_frames.into())], reason: reason.into() }).unwrap();
-        }
-        assert_eq!(plan.lines(&layers), ["train.key_frames = 9 (many)"]);
-        assert_eq!(layers.over(&plan.table).config().unwrap().train.key_frames, 9);
     }
 
     #[test]
