@@ -52,7 +52,7 @@ impl StageLengths {
     pub fn length(&self, stage: Stage) -> usize {
         if stage == Stage::Main { self.settled } else { self.lengths[stage as usize] }
     }
-    /// Iterations of the main stage by its share.
+    /// Iterations of the main stage before its length is settled.
     pub fn planned(&self) -> usize {
         self.lengths[Stage::Main as usize]
     }

@@ -3,6 +3,8 @@
 //! Faded Gaussians are removed, and as many others are split, drawn by their screen gradients. The budget grows with the root of the progress. The two halves of a
 //! split together draw nearly what the whole drew, so that a round costs little.
 //!
+//! With `decay`, opacities fall wherever a view shows a Gaussian. Those that images need recover; the others fade and are removed.
+//!
 //! In the main stage every round also moves some of those that are hardly seen: hidden, faint or covered by others, they cost as much as any other.
 
 use super::halves;
@@ -27,7 +29,7 @@ coarse_share = 0.6       # share of max_gaussians that the coarse stage grows to
 max_gaussians = 400000   # the budget at the end
 relocate = 0.8           # Gaussians that the rounds of the main stage move, those with the smallest blending weights, as a share of all; 0 is off
 noise = 0.0              # random steps of faint Gaussians, as a share of their size per iteration; 0 is off
-decay = 0.0              # share by which the opacity of what a view shows falls, while there are rounds (after Binocular3DGS); 0 is off
+decay = 0.0              # share by which a view lowers the opacities of the Gaussians that it shows, while there are rounds (after Binocular3DGS); 0 is off
 ";
 
 /// Least number of iterations between two rounds.
@@ -37,7 +39,7 @@ const COARSE_ROUNDS: f64 = 0.9;
 /// Opacity around which noise fades, and how steeply (3DGS-MCMC).
 const NOISE_OPACITY: f32 = 0.005;
 const NOISE_STEEPNESS: f32 = 100.0;
-/// Logits of opacities that fade are taken to lie within this.
+/// Bound of the opacity logits that are lowered: beyond it, their exponentials are not finite or opacities do not change.
 const MOST_LOGIT: f32 = 30.0;
 /// Largest share of the Gaussians that one round moves.
 const MOST_MOVED: f64 = 0.05;
@@ -79,13 +81,14 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// The share of the stage, and its iteration, at which rounds end.
+    /// The share of the stage at which rounds end.
     fn end_share(&self, schedule: &Schedule) -> f64 {
         match schedule.stage {
             Stage::Coarse => COARSE_ROUNDS,
             stage => self.until as f64 / stage.reference_length() as f64,
         }
     }
+    /// The iteration of the stage at which rounds end.
     fn end(&self, schedule: &Schedule) -> usize {
         schedule.iteration_at(self.end_share(schedule)).round() as usize
     }

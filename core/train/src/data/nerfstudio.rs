@@ -192,7 +192,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     Ok(scene)
 }
 
-/// The name of a file without what does not tell it apart.
+/// The name of a file without a leading `./`.
 fn plain(name: &str) -> &str {
     name.trim_start_matches("./")
 }

@@ -100,7 +100,7 @@ pub enum Outcome {
 pub struct ResultProvenance {
     /// Version of the program.
     pub version: String,
-    /// Commit of the program; empty if unknown, with `-dirty` where files were changed.
+    /// Commit of the program; empty if unknown, with `-dirty-HASH` of the changes where files were changed.
     pub commit: String,
     /// XXH3-64 of `configuration`, 16 hexadecimal digits.
     pub configuration_hash: String,
