@@ -2,7 +2,7 @@
 
 use super::recover::own_lives;
 use super::{Context, TrainState};
-use crate::data::init::{KeyFrames, KeyPoint};
+use crate::data::init::{KeyFrames, KeyPoint, limit_sizes_to};
 use crate::init::{SH_C0, from_points};
 use crate::masks::DynamicMask;
 use cc4dgs_core::{Camera, DensityPlan, Event, HostGaussians, LIFE_ATTRIBUTES, PointCloud, Result, Stage, gate_value};
@@ -20,6 +20,8 @@ const LASTING: f32 = 0.95;
 const LEAST_SHARE: f64 = 0.25;
 /// Least time between two key frames: frames may claim to be simultaneous.
 const LEAST_INTERVAL: f64 = 1e-4;
+/// Largest standard deviation of a new Gaussian, as a share of the width of the image: a point far from all others would cover much of each image.
+const WIDTH_SHARE: f64 = 0.01;
 /// Opacity of new Gaussians.
 const OPACITY: f32 = 0.6;
 
@@ -55,10 +57,12 @@ impl Context<'_> {
         let host = state.set.host_gaussians()?;
         let temporary = self.lives_of_first_frame(&mut plan, &host, state, &frames, &times)?;
         let coefficients = state.set.get("sh_rest")?.dims()[1];
+        let mut capped = 0;
         for key in 0..times.keys.len() {
             let own: Vec<&KeyPoint> = points.iter().filter(|p| p.key == key).collect();
             let cloud = PointCloud { positions: own.iter().map(|p| p.position.to_array()).collect(), colors: own.iter().map(|p| p.color).collect() };
-            let start = from_points(&cloud, 0, OPACITY);
+            let mut start = from_points(&cloud, 0, OPACITY);
+            capped += limit_sizes_to(scene, &mut start, WIDTH_SHARE);
             for (i, point) in own.into_iter().enumerate() {
                 let row = plan.copy(0);
                 plan.set(row, "means", &start.means[3 * i..3 * i + 3]);
@@ -78,7 +82,8 @@ impl Context<'_> {
             }
         }
         plan.report.cloned = points.len();
-        let message = format!("{} points of {} key frames; {temporary} Gaussians of the first frame are there for a while", points.len(), times.keys.len());
+        let (count, keys) = (points.len(), times.keys.len());
+        let message = format!("{count} points of {keys} key frames, {capped} made smaller; {temporary} Gaussians of the first frame are there for a while");
         self.job.events.emit(&Event::Note { object: "key frames".into(), message });
         let schedule = self.lengths.schedule(Stage::Main, 0);
         plan.check("key frames", &state.set.gaussians()?)?;

@@ -17,7 +17,7 @@ mod views;
 mod volume;
 
 pub(crate) use key_frames::{KeyFrames, KeyPoint};
-pub use size::{limit_opacities, limit_sizes};
+pub use size::{limit_opacities, limit_sizes, limit_sizes_to};
 
 use crate::config::InitSource;
 use cc4dgs_core::{Error, PointCloud, Result, Scene, Seed};

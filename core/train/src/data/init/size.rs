@@ -52,11 +52,15 @@ fn mean(host: &HostGaussians, row: usize) -> DVec3 {
     DVec3::from(std::array::from_fn(|k| f64::from(host.means[3 * row + k])))
 }
 
-/// Caps the scales of `host` at 4 % of the width of the image in the nearest training camera that sees each Gaussian (in the nearest camera, if none does; more
-/// if there are fewer than 10,000 Gaussians), and returns how many were larger.
+/// Caps the scales of first Gaussians of a whole scene at 4 % of the width of the image in the nearest training camera that sees each (in the nearest camera, if
+/// none does; more if there are fewer than 10,000 Gaussians), and returns how many were larger.
 pub fn limit_sizes(scene: &Scene, host: &mut HostGaussians) -> usize {
+    limit_sizes_to(scene, host, MAX_WIDTH_SHARE.max(COVER / (host.len().max(1) as f64).sqrt()))
+}
+
+/// Caps the scales of `host` at `share` of the width of the image, as [`limit_sizes`] does.
+pub fn limit_sizes_to(scene: &Scene, host: &mut HostGaussians, share: f64) -> usize {
     let eyes = eyes(scene);
-    let share = MAX_WIDTH_SHARE.max(COVER / (host.len().max(1) as f64).sqrt());
     let most: Vec<f32> = (0..host.len())
         .into_par_iter()
         .map(|row| {
