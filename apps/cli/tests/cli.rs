@@ -157,6 +157,11 @@ fn a_scene_goes_through_the_whole_chain() {
         let image = image::open(frames.join(format!("frame_{i:05}.png"))).unwrap();
         assert_eq!((image.width(), image.height()), (48, 36));
     }
+    // Frames of an earlier command would be taken for the last ones of a shorter orbit.
+    let shorter = ["render", text(&archive), "--out", text(&frames), "--frames", "2", "--size", "48x36", "-q"];
+    assert!(fail(&shorter, 2).contains("--overwrite"));
+    succeed(&[&shorter[..], &["--overwrite"]].concat());
+    assert_eq!(std::fs::read_dir(&frames).unwrap().count(), 2);
     succeed(&["render", text(&archive), "--out", text(&at("views")), "--scene", "procedural:tiny", "--frames", "2", "-q"]);
     assert_eq!(std::fs::read_dir(at("views")).unwrap().count(), 2);
     let output = cc4dgs().args(["render", text(&archive), "--out", text(&at("v")), "--mp4", text(&at("v.mp4"))]).env("PATH", "").output().unwrap();
@@ -198,7 +203,8 @@ fn every_kind_of_model_is_taken_everywhere() {
         let report = json_of(&["decompress", source, "--out", text(&flat), "--overwrite", "-q", "--json"]);
         assert_eq!(report["gaussians"].as_u64(), Some(count), "{source}");
         json_of(&["decompress", text(&packed), "--out", text(&flat), "--time", "0.5", "--overwrite", "-q", "--json"]);
-        let report = json_of(&["render", source, "--out", text(&frames), "--frames", "2", "--size", "40x30", "--device", "flex", "-q", "--json"]);
+        let report =
+            json_of(&["render", source, "--out", text(&frames), "--overwrite", "--frames", "2", "--size", "40x30", "--device", "flex", "-q", "--json"]);
         assert_eq!(report["frames"], 2);
         let drawn = image::open(frames.join("frame_00000.png")).unwrap().to_rgb8();
         assert!(drawn.pixels().any(|p| p != drawn.get_pixel(0, 0)), "{source}: the image is empty");

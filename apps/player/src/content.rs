@@ -26,6 +26,9 @@ pub struct Content {
     pub bytes: u64,
 }
 
+/// Share of the centres along each axis that a first view shows: a few far away would make the model a dot.
+const SHOWN: f64 = 0.95;
+
 /// Gaussians in the layout of the shaders, moving ones first.
 pub struct Scene {
     /// Gaussians N.
@@ -34,7 +37,7 @@ pub struct Scene {
     pub moving: usize,
     /// Spherical-harmonics degree, 0 to 4.
     pub sh_degree: usize,
-    /// Lower and upper corner of the canonical centres.
+    /// Lower and upper corner of the box that holds most canonical centres; cameras without a presentation look at it.
     pub bounds: [[f32; 3]; 2],
     /// Lower and upper corner of a box that holds all centres at all times.
     pub(crate) reach: [[f32; 3]; 2],
@@ -137,8 +140,8 @@ impl Scene {
             count: n,
             moving: layer.as_ref().map_or(0, |l| l.rows.len()),
             sh_degree: gaussians.sh_degree,
-            bounds: bounds(&gaussians.means),
-            reach: bounds(&gaussians.means),
+            bounds: gaussians.central_box(SHOWN),
+            reach: gaussians.central_box(1.0),
             background: [0.0; 3],
             near: Rules::default().near(),
             alpha_max: 0.99,
@@ -226,14 +229,6 @@ fn harmonics(gaussians: &HostGaussians, order: &[usize]) -> Vec<u32> {
 fn pair_of_halves(pair: &[f32]) -> u32 {
     let half = |k: usize| u32::from(half::f16::from_f32(pair.get(k).copied().unwrap_or(0.0).clamp(-65504.0, 65504.0)).to_bits());
     half(0) | half(1) << 16
-}
-
-fn bounds(means: &[f32]) -> [[f32; 3]; 2] {
-    if means.is_empty() {
-        return [[0.0; 3]; 2];
-    }
-    let fold = |start: f32, pick: fn(f32, f32) -> f32| std::array::from_fn(|k| means.iter().skip(k).step_by(3).copied().fold(start, pick));
-    [fold(f32::INFINITY, f32::min), fold(f32::NEG_INFINITY, f32::max)]
 }
 
 /// `still` widened to where `layer` can move the centres `means`: the sum of what each function can add, which no time exceeds.

@@ -92,6 +92,20 @@ impl HostGaussians {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
+    /// Lower and upper corner of the box that holds the middle `share` of the finite centres along each axis; zeros without any. With a share below 1, a few
+    /// Gaussians far away do not decide how large a model is.
+    pub fn central_box(&self, share: f64) -> [[f32; 3]; 2] {
+        let tail = 0.5 * (1.0 - share.clamp(0.0, 1.0));
+        let axis = |k: usize| {
+            let mut values: Vec<f32> = self.means.iter().skip(k).step_by(3).copied().filter(|v| v.is_finite()).collect();
+            let left_out = (tail * values.len() as f64) as usize;
+            let Some(last) = values.len().checked_sub(1 + left_out) else { return [0.0; 2] };
+            let low = *values.select_nth_unstable_by(left_out, f32::total_cmp).1;
+            [low, *values.select_nth_unstable_by(last, f32::total_cmp).1]
+        };
+        let [x, y, z] = [0, 1, 2].map(axis);
+        [0, 1].map(|end| [x[end], y[end], z[end]])
+    }
     /// The named core arrays with their widths, in a fixed order.
     pub fn columns(&self) -> [(&'static str, usize, &Vec<f32>); 7] {
         [
@@ -168,5 +182,20 @@ impl HostGaussians {
             out.extra.insert(name.clone(), ExtraAttribute { width: a.width, values: pick(a.width, &a.values), tolerance: a.tolerance, needed });
         }
         out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::HostGaussians;
+
+    #[test]
+    fn few_gaussians_far_away_do_not_decide_how_large_a_model_is() {
+        let mut host = HostGaussians { means: (0..100).flat_map(|i| [i as f32, -(i as f32), 1.0]).collect(), ..Default::default() };
+        assert_eq!(host.central_box(1.0), [[0.0, -99.0, 1.0], [99.0, 0.0, 1.0]]);
+        host.means[..3].copy_from_slice(&[1e9, f32::NAN, -1e9]);
+        assert_eq!(host.central_box(0.9), [[6.0, -95.0, 1.0], [95.0, -5.0, 1.0]]);
+        assert_eq!(HostGaussians::default().central_box(0.9), [[0.0; 3]; 2]);
+        assert_eq!(HostGaussians { means: vec![4.0, 5.0, 6.0], ..Default::default() }.central_box(0.0), [[4.0, 5.0, 6.0]; 2]);
     }
 }

@@ -134,11 +134,8 @@ impl Model {
     }
     /// Lower and upper corner of the box around all canonical centres, world units; zeros without Gaussians.
     pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
-        let corner = |start: f32, pick: fn(f32, f32) -> f32| -> [f32; 3] {
-            let axis = |k: usize| self.gaussians.means.iter().skip(k).step_by(3).copied().fold(start, pick);
-            std::array::from_fn(|k| if self.gaussians.is_empty() { 0.0 } else { axis(k) })
-        };
-        (corner(f32::INFINITY, f32::min), corner(f32::NEG_INFINITY, f32::max))
+        let [lower, upper] = self.gaussians.central_box(1.0);
+        (lower, upper)
     }
     /// Brings Gaussians of this model into the coordinates of the dataset it was trained on, as other programs expect them.
     pub fn to_dataset(&self, gaussians: &mut HostGaussians) {

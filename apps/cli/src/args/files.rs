@@ -34,6 +34,9 @@ pub struct Render {
     /// Folder for the frames, frame_00000.png and on.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Replace the frames of an earlier command in DIR, and the video.
+    #[arg(long)]
+    pub overwrite: bool,
     #[command(flatten)]
     pub shots: Shots,
     /// Scene options over those the model was trained with, such as scene.width=800; with --scene only; may be given several times.
@@ -63,7 +66,7 @@ pub struct Shots {
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<(u32, u32)>,
     /// Full turns of the orbit while time runs from 0 to 1.
-    #[arg(long, value_name = "TURNS", default_value_t = 1.0)]
+    #[arg(long, value_name = "TURNS", default_value_t = 1.0, conflicts_with = "scene")]
     pub turns: f64,
     /// The axis of the world that points up, for the orbit.
     #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]

@@ -5,11 +5,12 @@ use crate::args::Render;
 use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::video::{self, VideoWriter};
+use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Error, Event, EventSink, Result};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::images::write_png;
 use serde::Serialize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(Serialize)]
 struct RenderReport {
@@ -29,15 +30,22 @@ struct Timing {
 }
 
 pub fn run(context: &Context, args: &Render) -> Result<()> {
-    if args.mp4.is_some() {
+    if let Some(path) = &args.mp4 {
         // Before any frame: an hour of rendering should not end in a missing program.
         video::ffmpeg_version()?;
+        refuse_existing(path, args.overwrite)?;
+    }
+    let earlier = frames_in(&args.out)?;
+    if let Some(frame) = earlier.first().filter(|_| !args.overwrite) {
+        let problem = format!("{} is there already, and frames of two commands would mix", frame.display());
+        return Err(Error::parameter("--out", problem, "Name another folder, or add --overwrite"));
     }
     let stop = interrupt::stop_flag()?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let (shots, background) = shots::choose(context, &args.shots, &args.sets, &loaded.model, true)?;
     std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
+    earlier.iter().try_for_each(|frame| std::fs::remove_file(frame).map_err(|e| Error::io(frame, e)))?;
     let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(background);
     let mut video = match &args.mp4 {
         Some(path) => {
@@ -81,4 +89,21 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
             report.frame_ms.raster
         )
     })
+}
+
+/// The frames that an earlier command left in `folder`, by their names; none where there is no such folder.
+fn frames_in(folder: &Path) -> Result<Vec<PathBuf>> {
+    if !folder.exists() {
+        return Ok(Vec::new());
+    }
+    let is_frame = |name: &str| name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".png")).is_some_and(|n| n.parse::<u32>().is_ok());
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
+        let entry = entry.map_err(|e| Error::io(folder, e))?;
+        if entry.file_name().to_str().is_some_and(is_frame) {
+            found.push(entry.path());
+        }
+    }
+    found.sort();
+    Ok(found)
 }

@@ -112,6 +112,12 @@ fn constant_rates_keep_every_frame() {
     let scene = opened(&dir, &options);
     assert!(scene.warnings.is_empty(), "{:?}", scene.warnings);
     assert_eq!(instants(&scene), (0..40).map(|k| (k, vec![Some(k); 2])).collect());
+    // Whoever cleans a cache may leave a part of it.
+    let images = |dir: &Path| std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.extension().is_some_and(|e| e == "png"));
+    let cached = std::fs::read_dir(dir.path().join("cache")).unwrap().map(|entry| entry.unwrap().path()).find(|path| path.is_dir()).unwrap();
+    images(&cached).take(7).for_each(|image| std::fs::remove_file(image).unwrap());
+    assert_eq!(instants(&opened(&dir, &options)).len(), 40);
+    assert_eq!(images(&cached).count(), 40);
     let some = opened(&dir, &SceneOptions { frames: Some([5, 6, 4]), ..options });
     assert_eq!(instants(&some), (0..6).map(|k| (k, vec![Some(5 + 4 * k); 2])).collect());
 }

@@ -9,6 +9,8 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
+/// File of a cache folder that says how many images were decoded into it.
+const COUNT: &str = "count";
 /// The most ranges that a filter lists.
 const MOST_RANGES: usize = 300;
 
@@ -131,6 +133,11 @@ impl VideoFrames {
             self.decode(video, clip, &folder)?;
         }
         let file = folder.join(format!("{:06}.png", rank + 1));
+        // Whoever cleans a cache may leave a part of it.
+        if !file.is_file() && decoded_count(&folder).is_none_or(|count| rank < count) {
+            std::fs::remove_dir_all(&folder).map_err(|e| Error::io(&folder, e))?;
+            self.decode(video, clip, &folder)?;
+        }
         if !file.is_file() {
             return Err(Error::data(format!("video {}", video.display()), format!("it has no frame {frame}"), "Shorten scene.frames"));
         }
@@ -154,6 +161,9 @@ impl VideoFrames {
         arguments.extend(after.map(OsStr::new));
         arguments.push(pattern.as_os_str());
         run(&self.options.ffmpeg, &arguments, video, 1 << 20)?;
+        let decoded = std::fs::read_dir(work.path()).map_err(|e| Error::io(work.path(), e))?.count();
+        let counted = work.path().join(COUNT);
+        std::fs::write(&counted, decoded.to_string()).map_err(|e| Error::io(&counted, e))?;
         let kept = work.keep();
         if let Err(e) = std::fs::rename(&kept, folder) {
             let _ = std::fs::remove_dir_all(&kept);
@@ -164,6 +174,11 @@ impl VideoFrames {
         }
         Ok(())
     }
+}
+
+/// How many images the video gave, as [`VideoFrames`] noted it; `None` if it did not.
+fn decoded_count(folder: &Path) -> Option<usize> {
+    std::fs::read_to_string(folder.join(COUNT)).ok()?.parse().ok()
 }
 
 /// ffmpeg scales as it extracts, unless a lens has to be undone at the native size first.
