@@ -37,7 +37,7 @@ impl AttributeCodec for Spz {
         let mut held = gaussians.clone();
         held.means.iter_mut().for_each(|v| *v = v.clamp(-LARGEST, LARGEST));
         let file = to_spz(&held, &SpzOptions { sh1_bits: self.sh1_bits, sh_rest_bits: self.sh_rest_bits, ..SpzOptions::version(FILE_VERSION) })?;
-        let found = from_spz("SPZ just written", &file, &context.limits)?;
+        let found = from_spz("SPZ just written", &file, &context.limits)?.gaussians;
         let losses = self.losses();
         let mut beside = Vec::new();
         for (index, ((name, _, before), (_, _, after))) in gaussians.columns().into_iter().zip(found.columns()).enumerate() {
@@ -58,7 +58,7 @@ impl AttributeCodec for Spz {
         let (set, meta, shape) = open("spz", streams, VERSION, &context.limits)?;
         meta.finish()?;
         let file = set.reader(FILE)?;
-        let mut out = from_spz("spz stream", file.rest(), &context.limits)?;
+        let mut out = from_spz("spz stream", file.rest(), &context.limits)?.gaussians;
         if out.len() != shape.count || out.sh_degree != shape.sh_degree {
             return Err(Error::data("spz stream", format!("{} Gaussians of degree {}", out.len(), out.sh_degree), "The file is damaged"));
         }

@@ -80,16 +80,15 @@ impl Content {
         if bytes.starts_with(&MAGIC) {
             return Self::of_archive(object, &Archive::from_bytes(object, bytes, limits)?, limits);
         }
-        let gaussians = if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
-            ply::from_bytes(object, &bytes, limits)?.0
+        let file = if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
+            ply::from_bytes(object, &bytes, limits)?
         } else if spz::begins_as_spz(&bytes) {
             spz::from_spz(object, &bytes, limits)?
         } else {
             let remedy = "Give a .cc4d archive, a PLY file of 3D Gaussian splatting or an SPZ file";
             return Err(Error::data(object, "it begins like no model", remedy));
         };
-        gaussians.validate(object, limits)?;
-        let scene = Scene::new(&gaussians, None)?;
+        let scene = Scene { antialiased: file.antialiased, ..Scene::new(&file.gaussians, None)? };
         Ok(Self { scene, presentation: Presentation::default(), frame_count: 1, lacks_motion: false, bytes: size })
     }
     /// The model of an archive.

@@ -10,6 +10,17 @@ pub const fn sh_rest_len(degree: usize) -> usize {
     (degree + 1) * (degree + 1) - 1
 }
 
+/// What a file of static Gaussians of another program holds.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct GaussianFile {
+    /// Valid Gaussians ([`HostGaussians::validate`]).
+    pub gaussians: HostGaussians,
+    /// Whether they are to be drawn with Mip-Splatting's 2D filter: opacity in proportion to the share of the footprint that the pixel blur did not add.
+    pub antialiased: bool,
+    /// What was ignored or is missing, in words.
+    pub remarks: Vec<String>,
+}
+
 /// Names of the attributes every Gaussian has, in the order of [`HostGaussians::columns`].
 pub const CORE_ATTRIBUTES: [&str; 7] = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "dynamic_scores"];
 

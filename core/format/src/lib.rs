@@ -38,7 +38,7 @@ pub use deformer_context::DeformerContext;
 pub use error::{Error, Result};
 pub use events::{Event, EventSink, Fanout, Recorder, Silent};
 pub use exporter::{ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin};
-pub use gaussians::{ExtraAttribute, HostGaussians, NeededRows};
+pub use gaussians::{ExtraAttribute, GaussianFile, HostGaussians, NeededRows};
 pub use image::Image8;
 pub use limits::Limits;
 pub use moving::Moving;

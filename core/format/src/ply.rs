@@ -6,23 +6,26 @@
 
 use crate::archive::write_atomically;
 use crate::gaussians::sh_rest_len;
-use crate::{Error, HostGaussians, Limits, Result};
+use crate::{Error, GaussianFile, HostGaussians, Limits, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+/// The comment that names how viewers are to draw the model, and the mode of models that want Mip-Splatting's 2D filter.
+const RENDER_MODE: &str = "SplatRenderMode:";
+const ANTIALIASED: &str = "mip";
 /// Largest header in bytes; 3DGS headers have about 1.5 kB.
 const HEADER_LIMIT: usize = 64 << 10;
 
-/// Reads the Gaussians of a PLY file. Unknown properties are ignored; [`read_reporting`] lists them.
+/// Reads the Gaussians of a PLY file. Unknown properties are ignored; [`read_file`] lists them.
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Data`] for invalid files, [`Error::Unsupported`] for other PLY layouts, [`Error::Limit`].
 pub fn read(path: impl AsRef<Path>, limits: &Limits) -> Result<HostGaussians> {
-    Ok(read_reporting(path, limits)?.0)
+    Ok(read_file(path, limits)?.gaussians)
 }
 
-/// Like [`read`]; also returns warnings about ignored properties and missing dynamic scores.
-pub fn read_reporting(path: impl AsRef<Path>, limits: &Limits) -> Result<(HostGaussians, Vec<String>)> {
+/// Like [`read`], with what the header says of rendering, and remarks about ignored properties and missing dynamic scores.
+pub fn read_file(path: impl AsRef<Path>, limits: &Limits) -> Result<GaussianFile> {
     let path = path.as_ref();
     let object = path.display().to_string();
     let size = std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
@@ -31,8 +34,8 @@ pub fn read_reporting(path: impl AsRef<Path>, limits: &Limits) -> Result<(HostGa
     from_bytes(&object, &bytes, limits)
 }
 
-/// Like [`read_reporting`], for a file in memory; `object` names it in errors.
-pub fn from_bytes(object: &str, bytes: &[u8], limits: &Limits) -> Result<(HostGaussians, Vec<String>)> {
+/// Like [`read_file`], for a file in memory; `object` names it in errors.
+pub fn from_bytes(object: &str, bytes: &[u8], limits: &Limits) -> Result<GaussianFile> {
     let header = Header::parse(object, bytes, limits)?;
     let body = &bytes[header.body..];
     let claimed = header.count as u64 * header.stride as u64;
@@ -43,14 +46,14 @@ pub fn from_bytes(object: &str, bytes: &[u8], limits: &Limits) -> Result<(HostGa
     let layout = Layout::find(object, &header)?;
     let gaussians = layout.gather(&body[..claimed as usize], header.stride);
     gaussians.validate(object, limits)?;
-    let mut warnings = Vec::new();
+    let mut remarks = Vec::new();
     if layout.dynamic.is_none() {
-        warnings.push("there is no property 'dynamic'; all dynamic scores are 0".to_string());
+        remarks.push("there is no property 'dynamic'; all dynamic scores are 0".to_string());
     }
     if !layout.ignored.is_empty() {
-        warnings.push(format!("ignored properties: {}", layout.ignored.join(", ")));
+        remarks.push(format!("ignored properties: {}", layout.ignored.join(", ")));
     }
-    Ok((gaussians, warnings))
+    Ok(GaussianFile { gaussians, antialiased: header.antialiased, remarks })
 }
 
 /// Writes Gaussians as PLY, atomically. `include_dynamic` appends the property `dynamic`. Attributes of plug-ins are not written.
@@ -94,7 +97,7 @@ pub fn to_bytes_with(gaussians: &HostGaussians, options: &PlyOptions) -> Result<
     }
     let n = gaussians.len();
     let properties: String = names.iter().map(|name| format!("property float {name}\n")).collect();
-    let comment = if options.antialiased { "comment SplatRenderMode: mip\n" } else { "" };
+    let comment = if options.antialiased { format!("comment {RENDER_MODE} {ANTIALIASED}\n") } else { String::new() };
     let mut out = format!("ply\nformat binary_little_endian 1.0\n{comment}element vertex {n}\n{properties}end_header\n").into_bytes();
     out.reserve(4 * names.len() * n);
     for i in 0..n {
@@ -127,12 +130,14 @@ struct Header {
     last: bool,
     /// Byte offset of the first value.
     body: usize,
+    /// Whether a comment asks for Mip-Splatting's 2D filter.
+    antialiased: bool,
 }
 
 impl Header {
     fn parse(object: &str, bytes: &[u8], limits: &Limits) -> Result<Self> {
         let bad = |problem: String| Error::data(object, problem, "Give a binary PLY in the layout of 3D Gaussian splatting");
-        let mut header = Self { count: 0, stride: 0, properties: BTreeMap::new(), names: Vec::new(), last: true, body: 0 };
+        let mut header = Self { count: 0, stride: 0, properties: BTreeMap::new(), names: Vec::new(), last: true, body: 0, antialiased: false };
         let (mut format, mut vertex) = (false, None::<bool>);
         loop {
             let head = &bytes[header.body..bytes.len().min(HEADER_LIMIT)];
@@ -146,6 +151,7 @@ impl Header {
             match words.as_slice() {
                 ["ply"] if first => {}
                 _ if first => return Err(bad("the first line is not 'ply'".into())),
+                ["comment", RENDER_MODE, mode] => header.antialiased = *mode == ANTIALIASED,
                 ["comment" | "obj_info", ..] => {}
                 ["format", "binary_little_endian", _] => format = true,
                 ["format", other, ..] => {
@@ -273,10 +279,11 @@ mod tests {
         for degree in 0..=4 {
             let gaussians = sample(degree);
             let bytes = to_bytes(&gaussians, true).unwrap();
-            assert_eq!(from_bytes("t", &bytes, &Limits::default()).unwrap(), (gaussians.clone(), vec![]));
-            let (static_copy, warnings) = from_bytes("t", &to_bytes(&gaussians, false).unwrap(), &Limits::default()).unwrap();
+            assert_eq!(from_bytes("t", &bytes, &Limits::default()).unwrap(), GaussianFile { gaussians: gaussians.clone(), ..Default::default() });
+            let bytes = to_bytes_with(&gaussians, &PlyOptions { dynamic: false, antialiased: true }).unwrap();
+            let GaussianFile { gaussians: static_copy, remarks, antialiased } = from_bytes("t", &bytes, &Limits::default()).unwrap();
             assert_eq!(static_copy, HostGaussians { dynamic_scores: vec![0.0; 2], ..gaussians });
-            assert!(warnings[0].contains("dynamic"));
+            assert!(antialiased && remarks[0].contains("dynamic"));
         }
     }
 
@@ -332,8 +339,8 @@ mod tests {
             all.iter().rev().for_each(|v| bytes.extend(v.to_le_bytes()));
             bytes.extend(1.0f32.to_le_bytes());
         }
-        let (read, warnings) = from_bytes("t", &bytes, &Limits::default()).unwrap();
+        let GaussianFile { gaussians: read, remarks, .. } = from_bytes("t", &bytes, &Limits::default()).unwrap();
         assert_eq!(read, HostGaussians { dynamic_scores: vec![0.0; 2], ..gaussians });
-        assert!(warnings[1].contains("flags, embedding_0"), "{warnings:?}");
+        assert!(remarks[1].contains("flags, embedding_0"), "{remarks:?}");
     }
 }

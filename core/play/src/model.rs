@@ -6,7 +6,7 @@ use crate::source::{Source, SourceKind};
 use crate::{Moving, RenderConfig, default_rasterizer};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Archive, Provenance};
-use cc4dgs_core::{Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Similarity, ply, spz};
+use cc4dgs_core::{Deformer, DeformerContext, Error, Event, EventSink, GaussianFile, HostGaussians, Limits, Registry, Result, Similarity, ply, spz};
 use serde::Serialize;
 use std::path::Path;
 
@@ -97,11 +97,11 @@ impl Model {
                 Self::of_archive(&file.display().to_string(), &archive, registry, device, limits, events)
             }
             SourceKind::Ply => {
-                let (gaussians, remarks) = ply::read_reporting(&file, limits)?;
-                for message in remarks {
-                    events.emit(&Event::Note { object: file.display().to_string(), message });
+                let found = ply::read_file(&file, limits)?;
+                for message in &found.remarks {
+                    events.emit(&Event::Note { object: file.display().to_string(), message: message.clone() });
                 }
-                Ok(Self::from_static(gaussians, file_bytes(&file)?))
+                Ok(Self::from_static(found, file_bytes(&file)?))
             }
             SourceKind::Spz => {
                 let (object, bytes) = (file.display().to_string(), file_bytes(&file)?);
@@ -112,14 +112,15 @@ impl Model {
         }
     }
     /// A static model of `gaussians` that take `bytes` in their file. The file does not say its units: cameras around a small model are near it too.
-    fn from_static(gaussians: HostGaussians, bytes: u64) -> Self {
+    fn from_static(file: GaussianFile, bytes: u64) -> Self {
+        let GaussianFile { gaussians, antialiased, .. } = file;
         let near = (middle_and_radius(&gaussians).1 * NEAR_OF_RADIUS) as f32;
         let usual = RenderConfig::default();
         Self {
             gaussians,
             field: None,
             moving: Moving::Nothing,
-            render: RenderConfig { near: (near < usual.rules.near()).then_some(near), ..usual },
+            render: RenderConfig { near: (near < usual.rules.near()).then_some(near), antialiased, ..usual },
             background: None,
             rasterizer: default_rasterizer(),
             frame_count: 1,

@@ -11,8 +11,8 @@ use std::path::Path;
 pub fn any(path: &Path) -> HostGaussians {
     let bytes = std::fs::read(path).unwrap();
     match path.extension().and_then(|e| e.to_str()).unwrap() {
-        "ply" => ply::from_bytes("t", &bytes, &Limits::default()).unwrap().0,
-        "spz" => spz::from_spz("t", &bytes, &Limits::default()).unwrap(),
+        "ply" => ply::from_bytes("t", &bytes, &Limits::default()).unwrap().gaussians,
+        "spz" => spz::from_spz("t", &bytes, &Limits::default()).unwrap().gaussians,
         "glb" => glb(&bytes),
         "sog" => sog(&bytes),
         other => panic!("{other}"),

@@ -11,7 +11,7 @@ mod gzip;
 mod values;
 
 use crate::gaussians::sh_rest_len;
-use crate::{Error, HostGaussians, Limits, Result};
+use crate::{Error, GaussianFile, HostGaussians, Limits, Result};
 
 pub use values::LARGEST;
 
@@ -86,15 +86,15 @@ pub fn to_spz(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Vec<u8>
     if options.version == 3 { gzip::write(&packed) } else { frames::write(&packed) }
 }
 
-/// The Gaussians of an SPZ file of version 2, 3 or 4; dynamic scores are zero. `object` names the file in errors.
+/// What an SPZ file of version 2, 3 or 4 holds; dynamic scores are zero. `object` names the file in errors.
 ///
 /// # Errors
 /// [`Error::Data`] for invalid files, [`Error::Unsupported`] for other versions, [`Error::Limit`].
-pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<HostGaussians> {
+pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<GaussianFile> {
     let packed = if bytes.starts_with(&PLAIN_MAGIC) { frames::read(object, bytes, limits)? } else { gzip::read(object, bytes, limits)? };
-    let found = values::unpack(&packed);
-    found.validate(object, limits)?;
-    Ok(found)
+    let gaussians = values::unpack(&packed);
+    gaussians.validate(object, limits)?;
+    Ok(GaussianFile { gaussians, antialiased: packed.flags & ANTIALIASED != 0, remarks: Vec::new() })
 }
 
 /// Refuses counts over the limits and headers that no writer makes, before memory is allocated.
@@ -138,9 +138,12 @@ mod tests {
         for (count, degree) in [(0, 0), (1, 3), (300, 0), (300, 2), (50, 4)] {
             let gaussians = sample(count, degree);
             let read = |version| {
-                let bytes = to_spz(&gaussians, &SpzOptions::version(version)).unwrap();
+                let antialiased = count == 300;
+                let bytes = to_spz(&gaussians, &SpzOptions { antialiased, ..SpzOptions::version(version) }).unwrap();
                 assert_eq!(bytes.starts_with(&PLAIN_MAGIC), version == 4);
-                from_spz("t", &bytes, &Limits::default()).unwrap()
+                let file = from_spz("t", &bytes, &Limits::default()).unwrap();
+                assert_eq!(file.antialiased, antialiased);
+                file.gaussians
             };
             let (three, four) = (read(3), read(4));
             assert!(three == four, "{count} Gaussians of degree {degree}");
