@@ -6,6 +6,7 @@
 //! last, random points in the volume that the cameras see.
 
 mod choose;
+mod depth;
 mod foreground;
 mod fuse;
 mod hull;
@@ -16,6 +17,7 @@ mod sweep;
 mod views;
 mod volume;
 
+pub(crate) use depth::agreed_depths;
 pub(crate) use key_frames::{KeyFrames, KeyPoint};
 pub use size::{limit_opacities, limit_sizes, limit_sizes_to};
 
