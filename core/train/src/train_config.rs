@@ -57,8 +57,6 @@ pub struct TrainConfig {
     pub time_noise: f64,
     /// Share of the Gaussians that a view is drawn without at the end of the coarse and the main stage, from 0 at their start (DropGaussian, Park et al. 2025: 0.2).
     pub dropout: f64,
-    /// Weight of the difference of drawn depth from that on which training views agree, as a share of the depth; 0 is off.
-    pub depth: f32,
     /// Highest spherical-harmonics degree.
     pub sh_degree: usize,
     /// Reference iterations between two degrees.
@@ -117,7 +115,6 @@ impl Default for TrainConfig {
             image_growth: 0.0,
             time_noise: 0.0,
             dropout: 0.0,
-            depth: 0.0,
             sh_degree: 3,
             sh_interval: 1000,
             lambda_r: 0.05,
@@ -245,9 +242,6 @@ impl TrainConfig {
         }
         if !(0.0..=10.0).contains(&t.time_noise) {
             return bad("time_noise", format!("{} frames", t.time_noise), "Give 0 to 10 frames");
-        }
-        if !(0.0..=100.0).contains(&t.depth) {
-            return bad("depth", format!("{} is not in 0..100", t.depth), "It is the weight of a term of the loss; 0.3 is usual");
         }
         if !(0.0..=0.9).contains(&t.dropout) {
             return bad("dropout", format!("{} is not in 0..0.9", t.dropout), "It is a share of the Gaussians; 0.2 is usual");

@@ -3,7 +3,6 @@
 
 mod cost;
 mod density;
-mod depth;
 mod dropout;
 mod folder;
 mod guard;
@@ -123,7 +122,6 @@ pub(crate) struct Context<'a> {
     pub score_loss: LossTerms,
     pub seed: Seed,
     pub masks: Vec<DynamicMask>,
-    pub depths: depth::Depths,
     /// Index among the training cameras, by index in the scene.
     pub training_camera: BTreeMap<usize, usize>,
     pub checkpoint: Option<PathBuf>,
@@ -198,7 +196,6 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         score_loss,
         device,
         seed,
-        depths: if config.train.depth > 0.0 { depth::Depths::find(&job.scene, &masks)? } else { depth::Depths::default() },
         masks,
         training_camera,
         checkpoint,

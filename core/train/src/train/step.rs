@@ -116,12 +116,7 @@ impl Context<'_> {
             let target = Tensor::<3>::from_inner(self.rasterizer.upload(&scene.frame(view)?, background_rgb, &self.device));
             let radii = output.stats.radii;
             let input = LossInput { planes: &planes, target: &target, gaussians: &drawn, radii: &radii, time_norm, schedule };
-            let mut loss = self.losses.value(&input)?;
-            if train.depth > 0.0
-                && let Some(term) = self.depths.term(scene, view, &planes, &self.device)
-            {
-                loss = loss + term.mul_scalar(train.depth);
-            }
+            let loss = self.losses.value(&input)?;
             if (read || check) && !is_finite(&loss) {
                 let part = if is_finite(&planes) { self.losses.broken(&input)?.map(|term| format!("the loss term {term}")) } else { None };
                 return Ok(Some(Trouble::new(part.unwrap_or_else(|| format!("the image of camera {}", camera.name)))));

@@ -98,7 +98,7 @@ impl<'a> Tuner<'a> {
         (config.render, config.rasterizer) = (model.render.clone(), model.rasterizer.clone());
         (config.scene.background, config.render.background) = (None, Some(model.background_on(scene.background)));
         (config.density, config.appearance, config.train.image_growth, config.train.sh_every) = (none(), none(), 0.0, 1);
-        (config.train.time_noise, config.train.dropout, config.train.depth, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        (config.train.time_noise, config.train.dropout, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0);
         config.validate()?;
         let field_weights = FieldWeights::parse(field_weights, registry)?;
         let weight_settings = match self.moving_field() {
@@ -134,7 +134,6 @@ impl<'a> Tuner<'a> {
             score_loss: LossTerms::build(registry, std::slice::from_ref(&config.score_loss))?,
             device: (*device).clone(),
             seed,
-            depths: super::depth::Depths::default(),
             masks: Vec::new(),
             training_camera,
             checkpoint: None,

@@ -68,6 +68,7 @@ pub(super) fn fuse(set: &WorkSet, maps: &[DepthMap], seed: Seed) -> Fused {
 fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fused, [usize; 2]) {
     let (view, map) = (&set.views[index], &maps[index]);
     let level = view.fine();
+    let needed = if set.keys >= 6 { 2 } else { 1 };
     let solid = |p: usize| view.solid(set.foreground, p);
     let place = |p: usize, inverse: f32| {
         let (u, v) = ((p % level.width) as f64 + 0.5, (p / level.width) as f64 + 0.5);
@@ -75,10 +76,19 @@ fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fus
         (view.unproject(level, u, v, depth), depth as f32)
     };
     let mut found = Fused::default();
-    let (known, agree) = agreed(set, maps, index);
-    for p in (0..known.len()).filter(|&p| known[p].is_finite()) {
-        let (position, depth) = place(p, known[p]);
-        found.matched.push(Candidate { position, color: level.rgb[p], confidence: map.score[p] + 0.1 * agree[p] as f32, depth });
+    let mut known = vec![f32::NAN; map.inverse.len()];
+    // What matches best at the very near end would match better before it.
+    let nearest = (1.0 / view.depth_range[0]) as f32 - 0.5 * map.step;
+    for (p, &inverse) in map.inverse.iter().enumerate() {
+        if map.score[p] < MIN_SCORE || inverse >= nearest || !solid(p) {
+            continue;
+        }
+        let verdict = ask(set, maps, view, place(p, inverse).0);
+        if verdict.agree >= needed && verdict.agree > verdict.through {
+            known[p] = verdict.mean(inverse);
+            let (position, depth) = place(p, known[p]);
+            found.matched.push(Candidate { position, color: level.rgb[p], confidence: map.score[p] + 0.1 * verdict.agree as f32, depth });
+        }
     }
     let smooth = interpolate(&known, level.width);
     let least = (1.0 / view.depth_range[1]) as f32;
@@ -114,27 +124,6 @@ fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fus
         found.guessed.extend(best.filter(|c| c.confidence.is_finite() && !seen_through(c)));
     }
     (found, counts)
-}
-
-/// The inverse depth of each pixel of a depth map with which others agree, NaN elsewhere; and how many do.
-pub(super) fn agreed(set: &WorkSet, maps: &[DepthMap], index: usize) -> (Vec<f32>, Vec<u32>) {
-    let (view, map) = (&set.views[index], &maps[index]);
-    let level = view.fine();
-    let needed = if set.keys >= 6 { 2 } else { 1 };
-    let (mut known, mut agree) = (vec![f32::NAN; map.inverse.len()], vec![0; map.inverse.len()]);
-    // What matches best at the very near end would match better before it.
-    let nearest = (1.0 / view.depth_range[0]) as f32 - 0.5 * map.step;
-    for (p, &inverse) in map.inverse.iter().enumerate() {
-        if map.score[p] < MIN_SCORE || inverse >= nearest || !view.solid(set.foreground, p) {
-            continue;
-        }
-        let (u, v) = ((p % level.width) as f64 + 0.5, (p / level.width) as f64 + 0.5);
-        let verdict = ask(set, maps, view, view.unproject(level, u, v, 1.0 / f64::from(inverse.max(1e-9))));
-        if verdict.agree >= needed && verdict.agree > verdict.through {
-            (known[p], agree[p]) = (verdict.mean(inverse), verdict.agree);
-        }
-    }
-    (known, agree)
 }
 
 fn ask(set: &WorkSet, maps: &[DepthMap], view: &WorkView, position: Vec3) -> Verdict {

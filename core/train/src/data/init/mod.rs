@@ -6,7 +6,6 @@
 //! last, random points in the volume that the cameras see.
 
 mod choose;
-mod depth;
 mod foreground;
 mod fuse;
 mod hull;
@@ -17,7 +16,6 @@ mod sweep;
 mod views;
 mod volume;
 
-pub(crate) use depth::agreed_depths;
 pub(crate) use key_frames::{KeyFrames, KeyPoint};
 pub use size::{limit_opacities, limit_sizes, limit_sizes_to};
 
