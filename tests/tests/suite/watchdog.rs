@@ -1,8 +1,11 @@
 //! What a training does with values that are not finite, with loss terms that produce them on purpose.
 
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
 use cc4dgs::{Error, Event, RunConfig, Session};
-use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory, toml};
+use cc4dgs_core::{
+    DensityControl, DensityPlan, DensityPlugin, Gaussians, LossInput, LossPlugin, LossTerm, Plugin, Result, Schedule, Seed, Stage, Statistic, ViewStatistics,
+    config, inventory, toml,
+};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -19,7 +22,7 @@ struct Poison {
 
 impl LossTerm for Poison {
     fn value(&self, input: &LossInput) -> Result<Option<Tensor<1>>> {
-        let late = input.schedule.stage == cc4dgs_core::Stage::Main && input.schedule.iteration >= 130;
+        let late = input.schedule.stage == Stage::Main && input.schedule.iteration >= 130;
         let breaks = match self.when.as_str() {
             "" => return Ok(Some(input.planes.clone().mean())),
             // Two views of the same iteration, or the search for the term's name, may call it again.
@@ -41,6 +44,44 @@ inventory::submit! {
         info: Plugin { name: "poison", version: "1", summary: "NaN on demand", paper: "a test", schema: "when = \"\"\n", capabilities: &[] },
         build,
         fuses: None,
+    }
+}
+
+/// No density control, but the first Gaussian is broken in the last iteration of the main stage if `breaks` says so.
+#[derive(Default, serde::Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct BreakOne {
+    breaks: bool,
+}
+
+impl DensityControl for BreakOne {
+    fn begin_stage(&mut self, _count: usize, _device: &Device) {}
+    fn statistics(&self, _schedule: &Schedule) -> Vec<Statistic> {
+        Vec::new()
+    }
+    fn observe(&mut self, _view: &ViewStatistics) -> Result<()> {
+        Ok(())
+    }
+    fn plan(&mut self, _gaussians: &Gaussians, _schedule: &Schedule, _seed: Seed) -> Result<Option<DensityPlan>> {
+        Ok(None)
+    }
+    fn after_step(&mut self, gaussians: &Gaussians, schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
+        if !self.breaks || schedule.stage != Stage::Main || schedule.iteration < schedule.length {
+            return Ok(Vec::new());
+        }
+        let broken = Tensor::full([1, 3], f32::NAN, &gaussians.means.device());
+        Ok(vec![("means".into(), gaussians.means.clone().slice_assign([0..1, 0..3], broken))])
+    }
+}
+
+fn build_break_one(settings: &toml::Table) -> Result<Box<dyn DensityControl>> {
+    Ok(Box::new(config::parse_section::<BreakOne>("density break-one", settings)?))
+}
+
+inventory::submit! {
+    DensityPlugin {
+        info: Plugin { name: "break-one", version: "1", summary: "NaN in one Gaussian", paper: "a test", schema: "breaks = false\n", capabilities: &[] },
+        build: build_break_one,
     }
 }
 
@@ -94,4 +135,21 @@ fn the_part_that_runs_away_is_slowed_down() {
     assert!(saved.warnings.iter().any(|w| w.contains("gaussians/opacity_logits learns 0.25 times")), "{:?}", saved.warnings);
     let gaussians = saved.outcome.unwrap();
     assert!(!gaussians.is_empty() && gaussians.opacity_logits.iter().all(|o| o.is_finite()));
+}
+
+#[test]
+fn a_single_broken_gaussian_is_removed_before_the_model_is_stored() {
+    let counts = [false, true].map(|breaks| {
+        let session = Session::builder().device("flex").build().unwrap();
+        let density = format!("density={{kind='break-one', breaks={breaks}}}");
+        let config = session.config("demo", &[density.as_str(), "train.iterations=200"]).unwrap();
+        let scene = session.read_scene("procedural:tiny", &config.scene).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let run = folder.path().join("run");
+        let model = session.train(&config, scene, Some(&run)).unwrap();
+        assert!(model.gaussians.means.iter().all(|v| v.is_finite()));
+        assert_eq!(session.open(&run).unwrap().gaussians.len(), model.gaussians.len());
+        model.gaussians.len()
+    });
+    assert_eq!(counts[1] + 1, counts[0]);
 }

@@ -1,5 +1,6 @@
 //! Carries out what the density control plans.
 
+use super::guard::broken_rows;
 use super::{Context, TrainState};
 use crate::gaussian_set::GaussianSet;
 use cc4dgs_core::{DensityPlan, Error, Event, Result, Schedule};
@@ -28,6 +29,24 @@ impl Context<'_> {
             state.density.executed(&plan, &self.device)?;
         }
         self.guard_reset(state, schedule)
+    }
+
+    /// Removes the Gaussians with a value that is not finite, which are not drawn and cannot be stored: after the last round of a density control nobody else does.
+    pub(crate) fn remove_broken(&self, state: &mut TrainState) -> Result<()> {
+        let broken = broken_rows(state)?;
+        let count = broken.iter().filter(|broken| **broken).count();
+        if count == 0 || count == broken.len() {
+            return Ok(());
+        }
+        let mut plan = DensityPlan::new();
+        (0..broken.len()).filter(|&row| !broken[row]).for_each(|row| {
+            plan.keep(row);
+        });
+        plan.report.removed = count;
+        let schedule = self.lengths.schedule(state.stage, state.iteration);
+        self.guard_plan(&mut plan, state, &schedule)?;
+        self.carry_out(&plan, state, &schedule)?;
+        state.density.executed(&plan, &self.device)
     }
 
     /// Makes the Gaussians those of `plan`, with their optimizer state.

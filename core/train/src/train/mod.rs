@@ -224,7 +224,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
             state.iteration = 0;
         }
     }
-    context.save(&state)?;
+    context.save(&mut state)?;
     let verdict = watch.conclude(&context, &mut state)?;
     let dynamic_gaussians = state.moving_rows(&context.device)?.count();
     let report = TrainReport {
@@ -419,7 +419,8 @@ impl Context<'_> {
         Ok(())
     }
 
-    fn save(&self, state: &TrainState) -> Result<()> {
+    fn save(&self, state: &mut TrainState) -> Result<()> {
+        self.remove_broken(state)?;
         let Some(path) = &self.checkpoint else { return Ok(()) };
         let bytes = checkpoint::save(path, state, &self.settings)?;
         self.job.events.emit(&Event::Saved { path: path.display().to_string(), bytes });

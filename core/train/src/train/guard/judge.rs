@@ -143,7 +143,7 @@ impl Context<'_> {
 }
 
 /// The Gaussians with a value that is not finite `[N]`.
-fn broken_rows(state: &TrainState) -> Result<Vec<bool>> {
+pub(crate) fn broken_rows(state: &TrainState) -> Result<Vec<bool>> {
     let mut broken = vec![false; state.set.len()];
     for (name, values) in state.set.iter() {
         let width = values.dims()[1].max(1);

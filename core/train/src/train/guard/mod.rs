@@ -12,6 +12,8 @@
 
 mod judge;
 
+pub(crate) use judge::broken_rows;
+
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Error, Result, Schedule};
