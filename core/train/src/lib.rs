@@ -1,4 +1,5 @@
-//! Training and evaluation: readers, initialisation, the three-stage trainer, its checkpoints, scores of whole scenes. Plug-ins are named only in defaults.
+//! Training and evaluation: readers, initialisation, the three-stage trainer, its checkpoints, scores of whole scenes. Plug-ins are
+//! named in defaults, by the planner `auto`, and (`life`) by recovery and key frames only.
 
 pub mod agreement;
 pub mod auto;

@@ -29,7 +29,7 @@ coarse_share = 0.6       # share of max_gaussians that the coarse stage grows to
 max_gaussians = 400000   # the budget at the end
 relocate = 0.8           # Gaussians that the rounds of the main stage move, those with the smallest blending weights, as a share of all; 0 is off
 noise = 0.0              # random steps of faint Gaussians, as a share of their size per iteration; 0 is off
-decay = 0.0              # share by which a view lowers the opacities of the Gaussians that it shows, while there are rounds (after Binocular3DGS); 0 is off
+decay = 0.0              # share by which an iteration lowers opacities of what its views show, while there are rounds (after Binocular3DGS); 0 is off
 ";
 
 /// Least number of iterations between two rounds.

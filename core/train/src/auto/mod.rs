@@ -87,10 +87,11 @@ impl Plan {
         self.choices.push(choice);
         Ok(())
     }
-    /// A line per choice that `layers` do not override.
+    /// A line per choice that `layers` do not override; another deformer has none of the settings of the planned one.
     fn lines(&self, layers: &Layers) -> Vec<String> {
+        let overridden = |key: &str| layers.state(key) || (key.starts_with("deformer.") && layers.state("deformer.kind"));
         let line = |choice: &Choice| {
-            let own: Vec<String> = choice.settings.iter().filter(|(key, _)| !layers.state(key)).map(|(key, value)| format!("{key} = {value}")).collect();
+            let own: Vec<String> = choice.settings.iter().filter(|(key, _)| !overridden(key)).map(|(key, value)| format!("{key} = {value}")).collect();
             (!own.is_empty()).then(|| format!("{} ({})", own.join(", "), choice.reason))
         };
         self.choices.iter().filter_map(line).collect()

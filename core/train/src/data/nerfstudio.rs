@@ -1,5 +1,5 @@
-//! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Usually static; an entry that names a
-//! video is a camera with all frames of it.
+//! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Static, unless images
+//! state a `time` (those of a camera that stands still are then frames of one camera) or an entry names a video, which is a camera with all frames of it.
 
 use super::assemble::fit_to_image;
 use super::video::{self, Footage};

@@ -6,8 +6,8 @@
 //! - The part that it belongs to, or else the part that grew most since the good state, learns a quarter as fast from then on.
 //! - After a few attempts the run ends with an error that names the source.
 //!
-//! Single broken Gaussians are no trouble: they are not drawn, and density control removes them. A run without trouble computes nothing else than without this
-//! module.
+//! Single broken Gaussians are no trouble: they are not drawn, and density control removes them, or the trainer before it writes a checkpoint. A run without
+//! trouble computes nothing else than without this module.
 
 use super::{Context, TrainState};
 use crate::gaussian_set::GaussianSet;
