@@ -57,8 +57,8 @@ pub struct BenchSort {
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
     /// Numbers of pairs.
-    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "10000,100000,1000000")]
-    pub pairs: Vec<usize>,
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "10000,100000,1000000", value_parser = clap::value_parser!(u32).range(1..))]
+    pub pairs: Vec<u32>,
     /// Runs measured per size, after warming up.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub repeats: u32,

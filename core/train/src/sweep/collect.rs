@@ -4,7 +4,7 @@ use super::folder::SweepFolder;
 use super::lines::write_lines;
 use super::plan::Plan;
 use super::read::RESULTS;
-use super::result::CellResult;
+use super::result::{Axes, CellResult};
 use super::table::{csv, markdown};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Result};
@@ -53,7 +53,7 @@ pub struct Tables {
     pub csv: PathBuf,
 }
 
-/// Looks for the result of every cell of `plan`.
+/// Looks for the result of every cell of `plan`. Names of the grid are no part of a cell: results of an earlier plan get those of this one, in their files as well.
 ///
 /// # Errors
 /// [`Error::Io`].
@@ -63,7 +63,17 @@ pub fn collect(folder: &SweepFolder, plan: &Plan) -> Result<Collection> {
     let mut states: BTreeMap<&str, String> = BTreeMap::new();
     for cell in &plan.cells {
         match folder.finished(cell) {
-            Some(result) => results.push(result),
+            Some(mut result) => {
+                if let Some(training) = trainings.get(cell.training.as_str()) {
+                    let (scene, method, setting) = (training.scene.clone(), training.method.clone(), training.setting.clone());
+                    let axes = Axes { scene, method, setting, codec: cell.codec.clone(), seed: training.seed };
+                    if result.axes != axes || result.sweep != plan.name {
+                        (result.axes, result.sweep) = (axes, plan.name.clone());
+                        result.write(&folder.result(&cell.id))?;
+                    }
+                }
+                results.push(result);
+            }
             None => {
                 let state = states.entry(&cell.training).or_insert_with(|| folder.state(&cell.training));
                 let damaged = if folder.result(&cell.id).exists() { "its file is damaged; " } else { "" };
@@ -190,7 +200,11 @@ mod tests {
         all[1].write(&folder.result(&all[1].id)).unwrap();
         let complete = collect(&folder, &plan).unwrap();
         complete.check_complete(&folder).unwrap();
-        assert_eq!(complete.results, all);
+        // Names are those of the plan, also in the files.
+        let renamed = |r: &CellResult| (r.id.clone(), r.training.clone(), r.metrics.clone());
+        assert_eq!(complete.results.iter().map(renamed).collect::<Vec<_>>(), all.iter().map(renamed).collect::<Vec<_>>());
+        assert!(complete.results.iter().all(|r| (r.axes.method.as_str(), r.axes.setting.as_str()) == ("own", "base") && r.sweep == plan.name));
+        assert_eq!(collect(&folder, &plan).unwrap(), complete);
         let tables = write_tables(&folder, &complete.results).unwrap();
         assert_eq!(super::super::read_results(&tables.results).unwrap().len(), 2);
         assert!(std::fs::read_to_string(tables.markdown).unwrap().contains("| half |"));

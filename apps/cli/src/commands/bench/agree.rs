@@ -34,6 +34,9 @@ pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
     };
     let scene = open_as_trained(&args.views.scene, first, &args.views.sets, &context.registry, &context.limits)?;
     let views = scene.split(args.views.split.into());
+    if views.is_empty() {
+        return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Compare the views of the other split"));
+    }
     let wanted = if args.max_views == 0 { views.len() } else { args.max_views };
     let views: Vec<usize> = evenly(views.len(), wanted).into_iter().map(|i| views[i]).collect();
     let devices = agreement(&models, &scene, &views, &context.registry, &events)?;

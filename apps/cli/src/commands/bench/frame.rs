@@ -90,7 +90,12 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
         deformer,
         cases,
     };
-    context.output.result(&report, || text(&report))
+    let measured = report.cases.len();
+    context.output.result(&report, || text(&report))?;
+    if measured < wanted.len() {
+        return Err(Error::Interrupted(format!("after {measured} of {} cases", wanted.len())));
+    }
+    Ok(())
 }
 
 /// The model of a case, and the camera that looks at it.

@@ -36,7 +36,7 @@ pub fn sort(context: &Context, args: &BenchSort) -> Result<()> {
     let device = parse_device(&args.device)?;
     let mut random = Seed::root(args.seed).child("sort").rng();
     let mut cases = Vec::new();
-    for &pairs in &args.pairs {
+    for pairs in args.pairs.iter().map(|&pairs| pairs as usize) {
         // Random keys of as many bits as depths have, and of as many as tiles of an image have.
         for bits in [32, 13] {
             let keys: Vec<i32> = (0..pairs).map(|_| (random.random::<u32>() >> (32 - bits)) as i32).collect();

@@ -8,8 +8,9 @@ use cc4dgs_train::sweep::{Failure, INTERRUPTED, Plan, SweepFolder};
 use serde::Serialize;
 use std::collections::VecDeque;
 use std::fs::OpenOptions;
+use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Between two looks at the processes.
@@ -63,21 +64,10 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
     let (running, seconds, failed, not_before) = (Vec::new(), Vec::new(), Vec::new(), began);
     let mut pool = Pool { context, plan, folder, threads, events: &events, queue, running, seconds, failed, not_before };
     pool.progress();
-    loop {
-        if stop.load(Ordering::Relaxed) {
-            pool.stop();
-            let text = format!("{} of {} cells are finished; the next run does the others", pool.finished(), plan.cells.len());
-            return Err(Error::Interrupted(text));
-        }
-        while pool.running.len() < jobs && Instant::now() >= pool.not_before {
-            let Some(index) = pool.queue.pop_front() else { break };
-            pool.start(index)?;
-        }
-        if pool.running.is_empty() && pool.queue.is_empty() {
-            break;
-        }
-        pool.look(jobs)?;
-        std::thread::sleep(TICK);
+    if let Err(error) = pool.work(jobs, stop) {
+        // Nobody else would end them: they are in groups of their own.
+        pool.stop();
+        return Err(error);
     }
     if !pool.failed.is_empty() {
         return Err(pool.error());
@@ -89,6 +79,24 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
 }
 
 impl Pool<'_> {
+    /// Keeps `jobs` processes running until nothing is left to do.
+    fn work(&mut self, jobs: usize, stop: &AtomicBool) -> Result<()> {
+        loop {
+            if stop.load(Ordering::Relaxed) {
+                let text = format!("{} of {} cells are finished; the next run does the others", self.finished(), self.plan.cells.len());
+                return Err(Error::Interrupted(text));
+            }
+            while self.running.len() < jobs && Instant::now() >= self.not_before {
+                let Some(index) = self.queue.pop_front() else { break };
+                self.start(index)?;
+            }
+            if self.running.is_empty() && self.queue.is_empty() {
+                return Ok(());
+            }
+            self.look(jobs)?;
+            std::thread::sleep(TICK);
+        }
+    }
     fn finished(&self) -> usize {
         self.plan.cells.iter().filter(|cell| self.folder.finished(cell).is_some()).count()
     }
@@ -104,7 +112,11 @@ impl Pool<'_> {
         let log_path = self.folder.log(&self.plan.trainings[index].id);
         let io = |e| Error::io(&log_path, e);
         let log = OpenOptions::new().create(true).append(true).open(&log_path).map_err(io)?;
-        let program = std::env::current_exe().map_err(|e| Error::io("the program", e))?;
+        // On Linux the running program itself, also where a build has replaced its file.
+        let program = match Path::new("/proc/self/exe") {
+            own if own.exists() => own.to_path_buf(),
+            _ => std::env::current_exe().map_err(|e| Error::io("the program", e))?,
+        };
         let mut command = Command::new(&program);
         command.args(["--quiet", "--threads", &self.threads.to_string()]);
         command.args(self.context.limit_options.iter().flat_map(|limit| ["--limit", limit]));
