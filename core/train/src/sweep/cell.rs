@@ -38,7 +38,8 @@ pub(super) struct Trained<'a> {
 impl<'a> Trained<'a> {
     /// Opens the checkpoint of `training` and the scene as it was trained on.
     pub fn open(worker: &Worker, folder: &SweepFolder, training: &'a PlannedTraining, finished: FinishedTraining) -> Result<Self> {
-        let config = config_of(folder, training)?;
+        let mut config = config_of(folder, training)?;
+        config.limits = worker.limits_over(&config.limits)?;
         let device = parse_device(&config.device)?;
         let model = Model::open(&folder.training(&training.id), worker.registry, &device, &config.limits, worker.events)?;
         let scene = data::open_in(&locate(&training.data.path)?, &config.scene, &model.normalisation, worker.registry, &config.limits)?;

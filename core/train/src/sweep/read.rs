@@ -82,7 +82,7 @@ fn read_file(file: &Path, lenient: bool) -> Result<Vec<CellResult>> {
 }
 
 /// Refuses results that do not belong into one table: computed on different devices, scored on different sides of the split, by different protocols of a metric,
-/// or, within a scene, on different data, images or image sizes.
+/// or, within a scene, on different data, image sizes or images.
 ///
 /// # Errors
 /// [`Error::Data`] that names two of the results and what differs.
@@ -109,6 +109,10 @@ pub fn check_comparable(results: &[CellResult]) -> Result<()> {
         if a != b {
             return Err(mixed("image sizes", same_scene, &format!("{}x{}", a[0], a[1]), result, &format!("{}x{}", b[0], b[1])));
         }
+        if images(same_scene) != images(result) {
+            let of = |r: &CellResult| format!("{} images of {} frames", r.images.len(), r.frames);
+            return Err(mixed("sets of images", same_scene, &of(same_scene), result, &of(result)));
+        }
         for (name, score) in &result.metrics {
             let other = *of_metric.entry(name).or_insert(result);
             if let Some((a, b)) = difference(&other.metrics[name].protocol, &score.protocol, |key| key != FRAMES) {
@@ -121,6 +125,11 @@ pub fn check_comparable(results: &[CellResult]) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Camera and frame of each scored image.
+fn images(result: &CellResult) -> Vec<(&str, usize)> {
+    result.images.iter().map(|image| (image.camera.as_str(), image.frame)).collect()
 }
 
 fn describe(device: &super::result::DeviceFacts) -> String {

@@ -12,7 +12,7 @@ use crate::event_log::{EVENTS, History, JsonLines, read_history};
 use crate::layers::Layers;
 use crate::train::{CONFIG, TrainJob, train};
 use cc4dgs_core::archive::write_atomically;
-use cc4dgs_core::{Error, Event, EventSink, Registry, Result};
+use cc4dgs_core::{Error, Event, EventSink, Limits, Registry, Result, config, toml};
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -48,6 +48,17 @@ pub struct Worker<'a> {
     pub events: &'a dyn EventSink,
     /// Set to stop at a safe point.
     pub stop: &'a AtomicBool,
+    /// Limits of this machine over those of the grid, each `KEY=VALUE`. They decide what is refused and change no result.
+    pub limits: &'a [String],
+}
+
+impl Worker<'_> {
+    /// `limits` with those of this machine laid over them.
+    pub(super) fn limits_over(&self, limits: &Limits) -> Result<Limits> {
+        let mut table = toml::Table::try_from(limits).map_err(|e| Error::backend("limits", e.to_string(), "Report this as a defect"))?;
+        config::set_all(&mut table, self.limits)?;
+        config::parse_section("--limit", &table)
+    }
 }
 
 /// Sends events to the log of a training and to a listener.
@@ -80,10 +91,11 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let resume = run.join(CHECKPOINT).is_file();
     let log = JsonLines::open(&run.join(EVENTS), begun)?;
     let events = Both(&log, worker.events);
+    let limits: Vec<String> = worker.limits.iter().map(|limit| format!("limits.{limit}")).collect();
     let (config, scene) = if begun {
-        auto::open(&path, &Layers::collect(worker.registry, None, Some(&own), &[])?, worker.registry, &events)?
+        auto::open(&path, &Layers::collect(worker.registry, None, Some(&own), &limits)?, worker.registry, &events)?
     } else {
-        let layers = training.layers(worker.registry)?;
+        let layers = Layers::collect(worker.registry, Some(&training.preset), None, &[&training.sets[..], &limits].concat())?;
         let (mut config, scene) = auto::open(&path, &layers, worker.registry, &events)?;
         if !layers.state("train.checkpoint_every") {
             config.train.checkpoint_every = (config.train.iterations / CHECKPOINTS).clamp(CHECKPOINT_EVERY[0], CHECKPOINT_EVERY[1]);

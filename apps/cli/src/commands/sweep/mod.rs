@@ -97,7 +97,7 @@ fn index_of(plan: &Plan, id: &str) -> Result<usize> {
 /// One training with its cells, in this process.
 fn run_one(context: &Context, plan: &Plan, folder: &SweepFolder, index: usize, args: &SweepRun) -> Result<()> {
     let events = context.listeners(None)?;
-    let worker = Worker { registry: &context.registry, events: &events, stop: interrupt::stop_flag()? };
+    let worker = Worker { registry: &context.registry, events: &events, stop: interrupt::stop_flag()?, limits: context.limit_options };
     let busy = if args.no_wait { Busy::Leave } else { Busy::Wait };
     let results = match run_training(&worker, folder, plan, index, args.cell.as_deref(), busy)? {
         TrainingState::Finished(results) => results,
