@@ -151,7 +151,8 @@ fn stands_alone(facts: &Facts) -> bool {
 
 /// How many frames lie between key frames, where several cameras see each, things pass and there is time to match enough of them.
 fn key_frames(facts: &Facts, machine: Machine, minutes: f64) -> Option<usize> {
-    if stands_still(facts) || !facts.arrangement.has_several_cameras() || facts.occupied.is_some_and(|share| share > ON_THE_SPOT) {
+    // Where no camera stands still, nothing says what moves.
+    if stands_still(facts) || facts.moving.is_none() || !facts.arrangement.has_several_cameras() || facts.occupied.is_some_and(|share| share > ON_THE_SPOT) {
         return None;
     }
     let image = facts.pixels().min(MOST_MATCHED_PIXELS) * facts.cameras as f64;

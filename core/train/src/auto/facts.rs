@@ -1,7 +1,7 @@
 //! What can be known of a scene without training: its cameras, its images, and what differs between them.
 
 use crate::data::resize;
-use crate::sample::spread_from_first;
+use crate::sample::{spread_from_first, spread_views};
 use cc4dgs_core::{Image8, Result, Scene, Split};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -101,7 +101,7 @@ impl Facts {
         let cameras: BTreeSet<usize> = views.iter().map(|&v| scene.views[v].camera).collect();
         let mut sizes: Vec<[u32; 2]> = cameras.iter().map(|&c| [scene.cameras[c].width, scene.cameras[c].height]).collect();
         sizes.sort_unstable();
-        let looked = spread_from_first(&views, LOOKS);
+        let looked = spread_views(scene, &views, LOOKS);
         let images = looked.par_iter().map(|&view| small(scene, view)).collect::<Result<Vec<_>>>()?;
         let with_alpha = images.iter().filter(|image| image.channels == 4).map(transparent_share);
         let transparent = with_alpha.sum::<f32>() / images.len().max(1) as f32;

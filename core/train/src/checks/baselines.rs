@@ -2,7 +2,7 @@
 
 use crate::data::resample::resize;
 use crate::masks::{PUBLISHED_SIGMA, over_time};
-use crate::sample::spread;
+use crate::sample::{spread, spread_views};
 use cc4dgs_core::metrics::{Metric, Rounding};
 use cc4dgs_core::{Image8, Result, Scene, Split};
 use rayon::prelude::*;
@@ -51,7 +51,7 @@ pub(super) struct Yardstick {
 impl Yardstick {
     /// Chooses training views and scores the baselines. `threshold` is that of the dynamic masks.
     pub fn new(scene: &Scene, threshold: f32, background: [f32; 3]) -> Result<Self> {
-        let views = spread(&scene.split(Split::Train), VIEWS);
+        let views = spread_views(scene, &scene.split(Split::Train), VIEWS);
         let scores = views.par_iter().map(|&view| still_scores(scene, view, background)).collect::<Result<Vec<_>>>()?;
         let mean = |values: &dyn Fn(&[f64; 2]) -> f64| scores.iter().map(values).sum::<f64>() / scores.len().max(1) as f64;
         let (moving, mean_image_db) = moving_pixels(scene, threshold, background)?;

@@ -1,7 +1,7 @@
 //! Whether the images show anything.
 
 use super::{Finding, Subject, listed};
-use crate::sample::spread;
+use crate::sample::spread_views;
 use cc4dgs_core::{Image8, Result, Scene, Split};
 use rayon::prelude::*;
 
@@ -14,7 +14,7 @@ const BLACK: f64 = 8.0;
 
 /// Images of one colour: all of them is a reason to refuse, some of them a doubt.
 pub(super) fn check(scene: &Scene, background: [f32; 3]) -> Result<Vec<Finding>> {
-    let sample = spread(&scene.split(Split::Train), SAMPLE);
+    let sample = spread_views(scene, &scene.split(Split::Train), SAMPLE);
     let stats = sample.par_iter().map(|&view| Ok(gray_statistics(&*scene.frame(view)?, background))).collect::<Result<Vec<_>>>()?;
     let flat: Vec<(usize, f64)> = sample.iter().zip(&stats).filter(|(_, (_, deviation))| *deviation < ONE_COLOUR).map(|(&v, (mean, _))| (v, *mean)).collect();
     if flat.is_empty() {

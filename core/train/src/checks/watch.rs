@@ -4,7 +4,7 @@ use super::baselines::{MovingPixels, Yardstick, blurred, psnr_db};
 use super::rules::{Doubts, GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, shortfall};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
-use crate::sample::spread;
+use crate::sample::spread_views;
 use crate::train::{Context, Score, TrainJob, TrainState};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
@@ -210,7 +210,8 @@ fn same_time<'a>(job: &'a TrainJob) -> Option<&'a String> {
 /// because nobody asked for it.
 fn validation_psnr_db(context: &Context, state: &mut TrainState) -> Result<Option<f64>> {
     let asked = context.job.config.train.validation;
-    let views = spread(&context.job.scene.split(Split::Validation), if asked == 0 { VALIDATION_VIEWS } else { asked });
+    let scene = &context.job.scene;
+    let views = spread_views(scene, &scene.split(Split::Validation), if asked == 0 { VALIDATION_VIEWS } else { asked });
     if views.is_empty() {
         return Ok(None);
     }

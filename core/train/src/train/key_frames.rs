@@ -29,14 +29,18 @@ impl Context<'_> {
     /// Adds the Gaussians of key frames at the start of the main stage, where `train.key_frames` asks for them, and gives what moved at the first frame a life there.
     pub(super) fn add_key_frames(&self, state: &mut TrainState) -> Result<()> {
         let every = self.job.config.train.key_frames;
-        let Moving::Scored { zeta } = state.moving else { return Ok(()) };
-        if every == 0 || self.masks.is_empty() {
+        if every == 0 || self.job.scene.frame_count <= 1 {
             return Ok(());
         }
+        let warn = |message: String| self.job.events.emit(&Event::Warning { object: "train.key_frames".into(), message });
+        let (Moving::Scored { zeta }, false) = (state.moving, self.masks.is_empty()) else {
+            warn("key frames need cameras that stand still and dynamic scores (train.dynamic = \"auto\" or \"score\"): none is used".into());
+            return Ok(());
+        };
         if state.deformer.as_ref().is_none_or(|deformer| own_lives(deformer) != LIFE_ATTRIBUTES.len()) {
             let name = state.deformer.as_ref().map_or("none", ModelDeformer::name);
             let message = format!("the Gaussians of '{name}' have no lives, so key frames add none: set deformer.life = true, or train.key_frames = 0");
-            self.job.events.emit(&Event::Warning { object: "train.key_frames".into(), message });
+            warn(message);
             return Ok(());
         }
         let seed = self.seed.child("key frames");
@@ -45,14 +49,14 @@ impl Context<'_> {
         let masks: Vec<Option<&DynamicMask>> = (0..scene.cameras.len()).map(mask_of).collect();
         let moves = |camera: usize, x: f32, y: f32| masks[camera].is_some_and(|mask| covers(mask, &scene.cameras[camera], x, y));
         let Some(frames) = KeyFrames::load(scene, every, moves, self.job.config.train.mask_threshold, seed)? else {
-            let message = "no two key frames are seen by the same cameras: none is used".to_string();
-            self.job.events.emit(&Event::Note { object: "key frames".into(), message });
+            warn("fewer than two key frames, the first frame among them, have images of all cameras: none is used".into());
             return Ok(());
         };
         let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(0, |most| most.max(0) as usize);
         let count = most.saturating_sub(state.set.len()).max((LEAST_SHARE * state.set.len() as f64) as usize);
         let points = frames.points(count, seed.child("motion"));
-        let times = Times::new(&frames.times);
+        let end = self.job.scene.views.iter().fold(0.0f32, |end, view| end.max(view.time_norm));
+        let times = Times::new(&frames.times, f64::from(end));
         let mut plan = DensityPlan::unchanged(state.set.len());
         let host = state.set.host_gaussians()?;
         let temporary = self.lives_of_first_frame(&mut plan, &host, state, &frames, &times)?;
@@ -65,7 +69,7 @@ impl Context<'_> {
             capped += limit_sizes_to(scene, &mut start, WIDTH_SHARE);
             for (i, point) in own.into_iter().enumerate() {
                 let row = plan.copy(0);
-                plan.set(row, "means", &start.means[3 * i..3 * i + 3]);
+                plan.set(row, "means", &times.position(point).to_array());
                 plan.set(row, "log_scales", &start.log_scales[3 * i..3 * i + 3]);
                 plan.set(row, "quaternions", &[1.0, 0.0, 0.0, 0.0]);
                 plan.set(row, "opacity_logits", &start.opacity_logits[i..=i]);
@@ -130,18 +134,30 @@ fn covers(mask: &DynamicMask, camera: &Camera, x: f32, y: f32) -> bool {
 struct Times<'a> {
     /// The time of each, 0..1.
     keys: &'a [f64],
+    /// The time of the last frame, which need not be a key frame.
+    end: f64,
     /// From one to the next in the mean.
     interval: f64,
 }
 
 impl<'a> Times<'a> {
-    fn new(keys: &'a [f64]) -> Self {
+    fn new(keys: &'a [f64], end: f64) -> Self {
         let whole = keys.last().copied().unwrap_or(1.0) - keys.first().copied().unwrap_or(0.0);
-        Self { keys, interval: (whole / keys.len().saturating_sub(1).max(1) as f64).max(LEAST_INTERVAL) }
+        Self { keys, end, interval: (whole / keys.len().saturating_sub(1).max(1) as f64).max(LEAST_INTERVAL) }
+    }
+    /// From when to when a point is there: what is there at the last key frame is there until the end.
+    fn span(&self, point: &KeyPoint) -> [f64; 2] {
+        let [first, last] = point.alive.map(|key| self.keys[key]);
+        [first, if point.alive[1] + 1 == self.keys.len() { last.max(self.end) } else { last }]
+    }
+    /// Where a point is in the middle of its life.
+    fn position(&self, point: &KeyPoint) -> Vec3 {
+        let [first, last] = self.span(point);
+        point.position + point.velocity * ((0.5 * (first + last) - self.keys[point.key]) / self.interval) as f32
     }
     /// Gives a row the life and the velocity of a point.
     fn live(&self, plan: &mut DensityPlan, row: usize, point: &KeyPoint) {
-        let [first, last] = point.alive.map(|key| self.keys[key]);
+        let [first, last] = self.span(point);
         let half_width = 0.5 * (last - first) + HALF_WIDTH * self.interval;
         plan.set(row, "life_center", &[(0.5 * (first + last)) as f32]);
         plan.set(row, "life_log_half_width", &[half_width.ln() as f32]);
@@ -164,7 +180,7 @@ mod tests {
     fn lives_are_at_the_times_that_views_state() {
         // Five of six frames at k / 6: the last key frame is not at 1.
         let keys = [0.0, 1.0 / 3.0, 2.0 / 3.0];
-        let times = Times::new(&keys);
+        let times = Times::new(&keys, 2.0 / 3.0);
         let point = KeyPoint { position: Vec3::ZERO, color: [0.5; 3], key: 2, alive: [1, 2], velocity: Vec3::X };
         let mut plan = DensityPlan::unchanged(1);
         times.live(&mut plan, 0, &point);
@@ -172,6 +188,15 @@ mod tests {
         assert!((value("life_center") - 0.5).abs() < 1e-6, "between the second and the third");
         assert!((value("velocity") - 3.0).abs() < 1e-5, "a unit from one key frame to the next");
         assert!((value("life_log_half_width").exp() - (1.0 / 6.0 + 0.4 / 3.0)).abs() < 1e-6);
-        assert!(Times::new(&[0.0, 0.0]).interval > 0.0);
+        assert!(Times::new(&[0.0, 0.0], 0.0).interval > 0.0);
+        // The last frame is later than the last key frame.
+        let (times, mut plan) = (Times::new(&keys, 0.9), DensityPlan::unchanged(1));
+        let moving = KeyPoint { alive: [2, 2], ..point };
+        times.live(&mut plan, 0, &moving);
+        let value = |name: &str| plan.values().iter().find(|v| v.attribute == name).map(|v| v.values[0]).unwrap();
+        let (center, half_width) = (value("life_center"), value("life_log_half_width").exp());
+        assert!((center + half_width) as f64 > 0.9 && (center - half_width) as f64 <= 2.0 / 3.0 - 0.4 / 3.0 + 1e-6);
+        let at_key = times.position(&moving).x + value("velocity") * (keys[2] as f32 - center);
+        assert!((at_key - moving.position.x).abs() < 1e-5, "it is where it was found at its key frame: {at_key}");
     }
 }

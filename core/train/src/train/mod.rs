@@ -274,6 +274,9 @@ impl Context<'_> {
             return Ok(());
         }
         if state.iteration == 0 {
+            if stage != Stage::Coarse {
+                self.remove_broken(state)?;
+            }
             state.begin_stage(&self.device);
             if stage == Stage::Main {
                 self.begin_main(state)?;
@@ -380,7 +383,11 @@ impl Context<'_> {
         if stage != Stage::Coarse || self.job.config.train.coarse_frames == CoarseFrames::All {
             return all;
         }
-        let first = all.iter().map(|&v| scene.views[v].frame).min().unwrap_or(0);
+        let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
+        all.iter().for_each(|&v| *counts.entry(scene.views[v].frame).or_default() += 1);
+        // Single images of the first frames may be missing: the frame is the first that half of the cameras see.
+        let most = counts.values().copied().max().unwrap_or(0);
+        let first = counts.iter().find(|(_, count)| 2 * **count >= most).map_or(0, |(&frame, _)| frame);
         let of_first: Vec<usize> = all.iter().copied().filter(|&v| scene.views[v].frame == first).collect();
         // A single image says nothing of depth: one moving camera needs all of them.
         if of_first.len() >= 2 { of_first } else { all }

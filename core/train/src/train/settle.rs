@@ -3,7 +3,7 @@
 //! Scores say what may move before any motion is known. They err on the safe side: a floor that somebody walks over is seen to change.
 
 use super::{Context, TrainState};
-use crate::sample::spread;
+use crate::sample::spread_views;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Camera, Event, Result, Schedule, Split, Stage};
@@ -44,7 +44,7 @@ impl Context<'_> {
         let mut scores = to_vec(state.set.get("dynamic_scores")?.clone(), "dynamic_scores")?;
         let means = to_vec(state.set.get("means")?.clone(), "means")?;
         let scene = &self.job.scene;
-        let cameras: Vec<&Camera> = spread(&scene.split(Split::Train), CAMERAS).into_iter().map(|view| scene.camera(view)).collect();
+        let cameras: Vec<&Camera> = spread_views(scene, &scene.split(Split::Train), CAMERAS).into_iter().map(|view| scene.camera(view)).collect();
         let moving = state.moving.rows(&scores).unwrap_or_default();
         let mut settled = 0;
         for (k, &row) in moving.iter().enumerate() {

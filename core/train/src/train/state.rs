@@ -139,11 +139,12 @@ impl TrainState {
         if rows.is_empty() {
             rows = (0..host.len()).collect();
         }
+        rows.retain(|&row| host.is_finite(row));
         let (mut box_min, mut box_max) = ([0.0f32; 3], [0.0f32; 3]);
         for k in 0..3 {
             let mut values: Vec<f32> = rows.iter().map(|&i| host.means[3 * i + k]).collect();
             values.sort_unstable_by(f32::total_cmp);
-            let pick = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
+            let pick = |share: f64| values.get((values.len().saturating_sub(1) as f64 * share).round() as usize).copied().unwrap_or(0.0);
             let (low, high) = (pick(0.001), pick(0.999));
             // A flat axis still needs a width to be normalised by.
             let pad = (0.05 * (high - low)).max(1e-4 * (1.0 + low.abs().max(high.abs())));

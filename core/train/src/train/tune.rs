@@ -8,7 +8,7 @@ use super::sampler::Sampler;
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
-use crate::sample::spread;
+use crate::sample::spread_views;
 use crate::schedule::StageLengths;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
@@ -186,7 +186,7 @@ impl<'a> Tuner<'a> {
     /// Mean absolute error of `gaussians`, as they are, on a few training views.
     fn mean_error(&self, context: &Context, state: &mut TrainState, gaussians: &HostGaussians) -> Result<f64> {
         let scene = &self.job.scene;
-        let views = spread(&scene.split(Split::Train), PROBES);
+        let views = spread_views(scene, &scene.split(Split::Train), PROBES);
         let set = GaussianSet::new(gaussians, self.job.device).gaussians()?;
         let (background, requests) = (self.choices()?.config.background()?, views.iter().map(|&v| (v, scene.views[v].time_norm)).collect::<Vec<_>>());
         let mut sum = 0.0;
@@ -223,7 +223,7 @@ impl<'a> Tuner<'a> {
 /// The views on which PSNR is measured: validation views where the scene has some, else training views.
 pub(super) fn judges(scene: &Scene) -> Vec<usize> {
     let validation = scene.split(Split::Validation);
-    spread(&if validation.is_empty() { scene.split(Split::Train) } else { validation }, JUDGES)
+    spread_views(scene, &if validation.is_empty() { scene.split(Split::Train) } else { validation }, JUDGES)
 }
 
 /// What changes slowly.

@@ -1,7 +1,7 @@
 //! The curve of validation: views that are kept out of training are scored from time to time.
 
 use super::{Context, TrainState};
-use crate::sample::spread;
+use crate::sample::spread_views;
 use cc4dgs_core::{Event, Result, Schedule, Split, Stage};
 
 /// Scores of a coarse and of a main stage, at equal distances.
@@ -22,7 +22,8 @@ impl Context<'_> {
         if kept_out == 0 || index(schedule.iteration) == index(schedule.iteration - 1) {
             return Ok(());
         }
-        let views = spread(&spread(&self.job.scene.split(Split::Validation), kept_out), VIEWS);
+        let scene = &self.job.scene;
+        let views = spread_views(scene, &spread_views(scene, &scene.split(Split::Validation), kept_out), VIEWS);
         if views.is_empty() {
             return Ok(());
         }

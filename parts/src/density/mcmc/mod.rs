@@ -7,6 +7,8 @@
 //!
 //! In the main stage every round also moves some of those that are hardly seen: hidden, faint or covered by others, they cost as much as any other.
 
+mod weights;
+
 use super::halves;
 use super::statistics::Statistics;
 use burn::tensor::activation::sigmoid;
@@ -18,6 +20,7 @@ use cc4dgs_core::{
 };
 use rand::Rng;
 use serde::Deserialize;
+use weights::Weights;
 
 const SCHEMA: &str = "\
 from = 500               # first round, in reference iterations of the stage (coarse 5,000, main 20,000)
@@ -43,10 +46,6 @@ const NOISE_STEEPNESS: f32 = 100.0;
 const MOST_LOGIT: f32 = 30.0;
 /// Largest share of the Gaussians that one round moves.
 const MOST_MOVED: f64 = 0.05;
-/// Share of the sums of blending weights that a round leaves to the next: a round alone has not seen every view.
-const MEMORY: f32 = 0.7;
-/// Rounds after which a Gaussian is judged by its blending weights: until then, halves are still fainter than they will be.
-const LEAST_ROUNDS: f32 = 3.0;
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -123,43 +122,6 @@ fn faded(logits: Tensor<1>, decay: Tensor<1>) -> Tensor<1> {
     (kept / (logits.clamp(-MOST_LOGIT, MOST_LOGIT).neg().exp() + decay)).log()
 }
 
-/// What is remembered of the blending weights of N Gaussians.
-struct Weights {
-    /// Decaying sums over views: of the largest weight, of its square, of views that show the Gaussian `[N,3]`.
-    sums: Tensor<2>,
-    /// Rounds since the Gaussian was new `[N]`.
-    rounds: Vec<f32>,
-}
-
-impl Weights {
-    fn zeros(count: usize, device: &Device) -> Self {
-        Self { sums: Tensor::zeros([count, 3], device), rounds: vec![0.0; count] }
-    }
-    fn add(&mut self, view: &ViewStatistics) {
-        if let Some(weights) = &view.max_weights {
-            let shown = view.radii.clone().greater_elem(0).float();
-            self.sums = self.sums.clone() + Tensor::stack::<2>(vec![weights.clone(), weights.clone() * weights.clone(), shown], 1);
-        }
-    }
-    /// Of the rows that can be judged, at most so many with the smallest weights, the smallest first. Weights are averaged with themselves as shares: what is bright
-    /// for a short time, or on one side, counts by that.
-    fn smallest(&self, most: usize) -> Result<Vec<usize>> {
-        let sums = to_vec(self.sums.clone(), "blending weights")?;
-        let weight = |row: usize| sums[3 * row + 1] / sums[3 * row].max(f32::MIN_POSITIVE);
-        let mut rows: Vec<usize> = (0..self.rounds.len()).filter(|&row| self.rounds[row] >= LEAST_ROUNDS && sums[3 * row + 2] > 0.0).collect();
-        rows.sort_by(|&a, &b| weight(a).total_cmp(&weight(b)).then(a.cmp(&b)));
-        rows.truncate(most);
-        Ok(rows)
-    }
-    /// What the Gaussians of `plan` start the next round with; new ones with nothing.
-    fn after(&self, plan: &DensityPlan, device: &Device) -> Result<Self> {
-        let (old, rows) = (to_vec(self.sums.clone(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
-        let of = |(&parent, &fresh): (&usize, &bool)| std::array::from_fn::<f32, 3, _>(|k| if fresh { 0.0 } else { MEMORY * old[3 * parent + k] });
-        let sums = Tensor::from_data(TensorData::new(rows().flat_map(of).collect(), [plan.len(), 3]), device);
-        Ok(Self { sums, rounds: rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect() })
-    }
-}
-
 struct Mcmc {
     settings: Settings,
     statistics: Statistics,
@@ -175,7 +137,7 @@ struct Mcmc {
 impl DensityControl for Mcmc {
     fn begin_stage(&mut self, count: usize, device: &Device) {
         (self.statistics, self.weights) = (Statistics::zeros(count, device), Weights::zeros(count, device));
-        (self.start, self.shown) = (count, None);
+        (self.start, self.shown, self.round) = (count, None, false);
     }
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic> {
         let mut wanted = Vec::new();
@@ -209,8 +171,13 @@ impl DensityControl for Mcmc {
         Ok(Some(round(&self.settings, &gaussians.to_host()?, &scores, &hidden, self.settings.budget(self.start, schedule), seed)))
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
+        let (before, own) = (self.statistics.seen.dims()[0], std::mem::take(&mut self.round));
+        // What others add, such as points of key frames, is no growth.
+        if !own {
+            self.start += plan.len().saturating_sub(before);
+        }
         // A round starts over; so do the statistics when somebody else changed the rows.
-        if self.round || !plan.keeps_all(self.statistics.seen.dims()[0]) {
+        if own || !plan.keeps_all(before) {
             self.statistics = Statistics::zeros(plan.len(), device);
             self.weights = self.weights.after(plan, device)?;
         }
@@ -364,7 +331,6 @@ inventory::submit! {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use burn::tensor::Int;
 
     fn host_of(opacities: &[f32]) -> HostGaussians {
         let n = opacities.len();
@@ -400,30 +366,17 @@ mod tests {
     }
 
     #[test]
-    fn who_is_hidden_is_judged_after_some_rounds() {
+    fn what_others_add_is_no_growth() {
         let device = Device::flex();
-        let mut weights = Weights::zeros(4, &device);
-        let view = |largest: &[f32], radii: &[i64]| ViewStatistics {
-            radii: Tensor::<1, Int>::from_data(TensorData::new(radii.to_vec(), [radii.len()]), &device),
-            screen_gradient: None,
-            absolute_screen_gradient: None,
-            max_weights: Some(Tensor::from_floats(largest, &device)),
-            size: (8, 8),
-            views: 1,
-        };
-        weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0]));
-        assert!(weights.smallest(9).unwrap().is_empty(), "all are new");
-        weights.rounds = vec![3.0; 4];
-        // The last one was never shown, so nobody can tell.
-        assert_eq!((weights.smallest(9).unwrap(), weights.smallest(1).unwrap()), (vec![2, 1, 0], vec![2]));
-        let mut plan = DensityPlan::new();
-        plan.keep(1);
-        plan.copy(0);
-        plan.keep(0);
-        let mut after = weights.after(&plan, &device).unwrap();
-        assert_eq!((after.rounds.as_slice(), after.smallest(9).unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
-        (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])));
-        assert_eq!(after.smallest(9).unwrap(), [2, 0]);
+        let mut control = build(&toml::Table::new()).unwrap();
+        control.begin_stage(2, &device);
+        let mut plan = DensityPlan::unchanged(2);
+        (0..3).for_each(|_| {
+            plan.copy(0);
+        });
+        control.executed(&plan, &device).unwrap();
+        let start = control.state().into_iter().find(|(name, _)| name == "start").unwrap().1;
+        assert_eq!(start.into_scalar::<f32>(), 5.0);
     }
 
     #[test]

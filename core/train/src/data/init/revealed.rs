@@ -2,7 +2,7 @@
 
 use super::choose::{Arrangement, Choice};
 use super::views::WorkSet;
-use cc4dgs_core::Scene;
+use cc4dgs_core::{Scene, Split};
 
 /// Mean difference of the channels, 0..1, from which a pixel has changed.
 const CHANGED: f32 = 0.08;
@@ -20,7 +20,7 @@ pub(super) fn later_frame(scene: &Scene, first: &WorkSet) -> Option<WorkSet> {
     let choice = Choice::new(scene);
     let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
     let at = |frame: usize| -> Option<Vec<usize>> {
-        let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera);
+        let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera && v.split == Split::Train);
         cameras.iter().map(view).collect()
     };
     let (half, last) = (at(scene.frame_count / 2)?, at(scene.frame_count - 1)?);

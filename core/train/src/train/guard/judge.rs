@@ -2,7 +2,7 @@
 
 use super::super::{Context, TrainState};
 use super::{MAX_COST_DB, Removal, Reset, Standing, recovery};
-use crate::sample::spread;
+use crate::sample::spread_views;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Event, Result, Schedule};
@@ -138,7 +138,7 @@ impl Context<'_> {
     }
 
     fn probes(&self, schedule: &Schedule) -> Vec<usize> {
-        spread(&self.stage_views(schedule.stage), PROBES)
+        spread_views(&self.job.scene, &self.stage_views(schedule.stage), PROBES)
     }
 }
 

@@ -14,6 +14,7 @@ use crate::sample::spread;
 use blobs::blobs;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage};
+use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use glam::DVec3;
 use std::collections::BTreeSet;
@@ -48,7 +49,7 @@ impl Context<'_> {
     /// Adds Gaussians for what the model does not draw, when the iteration is due and `train.recover` is on.
     pub(crate) fn recover(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let due = SHARES.iter().any(|&share| schedule.iteration == schedule.iteration_at(share).round() as usize);
-        if !(self.job.config.train.recover && schedule.stage == Stage::Main && due && self.can_live(state)) {
+        if !(self.job.config.train.recover && schedule.stage == Stage::Main && due && state.moving != Moving::Nothing && self.can_live(state)) {
             return Ok(());
         }
         let lost = self.lost(state, schedule)?;

@@ -11,7 +11,7 @@ mod motion;
 use super::choose::{Arrangement, Choice};
 use super::views::{WorkSet, WorkView};
 use super::{Candidate, fuse, sweep, thin};
-use cc4dgs_core::{Result, Scene, Seed};
+use cc4dgs_core::{Result, Scene, Seed, Split};
 use glam::Vec3;
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -56,7 +56,7 @@ pub(crate) struct KeyFrames {
 
 impl KeyFrames {
     /// Every `every`-th frame of `scene`, with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so;
-    /// `None` where cameras move, frames lack cameras, or there would be a single key frame. Differences up to `noise`, 0..1, are none.
+    /// `None` where cameras move, or fewer than two of these frames, the first among them, have images of all cameras; others are left out. Differences up to `noise`, 0..1, are none.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
@@ -68,9 +68,15 @@ impl KeyFrames {
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
         let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new(), still: Vec::new(), unchanged: UNCHANGED.max(noise) };
         for frame in (0..scene.frame_count).step_by(every) {
-            let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera);
-            let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else { return Ok(None) };
-            let Some(time) = views.first().map(|&v| f64::from(scene.views[v].time_norm)) else { return Ok(None) };
+            let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera && v.split == Split::Train);
+            // Without the first frame nothing says what moves on from there.
+            let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else {
+                if frame == 0 {
+                    return Ok(None);
+                }
+                continue;
+            };
+            let Some(time) = views.first().map(|&v| f64::from(scene.views[v].time_norm)) else { continue };
             let mut set = WorkSet::load(scene, Choice { views, ..choice.clone() })?;
             for (view, &camera) in set.views.iter_mut().zip(&cameras) {
                 let level = view.fine();
@@ -88,6 +94,9 @@ impl KeyFrames {
             }
             loaded.sets.push(set);
             loaded.times.push(time);
+        }
+        if loaded.sets.len() < 2 {
+            return Ok(None);
         }
         loaded.still = medians(&loaded.sets);
         Ok(Some(loaded))

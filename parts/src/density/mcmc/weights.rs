@@ -1,0 +1,80 @@
+//! Blending weights over views: which Gaussians are hidden, faint or covered.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{DensityPlan, Result, ViewStatistics};
+
+/// Share of the sums of blending weights that a round leaves to the next: a round alone has not seen every view.
+const MEMORY: f32 = 0.7;
+/// Rounds after which a Gaussian is judged by its blending weights: until then, halves are still fainter than they will be.
+const LEAST_ROUNDS: f32 = 3.0;
+
+/// What is remembered of the blending weights of N Gaussians.
+pub(super) struct Weights {
+    /// Decaying sums over views: of the largest weight, of its square, of views that show the Gaussian `[N,3]`.
+    pub sums: Tensor<2>,
+    /// Rounds since the Gaussian was new `[N]`.
+    pub rounds: Vec<f32>,
+}
+
+impl Weights {
+    pub fn zeros(count: usize, device: &Device) -> Self {
+        Self { sums: Tensor::zeros([count, 3], device), rounds: vec![0.0; count] }
+    }
+    pub fn add(&mut self, view: &ViewStatistics) {
+        if let Some(weights) = &view.max_weights {
+            let shown = view.radii.clone().greater_elem(0).float();
+            self.sums = self.sums.clone() + Tensor::stack::<2>(vec![weights.clone(), weights.clone() * weights.clone(), shown], 1);
+        }
+    }
+    /// Of the rows that can be judged, at most so many with the smallest weights, the smallest first. Weights are averaged with themselves as shares: what is bright
+    /// for a short time, or on one side, counts by that.
+    pub fn smallest(&self, most: usize) -> Result<Vec<usize>> {
+        let sums = to_vec(self.sums.clone(), "blending weights")?;
+        let weight = |row: usize| sums[3 * row + 1] / sums[3 * row].max(f32::MIN_POSITIVE);
+        let mut rows: Vec<usize> = (0..self.rounds.len()).filter(|&row| self.rounds[row] >= LEAST_ROUNDS && sums[3 * row + 2] > 0.0).collect();
+        rows.sort_by(|&a, &b| weight(a).total_cmp(&weight(b)).then(a.cmp(&b)));
+        rows.truncate(most);
+        Ok(rows)
+    }
+    /// What the Gaussians of `plan` start the next round with; new ones with nothing.
+    pub fn after(&self, plan: &DensityPlan, device: &Device) -> Result<Self> {
+        let (old, rows) = (to_vec(self.sums.clone(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
+        let of = |(&parent, &fresh): (&usize, &bool)| std::array::from_fn::<f32, 3, _>(|k| if fresh { 0.0 } else { MEMORY * old[3 * parent + k] });
+        let sums = Tensor::from_data(TensorData::new(rows().flat_map(of).collect(), [plan.len(), 3]), device);
+        Ok(Self { sums, rounds: rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::Int;
+
+    #[test]
+    fn who_is_hidden_is_judged_after_some_rounds() {
+        let device = Device::flex();
+        let mut weights = Weights::zeros(4, &device);
+        let view = |largest: &[f32], radii: &[i64]| ViewStatistics {
+            radii: Tensor::<1, Int>::from_data(TensorData::new(radii.to_vec(), [radii.len()]), &device),
+            screen_gradient: None,
+            absolute_screen_gradient: None,
+            max_weights: Some(Tensor::from_floats(largest, &device)),
+            size: (8, 8),
+            views: 1,
+        };
+        weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0]));
+        assert!(weights.smallest(9).unwrap().is_empty(), "all are new");
+        weights.rounds = vec![3.0; 4];
+        // The last one was never shown, so nobody can tell.
+        assert_eq!((weights.smallest(9).unwrap(), weights.smallest(1).unwrap()), (vec![2, 1, 0], vec![2]));
+        let mut plan = DensityPlan::new();
+        plan.keep(1);
+        plan.copy(0);
+        plan.keep(0);
+        let mut after = weights.after(&plan, &device).unwrap();
+        assert_eq!((after.rounds.as_slice(), after.smallest(9).unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
+        (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])));
+        assert_eq!(after.smallest(9).unwrap(), [2, 0]);
+    }
+}
