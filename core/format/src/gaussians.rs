@@ -109,10 +109,11 @@ impl HostGaussians {
         let tail = 0.5 * (1.0 - share.clamp(0.0, 1.0));
         let axis = |k: usize| {
             let mut values: Vec<f32> = self.means.iter().skip(k).step_by(3).copied().filter(|v| v.is_finite()).collect();
-            let left_out = (tail * values.len() as f64) as usize;
-            let Some(last) = values.len().checked_sub(1 + left_out) else { return [0.0; 2] };
+            let Some(end) = values.len().checked_sub(1) else { return [0.0; 2] };
+            // Shares such as 0.9 are not exact.
+            let left_out = ((tail * values.len() as f64 + 1e-6) as usize).min(end / 2);
             let low = *values.select_nth_unstable_by(left_out, f32::total_cmp).1;
-            [low, *values.select_nth_unstable_by(last, f32::total_cmp).1]
+            [low, *values.select_nth_unstable_by(end - left_out, f32::total_cmp).1]
         };
         let [x, y, z] = [0, 1, 2].map(axis);
         [0, 1].map(|end| [x[end], y[end], z[end]])
