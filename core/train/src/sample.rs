@@ -61,7 +61,7 @@ mod tests {
             let seen: BTreeSet<usize> = chosen.iter().map(|&v| scene.views[v].camera).collect();
             let times: BTreeSet<usize> = chosen.iter().map(|&v| 4 * scene.views[v].frame / frames).collect();
             assert_eq!((chosen.len(), seen.len()), (most, cameras.min(most)), "{cameras} cameras, {frames} frames");
-            assert!(chosen.is_sorted() && times.len() >= most.min(3), "{cameras} cameras, {frames} frames: {times:?}");
+            assert!(chosen.is_sorted() && times.len() >= if most < 8 { 2 } else { 3 }, "{cameras} cameras, {frames} frames: {times:?}");
         }
     }
 
