@@ -14,7 +14,7 @@ mod text;
 pub use rows::{Better, QUANTITIES, Quantity, Row, rows};
 pub use tables::{Cell, Table};
 
-use crate::sweep::{PLAN, Plan, RESULTS, SweepFolder, check_comparable, collect, read_results, select};
+use crate::sweep::{CellResult, PLAN, Plan, RESULTS, SweepFolder, check_comparable, collect, read_results, select};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
@@ -90,24 +90,25 @@ pub struct ReportFiles {
     pub html_bytes: usize,
 }
 
-/// Makes the report of the results in `path` (see [`read_results`]); of a sweep's folder, those of the cells of its plan. The folder of images is `path` itself, the folder of a file, or that of a folder called
-/// `results`.
+/// The results of the cells of the plan in `folder`, in the order of [`read_results`].
+fn planned_results(folder: &Path) -> Result<Vec<CellResult>> {
+    let mut results = collect(&SweepFolder::new(folder), &Plan::read(folder)?)?.results;
+    if results.is_empty() {
+        return Err(Error::data(folder.display().to_string(), "no result is of a cell of its plan", "Run the sweep first: cc4dgs sweep run DIR"));
+    }
+    results.sort_by(|a, b| a.axes.cmp(&b.axes).then_with(|| a.id.cmp(&b.id)));
+    Ok(results)
+}
+
+/// Makes the report of the results in `path` (see [`read_results`]); of a sweep's folder, those of the cells of its plan. The folder of images is `path` itself,
+/// the folder of a file, or that of a folder called `results`.
 ///
 /// # Errors
 /// What reading reports; [`Error::Data`] for results that do not belong into one table, and for damaged images; [`Error::Parameter`] for options.
 pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
-    let mut all = read_results(path)?;
-    if path.join(PLAN).is_file() && path.join(RESULTS).is_dir() {
-        // Earlier plans leave results there, too.
-        let planned = Plan::read(path)?;
-        collect(&SweepFolder::new(path), &planned)?;
-        all = read_results(path)?;
-        all.retain(|result| planned.cells.iter().any(|cell| cell.id == result.id));
-        if all.is_empty() {
-            return Err(Error::data(path.display().to_string(), "no result is of a cell of its plan", "Run the sweep first: cc4dgs sweep run DIR"));
-        }
-    }
-    let results = select(all, &options.only)?;
+    // Earlier plans leave results in the folder of a sweep, too.
+    let is_sweep = path.join(PLAN).is_file() && path.join(RESULTS).is_dir();
+    let results = select(if is_sweep { planned_results(path)? } else { read_results(path)? }, &options.only)?;
     check_comparable(&results)?;
     let scenes = rows(&results)?;
     let beside = path.is_file() || path.file_name().is_some_and(|name| name == RESULTS);

@@ -15,7 +15,7 @@ use crate::sample::spread;
 use crate::train::{TuneJob, Tuner};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Archive, StreamKind};
-use cc4dgs_core::{Error, Result, Scene, parse_device};
+use cc4dgs_core::{Error, Limits, Result, Scene, parse_device};
 use cc4dgs_play::{ArchiveOptions, Model};
 use serde::Serialize;
 use serde_json::Value;
@@ -30,6 +30,8 @@ pub(super) struct Trained<'a> {
     pub training: &'a PlannedTraining,
     pub finished: FinishedTraining,
     config: RunConfig,
+    /// Those of the configuration, with those of this machine laid over them; results state the former.
+    limits: Limits,
     device: Device,
     model: Model,
     scene: Arc<Scene>,
@@ -38,13 +40,13 @@ pub(super) struct Trained<'a> {
 impl<'a> Trained<'a> {
     /// Opens the checkpoint of `training` and the scene as it was trained on.
     pub fn open(worker: &Worker, folder: &SweepFolder, training: &'a PlannedTraining, finished: FinishedTraining) -> Result<Self> {
-        let mut config = config_of(folder, training)?;
-        config.limits = worker.limits_over(&config.limits)?;
+        let config = config_of(folder, training)?;
+        let limits = worker.limits_over(&config.limits)?;
         let device = parse_device(&config.device)?;
-        let model = Model::open(&folder.training(&training.id), worker.registry, &device, &config.limits, worker.events)?;
-        let scene = data::open_in(&locate(&training.data.path)?, &config.scene, &model.normalisation, worker.registry, &config.limits)?;
+        let model = Model::open(&folder.training(&training.id), worker.registry, &device, &limits, worker.events)?;
+        let scene = data::open_in(&locate(&training.data.path)?, &config.scene, &model.normalisation, worker.registry, &limits)?;
         let scene = Arc::new(data::hold_out(&scene, config.train.validation)?);
-        Ok(Self { training, finished, config, device, model, scene })
+        Ok(Self { training, finished, config, limits, device, model, scene })
     }
     /// Stores, reads back, scores, and writes the result.
     pub fn run(&self, worker: &Worker, folder: &SweepFolder, plan: &Plan, cell: &PlannedCell) -> Result<CellResult> {
@@ -59,7 +61,7 @@ impl<'a> Trained<'a> {
             field_weights: &choice.field_weights,
             registry: worker.registry,
             device: &self.device,
-            limits: &self.config.limits,
+            limits: &self.limits,
             events: worker.events,
             stop: worker.stop,
         });
@@ -70,10 +72,10 @@ impl<'a> Trained<'a> {
             scene: Some((&self.scene, &self.device)),
             tuner: Some(&tuner),
         };
-        self.model.save_archive(&archive, &options, worker.registry, &self.config.limits, worker.events)?;
+        self.model.save_archive(&archive, &options, worker.registry, &self.limits, worker.events)?;
         let encode_seconds = began.elapsed().as_secs_f64();
         let began = Instant::now();
-        let decoded = Model::open(&archive, worker.registry, &self.device, &self.config.limits, worker.events)?;
+        let decoded = Model::open(&archive, worker.registry, &self.device, &self.limits, worker.events)?;
         let decode_seconds = began.elapsed().as_secs_f64();
 
         let split = plan.split.into();
@@ -152,7 +154,7 @@ impl<'a> Trained<'a> {
             absent,
             blocks: report.psnr_worst_block_db.zip(report.lost_blocks).map(|(worst_psnr_db, lost)| Blocks { worst_psnr_db, lost }),
             images,
-            storage: storage(&archive, &self.model, &self.config)?,
+            storage: storage(&archive, &self.model, &self.limits)?,
             verdict: finished.verdict.as_ref().map(to_value).transpose()?,
             curve: finished.curve.clone(),
             cost: Cost {
@@ -217,8 +219,8 @@ fn scores(report: &EvalReport) -> Result<(BTreeMap<String, Score>, BTreeMap<Stri
 }
 
 /// Bytes of an archive and of the model it stands for.
-fn storage(path: &Path, model: &Model, config: &RunConfig) -> Result<Storage> {
-    let streams = Archive::open(path, &config.limits)?.stream_sizes();
+fn storage(path: &Path, model: &Model, limits: &Limits) -> Result<Storage> {
+    let streams = Archive::open(path, limits)?.stream_sizes();
     let of_kind = |kind| streams.iter().filter(|s| s.kind == kind).map(|s| s.stored_bytes).sum();
     let float32 = model.float32_size();
     let kind_name = |kind| match kind {

@@ -17,7 +17,8 @@ mod views;
 mod volume;
 
 pub(crate) use key_frames::{KeyFrames, KeyPoint};
-pub use size::{limit_opacities, limit_sizes, limit_sizes_to};
+pub(crate) use size::limit_sizes_to;
+pub use size::{limit_opacities, limit_sizes};
 
 use crate::config::InitSource;
 use cc4dgs_core::{Error, PointCloud, Result, Scene, Seed};

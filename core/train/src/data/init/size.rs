@@ -59,7 +59,7 @@ pub fn limit_sizes(scene: &Scene, host: &mut HostGaussians) -> usize {
 }
 
 /// Caps the scales of `host` at `share` of the width of the image, as [`limit_sizes`] does.
-pub fn limit_sizes_to(scene: &Scene, host: &mut HostGaussians, share: f64) -> usize {
+pub(crate) fn limit_sizes_to(scene: &Scene, host: &mut HostGaussians, share: f64) -> usize {
     let eyes = eyes(scene);
     let most: Vec<f32> = (0..host.len())
         .into_par_iter()

@@ -56,7 +56,8 @@ pub(crate) struct KeyFrames {
 
 impl KeyFrames {
     /// Every `every`-th frame of `scene`, with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so;
-    /// `None` where cameras move, or fewer than two of these frames, the first among them, have images of all cameras; others are left out. Differences up to `noise`, 0..1, are none.
+    /// `None` where cameras move, or fewer than two of these frames, the first among them, have images of all cameras;
+    /// others are left out. Differences up to `noise`, 0..1, are none.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
