@@ -1,7 +1,8 @@
 //! Numerical stress: float32 kernels against float64 over conditions that break floating point.
 //!
 //! Each condition is tried at one or more levels (an offset of 1e2, 1e3, … units). A result *behaves* if every number is finite, or if the call returns an
-//! error; it must not panic. Where a float64 oracle exists, the error is the 95th percentile of the absolute differences over the largest absolute value of the
+//! error; it must not panic. Some cases of every part are ordinary (*required*): there an error does not behave, so that a device that fails at everything fails
+//! this test. Where a float64 oracle exists, the error is the 95th percentile of the absolute differences over the largest absolute value of the
 //! oracle, so that a pixel at which a comparison fell the other way does not hide the digits of the others; the share of values that differ by more than 1 % is
 //! stated beside it. The *limit* of a condition is the first level at which the error is over 1 %.
 
@@ -56,10 +57,20 @@ pub struct StressCase {
     pub error: Option<f64>,
     /// Share of the values that differ by more than 1 % of the oracle's largest.
     pub outliers: Option<f64>,
-    /// Whether every number was finite, or the call returned an error.
+    /// Whether the case is ordinary, so that an error does not behave.
+    pub required: bool,
+    /// Whether every number was finite, or the call of a case that is not required returned an error.
     pub behaves: bool,
     /// `finite`, `infinite as the exact value`, the error's text, or what went wrong.
     pub outcome: String,
+}
+
+impl StressCase {
+    /// The same as a required case, if it is `ordinary`.
+    fn required_if(self, ordinary: bool) -> Self {
+        let refused = ordinary && self.outcome.starts_with(ERROR);
+        Self { required: ordinary, behaves: self.behaves && !refused, ..self }
+    }
 }
 
 /// All cases of a run.
@@ -106,6 +117,8 @@ pub fn stress(job: &StressJob, progress: &mut dyn FnMut(&StressCase)) -> Result<
 
 /// In place of an oracle's name: the values were looked at, not compared.
 pub const NO_ORACLE: &str = "no oracle";
+/// How the outcome of a call that returned an error begins.
+const ERROR: &str = "error";
 /// Name of oracles that compute in float64.
 const FLOAT64: &str = "float64";
 
@@ -121,12 +134,13 @@ fn case(part: &str, condition: &str, level: impl Into<String>, work: impl FnOnce
         oracle: None,
         error: None,
         outliers: None,
+        required: false,
         behaves: true,
         outcome: String::new(),
     };
     match catch_unwind(AssertUnwindSafe(work)) {
         Err(_) => StressCase { behaves: false, outcome: "it panics".into(), ..empty },
-        Ok(Err(e)) => StressCase { outcome: format!("error: {e}"), ..empty },
+        Ok(Err(e)) => StressCase { outcome: format!("{ERROR}: {e}"), ..empty },
         Ok(Ok((found, None))) => judge(StressCase { oracle: Some(NO_ORACLE.into()), ..empty }, &found, None),
         Ok(Ok((found, Some((name, exact))))) => judge(StressCase { oracle: Some(name.into()), ..empty }, &found, Some(&exact)),
     }
@@ -176,6 +190,20 @@ mod tests {
         assert!(judged(|| Err(Error::data("x", "y", "z"))).behaves);
         assert!(!judged(|| panic!("on purpose")).behaves);
         assert!(!judged(|| Ok((vec![1.0], Some((FLOAT64, Vec::new()))))).behaves);
+    }
+
+    #[test]
+    fn a_device_that_fails_at_everything_does_not_pass() {
+        let fails = |condition: &str| case("p", condition, "l", || Err(Error::backend("device", "it is lost", "Restart it")));
+        let hard = || fails("hard").required_if(false);
+        assert!(hard().behaves && !hard().required);
+        let report = StressReport { cases: vec![hard(), fails("ordinary").required_if(true)] };
+        let failures: Vec<_> = report.failures().collect();
+        assert!(failures.len() == 1 && failures[0].condition == "ordinary" && failures[0].required, "{failures:?}");
+        assert!(failures[0].outcome.contains("it is lost"));
+        let works = case("p", "ordinary", "l", || Ok((vec![1.0], None))).required_if(true);
+        assert!(works.behaves && works.required);
+        assert!(!case("p", "ordinary", "l", || Ok((vec![f32::NAN], None))).required_if(true).behaves);
     }
 
     #[test]

@@ -21,8 +21,8 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
             let exact = values(oracle.as_ref(), job.host, &hard)?;
             Ok((values(tested.as_ref(), job.device, &hard)?, Some((FLOAT64, exact))))
         };
-        note(case("rasterizer", hard.condition, &hard.level, || compare(planes)));
-        note(case("gradients", hard.condition, &hard.level, || compare(gradients)));
+        note(case("rasterizer", hard.condition, &hard.level, || compare(planes)).required_if(hard.ordinary));
+        note(case("gradients", hard.condition, &hard.level, || compare(gradients)).required_if(hard.ordinary));
     }
     Ok(())
 }

@@ -12,10 +12,27 @@ const COUNT: usize = 60;
 /// Gaussians of equal depth.
 const MANY: usize = 3000;
 
+/// Conditions and levels that are ordinary: every device must draw them. Of families of levels those that nothing speaks against, such as the first decade.
+const ORDINARY: [(&str, &str); 11] = [
+    ("an ordinary scene", "-"),
+    ("coordinates far from the origin", "1e2"),
+    ("scales", "1e-2"),
+    ("scales", "1e0"),
+    ("needles", "1e1"),
+    ("opacity at a threshold", "0.99 +0 ulp"),
+    ("opacity of 0 and 1", "logit 1e2"),
+    ("a near plane crossed", "behind the camera"),
+    ("equal depths", "3000"),
+    ("saturated harmonics", "1e3"),
+    ("degenerate cameras", "inside the scene"),
+];
+
 /// A condition at one level.
 pub struct Hard {
     pub condition: &'static str,
     pub level: String,
+    /// Whether it is one of [`ORDINARY`].
+    pub ordinary: bool,
     pub gaussians: HostGaussians,
     pub camera: Camera,
 }
@@ -60,7 +77,8 @@ pub fn all() -> Vec<Hard> {
     let mut add = |condition: &'static str, level: String, camera: Camera, change: &dyn Fn(&mut HostGaussians)| {
         let mut gaussians = cloud(COUNT);
         change(&mut gaussians);
-        list.push(Hard { condition, level, gaussians, camera });
+        let ordinary = ORDINARY.contains(&(condition, level.as_str()));
+        list.push(Hard { condition, level, ordinary, gaussians, camera });
     };
     add("an ordinary scene", "-".into(), camera(0.0), &|_| {});
     for decade in 2..=6 {
@@ -142,4 +160,18 @@ pub fn all() -> Vec<Hard> {
     let inside = Camera::look_at("inside", SIZE, 0.9, [0.05, 0.02, 0.1], [0.0, 0.3, 1.0], [0.0, -1.0, 0.0]);
     add("degenerate cameras", "inside the scene".into(), inside, &|_| {});
     list
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_ordinary_condition_is_tried() {
+        let tried: Vec<Hard> = all();
+        for (condition, level) in ORDINARY {
+            assert_eq!(tried.iter().filter(|hard| hard.ordinary && hard.condition == condition && hard.level == level).count(), 1, "{condition}, {level}");
+        }
+        assert_eq!(tried.iter().filter(|hard| hard.ordinary).count(), ORDINARY.len());
+    }
 }
