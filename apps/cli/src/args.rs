@@ -68,7 +68,8 @@ pub enum Command {
     Plugins(Plugins),
     /// Check this machine: processor, threads, devices, ffmpeg, and an image drawn by two rasterizers.
     Doctor(Doctor),
-    /// Try float32 against float64 under conditions that break floating point. Ends with 5 where a result is neither finite nor an error.
+    /// Try float32 against float64 under conditions that break floating point. Ends with 5 where a result is neither finite nor an error, and where an ordinary
+    /// condition ends with an error.
     Stress(Stress),
     /// Run a grid of scenes, methods, settings, codecs and seeds, and make its tables.
     Sweep(Sweep),
@@ -188,9 +189,12 @@ pub struct Eval {
     /// Rows of the contact sheet, evenly spread over the images; 0 draws none.
     #[arg(long, value_name = "N", default_value_t = 6)]
     pub sheet_rows: usize,
-    /// Also write every render as a PNG file into this folder.
+    /// Also write every render as a PNG file into this folder, 00000.png and on. It must be new or empty.
     #[arg(long, value_name = "DIR")]
     pub renders: Option<PathBuf>,
+    /// Replace the renders of an earlier command in DIR, and a contact sheet that lies in the folder of the scene.
+    #[arg(long)]
+    pub overwrite: bool,
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
@@ -201,7 +205,7 @@ pub struct Report {
     /// The folder of a sweep, a folder of results, or one file of them.
     #[arg(value_name = "DIR")]
     pub results: PathBuf,
-    /// The page; tables are written beside it as .csv, .md and .tex. DIR/report.html by default.
+    /// The page; tables are written beside it as .csv, .md and .tex. DIR/report.html by default. Only files of earlier reports are replaced.
     #[arg(long, value_name = "FILE.html")]
     pub out: Option<PathBuf>,
     /// Heading of the page.

@@ -119,6 +119,17 @@ fn a_scene_goes_through_the_whole_chain() {
     assert!(number("/frame_ms/mean") > 0.0);
     assert_eq!(report["images"].as_array().unwrap().len(), 4);
     assert!(image::open(&sheet).unwrap().width() > 3 * 40);
+    // Neither a contact sheet nor renders replace what is none.
+    let (renders, measure) = (at("renders"), ["eval", text(&archive), "--scene", "procedural:tiny", "-q"]);
+    let draw = [&measure[..], &["--sheet-rows", "0", "--renders", text(&renders)]].concat();
+    assert!(fail(&[&measure[..], &["--sheet", text(&archive)]].concat(), 2).contains("not a PNG image"));
+    succeed(&[&measure[..], &["--sheet", text(&sheet)]].concat());
+    succeed(&draw);
+    assert!(fail(&draw, 2).contains("--overwrite"));
+    succeed(&[&draw[..], &["--overwrite", "--max-views", "1"]].concat());
+    assert_eq!(std::fs::read_dir(&renders).unwrap().count(), 1);
+    assert!(fail(&[&measure[..], &["--renders", text(&dir), "--overwrite"]].concat(), 2).contains("is not a render"));
+    assert!(std::fs::read(&archive).unwrap() == packed && dir.join("checkpoint").is_file());
 
     // The checkpoint evaluates too, and its float32 form is the larger one.
     let plain = json_of(&["eval", text(&dir), "--scene", "procedural:tiny", "-q", "--sheet-rows", "0", "--json"]);

@@ -5,7 +5,8 @@ use crate::args::Eval;
 use crate::interrupt;
 use crate::models::{Loaded, load_model};
 use cc4dgs::scenes::open_as_trained;
-use cc4dgs_core::{Event, EventSink, Limits, Result, Scene, Split};
+use cc4dgs_core::exporter::refuse_other_content;
+use cc4dgs_core::{Error, Event, EventSink, Limits, Result, Scene, Split};
 use cc4dgs_train::data::procedural::{self, ProceduralScene};
 use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
 use cc4dgs_train::images::{Comparison, SheetOptions, comparison_sheet, write_png};
@@ -13,6 +14,9 @@ use cc4dgs_train::trajectory::{MotionScore, motion_scores};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+
+/// The first bytes of every PNG file.
+const PNG: &[u8] = b"\x89PNG\r\n\x1a\n";
 
 /// An evaluation with what it was made from.
 #[derive(Serialize)]
@@ -51,12 +55,20 @@ pub struct Images {
 }
 
 pub fn run(context: &Context, args: &Eval) -> Result<()> {
-    let events = context.listeners(None)?;
-    let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.registry, &context.limits)?;
     let split = args.views.split.into();
     let sheet = args.sheet.clone().unwrap_or_else(|| default_sheet(&args.views.model, split, context.output.json_file()));
     let images = Images { sheet: (args.sheet_rows > 0).then_some(sheet), sheet_rows: args.sheet_rows, renders: args.renders.clone() };
+    if let Some(sheet) = &images.sheet {
+        check_sheet(sheet, &args.views.scene, args.overwrite)?;
+    }
+    let earlier = match &images.renders {
+        Some(folder) => earlier_renders(folder, &args.views.scene, args.overwrite)?,
+        None => Vec::new(),
+    };
+    let events = context.listeners(None)?;
+    let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
+    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.registry, &context.limits)?;
+    earlier.iter().try_for_each(|render| std::fs::remove_file(render).map_err(|e| Error::io(render, e)))?;
     let report =
         measure(context, &args.views.model, &loaded, &scene, Scored { split, max_views: args.max_views, perceptual: args.perceptual }, &images, &events)?;
     context.output.result(&report, || text(&report))
@@ -74,6 +86,49 @@ fn default_sheet(model: &Path, split: Split, json_file: Option<&Path>) -> PathBu
         None if model.is_dir() => model.join(format!("eval-{side}.png")),
         None => model.with_extension(format!("{side}.png")),
     }
+}
+
+/// Refuses a contact sheet in place of a file that is no PNG image, and of one in the folder of the scene, which may be one of its images.
+fn check_sheet(sheet: &Path, scene: &Path, overwrite: bool) -> Result<()> {
+    refuse_other_content(sheet, "a PNG image", |head| head.starts_with(PNG))?;
+    if !overwrite && lies_in(sheet, scene) {
+        let problem = format!("{} exists already in the folder of the scene, and may be one of its images", sheet.display());
+        return Err(Error::parameter("--sheet", problem, "Name another file, or add --overwrite to replace this one"));
+    }
+    Ok(())
+}
+
+/// The renders that an earlier command left in `folder`. A folder that holds anything is refused without `overwrite`; with it, one that holds anything else, and
+/// one in the folder of the scene, whose images may have such names, too.
+fn earlier_renders(folder: &Path, scene: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
+    let refuse = |problem: String, remedy: &str| Err(Error::parameter("--renders", problem, remedy));
+    if folder.symlink_metadata().is_err() {
+        return Ok(Vec::new());
+    }
+    let entries = std::fs::read_dir(folder).and_then(|entries| entries.map(|entry| entry.map(|e| e.path())).collect::<std::io::Result<Vec<_>>>());
+    let mut entries = entries.map_err(|e| Error::io(folder, e))?;
+    entries.sort();
+    let Some(first) = entries.first() else { return Ok(entries) };
+    if !overwrite {
+        let problem = format!("{} is there already, and renders of two commands would mix", first.display());
+        return refuse(problem, "Name another folder, or add --overwrite to replace the renders of an earlier command");
+    }
+    if lies_in(folder, scene) {
+        return refuse(format!("{} holds files and lies in the folder of the scene", folder.display()), "Name another folder: its images are never replaced");
+    }
+    let is_digits = |name: &str| name.len() >= 5 && name.bytes().all(|b| b.is_ascii_digit());
+    let is_render = |path: &Path| path.is_file() && path.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_suffix(".png")).is_some_and(is_digits);
+    if let Some(other) = entries.iter().find(|path| !is_render(path)) {
+        return refuse(format!("{} is not a render", other.display()), "Name another folder: only renders are replaced");
+    }
+    Ok(entries)
+}
+
+/// Whether `path` exists in the folder of the scene at `scene`, or is this folder. Built-in scenes have none.
+fn lies_in(path: &Path, scene: &Path) -> bool {
+    let Ok(scene) = scene.canonicalize() else { return false };
+    let folder = if scene.is_file() { scene.parent() } else { Some(scene.as_path()) };
+    folder.is_some_and(|folder| path.canonicalize().is_ok_and(|path| path.starts_with(folder)))
 }
 
 /// Measures and draws.
@@ -191,4 +246,61 @@ pub fn text(report: &FullReport) -> String {
         lines.push(format!("  contact sheet {}", path.display()));
     }
     lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A folder with a scene of one image, and a path in it.
+    fn place() -> (tempfile::TempDir, impl Fn(&str) -> PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().to_path_buf();
+        std::fs::create_dir_all(root.join("scene/images")).unwrap();
+        std::fs::write(root.join("scene/images/00000.png"), PNG).unwrap();
+        std::fs::write(root.join("scene/transforms.json"), "{}").unwrap();
+        (folder, move |name: &str| root.join(name))
+    }
+
+    #[test]
+    fn a_sheet_replaces_no_model_and_no_image_of_the_scene() {
+        let (_folder, at) = place();
+        let check = |sheet: &str, scene: &str, overwrite| check_sheet(&at(sheet), &at(scene), overwrite).map_err(|e| e.to_string());
+        std::fs::write(at("model.cc4d"), b"\x89CC4D\r\n\x1a").unwrap();
+        std::fs::write(at("model.test.png"), PNG).unwrap();
+        check("new.png", "scene", false).unwrap();
+        check("model.test.png", "scene", false).unwrap();
+        check("scene/new.png", "scene", false).unwrap();
+        for overwrite in [false, true] {
+            assert!(check("model.cc4d", "scene", overwrite).unwrap_err().contains("not a PNG image"));
+            assert!(check("scene/transforms.json", "scene", overwrite).unwrap_err().contains("not a PNG image"));
+        }
+        for scene in ["scene", "scene/transforms.json"] {
+            assert!(check("scene/images/00000.png", scene, false).unwrap_err().contains("--overwrite"));
+            check("scene/images/00000.png", scene, true).unwrap();
+        }
+        check("scene/images/00000.png", "procedural:tiny", false).unwrap();
+    }
+
+    #[test]
+    fn renders_replace_renders_only() {
+        let (_folder, at) = place();
+        let earlier = |folder: &str, overwrite| earlier_renders(&at(folder), &at("scene"), overwrite).map_err(|e| e.to_string());
+        let nothing: Vec<PathBuf> = Vec::new();
+        assert_eq!(earlier("renders", false), Ok(nothing.clone()));
+        std::fs::create_dir(at("renders")).unwrap();
+        assert_eq!(earlier("renders", false), Ok(nothing));
+        std::fs::write(at("renders/00000.png"), PNG).unwrap();
+        std::fs::write(at("renders/100000.png"), PNG).unwrap();
+        assert!(earlier("renders", false).unwrap_err().contains("--overwrite"));
+        assert_eq!(earlier("renders", true), Ok(vec![at("renders/00000.png"), at("renders/100000.png")]));
+        std::fs::write(at("renders/frame_00001.png"), PNG).unwrap();
+        assert!(earlier("renders", true).unwrap_err().contains("frame_00001.png is not a render"));
+        // The folder of the scene, and that of its images, whose names are those of renders.
+        for folder in ["scene", "scene/images"] {
+            assert!(earlier(folder, false).unwrap_err().contains("--overwrite"));
+            assert!(earlier(folder, true).unwrap_err().contains("lies in the folder of the scene"));
+        }
+        assert!(earlier("scene/transforms.json", true).is_err());
+    }
 }

@@ -6,7 +6,7 @@
 mod place;
 
 #[cfg(not(target_arch = "wasm32"))]
-pub use place::{export, refuse_existing};
+pub use place::{export, refuse_existing, refuse_other_content};
 
 use crate::playback::MaxError;
 use crate::plugin::Plugin;

@@ -3,7 +3,11 @@
 
 use super::{ExportSource, ExportTarget, Exported, Exporter};
 use crate::{Error, Result};
+use std::io::Read;
 use std::path::{Path, PathBuf};
+
+/// So much of a file is looked at to tell what it is.
+const HEAD_BYTES: u64 = 4096;
 
 /// Runs `exporter` on a temporary name beside `path`, and renames. Returns what it reported and the bytes on disk. An existing `path` is replaced only if
 /// `overwrite` is set, and a folder only if all it holds has names that the exporter writes.
@@ -55,6 +59,26 @@ pub fn refuse_existing(path: &Path, overwrite: bool) -> Result<()> {
         return Ok(());
     }
     Err(Error::parameter(path.display().to_string(), "it exists already", "Give another name, or --overwrite to replace it"))
+}
+
+/// Refuses a `path` that exists and holds something else than what will be written there. `kind` says what that is ("a PNG image"); `is_kind` tells it by the
+/// first bytes of a file, 4,096 at most. An empty file may be replaced. Call it before long work.
+///
+/// # Errors
+/// [`Error::Parameter`], and [`Error::Io`] for a file that cannot be read.
+pub fn refuse_other_content(path: &Path, kind: &str, is_kind: impl FnOnce(&[u8]) -> bool) -> Result<()> {
+    if path.symlink_metadata().is_err() {
+        return Ok(());
+    }
+    let mut head = Vec::new();
+    let is_file = path.is_file();
+    if is_file {
+        std::fs::File::open(path).and_then(|file| file.take(HEAD_BYTES).read_to_end(&mut head)).map_err(|e| Error::io(path, e))?;
+    }
+    if is_file && (head.is_empty() || is_kind(&head)) {
+        return Ok(());
+    }
+    Err(Error::parameter(path.display().to_string(), format!("it exists already and is not {kind}"), "Give another name: other files are never replaced"))
 }
 
 /// Refuses a `path` that may not be replaced.
@@ -163,5 +187,19 @@ mod tests {
         assert!(run("x", false, dir, "deep/many", true).unwrap_err().to_string().contains("notes.md"));
         assert!(run("x", false, file, "deep/many", true).is_err());
         assert!(run("x", false, dir, "deep/one.txt", true).is_err());
+    }
+
+    #[test]
+    fn files_of_another_kind_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        let check = |path: &Path| refuse_other_content(path, "a list", |head| head.starts_with(b"list"));
+        check(&path).unwrap();
+        for (content, accepted) in [("", true), ("list: 1", true), ("lis", false), ("a model", false)] {
+            std::fs::write(&path, content).unwrap();
+            assert_eq!(check(&path).is_ok(), accepted, "{content}");
+        }
+        let message = check(folder.path()).unwrap_err().to_string();
+        assert!(message.contains("not a list"), "{message}");
     }
 }

@@ -16,9 +16,14 @@ pub use tables::{Cell, Table};
 
 use crate::sweep::{CellResult, PLAN, Plan, RESULTS, SweepFolder, check_comparable, collect, read_results, select};
 use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+
+/// Near the beginning of the Markdown tables, and at that of the LaTeX tables.
+const MARKDOWN_NOTE: &str = "Mean ± sample standard deviation over seeds; best of a column in bold.";
+const LATEX_NOTE: &str = "% Mean and sample standard deviation over seeds.";
 
 /// Whose images a report shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -125,11 +130,8 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let mut links = anchors.clone();
     links.extend([("protocols".to_string(), "protocols".to_string()), ("published".to_string(), "reported by papers".to_string())]);
     let mut body = page::contents(&links) + &page::facts(&results);
-    let mut markdown = format!(
-        "# {}\n\nMean ± sample standard deviation over seeds; best of a column in bold. ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n",
-        text::markdown(&title)
-    );
-    let mut latex = String::from("% Mean and sample standard deviation over seeds. MB are 10^6 bytes.\n");
+    let mut markdown = format!("# {}\n\n{MARKDOWN_NOTE} ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n", text::markdown(&title));
+    let mut latex = format!("{LATEX_NOTE} MB are 10^6 bytes.\n");
     for (i, (scene, rows)) in scenes.iter().enumerate() {
         let table = tables::summary(scene, rows, &columns);
         markdown += &table.markdown();
@@ -168,15 +170,32 @@ fn columns(keys: &[String]) -> Result<Vec<&'static Quantity>> {
     keys.iter().map(found).collect()
 }
 
-/// Makes a report and writes the page to `out`, and the tables beside it as `.csv`, `.md` and `.tex`.
+/// Refuses to replace files that are of no report. The tables are written beside the page, where others may lie, such as a README.md.
+fn refuse_others(out: &Path) -> Result<()> {
+    let starts = |extension: &str, start: &str| {
+        refuse_other_content(&out.with_extension(extension), &format!("the .{extension} of a report"), |head| head.starts_with(start.as_bytes()))
+    };
+    starts("html", page::START)?;
+    starts("csv", tables::CSV_START)?;
+    starts("tex", LATEX_NOTE)?;
+    // Its first line is the title.
+    refuse_other_content(&out.with_extension("md"), "the .md of a report", |head| String::from_utf8_lossy(head).contains(MARKDOWN_NOTE))
+}
+
+/// Makes a report and writes the page to `out`, and the tables beside it as `.csv`, `.md` and `.tex`. Files of earlier reports are replaced, others are not.
 ///
 /// # Errors
-/// As [`report`], and [`Error::Io`]; [`Error::Parameter`] where `out` does not end in `.html`.
+/// As [`report`], and [`Error::Io`]; [`Error::Parameter`] where `out` does not end in `.html`, and where a file exists that is of no report.
 pub fn write_report(path: &Path, out: &Path, options: &ReportOptions) -> Result<ReportFiles> {
     if out.extension().is_none_or(|extension| extension != "html") {
         return Err(Error::parameter("--out", format!("{} does not end in .html", out.display()), "Name an HTML file; the tables are written beside it"));
     }
+    refuse_others(out)?;
     let report = report(path, options)?;
+    if let Some(folder) = &options.figures {
+        let is_plot = |head: &[u8]| head.starts_with(b"<svg ");
+        report.figures.iter().try_for_each(|(name, _)| refuse_other_content(&folder.join(name), "an SVG image", is_plot))?;
+    }
     if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
     }

@@ -8,10 +8,11 @@ use std::fmt::Write;
 /// The page around `body`. Nothing is loaded from anywhere: the content security policy forbids it.
 pub fn page(title: &str, body: &str) -> String {
     let title = html(title);
-    format!(
-        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n<title>{title}</title>\n<style>\n{STYLE}</style></head><body>\n<h1>{title}</h1>\n{body}<script>\n{SCRIPT}</script>\n</body></html>\n"
-    )
+    format!("{START}<title>{title}</title>\n<style>\n{STYLE}</style></head><body>\n<h1>{title}</h1>\n{body}<script>\n{SCRIPT}</script>\n</body></html>\n")
 }
+
+/// What every page begins with.
+pub const START: &str = "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n";
 
 const STYLE: &str = concat!(include_str!("page.css"), include_str!("plot.css"));
 const SCRIPT: &str = include_str!("page.js");

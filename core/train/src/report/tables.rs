@@ -166,10 +166,13 @@ impl Table {
     }
 }
 
+/// The first columns of the CSV table.
+pub const CSV_START: &str = "scene,method,setting,codec,outcome,seeds";
+
 /// All rows of all scenes as CSV: the axes, the number of seeds, then mean, sample standard deviation, least and largest value of every quantity. Missing
 /// values are empty.
 pub fn csv(scenes: &BTreeMap<&str, Vec<Row>>) -> String {
-    let mut head: Vec<String> = ["scene", "method", "setting", "codec", "outcome", "seeds"].map(str::to_string).to_vec();
+    let mut head: Vec<String> = CSV_START.split(',').map(str::to_string).collect();
     head.extend(QUANTITIES.iter().flat_map(|q| ["mean", "deviation", "low", "high"].map(|part| format!("{}_{part}", q.key))));
     let mut out = head.join(",") + "\n";
     for row in scenes.values().flatten() {

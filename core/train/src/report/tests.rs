@@ -123,6 +123,27 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
 }
 
 #[test]
+fn a_report_replaces_reports_only() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), &sweep(folder.path()));
+    let out = folder.path().join("page/README.html");
+    let options = ReportOptions { images: ImageChoice::None, figures: Some(folder.path().join("svg")), ..Default::default() };
+    let make = || write_report(folder.path(), &out, &options);
+    let files = make().unwrap();
+    make().unwrap();
+    let plot = &files.figures[0];
+    for file in [&files.html, &files.csv, &files.markdown, &files.latex, plot] {
+        let made = std::fs::read(file).unwrap();
+        std::fs::write(file, "<p>mine</p>\n# Mine\n").unwrap();
+        let message = make().unwrap_err().to_string();
+        assert!(message.contains(&file.display().to_string()) && message.contains("exists already"), "{message}");
+        assert_eq!(std::fs::read_to_string(file).unwrap(), "<p>mine</p>\n# Mine\n");
+        std::fs::write(file, made).unwrap();
+    }
+    make().unwrap();
+}
+
+#[test]
 fn profiles_of_a_codec_are_joined_to_a_curve() {
     let folder = tempfile::tempdir().unwrap();
     let mut cells = sweep(folder.path());
