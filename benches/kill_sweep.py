@@ -47,6 +47,12 @@ def kill(process, number):
         return False
 
 
+def program(folder):
+    """Version and commit of the program that planned a sweep, which no other program runs."""
+    plan = json.loads((folder / "plan.json").read_text())
+    return {"version": plan["version"], "commit": plan["commit"]}
+
+
 def results(folder):
     """Result files by name, without what differs between equal runs."""
     found = {}
@@ -133,8 +139,8 @@ def main():
         wrong += compare(whole, killed)
         resumed += sum(json.loads(file.read_text())["cost"]["resumed"] > 0 for file in (killed / "results").iterdir())
         print(f"round {rounds}: complete after {sum(hits.values())} kills and {runs} runs; {'; '.join(wrong) or 'the same bytes'}", flush=True)
-    report = {"kills": sum(hits.values()), "ways": hits, "runs": runs, "rounds": rounds, "cells": cells, "cells_of_resumed_trainings": resumed,
-              "undisturbed_seconds": round(undisturbed, 1), "wrong": wrong}
+    report = {**program(whole), "kills": sum(hits.values()), "ways": hits, "runs": runs, "rounds": rounds, "cells": cells,
+              "cells_of_resumed_trainings": resumed, "undisturbed_seconds": round(undisturbed, 1), "wrong": wrong}
     print(json.dumps(report, indent=1))
     if options.json:
         options.json.write_text(json.dumps(report, indent=1) + "\n")

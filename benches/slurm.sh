@@ -101,7 +101,7 @@ sys.path.insert(0, here)
 import kill_sweep
 wrong = kill_sweep.compare(out / "pool", out / "array")
 cells = [json.loads(file.read_text()) for file in (out / "array" / "results").iterdir()]
-report = {"scheduler": "slurm", "cells": len(cells), "tasks": len({cell["training"] for cell in cells}),
+report = {**kill_sweep.program(out / "array"), "scheduler": "slurm", "cells": len(cells), "tasks": len({cell["training"] for cell in cells}),
           "requeued_tasks": 1, "cells_of_resumed_trainings": sum(cell["cost"]["resumed"] > 0 for cell in cells), "wrong": wrong}
 (out / "slurm.json").write_text(json.dumps(report, indent=1) + "\n")
 print(json.dumps(report, indent=1))

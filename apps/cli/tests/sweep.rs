@@ -97,6 +97,8 @@ fn a_grid_becomes_tables() {
     let stored: Value = serde_json::from_slice(&std::fs::read(pool.join("results").join(&whole[0].0)).unwrap()).unwrap();
     let peaks = ["training_peak_memory_mb", "cell_peak_memory_mb"].map(|key| stored["cost"][key].as_f64());
     assert!(peaks.iter().all(|peak| *peak > Some(1.0)) || !cfg!(target_os = "linux"), "{}", stored["cost"]);
+    let trained = &stored["cost"]["training_devices"];
+    assert!(trained.as_array().unwrap().len() == 1 && trained[0]["threads"] == 1 && trained[0]["host"].is_string(), "{trained}");
     assert!(kept.len() == 2 && kept.iter().all(|name| pool.join(name).is_file()), "{kept:?}");
     let protocol = &result["metrics"]["psnr_db"]["protocol"];
     assert!(protocol["rounding"] == "eight-bit" && protocol["frames"]["count"] == 2, "{protocol}");
@@ -154,11 +156,16 @@ fn plans_are_by_content_and_mistakes_are_named() {
         ("iterations = 90", "minutes = 2.0", "auto"),
         ("preset = '+none'", "preset = '+'", "same training"),
         ("images = 1", "image = 1", "image"),
+        ("images = 1", "set = ['device=wgpu']", "top of the grid"),
+        ("iterations = 90", "set = ['seed=3']", "seeds = [0]"),
     ] {
         let said = plan(&GRID.replace(from, to), "wrong").unwrap_err();
         assert!(said.contains(expected), "{to}: {said}");
     }
     assert!(!folder.path().join("wrong").exists(), "a refused plan leaves nothing behind");
+    let sized = GRID.replace("iterations = 90", "minutes = 2.0").replace("family = 'demo'", "").replace("preset = '+none'", "preset = '+none'\nsize = 3.0");
+    std::fs::write(folder.path().join("sized.toml"), sized).unwrap();
+    assert_eq!(succeed(&["sweep", "plan", text(&folder.path().join("sized.toml"))])["minutes"], 8.0, "sizes count");
     let out = folder.path().join("a");
     assert!(fail(&["sweep", "run", text(&out), "--index", "2"], 2).contains("the plan has 2"));
     assert!(fail(&["sweep", "run", text(&out), "--cell", "0"], 2).contains("no such cell"));
@@ -181,8 +188,6 @@ fn the_grids_of_the_studies_expand() {
         for dataset in ["dnerf_mutant", "panoptic_basketball"] {
             text_of_grid = text_of_grid.replace(&format!("$CC4DGS_DATA/{dataset}"), "procedural:tiny");
         }
-        // Scenes that become the same one still differ in their options, if not in their data.
-        text_of_grid = text_of_grid.replace("name = \"basketball\"\n", "name = \"basketball\"\nsize = 1.5\n");
         // Paths in a grid are relative to the working directory.
         text_of_grid = text_of_grid.replace("config = \"benches", &format!("config = \"{}", grids.parent().unwrap().display()));
         let grid = folder.path().join(path.file_name().unwrap());

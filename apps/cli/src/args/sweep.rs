@@ -60,6 +60,9 @@ pub struct SweepRun {
     /// Leave a training that another process works on (exit code 75) instead of waiting.
     #[arg(long, hide = true)]
     pub no_wait: bool,
+    /// Processes that share the memory of this machine, this one included.
+    #[arg(long, hide = true, value_name = "N", default_value_t = 1)]
+    pub processes: usize,
 }
 
 #[derive(Debug, Args)]
@@ -106,7 +109,7 @@ pub struct SweepEmit {
     /// Memory of a job in GB.
     #[arg(long, value_name = "GB", default_value_t = 8)]
     pub memory_gb: u32,
-    /// Time limit of a job in minutes.
+    /// Time limit of a job in minutes. A job that reaches it leaves a checkpoint and goes on later.
     #[arg(long, value_name = "M", default_value_t = 240)]
     pub time_limit: u32,
     /// Jobs at a time; 0 leaves it to the scheduler.

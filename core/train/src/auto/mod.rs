@@ -4,6 +4,7 @@
 mod calibrate;
 mod choose;
 mod facts;
+mod memory;
 
 pub use choose::{Choice, Machine};
 pub use facts::{Arrangement, Facts};
@@ -103,6 +104,14 @@ impl Plan {
 /// # Errors
 /// What configuration, reader and images report.
 pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn EventSink) -> Result<(RunConfig, Arc<Scene>)> {
+    open_shared(path, layers, registry, events, 1)
+}
+
+/// As [`open`], where `processes` processes, this one included, share the memory of the machine.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &dyn EventSink, processes: usize) -> Result<(RunConfig, Arc<Scene>)> {
     let asked = layers.config()?;
     let read = |config: &RunConfig| Ok::<_, Error>(Arc::new(data::open(path, &config.scene, registry, &config.limits)?));
     if !layers.want_plan() {
@@ -114,7 +123,8 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
     let mut plan = Plan::default();
     let device = if layers.state("device") { asked.device.clone() } else { auto_device().0.to_string() };
     plan.add(Choice { settings: vec![("device", device.clone().into())], reason: auto_device().1 })?;
-    let machine = Machine { threads: rayon::current_num_threads(), graphics: !matches!(device.as_str(), "flex" | "ndarray"), memory: memory() };
+    let graphics = !matches!(device.as_str(), "flex" | "ndarray");
+    let machine = Machine { threads: rayon::current_num_threads(), graphics, memory: memory::memory(processes) };
     let minutes = asked.auto.minutes.unwrap_or(MINUTES[usize::from(machine.graphics)]);
     let mut scene = read(&asked)?;
     if let Some(choice) = choose::image_size(native_size(&scene), &asked.scene, machine, minutes) {
@@ -124,7 +134,8 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
     step(1);
     let facts = Facts::of(&scene)?;
     step(2);
-    if let Some(choice) = choose::cache(&facts, scene.views.len(), &asked.scene, machine).filter(|_| !layers.state("scene.cache_mb")) {
+    let cache = memory::cache(scene.views.len(), facts.pixels(), asked.scene.cache_mb, machine.memory);
+    if let Some(choice) = cache.filter(|_| !layers.state("scene.cache_mb")) {
         plan.add(choice)?;
         scene = read(&layers.over(&plan.table).config()?)?;
     }
@@ -215,19 +226,6 @@ fn native_size(scene: &Scene) -> [u32; 2] {
     let mut sizes: Vec<[u32; 2]> = scene.cameras.iter().map(|c| [c.width, c.height]).collect();
     sizes.sort_unstable_by_key(|size| u64::from(size[0]) * u64::from(size[1]));
     sizes.get(sizes.len() / 2).copied().unwrap_or([1, 1])
-}
-
-/// Files with the limit of memory of a container, of both versions of control groups.
-const MEMORY_LIMITS: [&str; 2] = ["/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"];
-
-/// Memory in bytes that this process may use, where the system says: that of the machine, or of its container.
-fn memory() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
-    let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
-    let machine = line.split_whitespace().next()?.parse::<u64>().ok()?.saturating_mul(1024);
-    // Where there is no limit they say so in words or by a huge number.
-    let limits = MEMORY_LIMITS.iter().filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse::<u64>().ok());
-    limits.chain([machine]).min()
 }
 
 #[cfg(test)]

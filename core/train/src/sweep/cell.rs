@@ -159,6 +159,7 @@ impl<'a> Trained<'a> {
             curve: finished.curve.clone(),
             cost: Cost {
                 training_seconds: finished.seconds,
+                training_devices: finished.devices.clone(),
                 stage_seconds: finished.stage_seconds.clone(),
                 resumed: finished.resumed,
                 curve_seconds: finished.curve_seconds.clone(),

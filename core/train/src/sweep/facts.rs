@@ -1,7 +1,7 @@
 //! What a sweep runs on: datasets by content, devices by name.
 
 use super::hash::ContentHash;
-use super::result::{DataFingerprint, DeviceFacts};
+use super::result::{DataFingerprint, DeviceFacts, TrainingDevice};
 use cc4dgs_core::{Error, Registry, Result, adapters, auto_device};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -150,6 +150,12 @@ pub fn device_facts(name: &str) -> DeviceFacts {
         threads: rayon::current_num_threads(),
         system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
     }
+}
+
+/// The device `name` of this machine, and the machine's name.
+pub(super) fn training_device(name: &str) -> TrainingDevice {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").ok().or_else(|| std::env::var("COMPUTERNAME").ok());
+    TrainingDevice { device: device_facts(name), host: host.unwrap_or_default().trim().into() }
 }
 
 /// Model of the processor, where the system has a file that says.

@@ -1,6 +1,7 @@
 //! A grid: scenes x methods x settings x codecs x seeds, as a TOML file. `docs/sweeps.md` describes the keys.
 
 use super::facts::locate;
+use super::overruled::refuse_overruled;
 use super::result::CodecChoice;
 use crate::auto::PRESET as AUTO;
 use cc4dgs_core::{Error, Result, Split, config};
@@ -237,7 +238,13 @@ impl Grid {
     /// # Errors
     /// [`Error::Parameter`] that names the key or value and the remedy.
     pub fn parse(object: &str, text: &str) -> Result<Self> {
-        let table = config::parse_table(object, text)?;
+        Self::of_table(object, config::parse_table(object, text)?)
+    }
+    /// As [`Grid::parse`], from TOML that has been read.
+    ///
+    /// # Errors
+    /// As [`Grid::parse`].
+    pub fn of_table(object: &str, table: toml::Table) -> Result<Self> {
         let grid: Self = table.try_into().map_err(|e: toml::de::Error| {
             let keys = "docs/sweeps.md lists the keys of a grid and of its tables [[scene]], [[method]], [[setting]] and [[codec]]";
             Error::parameter(object, e.message().trim().to_string(), keys)
@@ -294,7 +301,7 @@ impl Grid {
         if cells > MOST_CELLS {
             return bad("grid", format!("{cells} cells, at most {MOST_CELLS} are possible"), "Make several grids of it");
         }
-        Ok(())
+        refuse_overruled(object, self)
     }
 }
 

@@ -13,6 +13,7 @@ mod grid;
 mod hash;
 mod lines;
 mod lock;
+mod overruled;
 mod plan;
 mod read;
 mod result;
@@ -30,7 +31,7 @@ pub use plan::{PLAN, Plan, PlannedCell, PlannedTraining};
 pub use read::{RESULTS, check_comparable, read_results};
 pub use result::{
     Axes, Blocks, CellResult, CodecChoice, Cost, Curve, DataFingerprint, DeviceFacts, FrameMs, ImageResult, KIND, Outcome, ResultProvenance, SCHEMA, Score,
-    Storage, StreamBytes,
+    Storage, StreamBytes, TrainingDevice,
 };
 pub use run::{Busy, TrainingState, run_training, summary};
 pub(crate) use table::csv_field;

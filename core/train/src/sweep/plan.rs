@@ -40,6 +40,9 @@ pub struct PlannedTraining {
     pub preset: String,
     /// Overrides of the preset, in order.
     pub sets: Vec<String>,
+    /// Wall minutes that it is to take, where the grid is sized in minutes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub minutes: Option<f64>,
     /// The dataset.
     pub data: DataFingerprint,
     /// Names and sizes of its files.
@@ -92,8 +95,6 @@ pub struct Plan {
     pub max_views: usize,
     /// Images of each cell that are kept.
     pub images: usize,
-    /// Wall minutes that the grid states for a training of size 1.
-    pub minutes: Option<f64>,
     /// The trainings, in the order of their indices.
     pub trainings: Vec<PlannedTraining>,
     /// The cells, those of a training together.
@@ -117,7 +118,6 @@ impl Plan {
             split: grid.split,
             max_views: grid.max_views,
             images: grid.images,
-            minutes: grid.minutes,
             trainings: Vec::new(),
             cells: Vec::new(),
         };
@@ -143,6 +143,10 @@ impl Plan {
             }
         }
         Ok(plan)
+    }
+    /// Wall minutes that all trainings together are to take, each by its size; `None` where the grid is not sized in minutes.
+    pub fn minutes(&self) -> Option<f64> {
+        self.trainings.iter().map(|training| training.minutes).sum()
     }
     /// The cells of a training.
     pub fn cells_of<'a>(&'a self, training: &'a str) -> impl Iterator<Item = &'a PlannedCell> {
@@ -250,15 +254,14 @@ fn planned(
     if let Some(iterations) = grid.iterations {
         sets.push(format!("train.iterations={}", (iterations as f64 * size).round().max(1.0)));
     }
-    if let Some(minutes) = grid.minutes {
-        sets.push(format!("auto.minutes={:?}", minutes * size));
-    }
+    let minutes = grid.minutes.map(|minutes| minutes * size);
+    sets.extend(minutes.map(|minutes| format!("auto.minutes={minutes:?}")));
     if grid.validation_views() > 0 {
         sets.push(format!("train.validation={}", grid.validation_views()));
     }
     sets.extend([format!("device={}", grid.device), format!("seed={seed}")]);
     let (scene, method, setting) = (scene.name.clone(), method.name.clone(), setting.name.clone());
-    Ok(PlannedTraining { id: String::new(), scene, method, setting, seed, preset, sets, data, listing })
+    Ok(PlannedTraining { id: String::new(), scene, method, setting, seed, preset, sets, minutes, data, listing })
 }
 
 /// The configuration as far as it is known before the scene is looked at: all of it, or what the preset `auto` is told.
@@ -285,7 +288,7 @@ fn at(training: &PlannedTraining, error: Error) -> Error {
 }
 
 /// `error` with where it happened.
-fn within(place: &str, error: Error) -> Error {
+pub(super) fn within(place: &str, error: Error) -> Error {
     match error {
         Error::Parameter { object, problem, remedy } => Error::parameter(format!("{place}: {object}"), problem, remedy),
         other => other,
@@ -293,111 +296,4 @@ fn within(place: &str, error: Error) -> Error {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
-    use super::*;
-
-    pub(in crate::sweep) fn grid(text: &str) -> Grid {
-        let base = "name = 'g'\n[[scene]]\nname = 'tiny'\npath = 'procedural:tiny'\nfamily = 'demo'\n";
-        let (top, tables) = text.split_once("---").unwrap_or(("", text));
-        Grid::parse("g.toml", &format!("{top}{base}{tables}")).unwrap()
-    }
-    fn expand(text: &str) -> Result<Plan> {
-        Plan::expand(&grid(text), &Registry::collect().unwrap(), &|_| Ok(()))
-    }
-    const METHODS: &str = "[[method]]\nname = 'own'\npreset = '+'\n[[method]]\nname = 'planes'\npreset = '+hexplane'\n";
-    // This crate links no codecs, so grids of its own tests have none that could be built; the plan of trainings is what is tested here.
-    const CODEC: &str = "[[codec]]\nname = 'c'\ncodec = 'none-linked'\n";
-
-    /// The plan of trainings of a grid whose codecs are not built.
-    fn trainings(text: &str) -> Result<Vec<(PlannedTraining, toml::Table)>> {
-        let (grid, registry) = (grid(text), Registry::collect().unwrap());
-        let data = fingerprint(&grid.scene[0].own.path, &registry)?;
-        let mut all = Vec::new();
-        for (method, setting) in grid.method.iter().flat_map(|m| grid.setting.iter().map(move |s| (m, s))) {
-            for &seed in &grid.seeds {
-                let training = planned(&grid, &grid.scene[0], method, setting, seed, data.clone(), String::new())?;
-                let layers = training.layers(&registry)?;
-                layers.config().map_err(|error| at(&training, error))?;
-                all.push((training, layers.table().clone()));
-            }
-        }
-        Ok(all)
-    }
-
-    #[test]
-    fn axes_are_multiplied_and_sized() {
-        let text = format!(
-            "iterations = 100\nseeds = [3, 4]\nset = ['train.batch=2']\n---{METHODS}[[setting]]\nname = 'small'\n[[setting]]\nname = 'large'\nsize = 2.5\nset = ['train.sh_degree=1']\n{CODEC}"
-        );
-        let all = trainings(&text).unwrap();
-        assert_eq!(all.len(), 8);
-        let labels: Vec<String> = all.iter().map(|(t, _)| t.label()).collect();
-        assert_eq!((labels[0].as_str(), labels[7].as_str()), ("tiny own small seed 3", "tiny planes large seed 4"));
-        assert_eq!((all[0].0.preset.as_str(), all[4].0.preset.as_str()), ("demo", "demo+hexplane"));
-        let train = |index: usize, key: &str| all[index].1["train"][key].as_integer().unwrap();
-        assert_eq!((train(0, "iterations"), train(2, "iterations"), train(2, "sh_degree"), train(7, "batch")), (100, 250, 1, 2));
-        assert_eq!((all[1].1["seed"].as_integer(), all[1].1["device"].as_str()), (Some(4), Some("flex")));
-        let validation = trainings(&format!("split = 'validation'\n---{METHODS}{CODEC}")).unwrap();
-        assert_eq!(validation[0].1["train"]["validation"].as_integer(), Some(12));
-    }
-
-    #[test]
-    fn mistakes_name_their_place() {
-        let wrong = format!("{METHODS}[[setting]]\nname = 'typo'\nset = ['train.iteratons=5']\n{CODEC}");
-        let message = trainings(&wrong).unwrap_err().to_string();
-        assert!(message.contains("tiny own typo") && message.contains("iteratons"), "{message}");
-        let message = expand(&format!("{METHODS}{CODEC}")).unwrap_err().to_string();
-        assert!(message.contains("codec 'c'") && message.contains("none-linked"), "{message}");
-    }
-
-    #[test]
-    fn plans_are_read_strictly() {
-        let folder = tempfile::tempdir().unwrap();
-        assert!(Plan::read(folder.path()).unwrap_err().to_string().contains("sweep plan"));
-        let plan = example();
-        plan.write(folder.path()).unwrap();
-        assert_eq!(Plan::read(folder.path()).unwrap(), plan);
-        plan.check_program().unwrap();
-        let other = Plan { commit: "other".into(), ..plan.clone() };
-        let message = other.check_program().unwrap_err().to_string();
-        assert!(message.contains("other") && message.contains("Plan again"), "{message}");
-        let write = |from: &str, to: &str| {
-            let text = std::fs::read_to_string(folder.path().join(PLAN)).unwrap();
-            std::fs::write(folder.path().join(PLAN), text.replace(from, to)).unwrap();
-            Plan::read(folder.path()).unwrap_err()
-        };
-        assert!(write("00000000000000c0", "../../etc/passwd").to_string().contains("passwd"));
-        assert!(matches!(write("\"schema\": 1", "\"schema\": 9"), Error::Unsupported { .. }));
-        assert!(matches!(write(KIND, "other"), Error::Data { .. }));
-    }
-
-    /// A plan of one training with two cells.
-    pub(in crate::sweep) fn example() -> Plan {
-        let (version, commit) = code::version();
-        let choice = CodecChoice { codec: "raw".into(), field_weights: "fp32".into(), settings: toml::Table::new() };
-        let cell = |id: &str, codec: &str| PlannedCell { id: id.into(), training: "00000000000000a0".into(), codec: codec.into(), choice: choice.clone() };
-        Plan {
-            kind: KIND.into(),
-            schema: SCHEMA,
-            name: "g".into(),
-            version: version.into(),
-            commit: commit.into(),
-            split: ScoredViews::Test,
-            max_views: 0,
-            images: 0,
-            minutes: None,
-            trainings: vec![PlannedTraining {
-                id: "00000000000000a0".into(),
-                scene: "tiny".into(),
-                method: "own".into(),
-                setting: "base".into(),
-                seed: 0,
-                preset: "demo".into(),
-                sets: Vec::new(),
-                data: DataFingerprint { path: "procedural:tiny".into(), hash: "0".into(), files: 0, bytes: 0 },
-                listing: String::new(),
-            }],
-            cells: vec![cell("00000000000000c0", "raw"), cell("00000000000000c1", "half")],
-        }
-    }
-}
+pub(super) mod tests;

@@ -132,7 +132,8 @@ fn images(result: &CellResult) -> Vec<(&str, usize)> {
     result.images.iter().map(|image| (image.camera.as_str(), image.frame)).collect()
 }
 
-fn describe(device: &super::result::DeviceFacts) -> String {
+/// A device in words.
+pub(super) fn describe(device: &super::result::DeviceFacts) -> String {
     let adapter = device.adapter.as_ref().map_or_else(String::new, |name| format!(" on {name}, driver {}", device.driver.as_deref().unwrap_or("unknown")));
     let processor = if device.processor.is_empty() { "unknown processor" } else { &device.processor };
     format!("{}{adapter}, {processor}, {} threads, {}", device.name, device.threads, device.system)

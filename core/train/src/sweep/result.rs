@@ -110,7 +110,7 @@ pub struct ResultProvenance {
     pub codec: CodecChoice,
     /// The dataset.
     pub data: DataFingerprint,
-    /// What it was computed on.
+    /// What the cell was stored, read and scored on; [`Cost::training_devices`] has those of the training.
     pub device: DeviceFacts,
 }
 
@@ -139,7 +139,7 @@ pub struct DataFingerprint {
     pub bytes: u64,
 }
 
-/// What a result was computed on. Results of different devices are not put into one table.
+/// What a result was computed on: in [`ResultProvenance`], what it was stored, read and scored on. Results of different devices are not put into one table.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DeviceFacts {
     /// Name of the device: `flex`, `ndarray`, `wgpu`, `cuda`.
@@ -154,6 +154,16 @@ pub struct DeviceFacts {
     pub threads: usize,
     /// Operating system and architecture, such as `linux x86_64`.
     pub system: String,
+}
+
+/// What a training was computed on. The process that scores its cells may be another one.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TrainingDevice {
+    /// The device.
+    #[serde(flatten)]
+    pub device: DeviceFacts,
+    /// Name of the machine; empty if unknown.
+    pub host: String,
 }
 
 /// The mean of a metric over the scored images.
@@ -249,6 +259,9 @@ impl Curve {
 pub struct Cost {
     /// The training with all that belongs to it, repeated work after interruptions included.
     pub training_seconds: f64,
+    /// What [`Cost::training_seconds`] were spent on: a device per process that worked on the training, each different one once. Empty in older results.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub training_devices: Vec<TrainingDevice>,
     /// Stages of the training: `coarse`, `score`, `main`.
     pub stage_seconds: BTreeMap<String, f64>,
     /// Times at which the training went on after an interruption.

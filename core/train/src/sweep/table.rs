@@ -1,6 +1,6 @@
 //! Tables of results: mean and spread over seeds, as Markdown and CSV.
 
-use super::read::check_comparable;
+use super::read::{check_comparable, describe};
 use super::result::{CellResult, Outcome};
 use cc4dgs_core::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
@@ -96,13 +96,14 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     let _ = writeln!(
         text,
         "Mean and sample standard deviation over seeds. Device {}{adapter}, {}, {} threads, {}. Commit {}. Scored on {} views, images rounded to 8 bits. \
-         Seconds and milliseconds are wall time on that machine; MB are 10^6 bytes.",
+         Seconds and milliseconds are wall time on that machine; MB are 10^6 bytes.{}",
         device.name,
         if device.processor.is_empty() { "unknown processor" } else { &device.processor },
         device.threads,
         device.system,
         commits.into_iter().collect::<Vec<_>>().join(", "),
         format!("{:?}", first.split).to_lowercase(),
+        training_devices(results),
     );
     let scenes: BTreeSet<&str> = rows.iter().map(|row| row.axes[0]).collect();
     for scene in scenes {
@@ -131,6 +132,24 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
         }
     }
     Ok(text)
+}
+
+/// A sentence on what the trainings ran on, where that is not the device that scored them; else nothing.
+fn training_devices(results: &[CellResult]) -> String {
+    let all = || results.iter().flat_map(|result| result.cost.training_devices.iter().map(move |trained| (result, trained)));
+    if all().all(|(result, trained)| trained.device == result.provenance.device) {
+        return String::new();
+    }
+    let mut devices: BTreeMap<String, (BTreeSet<&str>, BTreeSet<&str>)> = BTreeMap::new();
+    for (result, trained) in all() {
+        let (hosts, trainings) = devices.entry(describe(&trained.device)).or_default();
+        hosts.insert(if trained.host.is_empty() { "unknown" } else { trained.host.as_str() });
+        trainings.insert(result.training.as_str());
+    }
+    let part = |(device, (hosts, trainings)): (String, (BTreeSet<&str>, BTreeSet<&str>))| {
+        format!("{device}, host {} (trainings: {})", hosts.into_iter().collect::<Vec<_>>().join(", "), trainings.len())
+    };
+    format!(" Training seconds are wall time on {}.", devices.into_iter().map(part).collect::<Vec<_>>().join("; "))
 }
 
 /// One CSV table of all results: mean and deviation over seeds of every metric.
@@ -224,6 +243,18 @@ mod tests {
         let mut gap = results;
         gap[1].metrics.remove("ssim");
         assert!(markdown(&gap).unwrap().contains("| cdf | base | cca | 2 | 31.00 ± 1.41 | - |"));
+    }
+
+    #[test]
+    fn trainings_on_other_devices_are_stated() {
+        let mut results = two_seeds();
+        assert!(!markdown(&results).unwrap().contains("Training seconds"), "all ran where they were scored");
+        results[1].cost.training_devices.clear();
+        assert!(!markdown(&results).unwrap().contains("Training seconds"), "older results do not say");
+        (results[0].training, results[0].cost.training_devices[0].device.threads) = ("other".into(), 8);
+        let table = markdown(&results).unwrap();
+        assert!(table.contains("Training seconds are wall time on flex, Example processor, 1 threads, linux x86_64, host node-1 (trainings: 1)"), "{table}");
+        assert!(table.contains("; flex, Example processor, 8 threads, linux x86_64, host node-1 (trainings: 1)."), "{table}");
     }
 
     #[test]

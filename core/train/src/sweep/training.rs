@@ -1,9 +1,9 @@
 //! Runs a training of a sweep, or goes on with one that was interrupted.
 
-use super::facts::{PeakMemory, listing, locate};
+use super::facts::{PeakMemory, listing, locate, training_device};
 use super::folder::SweepFolder;
 use super::plan::PlannedTraining;
-use super::result::{Curve, Outcome};
+use super::result::{Curve, Outcome, TrainingDevice};
 use crate::auto;
 use crate::checkpoint::read_config;
 use crate::checks::Verdict;
@@ -21,6 +21,8 @@ use std::sync::atomic::AtomicBool;
 
 /// What a finished training leaves beside its checkpoint.
 pub const FINISHED: &str = "training.json";
+/// Where the processes that work on a training say what they compute on.
+const DEVICES: &str = "devices.json";
 /// Checkpoints on the way, where the grid does not say: one in so many of the iterations, and between so many iterations.
 const CHECKPOINTS: usize = 8;
 const CHECKPOINT_EVERY: [usize; 2] = [50, 2000];
@@ -38,6 +40,8 @@ pub(super) struct FinishedTraining {
     pub stage_seconds: BTreeMap<String, f64>,
     pub resumed: usize,
     pub peak_memory_mb: Option<f64>,
+    #[serde(default)]
+    pub devices: Vec<TrainingDevice>,
 }
 
 /// What runs need.
@@ -50,6 +54,8 @@ pub struct Worker<'a> {
     pub stop: &'a AtomicBool,
     /// Limits of this machine over those of the grid, each `KEY=VALUE`. They decide what is refused and change no result.
     pub limits: &'a [String],
+    /// Processes that share the memory of this machine, this one included: plans of the preset `auto` count on an equal part.
+    pub processes: usize,
 }
 
 impl Worker<'_> {
@@ -93,15 +99,16 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let events = Both(&log, worker.events);
     let limits: Vec<String> = worker.limits.iter().map(|limit| format!("limits.{limit}")).collect();
     let (config, scene) = if begun {
-        auto::open(&path, &Layers::collect(worker.registry, None, Some(&own), &limits)?, worker.registry, &events)?
+        auto::open_shared(&path, &Layers::collect(worker.registry, None, Some(&own), &limits)?, worker.registry, &events, worker.processes)?
     } else {
         let layers = Layers::collect(worker.registry, Some(&training.preset), None, &[&training.sets[..], &limits].concat())?;
-        let (mut config, scene) = auto::open(&path, &layers, worker.registry, &events)?;
+        let (mut config, scene) = auto::open_shared(&path, &layers, worker.registry, &events, worker.processes)?;
         if !layers.state("train.checkpoint_every") {
             config.train.checkpoint_every = (config.train.iterations / CHECKPOINTS).clamp(CHECKPOINT_EVERY[0], CHECKPOINT_EVERY[1]);
         }
         (config, scene)
     };
+    let devices = note_device(&run.join(DEVICES), begun, training_device(&config.device))?;
     let job =
         TrainJob { config: &config, scene, out: Some(run.clone()), resume, registry: worker.registry, events: &events, stop: worker.stop, observer: None };
     let (outcome, message, verdict, iterations) = match train(&job) {
@@ -124,12 +131,25 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
         stage_seconds: history.stage_seconds,
         resumed: history.resumed,
         peak_memory_mb: memory.mb(),
+        devices,
     };
     let json =
         serde_json::to_string(&finished).map_err(|e| Error::backend("training", e.to_string(), "Report this: every training should have a JSON form"))?;
     write_atomically(&record, json.as_bytes())?;
     // From the file, as after an interruption: numbers that went through JSON may differ in the last digit.
     read_finished(&record)
+}
+
+/// Adds `device` to the devices that `file` has of a training, unless it is there, and returns all of them. A training that has not `begun` has none yet.
+fn note_device(file: &Path, begun: bool, device: TrainingDevice) -> Result<Vec<TrainingDevice>> {
+    let text = if begun { std::fs::read_to_string(file).unwrap_or_default() } else { String::new() };
+    let mut devices: Vec<TrainingDevice> = serde_json::from_str(&text).unwrap_or_default();
+    if !devices.contains(&device) {
+        devices.push(device);
+        let json = serde_json::to_string(&devices).map_err(|e| Error::backend("device", e.to_string(), "Report this: every device should have a JSON form"))?;
+        write_atomically(file, json.as_bytes())?;
+    }
+    Ok(devices)
 }
 
 pub(super) fn read_finished(path: &Path) -> Result<FinishedTraining> {
@@ -160,6 +180,19 @@ fn curve(history: &History) -> (Curve, Vec<f64>) {
 mod tests {
     use super::*;
     use crate::event_log::HistoryPoint;
+
+    #[test]
+    fn a_training_states_every_device_that_worked_on_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join(DEVICES);
+        let here = training_device("flex");
+        let mut there = TrainingDevice { host: "elsewhere".into(), ..here.clone() };
+        there.device.threads += 1;
+        assert_eq!(note_device(&file, false, here.clone()).unwrap(), std::slice::from_ref(&here));
+        note_device(&file, true, there.clone()).unwrap();
+        assert_eq!(note_device(&file, true, here.clone()).unwrap(), [here, there.clone()], "each once, in the order of their work");
+        assert_eq!(note_device(&file, false, there.clone()).unwrap(), [there], "begun anew");
+    }
 
     #[test]
     fn curves_are_short_and_end_where_the_training_does() {

@@ -6,7 +6,7 @@ use super::Context;
 use crate::args::{SchedulerArg, SweepCollect, SweepEmit, SweepPlan, SweepRun};
 use crate::interrupt;
 use cc4dgs::plugins;
-use cc4dgs_core::{Error, Result};
+use cc4dgs_core::{Error, Result, config};
 use cc4dgs_train::sweep::{
     Busy, Collection, EmitOptions, Grid, Outcome, Plan, Scheduler, SweepFolder, Tables, TrainingState, Worker, collect as collect_results, emit as emit_file,
     run_training, select, summary, write_tables,
@@ -29,23 +29,7 @@ struct PlanReport {
 }
 
 pub fn plan(context: &Context, args: &SweepPlan) -> Result<()> {
-    let text = std::fs::read_to_string(&args.grid).map_err(|e| Error::io(&args.grid, e))?;
-    let mut grid = Grid::parse(&args.grid.display().to_string(), &text)?;
-    if let Some(minutes) = args.minutes {
-        (grid.minutes, grid.iterations) = (Some(minutes), None);
-    }
-    if let Some(iterations) = args.iterations {
-        (grid.minutes, grid.iterations) = (None, Some(iterations));
-    }
-    if let Some(seeds) = args.seeds {
-        grid.seeds = (0..seeds).collect();
-    }
-    if let Some(device) = &args.device {
-        grid.device.clone_from(device);
-    }
-    // What replaced the grid's values is held to the same rules.
-    let changed = toml::to_string(&grid).map_err(|e| Error::parameter("grid", e.to_string(), "Report this: every grid should be printable"))?;
-    let grid = Grid::parse(&args.grid.display().to_string(), &changed)?;
+    let grid = grid(args)?;
     let plan = Plan::expand(&grid, &context.registry, &|config| plugins::check(config, &context.registry))?;
     let finished = match &args.out {
         Some(out) => {
@@ -60,7 +44,7 @@ pub fn plan(context: &Context, args: &SweepPlan) -> Result<()> {
         trainings: plan.trainings.len(),
         cells: plan.cells.len(),
         finished,
-        minutes: plan.minutes.map(|minutes| minutes * plan.trainings.len() as f64),
+        minutes: plan.minutes(),
         cells_per_training: grid.codec.len(),
         folder: args.out.as_ref().map(|out| out.display().to_string()),
     };
@@ -72,6 +56,29 @@ pub fn plan(context: &Context, args: &SweepPlan) -> Result<()> {
         };
         format!("{}: {} trainings, {} cells ({} of them finished){time}\n{next}", report.name, report.trainings, report.cells, report.finished)
     })
+}
+
+/// The grid with the options in place of its values, which are held to the same rules.
+fn grid(args: &SweepPlan) -> Result<Grid> {
+    let text = std::fs::read_to_string(&args.grid).map_err(|e| Error::io(&args.grid, e))?;
+    let object = args.grid.display().to_string();
+    let mut table = config::parse_table(&object, &text)?;
+    let whole = |number: u64| toml::Value::Integer(i64::try_from(number).unwrap_or(i64::MAX));
+    if let Some(minutes) = args.minutes {
+        table.remove("iterations");
+        table.insert("minutes".into(), toml::Value::Float(minutes));
+    }
+    if let Some(iterations) = args.iterations {
+        table.remove("minutes");
+        table.insert("iterations".into(), whole(iterations as u64));
+    }
+    if let Some(seeds) = args.seeds {
+        table.insert("seeds".into(), toml::Value::Array((0..seeds).map(whole).collect()));
+    }
+    if let Some(device) = &args.device {
+        table.insert("device".into(), device.as_str().into());
+    }
+    Grid::of_table(&object, table)
 }
 
 pub fn run(context: &Context, args: &SweepRun, threads: usize) -> Result<()> {
@@ -97,7 +104,8 @@ fn index_of(plan: &Plan, id: &str) -> Result<usize> {
 /// One training with its cells, in this process.
 fn run_one(context: &Context, plan: &Plan, folder: &SweepFolder, index: usize, args: &SweepRun) -> Result<()> {
     let events = context.listeners(None)?;
-    let worker = Worker { registry: &context.registry, events: &events, stop: interrupt::stop_flag()?, limits: context.limit_options };
+    let (stop, limits) = (interrupt::stop_flag()?, context.limit_options);
+    let worker = Worker { registry: &context.registry, events: &events, stop, limits, processes: args.processes };
     let busy = if args.no_wait { Busy::Leave } else { Busy::Wait };
     let results = match run_training(&worker, folder, plan, index, args.cell.as_deref(), busy)? {
         TrainingState::Finished(results) => results,
@@ -180,4 +188,30 @@ pub fn emit(context: &Context, args: &SweepEmit, threads: usize) -> Result<()> {
     };
     let report = EmitReport { file: emit_file(scheduler, &plan, &options)? };
     context.output.result(&report, || report.file.clone())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn options_take_the_place_of_the_grids_values() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("g.toml");
+        let axes = "[[scene]]\nname = 's'\npath = 'procedural:tiny'\n[[method]]\nname = 'm'\npreset = '+'\nsize = 2.0\n[[codec]]\nname = 'c'\ncodec = 'raw'\n";
+        let of = |top: &str, change: &dyn Fn(&mut SweepPlan)| {
+            std::fs::write(&file, format!("name = 'g'\n{top}{axes}")).unwrap();
+            let mut args = SweepPlan { grid: file.clone(), out: None, minutes: None, iterations: None, seeds: None, device: None };
+            change(&mut args);
+            grid(&args)
+        };
+        let timed = of("iterations = 90\ndevice = 'flex'\n", &|args| (args.minutes, args.device) = (Some(3.0), Some("wgpu".into()))).unwrap();
+        assert_eq!((timed.minutes, timed.iterations, timed.device.as_str()), (Some(3.0), None, "wgpu"));
+        let counted = of("minutes = 1.0\nseeds = [7]\n", &|args| (args.iterations, args.seeds) = (Some(50), Some(2))).unwrap();
+        assert_eq!((counted.minutes, counted.iterations, counted.seeds), (None, Some(50), vec![0, 1]));
+        // Sizes of a grid without minutes and iterations multiply those of the options.
+        assert!(of("", &|_| ()).unwrap_err().to_string().contains("size"));
+        assert_eq!(of("", &|args| args.iterations = Some(50)).unwrap().method[0].size, 2.0);
+        assert!(of("", &|args| args.minutes = Some(-1.0)).unwrap_err().to_string().contains("positive"));
+    }
 }

@@ -7,6 +7,7 @@ use cc4dgs_core::{Error, Event, EventSink, Result};
 use cc4dgs_train::sweep::{Failure, INTERRUPTED, Plan, SweepFolder};
 use serde::Serialize;
 use std::collections::VecDeque;
+use std::ffi::OsString;
 use std::fs::OpenOptions;
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -42,6 +43,8 @@ struct Pool<'a> {
     plan: &'a Plan,
     folder: &'a SweepFolder,
     threads: usize,
+    /// Processes at a time, which share the memory of the machine.
+    processes: usize,
     events: &'a dyn EventSink,
     queue: VecDeque<usize>,
     running: Vec<Job>,
@@ -60,9 +63,10 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
     let began = Instant::now();
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let jobs = jobs.unwrap_or_else(|| cores.checked_div(threads).map_or(1, |jobs| jobs.max(1)));
-    let queue = folder.open_trainings(plan).into();
+    let queue: VecDeque<usize> = folder.open_trainings(plan).into();
+    let processes = jobs.min(queue.len());
     let (running, seconds, failed, not_before) = (Vec::new(), Vec::new(), Vec::new(), began);
-    let mut pool = Pool { context, plan, folder, threads, events: &events, queue, running, seconds, failed, not_before };
+    let mut pool = Pool { context, plan, folder, threads, processes, events: &events, queue, running, seconds, failed, not_before };
     pool.progress();
     if let Err(error) = pool.work(jobs, stop) {
         // Nobody else would end them: they are in groups of their own.
@@ -118,9 +122,7 @@ impl Pool<'_> {
             _ => std::env::current_exe().map_err(|e| Error::io("the program", e))?,
         };
         let mut command = Command::new(&program);
-        command.args(["--quiet", "--threads", &self.threads.to_string()]);
-        command.args(self.context.limit_options.iter().flat_map(|limit| ["--limit", limit]));
-        command.args(["sweep", "run"]).arg(self.folder.root()).args(["--index", &index.to_string(), "--no-wait"]);
+        command.args(arguments(self.folder.root(), index, self.threads, self.processes, self.context.limit_options));
         command.stdin(Stdio::null()).stdout(log.try_clone().map_err(io)?).stderr(log);
         // A group of its own: Ctrl-C reaches this process alone, which then asks each child once.
         #[cfg(unix)]
@@ -226,6 +228,16 @@ impl Pool<'_> {
     }
 }
 
+/// The arguments of the process that runs the training at `index` of the sweep in `root`, beside others of the pool.
+fn arguments(root: &Path, index: usize, threads: usize, processes: usize, limits: &[String]) -> Vec<OsString> {
+    let mut all = Vec::from(["--quiet", "--threads", &threads.to_string()].map(OsString::from));
+    all.extend(limits.iter().flat_map(|limit| ["--limit", limit]).map(OsString::from));
+    all.extend(["sweep", "run"].map(OsString::from));
+    all.push(root.into());
+    all.extend(["--index", &index.to_string(), "--no-wait", "--processes", &processes.to_string()].map(OsString::from));
+    all
+}
+
 #[cfg(unix)]
 fn signal(status: ExitStatus) -> Option<i32> {
     std::os::unix::process::ExitStatusExt::signal(&status)
@@ -259,6 +271,18 @@ fn duration(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::args::{Cli, SweepWhat};
+    use clap::Parser;
+
+    #[test]
+    fn processes_are_told_their_share() {
+        let given = arguments(Path::new("my sweep"), 7, 2, 3, &["max_gaussians=5".into()]);
+        let cli = Cli::try_parse_from([OsString::from("cc4dgs")].into_iter().chain(given)).unwrap();
+        assert_eq!((cli.threads, cli.quiet, cli.limits.as_slice()), (2, true, &["max_gaussians=5".to_string()][..]));
+        let crate::args::Command::Sweep(sweep) = &cli.command else { panic!("{:?}", cli.command) };
+        let SweepWhat::Run(run) = &sweep.what else { panic!("{:?}", sweep.what) };
+        assert_eq!((run.dir.as_path(), run.index, run.no_wait, run.processes), (Path::new("my sweep"), Some(7), true, 3));
+    }
 
     #[test]
     fn durations_are_short() {

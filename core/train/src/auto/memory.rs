@@ -1,0 +1,114 @@
+//! The memory that a plan may count on, and how much of it holds decoded images.
+
+use super::Choice;
+use std::path::{Path, PathBuf};
+
+/// Hierarchies of control groups, version 2 and version 1: controller in `/proc/self/cgroup`, folder that the hierarchy is mounted at, file with the limit.
+const HIERARCHIES: [[&str; 3]; 2] = [["", "sys/fs/cgroup", "memory.max"], ["memory", "sys/fs/cgroup/memory", "memory.limit_in_bytes"]];
+
+/// Memory in bytes that this process may use, where the system says: its part, if `processes` such processes share the machine, a container or a job.
+pub(super) fn memory(processes: usize) -> Option<u64> {
+    memory_below(Path::new("/")).map(|bytes| bytes / processes.max(1) as u64)
+}
+
+/// The memory of the machine whose files lie in `root`, or the smallest limit of the control group of this process and the groups around it (a container,
+/// a Slurm job).
+fn memory_below(root: &Path) -> Option<u64> {
+    let text = std::fs::read_to_string(root.join("proc/meminfo")).ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let machine = line.split_whitespace().next()?.parse::<u64>().ok()?.saturating_mul(1024);
+    let groups = std::fs::read_to_string(root.join("proc/self/cgroup")).unwrap_or_default();
+    let files = HIERARCHIES.iter().flat_map(|hierarchy| limit_files(root, &groups, *hierarchy));
+    // Where there is no limit they say so in words or by a huge number.
+    let limits = files.filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse::<u64>().ok());
+    limits.chain([machine]).min()
+}
+
+/// The files with the limits of a group and the groups around it: the group that `groups`, the content of `/proc/self/cgroup`, names for a hierarchy.
+fn limit_files(root: &Path, groups: &str, [controller, mount, name]: [&str; 3]) -> Vec<PathBuf> {
+    let group = groups.lines().find_map(|line| {
+        let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
+        controllers.split(',').any(|other| other == controller).then_some(path)
+    });
+    let mount = root.join(mount);
+    // In a container the path may be that of the host. Its folders are then missing here, and the mounted folder is the group itself.
+    let folders = Path::new(group.unwrap_or("/")).ancestors();
+    folders.map(|folder| mount.join(folder.strip_prefix("/").unwrap_or(folder)).join(name)).collect()
+}
+
+/// The cache for decoded images: all `views` of so many `pixels`, as long as a third of the memory holds them. `stated_mb` is the setting without a plan.
+pub(super) fn cache(views: usize, pixels: f64, stated_mb: u64, memory: Option<u64>) -> Option<Choice> {
+    let (needed, stated) = (views as f64 * pixels * 4.0 / 1e6, stated_mb as f64);
+    let most = memory.map_or(stated, |bytes| bytes as f64 / 3e6);
+    let wanted = needed.min(most).ceil().max(1.0);
+    let reason = if wanted > stated {
+        format!("{views} images are kept decoded")
+    } else if wanted < needed.min(stated) {
+        format!("{views} decoded images would take more than a third of the memory")
+    } else {
+        return None;
+    };
+    Some(Choice { settings: vec![("scene.cache_mb", toml::Value::Integer(wanted as i64))], reason })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GIB: u64 = 1 << 30;
+
+    /// The memory of a machine with 16 GiB and these files.
+    fn memory_with(files: &[(&str, &str)]) -> Option<u64> {
+        let root = tempfile::tempdir().unwrap();
+        for (name, text) in [("proc/meminfo", "MemTotal:       16777216 kB\nMemFree:  1 kB\n")].iter().chain(files) {
+            let path = root.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, text).unwrap();
+        }
+        memory_below(root.path())
+    }
+
+    #[test]
+    fn the_smallest_limit_around_the_process_counts() {
+        assert_eq!(memory_below(tempfile::tempdir().unwrap().path()), None);
+        assert_eq!(memory_with(&[]), Some(16 * GIB));
+        // Version 2: the job of a Slurm step has the limit, not the group of the task.
+        let slurm = |limit| {
+            memory_with(&[
+                ("proc/self/cgroup", "0::/system.slice/slurmstepd.scope/job_7/step_batch/task_0\n"),
+                ("sys/fs/cgroup/system.slice/slurmstepd.scope/job_7/memory.max", limit),
+                ("sys/fs/cgroup/system.slice/slurmstepd.scope/job_7/step_batch/task_0/memory.max", "max\n"),
+                ("sys/fs/cgroup/system.slice/slurmstepd.scope/job_8/memory.max", "4096\n"),
+            ])
+        };
+        assert_eq!((slurm("4294967296\n"), slurm("max\n")), (Some(4 * GIB), Some(16 * GIB)));
+        // Version 1, beside hierarchies of other controllers.
+        let first = |own: &str| {
+            memory_with(&[
+                ("proc/self/cgroup", "9:name=systemd:/\n5:cpu,memory:/slurm/uid_0/job_7\n1:cpuset:/other\n0::/\n"),
+                ("sys/fs/cgroup/memory/memory.limit_in_bytes", "9223372036854771712\n"),
+                ("sys/fs/cgroup/memory/slurm/uid_0/memory.limit_in_bytes", "8589934592\n"),
+                ("sys/fs/cgroup/memory/slurm/uid_0/job_7/memory.limit_in_bytes", own),
+            ])
+        };
+        assert_eq!((first("2147483648\n"), first("9223372036854771712\n")), (Some(2 * GIB), Some(8 * GIB)));
+        // A container that sees the path of the host.
+        let container = [("proc/self/cgroup", "4:memory:/docker/abc\n"), ("sys/fs/cgroup/memory/memory.limit_in_bytes", "1073741824\n")];
+        assert_eq!(memory_with(&container), Some(GIB));
+    }
+
+    #[test]
+    fn processes_share_the_memory() {
+        assert_eq!(memory(4), memory(1).map(|bytes| bytes / 4));
+        assert_eq!(memory(0), memory(1));
+    }
+
+    #[test]
+    fn images_take_a_third_of_the_memory_at_most() {
+        let cache = |views, memory| cache(views, 1e6, 2000, memory).map(|choice| choice.settings[0].1.as_integer().unwrap());
+        assert_eq!((cache(400, Some(24_000_000_000)), cache(1500, Some(24_000_000_000))), (None, Some(6000)));
+        assert_eq!((cache(5000, Some(24_000_000_000)), cache(5000, None)), (Some(8000), None));
+        // An eighth of that memory: a third of it is less than the setting states.
+        assert_eq!((cache(1500, Some(3_000_000_000)), cache(100, Some(3_000_000_000))), (Some(1000), None));
+    }
+}

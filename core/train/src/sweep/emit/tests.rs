@@ -1,0 +1,191 @@
+//! Job files against a part of their schedulers' schemas, and scripts in the hands of a shell.
+
+use super::super::plan::tests::example as plan;
+use super::*;
+use serde_json::Value;
+use yaml_rust::{Yaml, YamlLoader};
+
+/// What the files must have: path, and the value or type. A part of the schedulers' own schemas.
+const SHAPES: &str = include_str!("shapes.json");
+
+fn options() -> EmitOptions {
+    EmitOptions {
+        folder: "/sweeps/it's a $(test)".into(),
+        working_folder: "/data".into(),
+        program: "/opt/cc4dgs".into(),
+        threads: 2,
+        memory_gb: 8,
+        minutes: 60,
+        parallel: 3,
+        image: "registry.example/cc4dgs:1".into(),
+        claim: "sweeps".into(),
+        bucket: "s3://sweeps".into(),
+    }
+}
+
+/// The one document of a YAML file.
+fn parse(text: &str) -> Value {
+    let mut documents = YamlLoader::load_from_str(text).unwrap_or_else(|e| panic!("{e}\n{text}"));
+    assert_eq!(documents.len(), 1, "{text}");
+    json(documents.remove(0))
+}
+fn json(yaml: Yaml) -> Value {
+    match yaml {
+        Yaml::Null => Value::Null,
+        Yaml::Boolean(value) => value.into(),
+        Yaml::Integer(value) => value.into(),
+        Yaml::String(value) | Yaml::Real(value) => value.into(),
+        Yaml::Array(items) => items.into_iter().map(json).collect(),
+        Yaml::Hash(entries) => Value::Object(entries.into_iter().map(|(key, value)| (key.into_string().unwrap(), json(value))).collect()),
+        other => panic!("{other:?} is not expected in a job file"),
+    }
+}
+
+/// What of `shape` the value does not fulfil: objects name required keys; strings that start with `<` are types, anything else is the value itself.
+fn faults(value: &Value, shape: &Value, place: &str, found: &mut Vec<String>) {
+    match shape {
+        Value::Object(keys) => {
+            for (key, inner) in keys {
+                match value.get(key) {
+                    Some(value) => faults(value, inner, &format!("{place}.{key}"), found),
+                    None => found.push(format!("{place}.{key} is missing")),
+                }
+            }
+        }
+        Value::Array(items) => {
+            for (index, inner) in items.iter().enumerate() {
+                match value.get(index) {
+                    Some(value) => faults(value, inner, &format!("{place}[{index}]"), found),
+                    None => found.push(format!("{place}[{index}] is missing")),
+                }
+            }
+        }
+        Value::String(text) if text.starts_with('<') => {
+            let right = match text.as_str() {
+                "<string>" => value.as_str().is_some_and(|s| !s.is_empty()),
+                "<count>" => value.as_u64().is_some_and(|n| n > 0),
+                "<name>" => value.as_str().is_some_and(|s| s.len() <= 63 && s.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-')),
+                "<null>" => value.is_null(),
+                other => panic!("unknown type {other}"),
+            };
+            if !right {
+                found.push(format!("{place} is {value}, not {text}"));
+            }
+        }
+        other if other != value => found.push(format!("{place} is {value}, not {other}")),
+        _ => {}
+    }
+}
+
+#[test]
+fn yaml_files_have_the_shape_of_their_schedulers() {
+    let shapes: Value = serde_json::from_str(SHAPES).unwrap();
+    for (name, scheduler) in [("kubernetes", Scheduler::Kubernetes), ("skypilot", Scheduler::SkyPilot)] {
+        let text = emit(scheduler, &plan(), &options()).unwrap();
+        let value = parse(&text);
+        let mut found = Vec::new();
+        faults(&value, &shapes[name], name, &mut found);
+        assert!(found.is_empty(), "{}\n{text}", found.join("\n"));
+        // The check itself finds mistakes.
+        let wrong = parse(&text.replace("completions: 1", "completions: one").replace("cpus: 2+", "cpu: 2+"));
+        faults(&wrong, &shapes[name], name, &mut found);
+        assert_eq!(found.len(), 1, "{name}");
+    }
+}
+
+/// The words of an `#SBATCH` line, as sbatch reads them (`get_argument` in Slurm's sources).
+fn sbatch_words(line: &str) -> Vec<String> {
+    let (mut words, mut word, mut quote, mut escaped): (Vec<String>, String, Option<char>, bool) = Default::default();
+    for c in line.strip_prefix("#SBATCH").unwrap().chars() {
+        match c {
+            _ if escaped => {
+                word.push(c);
+                escaped = false;
+            }
+            '\\' => escaped = true,
+            '"' | '\'' if quote.is_none() => quote = Some(c),
+            _ if quote == Some(c) => quote = None,
+            '#' if quote.is_none() => break,
+            ' ' if quote.is_none() => words.push(std::mem::take(&mut word)),
+            _ => word.push(c),
+        }
+    }
+    assert!(quote.is_none() && !escaped, "{line}");
+    words.push(word);
+    words.retain(|word| !word.is_empty());
+    words
+}
+
+#[test]
+fn sbatch_finds_the_log_in_any_folder() {
+    let output = |folder: &str| {
+        let text = emit(Scheduler::Slurm, &plan(), &EmitOptions { folder: folder.into(), ..options() }).unwrap();
+        sbatch_words(text.lines().find(|line| line.contains("--output")).unwrap())
+    };
+    for folder in ["/sweeps/plain", "/my sweeps/it's a $(test)", "/a \"quoted\" #1"] {
+        assert_eq!(output(folder), [format!("--output={folder}/logs/slurm-%a.log")]);
+    }
+    assert_eq!(output("/100 %"), ["--output=/100 %%/logs/slurm-%a.log"]);
+    let error = emit(Scheduler::Slurm, &plan(), &EmitOptions { folder: "/a\\b".into(), ..options() }).unwrap_err().to_string();
+    assert!(error.contains("backslash") && error.contains("--job-dir"), "{error}");
+}
+
+#[test]
+fn jobs_stop_before_their_time_limit() {
+    assert_eq!([1, 2, 3, 60, u32::MAX].map(stop_after), [60, 60, 60, 3480, 2_147_483_647]);
+    let of = |scheduler, minutes| emit(scheduler, &plan(), &EmitOptions { minutes, ..options() }).unwrap();
+    assert!(of(Scheduler::Slurm, 90).contains("#SBATCH --time=90\n"));
+    let pod = parse(&of(Scheduler::Kubernetes, 90));
+    assert_eq!(pod["spec"]["template"]["spec"]["activeDeadlineSeconds"], 5280);
+    assert!(pod["spec"].get("activeDeadlineSeconds").is_none(), "that would be a limit for all indices together");
+    let task = parse(&of(Scheduler::SkyPilot, 90));
+    assert!(task["run"].as_str().unwrap().contains("\ntimeout --preserve-status --kill-after=120 5280 '/opt/cc4dgs' --quiet"), "{task}");
+}
+
+#[test]
+fn indices_reach_the_program() {
+    let text = emit(Scheduler::Kubernetes, &plan(), &options()).unwrap();
+    let value = parse(&text);
+    let container = &value["spec"]["template"]["spec"]["containers"][0];
+    let arguments: Vec<&str> = container["args"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
+    assert_eq!(arguments, ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--index", "$(JOB_COMPLETION_INDEX)"]);
+    let slurm = emit(Scheduler::Slurm, &plan(), &options()).unwrap();
+    assert!(slurm.contains("#SBATCH --array=0-0%3\n") && slurm.contains("--index \"$SLURM_ARRAY_TASK_ID\""), "{slurm}");
+}
+
+/// The script as bash reads it, with a program that answers with its arguments and an exit code.
+#[cfg(unix)]
+#[test]
+fn the_slurm_script_is_bash_and_requeues_what_was_interrupted() {
+    use std::os::unix::fs::PermissionsExt;
+    use std::process::Command;
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let program = |name: &str, text: &str| {
+        std::fs::write(at(name), format!("#!/bin/bash\n{text}\n")).unwrap();
+        std::fs::set_permissions(at(name), std::fs::Permissions::from_mode(0o755)).unwrap();
+    };
+    program("scontrol", &format!("echo \"$@\" >> {}", at("requeued").display()));
+    let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap_or_default());
+    for (code, requeued) in [(0, ""), (6, ""), (i32::from(INTERRUPTED), "requeue 7_3\n")] {
+        program("it's the program", &format!("printf '%s\\n' \"$@\" > {}\nexit {code}", at("arguments").display()));
+        let options = EmitOptions { program: at("it's the program").display().to_string(), working_folder: folder.path().display().to_string(), ..options() };
+        std::fs::write(at("array.sh"), emit(Scheduler::Slurm, &plan(), &options).unwrap()).unwrap();
+        assert!(Command::new("bash").arg("-n").arg(at("array.sh")).status().unwrap().success());
+        let status =
+            Command::new("bash").arg(at("array.sh")).env("PATH", &path).env("SLURM_ARRAY_JOB_ID", "7").env("SLURM_ARRAY_TASK_ID", "3").status().unwrap();
+        assert_eq!(status.code(), Some(code));
+        let arguments = std::fs::read_to_string(at("arguments")).unwrap();
+        assert_eq!(arguments.lines().collect::<Vec<_>>(), ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--index", "3"]);
+        assert_eq!(std::fs::read_to_string(at("requeued")).unwrap_or_default(), requeued);
+    }
+}
+
+#[test]
+fn what_cannot_be_written_is_refused() {
+    let empty = Plan { trainings: Vec::new(), ..plan() };
+    assert!(emit(Scheduler::Slurm, &empty, &options()).unwrap_err().to_string().contains("no training"));
+    let broken = EmitOptions { image: "a\nb".into(), ..options() };
+    assert!(emit(Scheduler::Kubernetes, &plan(), &broken).unwrap_err().to_string().contains("--image"));
+    assert!(emit(Scheduler::Slurm, &plan(), &EmitOptions { minutes: 0, ..options() }).is_err());
+}

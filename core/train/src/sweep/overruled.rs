@@ -1,0 +1,114 @@
+//! Refuses what a grid states to no effect: settings that its own keys overrule, and sizes of nothing.
+
+use super::grid::{Axis, Grid};
+use super::plan::within;
+use cc4dgs_core::{Error, Result, config};
+
+/// Refuses `grid`, which `object` names, where something that it states would have no effect. Files of settings (`config`) may state anything: the keys of the
+/// grid are meant to take the place of theirs.
+///
+/// # Errors
+/// [`Error::Parameter`] that names place, key, value and remedy.
+pub(super) fn refuse_overruled(object: &str, grid: &Grid) -> Result<()> {
+    let mut lists = vec![("set".to_string(), grid.set.as_slice())];
+    lists.extend(lists_of("scene", &grid.scene).chain(lists_of("method", &grid.method)).chain(lists_of("setting", &grid.setting)));
+    for (place, set) in lists {
+        refuse_settings(grid, set).map_err(|error| within(&format!("{object}: {place}"), error))?;
+    }
+    if grid.minutes.is_none() && grid.iterations.is_none() {
+        let mut sizes = sizes_of("scene", &grid.scene).chain(sizes_of("method", &grid.method)).chain(sizes_of("setting", &grid.setting));
+        if let Some((place, size)) = sizes.find(|(_, size)| *size != 1.0) {
+            let problem = format!("{size} has no effect: the grid states neither minutes nor iterations that it could multiply");
+            let remedy = "Size the grid (minutes or iterations, or the options of these names), or remove size and set train.iterations";
+            return Err(Error::parameter(format!("{object}: {place}, size"), problem, remedy));
+        }
+    }
+    Ok(())
+}
+
+/// The settings of each value of an axis, with their place in the grid.
+fn lists_of<'a, T>(axis: &'a str, values: &'a [Axis<T>]) -> impl Iterator<Item = (String, &'a [String])> {
+    values.iter().map(move |value| (format!("[[{axis}]] '{}', set", value.name), value.set.as_slice()))
+}
+
+/// The size of each value of an axis, with its place in the grid.
+fn sizes_of<'a, T>(axis: &'a str, values: &'a [Axis<T>]) -> impl Iterator<Item = (String, f64)> {
+    values.iter().map(move |value| (format!("[[{axis}]] '{}'", value.name), value.size))
+}
+
+/// Refuses a list of settings in which one is overruled by a key of `grid`.
+fn refuse_settings(grid: &Grid, set: &[String]) -> Result<()> {
+    let mut stated = toml::Table::new();
+    config::set_all(&mut stated, set)?;
+    let views = grid.validation_views();
+    // The setting, what takes its place (if it is there), and what to write instead.
+    let overruled = [
+        ("device", Some(format!("device = \"{}\"", grid.device)), "State `device` once, at the top of the grid, or give --device"),
+        ("seed", Some(format!("seeds = {:?}", grid.seeds)), "List the seeds of all trainings at the top of the grid, such as seeds = [0, 1], or give --seeds"),
+        ("preset", Some("the preset of [[method]]".into()), "State it as the `preset` of a [[method]]"),
+        ("train.validation", (views > 0).then(|| format!("validation = {views}")), "State `validation` once, at the top of the grid"),
+        ("train.iterations", grid.iterations.map(|n| format!("iterations = {n}")), "Multiply the iterations by `size`, or remove `iterations` from the grid"),
+        ("auto.minutes", grid.minutes.map(|m| format!("minutes = {m}")), "Multiply the minutes by `size`, or remove `minutes` from the grid"),
+    ];
+    for (key, by, remedy) in overruled {
+        if let (Some(value), Some(by)) = (value_at(&stated, key), by) {
+            return Err(Error::parameter(key, format!("{value} has no effect: {by} takes its place"), remedy));
+        }
+    }
+    Ok(())
+}
+
+/// The value at `path`, such as `train.iterations`.
+fn value_at<'a>(table: &'a toml::Table, path: &str) -> Option<&'a toml::Value> {
+    let mut keys = path.split('.');
+    let first = table.get(keys.next()?);
+    keys.fold(first, |value, key| value?.get(key))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What a grid with these keys at its top and in its tables is refused for.
+    fn refused(top: &str, [scene, method, setting]: [&str; 3]) -> Option<String> {
+        let tables = format!(
+            "[[scene]]\nname = 's'\npath = 'procedural:tiny'\n{scene}\n[[method]]\nname = 'm'\npreset = '+'\n{method}\n[[setting]]\nname = 'x'\n{setting}\n"
+        );
+        let text = format!("name = 'g'\n{top}\n{tables}[[codec]]\nname = 'c'\ncodec = 'raw'\n");
+        Grid::parse("g.toml", &text).err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn settings_without_effect_name_key_value_and_remedy() {
+        let cases = [
+            ("set = ['device=wgpu']", ["", "", ""], ["g.toml: set: device", "wgpu", "device = \"flex\"", "--device"]),
+            ("", ["set = ['device = wgpu:1']", "", ""], ["[[scene]] 's', set: device", "wgpu:1", "device = \"flex\"", "top of the grid"]),
+            ("", ["", "set = ['seed=7']", ""], ["[[method]] 'm', set: seed", "7", "seeds = [0]", "--seeds"]),
+            ("", ["", "", "set = ['preset=demo']"], ["[[setting]] 'x', set: preset", "demo", "[[method]]", "`preset`"]),
+            ("split = 'validation'", ["", "set = ['train.validation=3']", ""], ["set: train.validation", "3", "validation = 12", "`validation`"]),
+            ("validation = 5", ["", "", "set = ['train={validation=3}']"], ["set: train.validation", "3", "validation = 5", "`validation`"]),
+            ("iterations = 90", ["set = ['train.iterations=50']", "", ""], ["set: train.iterations", "50", "iterations = 90", "`size`"]),
+            ("minutes = 2.0", ["", "", "set = ['auto.minutes=7']"], ["set: auto.minutes", "7", "minutes = 2", "`size`"]),
+            ("", ["size = 2.0", "", ""], ["[[scene]] 's', size", "2 has no effect", "neither minutes nor iterations", "iterations"]),
+            ("", ["", "", "size = 0.5"], ["[[setting]] 'x', size", "0.5 has no effect", "neither minutes nor iterations", "iterations"]),
+            ("set = ['nonsense']", ["", "", ""], ["g.toml: set", "nonsense", "'='", "key=value"]),
+        ];
+        for (top, tables, parts) in cases {
+            let message = refused(top, tables).unwrap_or_else(|| panic!("{top} {tables:?} is accepted"));
+            assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        }
+    }
+
+    #[test]
+    fn settings_with_an_effect_are_accepted() {
+        for (top, tables) in [
+            ("device = 'wgpu'\nseeds = [7]\nset = ['train.batch=2']", ["size = 1.0", "", ""]),
+            ("", ["", "set = ['train.validation=3']", ""]),
+            ("", ["set = ['train.iterations=50']", "", "set = ['auto.minutes=7']"]),
+            ("iterations = 90", ["size = 2.0", "set = ['auto.minutes=7']", ""]),
+            ("minutes = 2.0", ["", "size = 2.0", ""]),
+        ] {
+            assert_eq!(refused(top, tables), None);
+        }
+    }
+}

@@ -1,0 +1,120 @@
+//! Grids that are expanded, and plans that are read back.
+
+use super::*;
+
+pub(in crate::sweep) fn grid(text: &str) -> Grid {
+    let base = "name = 'g'\n[[scene]]\nname = 'tiny'\npath = 'procedural:tiny'\nfamily = 'demo'\n";
+    let (top, tables) = text.split_once("---").unwrap_or(("", text));
+    Grid::parse("g.toml", &format!("{top}{base}{tables}")).unwrap()
+}
+fn expand(text: &str) -> Result<Plan> {
+    Plan::expand(&grid(text), &Registry::collect().unwrap(), &|_| Ok(()))
+}
+const METHODS: &str = "[[method]]\nname = 'own'\npreset = '+'\n[[method]]\nname = 'planes'\npreset = '+hexplane'\n";
+// This crate links no codecs, so grids of its own tests have none that could be built; the plan of trainings is what is tested here.
+const CODEC: &str = "[[codec]]\nname = 'c'\ncodec = 'none-linked'\n";
+
+/// The plan of trainings of a grid whose codecs are not built.
+fn trainings(text: &str) -> Result<Vec<(PlannedTraining, toml::Table)>> {
+    let (grid, registry) = (grid(text), Registry::collect().unwrap());
+    let data = fingerprint(&grid.scene[0].own.path, &registry)?;
+    let mut all = Vec::new();
+    for (method, setting) in grid.method.iter().flat_map(|m| grid.setting.iter().map(move |s| (m, s))) {
+        for &seed in &grid.seeds {
+            let training = planned(&grid, &grid.scene[0], method, setting, seed, data.clone(), String::new())?;
+            let layers = training.layers(&registry)?;
+            layers.config().map_err(|error| at(&training, error))?;
+            all.push((training, layers.table().clone()));
+        }
+    }
+    Ok(all)
+}
+
+#[test]
+fn axes_are_multiplied_and_sized() {
+    let text = format!(
+        "iterations = 100\nseeds = [3, 4]\nset = ['train.batch=2']\n---{METHODS}[[setting]]\nname = 'small'\n[[setting]]\nname = 'large'\nsize = 2.5\nset = ['train.sh_degree=1']\n{CODEC}"
+    );
+    let all = trainings(&text).unwrap();
+    assert_eq!(all.len(), 8);
+    let labels: Vec<String> = all.iter().map(|(t, _)| t.label()).collect();
+    assert_eq!((labels[0].as_str(), labels[7].as_str()), ("tiny own small seed 3", "tiny planes large seed 4"));
+    assert_eq!((all[0].0.preset.as_str(), all[4].0.preset.as_str()), ("demo", "demo+hexplane"));
+    let train = |index: usize, key: &str| all[index].1["train"][key].as_integer().unwrap();
+    assert_eq!((train(0, "iterations"), train(2, "iterations"), train(2, "sh_degree"), train(7, "batch")), (100, 250, 1, 2));
+    assert_eq!((all[1].1["seed"].as_integer(), all[1].1["device"].as_str()), (Some(4), Some("flex")));
+    let validation = trainings(&format!("split = 'validation'\n---{METHODS}{CODEC}")).unwrap();
+    assert_eq!(validation[0].1["train"]["validation"].as_integer(), Some(12));
+}
+
+#[test]
+fn hours_are_those_of_every_size() {
+    let axes = "[[method]]\nname = 'm'\npreset = 'auto'\nsize = 2.0\n[[setting]]\nname = 'small'\nsize = 0.5\n[[setting]]\nname = 'large'\nsize = 3.0\n";
+    let plan_of = |top: &str| {
+        let trainings = trainings(&format!("{top}seeds = [0, 1]\n---{axes}{CODEC}")).unwrap().into_iter().map(|(training, _)| training).collect();
+        Plan { trainings, ..example() }
+    };
+    let timed = plan_of("minutes = 10.0\n");
+    assert_eq!(timed.trainings.iter().map(|training| training.minutes).collect::<Vec<_>>(), [10.0, 10.0, 60.0, 60.0].map(Some));
+    assert_eq!((timed.minutes(), plan_of("iterations = 10\n").minutes()), (Some(140.0), None));
+}
+
+#[test]
+fn mistakes_name_their_place() {
+    let wrong = format!("{METHODS}[[setting]]\nname = 'typo'\nset = ['train.iteratons=5']\n{CODEC}");
+    let message = trainings(&wrong).unwrap_err().to_string();
+    assert!(message.contains("tiny own typo") && message.contains("iteratons"), "{message}");
+    let message = expand(&format!("{METHODS}{CODEC}")).unwrap_err().to_string();
+    assert!(message.contains("codec 'c'") && message.contains("none-linked"), "{message}");
+}
+
+#[test]
+fn plans_are_read_strictly() {
+    let folder = tempfile::tempdir().unwrap();
+    assert!(Plan::read(folder.path()).unwrap_err().to_string().contains("sweep plan"));
+    let plan = example();
+    plan.write(folder.path()).unwrap();
+    assert_eq!(Plan::read(folder.path()).unwrap(), plan);
+    plan.check_program().unwrap();
+    let other = Plan { commit: "other".into(), ..plan.clone() };
+    let message = other.check_program().unwrap_err().to_string();
+    assert!(message.contains("other") && message.contains("Plan again"), "{message}");
+    let write = |from: &str, to: &str| {
+        let text = std::fs::read_to_string(folder.path().join(PLAN)).unwrap();
+        std::fs::write(folder.path().join(PLAN), text.replace(from, to)).unwrap();
+        Plan::read(folder.path()).unwrap_err()
+    };
+    assert!(write("00000000000000c0", "../../etc/passwd").to_string().contains("passwd"));
+    assert!(matches!(write("\"schema\": 1", "\"schema\": 9"), Error::Unsupported { .. }));
+    assert!(matches!(write(KIND, "other"), Error::Data { .. }));
+}
+
+/// A plan of one training with two cells.
+pub(in crate::sweep) fn example() -> Plan {
+    let (version, commit) = code::version();
+    let choice = CodecChoice { codec: "raw".into(), field_weights: "fp32".into(), settings: toml::Table::new() };
+    let cell = |id: &str, codec: &str| PlannedCell { id: id.into(), training: "00000000000000a0".into(), codec: codec.into(), choice: choice.clone() };
+    Plan {
+        kind: KIND.into(),
+        schema: SCHEMA,
+        name: "g".into(),
+        version: version.into(),
+        commit: commit.into(),
+        split: ScoredViews::Test,
+        max_views: 0,
+        images: 0,
+        trainings: vec![PlannedTraining {
+            id: "00000000000000a0".into(),
+            scene: "tiny".into(),
+            method: "own".into(),
+            setting: "base".into(),
+            seed: 0,
+            preset: "demo".into(),
+            sets: Vec::new(),
+            minutes: None,
+            data: DataFingerprint { path: "procedural:tiny".into(), hash: "0".into(), files: 0, bytes: 0 },
+            listing: String::new(),
+        }],
+        cells: vec![cell("00000000000000c0", "raw"), cell("00000000000000c1", "half")],
+    }
+}
