@@ -132,7 +132,7 @@ impl SpatialInput {
 }
 
 /// A number or vector per Gaussian that a deformer learns in addition to its weights. It is one of the Gaussians' extra attributes: density control copies and
-/// removes it with its Gaussian, and checkpoints and archives store it by name.
+/// removes it with its Gaussian, and checkpoints and archives store it by name. A Gaussian that key frames or recovery add has that of the nearest one that moves.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AttributeSpec {
     /// Name of the extra attribute: letters, digits, `_`, `-` and `.`; unique, and not one of the attributes that every Gaussian has.

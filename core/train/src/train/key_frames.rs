@@ -1,8 +1,9 @@
 //! Gaussians of key frames: what moves starts with a life at each of them, so that nothing has to be followed from the first frame to the last.
 
+use super::parents::Parents;
 use super::recover::own_lives;
 use super::{Context, TrainState};
-use crate::data::init::{KeyFrames, KeyPoint, limit_sizes_to};
+use crate::data::init::{KeyFrames, KeyPoint, LEAST_INTERVAL, limit_sizes_to};
 use crate::init::{SH_C0, from_points};
 use crate::masks::DynamicMask;
 use cc4dgs_core::{Camera, DensityPlan, Event, HostGaussians, LIFE_ATTRIBUTES, PointCloud, Result, Stage, gate_value};
@@ -10,16 +11,14 @@ use cc4dgs_play::Moving;
 use cc4dgs_play::model::ModelDeformer;
 use glam::Vec3;
 
-/// Half-width and falloff of a life at one key frame, as shares of the distance of two.
-const HALF_WIDTH: f64 = 0.4;
+/// How far a life reaches before its first and after its last key frame, and its falloff, as shares of the time to the next key frame there.
+const REACH: f64 = 0.4;
 const FALLOFF: f64 = 0.25;
 /// Gates: of what is there for a while, and of what stays.
 const TEMPORARY: f32 = 0.01;
 const LASTING: f32 = 0.95;
 /// Points that may be added in any case, as a share of the Gaussians there are.
 const LEAST_SHARE: f64 = 0.25;
-/// Least time between two key frames: frames may claim to be simultaneous.
-const LEAST_INTERVAL: f64 = 1e-4;
 /// Largest standard deviation of a new Gaussian, as a share of the width of the image: a point far from all others would cover much of each image.
 const WIDTH_SHARE: f64 = 0.01;
 /// Opacity of new Gaussians.
@@ -56,10 +55,11 @@ impl Context<'_> {
         let count = most.saturating_sub(state.set.len()).max((LEAST_SHARE * state.set.len() as f64) as usize);
         let points = frames.points(count, seed.child("motion"));
         let end = self.job.scene.views.iter().fold(0.0f32, |end, view| end.max(view.time_norm));
-        let times = Times::new(&frames.times, f64::from(end));
+        let times = Times { keys: &frames.times, end: f64::from(end) };
         let mut plan = DensityPlan::unchanged(state.set.len());
         let host = state.set.host_gaussians()?;
         let temporary = self.lives_of_first_frame(&mut plan, &host, state, &frames, &times)?;
+        let parents = Parents::new(&host, state.moving);
         let coefficients = state.set.get("sh_rest")?.dims()[1];
         let mut capped = 0;
         for key in 0..times.keys.len() {
@@ -68,8 +68,7 @@ impl Context<'_> {
             let mut start = from_points(&cloud, 0, OPACITY);
             capped += limit_sizes_to(scene, &mut start, WIDTH_SHARE);
             for (i, point) in own.into_iter().enumerate() {
-                let row = plan.copy(0);
-                plan.set(row, "means", &times.position(point).to_array());
+                let row = parents.copy(&mut plan, times.position(point).to_array());
                 plan.set(row, "log_scales", &start.log_scales[3 * i..3 * i + 3]);
                 plan.set(row, "quaternions", &[1.0, 0.0, 0.0, 0.0]);
                 plan.set(row, "opacity_logits", &start.opacity_logits[i..=i]);
@@ -136,34 +135,43 @@ struct Times<'a> {
     keys: &'a [f64],
     /// The time of the last frame, which need not be a key frame.
     end: f64,
-    /// From one to the next in the mean.
-    interval: f64,
 }
 
-impl<'a> Times<'a> {
-    fn new(keys: &'a [f64], end: f64) -> Self {
-        let whole = keys.last().copied().unwrap_or(1.0) - keys.first().copied().unwrap_or(0.0);
-        Self { keys, end, interval: (whole / keys.len().saturating_sub(1).max(1) as f64).max(LEAST_INTERVAL) }
+/// When a point is there, as shares of the sequence.
+struct Life {
+    center: f64,
+    half_width: f64,
+    falloff: f64,
+}
+
+impl Times<'_> {
+    /// Time from a key frame to the one before it and to the one after it. The first and the last one have the same on both sides.
+    fn intervals(&self, key: usize) -> [f64; 2] {
+        let interval = |from: usize, to: usize| (self.keys[to] - self.keys[from]).max(LEAST_INTERVAL);
+        let before = key.checked_sub(1).map(|earlier| interval(earlier, key));
+        let after = (key + 1 < self.keys.len()).then(|| interval(key, key + 1));
+        [before.or(after), after.or(before)].map(|time| time.unwrap_or(1.0))
     }
-    /// From when to when a point is there: what is there at the last key frame is there until the end.
-    fn span(&self, point: &KeyPoint) -> [f64; 2] {
+    /// When a point is there: what is there at the last key frame is there until the end.
+    fn life(&self, point: &KeyPoint) -> Life {
         let [first, last] = point.alive.map(|key| self.keys[key]);
-        [first, if point.alive[1] + 1 == self.keys.len() { last.max(self.end) } else { last }]
+        let last = if point.alive[1] + 1 == self.keys.len() { last.max(self.end) } else { last };
+        let (before, after) = (self.intervals(point.alive[0])[0], self.intervals(point.alive[1])[1]);
+        let (from, to) = (first - REACH * before, last + REACH * after);
+        Life { center: 0.5 * (from + to), half_width: 0.5 * (to - from), falloff: FALLOFF * 0.5 * (before + after) }
     }
     /// Where a point is in the middle of its life.
     fn position(&self, point: &KeyPoint) -> Vec3 {
-        let [first, last] = self.span(point);
-        point.position + point.velocity * ((0.5 * (first + last) - self.keys[point.key]) / self.interval) as f32
+        point.position + point.velocity * (self.life(point).center - self.keys[point.key]) as f32
     }
     /// Gives a row the life and the velocity of a point.
     fn live(&self, plan: &mut DensityPlan, row: usize, point: &KeyPoint) {
-        let [first, last] = self.span(point);
-        let half_width = 0.5 * (last - first) + HALF_WIDTH * self.interval;
-        plan.set(row, "life_center", &[(0.5 * (first + last)) as f32]);
-        plan.set(row, "life_log_half_width", &[half_width.ln() as f32]);
-        plan.set(row, "life_log_falloff", &[(FALLOFF * self.interval).ln() as f32]);
+        let life = self.life(point);
+        plan.set(row, "life_center", &[life.center as f32]);
+        plan.set(row, "life_log_half_width", &[life.half_width.ln() as f32]);
+        plan.set(row, "life_log_falloff", &[life.falloff.ln() as f32]);
         plan.set(row, "life_gate", &[gate_value(TEMPORARY)]);
-        plan.set(row, "velocity", &(point.velocity / self.interval as f32).to_array());
+        plan.set(row, "velocity", &point.velocity.to_array());
     }
     /// Keeps a row at all times.
     fn last(&self, plan: &mut DensityPlan, row: usize) {
@@ -176,27 +184,56 @@ impl<'a> Times<'a> {
 mod tests {
     use super::*;
 
+    /// A plan of one Gaussian that has the life of `point`.
+    fn lived(times: &Times, point: &KeyPoint) -> DensityPlan {
+        let mut plan = DensityPlan::unchanged(1);
+        times.live(&mut plan, 0, point);
+        plan
+    }
+
+    fn value(plan: &DensityPlan, attribute: &str) -> f32 {
+        plan.values().iter().find(|v| v.attribute == attribute).map(|v| v.values[0]).unwrap()
+    }
+
+    /// From when to when its life is, without the falloff.
+    fn ends(plan: &DensityPlan) -> [f32; 2] {
+        let (center, half_width) = (value(plan, "life_center"), value(plan, "life_log_half_width").exp());
+        [center - half_width, center + half_width]
+    }
+
     #[test]
     fn lives_are_at_the_times_that_views_state() {
         // Five of six frames at k / 6: the last key frame is not at 1.
         let keys = [0.0, 1.0 / 3.0, 2.0 / 3.0];
-        let times = Times::new(&keys, 2.0 / 3.0);
         let point = KeyPoint { position: Vec3::ZERO, color: [0.5; 3], key: 2, alive: [1, 2], velocity: Vec3::X };
-        let mut plan = DensityPlan::unchanged(1);
-        times.live(&mut plan, 0, &point);
-        let value = |name: &str| plan.values().iter().find(|v| v.attribute == name).map(|v| v.values[0]).unwrap();
-        assert!((value("life_center") - 0.5).abs() < 1e-6, "between the second and the third");
-        assert!((value("velocity") - 3.0).abs() < 1e-5, "a unit from one key frame to the next");
-        assert!((value("life_log_half_width").exp() - (1.0 / 6.0 + 0.4 / 3.0)).abs() < 1e-6);
-        assert!(Times::new(&[0.0, 0.0], 0.0).interval > 0.0);
+        let plan = lived(&Times { keys: &keys, end: 2.0 / 3.0 }, &point);
+        assert!((value(&plan, "life_center") - 0.5).abs() < 1e-6, "between the second and the third");
+        assert_eq!(value(&plan, "velocity"), 1.0);
+        assert!((value(&plan, "life_log_half_width").exp() - (1.0 / 6.0 + 0.4 / 3.0)).abs() < 1e-6);
+        assert!((value(&plan, "life_log_falloff").exp() - 0.25 / 3.0).abs() < 1e-6);
+        let simultaneous = Times { keys: &[0.0, 0.0], end: 0.0 }.life(&KeyPoint { key: 0, alive: [0, 0], ..point });
+        assert!(simultaneous.half_width > 0.0 && simultaneous.falloff > 0.0);
         // The last frame is later than the last key frame.
-        let (times, mut plan) = (Times::new(&keys, 0.9), DensityPlan::unchanged(1));
+        let times = Times { keys: &keys, end: 0.9 };
         let moving = KeyPoint { alive: [2, 2], ..point };
-        times.live(&mut plan, 0, &moving);
-        let value = |name: &str| plan.values().iter().find(|v| v.attribute == name).map(|v| v.values[0]).unwrap();
-        let (center, half_width) = (value("life_center"), value("life_log_half_width").exp());
-        assert!((center + half_width) as f64 > 0.9 && (center - half_width) as f64 <= 2.0 / 3.0 - 0.4 / 3.0 + 1e-6);
-        let at_key = times.position(&moving).x + value("velocity") * (keys[2] as f32 - center);
+        let plan = lived(&times, &moving);
+        let [from, to] = ends(&plan);
+        assert!(to as f64 > 0.9 && from as f64 <= 2.0 / 3.0 - 0.4 / 3.0 + 1e-6);
+        let at_key = times.position(&moving).x + value(&plan, "velocity") * (keys[2] as f32 - value(&plan, "life_center"));
         assert!((at_key - moving.position.x).abs() < 1e-5, "it is where it was found at its key frame: {at_key}");
+    }
+
+    #[test]
+    fn lives_reach_towards_neighbours_where_key_frames_are_left_out() {
+        // Those at 0.4 and at 0.6 are left out.
+        let times = Times { keys: &[0.0, 0.2, 0.8, 1.0], end: 1.0 };
+        let point = KeyPoint { position: Vec3::ZERO, color: [0.5; 3], key: 1, alive: [1, 1], velocity: Vec3::X };
+        let plan = lived(&times, &point);
+        let [from, to] = ends(&plan);
+        assert!((from - (0.2 - 0.4 * 0.2)).abs() < 1e-6 && (to - (0.2 + 0.4 * 0.6)).abs() < 1e-6, "{from} to {to}");
+        let at_key = times.position(&point).x + value(&plan, "velocity") * (0.2 - value(&plan, "life_center"));
+        assert!(at_key.abs() < 1e-6, "it is where it was found at its key frame: {at_key}");
+        let [from, to] = ends(&lived(&times, &KeyPoint { key: 2, alive: [2, 2], ..point }));
+        assert!((from - (0.8 - 0.4 * 0.6)).abs() < 1e-6 && (to - (0.8 + 0.4 * 0.2)).abs() < 1e-6, "{from} to {to}");
     }
 }

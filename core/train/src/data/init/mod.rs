@@ -16,7 +16,7 @@ mod sweep;
 mod views;
 mod volume;
 
-pub(crate) use key_frames::{KeyFrames, KeyPoint};
+pub(crate) use key_frames::{KeyFrames, KeyPoint, LEAST_INTERVAL};
 pub(crate) use size::limit_sizes_to;
 pub use size::{limit_opacities, limit_sizes};
 

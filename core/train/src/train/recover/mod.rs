@@ -38,10 +38,9 @@ const TRACKS: usize = 3;
 /// some agree by chance.
 const LEAST_EXPLAINED: f64 = 0.35;
 
-/// What a view shows and the model does not.
+/// What a view shows and the model does not. Images are not kept: they are loaded once more for the colours of what is added.
 struct Lost {
     view: usize,
-    image: Vec<f32>,
     sightings: Vec<Sighting>,
 }
 
@@ -122,7 +121,7 @@ impl Context<'_> {
                 Sighting { image: index, time, origin, direction: rotation.transpose() * ray, size: blob.radius_px / focal, pixel: 1.0 / focal }
             };
             let sightings = blobs(&mask, w, BLOBS).into_iter().map(sighting).collect();
-            lost.push(Lost { view, image, sightings });
+            lost.push(Lost { view, sightings });
             Ok(())
         })?;
         Ok(lost)

@@ -19,8 +19,10 @@ const WITHIN_RADIUS: f64 = 0.5;
 const WITHIN_PIXELS: f64 = 1.0;
 /// Radii of one thing differ by at most this factor.
 const SIZE_FACTOR: f64 = 1.6;
-/// Least angle in radians between two of its rays: else its depth is a guess.
+/// Least [`parallax`] in radians: else its distance is a guess.
 const LEAST_PARALLAX: f64 = 0.1;
+/// Steps of the inverse iteration for it.
+const STEPS: usize = 24;
 /// Least depth of a thing in front of a camera.
 const LEAST_DEPTH: f64 = 0.05;
 
@@ -91,11 +93,23 @@ pub(super) fn best_track(sightings: &[Sighting], among: &[usize], time: f64, see
 
 /// The track of least squares through the rays of `chosen`.
 fn fit(sightings: &[Sighting], chosen: Vec<usize>, time: f64) -> Option<Track> {
+    let [x, y, z, u, v, w] = solve(normal_equations(sightings, &chosen, |s| s.time - time))?;
+    let (position, velocity) = (DVec3::new(x, y, z), DVec3::new(u, v, w));
+    let mut track = Track { time, position, velocity, radius: 0.0, sightings: chosen };
+    let mut radii: Vec<f64> = track.sightings.iter().map(|&i| sightings[i].size * depth(&sightings[i], &track)).collect();
+    radii.sort_unstable_by(f64::total_cmp);
+    track.radius = radii[radii.len() / 2];
+    (track.radius.is_finite() && track.radius > 0.0).then_some(track)
+}
+
+/// The normal equations of the track of least squares through the rays of `chosen`, for position and velocity, with the right side in the last column. `clock` is
+/// the time of a sighting that the velocity refers to.
+fn normal_equations(sightings: &[Sighting], chosen: &[usize], clock: impl Fn(&Sighting) -> f64) -> [[f64; 7]; 6] {
     let mut system = [[0.0f64; 7]; 6];
-    for &i in &chosen {
+    for &i in chosen {
         let s = &sightings[i];
         let across = DMat3::IDENTITY - DMat3::from_cols(s.direction * s.direction.x, s.direction * s.direction.y, s.direction * s.direction.z);
-        let (target, tau) = (across * s.origin, s.time - time);
+        let (target, tau) = (across * s.origin, clock(s));
         for row in 0..3 {
             for column in 0..3 {
                 let value = across.col(column)[row];
@@ -108,13 +122,7 @@ fn fit(sightings: &[Sighting], chosen: Vec<usize>, time: f64) -> Option<Track> {
             system[row + 3][6] += tau * target[row];
         }
     }
-    let [x, y, z, u, v, w] = solve(system)?;
-    let (position, velocity) = (DVec3::new(x, y, z), DVec3::new(u, v, w));
-    let mut track = Track { time, position, velocity, radius: 0.0, sightings: chosen };
-    let mut radii: Vec<f64> = track.sightings.iter().map(|&i| sightings[i].size * depth(&sightings[i], &track)).collect();
-    radii.sort_unstable_by(f64::total_cmp);
-    track.radius = radii[radii.len() / 2];
-    (track.radius.is_finite() && track.radius > 0.0).then_some(track)
+    system
 }
 
 /// `track` with the sightings that agree with it, at most one of each image; `None` where fewer than three do.
@@ -145,10 +153,30 @@ fn depth(sighting: &Sighting, track: &Track) -> f64 {
     (track.at(sighting.time) - sighting.origin).dot(sighting.direction)
 }
 
-/// The largest angle between the first of the rays and another, in radians.
+/// How well the rays of `chosen` fix a track: the angle in radians between the rays of two standing cameras that see it at all times and fix it as well.
+///
+/// A change of position and velocity shifts the thing at each time. Of all changes, take the one that the rays show least: its part across the rays is a share
+/// of the whole (root mean squares), and the angle is twice the arc sine of that share. The angle between the rays themselves says nothing where camera and thing
+/// both move: a camera that goes along a line at constant speed sees the same rays of things at any distance, each on a straight track of its own.
 fn parallax(sightings: &[Sighting], chosen: &[usize]) -> f64 {
-    let Some(&first) = chosen.first() else { return 0.0 };
-    chosen.iter().map(|&i| sightings[i].direction.dot(sightings[first].direction).clamp(-1.0, 1.0).acos()).fold(0.0, f64::max)
+    let n = chosen.len().max(1) as f64;
+    let mean = chosen.iter().map(|&i| sightings[i].time).sum::<f64>() / n;
+    let spread = (chosen.iter().map(|&i| (sightings[i].time - mean).powi(2)).sum::<f64>() / n).sqrt();
+    if spread.is_nan() || spread <= 0.0 {
+        return 0.0;
+    }
+    // With times of mean 0 and variance 1, the mean square of a shift is the squared length of its six numbers.
+    let mut system = normal_equations(sightings, chosen, |s| (s.time - mean) / spread);
+    // Inverse iteration: `change` becomes the eigenvector of the least eigenvalue.
+    let (mut change, mut eigenvalue) = ([1.0, 0.9, 0.8, 0.7, 0.6, 0.5], 0.0f64);
+    for _ in 0..STEPS {
+        let length = change.iter().map(|v| v * v).sum::<f64>().sqrt();
+        system.iter_mut().zip(change).for_each(|(row, value)| row[6] = value / length);
+        let Some(solution) = solve(system) else { return 0.0 };
+        change = solution;
+        eigenvalue = change.iter().map(|v| v * v).sum::<f64>().sqrt().recip();
+    }
+    2.0 * (eigenvalue / n).sqrt().min(1.0).asin()
 }
 
 /// Solves six equations with the right side in the last column, by elimination with pivots; `None` where they are (nearly) singular.
@@ -202,6 +230,35 @@ mod tests {
         assert!((track.position - DVec3::new(0.5, 0.3, -0.2)).length() < 1e-3, "{track:?}");
         assert!((track.velocity - DVec3::new(2.0, -1.0, 0.5)).length() < 0.05, "{track:?}");
         assert!((track.radius - 0.25).abs() < 0.01 && track.sightings.len() == 8, "{track:?}");
+    }
+
+    #[test]
+    fn a_track_needs_places_that_fix_its_distance() {
+        let seen = |image: usize, step: usize, origin: DVec3| {
+            let time = 0.4 + 0.01 * step as f64;
+            let way = DVec3::new(0.1, 0.2, 0.0) + DVec3::new(1.0, -0.5, 0.3) * (time - 0.43) - origin;
+            Sighting { image, time, origin, direction: way.normalize(), size: 0.25 / way.length(), pixel: 0.005 }
+        };
+        let all: Vec<usize> = (0..8).collect();
+        let of = |place: &dyn Fn(f64) -> DVec3| (0..8).map(|i| seen(i, i, place(i as f64))).collect::<Vec<Sighting>>();
+        let passing = of(&|i: f64| DVec3::new(0.5 * i - 2.0, 0.0, -4.0));
+        let slow_orbit = of(&|i: f64| DVec3::new(4.0 * (0.05 * i).sin(), 1.0, -4.0 * (0.05 * i).cos()));
+        let turning = of(&|_: f64| DVec3::new(0.0, 0.0, -4.0));
+        assert!(passing[0].direction.angle_between(passing[7].direction) > 0.5 && slow_orbit[0].direction.angle_between(slow_orbit[7].direction) > 0.2);
+        for sightings in [&passing, &slow_orbit, &turning] {
+            assert!(parallax(sightings, &all) < 0.3 * LEAST_PARALLAX, "{}", parallax(sightings, &all));
+            assert!(best_track(sightings, &all, 0.43, Seed::root(1)).is_none());
+        }
+        // Two cameras that stand still, 0.2 rad apart.
+        let rig: Vec<Sighting> = (0..8).map(|i| seen(i, i / 2, DVec3::new(if i % 2 == 0 { -0.4 } else { 0.4 }, 0.0, -4.0))).collect();
+        assert!((0.17..0.23).contains(&parallax(&rig, &all)), "{}", parallax(&rig, &all));
+        // Three rays of two cameras hardly say how fast a thing comes nearer; those of four do.
+        let corner = |i: usize| DVec3::new(if i.is_multiple_of(2) { -0.4 } else { 0.4 }, if i % 4 < 2 { -0.4 } else { 0.4 }, -4.0);
+        let square: Vec<Sighting> = (0..8).map(|i| seen(i, i, corner(i))).collect();
+        assert!(best_track(&square, &all, 0.43, Seed::root(1)).is_some());
+        // At one time nothing says how fast it is.
+        let once: Vec<Sighting> = (0..8).map(|i| seen(i, 0, DVec3::new(i as f64 - 4.0, 0.0, -4.0))).collect();
+        assert_eq!((parallax(&once, &all), parallax(&once, &[])), (0.0, 0.0));
     }
 
     #[test]

@@ -6,13 +6,15 @@
 //! it is alive where something passes before it, too. The velocity is the one with which a point is found again at the neighbouring key frames, searched at
 //! random and handed on between neighbours as in PatchMatch (Barnes et al. 2009).
 
+mod images;
 mod motion;
 
 use super::choose::{Arrangement, Choice};
-use super::views::{WorkSet, WorkView};
+use super::views::WorkSet;
 use super::{Candidate, fuse, sweep, thin};
 use cc4dgs_core::{Result, Scene, Seed, Split};
 use glam::Vec3;
+use images::{KeySet, KeyView, most_pixels};
 use rayon::prelude::*;
 use std::collections::HashMap;
 
@@ -28,6 +30,11 @@ const ALIVE: f32 = 0.5;
 const LEAST_FRAMES: usize = 5;
 const HIDDEN: f32 = 0.25;
 
+/// The most matched points of all key frames that are kept at once, of 32 bytes each.
+const MOST_FOUND: usize = 8 << 20;
+/// Least time from one key frame to the next, as a share of the sequence: frames may claim to be simultaneous.
+pub(crate) const LEAST_INTERVAL: f64 = 1e-4;
+
 /// What a point is and when it is there.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct KeyPoint {
@@ -38,7 +45,7 @@ pub(crate) struct KeyPoint {
     pub key: usize,
     /// The first and the last key frame at which it is there without moving.
     pub alive: [usize; 2],
-    /// Scene units from one key frame to the next.
+    /// Scene units per sequence.
     pub velocity: Vec3,
 }
 
@@ -46,10 +53,10 @@ pub(crate) struct KeyPoint {
 pub(crate) struct KeyFrames {
     /// The time of each key frame, 0..1, as its views state it; the first is that of frame 0.
     pub times: Vec<f64>,
-    sets: Vec<WorkSet>,
+    sets: Vec<KeySet>,
     found: Vec<Vec<Candidate>>,
     /// The median over all key frames of each pixel of each view; empty where there are too few of them.
-    still: Vec<Vec<[f32; 3]>>,
+    still: Vec<Vec<[u8; 3]>>,
     /// Mean difference of the channels up to which a pixel of one camera shows the same at two times.
     unchanged: f32,
 }
@@ -57,7 +64,7 @@ pub(crate) struct KeyFrames {
 impl KeyFrames {
     /// Every `every`-th frame of `scene`, with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so;
     /// `None` where cameras move, or fewer than two of these frames, the first among them, have images of all cameras;
-    /// others are left out. Differences up to `noise`, 0..1, are none.
+    /// others are left out. Differences up to `noise`, 0..1, are none. Each thread holds one whole image at a time; those that are kept are small.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
@@ -67,17 +74,22 @@ impl KeyFrames {
             return Ok(None);
         }
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
-        let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new(), still: Vec::new(), unchanged: UNCHANGED.max(noise) };
-        for frame in (0..scene.frame_count).step_by(every) {
+        let views_of = |frame: usize| -> Option<Vec<usize>> {
             let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera && v.split == Split::Train);
-            // Without the first frame nothing says what moves on from there.
-            let Some(views) = cameras.iter().map(view).collect::<Option<Vec<usize>>>() else {
-                if frame == 0 {
-                    return Ok(None);
-                }
-                continue;
-            };
-            let Some(time) = views.first().map(|&v| f64::from(scene.views[v].time_norm)) else { continue };
+            cameras.iter().map(view).collect()
+        };
+        let complete: Vec<(usize, Vec<usize>)> =
+            (0..scene.frame_count).step_by(every).filter_map(|frame| views_of(frame).map(|views| (frame, views))).collect();
+        // Without the first frame nothing says what moves on from there.
+        if complete.len() < 2 || complete[0].0 != 0 {
+            return Ok(None);
+        }
+        // The medians are as many images as one key frame has.
+        let pixels = most_pixels((complete.len() + 1) * cameras.len());
+        let most_found = MOST_FOUND / complete.len();
+        let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new(), still: Vec::new(), unchanged: UNCHANGED.max(noise) };
+        for (frame, views) in complete {
+            let time = views.first().map_or(0.0, |&v| f64::from(scene.views[v].time_norm));
             let mut set = WorkSet::load(scene, Choice { views, ..choice.clone() })?;
             for (view, &camera) in set.views.iter_mut().zip(&cameras) {
                 let level = view.fine();
@@ -86,18 +98,14 @@ impl KeyFrames {
                 let share = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
                 view.opaque = Some((0..w * h).map(|p| drawn(p) && moves(camera, share(p % w, w), share(p / w, h))).collect());
             }
-            loaded.found.push(candidates(&set, seed.index(frame as u64)));
+            let mut found = candidates(&set, seed.index(frame as u64));
+            // They come in random order.
+            found.truncate(most_found);
+            found.shrink_to_fit();
+            loaded.found.push(found);
             // From here on nothing but colours is asked.
-            for view in &mut set.views {
-                view.levels.drain(..view.levels.len() - 1);
-                view.levels.iter_mut().for_each(|level| level.gray = Vec::new());
-                (view.mask, view.opaque) = (None, None);
-            }
-            loaded.sets.push(set);
+            loaded.sets.push(KeySet::new(set, pixels));
             loaded.times.push(time);
-        }
-        if loaded.sets.len() < 2 {
-            return Ok(None);
         }
         loaded.still = medians(&loaded.sets);
         Ok(Some(loaded))
@@ -108,7 +116,7 @@ impl KeyFrames {
         let each = count / self.sets.len();
         let mut points = Vec::new();
         for (key, candidates) in self.found.iter().enumerate() {
-            let known = Grid::new(self.sets[key].cell_size(), &points);
+            let known = Grid::new(self.sets[key].cell, &points);
             let judged = self.judge(candidates.iter().map(|c| (c.position, c.color)).collect(), key);
             let new = |p: &KeyPoint| (!self.always(p) || !self.shows(0, p)) && !known.has(p);
             let mut own: Vec<KeyPoint> = judged.into_iter().flatten().filter(new).take(each).collect();
@@ -142,9 +150,9 @@ impl KeyFrames {
 
     /// The pixels of `key` that show a point.
     fn sightings(&self, position: Vec3, color: [f32; 3], key: usize) -> Vec<Sighting> {
-        let of = |(view, drawn): (usize, &WorkView)| {
+        let of = |(view, drawn): (usize, &KeyView)| {
             let pixel = drawn.pixel_of(position)?;
-            let seen = drawn.fine().rgb[pixel];
+            let seen = images::color(drawn.rgb[pixel]);
             (difference(seen, color) < SIMILAR).then_some(Sighting { view, pixel, color: seen })
         };
         self.sets[key].views.iter().enumerate().filter_map(of).collect()
@@ -153,8 +161,8 @@ impl KeyFrames {
     /// The share of `sightings` whose pixels are the same at the key frame `other`, or in the medians over time.
     fn share(&self, sightings: &[Sighting], other: Option<usize>) -> f32 {
         let same = |s: &&Sighting| {
-            let colors = other.map_or_else(|| &self.still[s.view], |other| &self.sets[other].views[s.view].fine().rgb);
-            colors.get(s.pixel).is_some_and(|other| difference(*other, s.color) < self.unchanged)
+            let colors = other.map_or_else(|| &self.still[s.view], |other| &self.sets[other].views[s.view].rgb);
+            colors.get(s.pixel).is_some_and(|&other| difference(images::color(other), s.color) < self.unchanged)
         };
         sightings.iter().filter(same).count() as f32 / sightings.len().max(1) as f32
     }
@@ -227,14 +235,14 @@ fn reach(there: impl Fn(usize) -> bool, count: usize, from: usize, hidden: usize
 }
 
 /// The median over all sets of each pixel of each view; none of too few sets.
-fn medians(sets: &[WorkSet]) -> Vec<Vec<[f32; 3]>> {
+fn medians(sets: &[KeySet]) -> Vec<Vec<[u8; 3]>> {
     let views = if sets.len() < LEAST_FRAMES { 0 } else { sets[0].views.len() };
     let of = |v: usize| {
-        let pixels = sets.iter().map(|set| set.views[v].fine().rgb.len()).min().unwrap_or(0);
+        let pixels = sets.iter().map(|set| set.views[v].rgb.len()).min().unwrap_or(0);
         let median = |p: usize| {
             [0, 1, 2].map(|k| {
-                let mut values: Vec<f32> = sets.iter().map(|set| set.views[v].fine().rgb[p][k]).collect();
-                *values.select_nth_unstable_by(sets.len() / 2, f32::total_cmp).1
+                let mut values: Vec<u8> = sets.iter().map(|set| set.views[v].rgb[p][k]).collect();
+                *values.select_nth_unstable(sets.len() / 2).1
             })
         };
         (0..pixels).into_par_iter().map(median).collect()
@@ -243,8 +251,8 @@ fn medians(sets: &[WorkSet]) -> Vec<Vec<[f32; 3]>> {
 }
 
 /// How much a view differs from a point where it would show it; `None` outside the image.
-fn shown(view: &WorkView, position: Vec3, color: [f32; 3]) -> Option<f32> {
-    view.pixel_of(position).map(|p| difference(view.fine().rgb[p], color))
+fn shown(view: &KeyView, position: Vec3, color: [f32; 3]) -> Option<f32> {
+    view.pixel_of(position).map(|p| difference(images::color(view.rgb[p]), color))
 }
 
 fn difference(a: [f32; 3], b: [f32; 3]) -> f32 {
@@ -254,7 +262,7 @@ fn difference(a: [f32; 3], b: [f32; 3]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::super::super::focus::Focus;
-    use super::super::views::{Foreground, Level};
+    use super::super::views::{Foreground, Level, WorkView};
     use super::*;
     use glam::{DMat3, DVec3};
 
@@ -299,15 +307,22 @@ mod tests {
         Vec3::new(-0.2, 0.2, 0.0) + STEP * key as f32
     }
 
+    /// Key frames at the first, the second and the third of frames that are half a sequence apart.
     fn key_frames() -> KeyFrames {
-        let set = |key: usize| set_of(|x| view(x, ball(key)));
-        let candidate = |key: usize, k: usize| Candidate { position: ball(key) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
-        let found = (0..3).map(|key| (0..9).map(|k| candidate(key, k)).collect()).collect();
-        KeyFrames { times: vec![0.0, 0.5, 1.0], sets: (0..3).map(set).collect(), found, still: Vec::new(), unchanged: UNCHANGED }
+        key_frames_at([0, 1, 2], 0.5)
     }
 
-    fn set_of(view: impl Fn(f64) -> WorkView) -> WorkSet {
-        WorkSet {
+    /// Key frames at three of the frames that are `interval` apart; the ball moves by a step in each interval.
+    fn key_frames_at(frames: [usize; 3], interval: f64) -> KeyFrames {
+        let set = |frame: usize| set_of(|x| view(x, ball(frame)));
+        let candidate = |frame: usize, k: usize| Candidate { position: ball(frame) + offset(k), color: RED, confidence: 1.0, depth: 4.0 };
+        let found = frames.iter().map(|&frame| (0..9).map(|k| candidate(frame, k)).collect()).collect();
+        let times = frames.iter().map(|&frame| interval * frame as f64).collect();
+        KeyFrames { times, sets: frames.iter().map(|&frame| set(frame)).collect(), found, still: Vec::new(), unchanged: UNCHANGED }
+    }
+
+    fn set_of(view: impl Fn(f64) -> WorkView) -> KeySet {
+        let set = WorkSet {
             views: [-1.0, -0.4, 0.4, 1.0].map(view).into(),
             keys: 4,
             arrangement: Arrangement::OneTime,
@@ -315,7 +330,8 @@ mod tests {
             foreground: Foreground::Unknown,
             box_low: Vec3::splat(-1.0),
             box_high: Vec3::splat(1.0),
-        }
+        };
+        KeySet::new(set, usize::MAX)
     }
 
     #[test]
@@ -346,12 +362,16 @@ mod tests {
 
     #[test]
     fn velocities_are_found_from_the_neighbouring_key_frames() {
-        let frames = key_frames();
-        let mut points: Vec<KeyPoint> = frames.judge((0..9).map(|k| (ball(1) + offset(k), RED)).collect(), 1).into_iter().flatten().collect();
-        assert_eq!(points.len(), 9);
-        frames.set_in_motion(&mut points, Seed::root(1));
-        for point in points {
-            assert!((point.velocity - STEP).length() < 0.1, "{point:?}");
+        // The second and the third time the frame between 1 and 3 is left out: after the points' own key frame, then before it.
+        for (at, interval, key) in [([0, 1, 2], 0.5, 1), ([0, 1, 3], 0.25, 1), ([0, 1, 3], 0.25, 2)] {
+            let frames = key_frames_at(at, interval);
+            let mut points: Vec<KeyPoint> = frames.judge((0..9).map(|k| (ball(at[key]) + offset(k), RED)).collect(), key).into_iter().flatten().collect();
+            assert_eq!(points.len(), 9);
+            frames.set_in_motion(&mut points, Seed::root(1));
+            for point in points {
+                let step = point.velocity * interval as f32;
+                assert!((step - STEP).length() < 0.1, "{at:?}: {point:?}");
+            }
         }
     }
 
