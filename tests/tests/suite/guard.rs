@@ -18,6 +18,8 @@ const LEAST_AGE: usize = 50;
 const AGE_SHARE: usize = 6;
 const VIEWS: f32 = 16.0;
 const MOST_REMOVED: f64 = 0.25;
+/// A colour coefficient of something that is three times as bright as white.
+const DAZZLING: f32 = 10.0;
 
 /// What was carried out of the plans of a [`Hostile`].
 #[derive(Default)]
@@ -35,7 +37,8 @@ struct Done {
 static DONE: Mutex<Vec<(String, Arc<Done>)>> = Mutex::new(Vec::new());
 
 /// Does harm after every iteration: `does = "remove"` keeps a single Gaussian, `"reset"` makes all nearly transparent, `"children"` adds copies and removes those of
-/// the iteration before. The default does nothing, because other tests run every registered control.
+/// the iteration before, `"dazzle"` makes all far too bright in the last tenth of the main stage, which no guard prevents. The default does nothing, because
+/// other tests run every registered control.
 struct Hostile {
     does: String,
     done: Option<Arc<Done>>,
@@ -89,6 +92,10 @@ impl DensityControl for Hostile {
         }
         Ok(Some(plan))
     }
+    fn after_step(&mut self, gaussians: &Gaussians, schedule: &Schedule, _: Seed) -> Result<Vec<(String, Tensor<2>)>> {
+        let dazzles = self.does == "dazzle" && schedule.stage == Stage::Main && schedule.progress() > 0.9;
+        Ok(if dazzles { vec![("sh_dc".into(), gaussians.sh_dc.clone().mul_scalar(0.0f32).add_scalar(DAZZLING))] } else { Vec::new() })
+    }
     fn executed(&mut self, plan: &DensityPlan, _: &Device) -> Result<()> {
         let (Some(done), Some(schedule)) = (&self.done, &self.schedule) else { return Ok(()) };
         let removed = plan.removed(self.born.len());
@@ -134,10 +141,7 @@ struct Run {
     notes: Vec<String>,
 }
 
-fn run(does: &str, iterations: usize) -> Run {
-    let done = Arc::new(Done::default());
-    DONE.lock().unwrap().push((does.into(), done.clone()));
-    let registry = Registry::collect().unwrap();
+fn configured(does: &str, iterations: usize) -> RunConfig {
     let sets = [
         format!("density={{kind='hostile', does='{does}'}}"),
         format!("train.iterations={iterations}"),
@@ -146,7 +150,13 @@ fn run(does: &str, iterations: usize) -> Run {
         "init.count=400".into(),
         "deformer.kind=none".into(),
     ];
-    let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
+    RunConfig::resolve(Some("demo"), None, &sets).unwrap()
+}
+
+fn run(does: &str, iterations: usize) -> Run {
+    let done = Arc::new(Done::default());
+    DONE.lock().unwrap().push((does.into(), done.clone()));
+    let (registry, config) = (Registry::collect().unwrap(), configured(does, iterations));
     let scene = Arc::new(cc4dgs_train::data::open(Path::new("procedural:tiny"), &config.scene, &registry, &config.limits).unwrap());
     let (events, stop) = (Recorder::default(), AtomicBool::new(false));
     let job = TrainJob { config: &config, scene: scene.clone(), out: None, resume: false, registry: &registry, events: &events, stop: &stop, observer: None };
@@ -188,6 +198,26 @@ fn hostile_controls_do_not_take_a_training_apart() {
             }
         }
     }
+}
+
+#[test]
+fn a_run_that_falls_apart_late_fails_and_keeps_its_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let (registry, config) = (Registry::collect().unwrap(), configured("dazzle", 300));
+    let scene = Arc::new(cc4dgs_train::data::open(Path::new("procedural:tiny"), &config.scene, &registry, &config.limits).unwrap());
+    let (events, stop) = (Recorder::default(), AtomicBool::new(false));
+    let fails = |resume| {
+        let (scene, out) = (scene.clone(), Some(folder.path().to_path_buf()));
+        let job = TrainJob { config: &config, scene, out, resume, registry: &registry, events: &events, stop: &stop, observer: None };
+        train(&job).err().unwrap()
+    };
+    let error = fails(false);
+    let said = error.to_string();
+    assert!(error.exit_code() == 6 && said.contains("training views fell from") && said.contains("of 150 of the main stage"), "{said}");
+    assert!(folder.path().join("checkpoint").is_file() && said.contains("The checkpoint is kept"), "{said}");
+    let verdict = |event: &Event| matches!(event, Event::Note { object, message } if object == "verdict" && message.starts_with("fell apart"));
+    assert!(events.events().iter().any(verdict), "{:?}", events.events());
+    assert_eq!(fails(true).to_string(), said, "resumed, it says the same");
 }
 
 /// Gaussians at the start of a driven schedule, and the bound of controls that have one.

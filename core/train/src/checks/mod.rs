@@ -2,7 +2,7 @@
 //!
 //! Before training, [`check_scene`] looks at images, cameras, times and poses: what cannot be reconstructed is refused, what looks wrong is a doubt. During
 //! the main stage a `Watch` compares the model with baselines that cost nothing; a run that stays below them fails, and stops at 85 % of the stage. At the
-//! end a [`Verdict`] says in words how it went.
+//! end a run fails that is far below its own earlier scores, and a [`Verdict`] says in words how the others went.
 
 mod baselines;
 mod cameras;

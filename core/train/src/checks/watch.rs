@@ -1,7 +1,7 @@
 //! Scores a model on its way and at its end, and decides whether the run has failed.
 
 use super::baselines::{MovingPixels, Yardstick, blurred, psnr_db};
-use super::rules::{Doubts, GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, shortfall};
+use super::rules::{Doubts, GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, collapse, shortfall};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::sample::spread_views;
@@ -10,7 +10,8 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
-/// Where the main stage is scored, percent. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the scores at `HALF` and at `END` decide at the end.
+/// Where the main stage is scored, percent. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the scores at `HALF` and at `END` decide at the end,
+/// where it must not be far below any earlier one either.
 const HALF: usize = 50;
 const LATE: usize = 85;
 const END: usize = 100;
@@ -59,7 +60,7 @@ impl Watch {
     /// The verdict of a finished run, as an event too; `None` for a run that is too short to be judged, and an event that says so.
     ///
     /// # Errors
-    /// [`Error::Failed`] for a model that is not better than what can be had without one.
+    /// [`Error::Failed`] for a model that is not better than what can be had without one, and for one that was far better before.
     pub fn conclude(&mut self, context: &Context, state: &mut TrainState) -> Result<Option<Verdict>> {
         let train = &context.job.config.train;
         let note = |message: String| context.job.events.emit(&Event::Note { object: "verdict".into(), message });
@@ -71,6 +72,17 @@ impl Watch {
         }
         self.score(context, state, END)?;
         let (Some(yardstick), Some(end)) = (&self.yardstick, self.at(END)) else { return Ok(None) };
+        // Before the baselines: poses and times are no likely causes where the model was good.
+        let complete = train.time_ramp.max(train.image_growth);
+        if let Some(problem) = collapse(&self.scores, complete, context.lengths.length(Stage::Main), &yardstick.baselines) {
+            note(format!("fell apart: {problem}"));
+            let remedy = format!(
+                "It fell apart: try lower learning rates (train.lr, those of the deformer), rates that fall to 0 at the end (train.lr.cooldown = 0.2), or \
+                 density.kind = \"none\" to see whether density control is the cause. {} = false accepts such models",
+                kept(context)
+            );
+            return Err(Error::failed("training", problem, remedy));
+        }
         if let Some(failure) = self.failure_at(END, context, state) {
             return Err(failure);
         }
@@ -181,7 +193,7 @@ impl Watch {
     /// The error of a run that is below a baseline, with the likely cause.
     fn failure(&self, context: &Context, problem: String) -> Error {
         let iterations = context.job.config.train.iterations;
-        let kept = if context.checkpoint.is_some() { "The checkpoint is kept, and train.checks" } else { "train.checks" };
+        let kept = kept(context);
         let scene = &context.job.scene;
         match (self.doubts.first(), same_time(context.job).or(scene.warnings.first())) {
             (Some(doubt), _) => Error::failed("training", format!("{problem}. The likely cause: {}", doubt.problem), doubt.remedy.clone()),
@@ -199,6 +211,11 @@ impl Watch {
             }
         }
     }
+}
+
+/// How the sentence begins that says how to accept a model that has failed.
+fn kept(context: &Context) -> &'static str {
+    if context.checkpoint.is_some() { "The checkpoint is kept, and train.checks" } else { "train.checks" }
 }
 
 /// The reader's warning that all images state one time.
