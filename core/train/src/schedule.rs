@@ -6,8 +6,12 @@ use cc4dgs_core::{Schedule, Settled, Stage};
 /// Sizes per axis that images have before they have their full one, ascending; each for an equal part of the time.
 pub const IMAGE_SCALES: [f32; 3] = [0.25, 0.354, 0.5];
 
-/// The share of the main stage after which its length is settled ([`TrainConfig::stretch`]).
+/// The share of the main stage after which its length is settled ([`TrainConfig::stretch`]), or later where images are small for longer.
 const SETTLED: f64 = 0.2;
+/// The share of the main stage that is timed before that, all of it with images of full size.
+const TIMED: f64 = 0.1;
+/// The largest share after which the length is settled.
+const LAST_SETTLED: f64 = 0.9;
 
 /// Iterations of a run's stages.
 #[derive(Clone, Debug)]
@@ -62,11 +66,18 @@ impl StageLengths {
     }
     /// The last iteration of the main stage whose schedule does not know the settled length.
     pub fn settles_at(&self) -> usize {
-        (SETTLED * self.lengths[2] as f64) as usize
+        let [coarse, _, main] = self.lengths.map(|length| length as f64);
+        let small = self.image_growth * (coarse + main) - coarse;
+        (small + TIMED * main).clamp(SETTLED * main, LAST_SETTLED * main) as usize
     }
-    /// Makes the main stage `factor` times as long as its share, from [`StageLengths::settles_at`] on.
+    /// The iteration of the main stage after which iterations are timed to settle its length.
+    pub fn timed_after(&self) -> usize {
+        self.settles_at().saturating_sub((TIMED * self.lengths[2] as f64) as usize)
+    }
+    /// Makes the main stage `factor` times as long as its share, from [`StageLengths::settles_at`] on; it is longer than that in any case.
     pub fn stretch_main(&mut self, factor: f64) {
-        self.settled = (factor * self.lengths[2] as f64).round() as usize;
+        let least = (self.settles_at() + 1).min(self.lengths[2]);
+        self.settled = ((factor * self.lengths[2] as f64).round() as usize).max(least);
     }
     /// States in how many iterations every camera of `stage` is drawn once.
     pub fn set_pass(&mut self, stage: Stage, iterations: usize) {
@@ -119,6 +130,17 @@ mod tests {
         assert!((after.progress() - 0.2).abs() < 1e-3 && lengths.schedule(Stage::Main, 2620).progress() == 1.0);
         lengths.stretch_main(1.0);
         assert_eq!(lengths.schedule(Stage::Main, 401), plain.schedule(Stage::Main, 401));
+    }
+
+    #[test]
+    fn a_length_is_settled_when_images_have_their_full_size() {
+        let of = |image_growth, stretch| StageLengths::new(&TrainConfig { iterations: 2800, image_growth, stretch, ..Default::default() }, true, 1.0);
+        assert_eq!((of(0.0, 1.0).timed_after(), of(0.1, 1.0).settles_at()), (200, 400));
+        let growing = of(0.5, 1.4);
+        assert_eq!((growing.timed_after(), growing.settles_at(), growing.length(Stage::Main)), (750, 950, 2800));
+        let scale = |iteration| growing.schedule(Stage::Main, iteration).image_scale;
+        assert_eq!((scale(750), scale(751), scale(951), scale(2800)), (0.5, 1.0, 1.0, 1.0));
+        assert_eq!((of(1.0, 1.0).settles_at(), of(1.0, 0.7).length(Stage::Main)), (1800, 1801), "never shorter than what was done");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use crate::masks::PUBLISHED_SIGMA;
 use cc4dgs_core::{Error, Result, Schedule, Stage};
 use serde::{Deserialize, Serialize};
 
-/// Bounds of `train.stretch`. What happens at a third of the main stage still lies after its first fifth.
+/// Bounds of `train.stretch`. What happens at a third of the main stage still lies after its first fifth; a stage never ends before its length is settled.
 pub(crate) const LEAST_STRETCH: f64 = 0.7;
 pub(crate) const MOST_STRETCH: f64 = 4.0;
 
@@ -41,7 +41,8 @@ pub struct TrainConfig {
     pub iterations: usize,
     /// Shares of coarse, score and main stage.
     pub shares: [f64; 3],
-    /// Length of the main stage from its first fifth on, as a multiple of its share: runs that `auto` plans for a time find it when they have timed that fifth.
+    /// Length of the main stage from its first fifth on, or later where `image_growth` asks for it, as a multiple of its share: runs that `auto` plans for a
+    /// time find it when they have timed what is before.
     pub stretch: f64,
     /// Views per iteration.
     pub batch: usize,
@@ -91,8 +92,8 @@ pub struct TrainConfig {
     pub sh_every: usize,
     /// Learning rates of the Gaussians.
     pub lr: GaussianRates,
-    /// Check the scene before training and the result afterwards. A scene that cannot be reconstructed is refused, and a run that stays below simple baselines
-    /// fails; without checks both go on. Changes nothing else.
+    /// Check the scene before training and the result afterwards. A scene that cannot be reconstructed is refused, and a run fails that stays below simple
+    /// baselines or falls far below its own earlier scores; without checks both go on. Changes nothing else.
     pub checks: bool,
     /// Views that are kept out of training ([`crate::data::hold_out`]: whole cameras where cameras film) and scored at its end. Test views are never looked at.
     pub validation: usize,

@@ -1,4 +1,5 @@
-//! The length of the main stage of a run that has a time to end at: settled once its first fifth has been timed.
+//! The length of the main stage of a run that has a time to end at: settled after its first fifth, or once images have had their full size for a while, by the
+//! time of the last iterations until then. Earlier ones tell less: Gaussians that have just begun to learn cover more pixels.
 //!
 //! A plan times a few iterations of Gaussians that have not been trained. Trained ones take between two thirds of that and a fifth more, for reasons that differ
 //! from scene to scene: how much they overlap, how many there are, how many move. What was settled is written into the run's settings as `train.stretch`, so that
@@ -10,8 +11,6 @@ use crate::train_config::{LEAST_STRETCH, MOST_STRETCH};
 use cc4dgs_core::{Event, Result, Schedule, Stage};
 use std::time::Instant;
 
-/// The share of the first fifth before timing begins: Gaussians that have just begun to learn cover more pixels.
-const FIRST: f64 = 0.5;
 /// The most iterations that are timed together: a graphics card works on several at a time.
 const TOGETHER: usize = 10;
 /// What takes so many times the median of its stage happens once, and is not counted.
@@ -31,7 +30,7 @@ pub(crate) fn growth(now: usize, most: usize) -> f64 {
     (MEAN_GAUSSIANS * most as f64 / now.max(1) as f64).max(1.0).powf(GROWTH_POWER)
 }
 
-/// Times the first fifth of a main stage.
+/// Times a main stage until its length is settled.
 pub(super) struct Pace {
     ends: Instant,
     since: Option<Instant>,
@@ -52,7 +51,7 @@ impl Pace {
         let together = (last / 6).clamp(1, TOGETHER);
         if iteration.is_multiple_of(together) && iteration <= last {
             let now = Instant::now();
-            if let Some(since) = self.since.replace(now).filter(|_| iteration as f64 > FIRST * last as f64) {
+            if let Some(since) = self.since.replace(now).filter(|_| iteration > context.lengths.timed_after()) {
                 self.seconds.push(now.duration_since(since).as_secs_f64());
             }
         }
