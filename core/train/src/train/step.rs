@@ -42,7 +42,7 @@ impl Context<'_> {
         let moves = state.deformer.as_ref().is_some_and(|d| !d.field.is_static()) && rows.count() > 0;
         self.decide_smoothness(state, schedule, moves)?;
 
-        let neighbours = if moves && train.strain > 0.0 { state.current_neighbours(&self.device)? } else { None };
+        let mut neighbours = if moves && train.strain > 0.0 { state.current_neighbours(&self.device)? } else { None };
         let learns = |name: &str| match name {
             "dynamic_scores" => false,
             "sh_rest" => schedule.iteration.is_multiple_of(train.sh_every),
@@ -94,8 +94,9 @@ impl Context<'_> {
                             return Ok(Some(Trouble::of("deformer", format!("the offsets of {object}"))));
                         }
                     }
-                    if let (Some(neighbours), Some(means)) = (&neighbours, &offsets.means) {
-                        let term = neighbours.strain(means.clone()).mul_scalar(train.strain / batch.len() as f32);
+                    // At the time of the first view: at all of them, strain would take longer than the deformer's functions of time.
+                    if let (Some(neighbours), Some(means)) = (neighbours.take(), &offsets.means) {
+                        let term = neighbours.strain(means.clone()).mul_scalar(train.strain);
                         total = Some(total.map_or(term.clone(), |sum| sum + term));
                     }
                     offsets.apply(deformer.name(), &gaussians, rows.indices())?
