@@ -1,6 +1,6 @@
 //! Binary cross-entropy of logits, with its gradient, on the device.
 
-use super::tensor::{THREADS, floats, upload, workgroups_for};
+use super::tensor::{THREADS, floats, sum_of_threads, upload, workgroups_for};
 use burn::backend::TensorMetadata;
 use burn::tensor::DType;
 use burn_cubecl::kernel::into_contiguous;
@@ -40,18 +40,23 @@ fn bce_terms(logits: &[f32], mask: &[f32], grad: &mut [f32], partial: &mut [f32]
     }
 }
 
+/// Adds up the sums of all workgroups, by one workgroup, with compensation for rounding (Kahan).
 #[cube(launch)]
 fn finish_mean(partial: &[f32], mean: &mut [f32], workgroups: u32, scale: f32) {
+    let mut sums = Shared::<[f32]>::new_slice(THREADS as usize);
+    let mut sum = 0.0f32;
+    let mut lost = 0.0f32;
+    let mut k = UNIT_POS as usize;
+    while k < workgroups as usize {
+        let value = partial[k] - lost;
+        let next = sum + value;
+        lost = (next - sum) - value;
+        sum = next;
+        k += THREADS as usize;
+    }
+    let total = sum_of_threads(&mut sums, sum);
     if UNIT_POS == 0 {
-        let mut sum = 0.0f32;
-        let mut lost = 0.0f32;
-        for k in 0..workgroups as usize {
-            let value = partial[k] - lost;
-            let next = sum + value;
-            lost = (next - sum) - value;
-            sum = next;
-        }
-        mean[0] = sum * scale;
+        mean[0] = total * scale;
     }
 }
 
@@ -82,6 +87,6 @@ pub fn bce(planes: CubeTensor, mask: CubeTensor, gradient: bool) -> (CubeTensor,
         gradient,
     );
     let one = CubeCount::Static(1, 1, 1);
-    finish_mean::launch(&client, one, CubeDim::new_1d(32), partial.into_buffer_arg(), loss.clone().into_buffer_arg(), workgroups as u32, scale);
+    finish_mean::launch(&client, one, CubeDim::new_1d(THREADS), partial.into_buffer_arg(), loss.clone().into_buffer_arg(), workgroups as u32, scale);
     (loss, grad)
 }

@@ -1,9 +1,9 @@
 //! L1 + SSIM with its gradient, on the device. The cross-entropy of the score stage is in [`super::cross_entropy`].
 //!
 //! Four sweeps over the image: horizontal blur of x, y, x^2, y^2, xy; vertical blur, SSIM and its derivatives; the same two blurs of the derivatives.
-//! Sums are taken per workgroup and then by one thread, in order, so that every run gives the same bytes.
+//! Sums are taken per workgroup and then by one workgroup, in a fixed order, so that every run gives the same bytes.
 
-use super::tensor::{THREADS, floats, upload, workgroups_for};
+use super::tensor::{THREADS, floats, sum_of_threads, upload, workgroups_for};
 use crate::ops::photometric::{PhotometricKernels, PhotometricOps};
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
@@ -139,25 +139,34 @@ fn ssim_and_derivatives(
     }
 }
 
-/// Adds up the terms of all workgroups, in order, with compensation for rounding (Kahan); numbers = `[loss, l1, ssim, mse]`.
+/// The sum of one term over all workgroups, with compensation for rounding (Kahan), for the first thread.
+#[cube]
+fn sum_of_term(partial: &[f32], sums: &mut Shared<[f32]>, term: usize, workgroups: u32) -> f32 {
+    let mut sum = 0.0f32;
+    let mut lost = 0.0f32;
+    let mut k = UNIT_POS as usize;
+    while k < workgroups as usize {
+        let value = partial[k * 3 + term] - lost;
+        let next = sum + value;
+        lost = (next - sum) - value;
+        sum = next;
+        k += THREADS as usize;
+    }
+    sum_of_threads(sums, sum)
+}
+
+/// Adds up the terms (l1, ssim, mse) of all workgroups, by one workgroup, and combines them into the loss.
 #[cube(launch)]
 fn finish_terms(partial: &[f32], loss: &mut [f32], terms: &mut [f32], workgroups: u32, scale: f32, lambda_c: f32) {
-    let mut means = Shared::<[f32]>::new_slice(3usize);
-    if UNIT_POS < 3 {
-        let mut sum = 0.0f32;
-        let mut lost = 0.0f32;
-        for k in 0..workgroups {
-            let value = partial[(k * 3 + UNIT_POS) as usize] - lost;
-            let next = sum + value;
-            lost = (next - sum) - value;
-            sum = next;
-        }
-        means[UNIT_POS as usize] = sum * scale;
-        terms[UNIT_POS as usize] = sum * scale;
-    }
-    sync_cube();
+    let mut sums = Shared::<[f32]>::new_slice(THREADS as usize);
+    let l1 = sum_of_term(partial, &mut sums, 0usize, workgroups) * scale;
+    let ssim = sum_of_term(partial, &mut sums, 1usize, workgroups) * scale;
+    let mse = sum_of_term(partial, &mut sums, 2usize, workgroups) * scale;
     if UNIT_POS == 0 {
-        loss[0] = lambda_c * means[0] + (1.0 - lambda_c) * (1.0 - means[1]);
+        terms[0] = l1;
+        terms[1] = ssim;
+        terms[2] = mse;
+        loss[0] = lambda_c * l1 + (1.0 - lambda_c) * (1.0 - ssim);
     }
 }
 
@@ -263,7 +272,7 @@ impl PhotometricKernels for CubeBackend {
         finish_terms::launch(
             &client,
             CubeCount::Static(1, 1, 1),
-            CubeDim::new_1d(32),
+            dim,
             partial.into_buffer_arg(),
             loss.clone().into_buffer_arg(),
             terms.clone().into_buffer_arg(),

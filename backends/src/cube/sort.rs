@@ -16,6 +16,13 @@ const MASK: u32 = (1 << DIGIT) - 1;
 const ROUNDS: u32 = 4;
 const BLOCK: u32 = ROUNDS * THREADS;
 
+/// a + b, at most 2^31 - 1, as long as neither is larger. Huge Gaussians can meet more tiles than 32 bits count: their sum must exceed every limit, not wrap.
+#[cube]
+fn saturating_sum(a: u32, b: u32) -> u32 {
+    let sum = a + b;
+    select(sum < 0x7fff_ffffu32, sum, 0x7fff_ffffu32)
+}
+
 /// Inclusive prefix sum over the threads of a workgroup: running`[thread]` becomes the sum of the values of all threads up to it.
 #[cube]
 fn add_up(running: &mut Shared<[u32]>, value: u32) {
@@ -29,7 +36,8 @@ fn add_up(running: &mut Shared<[u32]>, value: u32) {
             before = running[thread - reach];
         }
         sync_cube();
-        running[thread] += before;
+        let own = running[thread];
+        running[thread] = saturating_sum(own, before);
         sync_cube();
         reach *= 2;
     }
@@ -69,11 +77,11 @@ fn scan_sums(sums: &mut [u32], total: &mut [u32], count: u32) {
         }
         add_up(&mut running, value);
         if at < count as usize {
-            sums[at] = carry + running[thread] - value;
+            sums[at] = saturating_sum(carry, running[thread] - value);
         }
         let end = running[THREADS as usize - 1];
         sync_cube();
-        carry += end;
+        carry = saturating_sum(carry, end);
         start += THREADS;
     }
     if UNIT_POS == 0 {
@@ -84,7 +92,8 @@ fn scan_sums(sums: &mut [u32], total: &mut [u32], count: u32) {
 #[cube(launch)]
 fn add_sums(values: &mut [u32], sums: &[u32], count: u32) {
     if ABSOLUTE_POS < count as usize {
-        values[ABSOLUTE_POS] += sums[ABSOLUTE_POS / THREADS as usize];
+        let own = values[ABSOLUTE_POS];
+        values[ABSOLUTE_POS] = saturating_sum(own, sums[ABSOLUTE_POS / THREADS as usize]);
     }
 }
 

@@ -110,6 +110,27 @@ fn copy_words(from: &[f32], to: &mut [f32]) {
     }
 }
 
+/// Adds up one value per thread of a workgroup of [`THREADS`], in the order of the threads, with compensation for rounding (Kahan). The first thread gets the
+/// sum, the others 0. All threads of the workgroup must call it.
+#[cube]
+pub fn sum_of_threads(values: &mut Shared<[f32]>, own: f32) -> f32 {
+    // What an earlier call left in `values` has been read.
+    sync_cube();
+    values[UNIT_POS as usize] = own;
+    sync_cube();
+    let mut sum = 0.0f32;
+    if UNIT_POS == 0 {
+        let mut lost = 0.0f32;
+        for k in 0..THREADS as usize {
+            let value = values[k] - lost;
+            let next = sum + value;
+            lost = (next - sum) - value;
+            sum = next;
+        }
+    }
+    sum
+}
+
 /// Whether `value` is finite, by its bits: shader compilers may assume that arithmetic never meets infinities and NaN.
 #[cube]
 pub fn is_finite(value: f32) -> bool {

@@ -139,8 +139,9 @@ pub fn backward(
         if n > 0 {
             let (of_camera, of_offset) = (floats(&means, [12]), floats(&means, [3]));
             for (from, to, stride, first) in [(&geometry, &of_camera, GEOMETRY, OF_CAMERA), (&screen, &of_offset, SCREEN, AT_OFFSET)] {
+                let count = spread(to.meta.shape().num_elements());
                 let (from, to) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
-                gradient::sum_rows::launch(&client, CubeCount::Static(1, 1, 1), CubeDim::new_1d(32), from, to, n as u32, stride as u32, first as u32);
+                gradient::sum_rows::launch(&client, count, DIM(), from, to, n as u32, stride as u32, first as u32);
             }
             let (matrix, offset) = (read_floats(&of_camera), read_floats(&of_offset));
             sums.rotation = std::array::from_fn(|k| f64::from(matrix[k]));
@@ -153,8 +154,7 @@ pub fn backward(
     let of_background = || {
         let out = floats(&means, [3]);
         let (state, upstream) = (lists.state.clone().into_buffer_arg(), upstream.clone().into_buffer_arg());
-        let one = CubeCount::Static(1, 1, 1);
-        gradient::background_backward::launch(&client, one, CubeDim::new_1d(32), state, upstream, out.clone().into_buffer_arg(), (width * height) as u32);
+        gradient::background_backward::launch(&client, spread(3), DIM(), state, upstream, out.clone().into_buffer_arg(), (width * height) as u32);
         out
     };
     let absolute_screen = || {

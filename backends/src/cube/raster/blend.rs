@@ -33,7 +33,7 @@ fn full_alpha(drawn: &Shared<[f32]>, at: usize, dx: f32, dy: f32) -> f32 {
     select(sigma >= 0.0 && alpha >= ALPHA_MIN, alpha, 0.0f32)
 }
 
-/// Planes `[5,H,W]`; per pixel the transmittance left and the list index at which it stopped, as bits `[2,H,W]`; largest weights `[N]` if asked for.
+/// Planes `[5,H,W]`; per pixel the bits of the transmittance left, and the list index at which it stopped `[2,H,W]`; largest weights `[N]` if asked for.
 #[cube(launch_unchecked)]
 pub fn blend_tiles(
     splats: &[f32],
@@ -42,7 +42,7 @@ pub fn blend_tiles(
     starts: &[u32],
     background: &[f32],
     planes: &mut [f32],
-    state: &mut [f32],
+    state: &mut [u32],
     weights: &mut [Atomic<u32>],
     width: u32,
     height: u32,
@@ -132,8 +132,9 @@ pub fn blend_tiles(
         planes[at + 2 * pixels] = blue + left * background[2];
         planes[at + 3 * pixels] = 1.0 - left;
         planes[at + 4 * pixels] = depth;
-        state[at] = left;
-        state[at + pixels] = f32::reinterpret(stop);
+        // As words: an index as a float would be subnormal, and WGSL lets devices flush those to zero.
+        state[at] = u32::reinterpret(left);
+        state[at + pixels] = stop;
     }
 }
 
@@ -151,7 +152,7 @@ pub fn blend_tiles_backward(
     sorted: &[u32],
     starts: &[u32],
     background: &[f32],
-    state: &[f32],
+    state: &[u32],
     upstream: &[f32],
     records: &mut [f32],
     width: u32,
@@ -183,8 +184,8 @@ pub fn blend_tiles_backward(
     let mut g_depth = 0.0f32;
     if x < width && y < height {
         let at = (y * width + x) as usize;
-        left = state[at];
-        stop = u32::reinterpret(state[at + pixels]);
+        left = f32::reinterpret(state[at]);
+        stop = state[at + pixels];
         g_red = upstream[at];
         g_green = upstream[at + pixels];
         g_blue = upstream[at + 2 * pixels];

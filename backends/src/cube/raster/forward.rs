@@ -146,7 +146,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     }
     lists::tile_starts::launch(&client, workgroups_for(pairs + 1), DIM(), sorted_tiles.into_buffer_arg(), tile_starts.clone().into_buffer_arg(), pairs as u32);
     let planes = floats(&means, [5, height, width]);
-    let state = floats(&means, [2, height, width]);
+    let state = empty(&means, [2, height, width], DType::U32);
     let weights = if settings.max_weights && n > 0 { upload(&means, &vec![0.0f32; n], DType::F32) } else { upload(&means, &[0.0f32], DType::F32) };
     // SAFETY: tiles and pixels are compared with the sizes of their buffers; pairs and Gaussians come from lists made above, which name none beyond the last.
     unsafe {

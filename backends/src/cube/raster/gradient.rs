@@ -4,6 +4,7 @@ use super::geometry::{CENTER, project, project_backward};
 use super::harmonics::{basis, basis_backward};
 use super::project::{KEY_TILES, KEYS, activated_opacity, activated_scales, quaternion, view_direction};
 use super::vector::{V3, add, dot, load3, scale, store3, v3};
+use crate::cube::tensor::{THREADS, sum_of_threads};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD};
 use cubecl::prelude::*;
 
@@ -227,35 +228,43 @@ pub fn take_columns(from: &[f32], to: &mut [f32], stride: u32, first: u32, width
     }
 }
 
-/// Sums of columns over rows, in order: one thread per column, for few columns.
+/// Sums of columns over rows, in a fixed order: one workgroup per column, for few columns.
 #[cube(launch)]
 pub fn sum_rows(from: &[f32], to: &mut [f32], rows: u32, stride: u32, first: u32) {
-    if ABSOLUTE_POS < to.len() {
-        let mut sum = 0.0f32;
-        let mut lost = 0.0f32;
-        for row in 0..rows as usize {
-            // Kahan's compensation: hundreds of thousands of terms go into one number.
-            let value = from[row * stride as usize + first as usize + ABSOLUTE_POS] - lost;
-            let next = sum + value;
-            lost = (next - sum) - value;
-            sum = next;
-        }
-        to[ABSOLUTE_POS] = sum;
+    let mut sums = Shared::<[f32]>::new_slice(THREADS as usize);
+    let mut sum = 0.0f32;
+    let mut lost = 0.0f32;
+    let mut row = UNIT_POS as usize;
+    while row < rows as usize {
+        // Kahan's compensation: hundreds of thousands of terms go into one number.
+        let value = from[row * stride as usize + first as usize + CUBE_POS] - lost;
+        let next = sum + value;
+        lost = (next - sum) - value;
+        sum = next;
+        row += THREADS as usize;
+    }
+    let total = sum_of_threads(&mut sums, sum);
+    if UNIT_POS == 0 && CUBE_POS < to.len() {
+        to[CUBE_POS] = total;
     }
 }
 
-/// Gradient of the background `[3]`: transmittance left times upstream colour, summed over pixels.
+/// Gradient of the background `[3]`: transmittance left times upstream colour, summed over pixels by one workgroup per channel.
 #[cube(launch)]
-pub fn background_backward(state: &[f32], upstream: &[f32], to: &mut [f32], pixels: u32) {
-    if ABSOLUTE_POS < 3usize {
-        let mut sum = 0.0f32;
-        let mut lost = 0.0f32;
-        for at in 0..pixels as usize {
-            let value = state[at] * upstream[ABSOLUTE_POS * pixels as usize + at] - lost;
-            let next = sum + value;
-            lost = (next - sum) - value;
-            sum = next;
-        }
-        to[ABSOLUTE_POS] = sum;
+pub fn background_backward(state: &[u32], upstream: &[f32], to: &mut [f32], pixels: u32) {
+    let mut sums = Shared::<[f32]>::new_slice(THREADS as usize);
+    let mut sum = 0.0f32;
+    let mut lost = 0.0f32;
+    let mut at = UNIT_POS as usize;
+    while at < pixels as usize {
+        let value = f32::reinterpret(state[at]) * upstream[CUBE_POS * pixels as usize + at] - lost;
+        let next = sum + value;
+        lost = (next - sum) - value;
+        sum = next;
+        at += THREADS as usize;
+    }
+    let total = sum_of_threads(&mut sums, sum);
+    if UNIT_POS == 0 && CUBE_POS < to.len() {
+        to[CUBE_POS] = total;
     }
 }
