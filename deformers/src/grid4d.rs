@@ -132,13 +132,18 @@ impl Grid4d {
             within(name, base as usize, 2, last.max(2) as usize)?;
             within(name, last as usize, 2, 65_536)?;
         }
+        for (name, value, most) in [("smooth_weight", s.smooth_weight, 1e6), ("smooth_delta", s.smooth_delta, 1.0)] {
+            if !(0.0..=most).contains(&value) {
+                return Err(Error::parameter(format!("deformer.{name}"), format!("{value} is not in 0..{most}"), "Choose a value in this range"));
+            }
+        }
         let space = grid(s.space_levels, s.features, [s.space_base; 3], [s.space_final; 3], s.log2_rows);
         let time = grid(s.time_levels, s.features, s.time_base, s.time_final, s.log2_rows);
         let attention = ReluShape::chain(&[space.width(), s.width]);
         let temporal = ReluShape { input: 3 * time.width(), trunk: vec![s.width], heads: Vec::new() };
         let network = ReluShape { input: s.width, trunk: vec![s.width; s.depth], heads: OUTPUTS.iter().map(|&out| vec![out]).collect() };
-        bounded([space.parameter_count(), time.parameter_count().saturating_mul(NAMES.len())])?;
-        bounded([&attention, &temporal, &network].map(ReluShape::parameter_count))?;
+        let of_network = [&attention, &temporal, &network].map(ReluShape::parameter_count);
+        bounded([space.parameter_count(), time.parameter_count().saturating_mul(NAMES.len())].into_iter().chain(of_network))?;
         let seed = context.seed;
         let table = |name: &str, shape: &GridShape| {
             parameter(format!("grid.{name}"), Part::Grid, GRID, weights::uniform(seed.child(name), shape.parameter_count(), TABLE), device)
@@ -263,5 +268,24 @@ inventory::submit! {
             capabilities: &["differentiable", "cached-spatial", "regularized"],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Seed;
+
+    #[test]
+    fn perturbations_that_cannot_be_drawn_are_refused() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let build = |smooth_delta: f32, smooth_weight: f32| {
+            let small = Settings { log2_rows: 4, space_levels: 1, time_levels: 1, width: 4, ..Settings::default() };
+            Grid4d::new(Settings { smooth_delta, smooth_weight, ..small }, &context, &Device::flex())
+        };
+        for (smooth_delta, smooth_weight) in [(-1e-3, 0.5), (f32::NAN, 0.5), (f32::INFINITY, 0.5), (5e-3, f32::NAN), (5e-3, -0.5)] {
+            assert!(build(smooth_delta, smooth_weight).is_err(), "{smooth_delta}, {smooth_weight}");
+        }
+        assert!(build(0.0, 0.0).is_ok() && build(5e-3, 0.5).is_ok());
     }
 }

@@ -31,6 +31,9 @@ mod tests {
             ("swift4d-hash", "log2_rows = 24\nlevels = 20\nfeatures = 16"),
             ("embedding", "time_rows = 100000\ntime_features = 4096"),
             ("deform-mlp", "width = 4096\nlayers = 32"),
+            // No network is too large by itself, but all together are.
+            ("cdf", "width = 4096\ntime_layers = 12"),
+            ("cdf-basis", "resolutions = [8]\nhidden = [4096, 4096, 4096, 4096, 4096, 4096]\nfeatures = 4096\nhashes = 4096\nwidth = 4096\nlayers = 8"),
         ] {
             let mut section: toml::Table = settings.parse().unwrap();
             section.insert("kind".into(), kind.into());

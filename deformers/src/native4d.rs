@@ -29,6 +29,8 @@ color_lr = 1.25e-4       # Adam on the cosines' coefficients
 const NAMES: [&str; 4] = ["time_center", "log_duration", "velocity", "sh_time"];
 /// Logarithm of the opacity factor of a hidden Gaussian.
 const HIDDEN: f32 = -30.0;
+/// Largest absolute logarithm of a duration: beyond it, quotients and their derivatives are not finite.
+const MOST_LOG: f32 = 30.0;
 
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -94,7 +96,7 @@ impl Deformer for Native4d {
         let [m, _] = features.dims();
         let part = |at: usize, width: usize| features.clone().narrow(1, at, width);
         let since = part(0, 1).neg().add_scalar(time_norm);
-        let in_durations = since.clone() / part(1, 1).exp();
+        let in_durations = since.clone() / part(1, 1).clamp(-MOST_LOG, MOST_LOG).exp();
         let factor = in_durations.powi_scalar(2).mul_scalar(-0.5).reshape([m]);
         let hidden = factor.clone().lower_elem(self.settings.hidden_below.max(f32::MIN_POSITIVE).ln());
         let sh = (self.settings.harmonics > 0).then(|| {
@@ -131,5 +133,28 @@ inventory::submit! {
             capabilities: &["differentiable", "per-gaussian-attributes"],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::TensorData;
+    use cc4dgs_core::Seed;
+    use cc4dgs_core::gaussians::to_vec;
+
+    #[test]
+    fn extreme_durations_have_finite_factors_and_gradients() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let field = Native4d::new(Settings { harmonics: 0, ..Settings::default() }, &context).unwrap();
+        // Centre in time, logarithm of the duration, velocity: at its moment, apart from it, and there at all times.
+        let rows: [[f32; 5]; 3] = [[0.5, -120.0, 1.0, 0.0, 0.0], [0.2, -120.0, 1.0, 0.0, 0.0], [0.2, 120.0, 1.0, 0.0, 0.0]];
+        let features = Tensor::<2>::from_data(TensorData::new(rows.concat(), [3, 5]), &Device::flex().autodiff()).require_grad();
+        let factors = field.deform(features.clone(), 0.5).unwrap().opacity_log_factor.unwrap();
+        let values = to_vec(factors.clone().inner(), "factors").unwrap();
+        assert!(values[0] == 0.0 && values[1] == HIDDEN && values[2].abs() < 1e-6, "{values:?}");
+        let gradients = factors.sum().backward();
+        let gradient = to_vec(features.grad(&gradients).unwrap(), "gradient").unwrap();
+        assert!(gradient.iter().all(|v| v.is_finite()), "{gradient:?}");
     }
 }

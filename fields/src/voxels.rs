@@ -56,6 +56,10 @@ impl VoxelSizes {
     pub fn width(&self) -> usize {
         self.resolutions.len() * self.decoder.output
     }
+    /// Weights of all decoders.
+    pub fn parameter_count(&self) -> usize {
+        self.resolutions.len().saturating_mul(self.decoder.parameter_count())
+    }
 }
 
 impl VoxelSettings {

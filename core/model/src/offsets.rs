@@ -131,7 +131,8 @@ impl Offsets {
                 return change;
             }
             let raw = select(&moved.quaternions, rows, change.dims()[0]);
-            let norm = raw.clone().powi_scalar(2).sum_dim(1).sqrt().clamp_min(LEAST_NORM);
+            // Limited before the root, whose gradient at 0 is infinite.
+            let norm = raw.clone().powi_scalar(2).sum_dim(1).clamp_min(LEAST_NORM * LEAST_NORM).sqrt();
             raw.clone() / norm - raw + change
         });
         moved.quaternions = add(moved.quaternions, quaternions, rows);

@@ -166,18 +166,11 @@ impl CdfConfig {
             ReluShape::chain(&widths)
         };
         let time = chain(1 + 2 * time_bands, network.time_layers, width);
-        bounded([time.parameter_count()])?;
-        Ok(Sizes {
-            voxels,
-            width,
-            time_bands,
-            time,
-            film: (network.fusion == Fusion::Film).then(|| chain(width, 1, 2 * width)),
-            network: ReluShape {
-                input: width,
-                trunk: vec![width; TRUNK_LAYERS],
-                heads: network.heads.iter().map(|h| vec![width, h.width(context.sh_degree)]).collect(),
-            },
-        })
+        let film = (network.fusion == Fusion::Film).then(|| chain(width, 1, 2 * width));
+        let heads = network.heads.iter().map(|h| vec![width, h.width(context.sh_degree)]).collect();
+        let network = ReluShape { input: width, trunk: vec![width; TRUNK_LAYERS], heads };
+        let of_film = film.as_ref().map_or(0, ReluShape::parameter_count);
+        bounded([voxels.parameter_count(), time.parameter_count(), of_film, network.parameter_count()])?;
+        Ok(Sizes { voxels, width, time_bands, time, film, network })
     }
 }

@@ -169,8 +169,10 @@ impl BasisPlan {
         let kept = settings.functions_of_heads(functions.count())?;
         let groups: Vec<(usize, usize)> = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let outputs = groups.iter().map(|(values, own)| vec![width, values * own]).collect();
-        let coefficients = Arc::new(ReluShape { input: voxels.sizes()?.width(), trunk: vec![width; settings.layers], heads: outputs });
-        bounded([coefficients.parameter_count(), functions.network.as_ref().map_or(0, |n| n.parameter_count())])?;
+        let sizes = voxels.sizes()?;
+        let coefficients = Arc::new(ReluShape { input: sizes.width(), trunk: vec![width; settings.layers], heads: outputs });
+        let of_functions = functions.network.as_ref().map_or(0, |n| n.parameter_count());
+        bounded([sizes.parameter_count(), coefficients.parameter_count(), of_functions])?;
         Ok(Self { settings, voxels, functions, kept, groups, coefficients })
     }
     /// Width of the coefficient network.
