@@ -32,6 +32,7 @@ fn run() -> Result<()> {
         match name {
             "--time" => start.time = Some(Start::parse_time(&value()?)?),
             "--pose" => start.pose = Some(Start::parse_pose(&value()?)?),
+            _ if text.starts_with('-') => return Err(usage(format!("{name} is none of its options"))),
             _ if path.is_none() => path = Some(PathBuf::from(&argument)),
             _ => return Err(usage(format!("{text:?} is one argument too many"))),
         }

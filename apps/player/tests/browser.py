@@ -80,6 +80,9 @@ def playing(page):
     say(f"plays; {rates:.1f} ms per frame at {page.evaluate('cc4dgs.ui.canvas.width')}x{page.evaluate('cc4dgs.ui.canvas.height')} on SwiftShader")
     page.get_by_label("Time", exact=True).fill("0.5")
     assert abs(page.evaluate("cc4dgs.time") - 0.5) < 1e-3
+    frame = page.evaluate("cc4dgs.gpu.frame")
+    page.get_by_label("Time", exact=True).press("ArrowRight")
+    assert page.evaluate("cc4dgs.gpu.frame") == frame + 1, "an arrow key on the slider is a frame"
     page.locator("canvas").focus()
     page.keyboard.press(".")
     assert page.evaluate("cc4dgs.time") > 0.5 and not page.evaluate("cc4dgs.playing")

@@ -21,7 +21,15 @@ export function build(container, player) {
     const openLabel = element("label", { className: "open" }, "Open", file);
     const play = button("▶", "Play", () => player.toggle());
     const time = element("input", { type: "range", min: 0, max: 1, step: 0.0005, value: 0, className: "time", ...labelled("Time"), oninput: () => player.seek(Number(time.value)) });
-    const clock = element("output", { textContent: "–" });
+    // A step of the slider is finer than a frame, so arrow keys would show no change.
+    time.addEventListener("keydown", e => {
+        const frames = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[e.key];
+        if (!frames || e.ctrlKey || e.metaKey || e.altKey) return;
+        player.step(frames);
+        e.preventDefault();
+    });
+    // Screen readers would read it out with every frame.
+    const clock = element("output", { textContent: "–", attributes: { "aria-live": "off" } });
     const speeds = [0.1, 0.25, 0.5, 1, 2, 4];
     const speed = element("select", { className: "wide", ...labelled("Speed"), onchange: () => player.set("speed", Number(speed.value)) },
         ...speeds.map(v => element("option", { value: v, textContent: `${v}×`, selected: v === 1 })));
@@ -68,13 +76,16 @@ export function build(container, player) {
     const top = element("div", { className: "top" }, title, openLabel, gear);
     const root = element("div", { className: "cc" }, canvas, poster, progress, top, panel, bar, note);
     container.replaceChildren(root);
+    // A page that is not the player alone keeps its own look and title.
+    const embedded = !container.matches("body > main");
+    document.documentElement.classList.toggle("cc-embedded", embedded);
 
     const open = source => player.load(source).catch(() => {});
     const say = (text, error) => {
         note.hidden = !text;
         note.className = error ? "note error" : player.facts ? "note hint" : "note";
         note.setAttribute("role", error ? "alert" : "status");
-        note.replaceChildren(element("p", { textContent: text ?? "" }), ...(text && player.facts ? [button("Close", "Close", () => { note.hidden = true; })] : []));
+        note.replaceChildren(element("p", { textContent: text ?? "" }), ...(text && player.facts ? [button("Close", "Close", () => { note.hidden = true; ui.canvas.focus({ preventScroll: true }); })] : []));
     };
     let depth = 0;
     const drag = (name, run) => root.addEventListener(name, e => { e.preventDefault(); run(e); root.classList.toggle("dropping", depth > 0); });
@@ -84,9 +95,9 @@ export function build(container, player) {
     drag("drop", e => { depth = 0; if (e.dataTransfer.files[0]) open(e.dataTransfer.files[0]); });
 
     const ui = {
-        root, canvas,
+        root, canvas, embedded,
         replaceCanvas: () => { const fresh = ui.canvas.cloneNode(); ui.canvas.replaceWith(fresh); ui.canvas = fresh; },
-        title: text => { title.textContent = text; document.title = `${text} – cc4dgs player`; },
+        title: text => { title.textContent = text; if (!embedded) document.title = `${text} – cc4dgs player`; },
         error: text => say(text, true),
         note: text => say(text, false),
         loading: on => { progress.hidden = !on; if (on) { progress.style.width = "2%"; if (!player.facts) say("Loading …"); } },
@@ -127,7 +138,12 @@ export function build(container, player) {
             stats.textContent = `${s.rate.toFixed(0)} frames/s, ${s.visible.toLocaleString("en")} of ${s.gaussians.toLocaleString("en")} Gaussians drawn\n` +
                 `${s.moving.toLocaleString("en")} move, ${megabytes(s.received ?? s.bytes)} fetched of ${megabytes(s.bytes)}, ${megabytes(s.gpuBytes)} on the GPU\n${s.adapter ?? ""}`;
         },
-        closePanel: () => { panel.hidden = true; gear.setAttribute("aria-expanded", "false"); },
+        closePanel: () => {
+            // What is hidden loses the focus, and keys would reach the player no more.
+            if (panel.contains(document.activeElement)) gear.focus();
+            panel.hidden = true;
+            gear.setAttribute("aria-expanded", "false");
+        },
     };
     ui.settings({ ...player.settings, flying: false });
     bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = true; });

@@ -62,6 +62,8 @@ export function addKeys(element, act, commands) {
     });
     element.addEventListener("keyup", e => held.delete(e.key.toLowerCase()));
     element.addEventListener("focusout", () => held.clear());
+    // Where nothing has the focus, nothing loses it with the window.
+    window.addEventListener("blur", () => held.clear());
     return seconds => {
         for (const key of held) act.fly(...FLY[key].map(v => v * seconds));
         return held.size > 0;

@@ -4,6 +4,8 @@
 const FIRST = 65536;
 // All layers.
 const BASE = 255;
+// Largest file in bytes: `LIMITS` of src/web/mod.rs.
+const MOST_BYTES = 2 ** 30;
 const MAGIC = [0x89, 0x43, 0x43, 0x34, 0x44, 0x0d, 0x0a, 0x1a];
 
 /// Calls `sink(offset, bytes)` with all that arrives of `response`, which begins at byte `offset`, until it returns false.
@@ -82,6 +84,11 @@ export function nameOf(path) {
     try { return decodeURIComponent(last); } catch { return last; }
 }
 
+/// Refuses a file that is too large for the page before it is in memory.
+export function checkSize(name, bytes) {
+    if (bytes > MOST_BYTES) throw new Error(`${name} has ${(bytes / 1e9).toFixed(2)} GB, more than the ${(MOST_BYTES / 1e9).toFixed(2)} GB that the page opens. Open it on the desktop: cc4dgs view FILE`);
+}
+
 function isArchive(bytes) { return MAGIC.every((b, i) => bytes[i] === b); }
 
 /// Loads `url`; `show` has poster(bytes), part(download, layer, motion, harmonics, first), harmonics(download), whole(name, bytes), progress(share, bytes).
@@ -108,6 +115,7 @@ export async function loadUrl(wasm, url, show, signal) {
     const start = new Uint8Array(await first.arrayBuffer());
     if (!isArchive(start)) {
         if (start.length >= total) return show.whole(name, start);
+        checkSize(name, total);
         return loadBody(wasm, name, await get({}), show);
     }
     const progress = new Progress(wasm, name, total, show);
@@ -135,11 +143,13 @@ async function loadBody(wasm, name, response, show) {
     const encoded = response.headers.get("Content-Encoding");
     const pieces = [];
     let progress = null, size = 0;
+    checkSize(name, total);
     try {
         await drain(response, 0, (offset, bytes) => {
             size += bytes.length;
             if (!progress && offset === 0 && total && !encoded && isArchive(bytes)) progress = new Progress(wasm, name, total, show);
             if (progress) return progress.put(offset, bytes);
+            checkSize(name, size);
             pieces.push(bytes);
             show.progress(total ? size / total : 0.5, size);
             return true;

@@ -7,7 +7,7 @@
 // Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
 
 import init, * as wasm from "./cc4dgs_player.js";
-import { loadUrl, nameOf } from "./loading.js";
+import { checkSize, loadUrl, nameOf } from "./loading.js";
 import { addGestures, addKeys } from "./gestures.js";
 import { WebGl } from "./webgl.js";
 import { build } from "./controls.js";
@@ -52,28 +52,38 @@ class Page {
             mode: () => (this.flying ? "fly" : "orbit"),
             ...Object.fromEntries(["orbit", "look", "pan", "zoom", "fly"].map(name => [name, (...values) => { this.gpu?.[name](...values); this.dirty = true; }])),
         };
+        const { canvas } = this.ui;
+        if (this.attached !== canvas) {
+            this.attached = canvas;
+            addGestures(canvas, act);
+            this.sizes ??= new ResizeObserver(() => this.resize());
+            this.sizes.disconnect();
+            this.sizes.observe(canvas);
+            canvas.addEventListener("webglcontextlost", e => e.preventDefault());
+        }
         if (!this.flyKeys) {
-            addGestures(this.ui.canvas, act);
-            this.flyKeys = addKeys(this.ui.root, act, this.commands(act));
-            new ResizeObserver(() => this.resize()).observe(this.ui.canvas);
-            this.ui.canvas.addEventListener("webglcontextlost", e => e.preventDefault());
+            // On a page of its own the player has the keys before anything was clicked.
+            this.flyKeys = addKeys(this.ui.embedded ? this.ui.root : document, act, this.commands(act));
             requestAnimationFrame(now => this.loop(now));
         }
         this.resize();
     }
-    // WebGPU where there is an adapter, else WebGL2.
+    // WebGPU where there is an adapter, else WebGL2. A canvas keeps the interface that it had first: WebGL2 stays on its own, and takes a new one after WebGPU.
     async startDevice() {
-        const forced = this.backend === "webgl";
+        const forced = this.backend === "webgl" || this.gl;
         if (!forced && await navigator.gpu?.requestAdapter()) {
+            this.isWebGpus = true;
             try {
                 this.gpu = await wasm.Player.create(this.ui.canvas);
                 return;
             } catch (e) {
-                // An adapter without the device that is needed. The canvas is WebGPU's now, so WebGL2 takes a new one; later, gestures belong to the old one.
-                if (this.flyKeys) throw e;
+                // An adapter without the device that is needed.
                 console.warn(`WebGPU: ${e.message}`);
-                this.ui.replaceCanvas();
             }
+        }
+        if (this.isWebGpus) {
+            this.isWebGpus = false;
+            this.ui.replaceCanvas();
         }
         // A lost context stays that of its canvas until the browser restores it.
         if (this.gl?.gl.isContextLost()) await new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
@@ -105,7 +115,7 @@ class Page {
         this.abort?.abort();
         this.abort = new AbortController();
         const { signal } = this.abort;
-        const again = source === this.source && this.facts;
+        const again = this.gpu && source === this.source && this.facts;
         const kept = again ? { pose: this.gpu.pose, time: this.gpu.time } : null;
         [this.source, this.name, this.first] = [source, name, first];
         this.ui.loading(true);
@@ -117,12 +127,14 @@ class Page {
             progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
         };
         try {
+            if (!this.gpu) throw new Error("There is no graphics device to show it with. Reload the page, or open the file with `cc4dgs view`.");
             if (!again) this.facts = null;
             if (typeof source === "string") {
                 this.ui.title(name ?? nameOf(source));
                 await loadUrl(wasm, source, show, signal);
             } else {
                 const label = name ?? source.name ?? "model";
+                checkSize(label, source.size ?? 0);
                 const bytes = source instanceof Uint8Array ? source : new Uint8Array(await (source.arrayBuffer?.() ?? source));
                 this.ui.title(label);
                 this.received = bytes.length;
@@ -138,7 +150,7 @@ class Page {
             // The model before is still there.
             Object.assign(this, this.shown ?? { source: null });
             this.ui.poster(null);
-            if (this.facts) {
+            if (this.facts && this.gpu) {
                 this.ui.facts(this.facts);
                 this.ui.title(this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source.name ?? "model"));
             }
@@ -175,7 +187,7 @@ class Page {
         this.emit(this.gpu.playing ? "play" : "pause", {});
     }
     seek(time) { this.gpu?.seek(time); this.timeChanged(); }
-    step(frames) { this.gpu?.step(frames); this.ui.playing(false); this.timeChanged(); }
+    step(frames) { if (this.playing) this.pause(); this.gpu?.step(frames); this.timeChanged(); }
     timeChanged() {
         this.dirty = true;
         if (!this.gpu) return;
@@ -194,18 +206,31 @@ class Page {
     apply() { if (this.gpu) Object.assign(this.gpu, this.settings); this.dirty = true; }
     resize() {
         const { canvas } = this.ui;
-        const ratio = Math.min(window.devicePixelRatio || 1, 2);
+        this.ratio = window.devicePixelRatio;
+        const ratio = Math.min(this.ratio || 1, 2);
         const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio))];
         if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
         this.gpu?.resize(width, height);
         this.draw();
     }
-    draw() { if (this.gl) { if (this.gpu) this.gl.draw(this.gpu); } else this.gpu?.draw(); this.dirty = false; this.drawn = (this.drawn ?? 0) + 1; }
+    draw() { if (this.gl) { if (this.gpu && !this.gl.lost) this.gl.draw(this.gpu); } else this.gpu?.draw(); this.dirty = false; this.drawn = (this.drawn ?? 0) + 1; }
     loop(now) {
+        try { this.advance(now); } catch (e) {
+            // Nothing that would draw can be relied on any more.
+            console.error(e);
+            this.gpu = null;
+            this.fail(new Error(`The player has stopped (${e.message}). Reload the page.`));
+            return;
+        }
+        requestAnimationFrame(next => this.loop(next));
+    }
+    advance(now) {
         const elapsed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
         this.last = now;
         if (this.gpu && (this.gl ? this.gl.lost : this.gpu.lost)) this.recover();
         else if (this.gpu) {
+            // A window that moves to another screen keeps its size in CSS pixels, which is all that an observer sees.
+            if (this.ratio !== window.devicePixelRatio) this.resize();
             const was = this.gpu.playing;
             if (this.gpu.tick(elapsed)) this.timeChanged();
             if (was && !this.gpu.playing) { this.ui.playing(false); this.emit("pause", {}); }
@@ -213,7 +238,6 @@ class Page {
             if (this.dirty) this.draw();
             this.statistics(now);
         }
-        requestAnimationFrame(next => this.loop(next));
     }
     statistics(now) {
         if (now - (this.counted ?? 0) < 1000) return;
@@ -228,15 +252,19 @@ class Page {
         const [old, source, name] = [this.gpu, this.source, this.name];
         const kept = { pose: old.pose, time: old.time, playing: old.playing };
         this.gpu = null;
+        // What is still being loaded has nothing to go to; it begins anew.
+        this.abort?.abort();
         try {
             old.free();
             await this.start();
             if (source) {
                 [this.facts, this.shown] = [null, null];
-                await this.load(source, name);
-                this.gpu.pose = kept.pose;
-                this.seek(kept.time);
-                this.setPlaying(kept.playing);
+                // Unless another model was opened meanwhile.
+                if (await this.load(source, name)) {
+                    this.gpu.pose = kept.pose;
+                    this.seek(kept.time);
+                    this.setPlaying(kept.playing);
+                }
             }
             this.emit("recovered", {});
         } catch (e) { this.fail(e); }
@@ -251,12 +279,18 @@ class Page {
         return out;
     }
     async savePng() {
-        if (!this.facts) return;
-        const { width, height, data } = await this.capture();
-        const canvas = Object.assign(document.createElement("canvas"), { width, height });
-        canvas.getContext("2d").putImageData(new ImageData(data, width, height), 0, 0);
-        const link = Object.assign(document.createElement("a"), { href: canvas.toDataURL("image/png"), download: `frame_${String(this.gpu.frame).padStart(4, "0")}.png` });
-        link.click();
+        if (!this.facts || !this.gpu) return;
+        const download = `frame_${String(this.gpu.frame).padStart(4, "0")}.png`;
+        try {
+            const { width, height, data } = await this.capture();
+            const canvas = Object.assign(document.createElement("canvas"), { width, height });
+            canvas.getContext("2d").putImageData(new ImageData(data, width, height), 0, 0);
+            const image = await new Promise(done => canvas.toBlob(done, "image/png"));
+            if (!image) throw new Error(`The image of ${width}x${height} pixels could not be saved as PNG. Choose a lower resolution.`);
+            const href = URL.createObjectURL(image);
+            Object.assign(document.createElement("a"), { href, download }).click();
+            setTimeout(() => URL.revokeObjectURL(href), 60000);
+        } catch (e) { this.fail(e); }
     }
     link() {
         const url = new URL(location.href);

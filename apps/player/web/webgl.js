@@ -196,12 +196,14 @@ export class WebGl {
             if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(`a shader does not compile: ${gl.getShaderInfoLog(shader)}`);
         }
         gl.linkProgram(program);
+        if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(`the shaders do not link: ${gl.getProgramInfoLog(program)}`);
         return { program, at: name => gl.getUniformLocation(program, name) };
     }
     texture(name, data, [internal, format, type], channels, width = WIDTH) {
         const { gl } = this;
         const texels = Math.max(1, Math.ceil(data.length / channels)), height = Math.ceil(texels / width);
-        if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`The model is too large for this graphics driver (${height} rows of ${name}). Use a browser with WebGPU.`);
+        // A lost context knows no limits.
+        if (height > (gl.getParameter(gl.MAX_TEXTURE_SIZE) ?? Infinity)) throw new Error(`The model is too large for this graphics driver (${height} rows of ${name}). Use a browser with WebGPU.`);
         const padded = new data.constructor(width * height * channels);
         padded.set(data);
         if (this.textures[name]) gl.deleteTexture(this.textures[name]);

@@ -14,11 +14,25 @@ const TEMPLATE: &str = include_str!("page.html");
 const PREFIX: &str = "cc4dgs/";
 /// Starts the player of a single file from what the other elements hold.
 const START: &str = r#"import { createPlayer } from "cc4dgs/player.js";
-const bytes = id => Uint8Array.from(atob(document.getElementById(id).textContent.trim()), c => c.charCodeAt(0));
+const bytes = id => {
+    const text = atob(document.getElementById(id).textContent), out = new Uint8Array(text.length);
+    for (let i = 0; i < out.length; i++) out[i] = text.charCodeAt(i);
+    return out;
+};
 const unpacked = packed => new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
 const { name, autoplay } = JSON.parse(document.getElementById("settings").textContent);
 const wasm = await unpacked(bytes("renderer"));
 window.cc4dgs = await createPlayer(document.getElementById("player"), { src: bytes("model"), name, wasm, autoplay });"#;
+
+/// Longest text that a browser (V8) holds, in characters.
+const MOST_TEXT: usize = (1 << 29) - 24;
+
+/// Browsers without import maps or `DecompressionStream` would show nothing.
+const OLD_BROWSER: &str = r#"<script>
+if (!window.DecompressionStream || !HTMLScriptElement.supports || !HTMLScriptElement.supports("importmap")) document.getElementById("player").textContent =
+    "This page needs a newer browser: Chrome or Edge 96, Firefox 113, Safari 16.4, or later.";
+</script>
+"#;
 
 /// `text` where HTML shows it.
 fn escaped(text: &str) -> String {
@@ -62,8 +76,19 @@ window.cc4dgs = await createPlayer(document.getElementById("player"), options);
     document(title, r#"<link rel="stylesheet" href="player.css">"#, &body)
 }
 
+/// Refuses an archive of so many `bytes` that browsers cannot read it out of an HTML file.
+fn check_size(bytes: usize) -> Result<()> {
+    let most = MOST_TEXT / 4 * 3;
+    if bytes > most {
+        let remedy = "Give a name that does not end in .html: a folder holds the archive as a file of its own";
+        return Err(Error::limit("archive in one HTML file, in bytes", bytes as u64, most as u64, remedy));
+    }
+    Ok(())
+}
+
 /// Everything in one file: styles, modules, the renderer (gzip) and `archive`, which is compressed already.
 pub(super) fn single(page: &Page, title: &str, archive: &[u8], autoplay: bool) -> Result<String> {
+    check_size(archive.len())?;
     let damaged = |name: &str, problem: &str| Error::data(format!("{}: {name}", page.origin), problem, "Build the page again with apps/player/build-web");
     let text = |name: &str| std::str::from_utf8(page.file(name)).map_err(|_| damaged(name, "it is not UTF-8"));
     let style = text("player.css")?;
@@ -90,6 +115,7 @@ pub(super) fn single(page: &Page, title: &str, archive: &[u8], autoplay: bool) -
     let data = |id: &str, kind: &str, content: &str| format!("<script type=\"{kind}\" id=\"{id}\">{content}</script>\n");
     let head = format!("<style>\n{style}</style>\n<script type=\"importmap\">{}</script>", script_json(&json!({ "imports": imports })));
     let body = [
+        OLD_BROWSER.to_string(),
         data("settings", "application/json", &script_json(&json!({ "autoplay": autoplay, "name": title }))),
         data("renderer", "text/plain", &STANDARD.encode(packed)),
         data("model", "text/plain", &STANDARD.encode(archive)),
@@ -116,6 +142,8 @@ mod tests {
         let source = html.split("cc4dgs/player.js\":\"data:text/javascript;base64,").nth(1).unwrap().split('"').next().unwrap();
         assert_eq!(STANDARD.decode(source).unwrap(), b"import { a } from \"cc4dgs/controls.js\"; // {body}");
         assert!(!html.contains("src=\"") && !html.contains("href=\"player"), "nothing is fetched");
+        let (told, started) = (html.find("newer browser").unwrap(), html.find("createPlayer").unwrap());
+        assert!(told < started, "old browsers are told before anything fails");
     }
 
     #[test]
@@ -126,6 +154,12 @@ mod tests {
         let mut other = page();
         other.files[6].1 = b"a { } </style><script>".to_vec();
         assert!(single(&other, "t", b"", true).unwrap_err().to_string().contains("player.css"));
+    }
+
+    #[test]
+    fn archives_that_no_browser_reads_from_html_are_refused() {
+        check_size(400_000_000).unwrap();
+        assert!(check_size(403_000_000).unwrap_err().to_string().contains(".html"));
     }
 
     #[test]
