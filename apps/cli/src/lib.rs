@@ -37,7 +37,7 @@ where
         }
     };
     let output = output::Output::new(cli.json.clone(), cli.quiet);
-    match commands::dispatch(&cli, &output) {
+    match output.check().and_then(|()| commands::dispatch(&cli, &output)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             output.failure(&error);

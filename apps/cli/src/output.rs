@@ -1,6 +1,7 @@
 //! Results go to standard output (for people, or as JSON), everything else to standard error.
 
 use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::{Error, Result};
 use serde::Serialize;
 use std::io::Write;
@@ -23,6 +24,11 @@ impl Output {
     /// The file `--json` names, if it names one.
     pub fn json_file(&self) -> Option<&Path> {
         self.json.as_deref().filter(|p| p.as_os_str() != "-")
+    }
+    /// Refuses a file for the JSON that exists and holds something else. Call it before long work.
+    pub fn check(&self) -> Result<()> {
+        let is_json = |head: &[u8]| head.trim_ascii_start().starts_with(b"{") || head.trim_ascii_start().starts_with(b"[");
+        self.json_file().map_or(Ok(()), |file| refuse_other_content(file, "a JSON file", is_json))
     }
     /// Reports a result: as JSON where `--json` says, and as `text` on standard output unless the JSON went there.
     pub fn result(&self, value: &impl Serialize, text: impl FnOnce() -> String) -> Result<()> {
@@ -63,4 +69,25 @@ impl Output {
 pub fn to_json(value: &impl Serialize) -> Result<String> {
     let text = serde_json::to_string_pretty(value).map_err(|e| Error::backend("JSON", e.to_string(), "Report this: every result should have a JSON form"))?;
     Ok(text + "\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn json_replaces_json_only() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("out");
+        let check = |file: &Path| Output::new(Some(file.to_path_buf()), true).check();
+        check(&file).unwrap();
+        for (content, accepted) in [("", true), ("{}\n", true), ("\n [1]", true), ("\u{89}PNG", false), ("name = 'grid'", false)] {
+            std::fs::write(&file, content).unwrap();
+            assert_eq!(check(&file).is_ok(), accepted, "{content}");
+        }
+        assert!(check(&file).unwrap_err().to_string().contains("not a JSON file"));
+        assert!(check(folder.path()).is_err());
+        check(Path::new("-")).unwrap();
+        Output::new(None, true).check().unwrap();
+    }
 }

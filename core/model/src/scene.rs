@@ -111,6 +111,10 @@ impl Scene {
             frames,
         })
     }
+    /// The most bytes of decoded frames that are kept.
+    pub fn cache_bytes(&self) -> u64 {
+        self.frames.cap
+    }
     /// Indices of the views of `split`, in order.
     pub fn split(&self, split: Split) -> Vec<usize> {
         (0..self.views.len()).filter(|&i| self.views[i].split == split).collect()

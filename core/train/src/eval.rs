@@ -190,7 +190,7 @@ pub fn evaluate(
     let dynamic_metric = metric(Metric::psnr(Rounding::EightBit).masked());
     let over_time: BTreeMap<usize, Vec<bool>> = dynamic_masks(scene, split, TrainConfig::default().mask_threshold, PUBLISHED_SIGMA, background, events)?
         .into_iter()
-        .map(|m| (scene.views[m.view].camera, m.mask.iter().map(|v| *v > 0.0).collect()))
+        .map(|m| (scene.views[m.view].camera, m.mask))
         .collect();
     let usual = usual_images(scene, split, background)?;
     let ssim_metric = metric(Metric::ssim(SsimConvention::Inria, Rounding::EightBit));

@@ -12,8 +12,8 @@ pub const PUBLISHED_SIGMA: f32 = 5.0;
 pub struct DynamicMask {
     /// The view (the camera's first frame) it is rendered from.
     pub view: usize,
-    /// 1 where the pixel is dynamic, else 0, row-major `[H,W]`.
-    pub mask: Vec<f32>,
+    /// Whether each pixel is dynamic, row-major `[H,W]`; a byte each.
+    pub mask: Vec<bool>,
 }
 
 /// Masks of every camera of `split` that has at least two frames there: the population standard deviation over time, averaged over the channels,
@@ -38,8 +38,8 @@ pub fn dynamic_masks(scene: &Scene, split: Split, threshold: f32, sigma: f32, ba
 pub(crate) struct OverTime {
     /// Sum of the images, planes `[3,H,W]`; over the number of images it is their mean.
     pub sum: Vec<f64>,
-    /// 1 where the pixel is dynamic, else 0, row-major `[H,W]`.
-    pub mask: Vec<f32>,
+    /// Whether each pixel is dynamic, row-major `[H,W]`.
+    pub mask: Vec<bool>,
 }
 
 /// Mean and mask of `views`, which are of one camera.
@@ -65,7 +65,7 @@ pub(crate) fn over_time(scene: &Scene, views: &[usize], threshold: f32, sigma: f
             (per_channel.sum::<f64>() / 3.0) as f32
         })
         .collect();
-    let mask = blur(&deviation, w, h, sigma).into_iter().map(|v| f32::from(u8::from(v > threshold))).collect();
+    let mask = blur(&deviation, w, h, sigma).into_iter().map(|v| v > threshold).collect();
     Ok(OverTime { sum, mask })
 }
 

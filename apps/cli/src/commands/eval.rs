@@ -1,6 +1,6 @@
 //! `cc4dgs eval`.
 
-use super::{Context, evenly};
+use super::{Context, evenly, lies_in};
 use crate::args::Eval;
 use crate::interrupt;
 use crate::models::{Loaded, load_model};
@@ -122,13 +122,6 @@ fn earlier_renders(folder: &Path, scene: &Path, overwrite: bool) -> Result<Vec<P
         return refuse(format!("{} is not a render", other.display()), "Name another folder: only renders are replaced");
     }
     Ok(entries)
-}
-
-/// Whether `path` exists in the folder of the scene at `scene`, or is this folder. Built-in scenes have none.
-fn lies_in(path: &Path, scene: &Path) -> bool {
-    let Ok(scene) = scene.canonicalize() else { return false };
-    let folder = if scene.is_file() { scene.parent() } else { Some(scene.as_path()) };
-    folder.is_some_and(|folder| path.canonicalize().is_ok_and(|path| path.starts_with(folder)))
 }
 
 /// Measures and draws.

@@ -148,6 +148,13 @@ pub fn create_parent(path: &Path) -> Result<()> {
     }
 }
 
+/// Whether `path` exists in the folder of the scene at `scene`, or is this folder. Built-in scenes have none.
+fn lies_in(path: &Path, scene: &Path) -> bool {
+    let Ok(scene) = scene.canonicalize() else { return false };
+    let folder = if scene.is_file() { scene.parent() } else { Some(scene.as_path()) };
+    folder.is_some_and(|folder| path.canonicalize().is_ok_and(|path| path.starts_with(folder)))
+}
+
 /// `bytes` as MB = 10^6 bytes.
 pub fn megabytes(bytes: u64) -> f64 {
     bytes as f64 / 1e6

@@ -1,6 +1,6 @@
 //! `cc4dgs render`.
 
-use super::{Context, create_parent};
+use super::{Context, create_parent, lies_in};
 use crate::args::Render;
 use crate::models::load_model;
 use crate::{interrupt, shots};
@@ -39,6 +39,9 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     if let Some(frame) = earlier.first().filter(|_| !args.overwrite) {
         let problem = format!("{} is there already, and frames of two commands would mix", frame.display());
         return Err(Error::parameter("--out", problem, "Name another folder, or add --overwrite"));
+    }
+    if !earlier.is_empty() {
+        refuse_images(&args.out, args.shots.scene.as_deref(), |folder| context.registry.readers().iter().any(|reader| (reader.probe)(folder)))?;
     }
     let stop = interrupt::stop_flag()?;
     let events = context.listeners(None)?;
@@ -106,4 +109,40 @@ fn frames_in(folder: &Path) -> Result<Vec<PathBuf>> {
     }
     found.sort();
     Ok(found)
+}
+
+/// Refuses to replace frames in the folder of the scene at `scene`, and in that of a dataset (`is_dataset`) or directly below: images have such names, too.
+fn refuse_images(folder: &Path, scene: Option<&Path>, is_dataset: impl Fn(&Path) -> bool) -> Result<()> {
+    let whole = folder.canonicalize().map_err(|e| Error::io(folder, e))?;
+    if scene.is_some_and(|scene| lies_in(folder, scene)) || whole.ancestors().take(2).any(is_dataset) {
+        let problem = format!("{} holds frame_NNNNN.png files and lies in the folder of a scene", folder.display());
+        return Err(Error::parameter("--out", problem, "Name another folder: images of a scene are never replaced"));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn images_of_a_scene_are_not_replaced() {
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        for folder in ["scene/images/left", "frames"] {
+            std::fs::create_dir_all(at(folder)).unwrap();
+        }
+        std::fs::write(at("scene/transforms.json"), "{}").unwrap();
+        std::fs::write(at("frames/frame_00001.png"), "").unwrap();
+        assert_eq!(frames_in(&at("frames")).unwrap(), [at("frames/frame_00001.png")]);
+        let is_dataset = |folder: &Path| folder.join("transforms.json").is_file();
+        let check = |folder: &str, scene: Option<&str>| refuse_images(&at(folder), scene.map(at).as_deref(), is_dataset).map_err(|e| e.to_string());
+        check("frames", None).unwrap();
+        check("frames", Some("scene")).unwrap();
+        for scene in ["scene", "scene/transforms.json"] {
+            assert!(check("scene/images/left", Some(scene)).unwrap_err().contains("lies in the folder of a scene"));
+        }
+        // An orbit names no scene.
+        assert!(check("scene/images", None).is_err() && check("scene", None).is_err());
+    }
 }

@@ -1,7 +1,12 @@
 //! The memory that a plan may count on, and how much of it holds decoded images.
 
 use super::Choice;
+use crate::config::RunConfig;
+use cc4dgs_core::SceneOptions;
 use std::path::{Path, PathBuf};
+
+/// The setting for the cache.
+const CACHE: &str = "scene.cache_mb";
 
 /// Hierarchies of control groups, version 2 and version 1: controller in `/proc/self/cgroup`, folder that the hierarchy is mounted at, file with the limit.
 const HIERARCHIES: [[&str; 3]; 2] = [["", "sys/fs/cgroup", "memory.max"], ["memory", "sys/fs/cgroup/memory", "memory.limit_in_bytes"]];
@@ -48,7 +53,26 @@ pub(super) fn cache(views: usize, pixels: f64, stated_mb: u64, memory: Option<u6
     } else {
         return None;
     };
-    Some(Choice { settings: vec![("scene.cache_mb", toml::Value::Integer(wanted as i64))], reason })
+    Some(Choice { settings: vec![(CACHE, toml::Value::Integer(wanted as i64))], reason })
+}
+
+/// The options of `config` that its scene is opened with, where `processes` processes share the memory: the share of now may be another than that of a plan.
+/// Results do not depend on the cache, so the configuration stays as it is.
+pub(crate) fn scene_options(config: &RunConfig, processes: usize) -> SceneOptions {
+    let stated_mb = config.scene.cache_mb;
+    // Unless it was changed after the plan.
+    let line = format!("{CACHE} = {stated_mb} (");
+    let planned = config.auto.plan.iter().any(|choice| choice.starts_with(&line));
+    SceneOptions { cache_mb: cache_mb(stated_mb, planned, processes, memory(processes)), ..config.scene.clone() }
+}
+
+/// The cache of a process: a third of its `memory` where a plan chose it, else what is stated, at most that third where other processes share the machine.
+fn cache_mb(stated_mb: u64, planned: bool, processes: usize, memory: Option<u64>) -> u64 {
+    match memory.map(|bytes| (bytes / 3_000_000).max(1)) {
+        Some(most) if planned => most,
+        Some(most) if processes > 1 => stated_mb.min(most),
+        _ => stated_mb,
+    }
 }
 
 #[cfg(test)]
@@ -101,6 +125,23 @@ mod tests {
     fn processes_share_the_memory() {
         assert_eq!(memory(4), memory(1).map(|bytes| bytes / 4));
         assert_eq!(memory(0), memory(1));
+    }
+
+    #[test]
+    fn the_cache_is_that_of_the_share_of_now() {
+        let memory = Some(3_000_000_000);
+        // A preset without a plan: 2000 MB, of a part of 3 GB at most 1000.
+        assert_eq!((cache_mb(2000, false, 4, memory), cache_mb(500, false, 4, memory), cache_mb(2000, false, 1, memory)), (1000, 500, 2000));
+        // A plan that was made beside more, or fewer, processes.
+        assert_eq!((cache_mb(700, true, 4, memory), cache_mb(6000, true, 1, memory), cache_mb(6000, true, 4, None)), (1000, 1000, 6000));
+        let mut config = RunConfig::resolve(Some("demo"), None, &["scene.cache_mb=987654321".into()]).unwrap();
+        let part = |config: &RunConfig, processes| scene_options(config, processes).cache_mb;
+        assert_eq!(part(&config, 1), 987_654_321, "it is stated");
+        config.auto.plan = vec!["scene.cache_mb = 987654321 (1500 images are kept decoded)".into()];
+        let expected = |processes| super::memory(processes).map_or(987_654_321, |bytes| bytes / 3_000_000);
+        assert_eq!([part(&config, 1), part(&config, 3)], [expected(1), expected(3)]);
+        config.scene.cache_mb = 5;
+        assert_eq!(part(&config, 1), 5, "it was changed after the plan");
     }
 
     #[test]

@@ -8,6 +8,7 @@ mod memory;
 
 pub use choose::{Choice, Machine};
 pub use facts::{Arrangement, Facts};
+pub(crate) use memory::scene_options;
 
 use crate::config::{Dynamic, RunConfig};
 use crate::data;
@@ -107,13 +108,14 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
     open_shared(path, layers, registry, events, 1)
 }
 
-/// As [`open`], where `processes` processes, this one included, share the memory of the machine.
+/// As [`open`], where `processes` processes, this one included, share the memory of the machine. Each of several keeps images decoded in a third of an equal
+/// part at most, whatever the configuration states.
 ///
 /// # Errors
 /// As [`open`].
 pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &dyn EventSink, processes: usize) -> Result<(RunConfig, Arc<Scene>)> {
     let asked = layers.config()?;
-    let read = |config: &RunConfig| Ok::<_, Error>(Arc::new(data::open(path, &config.scene, registry, &config.limits)?));
+    let read = |config: &RunConfig| Ok::<_, Error>(Arc::new(data::open(path, &scene_options(config, processes), registry, &config.limits)?));
     if !layers.want_plan() {
         return Ok((asked.clone(), read(&asked)?));
     }

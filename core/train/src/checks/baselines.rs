@@ -87,7 +87,7 @@ fn moving_pixels(scene: &Scene, threshold: f32, background: [f32; 3]) -> Result<
     for camera in spread(&of_camera.keys().copied().collect::<Vec<_>>(), MOVING_CAMERAS) {
         let frames = spread(&of_camera[&camera], MOVING_FRAMES);
         let over_time = over_time(scene, &frames, threshold, PUBLISHED_SIGMA, background)?;
-        let mask: Vec<bool> = over_time.mask.iter().map(|v| *v > 0.0).collect();
+        let mask = over_time.mask;
         if mask.iter().filter(|m| **m).count() as f64 <= MOVING_SHARE * mask.len() as f64 {
             continue;
         }

@@ -14,7 +14,7 @@ mod text;
 pub use rows::{Better, QUANTITIES, Quantity, Row, rows};
 pub use tables::{Cell, Table};
 
-use crate::sweep::{CellResult, PLAN, Plan, RESULTS, SweepFolder, check_comparable, collect, read_results, select};
+use crate::sweep::{CellResult, PLAN, Plan, RESULTS, SweepFolder, TrainingDevices, check_comparable, collect, read_results, select};
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::{Error, Result};
@@ -121,6 +121,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let public = images::built_in(&scenes);
     let key = charts::Key::of(scenes.values().flatten());
     let columns = columns(&options.columns)?;
+    let trained = TrainingDevices::of(&results);
 
     let title = options.title.clone().unwrap_or_else(|| {
         let sweeps: std::collections::BTreeSet<&str> = results.iter().map(|r| r.sweep.as_str()).collect();
@@ -133,7 +134,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let mut markdown = format!("# {}\n\n{MARKDOWN_NOTE} ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n", text::markdown(&title));
     let mut latex = format!("{LATEX_NOTE} MB are 10^6 bytes.\n");
     for (i, (scene, rows)) in scenes.iter().enumerate() {
-        let table = tables::summary(scene, rows, &columns);
+        let table = tables::summary(scene, rows, &columns, &trained);
         markdown += &table.markdown();
         latex += &table.latex();
         let class = if i == 0 { " class=\"first\"" } else { "" };

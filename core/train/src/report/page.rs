@@ -1,7 +1,7 @@
 //! The HTML page: style, the script of the sliders, and the facts about how the results were made.
 
 use super::text::html;
-use crate::sweep::CellResult;
+use crate::sweep::{CellResult, TrainingDevices};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
@@ -40,7 +40,7 @@ pub fn facts(results: &[CellResult]) -> String {
     let data = |r: &CellResult| {
         format!("{}: {} (xxh3 {}), {}x{}, {} frames", r.axes.scene, r.provenance.data.path, r.provenance.data.hash, r.image_size[0], r.image_size[1], r.frames)
     };
-    let rows = [
+    let mut rows = vec![
         ("sweep", set(&|r| r.sweep.clone())),
         (
             "results",
@@ -51,6 +51,10 @@ pub fn facts(results: &[CellResult]) -> String {
         ("split", set(&|r| format!("{:?}", r.split).to_lowercase())),
         ("data", set(&data)),
     ];
+    let trained = TrainingDevices::of(results).sentence();
+    if !trained.is_empty() {
+        rows.insert(4, ("training", trained));
+    }
     let mut out = String::from("<table class=\"facts\">\n");
     for (name, value) in rows {
         _ = writeln!(out, "<tr><th>{name}</th><td>{}</td></tr>", html(&value));
@@ -73,6 +77,6 @@ pub fn protocols(results: &[CellResult]) -> String {
         .map(|(name, texts)| format!("<tr><th>{}</th><td>{}</td></tr>\n", html(name), html(&texts.iter().cloned().collect::<Vec<_>>().join("; "))))
         .collect();
     format!(
-        "<table class=\"facts\">\n{rows}</table>\n<p class=\"note\">MB are 10⁶ bytes of the archive on disk. Times are wall times on the device above, synchronised; a frame is the mean of all frames but the first. ↑ high is better, ↓ low is better; ± is the sample standard deviation over seeds.</p>\n"
+        "<table class=\"facts\">\n{rows}</table>\n<p class=\"note\">MB are 10⁶ bytes of the archive on disk. Times are wall times on the device above, those of trainings on the devices stated for them, synchronised; a frame is the mean of all frames but the first. ↑ high is better, ↓ low is better; ± is the sample standard deviation over seeds.</p>\n"
     )
 }

@@ -1,8 +1,8 @@
 //! Tables of results as HTML, Markdown, LaTeX and CSV.
 
-use super::rows::{Better, QUANTITIES, Quantity, Row};
+use super::rows::{Better, QUANTITIES, Quantity, Row, TRAINING};
 use super::text;
-use crate::sweep::csv_field;
+use crate::sweep::{TrainingDevices, csv_field, trained_on};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -38,7 +38,8 @@ pub struct Table {
 }
 
 /// The rows of a scene with every one of `quantities` that one of them has: mean and sample standard deviation over seeds, the best mean of a column marked.
-pub fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity]) -> Table {
+/// Times of trainings that ran on different devices state these, and none is the best.
+pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], trained: &TrainingDevices) -> Table {
     let settings = rows.iter().any(|row| row.setting != "base");
     let mut head: Vec<String> = ["method", "setting", "codec", "seeds"].map(str::to_string).to_vec();
     if !settings {
@@ -56,6 +57,7 @@ pub fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity]) -> Table {
             line.into_iter().map(Cell::plain).collect()
         })
         .collect();
+    let mut notes = Vec::new();
     for quantity in quantities {
         let spreads: Vec<_> = rows.iter().map(|row| row.spread(quantity)).collect();
         if spreads.iter().all(Option::is_none) {
@@ -69,13 +71,17 @@ pub fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity]) -> Table {
         head.push(format!("{}{arrow}", quantity.title()));
         let rounded = |mean: f64| format!("{mean:.*}", quantity.digits);
         let best = best(quantity, spreads.iter().flatten().map(|s| s.mean)).map(rounded);
-        for (line, spread) in lines.iter_mut().zip(&spreads) {
-            let text = spread.map_or_else(|| "–".to_string(), |s| s.text(quantity.digits));
-            let is_best = rows.len() > 1 && spread.is_some_and(|s| Some(rounded(s.mean)) == best);
+        let mixed = quantity.key == TRAINING.key && trained.differ();
+        if mixed {
+            notes.push(trained.sentence());
+        }
+        for ((line, spread), row) in lines.iter_mut().zip(&spreads).zip(rows) {
+            let mark = if mixed { trained.mark(&row.cells) } else { String::new() };
+            let text = spread.map_or_else(|| "–".to_string(), |s| s.text(quantity.digits) + &mark);
+            let is_best = rows.len() > 1 && !mixed && spread.is_some_and(|s| Some(rounded(s.mean)) == best);
             line.push(Cell { text, best: is_best });
         }
     }
-    let mut notes = Vec::new();
     let hopeless: Vec<String> = rows
         .iter()
         .filter(|row| row.hopeless())
@@ -169,11 +175,12 @@ impl Table {
 /// The first columns of the CSV table.
 pub const CSV_START: &str = "scene,method,setting,codec,outcome,seeds";
 
-/// All rows of all scenes as CSV: the axes, the number of seeds, then mean, sample standard deviation, least and largest value of every quantity. Missing
-/// values are empty.
+/// All rows of all scenes as CSV: the axes, the number of seeds, then mean, sample standard deviation, least and largest value of every quantity, and
+/// what the trainings ran on. Missing values are empty.
 pub fn csv(scenes: &BTreeMap<&str, Vec<Row>>) -> String {
     let mut head: Vec<String> = CSV_START.split(',').map(str::to_string).collect();
     head.extend(QUANTITIES.iter().flat_map(|q| ["mean", "deviation", "low", "high"].map(|part| format!("{}_{part}", q.key))));
+    head.push("training_devices".into());
     let mut out = head.join(",") + "\n";
     for row in scenes.values().flatten() {
         let outcome = if row.hopeless() { "hopeless" } else { "done" };
@@ -184,6 +191,7 @@ pub fn csv(scenes: &BTreeMap<&str, Vec<Row>>) -> String {
             let part = |f: &dyn Fn(&crate::sweep::Spread) -> Option<f64>| spread.as_ref().and_then(f).map_or_else(String::new, |v| v.to_string());
             fields.extend([part(&|s| Some(s.mean)), part(&|s| s.deviation), part(&|s| Some(s.low)), part(&|s| Some(s.high))]);
         }
+        fields.push(csv_field(&trained_on(&row.cells)));
         out += &(fields.join(",") + "\n");
     }
     out

@@ -123,6 +123,30 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
 }
 
 #[test]
+fn times_of_trainings_on_other_devices_are_marked() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cells = sweep(folder.path());
+    let options = ReportOptions { columns: ["training_minutes", "psnr_db"].map(String::from).to_vec(), images: ImageChoice::None, ..Default::default() };
+    let make = |cells: &[CellResult]| {
+        write(folder.path(), cells);
+        report(folder.path(), &options).unwrap()
+    };
+    let same = make(&cells);
+    assert!(!same.markdown.contains("Training times") && !same.html.contains("Training times"), "{}", same.markdown);
+    cells.iter_mut().filter(|c| c.axes.method == "cdf").for_each(|c| {
+        let mut more = c.cost.training_devices[0].clone();
+        more.device.threads = 8;
+        c.cost.training_devices.push(more);
+        c.cost.training_seconds = 60.0;
+    });
+    let made = make(&cells);
+    let notes = made.markdown.matches("Training times are wall times on").count();
+    assert!(notes == 1 && made.markdown.contains("do not compare") && !made.markdown.contains("**1.00"), "{}", made.markdown);
+    assert!(made.html.contains("1.00 ±\u{a0}0.00 [1, 2]") && made.html.contains("3.00 ±\u{a0}0.00 [1]"), "{}", made.markdown);
+    assert!(made.csv.lines().nth(1).unwrap().contains(" 1 threads; linux x86_64 + flex; "), "{}", made.csv);
+}
+
+#[test]
 fn a_report_replaces_reports_only() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), &sweep(folder.path()));

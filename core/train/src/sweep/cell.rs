@@ -6,6 +6,7 @@ use super::hash::name_of;
 use super::plan::{Plan, PlannedCell, PlannedTraining};
 use super::result::{Axes, Blocks, CellResult, Cost, FrameMs, ImageResult, KIND, ResultProvenance, SCHEMA, Score, Storage, StreamBytes};
 use super::training::{FinishedTraining, Worker, config_of};
+use crate::auto::scene_options;
 use crate::code;
 use crate::config::RunConfig;
 use crate::data;
@@ -44,7 +45,7 @@ impl<'a> Trained<'a> {
         let limits = worker.limits_over(&config.limits)?;
         let device = parse_device(&config.device)?;
         let model = Model::open(&folder.training(&training.id), worker.registry, &device, &limits, worker.events)?;
-        let scene = data::open_in(&locate(&training.data.path)?, &config.scene, &model.normalisation, worker.registry, &limits)?;
+        let scene = data::open_in(&locate(&training.data.path)?, &scene_options(&config, worker.processes), &model.normalisation, worker.registry, &limits)?;
         let scene = Arc::new(data::hold_out(&scene, config.train.validation)?);
         Ok(Self { training, finished, config, limits, device, model, scene })
     }

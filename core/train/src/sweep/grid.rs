@@ -64,9 +64,16 @@ pub type SettingAxis = Axis<SettingKeys>;
 pub struct SceneKeys {
     /// A path, `procedural:NAME`, or a path that starts with an environment variable (`$CC4DGS_DATA/mutant`).
     pub path: String,
-    /// The family of presets that methods starting with `+` are put on.
-    #[serde(default = "auto")]
-    pub family: String,
+    /// The family of presets that methods starting with `+` are put on; see [`SceneKeys::family`].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub family: Option<String>,
+}
+
+impl SceneKeys {
+    /// The family that is stated, else `auto`.
+    pub fn family(&self) -> &str {
+        self.family.as_deref().unwrap_or(AUTO)
+    }
 }
 
 /// What a `[[method]]` has beside the keys of every axis.
@@ -207,9 +214,6 @@ pub struct Grid {
     pub codec: Vec<CodecAxis>,
 }
 
-fn auto() -> String {
-    AUTO.into()
-}
 fn one() -> f64 {
     1.0
 }
@@ -321,7 +325,7 @@ mod tests {
     fn defaults_are_few() {
         let grid = Grid::parse("g.toml", SMALL).unwrap();
         assert_eq!((grid.split, grid.validation_views(), grid.seeds.as_slice(), grid.setting[0].name.as_str()), (ScoredViews::Test, 0, &[0][..], "base"));
-        assert_eq!((grid.scene[0].own.family.as_str(), grid.codec[0].field_weights.as_str()), ("auto", "fp32"));
+        assert_eq!((grid.scene[0].own.family(), grid.codec[0].field_weights.as_str()), ("auto", "fp32"));
         let validation = Grid::parse("g.toml", &format!("split = 'validation'\n{SMALL}")).unwrap();
         assert_eq!(validation.validation_views(), VALIDATION_VIEWS);
         let again: Grid = toml::from_str(&toml::to_string(&grid).unwrap()).unwrap();

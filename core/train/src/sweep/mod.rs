@@ -19,6 +19,7 @@ mod read;
 mod result;
 mod run;
 mod table;
+mod trained;
 mod training;
 
 pub use collect::{Collection, Missing, Tables, collect, select, write_tables};
@@ -36,4 +37,5 @@ pub use result::{
 pub use run::{Busy, TrainingState, run_training, summary};
 pub(crate) use table::csv_field;
 pub use table::{Spread, csv, markdown};
+pub(crate) use trained::{TrainingDevices, trained_on};
 pub use training::Worker;

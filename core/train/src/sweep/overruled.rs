@@ -1,4 +1,4 @@
-//! Refuses what a grid states to no effect: settings that its own keys overrule, and sizes of nothing.
+//! Refuses what a grid states to no effect: settings that its own keys overrule, sizes of nothing, and families that no method is put on.
 
 use super::grid::{Axis, Grid};
 use super::plan::within;
@@ -22,6 +22,13 @@ pub(super) fn refuse_overruled(object: &str, grid: &Grid) -> Result<()> {
             let remedy = "Size the grid (minutes or iterations, or the options of these names), or remove size and set train.iterations";
             return Err(Error::parameter(format!("{object}: {place}, size"), problem, remedy));
         }
+    }
+    if !grid.method.iter().any(|method| method.own.preset.starts_with('+'))
+        && let Some((scene, family)) = grid.scene.iter().find_map(|scene| Some((scene, scene.own.family.as_ref()?)))
+    {
+        let problem = format!("'{family}' has no effect: the preset of no [[method]] starts with '+'");
+        let remedy = format!("Remove it, or write preset = \"+\" for {family}, or preset = \"+METHOD\" for {family}+METHOD");
+        return Err(Error::parameter(format!("{object}: [[scene]] '{}', family", scene.name), problem, remedy));
     }
     Ok(())
 }
@@ -96,6 +103,20 @@ mod tests {
         for (top, tables, parts) in cases {
             let message = refused(top, tables).unwrap_or_else(|| panic!("{top} {tables:?} is accepted"));
             assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_family_needs_a_method_on_it() {
+        let grid = |family: &str, presets: [&str; 2]| {
+            let methods: String = presets.iter().enumerate().map(|(i, preset)| format!("[[method]]\nname = 'm{i}'\npreset = '{preset}'\n")).collect();
+            let text = format!("name = 'g'\n[[scene]]\nname = 's'\npath = 'procedural:tiny'\n{family}\n{methods}[[codec]]\nname = 'c'\ncodec = 'raw'\n");
+            Grid::parse("g.toml", &text).map(drop).map_err(|error| error.to_string())
+        };
+        let message = grid("family = 'demo'", ["auto", ""]).unwrap_err();
+        assert!(["g.toml", "[[scene]] 's', family", "'demo'", "preset = \"+\""].iter().all(|part| message.contains(part)), "{message}");
+        for (family, presets) in [("", ["auto", ""]), ("family = 'demo'", ["auto", "+"]), ("family = 'demo'", ["+hexplane", ""])] {
+            assert_eq!(grid(family, presets), Ok(()));
         }
     }
 

@@ -244,8 +244,8 @@ fn planned(
     listing: String,
 ) -> Result<PlannedTraining> {
     let preset = match method.own.preset.strip_prefix('+') {
-        Some("") => scene.own.family.clone(),
-        Some(method) => format!("{}+{method}", scene.own.family),
+        Some("") => scene.own.family().into(),
+        Some(method) => format!("{}+{method}", scene.own.family()),
         None => method.own.preset.clone(),
     };
     let size = scene.size * method.size * setting.size;

@@ -82,7 +82,7 @@ fn read_file(file: &Path, lenient: bool) -> Result<Vec<CellResult>> {
 }
 
 /// Refuses results that do not belong into one table: computed on different devices, scored on different sides of the split, by different protocols of a metric,
-/// or, within a scene, on different data, image sizes or images.
+/// or, within a scene, on different data, image sizes or images. Those that were trained on different devices are marked in tables instead.
 ///
 /// # Errors
 /// [`Error::Data`] that names two of the results and what differs.

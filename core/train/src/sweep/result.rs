@@ -139,7 +139,8 @@ pub struct DataFingerprint {
     pub bytes: u64,
 }
 
-/// What a result was computed on: in [`ResultProvenance`], what it was stored, read and scored on. Results of different devices are not put into one table.
+/// What a result was computed on: in [`ResultProvenance`], what it was stored, read and scored on. Results of different devices are not put into one table;
+/// times of trainings on different devices are marked in one.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DeviceFacts {
     /// Name of the device: `flex`, `ndarray`, `wgpu`, `cuda`.

@@ -1,7 +1,8 @@
 //! Tables of results: mean and spread over seeds, as Markdown and CSV.
 
-use super::read::{check_comparable, describe};
+use super::read::check_comparable;
 use super::result::{CellResult, Outcome};
+use super::trained::{TrainingDevices, trained_on};
 use cc4dgs_core::{Error, Result};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -80,7 +81,7 @@ fn rows(results: &[CellResult]) -> Result<Vec<Row<'_>>> {
     Ok(rows.into_iter().map(|(axes, results)| Row { axes, results }).collect())
 }
 
-/// A Markdown table per scene, and the conditions under which they were measured.
+/// A Markdown table per scene, and the conditions under which they were measured. Where trainings ran on different devices, their times are marked.
 ///
 /// # Errors
 /// As [`check_comparable`], and [`Error::Data`] for two results of the same place in a grid.
@@ -89,6 +90,8 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     let Some(first) = results.first() else { return Ok(String::new()) };
     let metrics: Vec<_> = SHOWN.into_iter().filter(|(name, ..)| results.iter().any(|r| r.metrics.contains_key(*name))).collect();
     let mut text = format!("# {}\n\n", first.sweep);
+    let trained = TrainingDevices::of(results);
+    let sentence = trained.sentence();
     let device = &first.provenance.device;
     let adapter = device.adapter.as_ref().map_or_else(String::new, |adapter| format!(" on {adapter}"));
     let commits: BTreeSet<&str> = results.iter().map(|r| r.provenance.commit.as_str()).collect();
@@ -96,14 +99,14 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     let _ = writeln!(
         text,
         "Mean and sample standard deviation over seeds. Device {}{adapter}, {}, {} threads, {}. Commit {}. Scored on {} views, images rounded to 8 bits. \
-         Seconds and milliseconds are wall time on that machine; MB are 10^6 bytes.{}",
+         Seconds and milliseconds are wall time on that machine; MB are 10^6 bytes.{}{sentence}",
         device.name,
         if device.processor.is_empty() { "unknown processor" } else { &device.processor },
         device.threads,
         device.system,
         commits.into_iter().collect::<Vec<_>>().join(", "),
         format!("{:?}", first.split).to_lowercase(),
-        training_devices(results),
+        if sentence.is_empty() { "" } else { " " },
     );
     let scenes: BTreeSet<&str> = rows.iter().map(|row| row.axes[0]).collect();
     for scene in scenes {
@@ -122,7 +125,7 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
             cells.extend(metrics.iter().map(|(name, _, decimals)| shown(row.spread(|r| r.metrics.get(*name).map(|s| s.value)), *decimals)));
             cells.push(shown(row.spread(|r| Some(r.size_mb())), 3));
             cells.push(shown(row.spread(|r| Some(r.gaussians as f64)), 0));
-            cells.push(shown(row.spread(|r| Some(r.cost.training_seconds)), 1));
+            cells.push(shown(row.spread(|r| Some(r.cost.training_seconds)), 1) + &trained.mark(&row.results));
             cells.push(shown(row.spread(|r| Some(r.cost.encode_seconds)), 2));
             cells.push(shown(row.spread(|r| Some(r.cost.decode_seconds)), 2));
             cells.push(shown(row.spread(|r| Some(r.cost.frame_ms.mean)), 2));
@@ -134,25 +137,7 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     Ok(text)
 }
 
-/// A sentence on what the trainings ran on, where that is not the device that scored them; else nothing.
-fn training_devices(results: &[CellResult]) -> String {
-    let all = || results.iter().flat_map(|result| result.cost.training_devices.iter().map(move |trained| (result, trained)));
-    if all().all(|(result, trained)| trained.device == result.provenance.device) {
-        return String::new();
-    }
-    let mut devices: BTreeMap<String, (BTreeSet<&str>, BTreeSet<&str>)> = BTreeMap::new();
-    for (result, trained) in all() {
-        let (hosts, trainings) = devices.entry(describe(&trained.device)).or_default();
-        hosts.insert(if trained.host.is_empty() { "unknown" } else { trained.host.as_str() });
-        trainings.insert(result.training.as_str());
-    }
-    let part = |(device, (hosts, trainings)): (String, (BTreeSet<&str>, BTreeSet<&str>))| {
-        format!("{device}, host {} (trainings: {})", hosts.into_iter().collect::<Vec<_>>().join(", "), trainings.len())
-    };
-    format!(" Training seconds are wall time on {}.", devices.into_iter().map(part).collect::<Vec<_>>().join("; "))
-}
-
-/// One CSV table of all results: mean and deviation over seeds of every metric.
+/// One CSV table of all results: mean and deviation over seeds of every metric, and what the trainings ran on.
 ///
 /// # Errors
 /// As [`markdown`].
@@ -184,14 +169,15 @@ pub fn csv(results: &[CellResult]) -> Result<String> {
     ];
     columns.extend(fixed.into_iter().map(|(name, value)| (name.to_string(), Box::new(value) as Box<Value>)));
     let names = columns.iter().map(|(name, _)| format!("{name},{name}_sd"));
-    let mut text = format!("scene,method,setting,codec,seeds,{}\n", names.collect::<Vec<_>>().join(","));
+    let mut text = format!("scene,method,setting,codec,seeds,{},training_devices\n", names.collect::<Vec<_>>().join(","));
     for row in rows {
         let number = |value: Option<f64>| value.map_or_else(String::new, |v| format!("{v}"));
         let values = columns.iter().map(|(_, value)| {
             let spread = row.spread(value);
             format!("{},{}", number(spread.map(|s| s.mean)), number(spread.and_then(|s| s.deviation)))
         });
-        let _ = writeln!(text, "{},{},{}", row.axes.map(csv_field).join(","), row.results.len(), values.collect::<Vec<_>>().join(","));
+        let (axes, devices) = (row.axes.map(csv_field).join(","), csv_field(&trained_on(&row.results)));
+        let _ = writeln!(text, "{axes},{},{},{devices}", row.results.len(), values.collect::<Vec<_>>().join(","));
     }
     Ok(text)
 }
@@ -248,13 +234,16 @@ mod tests {
     #[test]
     fn trainings_on_other_devices_are_stated() {
         let mut results = two_seeds();
-        assert!(!markdown(&results).unwrap().contains("Training seconds"), "all ran where they were scored");
+        assert!(!markdown(&results).unwrap().contains("Training times"), "all ran where they were scored");
         results[1].cost.training_devices.clear();
-        assert!(!markdown(&results).unwrap().contains("Training seconds"), "older results do not say");
+        assert!(!markdown(&results).unwrap().contains("Training times"), "older results do not say");
         (results[0].training, results[0].cost.training_devices[0].device.threads) = ("other".into(), 8);
         let table = markdown(&results).unwrap();
-        assert!(table.contains("Training seconds are wall time on flex, Example processor, 1 threads, linux x86_64, host node-1 (trainings: 1)"), "{table}");
-        assert!(table.contains("; flex, Example processor, 8 threads, linux x86_64, host node-1 (trainings: 1)."), "{table}");
+        assert!(table.contains("Training times are wall times on [1] flex, Example processor, 1 threads, linux x86_64, host node-1 (trainings: 1)"), "{table}");
+        assert!(table.contains("; [2] flex, Example processor, 8 threads, linux x86_64, host node-1 (trainings: 1);"), "{table}");
+        // Of the two seeds of one row, one does not say.
+        assert!(table.contains("| 180.2 ± 0.0 [2, ?] |") && table.contains("| 180.2 [1] |"), "{table}");
+        assert!(csv(&results).unwrap().lines().nth(1).unwrap().ends_with(",flex; Example processor; 8 threads; linux x86_64"));
     }
 
     #[test]

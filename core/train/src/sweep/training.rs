@@ -54,7 +54,7 @@ pub struct Worker<'a> {
     pub stop: &'a AtomicBool,
     /// Limits of this machine over those of the grid, each `KEY=VALUE`. They decide what is refused and change no result.
     pub limits: &'a [String],
-    /// Processes that share the memory of this machine, this one included: plans of the preset `auto` count on an equal part.
+    /// Processes that share the memory of this machine, this one included: each keeps images decoded in a third of an equal part at most.
     pub processes: usize,
 }
 

@@ -48,7 +48,7 @@ impl Context<'_> {
         let masks: Vec<Option<&DynamicMask>> = (0..scene.cameras.len()).map(mask_of).collect();
         let moves = |camera: usize, x: f32, y: f32| masks[camera].is_some_and(|mask| covers(mask, &scene.cameras[camera], x, y));
         let Some(frames) = KeyFrames::load(scene, every, moves, self.job.config.train.mask_threshold, seed)? else {
-            warn("fewer than two key frames, the first frame among them, have images of all cameras: none is used".into());
+            warn("fewer than two key frames, the first frame among them and the earliest, have images of all cameras: none is used".into());
             return Ok(());
         };
         let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(0, |most| most.max(0) as usize);
@@ -126,7 +126,7 @@ impl Context<'_> {
 fn covers(mask: &DynamicMask, camera: &Camera, x: f32, y: f32) -> bool {
     let (w, h) = (camera.width as usize, camera.height as usize);
     let at = |share: f32, n: usize| ((share * n as f32) as usize).min(n - 1);
-    mask.mask.get(at(y, h) * w + at(x, w)).is_some_and(|&v| v > 0.5)
+    mask.mask.get(at(y, h) * w + at(x, w)).is_some_and(|&moves| moves)
 }
 
 /// When the key frames are.

@@ -18,7 +18,7 @@ impl Pyramid {
         let mut levels = Vec::new();
         if config.train.image_growth > 0.0 {
             for scale in IMAGE_SCALES {
-                levels.push((scale, Arc::new(shrunk(scene, scale, config.scene.cache_mb)?)));
+                levels.push((scale, Arc::new(shrunk(scene, scale)?)));
             }
         }
         levels.push((1.0, scene.clone()));
@@ -31,11 +31,11 @@ impl Pyramid {
     }
 }
 
-/// `scene` with images of `scale` per axis.
-fn shrunk(scene: &Arc<Scene>, scale: f32, cache_mb: u64) -> Result<Scene> {
+/// `scene` with images of `scale` per axis, and a cache for as many of them.
+fn shrunk(scene: &Arc<Scene>, scale: f32) -> Result<Scene> {
     let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
     let cameras = scene.cameras.iter().map(|camera| camera.resized(side(camera.width), side(camera.height))).collect();
-    let cache_bytes = (cache_mb as f32 * 1e6 * scale * scale) as u64;
+    let cache_bytes = (scene.cache_bytes() as f32 * scale * scale) as u64;
     Scene::new(scene.name.clone(), cameras, scene.views.clone(), Arc::new(Shrunk { scene: scene.clone(), scale }), cache_bytes)
 }
 

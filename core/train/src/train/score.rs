@@ -27,7 +27,8 @@ impl Context<'_> {
         let settings = self.job.config.render.settings(None);
         let output = self.rasterizer.render(&splats, camera, &settings)?;
         let (w, h) = (camera.width as usize, camera.height as usize);
-        let target = Tensor::<3>::from_inner(Tensor::from_data(TensorData::new(mask.mask.clone(), [1, h, w]), &self.device));
+        let wanted: Vec<f32> = mask.mask.iter().map(|&moves| f32::from(u8::from(moves))).collect();
+        let target = Tensor::<3>::from_inner(Tensor::from_data(TensorData::new(wanted, [1, h, w]), &self.device));
         let time_norm = self.job.scene.views[mask.view].time_norm;
         let loss = self.score_loss.value(&LossInput {
             planes: &output.planes,

@@ -3,7 +3,9 @@
 use super::*;
 
 pub(in crate::sweep) fn grid(text: &str) -> Grid {
-    let base = "name = 'g'\n[[scene]]\nname = 'tiny'\npath = 'procedural:tiny'\nfamily = 'demo'\n";
+    // A family that no method is put on is refused.
+    let family = if text.contains("'+") { "family = 'demo'\n" } else { "" };
+    let base = format!("name = 'g'\n[[scene]]\nname = 'tiny'\npath = 'procedural:tiny'\n{family}");
     let (top, tables) = text.split_once("---").unwrap_or(("", text));
     Grid::parse("g.toml", &format!("{top}{base}{tables}")).unwrap()
 }

@@ -16,7 +16,7 @@ const FAINT: f32 = 0.02;
 /// An opacity that undoes a removal in a rendered image: the Gaussian is not drawn.
 const INVISIBLE_LOGIT: f32 = -30.0;
 /// The attribute that a reset sets.
-const OPACITIES: &str = "opacity_logits";
+pub(super) const OPACITIES: &str = "opacity_logits";
 
 impl Context<'_> {
     /// Weakens what `plan` removes, and remembers what it resets. Call before the plan is carried out.

@@ -17,6 +17,7 @@ pub(crate) use judge::broken_rows;
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Error, Result, Schedule};
+use judge::OPACITIES;
 
 /// Passes over the cameras of a stage before a Gaussian may be removed.
 const PATIENCE_PASSES: usize = 2;
@@ -33,6 +34,8 @@ const MAX_COST_DB: f32 = 0.3;
 /// Iterations within which the PSNR must be back after an opacity reset or a removal, at least; and passes over the cameras.
 const RECOVERY: usize = 400;
 const RECOVERY_PASSES: usize = 4;
+/// In [`Reset::logits`]: added since, with an opacity of its own, which an undone reset leaves as it is. Finite, for checkpoints.
+const ADDED: f32 = f32::MIN;
 /// Multiple of that time after which a PSNR that is lower is not blamed on removals.
 const GIVE_UP: usize = 3;
 
@@ -57,7 +60,7 @@ pub struct Guard {
 struct Reset {
     iteration: usize,
     psnr_db: f32,
-    /// Opacity logits before it `[N]`.
+    /// Opacity logits before it, or [`ADDED`] `[N]`.
     logits: Vec<f32>,
 }
 
@@ -172,6 +175,11 @@ impl Guard {
         (self.born, self.drawn) = (of(&self.born, iteration as f32), of(&self.drawn, 0.0));
         if let Some(reset) = &mut self.reset {
             reset.logits = plan.parents().iter().map(|&parent| reset.logits[parent]).collect();
+            // The reset itself sets the opacities of all rows.
+            if !plan.restarted().iter().any(|name| name == OPACITIES) {
+                let given = plan.values().iter().filter(|set| set.attribute == OPACITIES).flat_map(|set| &set.rows);
+                given.filter(|&&row| plan.fresh()[row]).for_each(|&row| reset.logits[row] = ADDED);
+            }
         }
     }
     /// Divides the rows that a plan removes: those that stay because they are too young or too many, and those that may go, the faintest first. Broken rows
@@ -232,6 +240,28 @@ mod tests {
         assert!(Guard::restore(guard.state(), 3).is_err());
         let half: Vec<_> = guard.state().into_iter().filter(|(name, _)| name != "logits").collect();
         assert!(Guard::restore(half, 2).is_err());
+    }
+
+    #[test]
+    fn only_what_the_reset_changed_returns() {
+        let reset = || Some(Reset { iteration: 250, psnr_db: 20.0, logits: vec![1.0, 2.0] });
+        let mut plan = DensityPlan::unchanged(2);
+        let (copy, given) = (plan.copy(1), plan.copy(1));
+        [0, given].iter().for_each(|&row| plan.set(row, OPACITIES, &[-1.0]));
+        let followed = |plan: &DensityPlan| {
+            let mut guard = Guard::default();
+            guard.begin_stage(2);
+            guard.reset = reset();
+            guard.follow(plan, 300);
+            assert_eq!(Guard::restore(guard.state(), plan.len()).unwrap().reset, guard.reset);
+            guard.reset.unwrap().logits
+        };
+        let after = followed(&plan);
+        assert_eq!((copy, given), (2, 3));
+        assert_eq!(after, [1.0, 2.0, 2.0, ADDED], "a copy is as opaque as its parent was, unless it was given an opacity");
+        assert_eq!((-1.0f32).max(after[given]), -1.0);
+        plan.restart(OPACITIES);
+        assert_eq!(followed(&plan), [1.0, 2.0, 2.0, 2.0], "the opacities of the reset itself");
     }
 
     #[test]

@@ -12,7 +12,7 @@ mod motion;
 use super::choose::{Arrangement, Choice};
 use super::views::WorkSet;
 use super::{Candidate, fuse, sweep, thin};
-use cc4dgs_core::{Result, Scene, Seed, Split};
+use cc4dgs_core::{Result, Scene, Seed, Split, View};
 use glam::Vec3;
 use images::{KeySet, KeyView, most_pixels};
 use rayon::prelude::*;
@@ -51,7 +51,7 @@ pub(crate) struct KeyPoint {
 
 /// The images of all key frames, and the points that match in them.
 pub(crate) struct KeyFrames {
-    /// The time of each key frame, 0..1, as its views state it; the first is that of frame 0.
+    /// The time of each key frame, 0..1, as its views state it, ascending; the first is that of frame 0.
     pub times: Vec<f64>,
     sets: Vec<KeySet>,
     found: Vec<Vec<Candidate>>,
@@ -64,7 +64,8 @@ pub(crate) struct KeyFrames {
 impl KeyFrames {
     /// Every `every`-th frame of `scene`, with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so;
     /// `None` where cameras move, or fewer than two of these frames, the first among them, have images of all cameras;
-    /// others are left out. Differences up to `noise`, 0..1, are none. Each thread holds one whole image at a time; those that are kept are small.
+    /// others are left out. Key frames are in the order of their times; `None` where frame 0 is not the earliest.
+    /// Differences up to `noise`, 0..1, are none. Each thread holds one whole image at a time; those that are kept are small.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
@@ -74,22 +75,13 @@ impl KeyFrames {
             return Ok(None);
         }
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
-        let views_of = |frame: usize| -> Option<Vec<usize>> {
-            let view = |&camera: &usize| scene.views.iter().position(|v| v.frame == frame && v.camera == camera && v.split == Split::Train);
-            cameras.iter().map(view).collect()
-        };
-        let complete: Vec<(usize, Vec<usize>)> =
-            (0..scene.frame_count).step_by(every).filter_map(|frame| views_of(frame).map(|views| (frame, views))).collect();
-        // Without the first frame nothing says what moves on from there.
-        if complete.len() < 2 || complete[0].0 != 0 {
-            return Ok(None);
-        }
+        let Some(complete) = complete_frames(&scene.views, &cameras, scene.frame_count, every) else { return Ok(None) };
         // The medians are as many images as one key frame has.
         let pixels = most_pixels((complete.len() + 1) * cameras.len());
         let most_found = MOST_FOUND / complete.len();
         let mut loaded = Self { times: Vec::new(), sets: Vec::new(), found: Vec::new(), still: Vec::new(), unchanged: UNCHANGED.max(noise) };
         for (frame, views) in complete {
-            let time = views.first().map_or(0.0, |&v| f64::from(scene.views[v].time_norm));
+            let time = time_of(&scene.views, &views);
             let mut set = WorkSet::load(scene, Choice { views, ..choice.clone() })?;
             for (view, &camera) in set.views.iter_mut().zip(&cameras) {
                 let level = view.fine();
@@ -171,6 +163,24 @@ impl KeyFrames {
     fn shows(&self, key: usize, point: &KeyPoint) -> bool {
         self.share(&self.sightings(point.position, point.color, point.key), Some(key)) >= ALIVE
     }
+}
+
+/// The frames with an image of each of `cameras` for training, of every `every`-th of `count` frames, and these images in the order of `cameras`. Ordered by
+/// time: a dataset may number its frames otherwise. `None` for fewer than two, or if frame 0 is not the first: nothing says what moves on from there.
+fn complete_frames(views: &[View], cameras: &[usize], count: usize, every: usize) -> Option<Vec<(usize, Vec<usize>)>> {
+    let mut at: HashMap<(usize, usize), usize> = HashMap::new();
+    for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
+        at.entry((view.frame, view.camera)).or_insert(index);
+    }
+    let views_of = |frame: usize| cameras.iter().map(|&camera| at.get(&(frame, camera)).copied()).collect::<Option<Vec<usize>>>();
+    let mut complete: Vec<(usize, Vec<usize>)> = (0..count).step_by(every).filter_map(|frame| Some((frame, views_of(frame)?))).collect();
+    complete.sort_by(|(_, a), (_, b)| time_of(views, a).total_cmp(&time_of(views, b)));
+    (complete.len() > 1 && complete[0].0 == 0).then_some(complete)
+}
+
+/// The time of a key frame: that of the first of its images, whose indices in `views` are `own`.
+fn time_of(views: &[View], own: &[usize]) -> f64 {
+    own.first().map_or(0.0, |&view| f64::from(views[view].time_norm))
 }
 
 /// Points by the cube that they are in.
@@ -332,6 +342,28 @@ mod tests {
             box_high: Vec3::splat(1.0),
         };
         KeySet::new(set, usize::MAX)
+    }
+
+    #[test]
+    fn key_frames_are_complete_and_in_the_order_of_their_times() {
+        // Two cameras; camera 7 has a test view of frame 0 before its training view.
+        let scene = |times: &[f32]| {
+            let view = |frame: usize, camera: usize, split| View { camera, frame, time_norm: times[frame], split };
+            let pairs = (0..times.len()).flat_map(|frame| [view(frame, 7, Split::Train), view(frame, 3, Split::Train)]);
+            std::iter::once(view(0, 7, Split::Test)).chain(pairs).collect::<Vec<View>>()
+        };
+        let of = |views: &[View], count, every| complete_frames(views, &[3, 7], count, every);
+        let mut views = scene(&[0.0, 0.5, 1.0]);
+        assert_eq!(of(&views, 3, 1), Some(vec![(0, vec![2, 1]), (1, vec![4, 3]), (2, vec![6, 5])]));
+        assert_eq!(of(&views, 3, 2), Some(vec![(0, vec![2, 1]), (2, vec![6, 5])]));
+        views[3].split = Split::Validation;
+        assert_eq!(of(&views, 3, 1), Some(vec![(0, vec![2, 1]), (2, vec![6, 5])]), "frame 1 lacks an image");
+        views[1].split = Split::Validation;
+        assert_eq!(of(&views, 3, 1), None, "frame 0 lacks an image");
+        let frames = |times: &[f32]| of(&scene(times), times.len(), 1).map(|found| found.into_iter().map(|(frame, _)| frame).collect::<Vec<_>>());
+        assert_eq!(frames(&[0.0, 1.0, 0.5, 0.5]), Some(vec![0, 2, 3, 1]), "times that run backwards");
+        assert_eq!(frames(&[0.0; 3]), Some(vec![0, 1, 2]), "frames that claim to be simultaneous");
+        assert_eq!(frames(&[1.0, 0.5, 0.0]), None, "the first frame is the last one");
     }
 
     #[test]
