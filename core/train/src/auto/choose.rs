@@ -26,7 +26,8 @@ const PER_THREAD_MINUTE: f64 = 6500.0;
 /// The same where all of them move; and how many more there are per pixel with detail, where there is time for them: 0.7 dB on mutant at equal time.
 const ALL_MOVE_PER_THREAD_MINUTE: f64 = 1200.0;
 const ALL_MOVE_DETAIL: f64 = 2.0;
-/// Minutes of one thread below which the finest voxels are left out, whose vertices are most of a step, and the coefficient network is half as wide.
+/// Minutes of one thread below which the finest voxels are left out, whose vertices are most of a step, the coefficient network is half as wide, and images
+/// are small at first.
 const SHORT: f64 = 16.0;
 /// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
 const EXPOSURE: f32 = 0.09;
@@ -58,7 +59,8 @@ const DECAY: f64 = 0.005;
 const DECAY_CAMERAS: usize = 20;
 /// What a pixel adds to a footprint, square pixels: little more than the 1/12 of its own area. Held-out views gain 0.0 to 0.34 dB over 0.3.
 const BLUR: f64 = 0.1;
-/// Share of a run with smaller images where one camera at a time sees everything move: as good after as many iterations, which take up to 40 % less time.
+/// Share of a short run with smaller images where one camera at a time sees everything move: as good after as many iterations, which take up to 40 % less time.
+/// A long one with 100,000 Gaussians got worse while its images were small.
 const IMAGE_GROWTH: f64 = 0.5;
 /// Share of transparent pixels from which a scene is an object without surroundings.
 const OBJECT: f32 = 0.05;
@@ -121,7 +123,7 @@ pub(super) fn image_size(native: [u32; 2], options: &SceneOptions, machine: Mach
 /// Every other setting but the number of iterations. `free` says whether Gaussians may have lives: not where another deformer is stated.
 pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, free: bool) -> Vec<Choice> {
     let every = free.then(|| key_frames(facts, machine, minutes)).flatten();
-    let mut choices = vec![field(facts, machine, minutes, every), stages(facts, every), counts(facts, machine, minutes)];
+    let mut choices = vec![field(facts, machine, minutes, every), stages(facts, machine, minutes, every), counts(facts, machine, minutes)];
     choices.extend(background(facts));
     choices.extend(near(facts));
     choices.push(blur());
@@ -169,7 +171,7 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
     let mut settings = vec![("deformer.kind", "cdf-basis".into()), ("deformer.time_bands", Value::Integer(bands))];
     if !machine.graphics {
         settings.push(("deformer.capacity", "small".into()));
-        let short = machine.speed() * minutes < SHORT;
+        let short = is_short(machine, minutes);
         let resolutions: &[i64] = if short { &[8, 16, 32] } else { &[8, 16, 32, 64] };
         settings.push(("deformer.resolutions", Value::Array(resolutions.iter().map(|&r| Value::Integer(r)).collect())));
         settings.push(("deformer.hashes", Value::Integer(if short { 32 } else { 64 })));
@@ -178,7 +180,12 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
     choice(settings, format!("{} frames; the most accurate deformer for its time", facts.frames))
 }
 
-fn stages(facts: &Facts, key_frames: Option<usize>) -> Choice {
+/// Whether there is little time for a machine without a graphics card.
+fn is_short(machine: Machine, minutes: f64) -> bool {
+    !machine.graphics && machine.speed() * minutes < SHORT
+}
+
+fn stages(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize>) -> Choice {
     let shares = |shares: [f64; 3]| Value::Array(shares.map(Value::Float).to_vec());
     let (mut settings, reason) = match facts.arrangement {
         _ if stands_still(facts) => (vec![("train.shares", shares([1.0, 0.0, 4.0])), ("train.coarse_frames", "all".into())], "a static scene".to_string()),
@@ -196,12 +203,9 @@ fn stages(facts: &Facts, key_frames: Option<usize>) -> Choice {
                 ("train.lr.means", Value::Float(3.2e-4)),
                 ("train.lr.log_scales", Value::Float(1e-2)),
                 ("train.lr.sh_rest", Value::Float(5e-4)),
-                ("train.image_growth", Value::Float(IMAGE_GROWTH)),
+                ("train.image_growth", Value::Float(if is_short(machine, minutes) { IMAGE_GROWTH } else { 0.0 })),
             ],
-            format!(
-                "{}: all frames come at once, everything may move, and what crosses the scene is looked for; motion is found in small images first",
-                facts.arrangement.describe()
-            ),
+            format!("{}: all frames come at once, everything may move, and what crosses the scene is looked for", facts.arrangement.describe()),
         ),
         Arrangement::Photos | Arrangement::Dome | Arrangement::Rig => {
             // Lives need neither frames that come one after another nor a smooth function of space.
@@ -385,6 +389,8 @@ mod tests {
         let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
         let odd = choose(&odd, MACHINE, 5.0, true);
         assert_eq!((value(&odd, "train.dynamic"), value(&odd, "train.recover")), (Some("all".into()), Some(true.into())));
+        let growth = |minutes: f64| value(&choose(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, true), "train.image_growth");
+        assert_eq!((growth(5.0), growth(30.0)), (Some(0.5.into()), Some(0.0.into())));
         assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0, true), "train.dynamic"), Some("score".into()));
         assert!(value(&odd, "appearance.kind").is_some() && value(&odd, "train.mask_threshold").is_some() && value(&odd, "render.background").is_some());
     }
