@@ -16,6 +16,7 @@ pub mod ops {
     pub mod field;
     pub mod image;
     pub mod life;
+    mod limits;
     pub mod lookup;
     pub mod photometric;
     pub mod rasterize;

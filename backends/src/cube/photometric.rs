@@ -4,7 +4,7 @@
 //! Sums are taken per workgroup and then by one workgroup, in a fixed order, so that every run gives the same bytes.
 
 use super::tensor::{THREADS, floats, sum_of_threads, upload, workgroups_for};
-use crate::ops::photometric::{PhotometricKernels, PhotometricOps};
+use crate::ops::photometric::{MOMENTS, PhotometricKernels, PhotometricOps};
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
@@ -19,8 +19,7 @@ const RADIUS: u32 = 5;
 /// Constants of SSIM for a data range of 1.
 const C1: f32 = 1e-4;
 const C2: f32 = 9e-4;
-/// Blurred moments, and blurred derivatives, per channel.
-const MOMENTS: u32 = 5;
+/// Blurred derivatives per channel.
 const DERIVATIVES: u32 = 3;
 
 /// Gaussian of sigma 1.5, normalised.

@@ -2,6 +2,7 @@
 
 use burn::tensor::{DType, Shape};
 use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::ops::numeric::zeros_client;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::client::Client;
 use cubecl::prelude::*;
@@ -35,6 +36,11 @@ pub fn empty(like: &CubeTensor, shape: impl Into<Shape>, dtype: DType) -> CubeTe
 /// The same for float32.
 pub fn floats(like: &CubeTensor, shape: impl Into<Shape>) -> CubeTensor {
     empty(like, shape, DType::F32)
+}
+
+/// A flat tensor of `count` zeros, at least one, made on the device.
+pub fn zeros(like: &CubeTensor, count: usize) -> CubeTensor {
+    zeros_client(like.client.clone(), like.device.clone(), Shape::from([count.max(1)]), DType::F32)
 }
 
 /// A flat tensor that holds `values`.

@@ -1,6 +1,7 @@
 //! Offsets as combinations of shared functions of time: out = C φ, a dot product per number and Gaussian.
 
 use super::field::split_heads;
+use super::limits::check_binding;
 use super::shared::{Shared, Token, share};
 use crate::cpu::basis::{self as kernel, Coefficients};
 use crate::cpu::tensor::CpuBackend;
@@ -149,6 +150,8 @@ pub fn combine_all(coefficients: Tensor<2>, functions: Vec<Tensor<1>>, shape: &A
             return Err(Error::parameter("combination of functions", problem, "Give at least one row, as many coefficients and functions as the shape says"));
         }
     }
+    let most = shape.coefficients().max(shape.outputs());
+    check_binding(&coefficients.device(), "combination of functions", "Gaussians", rows, most * size_of::<f32>())?;
     let combinations = Arc::new(Combinations { shape: shape.clone(), rows, gradients: Shared::new(functions.len()) });
     let coefficients = <Dispatch as BasisOps>::coefficients(coefficients.into_dispatch(), combinations.clone());
     let at = |(index, moment): (usize, Tensor<1>)| {

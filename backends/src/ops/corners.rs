@@ -3,6 +3,7 @@
 //! The number of distinct vertices is known to the device alone, but buffers need a size. So the search has two halves. Between them, one read-back gets the
 //! numbers of all levels; or the worst case is allocated, and nothing is read back.
 
+use super::limits::{check_binding, unread};
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::index::{self, MAX_RESOLUTION};
 use burn::backend::tensor::{FloatTensor, IntTensor};
@@ -121,17 +122,21 @@ impl VoxelCorners {
             return Ok(Vec::new());
         }
         let points = points.inner();
+        check_binding(&points.device(), "voxel corners", "points", m, size_of::<[u32; 8]>())?;
         let begun: Vec<CornersBegun<Dispatch>> =
             grids.iter().map(|&grid| <Dispatch as CornerOps>::begin_corners(points.clone().into_dispatch(), grid, reuse)).collect();
         let vertices = |grid: &GridBox| if reuse { (grid.resolution as usize + 1).saturating_pow(3).min(8 * m) } else { 8 * m };
         let capacity: Vec<usize> = grids.iter().map(vertices).collect();
         let capacity = if counted || capacity.iter().any(|&vertices| vertices > MOST_UNCOUNTED) {
             let counts = Tensor::cat(begun.iter().map(|b| Tensor::<1, Int>::from_dispatch(b.count.clone())).collect(), 0);
-            let counts = counts.try_into_data().map_err(|e| Error::backend("voxel corners", format!("{e:?}"), "Try another device (--device flex)"))?;
+            let counts = counts.try_into_data().map_err(|error| unread("voxel corners, numbers of vertices", error))?;
             counts.iter::<i64>().map(|count| count.max(0) as usize).collect()
         } else {
             capacity
         };
+        for &vertices in &capacity {
+            check_binding(&points.device(), "voxel corners", "vertices", vertices, 3 * size_of::<u32>())?;
+        }
         let listed = begun.into_iter().zip(grids).zip(capacity).map(|((b, &grid), capacity)| {
             let (vertices, starts, corners) = <Dispatch as CornerOps>::list_corners(b.slots.clone(), b.vertices, b.starts, b.corners, grid, reuse, capacity);
             Self {

@@ -1,5 +1,6 @@
 //! Operations of computational deformation fields: hash-feature decoders, interpolation and the deformation network.
 
+use super::limits::check_binding;
 use crate::cpu::mlp::{mish, relu};
 use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::hash::signatures;
@@ -195,14 +196,17 @@ impl VoxelCorners {
         if decoder.hash.len() != decoder.shape.input {
             return Err(Error::parameter("decoder", format!("{} hash functions feed {} inputs", decoder.hash.len(), decoder.shape.input), "Make them equal"));
         }
+        check_binding(&weights.device(), "decoder", "vertices", self.vertices.dims()[0], decoder.shape.output * size_of::<f32>())?;
         Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::decode(weights.into_dispatch(), self.vertices.clone().into_dispatch(), decoder.clone())))
     }
     /// Trilinear interpolation of vertex `features` `[U,F]` at the points `[M,F]`.
     pub fn interpolate(&self, features: Tensor<2>) -> Result<Tensor<2>> {
-        let ([u, _], [vertices, _]) = (features.dims(), self.vertices.dims());
+        let ([u, width], [vertices, _], [corners]) = (features.dims(), self.vertices.dims(), self.corners.dims());
         if u != vertices {
             return Err(Error::parameter("interpolation", format!("{u} feature rows for {vertices} vertices"), "Decode the vertices of the same level"));
         }
+        check_binding(&features.device(), "interpolation", "vertices", u, width * size_of::<f32>())?;
+        check_binding(&features.device(), "interpolation", "points", corners / 8, width * size_of::<f32>())?;
         let [corners, slots, starts] = [&self.corners, &self.slots, &self.starts].map(|t| t.clone().into_dispatch());
         Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::trilinear(features.into_dispatch(), corners, self.weights.clone().into_dispatch(), slots, starts)))
     }

@@ -1,5 +1,6 @@
 //! Images from 8-bit files to the planes a loss reads, and back. Devices with memory of their own get the bytes, a quarter of the floats.
 
+use super::limits::unread;
 use crate::cpu::tensor::CpuBackend;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, TensorMetadata, backend_extension};
@@ -43,7 +44,8 @@ pub fn read_image(planes: Tensor<3>) -> Result<Image8> {
     }
     let words = Tensor::<1, Int>::from_dispatch(<Dispatch as ImageOps>::words(planes.inner().into_dispatch()));
     let data = words
-        .into_data()
+        .try_into_data()
+        .map_err(|error| unread("image", error))?
         .iter::<i64>()
         .flat_map(|word| {
             let [r, g, b, _] = (word as u32).to_le_bytes();

@@ -4,6 +4,7 @@
 //! FreeTimeGS++ and the flat-topped life of SharpTimeGS). At the time t the Gaussian is shifted by v (t - T) and its opacity is multiplied by
 //! g + (1 - g) exp(-(max(|t - T| - r, 0) / s)^2).
 
+use super::limits::check_binding;
 use super::split::split;
 use crate::cpu::life as kernel;
 use crate::cpu::tensor::CpuBackend;
@@ -110,6 +111,8 @@ pub fn lives(attributes: Tensor<2>, rules: LifeRules) -> Result<Vec<LifeAt>> {
     if lengths.is_empty() {
         return Ok(Vec::new());
     }
+    let most = WIDTH.max(OUTPUTS * rules.times_norm.len());
+    check_binding(&attributes.device(), "lives", "Gaussians", m, most * size_of::<f32>())?;
     let flat = Tensor::<1>::from_dispatch(<Dispatch as LifeOps>::lives(attributes.into_dispatch(), Arc::new(rules)));
     let pieces = split(flat, lengths);
     Ok(pieces.as_chunks::<2>().0.iter().map(|[shift, factor]| LifeAt { shift: shift.clone().reshape([m, 3]), log_factor: factor.clone() }).collect())

@@ -1,5 +1,6 @@
 //! Interpolated lookup in multi-resolution grids of stored features: hash grids and planes. The gradient goes to the table alone.
 
+use super::limits::check_binding;
 use crate::cpu::lookup as kernel;
 use crate::cpu::tensor::CpuBackend;
 use crate::ops::autodiff::{differentiate, record};
@@ -150,5 +151,9 @@ pub fn lookup(table: Tensor<1>, points: Tensor<2>, shape: &Arc<GridShape>) -> Re
     if shape.levels.iter().any(|l| l.rows == 0 || l.size[..dims].iter().any(|&s| s < if shape.clamps { 2 } else { 1 })) {
         return bad("a level has no cell".into(), "Give every axis at least two vertices");
     }
+    // Backwards, every corner of every point has a word.
+    let slots = if table.device().is_autodiff() { shape.levels.len() << dims } else { 0 };
+    check_binding(&points.device(), "grid lookup", "points", m, slots.max(shape.width()) * size_of::<u32>())?;
+    check_binding(&points.device(), "grid lookup", "weights", shape.parameter_count(), size_of::<f32>())?;
     Ok(Tensor::from_dispatch(<Dispatch as LookupOps>::lookup(table.into_dispatch(), points.into_dispatch(), shape.clone())))
 }

@@ -1,5 +1,6 @@
 //! The photometric loss and the cross-entropy of the score stage, with their gradients.
 
+use super::limits::check_binding;
 use crate::cpu::cross_entropy::bce_with_logits;
 use crate::cpu::photometric as kernel;
 use crate::cpu::tensor::CpuBackend;
@@ -11,6 +12,9 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
+
+/// Blurred moments per channel: the largest array of the kernels for GPUs.
+pub(crate) const MOMENTS: u32 = 5;
 
 /// The passes per device.
 pub trait PhotometricKernels: Backend {
@@ -160,6 +164,7 @@ pub fn photometric_loss(planes: Tensor<3>, target: Tensor<3>, lambda_c: f32) -> 
     if !(0.0..=1.0).contains(&lambda_c) {
         return Err(Error::parameter("photometric loss", format!("lambda_c = {lambda_c} is outside 0..1"), "Give the weight of L1 as a number from 0 to 1"));
     }
+    check_binding(&planes.device(), "photometric loss", "pixels", h * w, 3 * MOMENTS as usize * size_of::<f32>())?;
     let (loss, terms) = <Dispatch as PhotometricOps>::photometric(planes.into_dispatch(), target.into_dispatch(), lambda_c);
     Ok(PhotometricLoss { loss: Tensor::from_dispatch(loss), terms: Tensor::<1>::from_dispatch(terms).inner() })
 }

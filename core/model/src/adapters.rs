@@ -53,6 +53,10 @@ impl Adapter {
     pub fn is_software(&self) -> bool {
         self.kind == AdapterKind::Software
     }
+    /// Whether its kernels may bind the buffers they need: seven arrays, and one for scalars and lengths. WebGPU guarantees as many.
+    pub fn binds_enough(&self) -> bool {
+        self.max_storage_buffers >= 8
+    }
     /// Whether it answers through OpenGL only.
     pub fn is_opengl(&self) -> bool {
         self.api == "Gl"
@@ -152,6 +156,9 @@ pub fn auto_device() -> (&'static str, String) {
         [] => ("flex", "no graphics adapter answers, and flex is the CPU device burn recommends".into()),
         [first, ..] if first.is_software() => {
             ("flex", format!("the only adapter, {}, is software on the processor, where flex is faster; --device wgpu selects it", first.name))
+        }
+        [first, ..] if !first.binds_enough() => {
+            ("flex", format!("a kernel of {} may bind {} buffers, and 8 are needed", first.name, first.max_storage_buffers))
         }
         [first, ..] if first.is_opengl() => ("flex", format!("{} answers through OpenGL only; --device wgpu selects it", first.name)),
         [first, ..] => ("wgpu", format!("{} is a graphics card", first.name)),

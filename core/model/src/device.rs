@@ -93,6 +93,11 @@ mod adapter {
     pub fn wgpu_device(index: usize) -> Result<Device> {
         static ANSWERS: Mutex<BTreeMap<usize, bool>> = Mutex::new(BTreeMap::new());
         let kind = match adapters().get(index) {
+            Some(adapter) if !adapter.binds_enough() => {
+                let problem = format!("a kernel may bind {} buffers there, and 8 are needed", adapter.max_storage_buffers);
+                let device = format!("device wgpu:{index} ({})", adapter.name);
+                return Err(Error::unsupported(device, problem, "Use --device flex, or another adapter of `cc4dgs doctor`"));
+            }
             Some(adapter) => adapter.device_kind(),
             // burn may find an adapter that enumeration does not list.
             None if index == 0 => DeviceKind::DefaultDevice,

@@ -132,8 +132,6 @@ impl Gaussians {
 /// # Errors
 /// [`Error::Backend`] if the device fails.
 pub fn to_vec<const D: usize>(tensor: Tensor<D>, object: &str) -> Result<Vec<f32>> {
-    tensor
-        .into_data()
-        .try_to_vec::<f32>()
-        .map_err(|e| Error::backend(object, format!("reading the tensor back failed: {e:?}"), "Try another device (--device flex)"))
+    let failed = |problem: String| Error::backend(object, format!("reading the tensor back failed: {problem}"), "Try another device (--device flex)");
+    tensor.try_into_data().map_err(|e| failed(format!("{e:?}")))?.try_to_vec::<f32>().map_err(|e| failed(format!("{e:?}")))
 }

@@ -2,8 +2,8 @@
 
 use super::blend;
 use super::gradient::{self, AT_OFFSET, GEOMETRY, OF_CAMERA, OF_MEAN, OF_OPACITY, OF_QUATERNION, OF_SCALES, SCREEN};
-use super::{DIM, Lists, read_floats, rest_width};
-use crate::cube::tensor::{floats, row_blocks, rows_of, shared_bytes, spread, upload, workgroups_for};
+use super::{DIM, Lists, rest_width};
+use crate::cube::tensor::{floats, row_blocks, rows_of, shared_bytes, spread, upload, workgroups_for, zeros};
 use crate::ops::rasterize::camera::{CameraSums, RuleConstants};
 use crate::ops::rasterize::{AT_X, GradientRequest, RasterGradients, RasterSettings, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
@@ -24,7 +24,7 @@ pub fn backward(
     // Nothing was drawn (too many pairs), so no gradient flows back.
     let Some(lists) = saved.get::<Lists>() else { return RasterGradients::default() };
     let rest_shape = splats.sh_rest.meta.shape().clone();
-    let SplatTensors { means, scales, quaternions, opacities, sh_rest, background, .. } = super::contiguous(splats);
+    let SplatTensors { means, scales, quaternions, opacities, sh_rest, .. } = super::contiguous(splats);
     let upstream = into_contiguous(upstream);
     let client = means.client.clone();
     let n = means.meta.shape()[0];
@@ -46,7 +46,6 @@ pub fn backward(
                 lists.gaussian_of_pair.clone().into_buffer_arg(),
                 lists.sorted.clone().into_buffer_arg(),
                 lists.tile_starts.clone().into_buffer_arg(),
-                background.clone().into_buffer_arg(),
                 lists.state.clone().into_buffer_arg(),
                 upstream.clone().into_buffer_arg(),
                 records.clone().into_buffer_arg(),
@@ -69,7 +68,7 @@ pub fn backward(
         (true, true) => floats(&means, rest_shape),
         // Colours that are blended as they are do not depend on the coefficients.
         (true, false) => {
-            let zeros = upload(&means, &vec![0.0f32; rest_floats.max(1)], DType::F32);
+            let zeros = zeros(&means, rest_floats);
             CubeTensor::new_contiguous(zeros.client.clone(), zeros.device.clone(), rest_shape, zeros.handle.clone(), DType::F32)
         }
         _ => floats(&means, [1]),
@@ -116,7 +115,6 @@ pub fn backward(
             quaternions.into_buffer_arg(),
             opacities.into_buffer_arg(),
             lists.cam.clone().into_buffer_arg(),
-            lists.keys.clone().into_buffer_arg(),
             screen.clone().into_buffer_arg(),
             geometry.clone().into_buffer_arg(),
             n as u32,
@@ -143,10 +141,12 @@ pub fn backward(
                 let (from, to) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
                 gradient::sum_rows::launch(&client, count, DIM(), from, to, n as u32, stride as u32, first as u32);
             }
-            let (matrix, offset) = (read_floats(&of_camera), read_floats(&of_offset));
-            sums.rotation = std::array::from_fn(|k| f64::from(matrix[k]));
-            sums.translation = std::array::from_fn(|k| f64::from(matrix[9 + k]));
-            sums.center = std::array::from_fn(|k| -f64::from(offset[k]));
+            // A backward pass cannot return an error. Without an answer the gradient is NaN, and the next read of the device is the error.
+            let read = client.read(vec![of_camera.handle.clone(), of_offset.handle.clone()]).unwrap_or_default();
+            let number = |part: usize, k: usize| read.get(part).and_then(|bytes| f32::from_bytes(bytes).get(k)).map_or(f64::NAN, |&v| f64::from(v));
+            sums.rotation = std::array::from_fn(|k| number(0, k));
+            sums.translation = std::array::from_fn(|k| number(0, 9 + k));
+            sums.center = std::array::from_fn(|k| -number(1, k));
         }
         let gradient = upload(&means, &sums.matrix_gradient(&settings.world_to_camera), DType::F32);
         CubeTensor::new_contiguous(gradient.client.clone(), gradient.device.clone(), [4, 4].into(), gradient.handle.clone(), DType::F32)

@@ -1,6 +1,7 @@
 //! Front-to-back blending, a thread per pixel and a workgroup per tile, and its back-to-front derivative. The Gaussians of a tile are loaded into shared memory
 //! a batch at a time.
 
+use super::lists::{BACKGROUND, background_of};
 use crate::ops::rasterize::camera::{ALPHA_MIN, TRANSMITTANCE_STOP};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, TILE, TILE_PIXELS};
 use cubecl::prelude::*;
@@ -33,14 +34,14 @@ fn full_alpha(drawn: &Shared<[f32]>, at: usize, dx: f32, dy: f32) -> f32 {
     select(sigma >= 0.0 && alpha >= ALPHA_MIN, alpha, 0.0f32)
 }
 
-/// Planes `[5,H,W]`; per pixel the bits of the transmittance left, and the list index at which it stopped `[2,H,W]`; largest weights `[N]` if asked for.
+/// Planes `[5,H,W]`; per pixel the bits of the transmittance left, and the list index at which it stopped `[2,H,W]`; largest weights `[N]` if asked for. The
+/// background's colour is in `starts` ([`background_of`]).
 #[cube(launch_unchecked)]
 pub fn blend_tiles(
     splats: &[f32],
     gaussian_of_pair: &[u32],
     sorted: &[u32],
     starts: &[u32],
-    background: &[f32],
     planes: &mut [f32],
     state: &mut [u32],
     weights: &mut [Atomic<u32>],
@@ -52,6 +53,8 @@ pub fn blend_tiles(
 ) {
     let mut drawn = Shared::<[f32]>::new_slice(comptime!(RECORD * BATCH));
     let mut gaussians = Shared::<[u32]>::new_slice(BATCH);
+    // Largest weights of the batch, as bits.
+    let heaviest = Shared::<[Atomic<u32>]>::new_slice(comptime!(if wants_weights { BATCH } else { 1 }));
     let finished = Shared::<[Atomic<u32>]>::new_slice(1usize);
     let thread = UNIT_POS as usize;
     let tile = CUBE_POS as u32;
@@ -61,7 +64,7 @@ pub fn blend_tiles(
     let inside = x < width && y < height;
     let mut first = 0u32;
     let mut end = 0u32;
-    if (tile as usize) + 1 < starts.len() {
+    if (tile as usize) + 1 + BACKGROUND < starts.len() {
         first = starts[tile as usize];
         end = starts[tile as usize + 1];
     }
@@ -85,6 +88,9 @@ pub fn blend_tiles(
         let count = select(end - first < BATCH as u32, end - first, BATCH as u32);
         if UNIT_POS < count {
             gaussians[thread] = gaussian_of_pair[sorted[first as usize + thread] as usize];
+            if comptime!(wants_weights) {
+                heaviest[thread].store(0u32);
+            }
         }
         sync_cube();
         let mut k = thread;
@@ -113,7 +119,7 @@ pub fn blend_tiles(
                     left = after;
                     if comptime!(wants_weights) {
                         // Weights are positive, so their bits order like the numbers, and a maximum has no order.
-                        weights[gaussians[g as usize] as usize].fetch_max(u32::reinterpret(weight));
+                        heaviest[g as usize].fetch_max(u32::reinterpret(weight));
                     }
                 }
             }
@@ -121,15 +127,23 @@ pub fn blend_tiles(
         }
         first += count;
         sync_cube();
+        if comptime!(wants_weights) {
+            if UNIT_POS < count {
+                let most = heaviest[thread].load();
+                if most > 0 {
+                    weights[gaussians[thread] as usize].fetch_max(most);
+                }
+            }
+        }
         done = finished[0].load();
         sync_cube();
     }
     if inside {
         let pixels = (width * height) as usize;
         let at = (y * width + x) as usize;
-        planes[at] = red + left * background[0];
-        planes[at + pixels] = green + left * background[1];
-        planes[at + 2 * pixels] = blue + left * background[2];
+        planes[at] = red + left * background_of(starts, 0usize);
+        planes[at + pixels] = green + left * background_of(starts, 1usize);
+        planes[at + 2 * pixels] = blue + left * background_of(starts, 2usize);
         planes[at + 3 * pixels] = 1.0 - left;
         planes[at + 4 * pixels] = depth;
         // As words: an index as a float would be subnormal, and WGSL lets devices flush those to zero.
@@ -151,7 +165,6 @@ pub fn blend_tiles_backward(
     gaussian_of_pair: &[u32],
     sorted: &[u32],
     starts: &[u32],
-    background: &[f32],
     state: &[u32],
     upstream: &[f32],
     records: &mut [f32],
@@ -190,7 +203,8 @@ pub fn blend_tiles_backward(
         g_green = upstream[at + pixels];
         g_blue = upstream[at + 2 * pixels];
         g_depth = upstream[at + 4 * pixels];
-        behind = left * (background[0] * g_red + background[1] * g_green + background[2] * g_blue - upstream[at + 3 * pixels]);
+        let (red, green, blue) = (background_of(starts, 0usize), background_of(starts, 1usize), background_of(starts, 2usize));
+        behind = left * (red * g_red + green * g_green + blue * g_blue - upstream[at + 3 * pixels]);
     }
     of_image[thread] = g_red;
     of_image[thread + TILE_PIXELS] = g_green;
@@ -198,7 +212,7 @@ pub fn blend_tiles_backward(
     of_image[thread + 3 * TILE_PIXELS] = g_depth;
     let mut start = 0u32;
     let mut end = 0u32;
-    if (tile as usize) + 1 < starts.len() {
+    if (tile as usize) + 1 + BACKGROUND < starts.len() {
         start = starts[tile as usize];
         end = starts[tile as usize + 1];
     }

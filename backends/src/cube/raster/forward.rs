@@ -3,11 +3,11 @@
 use super::blend;
 use super::geometry::camera_buffer;
 use super::gradient::{GEOMETRY, SCREEN};
-use super::lists;
+use super::lists::{self, BACKGROUND};
 use super::project::{self, KEYS};
-use super::{DIM, Lists, read_words, rest_width, words};
+use super::{DIM, Lists, read_word, rest_width, words};
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{binding_bytes, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for};
+use crate::cube::tensor::{binding_bytes, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for, zeros};
 use crate::ops::rasterize::camera::{CameraConstants, RuleConstants};
 use crate::ops::rasterize::{MAX_TILE_PAIRS, RECORD, RasterSettings, Rasterized, Refusal, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
@@ -58,7 +58,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
             cam.clone().into_buffer_arg(),
             splats.clone().into_buffer_arg(),
             keys.clone().into_buffer_arg(),
-            radii.clone().into_buffer_arg(),
+            n as u32,
             raw,
             settings.antialiased,
             rules.square_tiles,
@@ -113,14 +113,17 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     let pairs = match settings.pair_capacity {
         Some(capacity) => capacity,
         None if n == 0 => 0,
-        None => read_words(&total).first().copied().unwrap_or(0) as usize,
+        None => match read_word(&total) {
+            Ok(pairs) => pairs as usize,
+            Err(error) => return refuse(&means, Refusal::Unread(error.to_string())),
+        },
     };
     let limit = MAX_TILE_PAIRS.min(binding_bytes(&client) / (4 * blend::record_floats(settings.absolute_centers) as u64));
     if pairs as u64 > limit {
         return refuse(&means, Refusal::Pairs { found: pairs as u64, limit });
     }
     let (tile_of_pair, pair, gaussian_of_pair) = (words(&means, pairs), words(&means, pairs), words(&means, pairs));
-    let tile_starts = words(&means, tiles + 1);
+    let tile_starts = words(&means, tiles + 1 + BACKGROUND);
     let mut sorted = pair.clone();
     let mut sorted_tiles = tile_of_pair.clone();
     if pairs > 0 {
@@ -144,10 +147,11 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
         }
         (sorted_tiles, sorted) = sort_pairs(tile_of_pair, pair, pairs, usize::BITS - tiles.leading_zeros());
     }
-    lists::tile_starts::launch(&client, workgroups_for(pairs + 1), DIM(), sorted_tiles.into_buffer_arg(), tile_starts.clone().into_buffer_arg(), pairs as u32);
+    let (tiles_of_pairs, behind, starts) = (sorted_tiles.into_buffer_arg(), background.into_buffer_arg(), tile_starts.clone().into_buffer_arg());
+    lists::tile_starts::launch(&client, workgroups_for(pairs + 1), DIM(), tiles_of_pairs, behind, starts, pairs as u32);
     let planes = floats(&means, [5, height, width]);
     let state = empty(&means, [2, height, width], DType::U32);
-    let weights = if settings.max_weights && n > 0 { upload(&means, &vec![0.0f32; n], DType::F32) } else { upload(&means, &[0.0f32], DType::F32) };
+    let weights = if settings.max_weights { zeros(&means, n) } else { floats(&means, [1]) };
     // SAFETY: tiles and pixels are compared with the sizes of their buffers; pairs and Gaussians come from lists made above, which name none beyond the last.
     unsafe {
         blend::blend_tiles::launch_unchecked(
@@ -158,7 +162,6 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
             gaussian_of_pair.clone().into_buffer_arg(),
             sorted.clone().into_buffer_arg(),
             tile_starts.clone().into_buffer_arg(),
-            background.into_buffer_arg(),
             planes.clone().into_buffer_arg(),
             state.clone().into_buffer_arg(),
             weights.clone().into_buffer_arg(),

@@ -8,10 +8,12 @@ use crate::cube::tensor::{THREADS, sum_of_threads};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD};
 use cubecl::prelude::*;
 
-/// Columns of the screen gradients: those of a record, then three for the offset from the camera (through the view direction).
-pub const SCREEN: usize = RECORD + 3;
+/// Columns of the screen gradients: those of a record, then three for the offset from the camera (through the view direction), then [`AT_DRAWN`].
+pub const SCREEN: usize = RECORD + 4;
 /// First column of the gradient of the offset from the camera.
 pub const AT_OFFSET: usize = RECORD;
+/// Column that is 1 for Gaussians that meet a tile, else 0.
+const AT_DRAWN: usize = RECORD + 3;
 
 /// Columns of the geometry's gradients.
 pub const GEOMETRY: usize = 23;
@@ -26,7 +28,7 @@ pub const OF_OPACITY: usize = 10;
 /// First of twelve columns of the camera: rotation by rows, translation.
 pub const OF_CAMERA: usize = 11;
 
-/// Adds up the records of each Gaussian, `stride` floats each, in the order of its tiles, and turns moments into gradients: screen `[N,13]`.
+/// Adds up the records of each Gaussian, `stride` floats each, in the order of its tiles, and turns moments into gradients: screen `[N,14]`.
 #[cube(launch)]
 pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], splats: &[f32], screen: &mut [f32], #[comptime] stride: usize) {
     let i = ABSOLUTE_POS;
@@ -58,11 +60,13 @@ pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], spl
             for k in 0..4usize {
                 screen[to + AT_COLOR + k] = sums[AT_COLOR + k];
             }
+            screen[to + AT_DRAWN] = 1.0;
         } else {
             #[unroll]
             for k in 0..RECORD {
                 screen[to + k] = 0.0;
             }
+            screen[to + AT_DRAWN] = 0.0;
         }
         store3(screen, to + AT_OFFSET, v3(0.0, 0.0, 0.0));
     }
@@ -167,7 +171,6 @@ pub fn geometry_backward(
     quaternions: &[f32],
     opacities: &[f32],
     cam: &[f32],
-    keys: &[u32],
     screen: &[f32],
     out: &mut [f32],
     gaussians: u32,
@@ -177,8 +180,8 @@ pub fn geometry_backward(
     let i = ABSOLUTE_POS;
     if i < gaussians as usize {
         let to = GEOMETRY * i;
-        if keys[KEYS * i + KEY_TILES] > 0 {
-            let from = SCREEN * i;
+        let from = SCREEN * i;
+        if screen[from + AT_DRAWN] > 0.0 {
             let mean = load3(means, 3 * i);
             let s = activated_scales(scales, i, raw);
             let opacity = activated_opacity(opacities, i, raw);

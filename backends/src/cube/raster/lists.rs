@@ -3,6 +3,9 @@
 use super::project::{KEY_COLUMNS, KEY_DEPTH, KEY_ROWS, KEY_TILES, KEYS};
 use cubecl::prelude::*;
 
+/// Words behind the starts of the tiles: the bits of the background's colour, so that blending needs no array of its own for it.
+pub const BACKGROUND: usize = 3;
+
 /// Depth keys and indices of all Gaussians, to be sorted.
 #[cube(launch)]
 pub fn depth_keys(keys: &[u32], depth: &mut [u32], index: &mut [u32]) {
@@ -63,11 +66,22 @@ pub fn fill_unused(tile_of_pair: &mut [u32], pair: &mut [u32], total: &[u32], ti
     }
 }
 
-/// starts`[tile]` is the first of the sorted pairs of a tile; starts`[tiles]` their number.
+/// A channel of the background's colour, from behind the starts of the tiles.
+#[cube]
+pub fn background_of(starts: &[u32], channel: usize) -> f32 {
+    f32::reinterpret(starts[starts.len() - BACKGROUND + channel])
+}
+
+/// starts`[tile]` is the first of the sorted pairs of a tile; starts`[tiles]` their number. The background's colour is behind them ([`background_of`]).
 #[cube(launch)]
-pub fn tile_starts(tile_of_pair: &[u32], starts: &mut [u32], pairs: u32) {
-    let tiles = starts.len() as u32 - 1;
+pub fn tile_starts(tile_of_pair: &[u32], background: &[f32], starts: &mut [u32], pairs: u32) {
+    let tiles = (starts.len() - 1 - BACKGROUND) as u32;
     let at = ABSOLUTE_POS as u32;
+    if at == 0 {
+        for channel in 0..BACKGROUND {
+            starts[tiles as usize + 1 + channel] = u32::reinterpret(background[channel]);
+        }
+    }
     if at <= pairs {
         // Pair `at` starts its own tile and all empty ones since the pair before it.
         let mut from = 0u32;

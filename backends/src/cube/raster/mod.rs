@@ -22,6 +22,7 @@ use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
+use cubecl::server::ServerError;
 
 /// What the backward pass needs of the forward pass.
 struct Lists {
@@ -42,13 +43,10 @@ fn words(like: &CubeTensor, count: usize) -> CubeTensor {
     empty(like, [count], DType::U32)
 }
 
-/// Reads a buffer of words back.
-fn read_words(tensor: &CubeTensor) -> Vec<u32> {
-    u32::from_bytes(&tensor.client.read_one_unchecked(tensor.handle.clone())).to_vec()
-}
-
-fn read_floats(tensor: &CubeTensor) -> Vec<f32> {
-    f32::from_bytes(&tensor.client.read_one_unchecked(tensor.handle.clone())).to_vec()
+/// Reads the first word of a buffer back.
+fn read_word(tensor: &CubeTensor) -> Result<u32, ServerError> {
+    let bytes = tensor.client.read_one(tensor.handle.clone())?;
+    Ok(u32::from_bytes(&bytes).first().copied().unwrap_or(0))
 }
 
 /// Floats of higher coefficients per Gaussian.

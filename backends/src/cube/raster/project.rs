@@ -102,7 +102,7 @@ fn all_finite(mean: V3, s: V3, q: V4, opacity: f32, p: Projected) -> bool {
         && is_finite(p.center_y)
 }
 
-/// Screen records `[N,10]` without colour, sorting keys `[N,4]`, radii `[N]`.
+/// Screen records `[N,10]` with the radius (0 if culled) in place of the colour, which [`color_gaussians`] adds; sorting keys `[N,4]`.
 #[cube(launch)]
 pub fn project_gaussians(
     means: &[f32],
@@ -112,13 +112,13 @@ pub fn project_gaussians(
     cam: &[f32],
     splats: &mut [f32],
     keys: &mut [u32],
-    radii: &mut [i32],
+    gaussians: u32,
     #[comptime] raw: bool,
     #[comptime] antialiased: bool,
     #[comptime] square: bool,
 ) {
     let i = ABSOLUTE_POS;
-    if i < radii.len() {
+    if i < gaussians as usize {
         let mean = load3(means, 3 * i);
         let s = activated_scales(scales, i, raw);
         let q = quaternion(quaternions, i);
@@ -178,7 +178,7 @@ pub fn project_gaussians(
         keys[key + KEY_COLUMNS] = columns;
         keys[key + KEY_ROWS] = rows;
         // Integer radii stay below 2^31, as in Inria's code.
-        radii[i] = select(drawn, select(radius < 1e9, radius, 1e9f32) as i32, 0i32);
+        splats[at + AT_COLOR] = select(drawn, select(radius < 1e9, radius, 1e9f32), 0.0f32);
     }
 }
 
@@ -189,7 +189,8 @@ pub fn view_direction(cam: &[f32], mean: V3) -> V3 {
     scale(offset, 1.0 / dot(offset, offset).sqrt())
 }
 
-/// Colours into the screen records, for `count` Gaussians from `first` on, whose coefficients `sh_rest` holds; Gaussians whose colour is not finite are culled.
+/// Colours into the screen records, and radii `[N]`, for `count` Gaussians from `first` on, whose coefficients `sh_rest` holds. Gaussians whose colour is not
+/// finite are culled.
 #[cube(launch)]
 pub fn color_gaussians(
     means: &[f32],
@@ -207,35 +208,40 @@ pub fn color_gaussians(
 ) {
     let row = ABSOLUTE_POS;
     let i = first as usize + row;
-    if row < count as usize && radii[i] > 0 {
-        let mut red = colors[3 * i];
-        let mut green = colors[3 * i + 1];
-        let mut blue = colors[3 * i + 2];
-        if comptime!(harmonics) {
-            let values = basis(view_direction(cam, load3(means, 3 * i)), degree);
-            red = red * values[0] + 0.5;
-            green = green * values[0] + 0.5;
-            blue = blue * values[0] + 0.5;
-            #[unroll]
-            for k in 1..comptime!((degree + 1) * (degree + 1)) {
-                let at = row * rest_width as usize + 3 * (k - 1);
-                red += sh_rest[at] * values[k];
-                green += sh_rest[at + 1] * values[k];
-                blue += sh_rest[at + 2] * values[k];
-            }
-        }
-        let finite = is_finite(red) && is_finite(green) && is_finite(blue) && red.abs() < COLOR_LIMIT && green.abs() < COLOR_LIMIT && blue.abs() < COLOR_LIMIT;
-        if finite {
+    if row < count as usize {
+        let mut radius = splats[RECORD * i + AT_COLOR] as i32;
+        if radius > 0 {
+            let mut red = colors[3 * i];
+            let mut green = colors[3 * i + 1];
+            let mut blue = colors[3 * i + 2];
             if comptime!(harmonics) {
-                red = select(red > 0.0, red, 0.0f32);
-                green = select(green > 0.0, green, 0.0f32);
-                blue = select(blue > 0.0, blue, 0.0f32);
+                let values = basis(view_direction(cam, load3(means, 3 * i)), degree);
+                red = red * values[0] + 0.5;
+                green = green * values[0] + 0.5;
+                blue = blue * values[0] + 0.5;
+                #[unroll]
+                for k in 1..comptime!((degree + 1) * (degree + 1)) {
+                    let at = row * rest_width as usize + 3 * (k - 1);
+                    red += sh_rest[at] * values[k];
+                    green += sh_rest[at + 1] * values[k];
+                    blue += sh_rest[at + 2] * values[k];
+                }
             }
-            store3(splats, RECORD * i + AT_COLOR, v3(red, green, blue));
-        } else {
-            keys[KEYS * i + KEY_DEPTH] = 0xffff_ffffu32;
-            keys[KEYS * i + KEY_TILES] = 0;
-            radii[i] = 0;
+            let finite =
+                is_finite(red) && is_finite(green) && is_finite(blue) && red.abs() < COLOR_LIMIT && green.abs() < COLOR_LIMIT && blue.abs() < COLOR_LIMIT;
+            if finite {
+                if comptime!(harmonics) {
+                    red = select(red > 0.0, red, 0.0f32);
+                    green = select(green > 0.0, green, 0.0f32);
+                    blue = select(blue > 0.0, blue, 0.0f32);
+                }
+                store3(splats, RECORD * i + AT_COLOR, v3(red, green, blue));
+            } else {
+                keys[KEYS * i + KEY_DEPTH] = 0xffff_ffffu32;
+                keys[KEYS * i + KEY_TILES] = 0;
+                radius = 0i32;
+            }
         }
+        radii[i] = radius;
     }
 }

@@ -5,6 +5,7 @@ pub mod camera;
 mod cpu;
 mod settings;
 
+use super::limits::{over_binding, unread};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, DispatchDevice, ExtensionType, backend_extension};
 use burn::tensor::{Device, Int, Tensor};
@@ -47,7 +48,7 @@ impl fmt::Debug for Saved {
 }
 
 /// Why a device refuses to draw.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Refusal {
     /// More (Gaussian, tile) pairs than the limit.
     Pairs {
@@ -63,6 +64,8 @@ pub enum Refusal {
         /// Upper bound on Gaussians.
         limit: u64,
     },
+    /// The device did not give the number of pairs back, for the reason it states: it is lost, or out of memory.
+    Unread(String),
 }
 
 impl Refusal {
@@ -71,12 +74,8 @@ impl Refusal {
             Self::Pairs { found, limit } => {
                 Error::limit("render", found, limit, "The value counts (Gaussian, tile) pairs. Prune huge Gaussians or render a smaller image")
             }
-            Self::Gaussians { found, limit } => Error::limit(
-                "render",
-                found,
-                limit,
-                "The value counts Gaussians; the limit follows from the largest binding of the adapter. Use a device with larger bindings (`cc4dgs doctor` lists them), or fewer Gaussians",
-            ),
+            Self::Gaussians { found, limit } => over_binding("render", "Gaussians", found, limit),
+            Self::Unread(error) => unread("render, number of (Gaussian, tile) pairs", error),
         }
     }
 }

@@ -178,8 +178,9 @@ fn change(track: &Track, row: usize, functions: &[f32], out: &mut HostGaussians,
         Head::LogScales => track.add(row, functions, &mut out.log_scales[3 * gaussian..3 * gaussian + 3]),
         Head::Rotations => {
             let quaternion = &mut out.quaternions[4 * gaussian..4 * gaussian + 4];
-            let norm = quaternion.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
-            quaternion.iter_mut().for_each(|v| *v /= norm);
+            // In float64: squares of float32 may leave its range.
+            let norm = quaternion.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt().max(f64::MIN_POSITIVE);
+            quaternion.iter_mut().for_each(|v| *v = (f64::from(*v) / norm) as f32);
             track.add(row, functions, quaternion);
         }
         Head::Opacities => {

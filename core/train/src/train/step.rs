@@ -182,7 +182,7 @@ impl Context<'_> {
         if let Some(visible) = &visible
             && read
         {
-            let shown = visible.clone().greater_elem(0).int().sum().into_scalar::<i64>().max(0) as u64;
+            let shown = to_vec(visible.clone().greater_elem(0).float().sum(), "number of Gaussians that are shown")?.first().map_or(0, |shown| *shown as u64);
             log.count_optimizer(shown, n as u64 - shown.min(n as u64));
         }
         let extent = f64::from(schedule.extent);

@@ -47,9 +47,9 @@ impl Trouble {
     }
 }
 
-/// Whether every value of `tensor` is finite: a sum is finite only if every summand is.
+/// Whether every value of `tensor` is finite: a sum is finite only if every summand is. A tensor that cannot be read is not.
 pub(crate) fn is_finite<const D: usize>(tensor: &Tensor<D>) -> bool {
-    tensor.clone().sum().into_scalar::<f32>().is_finite()
+    tensor.clone().sum().try_into_scalar::<f32>().is_ok_and(f32::is_finite)
 }
 
 /// Factors of learning rates by part; 1 where a part is not named.
