@@ -3,7 +3,7 @@
 //! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code.
 
 use crate::parts::centres::{check_time, finite};
-use crate::parts::settings::{bounded, within};
+use crate::parts::settings::{bounded, not_negative, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -75,6 +75,7 @@ impl DeformMlp {
         within("skip", settings.skip, 1, settings.layers - 1)?;
         within("position_bands", settings.position_bands, 0, 20)?;
         within("time_bands", settings.time_bands, 0, 20)?;
+        not_negative(&[("lr_start", settings.lr_start), ("lr_end", settings.lr_end)])?;
         let of_time = 1 + 2 * settings.time_bands;
         let input = 3 * (1 + 2 * settings.position_bands) + if settings.time_network { TIME_WIDTHS[1] } else { of_time };
         let w = settings.width;

@@ -1,11 +1,12 @@
 //! The deformer of E-D3DGS: a learned vector per Gaussian and one per time, instead of coordinates, feed a coarse and a fine network (Bae et al. 2024).
 //!
 //! The table of times is resized and then read by linear interpolation: the coarse network sees few rows, the fine one all of them. The
-//! published code's time offsets per camera are omitted, because a model here has no cameras.
+//! published code's time offsets per camera are omitted, because a model here has no cameras. So are two terms of its loss: the differences between the vectors of
+//! 20 nearest neighbours (weight 1; Technicolor 0.1), and the sigmoid of the mean opacity logit (weight 1e-4).
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::{bounded, within};
+use crate::parts::settings::{bounded, not_negative, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -22,13 +23,18 @@ time_features = 256      # width of the learned vector per time
 time_rows = 150          # rows of the table of times (published: 150, Technicolor 25)
 coarse_rows = 30         # rows that the coarse network sees (published: 30, Technicolor 5)
 rows_grow = 0.125        # share of training over which the fine network's rows grow from the coarse network's number to all (10,000 of 80,000 iterations)
-fade_in = 0.0125         # share of training over which offsets are faded in; opacity, colour and scale start five such shares later (1,000 of 80,000)
+fade_in = 0.0125         # share of training over which offsets are faded in, at most 1/6; opacity, colour and scale start five such shares later (1,000 of 80,000)
 width = 128
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
 gaussian_lr = 2.5e-3     # Adam on the vectors of Gaussians
 lr_start = 1.6e-4        # Adam on everything else, times the extent of the cameras, log-linear to lr_end
 lr_end = 1.6e-5
 "#;
+
+/// Shares `fade_in` after which opacity, colour and scale begin to fade in.
+const LATER: f32 = 5.0;
+/// Largest `fade_in`: all heads are faded in when training ends.
+const MOST_FADE_IN: f32 = 1.0 / (LATER + 1.0);
 
 /// Name of the extra attribute.
 const ATTRIBUTE: &str = "embedding";
@@ -84,11 +90,14 @@ impl Embedding {
         within("time_rows", settings.time_rows, 2, 100_000)?;
         within("coarse_rows", settings.coarse_rows, 2, settings.time_rows)?;
         within("width", settings.width, 1, 4096)?;
-        for (name, share) in [("rows_grow", settings.rows_grow), ("fade_in", settings.fade_in)] {
-            if !(0.0..=1.0).contains(&share) {
-                return Err(Error::parameter(format!("deformer.{name}"), format!("{share} is not in 0..1"), "Give a share from 0 to 1"));
-            }
+        if !(0.0..=1.0).contains(&settings.rows_grow) {
+            return Err(Error::parameter("deformer.rows_grow", format!("{} is not in 0..1", settings.rows_grow), "Give a share from 0 to 1"));
         }
+        if !(0.0..=MOST_FADE_IN).contains(&settings.fade_in) {
+            let problem = format!("{} is not in 0..1/6: opacity, colour and scale would not be faded in when training ends", settings.fade_in);
+            return Err(Error::parameter("deformer.fade_in", problem, "Give a share from 0 to 1/6"));
+        }
+        not_negative(&[("gaussian_lr", settings.gaussian_lr), ("lr_start", settings.lr_start), ("lr_end", settings.lr_end)])?;
         heads::check(&settings.heads)?;
         let (w, input) = (settings.width, settings.gaussian_features + settings.time_features);
         let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
@@ -144,7 +153,7 @@ impl Embedding {
         let fade = self.settings.fade_in;
         let begun = match head {
             Head::Means | Head::Quaternions => 0.0,
-            Head::LogScales | Head::Opacity | Head::Sh => 5.0 * fade,
+            Head::LogScales | Head::Opacity | Head::Sh => LATER * fade,
         };
         if fade == 0.0 || self.progress >= begun + fade { 1.0 } else { ((self.progress - begun) / fade).max(0.0) }
     }
@@ -216,6 +225,19 @@ mod tests {
             field.set_progress(progress);
             assert_eq!(field.fine_rows(), rows, "at {progress}");
             assert!((field.share_of(Head::Means) - means).abs() < 1e-4 && (field.share_of(Head::Sh) - colors).abs() < 1e-4, "at {progress}");
+        }
+    }
+
+    #[test]
+    fn every_head_is_faded_in_when_training_ends() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let build = |fade_in: f32| Embedding::new(Settings { fade_in, ..Settings::default() }, &context, &Device::flex());
+        let mut field = build(MOST_FADE_IN).unwrap();
+        field.set_progress(1.0);
+        assert!((field.share_of(Head::Sh) - 1.0).abs() < 1e-4);
+        for fade_in in [0.17, 0.2, 1.0, -0.01, f32::NAN] {
+            let error = build(fade_in).err().unwrap_or_else(|| panic!("{fade_in} was accepted")).to_string();
+            assert!(error.contains("fade_in") && error.contains("1/6"), "{error}");
         }
     }
 }

@@ -1,10 +1,12 @@
 //! The deformer of Grid4D: a spatial hash grid whose features, turned into attention, weigh those of three grids over pairs of axes and time (Xu et al. 2024).
 //!
 //! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are normalised
-//! by the deformer's box rather than by a fixed bound per dataset. R(q) passes no gradient to the canonical centre.
+//! by the deformer's box rather than by a fixed bound per dataset, and so are the perturbations of the smoothness term. R(q) passes no gradient to the canonical
+//! centre. The published term starts after densification on N3DV and also perturbs times on most D-NeRF scenes; here it acts from the first iteration of the main
+//! stage, and times are not perturbed.
 
 use crate::parts::centres::{check_time, column, finite, in_box};
-use crate::parts::settings::{bounded, within};
+use crate::parts::settings::{bounded, not_negative, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::activation::sigmoid;
@@ -30,7 +32,7 @@ features = 2             # per level
 width = 256
 depth = 0                # hidden layers after the attention
 smooth_weight = 0.5      # weight of the squared difference of features at perturbed centres
-smooth_delta = 5e-3      # the perturbation, as a share of the box
+smooth_delta = 1e-3      # the largest perturbation per axis, as a share of the box (published: 8e-5 on N3DV, 3e-3 on D-NeRF)
 lr_grid_start = 8e-3     # Adam on the tables
 lr_grid_end = 8e-5
 lr_start = 8e-4          # Adam on the network
@@ -85,7 +87,7 @@ impl Default for Settings {
             width: 256,
             depth: 0,
             smooth_weight: 0.5,
-            smooth_delta: 5e-3,
+            smooth_delta: 1e-3,
             lr_grid_start: 8e-3,
             lr_grid_end: 8e-5,
             lr_start: 8e-4,
@@ -137,6 +139,7 @@ impl Grid4d {
                 return Err(Error::parameter(format!("deformer.{name}"), format!("{value} is not in 0..{most}"), "Choose a value in this range"));
             }
         }
+        not_negative(&[("lr_grid_start", s.lr_grid_start), ("lr_grid_end", s.lr_grid_end), ("lr_start", s.lr_start), ("lr_end", s.lr_end)])?;
         let space = grid(s.space_levels, s.features, [s.space_base; 3], [s.space_final; 3], s.log2_rows);
         let time = grid(s.time_levels, s.features, s.time_base, s.time_final, s.log2_rows);
         let attention = ReluShape::chain(&[space.width(), s.width]);

@@ -4,7 +4,7 @@
 
 use crate::parts::centres::{check_time, column, in_box};
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::{bounded, within};
+use crate::parts::settings::{bounded, not_negative, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor};
@@ -96,6 +96,9 @@ impl HexPlane {
         within("features", settings.features, 1, 256)?;
         within("width", settings.width, 1, 4096)?;
         heads::check(&settings.heads)?;
+        let penalties = [("tv_space", settings.tv_space), ("tv_time", settings.tv_time), ("time_one", settings.time_one)];
+        not_negative(&penalties.map(|(name, weight)| (name, f64::from(weight))))?;
+        not_negative(&[("lr_start", settings.lr_start), ("lr_end", settings.lr_end), ("grid_rate", settings.grid_rate)])?;
         let (input, w) = (settings.features * settings.multires.len(), settings.width);
         let network = ReluShape { input, trunk: vec![w], heads: settings.heads.iter().map(|h| vec![w, h.width(context.sh_degree)]).collect() };
         let plane = |axes: &[usize; 2]| {

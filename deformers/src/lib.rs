@@ -41,4 +41,34 @@ mod tests {
             assert!(error.exit_code() == 4 && error.to_string().contains("parameters of the deformer"), "{kind}: {error}");
         }
     }
+
+    #[test]
+    fn rates_and_weights_that_are_negative_or_no_numbers_are_refused() {
+        let registry = Registry::collect().unwrap();
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(1) };
+        for (kind, settings) in [
+            ("cdf", "lr_start lr_end clip_norm"),
+            ("cdf-basis", "lr_start lr_end clip_norm sparsity"),
+            ("hexplane", "lr_start lr_end grid_rate tv_space tv_time time_one"),
+            ("grid4d", "lr_start lr_end lr_grid_start lr_grid_end smooth_weight smooth_delta"),
+            ("swift4d-hash", "lr_start lr_end"),
+            ("embedding", "lr_start lr_end gaussian_lr"),
+            ("deform-mlp", "lr_start lr_end"),
+            ("native-4d", "time_lr duration_lr velocity_lr color_lr"),
+            ("free-time", "center_lr width_lr gate_lr velocity_lr gate_weight"),
+            ("life", "center_lr width_lr gate_lr velocity_lr gate_weight"),
+        ] {
+            for name in settings.split(' ') {
+                for value in ["-1e-3", "nan", "inf", "1e300"] {
+                    let text = match kind {
+                        "life" => format!("kind = 'none'\nlife = {{ {name} = {value} }}"),
+                        _ => format!("kind = '{kind}'\n{name} = {value}"),
+                    };
+                    let section: toml::Table = text.parse().unwrap();
+                    let error = registry.build_deformer(&section, &context, &Device::flex()).err().unwrap_or_else(|| panic!("built: {text}"));
+                    assert!(error.to_string().contains(name), "{text}: {error}");
+                }
+            }
+        }
+    }
 }

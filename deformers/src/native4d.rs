@@ -6,7 +6,7 @@
 //! scales in four dimensions instead. Both represent the same Gaussians, but the optimizer takes other steps.
 
 use crate::parts::centres::check_time;
-use crate::parts::settings::within;
+use crate::parts::settings::{not_negative, within};
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
     AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures,
@@ -60,6 +60,8 @@ struct Native4d {
 impl Native4d {
     fn new(settings: Settings, context: &DeformerContext) -> Result<Self> {
         within("harmonics", settings.harmonics, 0, 8)?;
+        let s = &settings;
+        not_negative(&[("time_lr", s.time_lr), ("duration_lr", s.duration_lr), ("velocity_lr", s.velocity_lr), ("color_lr", s.color_lr)])?;
         let bad = |name: &str, value: f32, remedy: &str| Err(Error::parameter(format!("deformer.{name}"), format!("{value} cannot be used"), remedy));
         if !(settings.duration > 1e-4 && settings.duration < 1e4) {
             return bad("duration", settings.duration, "Give a share of the sequence, such as 0.14");

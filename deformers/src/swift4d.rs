@@ -5,7 +5,7 @@
 
 use crate::parts::centres::{check_time, column, in_box};
 use crate::parts::heads::{self, Head};
-use crate::parts::settings::{bounded, within};
+use crate::parts::settings::{bounded, not_negative, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
 use burn::tensor::{Device, Tensor};
@@ -70,6 +70,7 @@ impl Swift4d {
         within("base", settings.base as usize, 2, 256)?;
         within("width", settings.width, 1, 4096)?;
         heads::check(&settings.heads)?;
+        not_negative(&[("lr_start", settings.lr_start), ("lr_end", settings.lr_end)])?;
         let mut grid =
             GridShape { dims: 4, features: settings.features, levels: Vec::new(), stagger: 0.5, smooth: false, clamps: false, outside: Outside::Zero };
         for level in 0..settings.levels {

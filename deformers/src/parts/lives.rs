@@ -1,6 +1,8 @@
 //! Lives of Gaussians, for what appears, vanishes or crosses a scene faster than smooth functions follow: settings, attributes, and the formula of
 //! [`cc4dgs_backends::ops::life`].
 
+use crate::parts::centres::check_time;
+use crate::parts::settings::not_negative;
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
 use cc4dgs_backends::ops::life::{LEAST_FALLOFF, LifeAt, LifeRules, lives};
@@ -62,6 +64,13 @@ impl Life {
     /// # Errors
     /// [`Error::Parameter`] that names the setting.
     pub fn new(settings: LifeSettings) -> Result<Self> {
+        let s = &settings;
+        not_negative(&[
+            ("center_lr of lives", s.center_lr),
+            ("width_lr of lives", s.width_lr),
+            ("gate_lr of lives", s.gate_lr),
+            ("velocity_lr of lives", s.velocity_lr),
+        ])?;
         let limits = [
             ("half_width", settings.half_width, 1e-4, 10.0),
             ("falloff", settings.falloff, LEAST_FALLOFF, 10.0),
@@ -95,6 +104,7 @@ impl Life {
     /// # Errors
     /// [`Error::Parameter`] for times that are not finite.
     pub fn at(&self, attributes: Tensor<2>, times_norm: &[f32], gated_velocity: bool) -> Result<Vec<LifeAt>> {
+        times_norm.iter().try_for_each(|&time_norm| check_time(time_norm))?;
         if attributes.dims()[0] == 0 {
             let device = attributes.device();
             let none = |_: &f32| LifeAt { shift: Tensor::zeros([0, 3], &device), log_factor: Tensor::zeros([0], &device) };
@@ -106,5 +116,20 @@ impl Life {
     pub fn regularizer(&self, gates: Tensor<2>) -> Option<Tensor<1>> {
         let open = (self.settings.gate_weight > 0.0 && gates.dims()[0] > 0).then(|| sigmoid(gates.mul_scalar(LIFE_GATE_STEEPNESS)).mean());
         Some(open?.neg().add_scalar(1.0).mul_scalar(self.settings.gate_weight))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::Device;
+    use cc4dgs_backends::ops::life::WIDTH;
+
+    #[test]
+    fn times_that_are_no_numbers_are_refused_without_gaussians_too() {
+        let life = Life::new(LifeSettings::default()).unwrap();
+        let at = |time_norm: f32| life.at(Tensor::zeros([0, WIDTH], &Device::flex()), &[0.5, time_norm], true);
+        assert!(at(f32::NAN).is_err() && at(f32::INFINITY).is_err());
+        assert_eq!(at(0.2).unwrap().len(), 2);
     }
 }

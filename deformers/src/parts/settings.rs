@@ -25,6 +25,19 @@ impl Default for Rates {
     }
 }
 
+/// Refuses learning rates and weights of losses that are negative or not finite in float32.
+///
+/// # Errors
+/// [`Error::Parameter`] for `deformer.NAME`.
+pub fn not_negative(values: &[(&str, f64)]) -> Result<()> {
+    match values.iter().find(|(_, value)| !(0.0..=f64::from(f32::MAX)).contains(value)) {
+        Some((name, value)) => {
+            Err(Error::parameter(format!("deformer.{name}"), format!("{value} is negative or not finite"), "Give a finite number of 0 or more"))
+        }
+        None => Ok(()),
+    }
+}
+
 impl Rates {
     /// The keys of these settings in a `[deformer]` section.
     pub const KEYS: [&'static str; 4] = RATE_KEYS;
@@ -33,13 +46,9 @@ impl Rates {
     /// # Errors
     /// [`Error::Parameter`].
     pub fn check(&self) -> Result<()> {
-        let rates = [self.lr_start, self.lr_end, self.clip_norm];
-        if rates.iter().any(|r| !r.is_finite() || *r < 0.0) || !(0.0..=1.0).contains(&self.warmup) {
-            return Err(Error::parameter(
-                "deformer",
-                format!("lr_start, lr_end, clip_norm = {rates:?}, warmup = {}", self.warmup),
-                "Use finite rates of 0 or more and a warm-up in 0..1",
-            ));
+        not_negative(&[("lr_start", self.lr_start), ("lr_end", self.lr_end), ("clip_norm", self.clip_norm)])?;
+        if !(0.0..=1.0).contains(&self.warmup) {
+            return Err(Error::parameter("deformer.warmup", format!("{} is not in 0..1", self.warmup), "Give a share from 0 to 1"));
         }
         Ok(())
     }

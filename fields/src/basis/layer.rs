@@ -112,13 +112,18 @@ fn coefficient_weights(plan: &BasisPlan, source: &MotionSource) -> Result<Vec<f3
     Ok(weights)
 }
 
-/// Layers add to quaternions after those were divided by their norms.
+/// Largest factor of rotations. Beyond it, changes would be greater than layers may hold; what is added is all of the rotation long before.
+const MOST_FACTOR: f64 = 1e15;
+
+/// What coefficients are multiplied by. Layers add to quaternions after those were divided by their norms.
 fn factor(head: LayerHead, gaussians: &HostGaussians, gaussian: usize) -> f32 {
     if head != LayerHead::Rotations {
         return 1.0;
     }
-    let norm = gaussians.quaternions[4 * gaussian..4 * gaussian + 4].iter().map(|v| v * v).sum::<f32>().sqrt();
-    if norm > 1e-15 { 1.0 / norm } else { 0.0 }
+    // In float64, where squares of all float32 are neither infinite nor zero.
+    let norm = gaussians.quaternions[4 * gaussian..4 * gaussian + 4].iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    // What is added to a quaternion of norm 0 is the whole rotation, of which only the direction counts.
+    if norm > 0.0 { (1.0 / norm).min(MOST_FACTOR) as f32 } else { 1.0 }
 }
 
 inventory::submit! {
@@ -132,5 +137,20 @@ inventory::submit! {
             capabilities: &[],
         },
         motion,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rotations_change_whatever_the_norm_of_their_quaternion() {
+        for (length, expected) in [(0.0, 1.0), (1e-40, 1e15), (1e-20, 1e15), (0.5, 2.0), (1.0, 1.0), (1e25, 1e-25), (3e38, 1.0 / 3e38)] {
+            let gaussians = HostGaussians { quaternions: vec![1.0, 0.0, 0.0, 0.0, 0.0, 0.0, length, 0.0], ..Default::default() };
+            let found = factor(LayerHead::Rotations, &gaussians, 1);
+            assert!((found / expected - 1.0).abs() < 1e-3, "{length}: {found}");
+            assert_eq!(factor(LayerHead::Means, &gaussians, 1), 1.0);
+        }
     }
 }
