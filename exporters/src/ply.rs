@@ -24,10 +24,10 @@ impl Default for Ply {
 
 impl Exporter for Ply {
     fn loses(&self, facts: &ExportFacts) -> String {
-        still::sentence(facts, &[(true, "background"), (!self.dynamic, "dynamic scores")])
+        still::sentence(facts, &[(true, "background"), (!self.dynamic, "dynamic scores"), still::highest_degree(facts)])
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
-        let gaussians = still::instant(source, "PLY")?;
+        let gaussians = still::with_rotations(still::instant(source, "PLY")?);
         still::write(path, &to_bytes_with(&gaussians, &PlyOptions { dynamic: self.dynamic, antialiased: source.facts().antialiased })?)?;
         Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree, frames: 1, notes: Vec::new() })
     }

@@ -16,7 +16,9 @@ impl Exporter for PlySequence {
     fn loses(&self, facts: &ExportFacts) -> String {
         let frames = facts.times_norm.len();
         let blur = facts.lost_blur().map_or_else(String::new, |blur| format!(", {blur}"));
-        format!("It holds {frames} frames and nothing between them, without times, background{blur} and dynamic scores.")
+        let (applies, part) = still::highest_degree(facts);
+        let degree = if applies { format!(", {part}") } else { String::new() };
+        format!("It holds {frames} frames and nothing between them, without times, background{blur}{degree} and dynamic scores.")
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         let facts = source.facts().clone();
@@ -25,7 +27,7 @@ impl Exporter for PlySequence {
         let digits = (facts.times_norm.len().max(1) - 1).to_string().len().max(4);
         let mut written = Exported::default();
         for (index, time) in facts.times_norm.iter().enumerate() {
-            let gaussians = source.gaussians(Some(*time))?;
+            let gaussians = still::with_rotations(source.gaussians(Some(*time))?);
             still::write(&path.join(format!("{}_{index:0digits$}.ply", facts.name)), &to_bytes_with(&gaussians, &options)?)?;
             written = Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree, frames: index + 1, notes: Vec::new() };
             source.progress(index + 1, facts.times_norm.len())?;

@@ -28,7 +28,8 @@ impl Default for Spz {
 
 impl Exporter for Spz {
     fn loses(&self, facts: &ExportFacts) -> String {
-        still::sentence(facts, &[(true, "background"), (true, "dynamic scores"), (true, "all but 8 bits of colours, opacities and scales")])
+        let parts = [(true, "background"), (true, "dynamic scores"), (true, "all but 8 bits of colours, opacities and scales"), still::highest_degree(facts)];
+        still::sentence(facts, &parts)
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         let gaussians = still::instant(source, "SPZ")?;

@@ -17,6 +17,25 @@ pub fn check(gaussians: &HostGaussians, format: &str) -> Result<()> {
     gaussians.validate(&format!("Gaussians to write as {format}"), &Limits { max_gaussians: u64::MAX, ..Limits::default() })
 }
 
+/// Logit of an opacity that nobody sees (2e-35); that of opacity 0 is not finite.
+const INVISIBLE: f32 = -80.0;
+
+/// `gaussians` for formats that hold them as they are trained. Rotations of length zero, which are not drawn here, become the identity and invisible: other programs
+/// divide by the length.
+pub fn with_rotations(mut gaussians: HostGaussians) -> HostGaussians {
+    for (q, logit) in gaussians.quaternions.as_chunks_mut::<4>().0.iter_mut().zip(&mut gaussians.opacity_logits) {
+        if unit(q).is_none() {
+            (*q, *logit) = ([1.0, 0.0, 0.0, 0.0], INVISIBLE);
+        }
+    }
+    gaussians
+}
+
+/// What most viewers lose of a format that itself holds degree 4, as a part of [`sentence`].
+pub fn highest_degree(facts: &ExportFacts) -> (bool, &'static str) {
+    (facts.sh_degree > 3, "in most viewers harmonics over degree 3")
+}
+
 /// Writes `bytes` to `path`.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     std::fs::write(path, bytes).map_err(|e| Error::io(path, e))
@@ -55,4 +74,17 @@ pub fn color_bytes(dc: &[f32; 3]) -> [u8; 3] {
 /// A number in 0..1 in a byte.
 pub fn byte(value: f32) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rotations_of_length_zero_become_the_identity_and_invisible() {
+        let gaussians = HostGaussians { quaternions: vec![0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0], opacity_logits: vec![3.0, 4.0], ..Default::default() };
+        let out = with_rotations(gaussians);
+        assert_eq!(out.quaternions, [1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0]);
+        assert!(out.opacity_logits[1] == 4.0 && (0.0..1e-30).contains(&sigmoid(out.opacity_logits[0])));
+    }
 }

@@ -27,6 +27,16 @@ fn formats_for_other_viewers_say_that_they_lose_the_blur() {
 }
 
 #[test]
+fn formats_that_hold_degree_4_say_that_most_viewers_do_not() {
+    let exporters = Entries::<ExporterPlugin>::collect().unwrap();
+    for name in ["ply", "ply-sequence", "spz"] {
+        let exporter = (exporters.get(name).unwrap().build)(&toml::Table::new()).unwrap();
+        let says = |degree| exporter.loses(&conformance::export_facts(3, degree)).contains("most viewers harmonics over degree 3");
+        assert!(says(4) && !says(3), "{name}");
+    }
+}
+
+#[test]
 fn settings_out_of_range_are_refused_before_a_model_is_read() {
     let exporters = Entries::<ExporterPlugin>::collect().unwrap();
     for (name, bad) in [

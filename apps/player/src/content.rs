@@ -1,5 +1,6 @@
 //! What a file holds, in the form that the GPU reads.
 
+use crate::memory;
 use cc4dgs_format::archive::{Archive, MAGIC, Presentation, StreamKind};
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::playback::{Head, PlaybackLayer};
@@ -78,8 +79,11 @@ impl Content {
         let size = bytes.len() as u64;
         limits.check_bytes(object, size)?;
         if bytes.starts_with(&MAGIC) {
-            return Self::of_archive(object, &Archive::from_bytes(object, bytes, limits)?, limits);
+            let archive = Archive::from_bytes(object, bytes, limits)?;
+            memory::check_archive(object, &archive)?;
+            return Self::of_archive(object, &archive, limits);
         }
+        memory::check_file(object, &bytes)?;
         let file = if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
             ply::from_bytes(object, &bytes, limits)?
         } else if spz::begins_as_spz(&bytes) {

@@ -10,6 +10,7 @@ mod clock;
 mod content;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod exact;
+mod memory;
 mod navigator;
 mod render;
 #[cfg(target_arch = "wasm32")]

@@ -6,7 +6,8 @@ opened from disk, without a network. Chromium renders with SwiftShader, so no gr
 the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
-from browser_input import drop, embedded, touch
+from browser_faults import broken_module, hopeless, refused, small_textures, told_once
+from browser_input import drop, embedded, reduced_motion, touch, wheel
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
 from playwright.sync_api import sync_playwright
@@ -40,15 +41,22 @@ def main():
         page, facts = loading(pages)
         playing(page)
         navigation(pages, page)
+        wheel(page)
         webgl(pages, facts)
         lost(pages, page, facts)
         arriving(pages, page, facts, len(archive), args.layers)
         errors(pages, page)
+        told_once(pages)
+        refused(pages)
+        small_textures(pages)
+        hopeless(pages)
+        broken_module(pages)
         drop(page, facts)
         pages.quiet("dropping")
         page.close()
         phone(pages, args.archive)
         embedded(pages)
+        reduced_motion(pages)
         for file, name in ((args.single, "single"), (args.weights, "weights")):
             if file:
                 from_disk(pages, pathlib.Path(file).resolve(), name, facts)
@@ -108,6 +116,11 @@ def navigation(pages, page):
     assert apart(moved, other.evaluate(POSE)) < 1e-3
     assert abs(other.evaluate("cc4dgs.time") - page.evaluate("cc4dgs.time")) < 1e-4
     other.close()
+    # In a frame of `srcdoc` the address cannot be changed.
+    text = page.evaluate("""async () => { history.replaceState = () => { throw new DOMException("no", "SecurityError"); };
+        const share = [...document.querySelectorAll(".panel button")].find(b => b.textContent === "Copy link");
+        await share.onclick(); delete history.replaceState; return share.textContent; }""")
+    assert text in ("Copied", "Not copied"), text
     say("dragging orbits, the wheel zooms, R resets, a shared link restores time and pose")
 
 
@@ -126,6 +139,10 @@ def webgl(pages, facts):
         e.loseContext(); setTimeout(() => e.restoreContext(), 200); }""")
     page.evaluate("recovered")
     pages.agree(page, "WebGL2 after a lost context")
+    page.evaluate("window.recovered = new Promise(r => cc4dgs.on('recovered', r)); window.losing = cc4dgs.gl.gl.getExtension('WEBGL_lose_context'); losing.loseContext()")
+    page.wait_for_function("document.querySelector('[role=alert]')?.innerText.includes('not given WebGL2 back')")
+    page.evaluate("losing.restoreContext(); recovered")
+    assert page.locator("[role=alert]").count() == 0 or page.locator(".note").is_hidden(), "the message stays after the context was restored"
     assert page.evaluate("!!cc4dgs.gl.sorter.worker")
     page.close()
     pages.quiet("WebGL2")
@@ -164,6 +181,13 @@ def arriving(pages, page, facts, total, least_layers):
         assert page.evaluate(IMAGE, pose) == whole, f"{name}: the image is another one"
     fetched = page.evaluate("cc4dgs.received")
     assert page.evaluate("steps.some(([, frames]) => frames === 1) && steps.at(-1)[1] <= cc4dgs.facts.frames")
+    # The last is another site for the browser, and compresses.
+    other_site = pages.address.replace("127.0.0.1", "localhost")
+    for source in ("/tagged.cc4d", "/gzip.cc4d", f"{other_site}/gzip.cc4d"):
+        assert page.evaluate("source => cc4dgs.load(source)", source)["frames"] == facts["frames"]
+        assert page.evaluate(IMAGE, pose) == whole, f"{source}: the image is another one"
+    assert total <= 65536 or "/tagged.cc4d" in Handler.broken, "no connection broke"
+    pages.complaints[:] = [c for c in pages.complaints if "net::ERR_" not in c]
     for backend in ("", "?backend=webgl"):
         other = pages.open(backend)
         other.evaluate(STAGES)
@@ -185,7 +209,7 @@ def arriving(pages, page, facts, total, least_layers):
 
 def errors(pages, page):
     """Damage is a sentence."""
-    for name in ("damaged", "hostile", "cut", "text", "missing"):
+    for name in ("damaged", "hostile", "cut", "text", "vast", "missing"):
         message = page.evaluate(f"cc4dgs.load('/{name}.cc4d').then(() => 'it loaded', e => e.message)")
         assert len(message) > 20 and message != "it loaded" and "RuntimeError" not in message, f"{name}: {message}"
         shown = page.locator("[role=alert]").inner_text()

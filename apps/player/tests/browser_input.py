@@ -22,6 +22,31 @@ def drop(page, facts):
     say("a file that is dropped on the page is opened")
 
 
+def wheel(page):
+    """A notch zooms as far in pixels, in lines and in pages."""
+    arms = []
+    for mode, delta in ((0, 100), (1, 3), (2, 1)):
+        page.evaluate("cc4dgs.reset()")
+        page.evaluate("([deltaMode, deltaY]) => cc4dgs.ui.canvas.dispatchEvent(new WheelEvent('wheel', { deltaMode, deltaY, cancelable: true }))", [mode, delta])
+        arms.append(length(arm(page.evaluate(POSE))))
+    page.evaluate("cc4dgs.reset()")
+    assert max(arms) / min(arms) < 1 + 1e-6 and arms[0] > 1.1 * length(arm(page.evaluate(POSE))), arms
+    say("a notch of the wheel zooms as far in pixels, lines and pages")
+
+
+def reduced_motion(pages):
+    """Where the system asks for less motion, nothing starts by itself."""
+    page = pages.watch(pages.browser.new_page(reduced_motion="reduce"))
+    page.goto(f"{pages.address}/index.html?src={MODEL}&autoplay")
+    page.wait_for_function("window.cc4dgs?.facts")
+    assert not page.evaluate("cc4dgs.playing") and page.evaluate("cc4dgs.time") == 0
+    page.evaluate("cc4dgs.play()")
+    assert page.evaluate("cc4dgs.playing")
+    page.close()
+    pages.quiet("reduced motion")
+    say("with reduced motion the page does not start by itself")
+
+
 def arm(pose):
     """From the orbited point to the eye."""
     return [pose[k] - pose[3 + k] for k in range(3)]

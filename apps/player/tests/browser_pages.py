@@ -1,5 +1,5 @@
 """What the checks of browser.py share: a server of page and archives, and pages whose console is watched."""
-import functools, http.server, json, os, pathlib, re, shutil, threading, time
+import functools, gzip, http.server, json, os, pathlib, re, shutil, threading, time
 import numpy
 from PIL import Image
 
@@ -18,6 +18,8 @@ class Handler(http.server.SimpleHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     requests = []
     archives = {}
+    # Paths whose connection broke already.
+    broken = set()
 
     def do_GET(self):
         path = self.path.split("?")[0]
@@ -31,17 +33,34 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         wanted = self.headers.get("Range")
         Handler.requests.append((path, wanted))
         pieces = 40 if "slow" in path else 1
+        if "gzip" in path:
+            return self.answer(gzip.compress(body), 200, {"Content-Encoding": "gzip", "Access-Control-Allow-Origin": "*"})
+        version = {"ETag": '"1"'} if "tagged" in path else {}
+        if "tagged" in path and wanted and not wanted.startswith("bytes=0-"):
+            assert self.headers.get("If-Range") == '"1"', "parts are asked for without a condition"
+            if path not in Handler.broken:
+                Handler.broken.add(path)
+                part, place = self.part(wanted, body)
+                return self.answer(part, 206, {**version, "Content-Range": place}, cut=len(part) // 2)
         if not wanted or "plain" in path:
             return self.answer(body, 200, {}, pieces)
+        part, place = self.part(wanted, body)
+        self.answer(part, 206, {**version, "Content-Range": place}, pieces)
+
+    @staticmethod
+    def part(wanted, body):
         first, last = re.fullmatch(r"bytes=(\d+)-(\d+)", wanted).groups()
         part = body[int(first):int(last) + 1]
-        self.answer(part, 206, {"Content-Range": f"bytes {first}-{int(first) + len(part) - 1}/{len(body)}"}, pieces)
+        return part, f"bytes {first}-{int(first) + len(part) - 1}/{len(body)}"
 
-    def answer(self, body, status, headers, pieces=1):
+    def answer(self, body, status, headers, pieces=1, cut=None):
+        """Sends `body` in pieces; with `cut`, so many bytes of it before the connection ends."""
         self.send_response(status)
         for name, value in {**headers, "Content-Length": str(len(body))}.items():
             self.send_header(name, value)
         self.end_headers()
+        if cut:
+            body, self.close_connection = body[:cut], True
         step = max(1, len(body) // pieces)
         for at in range(0, len(body), step):
             try:
@@ -61,8 +80,11 @@ def serve(folder, archive):
     damaged = bytearray(archive)
     damaged[len(archive) // 3] ^= 0x55
     hostile = archive[:12] + (0xFFFFFFF0).to_bytes(4, "little") + archive[16:]
+    # The header of an SPZ file of 7,999,999 Gaussians of degree 4: more than WebAssembly holds.
+    vast = b"NGSP" + (4).to_bytes(4, "little") + (7999999).to_bytes(4, "little") + bytes([4, 12, 0, 6]) + (32).to_bytes(4, "little") + bytes(12)
     Handler.archives = {MODEL: archive, "/plain.cc4d": archive, "/slow.cc4d": archive, "/slow-plain.cc4d": archive, "/damaged.cc4d": bytes(damaged), "/hostile.cc4d": hostile,
-                        "/cut.cc4d": archive[:len(archive) // 2], "/text.cc4d": b"this is no model at all" * 9}
+                        "/cut.cc4d": archive[:len(archive) // 2], "/text.cc4d": b"this is no model at all" * 9, "/gzip.cc4d": archive,
+                        "/tagged.cc4d": archive, "/vast.cc4d": vast}
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=folder))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return f"http://127.0.0.1:{server.server_port}"

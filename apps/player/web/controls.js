@@ -59,8 +59,10 @@ export function build(container, player) {
     const fly = button("Fly", "Fly with W A S D Q E, drag to look", () => player.set("flying", !player.flying));
     const share = button("Copy link", "Copy a link with time and pose", async () => {
         const link = player.link();
-        history.replaceState(null, "", link);
-        try { await navigator.clipboard.writeText(link); share.textContent = "Copied"; } catch { share.textContent = "In address bar"; }
+        let failed = "In address bar";
+        // A frame of `srcdoc` has no address to change.
+        try { history.replaceState(null, "", link); } catch { failed = "Not copied"; }
+        try { await navigator.clipboard.writeText(link); share.textContent = "Copied"; } catch { share.textContent = failed; }
         setTimeout(() => { share.textContent = "Copy link"; }, 1500);
     });
     const stats = element("p", { className: "stats" });
@@ -120,6 +122,14 @@ export function build(container, player) {
             ui.settings({ ...player.settings, flying: player.flying });
             ui.time({ time: player.time, frame: player.gpu.frame, seconds: player.time * facts.seconds }, facts);
         },
+        /// There is nothing to play or to look at.
+        empty: () => {
+            bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = true; });
+            camera.replaceChildren();
+            clock.textContent = "–";
+            stats.textContent = "";
+            ui.playing(false);
+        },
         time: ({ time: t, frame, seconds }, facts) => {
             if (document.activeElement !== time || Math.abs(time.value - t) > 0.001) time.value = t;
             const text = facts && facts.frames > 1 ? `${frame + 1} / ${facts.frames} · ${seconds.toFixed(2)} s` : "still";
@@ -146,7 +156,7 @@ export function build(container, player) {
         },
     };
     ui.settings({ ...player.settings, flying: false });
-    bar.querySelectorAll("button, input, select").forEach(c => { c.disabled = true; });
+    ui.empty();
     say("Open a .cc4d, .ply or .spz file, or drop one here.");
     return ui;
 }

@@ -42,8 +42,9 @@ export function addGestures(canvas, act) {
     canvas.addEventListener("contextmenu", e => e.preventDefault());
     canvas.addEventListener("wheel", e => {
         e.preventDefault();
-        const lines = e.deltaY * (e.deltaMode === 1 ? 16 : 1);
-        act.zoom(Math.exp(-lines * 0.0015));
+        // A notch of a wheel is about 100 pixels, 3 lines or a page.
+        const pixels = e.deltaY * [1, 100 / 3, 100][e.deltaMode];
+        act.zoom(Math.exp(-pixels * 0.0015));
     }, { passive: false });
 }
 

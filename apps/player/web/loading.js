@@ -8,16 +8,42 @@ const BASE = 255;
 const MOST_BYTES = 2 ** 30;
 const MAGIC = [0x89, 0x43, 0x43, 0x34, 0x44, 0x0d, 0x0a, 0x1a];
 
-/// Calls `sink(offset, bytes)` with all that arrives of `response`, which begins at byte `offset`, until it returns false.
-async function drain(response, offset, sink) {
+/// A connection that broke.
+class Broken extends Error {}
+
+/// What `read` reads of the response for `name`.
+async function received(name, read) {
+    try { return await read(); } catch (e) {
+        if (e.name === "AbortError") throw e;
+        throw new Broken(`${name} arrived in part: the connection broke (${e.message}). Load it again.`);
+    }
+}
+
+/// `run()`, and a second time where the connection breaks.
+async function twice(run) {
+    try { return await run(); } catch (e) {
+        if (!(e instanceof Broken)) throw e;
+        console.warn(`${e.message} The page tries once more.`);
+    }
+    await new Promise(done => setTimeout(done, 500));
+    return run();
+}
+
+/// Frees `download`, unless a panic has left it borrowed: that is an error already.
+function free(download) {
+    try { download.free(); } catch (e) { console.warn(e); }
+}
+
+/// Calls `sink(offset, bytes)` with all that arrives of `response` for `name`, which begins at byte `offset`, until it returns false.
+async function drain(name, response, offset, sink) {
     if (!response.body) {
-        const bytes = new Uint8Array(await response.arrayBuffer());
+        const bytes = new Uint8Array(await received(name, () => response.arrayBuffer()));
         sink(offset, bytes);
         return offset + bytes.length;
     }
     const reader = response.body.getReader();
     for (;;) {
-        const { done, value } = await reader.read();
+        const { done, value } = await received(name, () => reader.read());
         if (done) return offset;
         const go = sink(offset, value);
         offset += value.length;
@@ -98,56 +124,77 @@ export async function loadUrl(wasm, url, show, signal) {
         let response;
         try { response = await fetch(url, { headers, signal }); } catch (e) {
             if (e.name === "AbortError") throw e;
-            throw new Error(`${name} could not be fetched (${e.message}). Check the address; the server must allow this page to read it.`);
+            throw new Broken(`${name} could not be fetched (${e.message}). Check the address; the server must allow this page to read it.`);
         }
         if (!response.ok) throw new Error(`${name} could not be fetched: the server answered ${response.status}. Check the address.`);
         return response;
     };
-    const first = await get({ Range: `bytes=0-${FIRST - 1}` });
-    const range = first.status === 206 && /\/(\d+)$/.exec(first.headers.get("Content-Range") || "");
-    if (!range) {
-        if (first.status !== 206) return loadBody(wasm, name, first, show);
+    // The whole file, of which `response` may be there.
+    const body = response => twice(async () => {
+        const own = response ?? await get({});
+        response = null;
+        return loadBody(wasm, name, own, show);
+    });
+    const sizeOf = response => (response.status === 206 ? Number(/\/(\d+)$/.exec(response.headers.get("Content-Range") || "")?.[1] ?? NaN) : NaN);
+    const [first, start] = await twice(async () => {
+        const response = await get({ Range: `bytes=0-${FIRST - 1}` });
+        return [response, sizeOf(response) >= 0 ? new Uint8Array(await received(name, () => response.arrayBuffer())) : null];
+    });
+    if (!start) {
+        if (first.status !== 206) return body(first);
         // Another site need not tell how long the file is, and a part of unknown length is no file.
         await first.body?.cancel();
-        return loadBody(wasm, name, await get({}), show);
+        return body(null);
     }
-    const total = Number(range[1]);
-    const start = new Uint8Array(await first.arrayBuffer());
+    const total = sizeOf(first);
     if (!isArchive(start)) {
         if (start.length >= total) return show.whole(name, start);
         checkSize(name, total);
-        return loadBody(wasm, name, await get({}), show);
+        return body(null);
     }
+    const condition = unchanged(first);
     const progress = new Progress(wasm, name, total, show);
     let whole = null;
     try {
         let more = progress.put(0, start);
         while (more && progress.arrived < total) {
-            // The header first, then everything that is needed.
-            const end = progress.streams ? progress.needed : Math.max(progress.header, 24);
-            const part = await get({ Range: `bytes=${progress.arrived}-${Math.max(end, progress.arrived + 1) - 1}` });
-            if (part.status !== 206) { whole = part; break; }
             const before = progress.arrived;
-            await drain(part, before, (offset, bytes) => (more = progress.put(offset, bytes)));
-            if (progress.arrived === before) break;
+            whole = await twice(async () => {
+                // The header first, then everything that is needed.
+                const end = progress.streams ? progress.needed : Math.max(progress.header, 24), { arrived } = progress;
+                const part = await get({ ...condition, Range: `bytes=${arrived}-${Math.max(end, arrived + 1) - 1}` });
+                if (part.status !== 206) return part;
+                if (sizeOf(part) !== total) throw new Error(`${name} was replaced on its server while it was loaded. Load it again.`);
+                await drain(name, part, arrived, (offset, bytes) => (more = progress.put(offset, bytes)));
+                return null;
+            });
+            if (whole || progress.arrived === before) break;
         }
         if (!whole) progress.finish();
-    } finally { progress.download.free(); }
-    // A server that stops answering with ranges sends the whole file.
-    if (whole) return loadBody(wasm, name, whole, show);
+    } finally { free(progress.download); }
+    // A server that stops answering with ranges, or has another file by now, sends the whole file.
+    if (whole) return body(whole);
+}
+
+/// Headers that make a server answer with a part only of the file that `response` is of. Other sites would have to allow the header.
+function unchanged(response) {
+    if (response.type === "cors") return {};
+    const tag = response.headers.get("ETag"), version = tag && !tag.startsWith("W/") ? tag : response.headers.get("Last-Modified");
+    return version ? { "If-Range": version } : {};
 }
 
 /// The whole file in one answer.
 async function loadBody(wasm, name, response, show) {
-    const total = Number(response.headers.get("Content-Length")) || 0;
-    const encoded = response.headers.get("Content-Encoding");
+    // Of a compressed answer it is the compressed length, and another site need not tell that it compresses.
+    const encoded = response.type === "cors" || response.headers.get("Content-Encoding");
+    const total = encoded ? 0 : Number(response.headers.get("Content-Length")) || 0;
     const pieces = [];
     let progress = null, size = 0;
     checkSize(name, total);
     try {
-        await drain(response, 0, (offset, bytes) => {
+        await drain(name, response, 0, (offset, bytes) => {
             size += bytes.length;
-            if (!progress && offset === 0 && total && !encoded && isArchive(bytes)) progress = new Progress(wasm, name, total, show);
+            if (!progress && offset === 0 && total && isArchive(bytes)) progress = new Progress(wasm, name, total, show);
             if (progress) return progress.put(offset, bytes);
             checkSize(name, size);
             pieces.push(bytes);
@@ -155,6 +202,6 @@ async function loadBody(wasm, name, response, show) {
             return true;
         });
         if (progress) return progress.finish();
-    } finally { progress?.download.free(); }
+    } finally { if (progress) free(progress.download); }
     show.whole(name, new Uint8Array(await new Blob(pieces).arrayBuffer()));
 }

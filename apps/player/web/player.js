@@ -3,7 +3,7 @@
 //     const player = await createPlayer(element, { src: "model.cc4d", autoplay: true });   // src: an address, a File, or bytes with { name }
 //     player.on("time", ({ time, frame }) => …);  player.seek(0.5);  player.play();  await player.load("other.cc4d");
 //
-// Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" { message }, "progress" { share, bytes }.
+// Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" { message }, "progress" { share, bytes }, "recovered".
 // Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
 
 import init, * as wasm from "./cc4dgs_player.js";
@@ -15,6 +15,12 @@ import { build } from "./controls.js";
 // What exports need of a page: raise it together with PAGE_VERSION in exporters/src/web/page.rs where archives need a newer one.
 export const PAGE_VERSION = 3;
 
+// A lost device is replaced at most so often in a row; it is none of the row once it has been kept for so many milliseconds.
+const MOST_RECOVERIES = 3;
+const KEPT_MS = 60000;
+// How long a lost WebGL2 context is waited for before the page says so, in milliseconds.
+const PATIENCE_MS = 5000;
+
 let ready;
 
 export async function createPlayer(container, options = {}) {
@@ -22,10 +28,12 @@ export async function createPlayer(container, options = {}) {
     const { src = query.get("src") ?? undefined, autoplay = query.has("autoplay"), backend = query.get("backend") } = options;
     const player = new Page(container, backend);
     try {
-        ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined);
+        // Another player may have it where this one could not fetch it.
+        ready ??= init(options.wasm ? { module_or_path: options.wasm } : undefined).catch(e => { ready = undefined; throw e; });
         await ready;
         await player.start();
-        if (src) await player.load(src, options.name, { autoplay });
+        const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+        if (src) await player.load(src, options.name, { autoplay: autoplay && !still });
         else player.followLink();
     } catch (e) {
         player.fail(e);
@@ -86,10 +94,21 @@ class Page {
             this.ui.replaceCanvas();
         }
         // A lost context stays that of its canvas until the browser restores it.
-        if (this.gl?.gl.isContextLost()) await new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
+        if (this.gl?.gl.isContextLost()) await this.contextRestored();
         this.gl?.free();
         this.gl = new WebGl(this.ui.canvas, () => { this.dirty = true; });
-        this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height);
+        this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height, this.gl.mostWords, this.gl.mostSide);
+    }
+    async contextRestored() {
+        const restored = new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
+        let told = false;
+        const late = setTimeout(() => {
+            told = true;
+            this.fail(new Error("The graphics device was lost, and the browser has not given WebGL2 back yet. Wait, or reload the page."));
+        }, PATIENCE_MS);
+        await restored;
+        clearTimeout(late);
+        if (told) this.ui.error(null);
     }
     commands(act) {
         return {
@@ -104,7 +123,9 @@ class Page {
     on(name, listener) { (this.listeners[name] ??= new Set()).add(listener); return () => this.listeners[name].delete(listener); }
     emit(name, detail) { this.listeners[name]?.forEach(listener => listener(detail)); }
     fail(e) {
-        if (e?.name === "AbortError") return;
+        // What `load` has told, its callers throw on.
+        if (e?.name === "AbortError" || e === this.told) return;
+        this.told = e;
         const message = (e?.message || String(e)).trim();
         this.ui.error(message);
         this.emit("error", { message });
@@ -145,15 +166,21 @@ class Page {
             if (this.facts.lacksMotion) this.ui.note("This archive has no playback layer, so it stands still here. Add one with: cc4dgs bake MODEL --out FILE.cc4d");
             this.emit("loaded", this.facts);
             return this.facts;
-        } catch (e) {
-            if (signal.aborted) return null;
+        } catch (thrown) {
+            let e = thrown;
+            if (e instanceof WebAssembly.RuntimeError) {
+                // A panic: what was called is borrowed for ever, and nothing of it can be called again.
+                console.error(e);
+                this.gpu = null;
+                e = new Error(`The player stopped while it opened ${this.title()} (${e.message}), most likely because its memory ran out. Reload the page, or open the file with \`cc4dgs view\`.`);
+            } else if (signal.aborted) return null;
             // The model before is still there.
             Object.assign(this, this.shown ?? { source: null });
             this.ui.poster(null);
             if (this.facts && this.gpu) {
                 this.ui.facts(this.facts);
-                this.ui.title(this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source.name ?? "model"));
-            }
+                this.ui.title(this.title());
+            } else this.ui.empty();
             this.fail(e);
             throw e;
         } finally {
@@ -161,6 +188,7 @@ class Page {
             if (this.abort.signal === signal) this.ui.loading(false);
         }
     }
+    title() { return this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source?.name ?? "model"); }
     loaded(facts) {
         this.facts = facts;
         this.shown = { source: this.source, name: this.name, facts };
@@ -207,7 +235,8 @@ class Page {
     resize() {
         const { canvas } = this.ui;
         this.ratio = window.devicePixelRatio;
-        const ratio = Math.min(this.ratio || 1, 2);
+        // WebGL2 draws no more pixels each way than it has.
+        const ratio = Math.min(this.ratio || 1, 2, (this.gl?.mostSide ?? Infinity) / Math.max(canvas.clientWidth, canvas.clientHeight, 1));
         const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio))];
         if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
         this.gpu?.resize(width, height);
@@ -254,8 +283,15 @@ class Page {
         this.gpu = null;
         // What is still being loaded has nothing to go to; it begins anew.
         this.abort?.abort();
+        const losses = this.losses = performance.now() - (this.keptSince ?? -Infinity) < KEPT_MS ? this.losses + 1 : 1;
+        this.keptSince = Infinity;
         try {
             old.free();
+            if (losses > MOST_RECOVERIES) {
+                [this.facts, this.shown] = [null, null];
+                this.ui.empty();
+                throw new Error(`The graphics device was lost ${losses} times in a row, most likely because the model is too large for it. Reload the page with another model, or open this one with \`cc4dgs view\`.`);
+            }
             await this.start();
             if (source) {
                 [this.facts, this.shown] = [null, null];
@@ -267,7 +303,12 @@ class Page {
                 }
             }
             this.emit("recovered", {});
-        } catch (e) { this.fail(e); }
+        } catch (e) {
+            this.fail(e);
+        } finally {
+            // A device that was lost meanwhile has a recovery of its own.
+            if (this.losses === losses) this.keptSince = performance.now();
+        }
     }
     // Images and links
     async capture(camera, time) {
@@ -296,7 +337,7 @@ class Page {
         const url = new URL(location.href);
         if (typeof this.source === "string") url.searchParams.set("src", this.source);
         const digits = v => Number(v.toPrecision(6));
-        url.hash = `t=${digits(this.time)}&pose=${Array.from(this.gpu.pose, digits).join(",")}`;
+        if (this.gpu) url.hash = `t=${digits(this.time)}&pose=${Array.from(this.gpu.pose, digits).join(",")}`;
         return url.href;
     }
     followLink() {

@@ -159,6 +159,11 @@ export class WebGl {
         }
         this.gl = gl;
         this.canvas = canvas;
+        // 2048 is what every WebGL2 has; a lost context tells nothing.
+        const most = name => gl.getParameter(gl[name]) || 2048;
+        /// Numbers of an array at most, and pixels of an image each way.
+        this.mostWords = 4 * WIDTH * most("MAX_TEXTURE_SIZE");
+        this.mostSide = Math.min(most("MAX_TEXTURE_SIZE"), most("MAX_RENDERBUFFER_SIZE"), ...(gl.getParameter(gl.MAX_VIEWPORT_DIMS) ?? []));
         // A browser may restore a lost context before anybody looks; what was made in it is gone all the same.
         canvas.addEventListener("webglcontextlost", () => { this.wasLost = true; }, { once: true });
         this.changed = changed;

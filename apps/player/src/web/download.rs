@@ -1,7 +1,7 @@
 //! An archive that arrives in pieces.
 
 use super::error;
-use crate::Content;
+use crate::{Content, memory};
 use cc4dgs_format::archive::{Archive, StreamKind};
 use cc4dgs_format::playback::PlaybackLayer;
 use cc4dgs_format::{Error, HostGaussians, Limits, Moving, Result, Silent, StoredModel, StreamStage, canonical_stages, read_gaussians, read_stage};
@@ -26,6 +26,8 @@ impl Download {
         if !(0.0..=most).contains(&total) {
             return Err(error(Error::limit(name, total.max(0.0) as u64, most as u64, "Open it on the desktop")));
         }
+        // An archive that is opened has a copy of the bytes.
+        memory::check(&name, 2 * total as u64).map_err(error)?;
         let mut bytes = Vec::new();
         bytes.try_reserve_exact(total as usize).map_err(error)?;
         bytes.resize(total as usize, 0);
@@ -45,11 +47,12 @@ impl Download {
         let prefix = &self.bytes[..self.bytes.len().min(Archive::PREFIX_BYTES)];
         Ok(Archive::header_end(&self.name, prefix, &super::LIMITS).map_err(error)? as f64)
     }
-    /// The streams as JSON: name, kind, layer, first byte and bytes of each. The header must have arrived.
+    /// The streams as JSON: name, kind, layer, first byte and bytes of each. The header must have arrived. Models that take too much memory are refused.
     pub fn streams(&mut self) -> std::result::Result<String, JsError> {
         crate::link();
         let name = self.name.clone();
         let archive = self.opened().map_err(error)?;
+        memory::check_archive(&name, archive).map_err(error)?;
         let computed = PlaybackLayer::may_be_computed(archive).map_err(error)?;
         let streams = archive.stream_sizes();
         let mut stages = canonical_stages(&name, archive).map_err(error)?.into_iter();

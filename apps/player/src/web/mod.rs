@@ -5,7 +5,7 @@ mod download;
 use crate::render::{Frame, functions};
 use crate::{Clock, Content, Mode, Navigator, Renderer, Scene, View, request_device};
 use cc4dgs_format::playback::Head;
-use cc4dgs_format::{Camera, Image8, Limits, StreamStage};
+use cc4dgs_format::{Camera, Error, Image8, Limits, StreamStage};
 use download::Download;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -38,8 +38,8 @@ fn start() {
 enum Output {
     /// A canvas with WebGPU.
     WebGpu { surface: wgpu::Surface<'static>, configuration: wgpu::SurfaceConfiguration, renderer: Renderer, adapter: String, lost: Arc<AtomicBool> },
-    /// The page draws with WebGL2 from these arrays.
-    Plain(Option<Scene>),
+    /// The page draws with WebGL2 from the arrays of `scene`, none of which may have more than `most_words` numbers.
+    Plain { scene: Option<Scene>, most_words: u64 },
 }
 
 /// A player on a canvas.
@@ -48,6 +48,8 @@ pub struct Player {
     output: Output,
     /// Of the canvas, in pixels.
     size: (u32, u32),
+    /// Largest side of an image in pixels.
+    most_side: u32,
     navigator: Navigator,
     clock: Clock,
     cameras: Vec<Camera>,
@@ -74,18 +76,20 @@ impl Player {
         let flag = lost.clone();
         device.set_device_lost_callback(move |_, _| flag.store(true, Ordering::Relaxed));
         device.on_uncaptured_error(Arc::new(|e: wgpu::Error| web_sys::console::error_1(&e.to_string().into())));
+        let most_side = device.limits().max_texture_dimension_2d;
         let renderer = Renderer::new(device, queue, configuration.format);
         let adapter = format!("{} {}", adapter.get_info().name, adapter.get_info().driver).trim().to_string();
-        Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost }, (width, height)))
+        Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost }, (width, height), most_side))
     }
-    /// A player that decodes, keeps time and navigates, for a page that draws by itself.
-    pub fn plain(width: u32, height: u32) -> Player {
-        Self::on(Output::Plain(None), (width.max(1), height.max(1)))
+    /// A player that decodes, keeps time and navigates, for a page that draws by itself: arrays of at most `most_words` numbers, images of at most `most_side` pixels
+    /// each way.
+    pub fn plain(width: u32, height: u32, most_words: f64, most_side: u32) -> Player {
+        Self::on(Output::Plain { scene: None, most_words: most_words as u64 }, (width.max(1), height.max(1)), most_side.max(1))
     }
-    fn on(output: Output, size: (u32, u32)) -> Self {
+    fn on(output: Output, size: (u32, u32), most_side: u32) -> Self {
         let navigator = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]);
         let look = View::new(navigator.camera(size.0, size.1), 0.0);
-        Self { output, size, navigator, clock: Clock::new(1, 1.0), cameras: Vec::new(), look, resolution: 1.0 }
+        Self { output, size, most_side, navigator, clock: Clock::new(1, 1.0), cameras: Vec::new(), look, resolution: 1.0 }
     }
     /// Opens a whole file: an archive, a PLY or an SPZ file. Returns facts as JSON.
     pub fn open(&mut self, name: &str, bytes: Vec<u8>) -> Result<String, JsError> {
@@ -105,8 +109,8 @@ impl Player {
         let gaussians = download.gaussians(StreamStage::Harmonics, &LIMITS).map_err(error)?;
         match &mut self.output {
             Output::WebGpu { renderer, .. } => renderer.load_harmonics(&gaussians).map_err(error)?,
-            Output::Plain(Some(scene)) => scene.harmonics = scene.harmonics_of(&gaussians).map_err(error)?,
-            Output::Plain(None) => {}
+            Output::Plain { scene: Some(scene), .. } => scene.harmonics = scene.harmonics_of(&gaussians).map_err(error)?,
+            Output::Plain { scene: None, .. } => {}
         }
         Ok(())
     }
@@ -115,7 +119,16 @@ impl Player {
         let (count, moving, sh_degree, gpu_bytes, [lower, upper]) = (scene.count, scene.moving, scene.sh_degree, scene.gpu_bytes(), scene.bounds);
         match &mut self.output {
             Output::WebGpu { renderer, .. } => renderer.load(scene).map_err(error)?,
-            Output::Plain(kept) => *kept = Some(scene),
+            Output::Plain { scene: kept, most_words } => {
+                // Where it is refused, the one before stays.
+                let words = [scene.gaussians.len(), scene.harmonics.len(), scene.starts.len(), scene.coefficients.len()];
+                let largest = words.into_iter().max().unwrap_or(0) as u64;
+                if largest > *most_words {
+                    let remedy = "Use a browser with WebGPU, or open it on the desktop: cc4dgs view FILE";
+                    return Err(error(Error::limit("largest texture of the model for WebGL2, in numbers", largest, *most_words, remedy)));
+                }
+                *kept = Some(scene);
+            }
         }
         let seconds = presentation.seconds_of(frame_count);
         if first {
@@ -133,16 +146,16 @@ impl Player {
     }
     /// Resizes the canvas' buffer to pixels.
     pub fn resize(&mut self, width: u32, height: u32) {
-        self.size = (width.max(1), height.max(1));
+        self.size = (width.clamp(1, self.most_side), height.clamp(1, self.most_side));
         if let Output::WebGpu { surface, configuration, renderer, .. } = &mut self.output {
-            let most = renderer.device().limits().max_texture_dimension_2d;
-            self.size = (self.size.0.min(most), self.size.1.min(most));
             (configuration.width, configuration.height) = self.size;
             surface.configure(renderer.device(), configuration);
         }
     }
     fn view(&self) -> View {
-        let scaled = |v: u32| ((v as f32 * self.resolution).round() as u32).max(1);
+        // The same share of both sides, so that the image keeps its shape.
+        let share = self.resolution.min(self.most_side as f32 / self.size.0.max(self.size.1) as f32);
+        let scaled = |v: u32| ((v as f32 * share).round() as u32).clamp(1, self.most_side);
         let camera = self.navigator.camera(scaled(self.size.0), scaled(self.size.1));
         View { camera, time: self.clock.time, ..self.look.clone() }
     }
@@ -153,6 +166,10 @@ impl Player {
             view.camera = serde_json::from_str(&json).map_err(error)?;
             view.camera.validate().map_err(error)?;
             LIMITS.check_pixels("captured image", view.camera.width.into(), view.camera.height.into()).map_err(error)?;
+            let side = view.camera.width.max(view.camera.height);
+            if side > self.most_side {
+                return Err(error(Error::limit("side of an image in pixels", side.into(), self.most_side.into(), "Ask for a smaller image")));
+            }
         }
         view.time = time.unwrap_or(view.time);
         Ok(view)
@@ -171,7 +188,7 @@ impl Player {
         }
     }
     fn plain_scene(&self) -> Option<&Scene> {
-        if let Output::Plain(scene) = &self.output { scene.as_ref() } else { None }
+        if let Output::Plain { scene, .. } = &self.output { scene.as_ref() } else { None }
     }
     /// For WebGL2: the Gaussians (0) or the coefficients (1).
     #[wasm_bindgen(js_name = plainFloats)]
