@@ -10,7 +10,7 @@ use cc4dgs_format::{Error, Result, spz};
 const MOST: u64 = (1 << 32) / 8 * 7;
 /// Memory is asked for in blocks of so many bytes, which fit between what is in use.
 const BLOCK: u64 = 64 << 20;
-/// What a gzipped SPZ file takes per byte that it holds unpacked: these bytes, and ten times as much as `of_gaussians` says, at every degree.
+/// What a gzipped SPZ file takes per byte that it holds unpacked: that byte, and ten for its Gaussians, no less than `of_gaussians` says at any degree.
 const OF_SPZ_BYTE: u64 = 11;
 /// What a PLY file takes per byte of its own.
 const OF_PLY_BYTE: u64 = 3;

@@ -144,7 +144,11 @@ class Page {
             poster: bytes => { if (bytes && !this.facts) this.ui.poster(bytes); },
             part: (download, ...what) => this.loaded(JSON.parse(this.gpu.openPart(download, ...what))),
             harmonics: download => { this.gpu.openHarmonics(download); this.gl?.loadHarmonics(this.gpu); this.draw(); },
-            whole: (name, bytes) => this.loaded(JSON.parse(this.gpu.open(name, bytes))),
+            whole: (name, bytes) => {
+                // A later load has the page; reading bytes is not interrupted.
+                if (signal.aborted) throw signal.reason;
+                this.loaded(JSON.parse(this.gpu.open(name, bytes)));
+            },
             progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
         };
         try {
@@ -157,6 +161,7 @@ class Page {
                 const label = name ?? source.name ?? "model";
                 checkSize(label, source.size ?? 0);
                 const bytes = source instanceof Uint8Array ? source : new Uint8Array(await (source.arrayBuffer?.() ?? source));
+                if (signal.aborted) return null;
                 this.ui.title(label);
                 this.received = bytes.length;
                 show.whole(label, bytes);
@@ -278,8 +283,9 @@ class Page {
     }
     // A lost device: a new one, and the same model at the same time and pose.
     async recover() {
-        const [old, source, name] = [this.gpu, this.source, this.name];
-        const kept = { pose: old.pose, time: old.time, playing: old.playing };
+        const [old, source, name, first] = [this.gpu, this.source, this.name, this.first];
+        // A model that nobody has seen yet has its own pose, and starts as it would have.
+        const kept = this.shown?.source === source ? { pose: old.pose, time: old.time, playing: old.playing } : null;
         this.gpu = null;
         // What is still being loaded has nothing to go to; it begins anew.
         this.abort?.abort();
@@ -296,10 +302,10 @@ class Page {
             if (source) {
                 [this.facts, this.shown] = [null, null];
                 // Unless another model was opened meanwhile.
-                if (await this.load(source, name)) {
+                if (await this.load(source, name, first) && kept) {
                     this.gpu.pose = kept.pose;
                     this.seek(kept.time);
-                    this.setPlaying(kept.playing);
+                    this.setPlaying(kept.playing || this.playing);
                 }
             }
             this.emit("recovered", {});

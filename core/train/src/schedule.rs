@@ -8,7 +8,7 @@ pub const IMAGE_SCALES: [f32; 3] = [0.25, 0.354, 0.5];
 
 /// The share of the main stage after which its length is settled ([`TrainConfig::stretch`]), or later where images are small for longer.
 const SETTLED: f64 = 0.2;
-/// The share of the main stage that is timed before that, all of it with images of full size.
+/// The share of the main stage that is timed before that, with images of full size unless they are small until [`LAST_SETTLED`].
 const TIMED: f64 = 0.1;
 /// The largest share after which the length is settled.
 const LAST_SETTLED: f64 = 0.9;

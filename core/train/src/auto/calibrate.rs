@@ -43,6 +43,8 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     trial.train.shares = [1.0, 0.0, 1.0];
     trial.train.dynamic = Dynamic::All;
     (trial.train.lambda_r, trial.train.recover) = (0.0, false);
+    // Small images would make the first stage, where nothing moves, cheaper than what it stands for.
+    trial.train.image_growth = 0.0;
     trial.train.log_every = PER_MEASUREMENT;
     trial.train.checkpoint_every = 0;
     // Trained Gaussians are mostly opaque, and pixels behind them cost nothing.

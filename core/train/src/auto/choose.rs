@@ -64,7 +64,7 @@ const BLUR: f64 = 0.1;
 const IMAGE_GROWTH: f64 = 0.5;
 /// Weight of strain where one camera at a time sees everything move, from unrelated poses: 0.4 dB on mutant.
 const STRAIN: f64 = 0.01;
-/// Up to so many Gaussians means learn at their full rate. With 86,000 and more, training views of mutant got worse for a thousand iterations.
+/// Up to so many Gaussians, means learn at their full rate. With 86,000 and more, training views of mutant got worse for a thousand iterations.
 const FULL_RATE_GAUSSIANS: f64 = 15_000.0;
 /// Share of transparent pixels from which a scene is an object without surroundings.
 const OBJECT: f32 = 0.05;
@@ -103,6 +103,11 @@ fn choice(settings: impl IntoIterator<Item = (&'static str, Value)>, reason: imp
 fn float(value: f64) -> Value {
     // Six digits: what is written to config.toml is read back to the same number.
     Value::Float(format!("{value:.6}").parse().unwrap_or(value))
+}
+
+/// A learning rate with three significant digits: decimals would round small ones by much.
+fn rate(value: f64) -> Value {
+    Value::Float(format!("{value:.2e}").parse().unwrap_or(value))
 }
 
 fn integer(value: f64) -> Value {
@@ -194,7 +199,7 @@ fn is_short(machine: Machine, minutes: f64) -> bool {
     !machine.graphics && machine.speed() * minutes < SHORT
 }
 
-/// Factor of the rate of means for so many Gaussians: a step is a share of their size, which falls with the root of their number.
+/// Factor of the learning rate of means for so many Gaussians: their size falls with the root of their number, and a step stays the same share of it.
 fn slower(gaussians: f64) -> f64 {
     (FULL_RATE_GAUSSIANS / gaussians).sqrt().min(1.0)
 }
@@ -215,7 +220,7 @@ fn stages(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usiz
                 ("train.dynamic", "all".into()),
                 ("train.recover", Value::Boolean(true)),
                 // Short runs end before what moves has its shape and colour: 0.35 dB on mutant after 2,000 iterations against the published rates.
-                ("train.lr.means", float(3.2e-4 * slower)),
+                ("train.lr.means", rate(3.2e-4 * slower)),
                 ("train.lr.log_scales", Value::Float(1e-2)),
                 ("train.lr.sh_rest", Value::Float(5e-4)),
                 ("train.strain", Value::Float(if facts.arrangement == Arrangement::OneCameraAnywhere { STRAIN } else { 0.0 })),
@@ -242,7 +247,7 @@ fn stages(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usiz
         }
     };
     // Positions still settle at the end of a short run: 0.3 dB on two built-in captures against a rate that falls a hundredfold.
-    settings.push(("train.lr.means_end", float(1.6e-5 * slower)));
+    settings.push(("train.lr.means_end", rate(1.6e-5 * slower)));
     choice(settings, reason)
 }
 
@@ -347,80 +352,4 @@ fn decay(facts: &Facts) -> Option<Choice> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const MACHINE: Machine = Machine { threads: 2, graphics: false, memory: Some(24_000_000_000) };
-
-    fn facts(arrangement: Arrangement) -> Facts {
-        Facts {
-            arrangement,
-            views: 480,
-            cameras: 16,
-            frames: 30,
-            size: [320, 180],
-            points: 0,
-            transparent: 0.0,
-            plain: None,
-            mean: Some([0.4, 0.5, 0.6]),
-            detail: 0.4,
-            moving: Some(0.1),
-            occupied: Some(0.2),
-            noise: Some(0.001),
-            exposure: Some(0.02),
-        }
-    }
-
-    fn value(choices: &[Choice], key: &str) -> Option<Value> {
-        choices.iter().flat_map(|c| &c.settings).find(|(k, _)| *k == key).map(|(_, v)| v.clone())
-    }
-
-    #[test]
-    fn scenes_get_what_they_need_and_no_more() {
-        let dome = choose(&facts(Arrangement::Dome), MACHINE, 5.0, true);
-        assert_eq!((value(&dome, "deformer.kind"), value(&dome, "train.key_frames")), (Some("free-time".into()), Some(3.into())));
-        let stated = choose(&facts(Arrangement::Dome), MACHINE, 5.0, false);
-        assert!(value(&stated, "deformer.kind") == Some("cdf-basis".into()) && value(&stated, "train.key_frames").is_none());
-        let on_the_spot = choose(&Facts { occupied: Some(0.46), ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
-        assert_eq!((value(&on_the_spot, "deformer.kind"), value(&on_the_spot, "train.key_frames")), (Some("cdf-basis".into()), None));
-        let long = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
-        assert_eq!((value(&long, "deformer.kind"), value(&long, "deformer.width")), (Some("cdf-basis".into()), Some(64.into())));
-        let sparse = Facts { cameras: 8, frames: 300, size: [160, 90], ..facts(Arrangement::Dome) };
-        assert!(value(&choose(&sparse, MACHINE, 5.0, true), "train.key_frames").is_none(), "too few points for each");
-        let sharp = Facts { size: [320, 180], ..sparse };
-        assert_eq!(value(&choose(&sharp, MACHINE, 20.0, true), "train.key_frames"), Some(9.into()), "37 key frames of 400 points");
-        let patient = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 25.0, true);
-        assert_eq!(value(&patient, "deformer.width"), Some(128.into()));
-        assert_eq!(value(&dome, "train.coarse_frames"), Some("first".into()));
-        assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none());
-        assert_eq!(value(&dome, "render.background"), Some(vec![0.4, 0.5, 0.6].into()));
-        let few = choose(&Facts { cameras: 6, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
-        let many = choose(&Facts { cameras: 27, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
-        assert!(value(&few, "density.decay").is_some() && value(&many, "density.decay").is_none());
-        assert!(value(&few, "train.dropout").is_some() && value(&dome, "train.dropout").is_none());
-        let most = |cameras: usize| value(&choose(&Facts { cameras, ..facts(Arrangement::Dome) }, MACHINE, 10.0, true), "density.max_gaussians");
-        assert_eq!([4, 9, 60].map(most), [6500, 22_000, 37_000].map(|n: i64| Some(n.into())));
-        let photos = choose(&Facts { frames: 1, moving: None, noise: None, ..facts(Arrangement::Photos) }, MACHINE, 5.0, true);
-        assert_eq!(value(&photos, "deformer.kind"), Some("none".into()));
-        let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
-        let odd = choose(&odd, MACHINE, 5.0, true);
-        assert_eq!((value(&odd, "train.dynamic"), value(&odd, "train.recover")), (Some("all".into()), Some(true.into())));
-        let growth = |minutes: f64| value(&choose(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, true), "train.image_growth");
-        assert_eq!((growth(5.0), growth(30.0)), (Some(0.5.into()), Some(0.0.into())));
-        let large = Facts { size: [800, 800], transparent: 0.8, ..facts(Arrangement::OneCameraAnywhere) };
-        let rate = |minutes: f64| value(&choose(&large, MACHINE, minutes, true), "train.lr.means").and_then(|v| v.as_float()).unwrap();
-        assert_eq!((rate(5.0), slower(60_000.0)), (3.2e-4, 0.5));
-        assert!(rate(90.0) < 1e-4);
-        assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0, true), "train.dynamic"), Some("score".into()));
-        assert!(value(&odd, "appearance.kind").is_some() && value(&odd, "train.mask_threshold").is_some() && value(&odd, "render.background").is_some());
-    }
-
-    #[test]
-    fn images_shrink_to_the_time() {
-        let options = SceneOptions::default();
-        assert!(image_size([320, 180], &options, MACHINE, 10.0).is_none());
-        let width = image_size([1920, 1080], &options, MACHINE, 10.0).and_then(|c| c.settings[0].1.as_integer()).unwrap();
-        assert!((500..700).contains(&width), "{width}");
-        assert!(image_size([1920, 1080], &SceneOptions { width: 700, ..options }, MACHINE, 10.0).is_none());
-    }
-}
+mod tests;

@@ -48,7 +48,7 @@ impl Context<'_> {
         let masks: Vec<Option<&DynamicMask>> = (0..scene.cameras.len()).map(mask_of).collect();
         let moves = |camera: usize, x: f32, y: f32| masks[camera].is_some_and(|mask| covers(mask, &scene.cameras[camera], x, y));
         let Some(frames) = KeyFrames::load(scene, every, moves, self.job.config.train.mask_threshold, seed)? else {
-            warn("fewer than two key frames, the first frame among them and the earliest, have images of all cameras: none is used".into());
+            warn("none is used: fewer than two have images of all cameras, the first frame lacks one, or it is not the earliest".into());
             return Ok(());
         };
         let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(0, |most| most.max(0) as usize);

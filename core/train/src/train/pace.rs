@@ -51,7 +51,7 @@ impl Pace {
         let together = (last / 6).clamp(1, TOGETHER);
         if iteration.is_multiple_of(together) && iteration <= last {
             let now = Instant::now();
-            if let Some(since) = self.since.replace(now).filter(|_| iteration > context.lengths.timed_after()) {
+            if let Some(since) = self.since.replace(now).filter(|_| iteration >= context.lengths.timed_after() + together) {
                 self.seconds.push(now.duration_since(since).as_secs_f64());
             }
         }

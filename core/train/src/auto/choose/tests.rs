@@ -1,0 +1,78 @@
+//! Plans for made-up scenes and machines.
+
+use super::*;
+
+const MACHINE: Machine = Machine { threads: 2, graphics: false, memory: Some(24_000_000_000) };
+
+fn facts(arrangement: Arrangement) -> Facts {
+    Facts {
+        arrangement,
+        views: 480,
+        cameras: 16,
+        frames: 30,
+        size: [320, 180],
+        points: 0,
+        transparent: 0.0,
+        plain: None,
+        mean: Some([0.4, 0.5, 0.6]),
+        detail: 0.4,
+        moving: Some(0.1),
+        occupied: Some(0.2),
+        noise: Some(0.001),
+        exposure: Some(0.02),
+    }
+}
+
+fn value(choices: &[Choice], key: &str) -> Option<Value> {
+    choices.iter().flat_map(|c| &c.settings).find(|(k, _)| *k == key).map(|(_, v)| v.clone())
+}
+
+#[test]
+fn scenes_get_what_they_need_and_no_more() {
+    let dome = choose(&facts(Arrangement::Dome), MACHINE, 5.0, true);
+    assert_eq!((value(&dome, "deformer.kind"), value(&dome, "train.key_frames")), (Some("free-time".into()), Some(3.into())));
+    let stated = choose(&facts(Arrangement::Dome), MACHINE, 5.0, false);
+    assert!(value(&stated, "deformer.kind") == Some("cdf-basis".into()) && value(&stated, "train.key_frames").is_none());
+    let on_the_spot = choose(&Facts { occupied: Some(0.46), ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
+    assert_eq!((value(&on_the_spot, "deformer.kind"), value(&on_the_spot, "train.key_frames")), (Some("cdf-basis".into()), None));
+    let long = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
+    assert_eq!((value(&long, "deformer.kind"), value(&long, "deformer.width")), (Some("cdf-basis".into()), Some(64.into())));
+    let sparse = Facts { cameras: 8, frames: 300, size: [160, 90], ..facts(Arrangement::Dome) };
+    assert!(value(&choose(&sparse, MACHINE, 5.0, true), "train.key_frames").is_none(), "too few points for each");
+    let sharp = Facts { size: [320, 180], ..sparse };
+    assert_eq!(value(&choose(&sharp, MACHINE, 20.0, true), "train.key_frames"), Some(9.into()), "37 key frames of 400 points");
+    let patient = choose(&Facts { frames: 3000, ..facts(Arrangement::Dome) }, MACHINE, 25.0, true);
+    assert_eq!(value(&patient, "deformer.width"), Some(128.into()));
+    assert_eq!(value(&dome, "train.coarse_frames"), Some("first".into()));
+    assert!(value(&dome, "appearance.kind").is_none() && value(&dome, "train.mask_threshold").is_none());
+    assert_eq!(value(&dome, "render.background"), Some(vec![0.4, 0.5, 0.6].into()));
+    let few = choose(&Facts { cameras: 6, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
+    let many = choose(&Facts { cameras: 27, ..facts(Arrangement::Dome) }, MACHINE, 5.0, true);
+    assert!(value(&few, "density.decay").is_some() && value(&many, "density.decay").is_none());
+    assert!(value(&few, "train.dropout").is_some() && value(&dome, "train.dropout").is_none());
+    let most = |cameras: usize| value(&choose(&Facts { cameras, ..facts(Arrangement::Dome) }, MACHINE, 10.0, true), "density.max_gaussians");
+    assert_eq!([4, 9, 60].map(most), [6500, 22_000, 37_000].map(|n: i64| Some(n.into())));
+    let photos = choose(&Facts { frames: 1, moving: None, noise: None, ..facts(Arrangement::Photos) }, MACHINE, 5.0, true);
+    assert_eq!(value(&photos, "deformer.kind"), Some("none".into()));
+    let odd = Facts { noise: Some(0.02), exposure: Some(0.2), plain: Some([1.0; 3]), ..facts(Arrangement::OneMovingCamera) };
+    let odd = choose(&odd, MACHINE, 5.0, true);
+    assert_eq!((value(&odd, "train.dynamic"), value(&odd, "train.recover")), (Some("all".into()), Some(true.into())));
+    let growth = |minutes: f64| value(&choose(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, true), "train.image_growth");
+    assert_eq!((growth(5.0), growth(30.0)), (Some(0.5.into()), Some(0.0.into())));
+    let large = Facts { size: [800, 800], transparent: 0.8, ..facts(Arrangement::OneCameraAnywhere) };
+    let rate = |minutes: f64| value(&choose(&large, MACHINE, minutes, true), "train.lr.means").and_then(|v| v.as_float()).unwrap();
+    assert_eq!((rate(5.0), slower(60_000.0)), (3.2e-4, 0.5));
+    assert!(rate(90.0) < 1e-4);
+    assert_eq!(super::rate(1.6e-5 * 0.4), Value::Float(6.4e-6));
+    assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0, true), "train.dynamic"), Some("score".into()));
+    assert!(value(&odd, "appearance.kind").is_some() && value(&odd, "train.mask_threshold").is_some() && value(&odd, "render.background").is_some());
+}
+
+#[test]
+fn images_shrink_to_the_time() {
+    let options = SceneOptions::default();
+    assert!(image_size([320, 180], &options, MACHINE, 10.0).is_none());
+    let width = image_size([1920, 1080], &options, MACHINE, 10.0).and_then(|c| c.settings[0].1.as_integer()).unwrap();
+    assert!((500..700).contains(&width), "{width}");
+    assert!(image_size([1920, 1080], &SceneOptions { width: 700, ..options }, MACHINE, 10.0).is_none());
+}
