@@ -1,4 +1,4 @@
-"""Checks of browser.py: files that are dropped, fingers on a screen."""
+"""Checks of browser.py: files that are dropped, fingers on a screen, wheels, and reduced motion."""
 import math
 from browser_pages import MODEL, PATIENCE_MS, say
 

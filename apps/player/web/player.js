@@ -121,7 +121,12 @@ class Page {
     }
     // Events
     on(name, listener) { (this.listeners[name] ??= new Set()).add(listener); return () => this.listeners[name].delete(listener); }
-    emit(name, detail) { this.listeners[name]?.forEach(listener => listener(detail)); }
+    /// What a listener throws is its own affair, and goes to the console.
+    emit(name, detail) {
+        this.listeners[name]?.forEach(listener => {
+            try { listener(detail); } catch (e) { console.error(e); }
+        });
+    }
     fail(e) {
         // What `load` has told, its callers throw on.
         if (e?.name === "AbortError" || e === this.told) return;
