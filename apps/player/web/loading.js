@@ -136,10 +136,17 @@ export async function loadUrl(wasm, url, show, signal) {
         return loadBody(wasm, name, own, show);
     });
     const sizeOf = response => (response.status === 206 ? Number(/\/(\d+)$/.exec(response.headers.get("Content-Range") || "")?.[1] ?? NaN) : NaN);
-    const [first, start] = await twice(async () => {
-        const response = await get({ Range: `bytes=0-${FIRST - 1}` });
-        return [response, sizeOf(response) >= 0 ? new Uint8Array(await received(name, () => response.arrayBuffer())) : null];
-    });
+    let first, start;
+    try {
+        [first, start] = await twice(async () => {
+            const response = await get({ Range: `bytes=0-${FIRST - 1}` });
+            return [response, sizeOf(response) >= 0 ? new Uint8Array(await received(name, () => response.arrayBuffer())) : null];
+        });
+    } catch (e) {
+        // Browsers refuse a compressed answer to a request for a part.
+        if (e instanceof Broken) return body(null);
+        throw e;
+    }
     if (!start) {
         if (first.status !== 206) return body(first);
         // Another site need not tell how long the file is, and a part of unknown length is no file.
