@@ -69,7 +69,8 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             except (BrokenPipeError, ConnectionResetError):
                 return
             if pieces > 1:
-                time.sleep(0.15)
+                # Without a graphics card a frame of the page takes half a second, in which pieces gather: layers are seen apart where each takes longer.
+                time.sleep(0.5 if "plain" in self.path else 0.15)
 
     def log_message(self, *_):
         pass
