@@ -24,7 +24,7 @@ def told_once(pages):
 def refused(pages):
     """A panic while a model opens is a sentence, and the player has stopped."""
     page = pages.open(f"?src={MODEL}")
-    page.evaluate("cc4dgs.gpu.openPart = () => { throw new WebAssembly.RuntimeError('unreachable'); }")
+    page.evaluate("cc4dgs.gpu.openPart = () => { throw new WebAssembly.RuntimeError('unreachable'); }; 0")
     message = page.evaluate("cc4dgs.load('/plain.cc4d').then(() => 'it loaded', e => e.message)")
     assert "memory ran out" in message and page.evaluate("cc4dgs.gpu") is None, message
     assert page.get_by_label("Play", exact=True).is_disabled()
