@@ -81,6 +81,8 @@ fn plans_fit_the_capture() {
     std::fs::write(&file, &text).unwrap();
     let layers = Layers::collect(&registry, None, Some(&file), &[]).unwrap();
     assert!(!layers.want_plan() && !handheld.auto.plan.is_empty());
+    let overlap = |config: &RunConfig, noun: &str| config.auto.plan.iter().any(|line| line.starts_with("overlap: ") && line.contains(noun));
+    assert!(overlap(&handheld, "of 64 positions") && overlap(&photos, "of 35 cameras"), "{:?} {:?}", handheld.auto.plan, photos.auto.plan);
     assert_eq!(layers.config().unwrap().to_toml().unwrap(), text);
     let (other, _) = planned("handheld", &["train.iterations=100", "deformer.kind=hexplane", "train.batch=2"], &registry);
     assert_eq!((kind(&other.deformer), other.train.batch), ("hexplane".into(), 2));

@@ -1,5 +1,6 @@
 //! What can be known of a scene without training: its cameras, its images, and what differs between them.
 
+use super::overlap::Overlap;
 use crate::data::resize;
 use crate::sample::{spread_from_first, spread_views};
 use cc4dgs_core::{Image8, Result, Scene, Split};
@@ -89,6 +90,8 @@ pub struct Facts {
     pub noise: Option<f32>,
     /// Median ratio of mean brightness between neighbouring cameras of one time, as |ln|.
     pub exposure: Option<f32>,
+    /// How much of what one camera sees others see, where there is more than one pose.
+    pub overlap: Option<Overlap>,
 }
 
 impl Facts {
@@ -121,6 +124,7 @@ impl Facts {
             occupied: motion.as_ref().and_then(|m| m.occupied),
             noise: motion.as_ref().map(|m| m.noise),
             exposure: exposure(scene, &views)?,
+            overlap: Overlap::of(scene, &views),
         })
     }
     /// Pixels of the median training image.

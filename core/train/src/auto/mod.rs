@@ -5,10 +5,12 @@ mod calibrate;
 mod choose;
 mod facts;
 mod memory;
+mod overlap;
 
 pub use choose::{Choice, Machine};
 pub use facts::{Arrangement, Facts};
 pub(crate) use memory::scene_options;
+pub use overlap::Overlap;
 
 use crate::config::{Dynamic, RunConfig};
 use crate::data;
@@ -135,6 +137,9 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
     }
     step(1);
     let facts = Facts::of(&scene)?;
+    if let Some(message) = facts.overlap.as_ref().and_then(Overlap::warning) {
+        events.emit(&Event::Warning { object: scene.name.clone(), message });
+    }
     step(2);
     let cache = memory::cache(scene.views.len(), facts.pixels(), asked.scene.cache_mb, machine.memory);
     if let Some(choice) = cache.filter(|_| !layers.state("scene.cache_mb")) {
@@ -173,7 +178,9 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
     config.auto.ends = ends;
     let [width, height] = facts.size;
     let seen = format!("{}: {} training images of {width}x{height} pixels, {} frames", facts.arrangement.describe(), facts.views, facts.frames);
-    config.auto.plan = [vec![seen], plan.lines(layers)].concat();
+    let noun = if matches!(facts.arrangement, Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere) { "positions" } else { "cameras" };
+    let overlap = facts.overlap.iter().map(|overlap| overlap.describe(noun)).collect();
+    config.auto.plan = [vec![seen], overlap, plan.lines(layers)].concat();
     if (config.train.iterations as f64) < SHORT {
         config
             .auto

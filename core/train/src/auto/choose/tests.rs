@@ -20,6 +20,7 @@ fn facts(arrangement: Arrangement) -> Facts {
         occupied: Some(0.2),
         noise: Some(0.001),
         exposure: Some(0.02),
+        overlap: None,
     }
 }
 
