@@ -66,9 +66,27 @@ impl StageLengths {
     }
     /// The last iteration of the main stage whose schedule does not know the settled length.
     pub fn settles_at(&self) -> usize {
+        let main = self.lengths[2] as f64;
+        self.planned_growth().clamp(SETTLED * main, LAST_SETTLED * main) as usize
+    }
+    /// The iteration of the main stage, by its planned length, until which images have had their full size for [`TIMED`] of it; may lie outside the stage.
+    fn planned_growth(&self) -> f64 {
         let [coarse, _, main] = self.lengths.map(|length| length as f64);
-        let small = self.image_growth * (coarse + main) - coarse;
-        (small + TIMED * main).clamp(SETTLED * main, LAST_SETTLED * main) as usize
+        self.image_growth * (coarse + main) - coarse + TIMED * main
+    }
+    /// The iteration of the main stage after which images have had their full size for a tenth of it, and its length is settled; beyond its end where they have
+    /// it for less.
+    pub fn grown_at(&self) -> usize {
+        let (growth, main) = (self.planned_growth(), self.lengths[2] as f64);
+        if growth <= LAST_SETTLED * main {
+            return self.settles_at();
+        }
+        self.schedule(Stage::Main, self.settled).iteration_at(growth / main) as usize
+    }
+    /// The iteration of the main stage after which the model is scored that has `percent` of it behind it: not before the length is settled, so that a score is
+    /// made once.
+    pub fn scored_at(&self, percent: usize) -> usize {
+        (self.settled * percent / 100).max(self.settles_at())
     }
     /// The iteration of the main stage after which iterations are timed to settle its length.
     pub fn timed_after(&self) -> usize {
@@ -141,6 +159,43 @@ mod tests {
         let scale = |iteration| growing.schedule(Stage::Main, iteration).image_scale;
         assert_eq!((scale(750), scale(751), scale(951), scale(2800)), (0.5, 1.0, 1.0, 1.0));
         assert_eq!((of(1.0, 1.0).settles_at(), of(1.0, 0.7).length(Stage::Main)), (1800, 1801), "never shorter than what was done");
+    }
+
+    #[test]
+    fn scores_wait_until_the_length_is_settled() {
+        let of = |image_growth, stretch| StageLengths::new(&TrainConfig { iterations: 2800, image_growth, stretch, ..Default::default() }, true, 1.0);
+        // When a run is scored that plans 2,000 iterations and finds `stretch` at its settling.
+        let scored = |image_growth, stretch| {
+            let (mut lengths, mut found) = (of(image_growth, 1.0), Vec::new());
+            for iteration in 1..=8000 {
+                if iteration == lengths.settles_at() {
+                    lengths.stretch_main(stretch);
+                }
+                if iteration <= lengths.length(Stage::Main) {
+                    found.extend([85, 50].into_iter().find(|&percent| iteration == lengths.scored_at(percent)).map(|percent| (percent, iteration)));
+                }
+            }
+            found
+        };
+        assert_eq!(scored(0.0, 1.0), [(50, 1000), (85, 1700)]);
+        assert_eq!(scored(0.0, 1.31), [(50, 1310), (85, 2227)]);
+        // The length is settled after 1,200 iterations, then after 1,700: none is scored for half of a length that changes.
+        assert_eq!(scored(0.6, 2.0), [(50, 2000), (85, 3400)]);
+        assert_eq!((scored(0.6, 1.0), scored(0.6, 0.7)), (vec![(50, 1200), (85, 1700)], vec![(85, 1200)]));
+        assert_eq!((scored(0.8, 4.0), scored(0.8, 1.0)), (vec![(50, 4000), (85, 6800)], vec![(85, 1700)]));
+    }
+
+    #[test]
+    fn images_that_grow_late_have_their_full_size_for_a_tenth() {
+        let of = |image_growth, stretch| StageLengths::new(&TrainConfig { iterations: 2800, image_growth, stretch, ..Default::default() }, true, 1.0);
+        for growth in [0.0, 0.5, 0.8] {
+            assert_eq!(of(growth, 2.0).grown_at(), of(growth, 2.0).settles_at());
+            assert!(of(growth, 1.0).grown_at() <= of(growth, 1.0).scored_at(85));
+        }
+        // Full size from 1,650 of 2,000 on: not yet a tenth when the score is due, unless the stage gets longer.
+        assert_eq!((of(0.86, 1.0).settles_at(), of(0.86, 1.0).scored_at(85)), (1800, 1800));
+        assert!(of(0.86, 1.0).grown_at() > 1800 && of(0.86, 2.0).grown_at() < of(0.86, 2.0).scored_at(85));
+        assert!(of(1.0, 1.0).grown_at() > 2000 && of(1.0, 4.0).grown_at() > 8000);
     }
 
     #[test]

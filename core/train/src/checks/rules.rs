@@ -1,7 +1,9 @@
 //! When a run has failed: its scores are compared with the baselines.
 
 use super::Baselines;
+use crate::schedule::StageLengths;
 use crate::train::Score;
+use cc4dgs_core::Stage;
 
 /// A score that is no failure whatever the baselines reach, dB: blurring hardly hurts images with little detail.
 pub(super) const GOOD_ENOUGH_DB: f64 = 30.0;
@@ -89,10 +91,10 @@ pub(super) fn shortfall(scores: &[Score], baselines: &Baselines, rules: Rules, d
 }
 
 /// How far a run has fallen whose last score is more than 6 dB below its best earlier one, in words. All scores are of the same views at their full size. Scores
-/// before `complete` do not count: the share of the main stage after which no frames and pixels are added. `length` is that of the main stage in iterations.
-pub(super) fn collapse(scores: &[Score], complete: f64, length: usize, baselines: &Baselines) -> Option<String> {
+/// before `complete` do not count: the iteration of the main stage after which no frames and pixels are added.
+pub(super) fn collapse(scores: &[Score], complete: usize, lengths: &StageLengths, baselines: &Baselines) -> Option<String> {
     let (end, earlier) = scores.split_last()?;
-    let counts = |score: &&Score| score.percent as f64 >= 100.0 * complete;
+    let counts = |score: &&Score| lengths.scored_at(score.percent) >= complete;
     let best = earlier.iter().filter(counts).max_by(|a, b| a.psnr_db.total_cmp(&b.psnr_db))?;
     if best.psnr_db - end.psnr_db <= MOST_FALL_DB {
         return None;
@@ -101,7 +103,7 @@ pub(super) fn collapse(scores: &[Score], complete: f64, length: usize, baselines
         true => format!(", less than the images blurred 16 times ({:.1} dB)", baselines.blur_db),
         false => String::new(),
     };
-    let at = length * best.percent / 100;
+    let (at, length) = (lengths.scored_at(best.percent), lengths.length(Stage::Main));
     let (from, to) = (best.psnr_db, end.psnr_db);
     Some(format!("training views fell from {from:.1} dB at iteration {at} of {length} of the main stage to {to:.1} dB at its end{blurred}"))
 }
@@ -109,27 +111,30 @@ pub(super) fn collapse(scores: &[Score], complete: f64, length: usize, baselines
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::TrainConfig;
 
     #[test]
     fn a_run_that_ends_far_below_its_best_score_has_collapsed() {
         let baselines = Baselines { mean_colour_db: 12.0, blur_db: 20.0, mean_image_db: None };
-        let of = |complete: f64, scores: [f64; 3]| {
+        // 800 iterations of the main stage.
+        let lengths = StageLengths::new(&TrainConfig { iterations: 1120, ..Default::default() }, true, 1.0);
+        let of = |complete: usize, scores: [f64; 3]| {
             let score = |(percent, psnr_db)| Score { percent, psnr_db, moving_db: None, frozen_db: None, detail: 1.0, blurred_db: None };
-            collapse(&[50, 85, 100].into_iter().zip(scores).map(score).collect::<Vec<_>>(), complete, 800, &baselines)
+            collapse(&[50, 85, 100].into_iter().zip(scores).map(score).collect::<Vec<_>>(), complete, &lengths, &baselines)
         };
-        let fell = of(0.0, [27.0, 30.0, 11.0]).unwrap();
+        let fell = of(0, [27.0, 30.0, 11.0]).unwrap();
         assert!(fell.starts_with("training views fell from 30.0 dB at iteration 680 of 800 of the main stage to 11.0 dB at its end"), "{fell}");
         assert!(fell.ends_with(", less than the images blurred 16 times (20.0 dB)"), "{fell}");
         // One that fell before the second score, and one that is still above the blurred images.
-        assert!(of(0.0, [29.0, 12.0, 13.0]).unwrap().contains("fell from 29.0 dB at iteration 400 of 800"));
-        assert!(of(0.0, [27.0, 30.0, 23.5]).unwrap().ends_with("to 23.5 dB at its end"));
+        assert!(of(0, [29.0, 12.0, 13.0]).unwrap().contains("fell from 29.0 dB at iteration 400 of 800"));
+        assert!(of(0, [27.0, 30.0, 23.5]).unwrap().ends_with("to 23.5 dB at its end"));
         // Six decibels are not more than six; rounds of density control and rates that fall cost less.
-        assert_eq!((of(0.0, [27.0, 30.0, 24.0]), of(0.0, [31.0, 30.0, 30.5]), of(0.0, [20.0, 26.0, 30.0])), (None, None, None));
+        assert_eq!((of(0, [27.0, 30.0, 24.0]), of(0, [31.0, 30.0, 30.5]), of(0, [20.0, 26.0, 30.0])), (None, None, None));
         // Early frames alone may be drawn better than all of them, and small images better than whole ones.
-        assert_eq!((of(0.6, [30.0, 24.0, 23.0]), of(0.9, [30.0, 31.0, 23.0])), (None, None));
-        assert!(of(0.5, [30.0, 24.0, 23.0]).is_some() && of(0.6, [20.0, 30.0, 23.0]).is_some());
+        assert_eq!((of(480, [30.0, 24.0, 23.0]), of(681, [30.0, 31.0, 23.0])), (None, None));
+        assert!(of(400, [30.0, 24.0, 23.0]).is_some() && of(680, [20.0, 30.0, 23.0]).is_some());
         // A resumed run whose checkpoint has no scores.
-        assert_eq!(collapse(&[], 0.0, 800, &baselines), None);
+        assert_eq!(collapse(&[], 0, &lengths, &baselines), None);
     }
 
     #[test]

@@ -5,13 +5,14 @@ use super::rules::{Doubts, GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, c
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::sample::spread_views;
+use crate::schedule::StageLengths;
 use crate::train::{Context, Score, TrainJob, TrainState};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
-/// Where the main stage is scored, percent. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the scores at `HALF` and at `END` decide at the end,
-/// where it must not be far below any earlier one either.
+/// Where the main stage is scored, percent, but never before its length is settled. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the scores
+/// at `HALF` and at `END` decide at the end, where it must not be far below any earlier one either.
 const HALF: usize = 50;
 const LATE: usize = 85;
 const END: usize = 100;
@@ -34,10 +35,9 @@ impl Watch {
     /// [`Error::Failed`] again, where `state` comes from the checkpoint of a run that stopped because it had failed.
     pub fn new(context: &Context, doubts: Vec<Finding>, state: &TrainState) -> Result<Self> {
         let train = &context.job.config.train;
-        let length = context.lengths.length(Stage::Main);
         let rules = if train.checks { Rules::of(train.iterations, context.lengths.planned() * train.batch, context.training_camera.len()) } else { None };
         let mut watch = Self { doubts, rules, yardstick: None, scores: state.record.scores.clone() };
-        if watch.rules == Some(Rules::All) && state.stage == Stage::Main && state.iteration == length * LATE / 100 && watch.at(LATE).is_some() {
+        if watch.rules == Some(Rules::All) && state.stage == Stage::Main && state.iteration == context.lengths.scored_at(LATE) && watch.at(LATE).is_some() {
             watch.measure_baselines(context)?;
             if let Some(failure) = watch.failure_at(LATE, context, state) {
                 return Err(failure);
@@ -45,14 +45,15 @@ impl Watch {
         }
         Ok(watch)
     }
-    /// To be called after every iteration; scores the model at half and at 85 % of the main stage. Returns the error of a run that has failed at both: it is to
-    /// be stopped.
+    /// To be called after every iteration; scores the model at half and at 85 % of the main stage, once its length is settled. Returns the error of a run that has
+    /// failed at both: it is to be stopped.
     pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, schedule: &Schedule) -> Result<Option<Error>> {
         if self.rules.is_none() || schedule.stage != Stage::Main {
             return Ok(None);
         }
-        let due = |percent: &usize| schedule.iteration == schedule.length * percent / 100;
-        let Some(percent) = [HALF, LATE].into_iter().find(due) else { return Ok(None) };
+        // Both are due where the length is settled late and gets shorter.
+        let due = |percent: &usize| schedule.iteration == context.lengths.scored_at(*percent);
+        let Some(percent) = [LATE, HALF].into_iter().find(due) else { return Ok(None) };
         self.score(context, state, percent)?;
         state.record.scores.clone_from(&self.scores);
         Ok(if percent == LATE { self.failure_at(LATE, context, state) } else { None })
@@ -73,8 +74,7 @@ impl Watch {
         self.score(context, state, END)?;
         let (Some(yardstick), Some(end)) = (&self.yardstick, self.at(END)) else { return Ok(None) };
         // Before the baselines: poses and times are no likely causes where the model was good.
-        let complete = train.time_ramp.max(train.image_growth);
-        if let Some(problem) = collapse(&self.scores, complete, context.lengths.length(Stage::Main), &yardstick.baselines) {
+        if let Some(problem) = collapse(&self.scores, complete_at(&context.lengths, train.time_ramp), &context.lengths, &yardstick.baselines) {
             note(format!("fell apart: {problem}"));
             let remedy = format!(
                 "It fell apart: try lower learning rates (train.lr, those of the deformer), rates that fall to 0 at the end (train.lr.cooldown = 0.2), or \
@@ -158,7 +158,7 @@ impl Watch {
         let (rules, yardstick, now) = (self.rules?, self.yardstick.as_ref()?, self.at(percent)?);
         let deciding: Vec<Score> = match (self.at(HALF), rules, percent) {
             (Some(half), Rules::All, END) => vec![*half, *now],
-            (Some(half), Rules::All, _) if !self.grows_late(context) => vec![*half, *now],
+            (Some(half), Rules::All, _) if !grows_late(context) => vec![*half, *now],
             (_, _, END) => vec![*now],
             _ => return None,
         };
@@ -185,11 +185,6 @@ impl Watch {
         };
         Some(self.failure(context, problem))
     }
-    /// Whether frames or pixels are still added after the score on the way.
-    fn grows_late(&self, context: &Context) -> bool {
-        let train = &context.job.config.train;
-        train.time_ramp.max(train.image_growth) > LATE as f64 / 100.0
-    }
     /// The error of a run that is below a baseline, with the likely cause.
     fn failure(&self, context: &Context, problem: String) -> Error {
         let iterations = context.job.config.train.iterations;
@@ -211,6 +206,18 @@ impl Watch {
             }
         }
     }
+}
+
+/// Whether frames or pixels are still added at the score on the way, or were until shortly before it.
+fn grows_late(context: &Context) -> bool {
+    complete_at(&context.lengths, context.job.config.train.time_ramp) > context.lengths.scored_at(LATE)
+}
+
+/// The iteration of the main stage from which scores can be compared with later ones: all frames are there, which takes the share `time_ramp`, and images have
+/// had their full size for a tenth of the stage.
+fn complete_at(lengths: &StageLengths, time_ramp: f64) -> usize {
+    let all_frames = lengths.schedule(Stage::Main, lengths.length(Stage::Main)).iteration_at(time_ramp) as usize;
+    all_frames.max(lengths.grown_at())
 }
 
 /// How the sentence begins that says how to accept a model that has failed.
@@ -275,4 +282,27 @@ fn scored(context: &Context, state: &mut TrainState, views: &[usize]) -> Result<
 fn slope(planes: &[f32], width: usize) -> f64 {
     let sum: f64 = planes.chunks_exact(width.max(1)).flat_map(|row| row.windows(2)).map(|pair| f64::from((pair[1] - pair[0]).abs())).sum();
     sum / planes.len().max(1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::TrainConfig;
+
+    #[test]
+    fn scores_count_once_frames_and_pixels_are_there() {
+        // 2,000 iterations of the main stage are planned.
+        let of = |image_growth, stretch| StageLengths::new(&TrainConfig { iterations: 2800, image_growth, stretch, ..Default::default() }, true, 1.0);
+        let counts = |lengths: &StageLengths, percent, time_ramp| lengths.scored_at(percent) >= complete_at(lengths, time_ramp);
+        assert!(counts(&of(0.0, 1.0), HALF, 0.5) && !counts(&of(0.0, 1.0), HALF, 0.6) && counts(&of(0.0, 1.0), LATE, 0.85));
+        // A shorter stage has 83 % of its progress after 85 % of its iterations.
+        assert!(!counts(&of(0.0, 0.7), LATE, 0.85) && counts(&of(0.0, 0.7), LATE, 0.83));
+        for growth in [0.8, 0.82, 0.84, 1.0] {
+            let (plain, longer) = (of(growth, 1.0), of(growth, 4.0));
+            assert_eq!((counts(&plain, LATE, 0.0), counts(&longer, LATE, 0.0)), (growth < 1.0, growth < 1.0), "{growth}");
+            assert!(plain.scored_at(LATE) >= plain.settles_at() && longer.scored_at(LATE) == 6800);
+        }
+        // Full size for a twentieth of the planned stage: too little, unless the stage is longer.
+        assert!(!counts(&of(0.86, 1.0), LATE, 0.0) && counts(&of(0.86, 2.0), LATE, 0.0));
+    }
 }

@@ -24,6 +24,7 @@ mod sampler;
 mod score;
 mod settle;
 mod smoothness;
+mod stage;
 mod state;
 mod step;
 mod strain;
@@ -46,30 +47,24 @@ pub use watchdog::RateFactors;
 
 use crate::checkpoint;
 use crate::checks::{Verdict, Watch, examine};
-use crate::config::{CoarseFrames, Dynamic, RunConfig};
+use crate::config::{Dynamic, RunConfig};
 use crate::data::hold_out;
 use crate::gaussian_set::GaussianSet;
 use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
 use crate::schedule::StageLengths;
 use burn::tensor::Device;
-use cc4dgs_core::{
-    AppearanceContext, Error, Event, EventSink, Rasterizer, Registry, Result, Scene, Schedule, Seed, Split, Stage, check_attributes, parse_device,
-};
+use cc4dgs_core::{AppearanceContext, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, parse_device};
 use cc4dgs_play::checkpoint::CHECKPOINT;
-use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, Moving};
 use losses::LossTerms;
-use pace::Pace;
 use pyramid::Pyramid;
-use sampler::{Prefetcher, Sampler};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Instant;
-use watchdog::Watchdog;
 
 /// What to train, where to, and who listens.
 pub struct TrainJob<'a> {
@@ -134,6 +129,11 @@ pub(crate) struct Context<'a> {
 /// [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with lower rates,
 /// [`Error::Data`] for a scene that cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines, or ends far below its own
 /// earlier scores (the checkpoint is kept), and whatever the scene, the plug-ins or the disk report.
+///
+/// [`Error::Interrupted`]: cc4dgs_core::Error::Interrupted
+/// [`Error::Backend`]: cc4dgs_core::Error::Backend
+/// [`Error::Data`]: cc4dgs_core::Error::Data
+/// [`Error::Failed`]: cc4dgs_core::Error::Failed
 pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
     // On a thread of the pool, so that each of the thousands of parallel operations of a step starts at once: 17 % faster on two threads, 25 % on one.
     rayon::scope(|_| train_here(job))
@@ -262,176 +262,5 @@ fn decide_moving(job: &TrainJob) -> Moving {
         Dynamic::Score => Moving::Scored { zeta: train.zeta },
         Dynamic::Auto if can_score => Moving::Scored { zeta: train.zeta },
         Dynamic::Auto => Moving::Everything,
-    }
-}
-
-impl Context<'_> {
-    fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
-        let events = self.job.events;
-        if self.lengths.length(stage) == 0 || (stage == Stage::Score && self.masks.is_empty()) {
-            if stage == Stage::Main {
-                self.begin_main(state)?;
-            }
-            return Ok(());
-        }
-        if state.iteration == 0 {
-            if stage != Stage::Coarse {
-                self.remove_broken(state)?;
-            }
-            state.begin_stage(&self.device);
-            if stage == Stage::Main {
-                self.begin_main(state)?;
-                self.add_key_frames(state)?;
-            }
-        }
-        let first = self.lengths.schedule(stage, state.iteration + 1);
-        let mut length = first.length;
-        events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
-        let began = Instant::now();
-        let mut sampler = self.sampler(&first);
-        let mut pace = Pace::new(self, stage, state);
-        let prefetcher = Prefetcher::new();
-        let resumed_at = state.iteration;
-        let mut watchdog = Watchdog::new(state);
-        let mut log = log::Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
-        while state.iteration < self.lengths.length(stage) {
-            // A main stage that has begun and has no iteration would begin again, key frames included, when it is resumed.
-            if (state.iteration > 0 || stage != Stage::Main) && self.job.stop.load(Ordering::Relaxed) {
-                state.record.log = log.record();
-                self.save(state)?;
-                let at = format!("at iteration {} of stage {}", state.iteration, stage.name());
-                return Err(Error::Interrupted(match &self.checkpoint {
-                    Some(path) => format!("{at}; everything is in {}, --resume continues", path.display()),
-                    None => at,
-                }));
-            }
-            let schedule = self.lengths.schedule(stage, state.iteration + 1);
-            if schedule.length != length {
-                length = schedule.length;
-                sampler = self.sampler(&schedule);
-                log.set_length(length);
-            }
-            let batch = sampler.batch(state.iteration);
-            // Scores are fitted to masks.
-            if stage != Stage::Score {
-                prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
-            }
-            let check = watchdog.checks(schedule.iteration);
-            let trouble = match stage {
-                Stage::Score => self.score_step(state, &schedule, check, &mut log)?,
-                _ => self.photometric_step(&schedule, state, &batch, check, &mut log)?,
-            };
-            if trouble.is_none() {
-                if stage != Stage::Score {
-                    self.control_density(&schedule, state)?;
-                }
-                self.settle(state, &schedule)?;
-                self.recover(state, &schedule)?;
-            }
-            state.iteration = schedule.iteration;
-            let every = self.job.config.train.checkpoint_every;
-            let saves = every > 0 && state.iteration.is_multiple_of(every) && state.iteration < self.lengths.length(stage);
-            watchdog.after_iteration(self, state, trouble, length, saves)?;
-            if state.iteration < schedule.iteration {
-                // Back at an earlier state.
-                continue;
-            }
-            if let Some(factor) = pace.as_mut().and_then(|pace| pace.after_iteration(self, &schedule, state.set.len())) {
-                pace = None;
-                self.stretch_main(factor)?;
-            }
-            if let Some(failure) = watch.after_iteration(self, state, &schedule)? {
-                state.record.log = log.record();
-                self.save(state)?;
-                return Err(failure);
-            }
-            self.validate(state, &schedule)?;
-            self.observe(state, &schedule)?;
-            if saves {
-                state.record.log = log.record();
-                self.save(state)?;
-            }
-        }
-        log.finish(events);
-        state.record.log = Default::default();
-        if stage == Stage::Main && state.iteration > resumed_at {
-            self.simplify(state)?;
-        }
-        events.emit(&Event::StageFinished { stage: stage.name().into(), seconds: began.elapsed().as_secs_f64(), gaussians: state.set.len() });
-        if stage == Stage::Score {
-            let moving = state.moving_rows(&self.device)?.count() as u64;
-            let all = state.set.len() as u64;
-            events.emit(&Event::Work { stage: "score".into(), counter: "Gaussians that move".into(), done: moving, skipped: all - moving });
-        }
-        Ok(())
-    }
-
-    /// Which views the iterations of the stage of `schedule` see.
-    fn sampler(&self, schedule: &Schedule) -> Sampler {
-        let (train, stage) = (&self.job.config.train, schedule.stage);
-        let sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), train.views_per_iteration(stage));
-        // Only a canonical space that is the first frame can be left frame by frame.
-        if stage != Stage::Main || self.stage_views(Stage::Coarse).len() == self.stage_views(Stage::Main).len() {
-            return sampler;
-        }
-        sampler.with_ramp(|share| schedule.iteration_at(share * train.time_ramp), |view| self.job.scene.views[view].time_norm)
-    }
-
-    /// The training views a stage draws from.
-    fn stage_views(&self, stage: Stage) -> Vec<usize> {
-        let scene = &self.job.scene;
-        let all = scene.split(Split::Train);
-        if stage != Stage::Coarse || self.job.config.train.coarse_frames == CoarseFrames::All {
-            return all;
-        }
-        let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
-        all.iter().for_each(|&v| *counts.entry(scene.views[v].frame).or_default() += 1);
-        // Single images of the first frames may be missing: the frame is the first that half of the cameras see.
-        let most = counts.values().copied().max().unwrap_or(0);
-        let first = counts.iter().find(|(_, count)| 2 * **count >= most).map_or(0, |(&frame, _)| frame);
-        let of_first: Vec<usize> = all.iter().copied().filter(|&v| scene.views[v].frame == first).collect();
-        // A single image says nothing of depth: one moving camera needs all of them.
-        if of_first.len() >= 2 { of_first } else { all }
-    }
-
-    /// Builds the deformer over the box of what moves, once the scores are known.
-    fn begin_main(&self, state: &mut TrainState) -> Result<()> {
-        let section = &self.job.config.deformer;
-        let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
-        let field = self.job.registry.build_deformer(section, &context, &self.device)?;
-        let deformer = ModelDeformer { field, section: section.clone(), context };
-        check_attributes(deformer.name(), &deformer.field.attributes())?;
-        state.set.add_attributes(&deformer.field.attributes(), self.seed.child("attributes"))?;
-        let moves = !deformer.field.is_static() && state.moving_rows(&self.device)?.count() > 0;
-        if !moves && !deformer.field.is_static() && state.moving != Moving::Nothing {
-            let message = "no dynamic score is over train.zeta: the deformer is skipped".to_string();
-            self.job.events.emit(&Event::Warning { object: "deformer".into(), message });
-        }
-        state.deformer = Some(deformer);
-        Ok(())
-    }
-
-    /// Leaves out what the trained deformer does not use. Not called again when a finished run is resumed.
-    fn simplify(&self, state: &mut TrainState) -> Result<()> {
-        let rows = state.moving_rows(&self.device)?;
-        let Some(deformer) = state.deformer.as_ref().filter(|_| rows.count() > 0) else { return Ok(()) };
-        let spatial = deformer.field.spatial(&state.spatial_input(deformer, &rows)?)?;
-        let frames = self.job.scene.frame_count.max(2);
-        let times: Vec<f32> = (0..frames).map(|f| f as f32 / (frames - 1) as f32).collect();
-        let Some(simple) = deformer.field.simplified(spatial.values, &times)? else { return Ok(()) };
-        let mut section = simple.settings;
-        section.insert("kind".into(), deformer.name().into());
-        self.job.events.emit(&Event::Note { object: "deformer".into(), message: simple.message });
-        state.deformer = Some(ModelDeformer { field: simple.field, section, context: deformer.context.clone() });
-        state.optimizer.restart("deformer/");
-        Ok(())
-    }
-
-    fn save(&self, state: &mut TrainState) -> Result<()> {
-        self.remove_broken(state)?;
-        let Some(path) = &self.checkpoint else { return Ok(()) };
-        let bytes = checkpoint::save(path, state, &self.settings)?;
-        self.job.events.emit(&Event::Saved { path: path.display().to_string(), bytes });
-        Ok(())
     }
 }

@@ -1,0 +1,189 @@
+//! One stage of a run, iteration by iteration: which views it draws from, what the main stage begins and ends with, and checkpoints.
+
+use super::log::Log;
+use super::pace::Pace;
+use super::sampler::{Prefetcher, Sampler};
+use super::watchdog::Watchdog;
+use super::{Context, TrainState};
+use crate::checkpoint;
+use crate::checks::Watch;
+use crate::config::CoarseFrames;
+use cc4dgs_core::{Error, Event, Result, Schedule, Split, Stage, check_attributes};
+use cc4dgs_play::Moving;
+use cc4dgs_play::model::ModelDeformer;
+use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+impl Context<'_> {
+    /// Runs `stage` from where `state` stands to its end.
+    pub(super) fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
+        let events = self.job.events;
+        if self.lengths.length(stage) == 0 || (stage == Stage::Score && self.masks.is_empty()) {
+            if stage == Stage::Main {
+                self.begin_main(state)?;
+            }
+            return Ok(());
+        }
+        if state.iteration == 0 {
+            if stage != Stage::Coarse {
+                self.remove_broken(state)?;
+            }
+            state.begin_stage(&self.device);
+            if stage == Stage::Main {
+                self.begin_main(state)?;
+                self.add_key_frames(state)?;
+            }
+        }
+        let first = self.lengths.schedule(stage, state.iteration + 1);
+        let mut length = first.length;
+        events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
+        let began = Instant::now();
+        let mut sampler = self.sampler(&first);
+        let mut pace = Pace::new(self, stage, state);
+        let prefetcher = Prefetcher::new();
+        let resumed_at = state.iteration;
+        let mut watchdog = Watchdog::new(state);
+        let mut log = Log::new(stage, length, self.job.config.train.log_every).resumed(state.record.log, resumed_at);
+        while state.iteration < self.lengths.length(stage) {
+            // A main stage that has begun and has no iteration would begin again, key frames included, when it is resumed.
+            if (state.iteration > 0 || stage != Stage::Main) && self.job.stop.load(Ordering::Relaxed) {
+                state.record.log = log.record();
+                self.save(state)?;
+                let at = format!("at iteration {} of stage {}", state.iteration, stage.name());
+                return Err(Error::Interrupted(match &self.checkpoint {
+                    Some(path) => format!("{at}; everything is in {}, --resume continues", path.display()),
+                    None => at,
+                }));
+            }
+            let schedule = self.lengths.schedule(stage, state.iteration + 1);
+            if schedule.length != length {
+                length = schedule.length;
+                sampler = self.sampler(&schedule);
+                log.set_length(length);
+            }
+            let batch = sampler.batch(state.iteration);
+            // Scores are fitted to masks.
+            if stage != Stage::Score {
+                prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
+            }
+            let check = watchdog.checks(schedule.iteration);
+            let trouble = match stage {
+                Stage::Score => self.score_step(state, &schedule, check, &mut log)?,
+                _ => self.photometric_step(&schedule, state, &batch, check, &mut log)?,
+            };
+            if trouble.is_none() {
+                if stage != Stage::Score {
+                    self.control_density(&schedule, state)?;
+                }
+                self.settle(state, &schedule)?;
+                self.recover(state, &schedule)?;
+            }
+            state.iteration = schedule.iteration;
+            let every = self.job.config.train.checkpoint_every;
+            let saves = every > 0 && state.iteration.is_multiple_of(every) && state.iteration < self.lengths.length(stage);
+            watchdog.after_iteration(self, state, trouble, length, saves)?;
+            if state.iteration < schedule.iteration {
+                // Back at an earlier state.
+                continue;
+            }
+            if let Some(factor) = pace.as_mut().and_then(|pace| pace.after_iteration(self, &schedule, state.set.len())) {
+                pace = None;
+                self.stretch_main(factor)?;
+            }
+            if let Some(failure) = watch.after_iteration(self, state, &schedule)? {
+                state.record.log = log.record();
+                self.save(state)?;
+                return Err(failure);
+            }
+            self.validate(state, &schedule)?;
+            self.observe(state, &schedule)?;
+            if saves {
+                state.record.log = log.record();
+                self.save(state)?;
+            }
+        }
+        log.finish(events);
+        state.record.log = Default::default();
+        if stage == Stage::Main && state.iteration > resumed_at {
+            self.simplify(state)?;
+        }
+        events.emit(&Event::StageFinished { stage: stage.name().into(), seconds: began.elapsed().as_secs_f64(), gaussians: state.set.len() });
+        if stage == Stage::Score {
+            let moving = state.moving_rows(&self.device)?.count() as u64;
+            let all = state.set.len() as u64;
+            events.emit(&Event::Work { stage: "score".into(), counter: "Gaussians that move".into(), done: moving, skipped: all - moving });
+        }
+        Ok(())
+    }
+
+    /// Which views the iterations of the stage of `schedule` see.
+    fn sampler(&self, schedule: &Schedule) -> Sampler {
+        let (train, stage) = (&self.job.config.train, schedule.stage);
+        let sampler = Sampler::new(self.stage_views(stage), self.seed.child(stage.name()).child("views"), train.views_per_iteration(stage));
+        // Only a canonical space that is the first frame can be left frame by frame.
+        if stage != Stage::Main || self.stage_views(Stage::Coarse).len() == self.stage_views(Stage::Main).len() {
+            return sampler;
+        }
+        sampler.with_ramp(|share| schedule.iteration_at(share * train.time_ramp), |view| self.job.scene.views[view].time_norm)
+    }
+
+    /// The training views a stage draws from.
+    pub(super) fn stage_views(&self, stage: Stage) -> Vec<usize> {
+        let scene = &self.job.scene;
+        let all = scene.split(Split::Train);
+        if stage != Stage::Coarse || self.job.config.train.coarse_frames == CoarseFrames::All {
+            return all;
+        }
+        let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
+        all.iter().for_each(|&v| *counts.entry(scene.views[v].frame).or_default() += 1);
+        // Single images of the first frames may be missing: the frame is the first that half of the cameras see.
+        let most = counts.values().copied().max().unwrap_or(0);
+        let first = counts.iter().find(|(_, count)| 2 * **count >= most).map_or(0, |(&frame, _)| frame);
+        let of_first: Vec<usize> = all.iter().copied().filter(|&v| scene.views[v].frame == first).collect();
+        // A single image says nothing of depth: one moving camera needs all of them.
+        if of_first.len() >= 2 { of_first } else { all }
+    }
+
+    /// Builds the deformer over the box of what moves, once the scores are known.
+    fn begin_main(&self, state: &mut TrainState) -> Result<()> {
+        let section = &self.job.config.deformer;
+        let context = state.field_context(self.job.scene.frame_count, self.seed.child("field"))?;
+        let field = self.job.registry.build_deformer(section, &context, &self.device)?;
+        let deformer = ModelDeformer { field, section: section.clone(), context };
+        check_attributes(deformer.name(), &deformer.field.attributes())?;
+        state.set.add_attributes(&deformer.field.attributes(), self.seed.child("attributes"))?;
+        let moves = !deformer.field.is_static() && state.moving_rows(&self.device)?.count() > 0;
+        if !moves && !deformer.field.is_static() && state.moving != Moving::Nothing {
+            let message = "no dynamic score is over train.zeta: the deformer is skipped".to_string();
+            self.job.events.emit(&Event::Warning { object: "deformer".into(), message });
+        }
+        state.deformer = Some(deformer);
+        Ok(())
+    }
+
+    /// Leaves out what the trained deformer does not use. Not called again when a finished run is resumed.
+    fn simplify(&self, state: &mut TrainState) -> Result<()> {
+        let rows = state.moving_rows(&self.device)?;
+        let Some(deformer) = state.deformer.as_ref().filter(|_| rows.count() > 0) else { return Ok(()) };
+        let spatial = deformer.field.spatial(&state.spatial_input(deformer, &rows)?)?;
+        let frames = self.job.scene.frame_count.max(2);
+        let times: Vec<f32> = (0..frames).map(|f| f as f32 / (frames - 1) as f32).collect();
+        let Some(simple) = deformer.field.simplified(spatial.values, &times)? else { return Ok(()) };
+        let mut section = simple.settings;
+        section.insert("kind".into(), deformer.name().into());
+        self.job.events.emit(&Event::Note { object: "deformer".into(), message: simple.message });
+        state.deformer = Some(ModelDeformer { field: simple.field, section, context: deformer.context.clone() });
+        state.optimizer.restart("deformer/");
+        Ok(())
+    }
+
+    /// Writes the checkpoint, where the run has a folder.
+    pub(super) fn save(&self, state: &mut TrainState) -> Result<()> {
+        self.remove_broken(state)?;
+        let Some(path) = &self.checkpoint else { return Ok(()) };
+        let bytes = checkpoint::save(path, state, &self.settings)?;
+        self.job.events.emit(&Event::Saved { path: path.display().to_string(), bytes });
+        Ok(())
+    }
+}
