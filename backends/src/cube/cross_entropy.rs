@@ -1,6 +1,6 @@
 //! Binary cross-entropy of logits, with its gradient, on the device.
 
-use super::tensor::{THREADS, floats, sum_of_threads, upload, workgroups_for};
+use super::tensor::{THREADS, compensated_sum, floats, sum_of_threads, upload, workgroups_for};
 use burn::backend::TensorMetadata;
 use burn::tensor::DType;
 use burn_cubecl::kernel::into_contiguous;
@@ -48,10 +48,9 @@ fn finish_mean(partial: &[f32], mean: &mut [f32], workgroups: u32, scale: f32) {
     let mut lost = 0.0f32;
     let mut k = UNIT_POS as usize;
     while k < workgroups as usize {
-        let value = partial[k] - lost;
-        let next = sum + value;
-        lost = (next - sum) - value;
+        let (next, rest) = compensated_sum(sum, lost, partial[k]);
         sum = next;
+        lost = rest;
         k += THREADS as usize;
     }
     let total = sum_of_threads(&mut sums, sum);

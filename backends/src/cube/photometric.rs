@@ -3,7 +3,7 @@
 //! Four sweeps over the image: horizontal blur of x, y, x^2, y^2, xy; vertical blur, SSIM and its derivatives; the same two blurs of the derivatives.
 //! Sums are taken per workgroup and then by one workgroup, in a fixed order, so that every run gives the same bytes.
 
-use super::tensor::{THREADS, floats, sum_of_threads, upload, workgroups_for};
+use super::tensor::{THREADS, compensated_sum, floats, sum_of_threads, upload, workgroups_for};
 use crate::ops::photometric::{MOMENTS, PhotometricKernels, PhotometricOps};
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
@@ -145,10 +145,9 @@ fn sum_of_term(partial: &[f32], sums: &mut Shared<[f32]>, term: usize, workgroup
     let mut lost = 0.0f32;
     let mut k = UNIT_POS as usize;
     while k < workgroups as usize {
-        let value = partial[k * 3 + term] - lost;
-        let next = sum + value;
-        lost = (next - sum) - value;
+        let (next, rest) = compensated_sum(sum, lost, partial[k * 3 + term]);
         sum = next;
+        lost = rest;
         k += THREADS as usize;
     }
     sum_of_threads(sums, sum)

@@ -116,6 +116,14 @@ fn copy_words(from: &[f32], to: &mut [f32]) {
     }
 }
 
+/// A running sum with compensation for rounding (Kahan): `sum` and what it has `lost`, after `value` was added.
+#[cube]
+pub fn compensated_sum(sum: f32, lost: f32, value: f32) -> (f32, f32) {
+    let missing = value - lost;
+    let next = sum + missing;
+    (next, (next - sum) - missing)
+}
+
 /// Adds up one value per thread of a workgroup of [`THREADS`], in the order of the threads, with compensation for rounding (Kahan). The first thread gets the
 /// sum, the others 0. All threads of the workgroup must call it.
 #[cube]
@@ -128,10 +136,9 @@ pub fn sum_of_threads(values: &mut Shared<[f32]>, own: f32) -> f32 {
     if UNIT_POS == 0 {
         let mut lost = 0.0f32;
         for k in 0..THREADS as usize {
-            let value = values[k] - lost;
-            let next = sum + value;
-            lost = (next - sum) - value;
+            let (next, rest) = compensated_sum(sum, lost, values[k]);
             sum = next;
+            lost = rest;
         }
     }
     sum

@@ -1,6 +1,7 @@
 //! The graphics adapters of this machine, and the choice of `auto` among them.
 
 use serde::Serialize;
+use std::path::PathBuf;
 
 /// What kind of hardware an adapter is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -25,7 +26,7 @@ pub struct Adapter {
     pub name: String,
     /// Kind of hardware.
     pub kind: AdapterKind,
-    /// Vulkan, Metal or Dx12; Gl if no adapter answers through these.
+    /// Vulkan or Metal; Dx12 if no graphics card answers through these, then Gl.
     pub api: String,
     /// Driver and its version.
     pub driver: String,
@@ -61,6 +62,20 @@ impl Adapter {
     pub fn is_opengl(&self) -> bool {
         self.api == "Gl"
     }
+    /// Whether Direct3D 12 would compile its kernels with FXC, which refuses barriers in loops whose end depends on data.
+    pub fn lacks_compiler(&self) -> bool {
+        self.api == "Dx12" && !finds_dxc()
+    }
+}
+
+/// What is wrong with an adapter that [lacks a compiler](Adapter::lacks_compiler).
+pub(crate) const LACKS_COMPILER: &str = "it answers through Direct3D 12 only, whose compiler FXC refuses our kernels, and dxcompiler.dll was not found";
+
+/// Whether Windows finds the shader compiler DXC: beside the program, in the current folder, or on the path.
+fn finds_dxc() -> bool {
+    let beside = std::env::current_exe().ok().and_then(|program| program.parent().map(PathBuf::from));
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    beside.into_iter().chain([PathBuf::new()]).chain(std::env::split_paths(&path)).any(|folder| folder.join("dxcompiler.dll").is_file())
 }
 
 /// All adapters, the most capable kind first; enumerated once. None in a build without the feature `wgpu`.
@@ -96,10 +111,25 @@ mod enumeration {
     /// All adapters, the most capable kind first; enumerated once. None in a build without the feature `wgpu`.
     pub fn adapters() -> &'static [Adapter] {
         static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
-        // A driver that panics during enumeration counts as absent.
-        let enumerate = |backends| std::panic::catch_unwind(|| enumerate(backends)).unwrap_or_default();
-        // burn uses OpenGL only if no other API has an adapter. Listing it beside Vulkan would list the same cards twice.
-        ADAPTERS.get_or_init(|| Some(enumerate(Backends::PRIMARY)).filter(|all| !all.is_empty()).unwrap_or_else(|| enumerate(Backends::GL)))
+        ADAPTERS.get_or_init(settle)
+    }
+
+    /// The adapters of one API, chosen as burn chooses: the first with a GPU, else the first with software. Another would list the same cards again, and burn
+    /// counts within one.
+    fn settle() -> Vec<Adapter> {
+        let apis: &[Backends] = if cfg!(target_os = "macos") { &[Backends::METAL] } else { &[Backends::VULKAN, Backends::DX12, Backends::GL] };
+        let mut software = Vec::new();
+        for &api in apis {
+            // A driver that panics during enumeration counts as absent.
+            let found = std::panic::catch_unwind(|| enumerate(api)).unwrap_or_default();
+            if found.iter().any(|adapter| !adapter.is_software()) {
+                return found;
+            }
+            if software.is_empty() {
+                software = found;
+            }
+        }
+        software
     }
 
     fn enumerate(backends: Backends) -> Vec<Adapter> {
@@ -160,6 +190,7 @@ pub fn auto_device() -> (&'static str, String) {
         [first, ..] if !first.binds_enough() => {
             ("flex", format!("a kernel of {} may bind {} buffers, and 8 are needed", first.name, first.max_storage_buffers))
         }
+        [first, ..] if first.lacks_compiler() => ("flex", format!("{}: {LACKS_COMPILER}", first.name)),
         [first, ..] if first.is_opengl() => ("flex", format!("{} answers through OpenGL only; --device wgpu selects it", first.name)),
         [first, ..] => ("wgpu", format!("{} is a graphics card", first.name)),
     }

@@ -83,7 +83,7 @@ mod tests {
 
 #[cfg(feature = "wgpu")]
 mod adapter {
-    use crate::adapters::adapters;
+    use crate::adapters::{LACKS_COMPILER, adapters};
     use crate::{Error, Result};
     use burn::tensor::{Device, DeviceKind, Tensor};
     use std::collections::BTreeMap;
@@ -97,6 +97,11 @@ mod adapter {
                 let problem = format!("a kernel may bind {} buffers there, and 8 are needed", adapter.max_storage_buffers);
                 let device = format!("device wgpu:{index} ({})", adapter.name);
                 return Err(Error::unsupported(device, problem, "Use --device flex, or another adapter of `cc4dgs doctor`"));
+            }
+            Some(adapter) if adapter.lacks_compiler() => {
+                let remedy =
+                    "Install a Vulkan driver (the one of the graphics card has it), put dxcompiler.dll (1.8.2502 or later) beside cc4dgs, or use --device flex";
+                return Err(Error::unsupported(format!("device wgpu:{index} ({})", adapter.name), LACKS_COMPILER, remedy));
             }
             Some(adapter) => adapter.device_kind(),
             // burn may find an adapter that enumeration does not list.
@@ -118,11 +123,11 @@ mod adapter {
         if answers {
             return Ok(device());
         }
-        Err(Error::unsupported(
-            "device wgpu",
-            "no graphics adapter was found (Vulkan, Metal, Dx12 or OpenGL)",
-            "Install a Vulkan driver (mesa-vulkan-drivers for a software one), or use --device flex",
-        ))
+        let problem = match adapters().get(index) {
+            Some(adapter) => format!("{} ({}) does not compute a small sum", adapter.name, adapter.api),
+            None => "no graphics adapter was found (Vulkan, Metal, Dx12 or OpenGL)".to_string(),
+        };
+        Err(Error::unsupported("device wgpu", problem, "Install a Vulkan driver (mesa-vulkan-drivers for a software one), or use --device flex"))
     }
 
     /// Ends the process without the static destructors of graphics drivers. Mesa's software driver destroys its compiler while a thread may still be compiling kernels

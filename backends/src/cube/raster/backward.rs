@@ -4,7 +4,7 @@ use super::blend;
 use super::gradient::{self, AT_OFFSET, GEOMETRY, OF_CAMERA, OF_MEAN, OF_OPACITY, OF_QUATERNION, OF_SCALES, SCREEN};
 use super::{DIM, Lists, rest_width};
 use crate::cube::tensor::{floats, row_blocks, rows_of, shared_bytes, spread, upload, workgroups_for, zeros};
-use crate::ops::rasterize::camera::{CameraSums, RuleConstants};
+use crate::ops::rasterize::camera::{RuleConstants, camera_to_world};
 use crate::ops::rasterize::{AT_X, GradientRequest, RasterGradients, RasterSettings, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -133,23 +133,17 @@ pub fn backward(
         out
     };
     let camera = || {
-        let mut sums = CameraSums::default();
-        if n > 0 {
-            let (of_camera, of_offset) = (floats(&means, [12]), floats(&means, [3]));
-            for (from, to, stride, first) in [(&geometry, &of_camera, GEOMETRY, OF_CAMERA), (&screen, &of_offset, SCREEN, AT_OFFSET)] {
-                let count = spread(to.meta.shape().num_elements());
-                let (from, to) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
-                gradient::sum_rows::launch(&client, count, DIM(), from, to, n as u32, stride as u32, first as u32);
-            }
-            // A backward pass cannot return an error. Without an answer the gradient is NaN, and the next read of the device is the error.
-            let read = client.read(vec![of_camera.handle.clone(), of_offset.handle.clone()]).unwrap_or_default();
-            let number = |part: usize, k: usize| read.get(part).and_then(|bytes| f32::from_bytes(bytes).get(k)).map_or(f64::NAN, |&v| f64::from(v));
-            sums.rotation = std::array::from_fn(|k| number(0, k));
-            sums.translation = std::array::from_fn(|k| number(0, 9 + k));
-            sums.center = std::array::from_fn(|k| -number(1, k));
+        let (of_camera, of_offset, out) = (floats(&means, [12]), floats(&means, [3]), floats(&means, [4, 4]));
+        for (from, to, stride, first) in [(&geometry, &of_camera, GEOMETRY, OF_CAMERA), (&screen, &of_offset, SCREEN, AT_OFFSET)] {
+            let count = spread(to.meta.shape().num_elements());
+            let (from, to) = (from.clone().into_buffer_arg(), to.clone().into_buffer_arg());
+            gradient::sum_rows::launch(&client, count, DIM(), from, to, n as u32, stride as u32, first as u32);
         }
-        let gradient = upload(&means, &sums.matrix_gradient(&settings.world_to_camera), DType::F32);
-        CubeTensor::new_contiguous(gradient.client.clone(), gradient.device.clone(), [4, 4].into(), gradient.handle.clone(), DType::F32)
+        // Nothing is read back here: a backward pass could not return the error of a failed read.
+        let inverse = upload(&means, &camera_to_world(&settings.world_to_camera), DType::F32);
+        let (sums, offset, inverse) = (of_camera.into_buffer_arg(), of_offset.into_buffer_arg(), inverse.into_buffer_arg());
+        gradient::camera_matrix::launch(&client, workgroups_for(16), DIM(), sums, offset, inverse, out.clone().into_buffer_arg());
+        out
     };
     let of_background = || {
         let out = floats(&means, [3]);

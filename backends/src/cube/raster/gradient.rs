@@ -4,7 +4,7 @@ use super::geometry::{CENTER, project, project_backward};
 use super::harmonics::{basis, basis_backward};
 use super::project::{KEY_TILES, KEYS, activated_opacity, activated_scales, quaternion, view_direction};
 use super::vector::{V3, add, dot, load3, scale, store3, v3};
-use crate::cube::tensor::{THREADS, sum_of_threads};
+use crate::cube::tensor::{THREADS, compensated_sum, sum_of_threads};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD};
 use cubecl::prelude::*;
 
@@ -239,16 +239,36 @@ pub fn sum_rows(from: &[f32], to: &mut [f32], rows: u32, stride: u32, first: u32
     let mut lost = 0.0f32;
     let mut row = UNIT_POS as usize;
     while row < rows as usize {
-        // Kahan's compensation: hundreds of thousands of terms go into one number.
-        let value = from[row * stride as usize + first as usize + CUBE_POS] - lost;
-        let next = sum + value;
-        lost = (next - sum) - value;
+        // Compensated, because hundreds of thousands of terms go into one number.
+        let (next, rest) = compensated_sum(sum, lost, from[row * stride as usize + first as usize + CUBE_POS]);
         sum = next;
+        lost = rest;
         row += THREADS as usize;
     }
     let total = sum_of_threads(&mut sums, sum);
     if UNIT_POS == 0 && CUBE_POS < to.len() {
         to[CUBE_POS] = total;
+    }
+}
+
+/// Gradient of the camera matrix `[4,4]`, row-major, as `CameraSums::matrix_gradient` finds it: from the sums of the gradients of rotation and translation `[12]`
+/// and of the offsets from the camera `[3]`, and the inverse of the matrix `[4,4]`.
+#[cube(launch)]
+pub fn camera_matrix(of_camera: &[f32], of_offset: &[f32], inverse: &[f32], out: &mut [f32]) {
+    if ABSOLUTE_POS < out.len() {
+        let (row, column) = (ABSOLUTE_POS / 4, ABSOLUTE_POS % 4);
+        let mut sum = 0.0f32;
+        if row < 3 {
+            let at = select(column < 3, 3 * row + column, row + 9);
+            sum = of_camera[at];
+        }
+        // The centre is the last column of the inverse, and d inverse = -inverse dM inverse; offsets shrink as the centre grows.
+        let mut through = 0.0f32;
+        #[unroll]
+        for k in 0..3usize {
+            through += inverse[4 * k + row] * of_offset[k];
+        }
+        out[ABSOLUTE_POS] = sum + through * inverse[4 * column + 3];
     }
 }
 
@@ -260,10 +280,9 @@ pub fn background_backward(state: &[u32], upstream: &[f32], to: &mut [f32], pixe
     let mut lost = 0.0f32;
     let mut at = UNIT_POS as usize;
     while at < pixels as usize {
-        let value = f32::reinterpret(state[at]) * upstream[CUBE_POS * pixels as usize + at] - lost;
-        let next = sum + value;
-        lost = (next - sum) - value;
+        let (next, rest) = compensated_sum(sum, lost, f32::reinterpret(state[at]) * upstream[CUBE_POS * pixels as usize + at]);
         sum = next;
+        lost = rest;
         at += THREADS as usize;
     }
     let total = sum_of_threads(&mut sums, sum);

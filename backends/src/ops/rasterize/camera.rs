@@ -103,6 +103,11 @@ fn matrix(m: &[[f64; 4]; 4]) -> DMat4 {
     DMat4::from_cols_array_2d(m).transpose()
 }
 
+/// The inverse of a row-major 4x4, row-major and rounded.
+pub fn camera_to_world(world_to_camera: &[[f64; 4]; 4]) -> [f32; 16] {
+    matrix(world_to_camera).inverse().transpose().to_cols_array().map(|v| v as f32)
+}
+
 /// The camera centre: the last column of the inverse.
 fn camera_center(m: &[[f64; 4]; 4]) -> DVec3 {
     matrix(m).inverse().col(3).truncate()
