@@ -54,6 +54,7 @@ def machine(options):
         return kept
     version = subprocess.run([options.bin, "--version"], capture_output=True, text=True).stdout.strip()
     arguments = ["bench", "step", "--repeats", "5", "--quiet", f"--json={step}", "--threads", str(options.threads)]
+    step.unlink(missing_ok=True)
     code, _ = run(options.bin, arguments, options.out / "step.log")
     found = {"version": version, "binary_sha256": binary, "bench_step": json.loads(step.read_text()) if code == 0 else None}
     path.write_text(json.dumps(found, indent=1))
@@ -101,6 +102,7 @@ def train(options, name, path, setting, target):
     row["plan"] = tomllib.loads(config.read_text()).get("auto", {}).get("plan", []) if config.exists() else []
     if code in TRAINED:
         report, log = out.with_suffix(".json"), out.with_suffix(".eval.log")
+        report.unlink(missing_ok=True)
         eval_code, _ = run(options.bin, ["eval", str(out), "--scene", path, "--split", "test", f"--json={report}", *shared], log)
         found = json.loads(report.read_text()) if eval_code == 0 else None
         row |= {key: found.get(key) for key in SCORES} if found else {"said": last_line(log)}

@@ -39,6 +39,7 @@ step() {
     local name=$1 seconds=$2 began=$SECONDS
     shift 2
     echo "== $name"
+    rm -f "$out/$name.json"
     timeout --signal=INT --kill-after=30 "$seconds" "$bin" "$@" "--json=$out/$name.json" 2>"$out/$name.log"
     local status=$?
     if [ $status = 124 ] || [ $status = 130 ]; then

@@ -118,6 +118,7 @@ def main():
             scene = str(args.out / name / "scene")
             train = ["train", "--scene", scene, "--preset", preset, "--device", args.device, "--out", str(run), *options]
             report = args.out / name / f"eval-{seed}.json"
+            report.unlink(missing_ok=True)
             measure = ["eval", str(run), "--scene", scene, "--device", args.device, "--sheet-rows", "0", f"--json={report}"]
             psnr = None
             if all(subprocess.run([args.bin, "--quiet", *command], stdout=subprocess.DEVNULL).returncode == 0 for command in (train, measure)):

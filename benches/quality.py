@@ -31,6 +31,7 @@ CURVES = ["train.validation=12"]
 def medians(options, out):
     """Median milliseconds of `bench step` by case, or None where it fails."""
     report = out.with_suffix(".step.json")
+    report.unlink(missing_ok=True)
     arguments = [options.bin, "bench", "step", "--repeats", "5", "--quiet", f"--json={report}"]
     if options.threads:
         arguments += ["--threads", str(options.threads)]
@@ -54,12 +55,14 @@ def train(options, name, scene, minutes, settings):
             arguments += ["--set", text]
     if options.threads:
         arguments += ["--threads", str(options.threads)]
+    out.with_suffix(".train.json").unlink(missing_ok=True)
     began = time.time()
     with open(log, "a") as file:
         code = subprocess.run([options.bin, *arguments], stdout=file, stderr=subprocess.STDOUT).returncode
     row = {"name": name, "scene": scene, "minutes": minutes, "settings": [*settings, *options.sets], "exit": code, "resumed": resumed}
     row |= {"seconds": round(time.time() - began, 1), "bench_step": step, "curve": curve(out / "events.jsonl")}
     report = out.with_suffix(".eval.json")
+    report.unlink(missing_ok=True)
     evaluation = [options.bin, "eval", str(out), "--scene", path, "--split", "test", f"--json={report}", "--sheet", str(out.with_suffix(".png")), "--quiet"]
     with open(out.with_suffix(".eval.log"), "w") as file:
         if code == 0 and subprocess.run(evaluation, stdout=file, stderr=subprocess.STDOUT).returncode == 0:

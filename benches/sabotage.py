@@ -233,6 +233,7 @@ def main():
         psnr = None
         if (run / "checkpoint").is_file():
             report = args.out / name / "eval.json"
+            report.unlink(missing_ok=True)
             measure = [args.bin, "--quiet", "eval", str(run), "--scene", str(args.scene), "--device", args.device, "--sheet-rows", "0", f"--json={report}"]
             if subprocess.run(measure, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode == 0:
                 psnr = json.loads(report.read_text())["psnr_db"]

@@ -17,6 +17,7 @@ import time
 def train(options, scene, path, name, settings, seed):
     out = options.out / f"{scene}-{name}-{seed}"
     report = out.with_suffix(".json")
+    report.unlink(missing_ok=True)
     arguments = ["train", "--scene", path, "--out", str(out), "--overwrite", "--quiet", "--preset", options.preset, f"--json={report}"]
     if options.minutes > 0:
         arguments += ["--minutes", str(options.minutes)]

@@ -21,7 +21,7 @@ const EXIT_CODES: &str = "Exit codes: 0 done, 2 user error, 3 data error, 4 out 
 #[derive(Debug, Parser)]
 #[command(name = "cc4dgs", version, about, after_help = EXIT_CODES, subcommand_precedence_over_arg = true, arg_required_else_help = true)]
 pub struct Cli {
-    /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE. An existing FILE is replaced if it holds JSON.
+    /// Write the result as JSON, to FILE or (without one) to standard output. Put it last or write --json=FILE. An existing FILE is replaced if it is such a result.
     #[arg(long, global = true, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub json: Option<PathBuf>,
     /// Print results and errors only.

@@ -7,6 +7,9 @@ use serde::Serialize;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// The first key of every result: the version of the program that wrote it. Files that begin otherwise are not replaced.
+const MARK: &str = "cc4dgs";
+
 /// Where results go.
 pub struct Output {
     json: Option<PathBuf>,
@@ -25,10 +28,9 @@ impl Output {
     pub fn json_file(&self) -> Option<&Path> {
         self.json.as_deref().filter(|p| p.as_os_str() != "-")
     }
-    /// Refuses a file for the JSON that exists and holds something else. Call it before long work.
+    /// Refuses a file for the JSON that exists and is no result of this program. Call it before long work.
     pub fn check(&self) -> Result<()> {
-        let is_json = |head: &[u8]| head.trim_ascii_start().starts_with(b"{") || head.trim_ascii_start().starts_with(b"[");
-        self.json_file().map_or(Ok(()), |file| refuse_other_content(file, "a JSON file", is_json))
+        self.json_file().map_or(Ok(()), |file| refuse_other_content(file, "a result that --json wrote", is_result))
     }
     /// Reports a result: as JSON where `--json` says, and as `text` on standard output unless the JSON went there.
     pub fn result(&self, value: &impl Serialize, text: impl FnOnce() -> String) -> Result<()> {
@@ -65,10 +67,22 @@ impl Output {
     }
 }
 
-/// Indented JSON with a final newline.
+/// Indented JSON with a final newline. Objects begin with [`MARK`]; of a list, each of its objects does.
 pub fn to_json(value: &impl Serialize) -> Result<String> {
     let text = serde_json::to_string_pretty(value).map_err(|e| Error::backend("JSON", e.to_string(), "Report this: every result should have a JSON form"))?;
-    Ok(text + "\n")
+    let begin = |indent: &str| format!("{indent}{{\n{indent}  \"{MARK}\": \"{}\",\n", env!("CARGO_PKG_VERSION"));
+    let marked = match text.strip_prefix("{\n") {
+        Some(rest) => begin("") + rest,
+        // Strings hold no line ends, so these are the objects of a list and nothing else.
+        None => text.replace("\n  {\n", &format!("\n{}", begin("  "))),
+    };
+    Ok(marked + "\n")
+}
+
+/// Whether a file with the first bytes `head` is a result: an object that begins with [`MARK`], or a list of such objects.
+fn is_result(head: &[u8]) -> bool {
+    let text: String = String::from_utf8_lossy(head).chars().filter(|c| !c.is_whitespace()).collect();
+    text.strip_prefix('[').unwrap_or(&text).starts_with(&format!("{{\"{MARK}\":\""))
 }
 
 #[cfg(test)]
@@ -76,17 +90,34 @@ mod tests {
     use super::*;
 
     #[test]
-    fn json_replaces_json_only() {
+    fn json_replaces_results_only() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("out");
         let check = |file: &Path| Output::new(Some(file.to_path_buf()), true).check();
         check(&file).unwrap();
-        for (content, accepted) in [("", true), ("{}\n", true), ("\n [1]", true), ("\u{89}PNG", false), ("name = 'grid'", false)] {
+        let own = "\n{\"cc4dgs\":\"0.0.9\"}";
+        let others = ["{}\n", "\n [1]", "{\"frames\": []}", "{\"frames\": [{\"cc4dgs\": \"1\"}]}", "\u{89}PNG", "name = 'grid'"];
+        for (content, accepted) in [("", true), (own, true)].into_iter().chain(others.map(|content| (content, false))) {
             std::fs::write(&file, content).unwrap();
             assert_eq!(check(&file).is_ok(), accepted, "{content}");
         }
-        assert!(check(&file).unwrap_err().to_string().contains("not a JSON file"));
+        let message = check(&file).unwrap_err().to_string();
+        assert!(
+            ["not a result that --json wrote", "another name, or remove it", file.to_str().unwrap()].iter().all(|part| message.contains(part)),
+            "{message}"
+        );
         assert!(check(folder.path()).is_err());
+        // What is written may be written again.
+        let object = serde_json::json!({ "scores": [{ "psnr_db": 30.5 }], "text": "a\n  {\nb" });
+        for (value, place) in [(object.clone(), ""), (serde_json::json!([object, object]), "/1")] {
+            let text = to_json(&value).unwrap();
+            let read: serde_json::Value = serde_json::from_str(&text).unwrap();
+            let mark = read.pointer(&format!("{place}/{MARK}")).and_then(serde_json::Value::as_str);
+            assert_eq!((mark, text.matches("\"cc4dgs\"").count()), (Some(env!("CARGO_PKG_VERSION")), if place.is_empty() { 1 } else { 2 }), "{text}");
+            assert_eq!(read.pointer(&format!("{place}/text")), Some(&object["text"]));
+            std::fs::write(&file, text).unwrap();
+            check(&file).unwrap();
+        }
         check(Path::new("-")).unwrap();
         Output::new(None, true).check().unwrap();
     }

@@ -38,6 +38,8 @@ pub struct Scene {
     pub moving: usize,
     /// Spherical-harmonics degree, 0 to 4.
     pub sh_degree: usize,
+    /// Largest degree that `harmonics` holds: `sh_degree`, unless that was too much for the device.
+    pub(crate) drawn_degree: usize,
     /// Lower and upper corner of the box that holds most canonical centres; cameras without a presentation look at it.
     pub bounds: [[f32; 3]; 2],
     /// Lower and upper corner of a box that holds all centres at all times.
@@ -143,6 +145,7 @@ impl Scene {
             count: n,
             moving: layer.as_ref().map_or(0, |l| l.rows.len()),
             sh_degree: gaussians.sh_degree,
+            drawn_degree: gaussians.sh_degree,
             bounds: gaussians.central_box(SHOWN),
             reach: gaussians.central_box(1.0),
             background: [0.0; 3],
@@ -153,7 +156,7 @@ impl Scene {
             antialiased: false,
             square: false,
             gaussians: Vec::with_capacity(GAUSSIAN_FLOATS * n),
-            harmonics: harmonics(gaussians, &order),
+            harmonics: harmonics(gaussians, &order, gaussians.sh_degree),
             starts: Vec::new(),
             coefficients: Vec::new(),
             layer: None,
@@ -183,11 +186,22 @@ impl Scene {
         if (gaussians.len(), gaussians.sh_degree) != (self.count, self.sh_degree) {
             return Err(Error::data("colour coefficients", "they are those of another model", "Load it again"));
         }
-        Ok(harmonics(gaussians, &order(self.count, self.layer.as_ref())))
+        Ok(harmonics(gaussians, &order(self.count, self.layer.as_ref()), self.drawn_degree))
+    }
+    /// Leaves out the highest degrees of the harmonics until they take at most `most_words` words.
+    pub fn fit_harmonics(&mut self, most_words: u64) {
+        let stored = self.harmonics_words();
+        while self.drawn_degree > 0 && (self.count * self.harmonics_words()) as u64 > most_words {
+            self.drawn_degree -= 1;
+        }
+        let kept = self.harmonics_words();
+        if kept < stored {
+            self.harmonics = self.harmonics.chunks_exact(stored).flat_map(|words| &words[..kept]).copied().collect();
+        }
     }
     /// Words of harmonics per Gaussian.
     pub(crate) fn harmonics_words(&self) -> usize {
-        (3 * sh_rest_len(self.sh_degree)).div_ceil(2)
+        (3 * sh_rest_len(self.drawn_degree)).div_ceil(2)
     }
     fn set_layer(&mut self, mut layer: PlaybackLayer) -> Result<()> {
         for segment in &mut layer.segments {
@@ -222,10 +236,11 @@ fn order(n: usize, layer: Option<&PlaybackLayer>) -> Vec<usize> {
     rows.into_iter().chain((0..n).filter(|&i| still[i])).collect()
 }
 
-fn harmonics(gaussians: &HostGaussians, order: &[usize]) -> Vec<u32> {
-    let rest = 3 * sh_rest_len(gaussians.sh_degree);
-    let mut out = Vec::with_capacity(order.len() * rest.div_ceil(2));
-    order.iter().for_each(|&i| out.extend(gaussians.sh_rest[rest * i..rest * (i + 1)].chunks(2).map(pair_of_halves)));
+/// The coefficients of degree 1 to `degree`.
+fn harmonics(gaussians: &HostGaussians, order: &[usize], degree: usize) -> Vec<u32> {
+    let (rest, kept) = (3 * sh_rest_len(gaussians.sh_degree), 3 * sh_rest_len(degree));
+    let mut out = Vec::with_capacity(order.len() * kept.div_ceil(2));
+    order.iter().for_each(|&i| out.extend(gaussians.sh_rest[rest * i..rest * i + kept].chunks(2).map(pair_of_halves)));
     out
 }
 
@@ -285,19 +300,40 @@ mod tests {
         assert_eq!(scene.reach, [[0.0, 1.0, 2.0], [11.0, 12.0, 13.0]]);
     }
 
-    #[test]
-    fn harmonics_that_arrive_later_are_those_of_the_whole() {
-        let whole = HostGaussians {
-            sh_degree: 1,
+    /// Three Gaussians whose harmonics count from 0.
+    fn three(sh_degree: usize) -> HostGaussians {
+        HostGaussians {
+            sh_degree,
             means: vec![0.0; 9],
             log_scales: vec![0.0; 9],
             quaternions: [1.0, 0.0, 0.0, 0.0].repeat(3),
             opacity_logits: vec![0.0; 3],
             sh_dc: vec![0.0; 9],
-            sh_rest: (0..27).map(|v| v as f32).collect(),
+            sh_rest: (0..9 * sh_rest_len(sh_degree)).map(|v| v as f32).collect(),
             dynamic_scores: vec![0.0; 3],
             ..Default::default()
-        };
+        }
+    }
+
+    #[test]
+    fn harmonics_that_do_not_fit_lose_their_highest_degrees() {
+        let whole = three(3);
+        let mut scene = Scene::new(&whole, None).unwrap();
+        let complete = scene.harmonics.clone();
+        scene.fit_harmonics(69);
+        assert!(scene.drawn_degree == 3 && scene.harmonics == complete);
+        scene.fit_harmonics(68);
+        assert_eq!((scene.sh_degree, scene.drawn_degree, scene.harmonics_words(), scene.harmonics.len()), (3, 2, 12, 36));
+        assert_eq!((scene.harmonics[11], scene.harmonics[12]), (complete[11], complete[23]));
+        // Those that arrive later are as many.
+        assert_eq!(scene.harmonics_of(&whole).unwrap(), scene.harmonics);
+        scene.fit_harmonics(1);
+        assert!(scene.drawn_degree == 0 && scene.harmonics.is_empty() && scene.harmonics_of(&whole).unwrap().is_empty());
+    }
+
+    #[test]
+    fn harmonics_that_arrive_later_are_those_of_the_whole() {
+        let whole = three(1);
         let layer = || Some(PlaybackLayer { rows: vec![2], samples: 1, sh_degree: 1, segments: vec![Segment { first: 0, last: 0, tracks: Vec::new() }] });
         let base = Scene::new(&HostGaussians { sh_rest: vec![0.0; 27], ..whole.clone() }, layer()).unwrap();
         let complete = Scene::new(&whole, layer()).unwrap();

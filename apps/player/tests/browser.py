@@ -6,7 +6,7 @@ opened from disk, without a network. Chromium renders with SwiftShader, so no gr
 the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
-from browser_faults import broken_module, hopeless, refused, small_textures, told_once
+from browser_faults import broken_module, few_degrees, hopeless, opened_meanwhile, refused, second_player, small_textures, told_once
 from browser_input import drop, embedded, reduced_motion, touch, wheel
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
@@ -49,6 +49,9 @@ def main():
         told_once(pages)
         refused(pages)
         small_textures(pages)
+        few_degrees(pages)
+        opened_meanwhile(pages)
+        second_player(pages)
         hopeless(pages)
         broken_module(pages)
         drop(page, facts)

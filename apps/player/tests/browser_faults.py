@@ -52,6 +52,55 @@ def small_textures(pages):
     say(f"images fit into small textures; models that do not: {message}")
 
 
+def few_degrees(pages):
+    """Where only the harmonics do not fit into textures of WebGL2, their lower degrees are shown, and a warning says so once."""
+    page = pages.open(f"?src={MODEL}&backend=webgl")
+    facts = page.evaluate("cc4dgs.facts")
+    stored, count = facts["shDegree"], facts["gaussians"]
+    words = count * -(-3 * ((stored + 1) ** 2 - 1) // 2)
+    # 16 numbers of each Gaussian, and the motion, must fit.
+    if words <= max(16 * count, facts["gpuBytes"] // 4 - 16 * count - words):
+        say(f"harmonics of degree {stored} are not the largest texture of this model: what happens where they do not fit is not checked")
+        return page.close()
+    shown = page.evaluate("""async ([most, source]) => { const wasm = await import("./cc4dgs_player.js"), { width, height } = cc4dgs.ui.canvas;
+        const warned = []; cc4dgs.on("warning", e => warned.push(e.message));
+        cc4dgs.gpu = wasm.Player.plain(width, height, most, cc4dgs.gl.mostSide);
+        const facts = await cc4dgs.load(source);
+        cc4dgs.draw();
+        return [facts.shDegree, facts.storedDegree, warned]; }""", [words - 1, "/slow-plain.cc4d"])
+    assert shown[:2] == [stored - 1, stored] and len(shown[2]) == 1 and f"up to degree {stored - 1} of {stored}" in shown[2][0], shown
+    page.close()
+    pages.quiet("harmonics that do not fit")
+    say(f"harmonics that do not fit: {shown[2][0]}")
+
+
+def opened_meanwhile(pages):
+    """A model that is asked for while a lost device is replaced is loaded."""
+    page = pages.open(f"?src={MODEL}")
+    found = page.evaluate("""source => new Promise(done => {
+        cc4dgs.start = () => { delete cc4dgs.start; const started = cc4dgs.start(); cc4dgs.load(source).then(f => done([f?.frames, cc4dgs.source]), e => done([e.message])); return started; };
+        cc4dgs.gpu.loseDevice(); })""", "/plain.cc4d")
+    assert found == [page.evaluate("cc4dgs.facts.frames"), "/plain.cc4d"], found
+    page.close()
+    pages.quiet("a model that was opened while the device was lost")
+    say("a model can be opened while a lost device is replaced")
+
+
+def second_player(pages):
+    """A second player leaves the page its look."""
+    page = pages.open()
+    look = "getComputedStyle(document.documentElement).overflow + document.documentElement.classList"
+    before = page.evaluate(look)
+    page.evaluate("""async () => { const { createPlayer } = await import("./player.js"), element = document.body.appendChild(document.createElement("div"));
+        await createPlayer(element); window.added = element; }""")
+    during = page.evaluate(look)
+    page.evaluate("added.remove()")
+    assert before == during == page.evaluate(look) and "cc-embedded" not in before, [before, during]
+    page.close()
+    pages.quiet("a second player")
+    say("a second player leaves the page its look")
+
+
 def hopeless(pages):
     """A model that loses its device each time is given up."""
     page = pages.open()

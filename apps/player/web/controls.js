@@ -80,7 +80,8 @@ export function build(container, player) {
     container.replaceChildren(root);
     // A page that is not the player alone keeps its own look and title.
     const embedded = !container.matches("body > main");
-    document.documentElement.classList.toggle("cc-embedded", embedded);
+    // One player that is the page alone keeps the page's look, whatever is added.
+    document.documentElement.classList.toggle("cc-embedded", !document.querySelector("body > main > .cc"));
 
     const open = source => player.load(source).catch(() => {});
     const say = (text, error) => {

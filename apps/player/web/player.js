@@ -3,7 +3,7 @@
 //     const player = await createPlayer(element, { src: "model.cc4d", autoplay: true });   // src: an address, a File, or bytes with { name }
 //     player.on("time", ({ time, frame }) => …);  player.seek(0.5);  player.play();  await player.load("other.cc4d");
 //
-// Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" { message }, "progress" { share, bytes }, "recovered".
+// Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" and "warning" { message }, "progress" { share, bytes }, "recovered".
 // Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
 
 import init, * as wasm from "./cc4dgs_player.js";
@@ -53,7 +53,9 @@ class Page {
         this.flying = false;
         this.ui = build(container, this);
     }
-    async start() {
+    /// `starting` is the promise of it.
+    start() { return this.starting = this.begin(); }
+    async begin() {
         await this.startDevice();
         this.apply();
         const act = {
@@ -157,6 +159,9 @@ class Page {
             progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
         };
         try {
+            // A lost device is being replaced: its model gives way to this one.
+            if (!this.gpu) await this.starting?.catch(() => {});
+            if (signal.aborted) return null;
             if (!this.gpu) throw new Error("There is no graphics device to show it with. Reload the page, or open the file with `cc4dgs view`.");
             if (!again) this.facts = null;
             if (typeof source === "string") {
@@ -173,7 +178,7 @@ class Page {
             }
             if (kept) { this.gpu.pose = kept.pose; this.gpu.seek(kept.time); }
             this.ui.error(null);
-            if (this.facts.lacksMotion) this.ui.note("This archive has no playback layer, so it stands still here. Add one with: cc4dgs bake MODEL --out FILE.cc4d");
+            this.warn();
             this.emit("loaded", this.facts);
             return this.facts;
         } catch (thrown) {
@@ -197,6 +202,14 @@ class Page {
             // A later load has a bar of its own.
             if (this.abort.signal === signal) this.ui.loading(false);
         }
+    }
+    /// Says what is not shown of the model.
+    warn() {
+        const { lacksMotion, shDegree, storedDegree } = this.facts, lines = [];
+        if (lacksMotion) lines.push("This archive has no playback layer, so it stands still here. Add one with: cc4dgs bake MODEL --out FILE.cc4d");
+        if (shDegree < storedDegree) lines.push(`Spherical harmonics are shown up to degree ${shDegree} of ${storedDegree}: more do not fit into a texture of WebGL2. Use a browser with WebGPU to see all.`);
+        const message = lines.join(" ");
+        if (message) { this.ui.note(message); this.emit("warning", { message }); }
     }
     title() { return this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source?.name ?? "model"); }
     loaded(facts) {
@@ -294,27 +307,23 @@ class Page {
         this.gpu = null;
         // What is still being loaded has nothing to go to; it begins anew.
         this.abort?.abort();
+        const { abort } = this;
         const losses = this.losses = performance.now() - (this.keptSince ?? -Infinity) < KEPT_MS ? this.losses + 1 : 1;
         this.keptSince = Infinity;
         try {
+            [this.facts, this.shown] = [null, null];
             old.free();
-            if (losses > MOST_RECOVERIES) {
-                [this.facts, this.shown] = [null, null];
-                this.ui.empty();
-                throw new Error(`The graphics device was lost ${losses} times in a row, most likely because the model is too large for it. Reload the page with another model, or open this one with \`cc4dgs view\`.`);
-            }
+            if (losses > MOST_RECOVERIES) throw new Error(`The graphics device was lost ${losses} times in a row, most likely because the model is too large for it. Reload the page with another model, or open this one with \`cc4dgs view\`.`);
             await this.start();
-            if (source) {
-                [this.facts, this.shown] = [null, null];
-                // Unless another model was opened meanwhile.
-                if (await this.load(source, name, first) && kept) {
-                    this.gpu.pose = kept.pose;
-                    this.seek(kept.time);
-                    this.setPlaying(kept.playing || this.playing);
-                }
+            // Unless another model was opened meanwhile.
+            if (source && this.abort === abort && await this.load(source, name, first) && kept) {
+                this.gpu.pose = kept.pose;
+                this.seek(kept.time);
+                this.setPlaying(kept.playing || this.playing);
             }
             this.emit("recovered", {});
         } catch (e) {
+            if (!this.gpu) this.ui.empty();
             this.fail(e);
         } finally {
             // A device that was lost meanwhile has a recovery of its own.

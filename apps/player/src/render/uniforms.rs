@@ -52,7 +52,7 @@ impl Frame {
             size: [size[0] as f32, size[1] as f32, scene.near, FAR],
             depth: [near.ln(), per_ln, view.scale, scene.alpha_max],
             background: [background[0], background[1], background[2], 1.0],
-            counts: [scene.count as u32, scene.moving as u32, scene.harmonics_words() as u32, view.sh_degree.min(scene.sh_degree) as u32],
+            counts: [scene.count as u32, scene.moving as u32, scene.harmonics_words() as u32, view.sh_degree.min(scene.drawn_degree) as u32],
             flags: [u32::from(scene.antialiased), u32::from(view.mode == super::Mode::Depth), u32::from(view.tint), u32::from(scene.square)],
             heads,
         }

@@ -81,8 +81,7 @@ impl Player {
         let adapter = format!("{} {}", adapter.get_info().name, adapter.get_info().driver).trim().to_string();
         Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost }, (width, height), most_side))
     }
-    /// A player that decodes, keeps time and navigates, for a page that draws by itself: arrays of at most `most_words` numbers, images of at most `most_side` pixels
-    /// each way.
+    /// A player that decodes, keeps time and navigates, for a page that draws by itself: at most `most_words` numbers per array, `most_side` pixels each way.
     pub fn plain(width: u32, height: u32, most_words: f64, most_side: u32) -> Player {
         Self::on(Output::Plain { scene: None, most_words: most_words as u64 }, (width.max(1), height.max(1)), most_side.max(1))
     }
@@ -115,13 +114,15 @@ impl Player {
         Ok(())
     }
     fn show(&mut self, content: Content, first: bool) -> Result<String, JsError> {
-        let Content { scene, presentation, frame_count, lacks_motion, bytes } = content;
-        let (count, moving, sh_degree, gpu_bytes, [lower, upper]) = (scene.count, scene.moving, scene.sh_degree, scene.gpu_bytes(), scene.bounds);
+        let Content { mut scene, presentation, frame_count, lacks_motion, bytes } = content;
+        scene.fit_harmonics(if let Output::Plain { most_words, .. } = &self.output { *most_words } else { u64::MAX });
+        let (count, moving, gpu_bytes, [lower, upper]) = (scene.count, scene.moving, scene.gpu_bytes(), scene.bounds);
+        let degrees = [scene.drawn_degree, scene.sh_degree];
         match &mut self.output {
             Output::WebGpu { renderer, .. } => renderer.load(scene).map_err(error)?,
             Output::Plain { scene: kept, most_words } => {
                 // Where it is refused, the one before stays.
-                let words = [scene.gaussians.len(), scene.harmonics.len(), scene.starts.len(), scene.coefficients.len()];
+                let words = [scene.gaussians.len(), scene.starts.len(), scene.coefficients.len()];
                 let largest = words.into_iter().max().unwrap_or(0) as u64;
                 if largest > *most_words {
                     let remedy = "Use a browser with WebGPU, or open it on the desktop: cc4dgs view FILE";
@@ -139,7 +140,8 @@ impl Player {
         self.cameras = presentation.cameras;
         let names: Vec<&str> = self.cameras.iter().map(|c| c.name.as_str()).collect();
         let facts = serde_json::json!({
-            "gaussians": count, "moving": moving, "shDegree": sh_degree, "gpuBytes": gpu_bytes, "bytes": bytes, "frames": frame_count, "seconds": seconds,
+            "gaussians": count, "moving": moving, "shDegree": degrees[0], "storedDegree": degrees[1], "gpuBytes": gpu_bytes, "bytes": bytes,
+            "frames": frame_count, "seconds": seconds,
             "framesPerSecond": frame_count.saturating_sub(1).max(1) as f32 / seconds.max(1e-3), "cameras": names, "lacksMotion": lacks_motion,
         });
         Ok(facts.to_string())

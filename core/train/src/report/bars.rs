@@ -1,6 +1,6 @@
 //! Bars of parts that add up, and strips of single values, one line per name.
 
-use super::plot::{COLOURS, Scale, marker, open_svg};
+use super::plot::{COLOURS, Scale, footnote, marker, open_svg};
 use super::text::{html, short};
 use std::fmt::Write;
 
@@ -23,6 +23,8 @@ pub struct Bars {
     pub parts: Vec<String>,
     /// A name and one value per part; no value is below 0.
     pub lines: Vec<(String, Vec<f64>)>,
+    /// Below it; may be empty.
+    pub note: String,
 }
 
 /// Values of equal kind as points on a line each, with their mean.
@@ -65,7 +67,8 @@ impl Bars {
             _ = write!(svg, "<text x=\"{:.1}\" y=\"{:.1}\">{}</text>", scale.at(from) + 5.0, y + 15.0, precise(total(values)));
         }
         let legend: String = self.parts.iter().enumerate().map(|(i, name)| swatch(COLOURS[i % COLOURS.len()], name)).collect();
-        format!("<figure class=\"wide\"><figcaption>{}</figcaption><p class=\"legend\">{legend}</p>{svg}</svg></figure>\n", html(&self.title))
+        let (title, note) = (html(&self.title), footnote(&self.note));
+        format!("<figure class=\"wide\"><figcaption>{title}</figcaption><p class=\"legend\">{legend}</p>{svg}</svg>{note}</figure>\n")
     }
 }
 
@@ -129,7 +132,8 @@ mod tests {
 
     #[test]
     fn parts_stand_one_after_the_other() {
-        let bars = Bars { title: "storage".into(), axis: "MB".into(), parts: vec!["a".into(), "b".into()], lines: vec![("<x>".into(), vec![1.0, 3.0])] };
+        let (parts, lines) = (vec!["a".into(), "b".into()], vec![("<x>".into(), vec![1.0, 3.0])]);
+        let bars = Bars { title: "storage".into(), axis: "MB".into(), parts, lines, note: String::new() };
         let svg = bars.figure();
         let edges: Vec<(f64, f64)> = svg
             .match_indices("<rect x=\"")
@@ -149,6 +153,6 @@ mod tests {
     fn an_empty_chart_is_still_a_chart() {
         let svg = Strips { title: "seeds".into(), axis: "dB".into(), lines: vec![("one".into(), 3, vec![30.0])] }.figure();
         assert!(svg.contains("<path d=") && !svg.contains("class=\"mean\"") && !svg.contains("NaN"));
-        assert!(!Bars { title: String::new(), axis: String::new(), parts: vec![], lines: vec![] }.figure().contains("NaN"));
+        assert!(!Bars { title: String::new(), axis: String::new(), parts: vec![], lines: vec![], note: String::new() }.figure().contains("NaN"));
     }
 }

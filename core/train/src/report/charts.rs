@@ -5,7 +5,7 @@ use super::pareto::front;
 use super::plot::{Axis, COLOURS, Entry, Plot, Point, Series, marker};
 use super::rows::{Better, CodecFamily, DECODE, ENCODE, FRAME, LPIPS, PSNR, Quantity, Row, SIZE, SSIM, TRAINING};
 use super::text::html;
-use crate::sweep::CellResult;
+use crate::sweep::{CellResult, TrainingDevices};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// One colour per training and one marker per codec, the same in all plots of a report.
@@ -62,22 +62,23 @@ struct Plots {
 }
 
 impl Plots {
-    fn of(rows: &[Row], key: &Key) -> Self {
+    fn of(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Self {
         let best: Vec<Row> = best_codecs(rows).into_iter().cloned().collect();
-        let costs =
-            |metric| [(&FRAME, rows), (&TRAINING, &best), (&ENCODE, rows), (&DECODE, rows), (&SIZE, rows)].map(|(cost, rows)| pareto(rows, cost, metric, key));
+        let costs = |metric| {
+            [(&FRAME, rows), (&TRAINING, &best), (&ENCODE, rows), (&DECODE, rows), (&SIZE, rows)].map(|(cost, rows)| pareto(rows, cost, metric, key, trained))
+        };
         let shown = |plots: &mut dyn Iterator<Item = Plot>| plots.filter(|plot| !plot.is_empty()).collect();
         Self {
             rate: shown(&mut [&PSNR, &SSIM, &LPIPS].into_iter().map(|metric| rate_distortion(rows, metric, key))),
             cost: shown(&mut [&PSNR, &LPIPS].into_iter().flat_map(costs)),
-            progress: shown(&mut [training_curves(rows, key, false), training_curves(rows, key, true), per_frame(rows, key)].into_iter()),
+            progress: shown(&mut [training_curves(rows, key, None), training_curves(rows, key, Some(trained)), per_frame(rows, key)].into_iter()),
         }
     }
 }
 
 /// The plots of a scene as SVG files with legends, by name.
-pub fn files(scene: &str, rows: &[Row], key: &Key) -> Vec<(String, String)> {
-    let plots = Plots::of(rows, key);
+pub(super) fn files(scene: &str, rows: &[Row], key: &Key, trained: &TrainingDevices) -> Vec<(String, String)> {
+    let plots = Plots::of(rows, key, trained);
     let name = |plot: &Plot| {
         let text = format!("{scene} {}", plot.title).to_lowercase();
         text.split(|c: char| !c.is_alphanumeric()).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".svg"
@@ -90,9 +91,9 @@ pub fn files(scene: &str, rows: &[Row], key: &Key) -> Vec<(String, String)> {
 }
 
 /// All figures of a scene but images, as HTML.
-pub fn figures(rows: &[Row], key: &Key) -> String {
+pub(super) fn figures(rows: &[Row], key: &Key, trained: &TrainingDevices) -> String {
     let plots = |plots: &[Plot]| grid("", plots.iter().map(Plot::figure).collect());
-    let Plots { rate, cost, progress } = Plots::of(rows, key);
+    let Plots { rate, cost, progress } = Plots::of(rows, key, trained);
     let note = "A point is the mean over seeds, its whisker the least and the largest seed. Lines join the profiles of a codec, and the settings of a method.";
     let mut out = heading("Rate and distortion", note) + &key.legend();
     out += &plots(&rate);
@@ -102,7 +103,7 @@ pub fn figures(rows: &[Row], key: &Key) -> String {
     out += &plots(&cost);
 
     out += &heading("Where time and bytes go", "");
-    out += &grid(" bars", [stage_bars(rows), frame_bars(rows), storage_bars(rows)].map(|bars| bars.figure()).concat());
+    out += &grid(" bars", [stage_bars(rows, trained), frame_bars(rows), storage_bars(rows)].map(|bars| bars.figure()).concat());
     out += &(heading("Training, frames, seeds", "") + &key.legend());
     out += &plots(&progress);
     if rows.iter().any(|row| row.cells.len() > 1) {
@@ -111,6 +112,15 @@ pub fn figures(rows: &[Row], key: &Key) -> String {
         out += &grid(" bars", Strips { title: "Every seed, and the mean".into(), axis: PSNR.title(), lines }.figure());
     }
     out
+}
+
+/// What stands below a plot of times of trainings that ran on different devices: these, and the mark of each training. Nothing where they are comparable.
+fn device_note(rows: &[Row], trained: &TrainingDevices) -> String {
+    if !trained.differ() {
+        return String::new();
+    }
+    let marks: Vec<String> = trainings(rows).into_iter().map(|row| row.training() + &trained.mark(&row.cells)).collect();
+    format!("{} Here: {}.", trained.sentence(), marks.join("; "))
 }
 
 fn heading(title: &str, note: &str) -> String {
@@ -157,19 +167,29 @@ fn rate_distortion(rows: &[Row], metric: &Quantity, key: &Key) -> Plot {
         })
         .collect();
     series.extend(points(rows, &SIZE, metric, key));
-    Plot { title: format!("Rate and distortion: {}", metric.name), x: Axis::ranged("archive (MB)"), y: metric_axis(metric), series, front: Vec::new() }
+    Plot {
+        title: format!("Rate and distortion: {}", metric.name),
+        x: Axis::ranged("archive (MB)"),
+        y: metric_axis(metric),
+        series,
+        front: Vec::new(),
+        note: String::new(),
+    }
 }
 
-fn pareto(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key) -> Plot {
+/// Where the trainings ran on different devices, their times are marked and have no front.
+fn pareto(rows: &[Row], cost: &Quantity, metric: &Quantity, key: &Key, trained: &TrainingDevices) -> Plot {
     let means: Vec<(f64, f64)> = rows.iter().filter_map(|row| point(row, cost, metric)).map(|p| (p.x, p.y)).collect();
-    let best = front(&means, metric.better == Better::Lower).into_iter().map(|i| means[i]).collect();
-    Plot {
-        title: format!("{} against {}", metric.name, cost.name),
-        x: Axis::ranged(cost.title()),
-        y: metric_axis(metric),
-        series: points(rows, cost, metric, key),
-        front: best,
+    let mut best: Vec<(f64, f64)> = front(&means, metric.better == Better::Lower).into_iter().map(|i| means[i]).collect();
+    let (mut series, mut note) = (points(rows, cost, metric, key), String::new());
+    if cost.key == TRAINING.key && trained.differ() {
+        best.clear();
+        note = device_note(rows, trained);
+        for (row, own) in rows.iter().zip(&mut series) {
+            own.points.iter_mut().for_each(|point| point.hint += &format!(", trained on{}", trained.mark(&row.cells)));
+        }
     }
+    Plot { title: format!("{} against {}", metric.name, cost.name), x: Axis::ranged(cost.title()), y: metric_axis(metric), series, front: best, note }
 }
 
 /// The first row of each training: all its codecs share the training.
@@ -192,7 +212,7 @@ fn mean(row: &Row, value: impl Fn(&CellResult) -> f64) -> f64 {
     row.cells.iter().map(|cell| value(cell).max(0.0)).sum::<f64>() / row.cells.len() as f64
 }
 
-fn stage_bars(rows: &[Row]) -> Bars {
+fn stage_bars(rows: &[Row], trained: &TrainingDevices) -> Bars {
     let mut stages: Vec<String> = ["coarse", "score", "main"].map(str::to_string).to_vec();
     let named: BTreeSet<&String> = rows.iter().flat_map(|row| &row.cells).flat_map(|cell| cell.cost.stage_seconds.keys()).collect();
     stages.retain(|stage| named.contains(stage));
@@ -206,14 +226,14 @@ fn stage_bars(rows: &[Row]) -> Bars {
     };
     let lines = trainings(rows).into_iter().map(|row| (row.training(), values(row))).collect();
     let parts = stages.iter().cloned().chain(["reading, checks, saving".to_string()]).collect();
-    Bars { title: "Training by stage, mean over seeds".into(), axis: "wall time (s)".into(), parts, lines }
+    Bars { title: "Training by stage, mean over seeds".into(), axis: "wall time (s)".into(), parts, lines, note: device_note(rows, trained) }
 }
 
 fn frame_bars(rows: &[Row]) -> Bars {
     let values = |row: &Row| vec![mean(row, |cell| cell.cost.frame_ms.field), mean(row, |cell| cell.cost.frame_ms.raster)];
     let lines = best_codecs(rows).into_iter().map(|row| (row.name(), values(row))).collect();
     let parts = ["deformer", "rasterizer"].map(str::to_string).to_vec();
-    Bars { title: "A frame after the first, median; codec with the highest PSNR".into(), axis: "time (ms)".into(), parts, lines }
+    Bars { title: "A frame after the first, median; codec with the highest PSNR".into(), axis: "time (ms)".into(), parts, lines, note: String::new() }
 }
 
 fn storage_bars(rows: &[Row]) -> Bars {
@@ -224,21 +244,26 @@ fn storage_bars(rows: &[Row]) -> Bars {
     };
     let lines = rows.iter().map(|row| (row.name(), values(row))).collect();
     let parts = ["deformer", "Gaussians", "header and metadata"].map(str::to_string).to_vec();
-    Bars { title: "Archive by part, mean over seeds".into(), axis: "size (MB)".into(), parts, lines }
+    Bars { title: "Archive by part, mean over seeds".into(), axis: "size (MB)".into(), parts, lines, note: String::new() }
 }
 
-fn training_curves(rows: &[Row], key: &Key, by_time: bool) -> Plot {
+/// By iteration, or by time where `times` says what the trainings ran on.
+fn training_curves(rows: &[Row], key: &Key, times: Option<&TrainingDevices>) -> Plot {
     let mut series = Vec::new();
     for row in trainings(rows) {
         for cell in &row.cells {
-            let x = |i: usize| if by_time { cell.cost.curve_seconds[i] / 60.0 } else { cell.curve.iteration[i] as f64 };
+            let x = |i: usize| if times.is_some() { cell.cost.curve_seconds[i] / 60.0 } else { cell.curve.iteration[i] as f64 };
             let points = cell.curve.psnr_db.iter().enumerate().map(|(i, y)| Point { x: x(i), y: *y, y_range: None, hint: String::new() }).collect();
             series.push(Series { colour: key.colour(row), marker: None, line: true, points });
         }
     }
-    let (title, x) =
-        if by_time { ("Training views by time, a line per seed", "wall time (min)") } else { ("Training views by iteration, a line per seed", "iteration") };
-    Plot { title: title.into(), x: Axis::linear(x), y: Axis::linear("PSNR of training views (dB)"), series, front: Vec::new() }
+    let (title, x) = if times.is_some() {
+        ("Training views by time, a line per seed", "wall time (min)")
+    } else {
+        ("Training views by iteration, a line per seed", "iteration")
+    };
+    let note = times.map_or_else(String::new, |trained| device_note(rows, trained));
+    Plot { title: title.into(), x: Axis::linear(x), y: Axis::linear("PSNR of training views (dB)"), series, front: Vec::new(), note }
 }
 
 fn per_frame(rows: &[Row], key: &Key) -> Plot {
@@ -258,5 +283,5 @@ fn per_frame(rows: &[Row], key: &Key) -> Plot {
         }
     }
     let title = "Held-out views over the sequence, mean over cameras and seeds".into();
-    Plot { title, x: Axis::linear("frame"), y: Axis::linear(PSNR.title()), series, front: Vec::new() }
+    Plot { title, x: Axis::linear("frame"), y: Axis::linear(PSNR.title()), series, front: Vec::new(), note: String::new() }
 }

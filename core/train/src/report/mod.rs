@@ -140,7 +140,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
         let class = if i == 0 { " class=\"first\"" } else { "" };
         body += &format!("<h2 id=\"scene-{i}\"{class}>{}</h2>\n", text::html(scene));
         body += &table.html();
-        body += &charts::figures(rows, &key);
+        body += &charts::figures(rows, &key, &trained);
         if options.images == ImageChoice::All || (options.images == ImageChoice::BuiltIn && public.contains(scene)) {
             body += &images::gallery(folder, scene, rows, options.views)?;
         }
@@ -155,7 +155,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
         latex += &table.latex();
     }
     body += "</div>\n";
-    let figures = scenes.iter().flat_map(|(scene, rows)| charts::files(scene, rows, &key)).collect();
+    let figures = scenes.iter().flat_map(|(scene, rows)| charts::files(scene, rows, &key, &trained)).collect();
     Ok(Report { html: page::page(&title, &body), csv: tables::csv(&scenes), markdown, latex, figures, cells: results.len() })
 }
 

@@ -18,6 +18,8 @@ const BOTTOM: f64 = 46.0;
 /// Height of a line of a file's legend, and the width of a character there at most.
 const LEGEND_LINE: f64 = 18.0;
 const CHARACTER: f64 = 7.0;
+/// Beside the note of a file.
+const MARGIN: f64 = 8.0;
 const STYLE: &str = include_str!("plot.css");
 
 /// One axis.
@@ -83,6 +85,8 @@ pub struct Plot {
     pub series: Vec<Series>,
     /// Corners of a Pareto front, from left to right.
     pub front: Vec<(f64, f64)>,
+    /// Below it; may be empty.
+    pub note: String,
 }
 
 /// Maps values of an axis to pixels.
@@ -192,6 +196,29 @@ pub fn marker(kind: usize, x: f64, y: f64, colour: &str) -> String {
     format!("<path d=\"M{x:.1} {y:.1}{shape}\" {style}/>")
 }
 
+/// What stands below a figure.
+pub(super) fn footnote(note: &str) -> String {
+    if note.is_empty() { String::new() } else { format!("<p class=\"note\">{}</p>", html(note)) }
+}
+
+/// `text` in lines of at most `most` characters, broken between words where that is possible.
+fn wrapped(text: &str, most: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        let letters: Vec<char> = word.chars().collect();
+        for piece in letters.chunks(most) {
+            match lines.last_mut().filter(|line| line.chars().count() + 1 + piece.len() <= most) {
+                Some(line) => {
+                    line.push(' ');
+                    line.extend(piece);
+                }
+                None => lines.push(piece.iter().collect()),
+            }
+        }
+    }
+    lines
+}
+
 impl Plot {
     /// Whether there is anything to draw.
     pub fn is_empty(&self) -> bool {
@@ -200,9 +227,10 @@ impl Plot {
     /// A figure with the drawing.
     pub fn figure(&self) -> String {
         let name = format!("{}: {} against {}", self.title, self.y.title, self.x.title);
-        format!("<figure><figcaption>{}</figcaption>{}{}</svg></figure>\n", html(&self.title), open_svg(WIDTH, HEIGHT, &name), self.drawing())
+        let note = footnote(&self.note);
+        format!("<figure><figcaption>{}</figcaption>{}{}</svg>{note}</figure>\n", html(&self.title), open_svg(WIDTH, HEIGHT, &name), self.drawing())
     }
-    /// An SVG file with a heading and a legend.
+    /// An SVG file with a heading, a legend and the note.
     pub fn file(&self, heading: &str, legend: &[Entry]) -> String {
         let (above, mut x, mut y) = (24.0, LEFT, 0.0);
         let mut entries = String::new();
@@ -218,6 +246,10 @@ impl Plot {
             };
             _ = write!(entries, "{symbol}<text x=\"{:.1}\" y=\"{:.1}\">{}</text>", x + 17.0, at + 4.0, html(&entry.name));
             x += width;
+        }
+        for line in wrapped(&self.note, ((WIDTH - 2.0 * MARGIN) / CHARACTER) as usize) {
+            y += LEGEND_LINE;
+            _ = write!(entries, "<text x=\"{MARGIN}\" y=\"{:.1}\">{}</text>", above + HEIGHT + y + 12.0, html(&line));
         }
         let height = above + HEIGHT + y + LEGEND_LINE + 4.0;
         format!(
@@ -327,11 +359,20 @@ mod tests {
     fn a_plot_names_its_axes_and_escapes_its_hints() {
         let point = Point { x: 1.0, y: 30.0, y_range: Some((29.0, 31.0)), hint: "<b>".into() };
         let series = Series { colour: 0, marker: Some(2), line: true, points: vec![point] };
-        let plot = Plot { title: "a & b".into(), x: Axis::ranged("size (MB)"), y: Axis::linear("PSNR (dB)"), series: vec![series], front: vec![(1.0, 30.0)] };
+        let (x, y) = (Axis::ranged("size (MB)"), Axis::linear("PSNR (dB)"));
+        let plot = Plot { title: "a & b".into(), x, y, series: vec![series], front: vec![(1.0, 30.0)], note: "of <two> devices ".repeat(9) };
         let svg = plot.figure();
         for part in ["size (MB)", "PSNR (dB)", "a &amp; b", "&lt;b&gt;", "class=\"range\"", "class=\"onfront\""] {
             assert!(svg.contains(part), "{part} in {svg}");
         }
         assert!(!svg.contains("<b>") && !svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+        let file = plot.file("a", &[]);
+        assert!(svg.contains("</svg><p class=\"note\">of &lt;two&gt;") && file.matches("<text x=\"8\"").count() == 3 && !file.contains("<two>"), "{file}");
+    }
+
+    #[test]
+    fn lines_of_a_note_are_no_longer_than_there_is_room() {
+        assert_eq!(wrapped("one two  three abcdefghij k", 7), ["one two", "three", "abcdefg", "hij k"]);
+        assert!(wrapped(" ", 7).is_empty());
     }
 }

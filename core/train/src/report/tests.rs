@@ -133,6 +133,8 @@ fn times_of_trainings_on_other_devices_are_marked() {
     };
     let same = make(&cells);
     assert!(!same.markdown.contains("Training times") && !same.html.contains("Training times"), "{}", same.markdown);
+    let plots = |report: &Report, part: &str| report.figures.iter().filter(|(_, svg)| svg.contains(part)).map(|(name, _)| name.clone()).collect::<Vec<_>>();
+    assert!(plots(&same, "Training times").is_empty() && plots(&same, "class=\"onfront\"").contains(&"tiny-psnr-against-training-time.svg".to_string()));
     cells.iter_mut().filter(|c| c.axes.method == "cdf").for_each(|c| {
         let mut more = c.cost.training_devices[0].clone();
         more.device.threads = 8;
@@ -144,6 +146,15 @@ fn times_of_trainings_on_other_devices_are_marked() {
     assert!(notes == 1 && made.markdown.contains("do not compare") && !made.markdown.contains("**1.00"), "{}", made.markdown);
     assert!(made.html.contains("1.00 ±\u{a0}0.00 [1, 2]") && made.html.contains("3.00 ±\u{a0}0.00 [1]"), "{}", made.markdown);
     assert!(made.csv.lines().nth(1).unwrap().contains(" 1 threads; linux x86_64 + flex; "), "{}", made.csv);
+    // So are the plots of these times, and no others.
+    let marked = plots(&made, "Training times are wall times on [1] flex");
+    assert!(marked.contains(&"tiny-psnr-against-training-time.svg".to_string()) && marked.iter().all(|name| name.contains("time")), "{marked:?}");
+    assert!(
+        marked.contains(&"tiny-training-views-by-time-a-line-per-seed.svg".to_string()) && !marked.iter().any(|name| name.contains("frame-time")),
+        "{marked:?}"
+    );
+    assert!(!plots(&made, "class=\"onfront\"").contains(&marked[0]) && made.html.contains("Here: cdf [1, 2]; hexplane [1].</p>"), "{marked:?}");
+    assert!(made.html.contains(", trained on [1, 2]</title>"), "{}", made.markdown);
 }
 
 #[test]
@@ -174,7 +185,7 @@ fn profiles_of_a_codec_are_joined_to_a_curve() {
     // Lines of the plot of PSNR against size.
     let lines = |cells: &[CellResult]| {
         let scenes = rows(cells).unwrap();
-        let figures = charts::figures(&scenes["tiny"], &charts::Key::of(scenes.values().flatten()));
+        let figures = charts::figures(&scenes["tiny"], &charts::Key::of(scenes.values().flatten()), &TrainingDevices::of(cells));
         figures.split("Rate and distortion: PSNR").nth(2).unwrap().split("</svg>").next().unwrap().matches("class=\"line\"").count()
     };
     assert_eq!(lines(&cells), 2, "one per method");
