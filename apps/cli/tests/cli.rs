@@ -34,7 +34,7 @@ fn train_args<'a>(out: &'a str, iterations: &'a str) -> Vec<&'a str> {
 }
 
 #[test]
-fn plugins_are_listed_with_four_facts_each() {
+fn plugins_are_listed_with_their_facts() {
     let list = json_of(&["plugins", "--json"]);
     let list = list.as_array().unwrap();
     for (kind, name) in [("deformer", "cdf"), ("deformer", "none"), ("codec", "raw"), ("codec", "cca"), ("rasterizer", "tile"), ("rasterizer", "reference")] {
@@ -42,7 +42,7 @@ fn plugins_are_listed_with_four_facts_each() {
     }
     for plugin in list {
         let keys: Vec<&String> = plugin.as_object().unwrap().keys().collect();
-        assert_eq!(keys, ["kind", "name", "summary", "version"]);
+        assert_eq!(keys, ["cc4dgs", "kind", "name", "summary", "version"]);
         assert!(plugin.as_object().unwrap().values().all(|v| v.as_str().is_some_and(|s| !s.is_empty())), "{plugin}");
     }
     let cdf = json_of(&["plugins", "cdf", "--json"]);
