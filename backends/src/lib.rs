@@ -12,6 +12,7 @@ pub mod ops {
     pub mod adam;
     mod autodiff;
     pub mod basis;
+    pub mod columns;
     pub mod corners;
     pub mod field;
     pub mod image;
@@ -29,8 +30,10 @@ pub mod ops {
 pub mod cpu {
     pub mod adam;
     pub mod basis;
+    pub mod columns;
     pub mod cross_entropy;
     pub mod heads;
+    pub mod image;
     pub mod life;
     pub mod lookup;
     pub mod mlp;

@@ -3,7 +3,7 @@
 //! Each has a velocity and a [`Life`], and nothing else moves it. The mean of 1 - g, where g is the gate of a life, is penalised with the weight `gate_weight`, so
 //! that only what appears or moves becomes temporary.
 
-use crate::parts::lives::{Life, LifeSettings};
+use crate::parts::lives::{Life, LifeSettings, side_by_side};
 use burn::tensor::{Device, Tensor};
 use cc4dgs_backends::ops::life::LifeAt;
 use cc4dgs_core::{
@@ -79,7 +79,7 @@ impl Deformer for FreeTime {
     fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
         input.check("free-time", &self.attributes())?;
         let work = DeformerWork { gaussians: input.len() as u64, ..DeformerWork::default() };
-        Ok(SpatialFeatures { values: Tensor::cat(input.attributes.clone(), 1), work })
+        Ok(SpatialFeatures { values: side_by_side(input.attributes.clone()), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         Ok(self.deform_all(features, &[time_norm])?.pop().unwrap_or_default())

@@ -1,6 +1,6 @@
 //! `life = true` beside any deformer: its Gaussians have lives too, for what appears, vanishes or is too fast for it.
 
-use crate::parts::lives::Life;
+use crate::parts::lives::{Life, side_by_side};
 use burn::tensor::Tensor;
 use cc4dgs_backends::ops::life::{LifeAt, WIDTH};
 use cc4dgs_backends::ops::split::split;
@@ -50,7 +50,7 @@ impl WithLife {
         input.check("with lives", &self.attributes())?;
         let mut own = input.clone();
         let lives = own.attributes.split_off(own.attributes.len() - LIFE_ATTRIBUTES.len());
-        Ok((own, Tensor::cat(lives, 1)))
+        Ok((own, side_by_side(lives)))
     }
     /// The attributes of lives `[M,7]`, and the features of the inner deformer, which a static one does not have.
     fn divide_features(features: Tensor<2>) -> (Tensor<2>, Option<Tensor<2>>) {

@@ -1,6 +1,7 @@
 //! Images from 8-bit files to the planes a loss reads, and back. Devices with memory of their own get the bytes, a quarter of the floats.
 
 use super::limits::unread;
+use crate::cpu::image as kernel;
 use crate::cpu::tensor::CpuBackend;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, TensorMetadata, backend_extension};
@@ -19,7 +20,7 @@ pub trait ImageOps: Backend {
 
 impl<B: CpuBackend> ImageOps for B {
     fn planes(_like: FloatTensor<Self>, image: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
-        B::from_floats(image.to_planes(background), [3, image.height as usize, image.width as usize])
+        B::from_floats(kernel::planes(&image, background), [3, image.height as usize, image.width as usize])
     }
     fn words(planes: FloatTensor<Self>) -> IntTensor<Self> {
         let [height, width] = [1, 2].map(|d| planes.shape()[d]);

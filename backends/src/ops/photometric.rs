@@ -12,6 +12,10 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
+use rayon::prelude::*;
+
+/// Values per task where a gradient is scaled.
+const SCALED: usize = 65536;
 
 /// Blurred moments per channel: the largest array of the kernels for GPUs.
 pub(crate) const MOMENTS: u32 = 5;
@@ -70,7 +74,7 @@ impl<B: CpuBackend> PhotometricKernels for B {
         if factor == 1.0 {
             return gradient;
         }
-        B::update_floats(gradient, |values| values.iter_mut().for_each(|v| *v *= factor))
+        B::update_floats(gradient, |values| values.par_chunks_mut(SCALED).for_each(|values| values.iter_mut().for_each(|v| *v *= factor)))
     }
 }
 

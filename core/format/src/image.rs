@@ -35,14 +35,21 @@ impl Image8 {
     pub fn to_planes(&self, background: [f32; 3]) -> Vec<f32> {
         let pixels = (self.width * self.height) as usize;
         let mut planes = vec![0.0f32; 3 * pixels];
-        let c = self.channels as usize;
-        for (i, px) in self.data.chunks_exact(c).enumerate() {
-            let a = if c == 4 { f32::from(px[3]) / 255.0 } else { 1.0 };
-            for k in 0..3 {
-                planes[k * pixels + i] = a * f32::from(px[k]) / 255.0 + (1.0 - a) * background[k];
-            }
-        }
+        let (red, rest) = planes.split_at_mut(pixels);
+        let (green, blue) = rest.split_at_mut(pixels);
+        self.composite(0, background, [red, green, blue]);
         planes
+    }
+    /// Red, green and blue in 0..1 of the pixels from the index `from` on, as many as `out` has, alpha composited over `background`.
+    pub fn composite(&self, from: usize, background: [f32; 3], out: [&mut [f32]; 3]) {
+        let c = self.channels as usize;
+        let data = self.data.get(from * c..).unwrap_or_default();
+        let [red, green, blue] = out;
+        for (((px, red), green), blue) in data.chunks_exact(c).zip(red).zip(green).zip(blue) {
+            let a = if c == 4 { f32::from(px[3]) / 255.0 } else { 1.0 };
+            let over = |k: usize| a * f32::from(px[k]) / 255.0 + (1.0 - a) * background[k];
+            (*red, *green, *blue) = (over(0), over(1), over(2));
+        }
     }
     /// The RGB image of planes `[3,H,W]`: clamped to 0..1, `value * 255 + 0.5` truncated (the protocol of published tables).
     pub fn from_planes(planes: &[f32], width: u32, height: u32) -> Self {

@@ -5,6 +5,7 @@ use crate::parts::centres::check_time;
 use crate::parts::settings::not_negative;
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
+use cc4dgs_backends::ops::columns::beside;
 use cc4dgs_backends::ops::life::{LEAST_FALLOFF, LifeAt, LifeRules, lives};
 use cc4dgs_core::{AttributeSpec, Error, LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, Result, gate_value};
 use serde::{Deserialize, Serialize};
@@ -117,6 +118,11 @@ impl Life {
         let open = (self.settings.gate_weight > 0.0 && gates.dims()[0] > 0).then(|| sigmoid(gates.mul_scalar(LIFE_GATE_STEEPNESS)).mean());
         Some(open?.neg().add_scalar(1.0).mul_scalar(self.settings.gate_weight))
     }
+}
+
+/// The attributes of lives, in their order, side by side `[M,7]`.
+pub fn side_by_side(attributes: Vec<Tensor<2>>) -> Tensor<2> {
+    attributes.try_into().map_or_else(|attributes| Tensor::cat(attributes, 1), beside)
 }
 
 #[cfg(test)]

@@ -30,11 +30,11 @@ impl Statistics {
             let (x, y) = (axis(0, view.size.0), axis(1, view.size.1));
             let norm = (x.clone() * x + y.clone() * y).sqrt();
             let visible = view.radii.clone().greater_elem(0).float();
-            self.gradient_sum = self.gradient_sum.clone() + norm * visible.clone();
-            self.seen = self.seen.clone() + visible;
+            self.gradient_sum.inplace(|sum| sum + norm * visible.clone());
+            self.seen.inplace(|seen| seen + visible);
         }
         if let Some(weights) = &view.max_weights {
-            self.max_weight = self.max_weight.clone().max_pair(weights.clone());
+            self.max_weight.inplace(|largest| largest.max_pair(weights.clone()));
         }
     }
     /// Mean norm of the screen gradient over the views that saw a Gaussian; 0 where none did `[N]`.

@@ -78,7 +78,11 @@ pub fn refuse_other_content(path: &Path, kind: &str, is_kind: impl FnOnce(&[u8])
     if is_file && (head.is_empty() || is_kind(&head)) {
         return Ok(());
     }
-    Err(Error::parameter(path.display().to_string(), format!("it exists already and is not {kind}"), "Give another name, or remove it: other files are never replaced"))
+    Err(Error::parameter(
+        path.display().to_string(),
+        format!("it exists already and is not {kind}"),
+        "Give another name, or remove it: other files are never replaced",
+    ))
 }
 
 /// Refuses a `path` that may not be replaced.

@@ -209,7 +209,7 @@ impl DensityControl for Mcmc {
         // Up to 16,777,216 a float32 is exact; beyond, the budget of a resumed run differs by a row or two.
         arrays.push(("start".into(), Tensor::from_floats([self.start as f32], &device)));
         let rounds = Tensor::from_floats(self.weights.rounds.as_slice(), &device);
-        arrays.extend([("weights".into(), self.weights.sums.clone().flatten(0, 1)), ("rounds".into(), rounds)]);
+        arrays.extend([("weights".into(), self.weights.sums().flatten(0, 1)), ("rounds".into(), rounds)]);
         arrays
     }
     fn restore(&mut self, mut state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()> {
@@ -231,7 +231,7 @@ impl DensityControl for Mcmc {
         // Programs before relocation stored no weights.
         let weights = if stored {
             let (sums, rounds) = (take("weights", 3 * count)?.reshape([count, 3]), to_vec(take("rounds", count)?, "rounds")?);
-            Some(Weights { sums, rounds })
+            Some(Weights::restored(sums, rounds))
         } else {
             None
         };

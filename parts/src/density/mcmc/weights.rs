@@ -9,28 +9,43 @@ const MEMORY: f32 = 0.7;
 /// Rounds after which a Gaussian is judged by its blending weights: until then, halves are still fainter than they will be.
 const LEAST_ROUNDS: f32 = 3.0;
 
-/// What is remembered of the blending weights of N Gaussians.
+/// What is remembered of the blending weights of N Gaussians: sums over views, of which every round leaves a share to the next.
 pub(super) struct Weights {
-    /// Decaying sums over views: of the largest weight, of its square, of views that show the Gaussian `[N,3]`.
-    pub sums: Tensor<2>,
+    /// Of the largest weight `[N]`.
+    largest: Tensor<1>,
+    /// Of its square `[N]`.
+    squares: Tensor<1>,
+    /// Of views that show the Gaussian `[N]`.
+    shown: Tensor<1>,
     /// Rounds since the Gaussian was new `[N]`.
     pub rounds: Vec<f32>,
 }
 
 impl Weights {
     pub fn zeros(count: usize, device: &Device) -> Self {
-        Self { sums: Tensor::zeros([count, 3], device), rounds: vec![0.0; count] }
+        let zeros = || Tensor::zeros([count], device);
+        Self { largest: zeros(), squares: zeros(), shown: zeros(), rounds: vec![0.0; count] }
+    }
+    /// As [`Weights::sums`] and `rounds` returned them.
+    pub fn restored(sums: Tensor<2>, rounds: Vec<f32>) -> Self {
+        let column = |k| sums.clone().narrow(1, k, 1).squeeze_dim(1);
+        Self { largest: column(0), squares: column(1), shown: column(2), rounds }
+    }
+    /// The three sums side by side `[N,3]`.
+    pub fn sums(&self) -> Tensor<2> {
+        Tensor::stack(vec![self.largest.clone(), self.squares.clone(), self.shown.clone()], 1)
     }
     pub fn add(&mut self, view: &ViewStatistics) {
         if let Some(weights) = &view.max_weights {
-            let shown = view.radii.clone().greater_elem(0).float();
-            self.sums = self.sums.clone() + Tensor::stack::<2>(vec![weights.clone(), weights.clone() * weights.clone(), shown], 1);
+            self.largest.inplace(|sum| sum + weights.clone());
+            self.squares.inplace(|sum| sum + weights.clone() * weights.clone());
+            self.shown.inplace(|sum| sum + view.radii.clone().greater_elem(0).float());
         }
     }
     /// Of the rows that can be judged, at most so many with the smallest weights, the smallest first. Weights are averaged with themselves as shares: what is bright
     /// for a short time, or on one side, counts by that.
     pub fn smallest(&self, most: usize) -> Result<Vec<usize>> {
-        let sums = to_vec(self.sums.clone(), "blending weights")?;
+        let sums = to_vec(self.sums(), "blending weights")?;
         let weight = |row: usize| sums[3 * row + 1] / sums[3 * row].max(f32::MIN_POSITIVE);
         let mut rows: Vec<usize> = (0..self.rounds.len()).filter(|&row| self.rounds[row] >= LEAST_ROUNDS && sums[3 * row + 2] > 0.0).collect();
         rows.sort_by(|&a, &b| weight(a).total_cmp(&weight(b)).then(a.cmp(&b)));
@@ -39,10 +54,10 @@ impl Weights {
     }
     /// What the Gaussians of `plan` start the next round with; new ones with nothing.
     pub fn after(&self, plan: &DensityPlan, device: &Device) -> Result<Self> {
-        let (old, rows) = (to_vec(self.sums.clone(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
+        let (old, rows) = (to_vec(self.sums(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
         let of = |(&parent, &fresh): (&usize, &bool)| std::array::from_fn::<f32, 3, _>(|k| if fresh { 0.0 } else { MEMORY * old[3 * parent + k] });
         let sums = Tensor::from_data(TensorData::new(rows().flat_map(of).collect(), [plan.len(), 3]), device);
-        Ok(Self { sums, rounds: rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect() })
+        Ok(Self::restored(sums, rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect()))
     }
 }
 
