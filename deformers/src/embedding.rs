@@ -1,19 +1,22 @@
 //! The deformer of E-D3DGS: a learned vector per Gaussian and one per time, instead of coordinates, feed a coarse and a fine network (Bae et al. 2024).
 //!
-//! The table of times is resized and then read by linear interpolation: the coarse network sees few rows, the fine one all of them. The
-//! published code's time offsets per camera are omitted, because a model here has no cameras. So are two terms of its loss: the differences between the vectors of
-//! 20 nearest neighbours (weight 1; Technicolor 0.1), and the sigmoid of the mean opacity logit (weight 1e-4).
+//! The table of times is resized and then read by linear interpolation: the coarse network sees few rows, the fine one all of them. Neighbours shall have
+//! similar vectors. The published code compares every Gaussian with all of its 20 nearest, found when their number changed; this one compares random pairs of
+//! present neighbours. Its time offsets per camera are omitted, because a model here has no cameras. So is a term of its loss, the sigmoid of the mean opacity
+//! logit (weight 1e-4), because a deformer does not see opacities; the loss term `opacity`, the mean of the sigmoids, is near it.
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
+use crate::parts::neighbours::{PATCH, neighbour_pairs};
 use crate::parts::settings::{bounded, not_negative, within};
 use crate::parts::voxels::parameter;
 use crate::parts::weights;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
+use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures,
-    SpatialInput, config, inventory,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Seed,
+    SpatialFeatures, SpatialInput, config, inventory,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -26,6 +29,9 @@ rows_grow = 0.125        # share of training over which the fine network's rows 
 fade_in = 0.0125         # share of training over which offsets are faded in, at most 1/6; opacity, colour and scale start five such shares later (1,000 of 80,000)
 width = 128
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
+smooth_weight = 1.0      # weight of the differences between vectors of neighbours; 0 is off (published: 1, Technicolor 0.1)
+smooth_neighbours = 20   # the nearest Gaussians that count as neighbours
+smooth_falloff = 2000.0  # differences count exp(-smooth_falloff d^2 / 2) at distance d (published: 2000, d in units of the dataset; here in world units)
 gaussian_lr = 2.5e-3     # Adam on the vectors of Gaussians
 lr_start = 1.6e-4        # Adam on everything else, times the extent of the cameras, log-linear to lr_end
 lr_end = 1.6e-5
@@ -35,6 +41,9 @@ lr_end = 1.6e-5
 const LATER: f32 = 5.0;
 /// Largest `fade_in`: all heads are faded in when training ends.
 const MOST_FADE_IN: f32 = 1.0 / (LATER + 1.0);
+
+/// Added to squared differences of vectors: the root has no gradient at 0. As published.
+const LEAST_SQUARE: f32 = 1e-20;
 
 /// Name of the extra attribute.
 const ATTRIBUTE: &str = "embedding";
@@ -50,6 +59,9 @@ struct Settings {
     fade_in: f32,
     width: usize,
     heads: Vec<Head>,
+    smooth_weight: f64,
+    smooth_neighbours: usize,
+    smooth_falloff: f64,
     gaussian_lr: f64,
     lr_start: f64,
     lr_end: f64,
@@ -66,6 +78,9 @@ impl Default for Settings {
             fade_in: 0.0125,
             width: 128,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions, Head::Opacity, Head::Sh],
+            smooth_weight: 1.0,
+            smooth_neighbours: 20,
+            smooth_falloff: 2000.0,
             gaussian_lr: 2.5e-3,
             lr_start: 1.6e-4,
             lr_end: 1.6e-5,
@@ -79,6 +94,8 @@ struct Embedding {
     sh_degree: usize,
     network: Arc<ReluShape>,
     parameters: Vec<Parameter>,
+    /// Of the pairs of neighbours.
+    seed: Seed,
     /// Progress of the main stage, 0..1.
     progress: f32,
 }
@@ -97,6 +114,8 @@ impl Embedding {
             let problem = format!("{} is not in 0..1/6: opacity, colour and scale would not be faded in when training ends", settings.fade_in);
             return Err(Error::parameter("deformer.fade_in", problem, "Give a share from 0 to 1/6"));
         }
+        within("smooth_neighbours", settings.smooth_neighbours, 1, PATCH - 1)?;
+        not_negative(&[("smooth_weight", settings.smooth_weight), ("smooth_falloff", settings.smooth_falloff)])?;
         not_negative(&[("gaussian_lr", settings.gaussian_lr), ("lr_start", settings.lr_start), ("lr_end", settings.lr_end)])?;
         heads::check(&settings.heads)?;
         let (w, input) = (settings.width, settings.gaussian_features + settings.time_features);
@@ -117,7 +136,7 @@ impl Embedding {
             }
             parameters.push(parameter(format!("net.{name}"), Part::Net, 0, values, device));
         }
-        Ok(Self { sh_degree: context.sh_degree, network: Arc::new(network), parameters, settings, progress: 1.0 })
+        Ok(Self { sh_degree: context.sh_degree, network: Arc::new(network), parameters, settings, seed: seed.child("neighbours"), progress: 1.0 })
     }
     /// The row `[1, F]` at `time_norm` of the table resized to `rows` rows, corners aligned.
     fn time_row(&self, time_norm: f32, rows: usize) -> Tensor<2> {
@@ -190,6 +209,26 @@ impl Deformer for Embedding {
         });
         Ok(heads::offsets(&self.settings.heads, faded.collect(), self.sh_degree))
     }
+    /// `smooth_weight` times the mean of sqrt(exp(-smooth_falloff d²) |z_i - z_j|² + 1e-20) over up to 2,048 random pairs of neighbours i and j, with the vectors
+    /// z, at the distance d; see [`neighbour_pairs`]. It reads the centres back, and its time is linear in their number.
+    fn regularizer(&self, input: &SpatialInput, _time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
+        let s = &self.settings;
+        let Some(vectors) = input.attributes.first().filter(|_| s.smooth_weight > 0.0 && input.len() > 1) else { return Ok(None) };
+        let means = to_vec(input.means_world.clone(), "centres")?;
+        let points: Vec<[f32; 3]> = means.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+        let pairs = neighbour_pairs(&points, s.smooth_neighbours, self.seed.index(u64::from(progress.to_bits())));
+        let count = pairs.len();
+        if count == 0 {
+            return Ok(None);
+        }
+        let device = vectors.device();
+        let select = |rows: Vec<i64>| vectors.clone().select(0, Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), &device));
+        let difference = select(pairs.iter().map(|pair| i64::from(pair.first)).collect()) - select(pairs.iter().map(|pair| i64::from(pair.second)).collect());
+        let near: Vec<f32> = pairs.iter().map(|pair| (-s.smooth_falloff * f64::from(pair.squared)).exp() as f32).collect();
+        let near = Tensor::<2>::from_data(TensorData::new(near, [count, 1]), &device);
+        let squares = (difference.clone() * difference).sum_dim(1) * near;
+        Ok(Some(squares.add_scalar(LEAST_SQUARE).sqrt().mean().mul_scalar(s.smooth_weight)))
+    }
     fn set_progress(&mut self, progress: f32) {
         self.progress = progress;
     }
@@ -211,7 +250,57 @@ fn build(section: &toml::Table, context: &DeformerContext, device: &Device) -> R
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cc4dgs_core::Seed;
+
+    /// A field with two floats per Gaussian whose term of neighbours has the weight `smooth_weight`.
+    fn smooth(smooth_weight: f64) -> Embedding {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let settings = Settings { gaussian_features: 2, time_features: 4, width: 4, smooth_weight, ..Settings::default() };
+        Embedding::new(settings, &context, &Device::flex()).unwrap()
+    }
+
+    /// The term of `field` and its gradient by the vectors, for Gaussians on the x axis with two floats each. `None` where there is no term.
+    fn term(field: &Embedding, x: &[f32], vectors: &[f32], progress: f32) -> Option<(f32, Vec<f32>)> {
+        let device = Device::flex().autodiff();
+        let means: Vec<f32> = x.iter().flat_map(|&x| [x, 0.0, 0.0]).collect();
+        let means_world = Tensor::<2>::from_data(TensorData::new(means, [x.len(), 3]), &device);
+        let vectors = Tensor::<2>::from_data(TensorData::new(vectors.to_vec(), [x.len(), 2]), &device).require_grad();
+        let term = field.regularizer(&SpatialInput { means_world, attributes: vec![vectors.clone()] }, 0.5, progress).unwrap()?;
+        let gradient = vectors.grad(&term.backward()).unwrap();
+        Some((to_vec(term, "term").unwrap()[0], to_vec(gradient, "gradient").unwrap()))
+    }
+
+    #[test]
+    fn neighbours_with_equal_vectors_cost_nothing() {
+        let x: Vec<f32> = (0..30).map(|i| 0.01 * (i / 2) as f32).collect();
+        let (value, gradient) = term(&smooth(1.0), &x, &[0.3; 60], 0.5).unwrap();
+        assert!(value < 1e-9 && gradient.iter().all(|&g| g == 0.0), "{value}: {gradient:?}");
+    }
+
+    #[test]
+    fn neighbours_with_different_vectors_cost_what_the_formula_says() {
+        // The vectors are 0.5 apart; at 0.01, half of the falloff's exponent is -0.1.
+        let (value, gradient) = term(&smooth(0.8), &[0.2, 0.21], &[0.1, 0.0, 0.4, 0.4], 0.5).unwrap();
+        let near = (-0.1f32).exp();
+        assert!((value - 0.8 * near * 0.5).abs() < 1e-4, "{value}");
+        for (found, wanted) in gradient.iter().zip([-0.6, -0.8, 0.6, 0.8]) {
+            assert!((found - 0.8 * near * wanted).abs() < 1e-3, "{gradient:?}");
+        }
+        let (far, _) = term(&smooth(0.8), &[0.0, 9.0], &[0.1, 0.0, 0.4, 0.4], 0.5).unwrap();
+        assert!(far < 1e-9, "{far}");
+        // Duplicates of the same Gaussian, and one that is nowhere.
+        let (value, gradient) = term(&smooth(1.0), &[0.2, 0.2, f32::NAN], &[0.0, 0.0, 3.0, 4.0, 7.0, 7.0], 0.5).unwrap();
+        assert!((value - 5.0).abs() < 1e-4 && gradient.iter().all(|g| g.is_finite()) && gradient[4..] == [0.0, 0.0], "{value}: {gradient:?}");
+    }
+
+    #[test]
+    fn pairs_of_neighbours_follow_from_seed_and_progress() {
+        let x: Vec<f32> = (0..100).map(|i| 1e-3 * i as f32).collect();
+        let vectors: Vec<f32> = (0..200).map(|i| (0.7 * i as f32).sin()).collect();
+        let at = |progress: f32| term(&smooth(1.0), &x, &vectors, progress).unwrap();
+        assert_eq!(at(0.25), at(0.25));
+        assert_ne!(at(0.25).0, at(0.5).0);
+        assert!(term(&smooth(0.0), &x, &vectors, 0.5).is_none() && term(&smooth(1.0), &[0.0], &[1.0, 1.0], 0.5).is_none());
+    }
 
     #[test]
     fn rows_grow_and_changes_come_in_with_progress() {
@@ -250,7 +339,7 @@ inventory::submit! {
             summary: "learned vectors per Gaussian and per time, a coarse and a fine network",
             paper: "E-D3DGS (Bae et al. 2024)",
             schema: SCHEMA,
-            capabilities: &["differentiable", "starts-as-identity", "per-gaussian-attributes"],
+            capabilities: &["differentiable", "starts-as-identity", "per-gaussian-attributes", "regularized"],
         },
         build,
     }

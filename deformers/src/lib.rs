@@ -52,7 +52,7 @@ mod tests {
             ("hexplane", "lr_start lr_end grid_rate tv_space tv_time time_one"),
             ("grid4d", "lr_start lr_end lr_grid_start lr_grid_end smooth_weight smooth_delta"),
             ("swift4d-hash", "lr_start lr_end"),
-            ("embedding", "lr_start lr_end gaussian_lr"),
+            ("embedding", "lr_start lr_end gaussian_lr smooth_weight smooth_falloff"),
             ("deform-mlp", "lr_start lr_end"),
             ("native-4d", "time_lr duration_lr velocity_lr color_lr"),
             ("free-time", "center_lr width_lr gate_lr velocity_lr gate_weight"),

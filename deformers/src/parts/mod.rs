@@ -3,6 +3,7 @@
 pub mod centres;
 pub mod heads;
 pub mod lives;
+pub mod neighbours;
 pub mod settings;
 pub mod voxels;
 pub mod weights;
