@@ -1,11 +1,13 @@
 //! The player in a browser: what the page's JavaScript calls. Gestures, buttons and fetching are the page's, everything else is here.
 
+mod capture;
 mod download;
 
 use crate::render::{Frame, functions};
 use crate::{Clock, Content, Mode, Navigator, Renderer, Scene, View, request_device};
+use capture::Capture;
 use cc4dgs_format::playback::Head;
-use cc4dgs_format::{Camera, Error, Image8, Limits, StreamStage};
+use cc4dgs_format::{Camera, Error, Limits, StreamStage};
 use download::Download;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -375,30 +377,5 @@ impl Player {
                 renderer.count_visible(move |count| drop(resolve.call1(&JsValue::NULL, &count.into())));
             }
         })
-    }
-}
-
-/// The pixels of a view.
-#[wasm_bindgen]
-pub struct Capture {
-    image: Image8,
-}
-
-#[wasm_bindgen]
-impl Capture {
-    /// Pixels per row.
-    #[wasm_bindgen(getter)]
-    pub fn width(&self) -> u32 {
-        self.image.width
-    }
-    /// Rows.
-    #[wasm_bindgen(getter)]
-    pub fn height(&self) -> u32 {
-        self.image.height
-    }
-    /// Red, green, blue, 255 per pixel.
-    #[wasm_bindgen(getter)]
-    pub fn rgba(&self) -> wasm_bindgen::Clamped<Vec<u8>> {
-        wasm_bindgen::Clamped(self.image.data.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect())
     }
 }
