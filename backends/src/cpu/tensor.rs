@@ -8,6 +8,7 @@ use burn::backend::ndarray::NdArrayTensor;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Flex};
 use burn::tensor::{DType, Shape, TensorData};
+use rayon::prelude::*;
 use std::borrow::Cow;
 
 /// A backend whose tensors live in host memory.
@@ -26,11 +27,34 @@ pub trait CpuBackend: Backend {
     fn from_ints(values: Vec<i64>, shape: impl Into<Shape>) -> IntTensor<Self>;
 }
 
+/// Rows per task of [`row_major`].
+const ROWS: usize = 64;
+
+/// The matrix of `rows` rows that is stored as `columns`, row by row.
+fn row_major(columns: &[f32], rows: usize) -> Vec<f32> {
+    let mut out = vec![0.0f32; columns.len()];
+    if columns.is_empty() {
+        return out;
+    }
+    let width = columns.len() / rows;
+    out.par_chunks_mut(ROWS * width).enumerate().for_each(|(block, out)| {
+        for (c, column) in columns.chunks_exact(rows).enumerate() {
+            for (row, value) in out.chunks_exact_mut(width).zip(&column[block * ROWS..]) {
+                row[c] = *value;
+            }
+        }
+    });
+    out
+}
+
 impl CpuBackend for Flex {
     fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]> {
         match tensor.as_slice::<f32>() {
             Some(slice) => Cow::Borrowed(slice),
-            None => Cow::Owned(tensor.to_contiguous().storage::<f32>().to_vec()),
+            None => match Self::columns(tensor) {
+                Some(columns) => Cow::Owned(row_major(columns, tensor.layout().shape()[0])),
+                None => Cow::Owned(tensor.to_contiguous().storage::<f32>().to_vec()),
+            },
         }
     }
     fn columns(tensor: &FloatTensor<Self>) -> Option<&[f32]> {
@@ -101,5 +125,20 @@ impl CpuBackend for NdArray {
     }
     fn from_ints(values: Vec<i64>, shape: impl Into<Shape>) -> IntTensor<Self> {
         NdArrayTensor::from_data(TensorData::new(values, shape.into()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_become_rows() {
+        for (rows, width) in [(1, 1), (3, 5), (200, 7), (65, 1)] {
+            let columns: Vec<f32> = (0..rows * width).map(|i| i as f32).collect();
+            let expected: Vec<f32> = (0..rows * width).map(|i| columns[i % width * rows + i / width]).collect();
+            assert_eq!(row_major(&columns, rows), expected, "{rows}x{width}");
+        }
+        assert!(row_major(&[], 0).is_empty());
     }
 }

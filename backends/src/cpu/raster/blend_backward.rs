@@ -33,6 +33,9 @@ pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, works
             let counted = if absolute { entries.clone() } else { 0..0 };
             (records.slice(entries.start, entries.len()), absolute_sums.slice(counted.start, counted.len()))
         };
+        if entries.is_empty() {
+            return;
+        }
         let list = &list[entries];
         let pixels = tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS;
         let mut state = TileGradient::new(origin, settings, background, upstream, &transmittance[pixels.clone()]);
