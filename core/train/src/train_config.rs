@@ -70,8 +70,8 @@ pub struct TrainConfig {
     pub flicker_threshold: f32,
     /// Half-width of the smoothness perturbation, normalised units (the paper's delta).
     pub smooth_delta: f32,
-    /// Weight of the strain of neighbouring moving Gaussians: the squared change of their distance as a share of the canonical one, at the
-    /// time of one view per iteration; 0 is off.
+    /// Weight of the strain of neighbouring moving Gaussians: s^2 / (1 + s^2) of the change s of their distance as a share of the canonical
+    /// one, at the time of one view per iteration; 0 is off.
     pub strain: f32,
     /// Dynamic-score threshold (the paper's zeta).
     pub zeta: f32,

@@ -1,5 +1,6 @@
 //! Strain: neighbouring Gaussians should keep their distance while they move. Normalised by the canonical distance, as in "Incoherent Deformation"
-//! (arXiv 2604.16747), where the plain difference of distances gained nothing. Rotations and translations cost nothing.
+//! (arXiv 2604.16747), where the plain difference of distances gained nothing. Rotations and translations cost nothing. Unlike there, the penalty is bounded: with
+//! squares alone, two things that are neighbours in the canonical space and part later held each other.
 
 use crate::knn::nearest;
 use burn::tensor::{Device, Int, Tensor, TensorData};
@@ -60,12 +61,14 @@ impl Neighbours {
     pub fn means(&self) -> &[f32] {
         &self.means
     }
-    /// Mean over the pairs of the squared change of their distance, as a share of the canonical one. `offsets` are those of the centres `[M,3]`.
+    /// Mean over the pairs of s^2 / (1 + s^2), with the change s of their distance as a share of the canonical one: squared where it is small, bounded where neighbours
+    /// belong to things that part (Geman and McClure's function). `offsets` are those of the centres `[M,3]`.
     pub fn strain(&self, offsets: Tensor<2>) -> Tensor<1> {
         let difference = offsets.clone().select(0, self.first.clone()) - offsets.select(0, self.second.clone());
         let apart = Tensor::from_inner(self.directions.clone()) + difference * Tensor::from_inner(self.inverse.clone());
         let stretch = (apart.clone() * apart).sum_dim(1).clamp_min(LEAST).sqrt().sub_scalar(1.0);
-        (stretch.clone() * stretch).mean()
+        let squares = stretch.clone() * stretch;
+        (squares.clone() / squares.add_scalar(1.0)).mean()
     }
 }
 
@@ -93,7 +96,9 @@ mod tests {
         let (sin, cos) = 0.7f32.sin_cos();
         assert!(strain(&|[x, y, z]| [cos * x - sin * y + 4.0, sin * x + cos * y, z - 2.0]) < 1e-9);
         let stretched = strain(&|[x, y, z]| [1.1 * x, 1.1 * y, 1.1 * z]);
-        assert!((stretched - 0.01).abs() < 1e-4, "{stretched}");
+        assert!((stretched - 0.01 / 1.01).abs() < 1e-4, "{stretched}");
+        let apart = strain(&|[x, y, z]| [100.0 * x, 100.0 * y, 100.0 * z]);
+        assert!((0.99..=1.0).contains(&apart), "{apart}");
         assert!(Neighbours::of(&[0.0; 3], &Device::flex()).is_none() && Neighbours::of(&[f32::NAN; 6], &Device::flex()).is_none());
     }
 }
