@@ -63,7 +63,7 @@ const BLUR: f64 = 0.1;
 /// Share of a short run with smaller images where one camera at a time sees everything move: as good after as many iterations, which take up to 40 % less time.
 /// A long one with 100,000 Gaussians got worse while its images were small.
 const IMAGE_GROWTH: f64 = 0.5;
-/// Weight of strain where one camera at a time sees everything move, from unrelated poses.
+/// Weight of strain where one camera at a time sees everything move, from unrelated poses: 0.3 dB on mutant.
 const STRAIN: f64 = 0.03;
 /// Up to so many Gaussians, means learn at their full rate. With 86,000 and more, training views of mutant got worse for a thousand iterations.
 const FULL_RATE_GAUSSIANS: f64 = 15_000.0;
