@@ -56,20 +56,6 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
         let list = &list[entries];
         // SAFETY: every tile has its own part of these.
         let (transmittance, stop_at) = unsafe { (transmittance.slice(tile * TILE_PIXELS, TILE_PIXELS), stop_at.slice(tile * TILE_PIXELS, TILE_PIXELS)) };
-        let width = TILE.min(settings.width - origin[0]);
-        let rows = 0..TILE.min(settings.height - origin[1]);
-        let start_of_row = |row: usize| (origin[1] + row) * settings.width + origin[0];
-        if list.is_empty() {
-            // SAFETY: as above. `planes` starts as zeros, which alpha and depth stay.
-            unsafe {
-                (ends.slice(tile, 1)[0], stops.slice(tile, 1)[0]) = (0, 0);
-                for row in rows {
-                    background.into_iter().enumerate().for_each(|(c, shown)| planes.slice(c * pixels + start_of_row(row), width).fill(shown));
-                }
-            }
-            transmittance.fill(1.0);
-            return;
-        }
         let mut state = TileState::new(origin, settings, stop_at);
         if settings.max_weights {
             dispatch(BlendTile::<true> { ranked, list, origin, rules, state: &mut state, weights, ends_early });
@@ -87,8 +73,9 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
             let running = state.running[pixel];
             *left = if running.is_nan() { state.stopped[pixel] } else { running };
         }
-        for row in rows {
-            let from = start_of_row(row);
+        let width = TILE.min(settings.width - origin[0]);
+        for row in 0..TILE.min(settings.height - origin[1]) {
+            let from = (origin[1] + row) * settings.width + origin[0];
             for plane in 0..PLANES {
                 // SAFETY: pixels belong to one tile.
                 let out = unsafe { planes.slice(plane * pixels + from, width) };
