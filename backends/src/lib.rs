@@ -24,6 +24,7 @@ pub mod ops {
     mod shared;
     pub mod sort;
     pub mod split;
+    pub mod view_sums;
 }
 
 /// Plain-slice kernels (rayon and SIMD) that serve every CPU backend.
@@ -44,6 +45,7 @@ pub mod cpu {
     pub mod sort;
     pub mod tensor;
     pub mod vertex;
+    pub mod view_sums;
 }
 
 /// Kernels for burn's CubeCL backend: one source for wgpu and CUDA.
@@ -62,6 +64,7 @@ mod cube {
     mod raster;
     mod sort;
     pub(crate) mod tensor;
+    mod view_sums;
 
     pub use tensor::{cap_bindings, cap_shared_memory};
 }

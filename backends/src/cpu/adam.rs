@@ -12,9 +12,9 @@ const CHUNK: usize = 16 << 10;
 /// From this width on, runs of selected rows are updated one after the other; narrower rows are masked element by element.
 const WIDE_ROW: usize = 16;
 
-/// One step in place over rows of `width` elements. Rows whose entry in `rows` is false are unchanged, moments included; so are
+/// One step in place over rows of `width` elements. Rows whose entry in `rows` is 0 are unchanged, moments included; so are
 /// rows with a gradient that is not finite. Returns the number of the latter.
-pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width: usize, rows: Option<&[bool]>, scalars: &AdamScalars) -> u64 {
+pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width: usize, rows: Option<&[i64]>, scalars: &AdamScalars) -> u64 {
     if param.is_empty() || width == 0 {
         return 0;
     }
@@ -25,12 +25,12 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
     chunks.enumerate().for_each(|(i, (((p, m), v), g))| {
         let visible = rows.map(|rows| &rows[i * rows_per_chunk..][..p.len() / width]);
         let finite = dispatch(AllFinite(g));
-        if finite && visible.is_none_or(|rows| rows.iter().all(|&r| r)) {
+        if finite && visible.is_none_or(|rows| rows.iter().all(|&r| r != 0)) {
             return dispatch(Update { p, m, v, g, keep: None, scalars });
         }
         let mut bad = 0;
         let mut wanted = |row: usize| {
-            let visible = visible.is_none_or(|rows| rows[row]);
+            let visible = visible.is_none_or(|rows| rows[row] != 0);
             let row_finite = finite || g[row * width..][..width].iter().all(|v| v.is_finite());
             bad += u64::from(visible && !row_finite);
             visible && row_finite

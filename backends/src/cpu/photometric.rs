@@ -82,7 +82,7 @@ fn copy_padded(to: &mut [f32], row: &[f32]) {
     to[row.len()..].fill(0.0);
 }
 
-/// The loss terms of `image` against `target`, both planar `[channels, height, width]`. With `gradient` `[channels, height, width]`,
+/// The loss terms of `image` against `target`, both planar `[channels, height, width]`. To `gradient` `[channels, height, width]`, which holds zeros, it
 /// writes d(lambda_c * l1 + (1 - lambda_c) * (1 - ssim)) / d image there; the derivative of |0| is 0.
 pub fn photometric(
     image: &[f32],
@@ -163,12 +163,9 @@ impl Sweep {
     }
 }
 
-/// Row sums of |x - y|, SSIM and (x - y)^2 of one plane, and its gradient.
-fn one_channel(image: &[f32], target: &[f32], sweep: &Sweep, (l1_scale, ssim_scale): (f32, f32), mut gradient: Option<&mut [f32]>) -> Vec<[f64; 3]> {
+/// Row sums of |x - y|, SSIM and (x - y)^2 of one plane, and its gradient where it may differ from 0.
+fn one_channel(image: &[f32], target: &[f32], sweep: &Sweep, (l1_scale, ssim_scale): (f32, f32), gradient: Option<&mut [f32]>) -> Vec<[f64; 3]> {
     let (rows, width) = (sweep.rows.len(), sweep.columns.len());
-    if let Some(gradient) = gradient.as_deref_mut() {
-        gradient.fill(0.0);
-    }
     if rows == 0 {
         return Vec::new();
     }

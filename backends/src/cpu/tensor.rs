@@ -17,8 +17,8 @@ pub trait CpuBackend: Backend {
     fn floats(tensor: &FloatTensor<Self>) -> Cow<'_, [f32]>;
     /// The elements of a matrix column by column, if they are stored that way (as in the transposed view of a row-major matrix).
     fn columns(tensor: &FloatTensor<Self>) -> Option<&[f32]>;
-    /// The integer elements, row-major.
-    fn ints(tensor: &IntTensor<Self>) -> Vec<i64>;
+    /// The integer elements, row-major; borrowed when the tensor is contiguous and stores 64 bits.
+    fn ints(tensor: &IntTensor<Self>) -> Cow<'_, [i64]>;
     /// Changes the elements in place if the tensor has no other owner, in a copy otherwise.
     fn update_floats(tensor: FloatTensor<Self>, change: impl FnOnce(&mut [f32])) -> FloatTensor<Self>;
     /// A tensor that owns `values`, row-major; no copy.
@@ -63,12 +63,15 @@ impl CpuBackend for Flex {
         let from = layout.start_offset();
         (apart == rows as isize).then(|| tensor.storage::<f32>().get(from..from + rows * columns)).flatten()
     }
-    fn ints(tensor: &IntTensor<Self>) -> Vec<i64> {
+    fn ints(tensor: &IntTensor<Self>) -> Cow<'_, [i64]> {
+        if let Some(slice) = tensor.as_slice::<i64>() {
+            return Cow::Borrowed(slice);
+        }
         let tensor = tensor.to_contiguous();
-        match tensor.dtype() {
+        Cow::Owned(match tensor.dtype() {
             DType::I32 => tensor.storage::<i32>().iter().map(|&v| i64::from(v)).collect(),
             _ => tensor.storage::<i64>().to_vec(),
-        }
+        })
     }
     fn update_floats(mut tensor: FloatTensor<Self>, change: impl FnOnce(&mut [f32])) -> FloatTensor<Self> {
         let len = tensor.layout().shape().num_elements();
@@ -102,10 +105,13 @@ impl CpuBackend for NdArray {
         let view = storage.view();
         (view.ndim() == 2).then(|| view.reversed_axes().to_slice()).flatten()
     }
-    fn ints(tensor: &IntTensor<Self>) -> Vec<i64> {
+    fn ints(tensor: &IntTensor<Self>) -> Cow<'_, [i64]> {
         match tensor {
-            NdArrayTensor::I64(storage) => storage.view().iter().copied().collect(),
-            NdArrayTensor::I32(storage) => storage.view().iter().map(|&v| i64::from(v)).collect(),
+            NdArrayTensor::I64(storage) => {
+                let view = storage.view();
+                view.to_slice().map_or_else(|| Cow::Owned(view.iter().copied().collect()), Cow::Borrowed)
+            }
+            NdArrayTensor::I32(storage) => Cow::Owned(storage.view().iter().map(|&v| i64::from(v)).collect()),
             other => panic!("ndarray: expected integers, got {:?}", burn::backend::TensorMetadata::dtype(other)),
         }
     }

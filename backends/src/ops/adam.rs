@@ -97,7 +97,7 @@ fn step_on_cpu<B: CpuBackend>(
 ) -> Moved<B> {
     let shape = param.shape();
     let width = shape.num_elements().checked_div(shape[0]).unwrap_or(0);
-    let rows: Option<Vec<bool>> = visible.map(|visible| B::ints(&visible).into_iter().map(|v| v != 0).collect());
+    let rows = visible.as_ref().map(|visible| B::ints(visible));
     let grad = B::floats(&grad);
     let (mut moments, mut skipped) = ((None, None), 0);
     let param = B::update_floats(param, |p| {

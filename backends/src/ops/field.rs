@@ -64,7 +64,7 @@ pub trait FieldOps: Backend {
 }
 
 fn unsigned<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<u32> {
-    B::ints(tensor).into_iter().map(|v| v as u32).collect()
+    B::ints(tensor).iter().map(|&v| v as u32).collect()
 }
 
 fn triples<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<[u32; 3]> {

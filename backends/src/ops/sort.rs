@@ -17,7 +17,7 @@ pub trait SortOps: Backend {
 impl<B: CpuBackend> SortOps for B {
     fn order(keys: IntTensor<Self>, bits: u32) -> IntTensor<Self> {
         let bound = 1u64 << bits;
-        let keys: Vec<u32> = B::ints(&keys).into_iter().map(|k| (k as u32 as u64 % bound) as u32).collect();
+        let keys: Vec<u32> = B::ints(&keys).iter().map(|&k| (k as u32 as u64 % bound) as u32).collect();
         let order: Vec<i64> = stable_order(&keys, bound).into_iter().map(i64::from).collect();
         let n = order.len();
         B::from_ints(order, [n])

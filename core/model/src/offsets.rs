@@ -258,8 +258,18 @@ fn select<const D: usize>(values: &Tensor<D>, rows: Option<&Tensor<1, Int>>, cou
     match rows {
         None if count == values.dims()[0] => values.clone(),
         None => values.clone().narrow(0, 0, count),
-        Some(rows) => values.clone().select(0, rows.clone()),
+        Some(rows) => {
+            let mut dims = values.dims();
+            dims[0] = rows.dims()[0];
+            as_rows(values.clone()).select(0, rows.clone()).reshape(dims)
+        }
     }
+}
+
+/// `[N,…]` as a matrix `[N, rest]`: burn's CPU back end copies rows of matrices, and single elements of all other shapes.
+fn as_rows<const D: usize>(values: Tensor<D>) -> Tensor<2> {
+    let dims = values.dims();
+    values.reshape([dims[0], dims[1..].iter().product()])
 }
 
 /// `base` `[N,…]` with its first rows replaced by `first` `[M,…]`.
@@ -277,7 +287,10 @@ fn add<const D: usize>(base: Tensor<D>, offset: Option<Tensor<D>>, rows: Option<
     let Some(offset) = offset else { return base };
     let (m, n) = (offset.dims()[0], base.dims()[0]);
     match rows {
-        Some(rows) => base.select_assign(0, rows.clone(), offset, burn::tensor::IndexingUpdateOp::Add),
+        Some(rows) => {
+            let dims = base.dims();
+            as_rows(base).select_assign(0, rows.clone(), as_rows(offset), burn::tensor::IndexingUpdateOp::Add).reshape(dims)
+        }
         None if m == n => base + offset,
         None if m == 0 => base,
         None => Tensor::cat(vec![base.clone().narrow(0, 0, m) + offset, base.narrow(0, m, n - m)], 0),

@@ -35,4 +35,5 @@ mod session;
 mod shortcuts;
 mod sort;
 mod tuning;
+mod view_sums;
 mod watchdog;

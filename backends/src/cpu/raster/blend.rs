@@ -4,7 +4,7 @@ use super::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
 use super::{RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
-use crate::cpu::simd::{Lanes, dispatch, prefetch};
+use crate::cpu::simd::{Lanes, dispatch, prefetch, vectorized};
 use pulp::{Simd, WithSimd};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -68,27 +68,12 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
             ends.slice(tile, 1)[0] = state.end;
             stops.slice(tile, 1)[0] = u32::from(state.stops);
         }
-        for (pixel, left) in transmittance.iter_mut().enumerate() {
-            // A running transmittance of NaN marks a stopped pixel.
-            let running = state.running[pixel];
-            *left = if running.is_nan() { state.stopped[pixel] } else { running };
-        }
-        let width = TILE.min(settings.width - origin[0]);
-        for row in 0..TILE.min(settings.height - origin[1]) {
-            let from = (origin[1] + row) * settings.width + origin[0];
-            for plane in 0..PLANES {
-                // SAFETY: pixels belong to one tile.
-                let out = unsafe { planes.slice(plane * pixels + from, width) };
-                for (x, value) in out.iter_mut().enumerate() {
-                    let pixel = row * TILE + x;
-                    *value = match plane {
-                        3 => 1.0 - transmittance[pixel],
-                        4 => state.sums[3][pixel],
-                        c => state.sums[c][pixel] + transmittance[pixel] * background[c],
-                    };
-                }
-            }
-        }
+        // SAFETY: pixels belong to one tile.
+        let rows = |plane: usize, from: usize, width: usize| unsafe { planes.slice(plane * pixels + from, width) };
+        vectorized(
+            #[inline(always)]
+            || state.finish(origin, settings, background, transmittance, rows),
+        );
     });
     evaluations.into_inner()
 }
@@ -147,6 +132,36 @@ impl<'a> TileState<'a> {
             }
         }
         state
+    }
+    /// Saves the transmittance that is left, and writes the tile's pixels. `rows(plane, from, width)` are pixels of the image.
+    #[inline(always)]
+    fn finish<'p>(
+        &self,
+        origin: [usize; 2],
+        settings: &RasterSettings,
+        background: [f32; 3],
+        transmittance: &mut [f32],
+        rows: impl Fn(usize, usize, usize) -> &'p mut [f32],
+    ) {
+        for ((left, running), stopped) in transmittance.iter_mut().zip(&self.running).zip(&self.stopped) {
+            // A running transmittance of NaN marks a stopped pixel.
+            *left = if running.is_nan() { *stopped } else { *running };
+        }
+        let width = TILE.min(settings.width - origin[0]);
+        for row in 0..TILE.min(settings.height - origin[1]) {
+            let from = (origin[1] + row) * settings.width + origin[0];
+            let at = row * TILE..row * TILE + width;
+            let transmittance = &transmittance[at.clone()];
+            for (c, background) in background.into_iter().enumerate() {
+                for ((value, sum), left) in rows(c, from, width).iter_mut().zip(&self.sums[c][at.clone()]).zip(transmittance) {
+                    *value = sum + left * background;
+                }
+            }
+            for (value, left) in rows(3, from, width).iter_mut().zip(transmittance) {
+                *value = 1.0 - left;
+            }
+            rows(4, from, width).copy_from_slice(&self.sums[3][at]);
+        }
     }
     /// From here on `stop_at` is read.
     #[cold]

@@ -9,7 +9,7 @@ use super::camera::{ALPHA_MIN, RuleConstants};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
 use super::{RECORD, RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
-use crate::cpu::simd::{Lanes, dispatch, each, prefetch};
+use crate::cpu::simd::{Lanes, dispatch, each, prefetch, vectorized};
 use pulp::{Simd, WithSimd};
 
 /// Fills the gradient records of all pairs from `upstream` `[5,H,W]`; with `absolute`, also the sums of absolute gradients of the centres.
@@ -75,29 +75,41 @@ impl TileGradient {
         let zero = [0.0; TILE_PIXELS];
         let mut state = Self { upstream: [zero; 4], running: [1.0; TILE_PIXELS], behind: zero, live_rows: 0, depth_matters: false };
         state.running.copy_from_slice(transmittance);
+        vectorized(
+            #[inline(always)]
+            || state.read(origin, settings, background, upstream),
+        );
+        state
+    }
+    /// Reads the upstream gradients of the tile.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // Six rows at once.
+    fn read(&mut self, origin: [usize; 2], settings: &RasterSettings, background: [f32; 3], upstream: &[f32]) {
         let (width, height) = (TILE.min(settings.width - origin[0]), TILE.min(settings.height - origin[1]));
         let plane = settings.width * settings.height;
+        let mut depth_bits = 0;
         for row in 0..height {
             let from = (origin[1] + row) * settings.width + origin[0];
-            let at = row * TILE;
-            for (k, source) in [0, 1, 2, 4].into_iter().enumerate() {
-                state.upstream[k][at..at + width].copy_from_slice(&upstream[source * plane + from..][..width]);
-            }
-            let alpha = &upstream[3 * plane + from..][..width];
-            let mut any = false;
+            let at = row * TILE..row * TILE + width;
+            let [red, green, blue, alpha, depth]: [&[f32]; 5] = each(
+                #[inline(always)]
+                |k| &upstream[k * plane + from..][..width],
+            );
+            let (running, behind) = (&self.running[at.clone()], &mut self.behind[at.clone()]);
+            // Numbers are 0 if all bits but the sign are.
+            let mut bits = 0;
             for x in 0..width {
-                let g: [f32; 4] = each(
-                    #[inline(always)]
-                    |k| state.upstream[k][at + x],
-                );
-                state.depth_matters |= g[3] != 0.0;
-                any |= g.iter().any(|&v| v != 0.0) || alpha[x] != 0.0;
-                let shown = background[0] * g[0] + background[1] * g[1] + background[2] * g[2] - alpha[x];
-                state.behind[at + x] = state.running[at + x] * shown;
+                let shown = background[0] * red[x] + background[1] * green[x] + background[2] * blue[x] - alpha[x];
+                behind[x] = running[x] * shown;
+                bits |= red[x].to_bits() | green[x].to_bits() | blue[x].to_bits() | alpha[x].to_bits() | depth[x].to_bits();
+                depth_bits |= depth[x].to_bits();
             }
-            state.live_rows |= u32::from(any) << row;
+            self.live_rows |= u32::from(bits << 1 != 0) << row;
+            for (own, source) in self.upstream.iter_mut().zip([red, green, blue, depth]) {
+                own[at.clone()].copy_from_slice(source);
+            }
         }
-        state
+        self.depth_matters = depth_bits << 1 != 0;
     }
 }
 

@@ -13,8 +13,8 @@ use pulp::{Simd, WithSimd};
 const TASKS: usize = 8;
 /// Prefetch distance.
 const AHEAD: usize = 8;
-/// Bits of a digit of the radix sort.
-const DIGIT: u32 = 12;
+/// Most bits of a digit of the radix sort: two digits for depths over four octaves.
+const MOST_BITS: u32 = 13;
 
 /// Fills `ranked`, the tile lists and the record positions from the slots.
 pub fn build_lists(settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, radii: &[i64]) {
@@ -129,9 +129,11 @@ fn sort_by_depth(buffers: &mut Buffers) {
     let bits = 32 - (high - low).leading_zeros();
     let len = buffers.order.len();
     set_len(&mut buffers.order_spare, len);
-    let mut counts = vec![0u32; 1 << DIGIT];
-    for pass in 0..bits.div_ceil(DIGIT) {
-        let digit = |v: u64| (((v >> 32) as u32 - low) >> (pass * DIGIT)) as usize & ((1 << DIGIT) - 1);
+    let passes = bits.div_ceil(MOST_BITS);
+    let width = bits.div_ceil(passes);
+    let mut counts = vec![0u32; 1 << width];
+    for pass in 0..passes {
+        let digit = |v: u64| (((v >> 32) as u32 - low) >> (pass * width)) as usize & ((1 << width) - 1);
         counts.fill(0);
         for &v in &buffers.order {
             counts[digit(v)] += 1;

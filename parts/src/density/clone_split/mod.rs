@@ -119,8 +119,7 @@ impl DensityControl for CloneSplit {
         wanted
     }
     fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
-        self.statistics.add(view);
-        Ok(())
+        self.statistics.add(view)
     }
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
         let due = self.settings.due(schedule);
@@ -151,7 +150,7 @@ impl DensityControl for CloneSplit {
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
         // Somebody else may have changed the rows.
-        if self.due.grow || self.due.prune_weight || !plan.keeps_all(self.statistics.seen.dims()[0]) {
+        if self.due.grow || self.due.prune_weight || !plan.keeps_all(self.statistics.len()) {
             self.statistics = self.statistics.after(plan, self.due.prune_weight, device)?;
         }
         Ok(())

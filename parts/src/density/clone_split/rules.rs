@@ -129,8 +129,7 @@ mod tests {
         host.log_scales[0..3].fill(0.001f32.ln());
         host.opacity_logits[2] = -20.0;
         let mut statistics = Statistics::zeros(4, &device);
-        statistics.gradient_sum = Tensor::from_floats([1.0, 1.0, 1.0, 0.0], &device);
-        statistics.seen = Tensor::ones([4], &device);
+        statistics.gradients = Tensor::from_floats([[1.0, 1.0], [1.0, 1.0], [1.0, 1.0], [0.0, 1.0]], &device);
         let due = Due { grow: true, ..Default::default() };
         let plan = round(&Settings::default(), &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
         assert_eq!((plan.report.cloned, plan.report.split, plan.report.removed), (1, 1, 1));
@@ -150,8 +149,7 @@ mod tests {
         host.log_scales.fill(0.001f32.ln());
         host.opacity_logits[0] = 1.5;
         let mut statistics = Statistics::zeros(1, &device);
-        statistics.gradient_sum = Tensor::from_floats([1.0], &device);
-        statistics.seen = Tensor::ones([1], &device);
+        statistics.gradients = Tensor::from_floats([[1.0, 1.0]], &device);
         let due = Due { grow: true, ..Default::default() };
         let passed = |corrected: bool| {
             let plan = round(&Settings { corrected, ..Settings::default() }, &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();

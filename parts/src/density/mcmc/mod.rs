@@ -12,7 +12,8 @@ mod weights;
 
 use super::statistics::Statistics;
 use burn::tensor::activation::sigmoid;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use cc4dgs_backends::ops::view_sums::fade;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
     DensityControl, DensityPlan, DensityPlugin, Error, Gaussians, Plugin, Result, Schedule, Seed, Stage, Statistic, ViewStatistics, config, inventory,
@@ -42,8 +43,6 @@ const COARSE_ROUNDS: f64 = 0.9;
 /// Opacity around which noise fades, and how steeply (3DGS-MCMC).
 const NOISE_OPACITY: f32 = 0.005;
 const NOISE_STEEPNESS: f32 = 100.0;
-/// Bound of the opacity logits that are lowered: beyond it, their exponentials are not finite or opacities do not change.
-const MOST_LOGIT: f32 = 30.0;
 /// Largest share of the Gaussians that one round moves.
 const MOST_MOVED: f64 = 0.05;
 
@@ -115,13 +114,6 @@ impl Settings {
     }
 }
 
-/// The logits of opacities that are smaller by the shares `decay`.
-fn faded(logits: Tensor<1>, decay: Tensor<1>) -> Tensor<1> {
-    // o' / (1 - o') = (1 - decay) / (e^-l + decay), where o' = (1 - decay) o.
-    let kept = decay.clone().neg().add_scalar(1.0);
-    (kept / (logits.clamp(-MOST_LOGIT, MOST_LOGIT).neg().exp() + decay)).log()
-}
-
 struct Mcmc {
     settings: Settings,
     statistics: Statistics,
@@ -130,8 +122,8 @@ struct Mcmc {
     start: usize,
     /// Whether the last plan was a round.
     round: bool,
-    /// 1 for the Gaussians that views of this iteration show, 0 for the others `[N]`.
-    shown: Option<Tensor<1>>,
+    /// The largest radius of each Gaussian in the views of this iteration, 0 where none shows it `[N]`.
+    shown: Option<Tensor<1, Int>>,
 }
 
 impl DensityControl for Mcmc {
@@ -148,14 +140,13 @@ impl DensityControl for Mcmc {
         wanted
     }
     fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
-        self.statistics.add(view);
-        self.weights.add(view);
+        self.statistics.add(view)?;
+        self.weights.add(view)?;
         if self.settings.decay > 0.0 {
-            let shown = view.radii.clone().greater_elem(0).float();
             // Of several views one is enough.
             self.shown = Some(match self.shown.take() {
-                Some(before) => before.max_pair(shown),
-                None => shown,
+                Some(before) => before.max_pair(view.radii.clone()),
+                None => view.radii.clone(),
             });
         }
         Ok(())
@@ -171,7 +162,7 @@ impl DensityControl for Mcmc {
         Ok(Some(round(&self.settings, &gaussians.to_host()?, &scores, &hidden, self.settings.budget(self.start, schedule), seed)))
     }
     fn executed(&mut self, plan: &DensityPlan, device: &Device) -> Result<()> {
-        let (before, own) = (self.statistics.seen.dims()[0], std::mem::take(&mut self.round));
+        let (before, own) = (self.statistics.len(), std::mem::take(&mut self.round));
         // What others add, such as points of key frames, is no growth.
         if !own {
             self.start += plan.len().saturating_sub(before);
@@ -186,7 +177,7 @@ impl DensityControl for Mcmc {
     fn after_step(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
         let mut changed = Vec::new();
         if let Some(shown) = self.shown.take().filter(|_| schedule.iteration <= self.settings.end(schedule)) {
-            let faded = faded(gaussians.opacity_logits.clone(), shown.mul_scalar(self.settings.decay));
+            let faded = fade(gaussians.opacity_logits.clone(), shown, self.settings.decay)?;
             changed.push(("opacity_logits".into(), faded.reshape([-1, 1])));
         }
         if self.settings.noise == 0.0 {
@@ -209,7 +200,7 @@ impl DensityControl for Mcmc {
         // Up to 16,777,216 a float32 is exact; beyond, the budget of a resumed run differs by a row or two.
         arrays.push(("start".into(), Tensor::from_floats([self.start as f32], &device)));
         let rounds = Tensor::from_floats(self.weights.rounds.as_slice(), &device);
-        arrays.extend([("weights".into(), self.weights.sums().flatten(0, 1)), ("rounds".into(), rounds)]);
+        arrays.extend([("weights".into(), self.weights.sums.clone().flatten(0, 1)), ("rounds".into(), rounds)]);
         arrays
     }
     fn restore(&mut self, mut state: Vec<(String, Tensor<1>)>, count: usize) -> Result<()> {
@@ -231,12 +222,12 @@ impl DensityControl for Mcmc {
         // Programs before relocation stored no weights.
         let weights = if stored {
             let (sums, rounds) = (take("weights", 3 * count)?.reshape([count, 3]), to_vec(take("rounds", count)?, "rounds")?);
-            Some(Weights::restored(sums, rounds))
+            Some(Weights { sums, rounds })
         } else {
             None
         };
         self.statistics = Statistics::from_arrays(state, count)?;
-        self.weights = weights.unwrap_or_else(|| Weights::zeros(count, &self.statistics.seen.device()));
+        self.weights = weights.unwrap_or_else(|| Weights::zeros(count, &self.statistics.gradients.device()));
         Ok(())
     }
 }
@@ -294,19 +285,6 @@ mod tests {
         control.executed(&plan, &device).unwrap();
         let start = control.state().into_iter().find(|(name, _)| name == "start").unwrap().1;
         assert_eq!(start.into_scalar::<f32>(), 5.0);
-    }
-
-    #[test]
-    fn what_is_shown_fades_by_its_share_alone() {
-        let device = Device::flex();
-        let tensor = |values: &[f32]| Tensor::<1>::from_floats(values, &device);
-        let logits = [0.0, 3.0, -4.0, 1e30, -1e30, 2.0];
-        let after = sigmoid(faded(tensor(&logits), tensor(&[0.1, 0.1, 0.1, 0.1, 0.1, 0.0])));
-        for (logit, after) in logits.iter().zip(to_vec(after, "opacities").unwrap()) {
-            let before = 1.0 / (1.0 + (-logit.clamp(-30.0, 30.0)).exp());
-            let expected = if *logit == 2.0 { before } else { 0.9 * before };
-            assert!((after - expected).abs() < 1e-6, "{logit}: {after}, expected {expected}");
-        }
     }
 
     #[test]

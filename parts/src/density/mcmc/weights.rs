@@ -1,6 +1,7 @@
 //! Blending weights over views: which Gaussians are hidden, faint or covered.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::view_sums::add_weights;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Result, ViewStatistics};
 
@@ -11,41 +12,28 @@ const LEAST_ROUNDS: f32 = 3.0;
 
 /// What is remembered of the blending weights of N Gaussians: sums over views, of which every round leaves a share to the next.
 pub(super) struct Weights {
-    /// Of the largest weight `[N]`.
-    largest: Tensor<1>,
-    /// Of its square `[N]`.
-    squares: Tensor<1>,
-    /// Of views that show the Gaussian `[N]`.
-    shown: Tensor<1>,
+    /// Of the largest weight, of its square, and of views that show the Gaussian `[N,3]`.
+    pub sums: Tensor<2>,
     /// Rounds since the Gaussian was new `[N]`.
     pub rounds: Vec<f32>,
 }
 
 impl Weights {
     pub fn zeros(count: usize, device: &Device) -> Self {
-        let zeros = || Tensor::zeros([count], device);
-        Self { largest: zeros(), squares: zeros(), shown: zeros(), rounds: vec![0.0; count] }
+        Self { sums: Tensor::zeros([count, 3], device), rounds: vec![0.0; count] }
     }
-    /// As [`Weights::sums`] and `rounds` returned them.
-    pub fn restored(sums: Tensor<2>, rounds: Vec<f32>) -> Self {
-        let column = |k| sums.clone().narrow(1, k, 1).squeeze_dim(1);
-        Self { largest: column(0), squares: column(1), shown: column(2), rounds }
-    }
-    /// The three sums side by side `[N,3]`.
-    pub fn sums(&self) -> Tensor<2> {
-        Tensor::stack(vec![self.largest.clone(), self.squares.clone(), self.shown.clone()], 1)
-    }
-    pub fn add(&mut self, view: &ViewStatistics) {
+    pub fn add(&mut self, view: &ViewStatistics) -> Result<()> {
         if let Some(weights) = &view.max_weights {
-            self.largest.inplace(|sum| sum + weights.clone());
-            self.squares.inplace(|sum| sum + weights.clone() * weights.clone());
-            self.shown.inplace(|sum| sum + view.radii.clone().greater_elem(0).float());
+            // Moved out, so that nobody else holds it and it is changed in place.
+            let sums = std::mem::replace(&mut self.sums, Tensor::empty([0, 3], &weights.device()));
+            self.sums = add_weights(sums, view.radii.clone(), weights.clone())?;
         }
+        Ok(())
     }
     /// Of the rows that can be judged, at most so many with the smallest weights, the smallest first. Weights are averaged with themselves as shares: what is bright
     /// for a short time, or on one side, counts by that.
     pub fn smallest(&self, most: usize) -> Result<Vec<usize>> {
-        let sums = to_vec(self.sums(), "blending weights")?;
+        let sums = to_vec(self.sums.clone(), "blending weights")?;
         let weight = |row: usize| sums[3 * row + 1] / sums[3 * row].max(f32::MIN_POSITIVE);
         let mut rows: Vec<usize> = (0..self.rounds.len()).filter(|&row| self.rounds[row] >= LEAST_ROUNDS && sums[3 * row + 2] > 0.0).collect();
         rows.sort_by(|&a, &b| weight(a).total_cmp(&weight(b)).then(a.cmp(&b)));
@@ -54,10 +42,10 @@ impl Weights {
     }
     /// What the Gaussians of `plan` start the next round with; new ones with nothing.
     pub fn after(&self, plan: &DensityPlan, device: &Device) -> Result<Self> {
-        let (old, rows) = (to_vec(self.sums(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
+        let (old, rows) = (to_vec(self.sums.clone(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
         let of = |(&parent, &fresh): (&usize, &bool)| std::array::from_fn::<f32, 3, _>(|k| if fresh { 0.0 } else { MEMORY * old[3 * parent + k] });
         let sums = Tensor::from_data(TensorData::new(rows().flat_map(of).collect(), [plan.len(), 3]), device);
-        Ok(Self::restored(sums, rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect()))
+        Ok(Self { sums, rounds: rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect() })
     }
 }
 
@@ -78,7 +66,7 @@ mod tests {
             size: (8, 8),
             views: 1,
         };
-        weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0]));
+        weights.add(&view(&[0.5, 0.1, 0.0, 0.9], &[3, 3, 3, 0])).unwrap();
         assert!(weights.smallest(9).unwrap().is_empty(), "all are new");
         weights.rounds = vec![3.0; 4];
         // The last one was never shown, so nobody can tell.
@@ -89,7 +77,7 @@ mod tests {
         plan.keep(0);
         let mut after = weights.after(&plan, &device).unwrap();
         assert_eq!((after.rounds.as_slice(), after.smallest(9).unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
-        (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])));
+        (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])).unwrap());
         assert_eq!(after.smallest(9).unwrap(), [2, 0]);
     }
 }
