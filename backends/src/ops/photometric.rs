@@ -140,7 +140,7 @@ pub struct PhotometricNumbers {
 impl PhotometricNumbers {
     /// PSNR in dB of the unrounded image for a data range of 1; capped at 100 dB, where float32 images stop differing.
     pub fn psnr_db(&self) -> f32 {
-        -10.0 * self.mse.max(1e-10).log10()
+        -10.0 * self.mse.clamp(1e-10, f32::INFINITY).log10()
     }
 }
 

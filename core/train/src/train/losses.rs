@@ -60,7 +60,9 @@ impl LossTerms {
     /// Name of the first term whose value is not finite.
     pub fn broken(&self, input: &LossInput) -> Result<Option<&str>> {
         for Term { name, term, .. } in &self.0 {
-            if term.value(input)?.is_some_and(|value| !is_finite(&value)) {
+            if let Some(value) = term.value(input)?
+                && !is_finite(&value, name)?
+            {
                 return Ok(Some(name));
             }
         }

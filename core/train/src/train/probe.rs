@@ -48,7 +48,8 @@ impl Context<'_> {
             let target = self.rasterizer.upload(&self.job.scene.frame(views[index])?, rgb, &self.device);
             let difference = image - target;
             let mse = to_vec((difference.clone() * difference).mean(), "mean squared error")?;
-            scores.push(-10.0 * mse.first().copied().unwrap_or(f32::NAN).max(1e-10).log10());
+            // Unlike `max`, `clamp` leaves NaN as it is.
+            scores.push(-10.0 * mse.first().copied().unwrap_or(f32::NAN).clamp(1e-10, f32::INFINITY).log10());
             Ok(())
         })?;
         Ok(scores)

@@ -9,8 +9,7 @@ use crate::gaussian_set::{Leaves, gaussian_rate};
 use burn::tensor::{Gradients, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, Error, Event, LossInput, Parameter, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings,
-    ViewStatistics,
+    Camera, Error, Event, LossInput, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics,
 };
 use cc4dgs_play::MovingRows;
 use cc4dgs_play::model::ModelDeformer;
@@ -118,8 +117,8 @@ impl Context<'_> {
             let radii = output.stats.radii;
             let input = LossInput { planes: &planes, target: &target, gaussians: &drawn, radii: &radii, time_norm, schedule };
             let loss = self.losses.value(&input)?;
-            if (read || check) && !is_finite(&loss) {
-                let part = if is_finite(&planes) { self.losses.broken(&input)?.map(|term| format!("the loss term {term}")) } else { None };
+            if (read || check) && !is_finite(&loss, "loss")? {
+                let part = if is_finite(&planes, "image")? { self.losses.broken(&input)?.map(|term| format!("the loss term {term}")) } else { None };
                 return Ok(Some(Trouble::new(part.unwrap_or_else(|| format!("the image of camera {}", camera.name)))));
             }
             if read {
@@ -172,7 +171,7 @@ impl Context<'_> {
             state.density.observe(&ViewStatistics { radii, screen_gradient, absolute_screen_gradient, max_weights, size, views: batch.len() })?;
         }
         let of_gaussians = leaves.gradients(&gradients);
-        if check && let Some(trouble) = broken_gradient(state, &of_gaussians, &gradients) {
+        if check && let Some(trouble) = broken_gradient(state, &of_gaussians, &gradients)? {
             return Ok(Some(trouble));
         }
         let deformed = spatial.is_some();
@@ -283,21 +282,28 @@ fn spatial_pass(deformer: &ModelDeformer, leaves: &Leaves, rows: &MovingRows, lo
 }
 
 /// The first gradient that is not finite.
-fn broken_gradient(state: &TrainState, of_gaussians: &[(String, Tensor<2>)], gradients: &Gradients) -> Option<Trouble> {
-    if let Some((name, _)) = of_gaussians.iter().find(|(_, gradient)| !is_finite(gradient)) {
-        return Some(Trouble::of(format!("gaussians/{name}"), format!("the gradient of {name}")));
+fn broken_gradient(state: &TrainState, of_gaussians: &[(String, Tensor<2>)], gradients: &Gradients) -> Result<Option<Trouble>> {
+    for (name, gradient) in of_gaussians {
+        if !is_finite(gradient, name)? {
+            return Ok(Some(Trouble::of(format!("gaussians/{name}"), format!("the gradient of {name}"))));
+        }
     }
     let deformer = state.deformer.iter().flat_map(|d| d.field.parameters()).map(|p| ("deformer", p));
-    let mut weights = deformer.chain(state.appearance.parameters().into_iter().map(|p| ("appearance", p)));
+    let weights = deformer.chain(state.appearance.parameters().into_iter().map(|p| ("appearance", p)));
     // Weights that took no part in the step are not tracked.
-    let broken = |p: &Parameter| p.value.is_require_grad() && p.value.grad(gradients).is_some_and(|gradient| !is_finite(&gradient));
-    let (part, parameter) = weights.find(|(_, p)| broken(p))?;
-    Some(Trouble::of(part, format!("the gradient of the weights '{}' of {part}", parameter.name)))
+    for (part, parameter) in weights.filter(|(_, p)| p.value.is_require_grad()) {
+        if let Some(gradient) = parameter.value.grad(gradients)
+            && !is_finite(&gradient, &parameter.name)?
+        {
+            return Ok(Some(Trouble::of(part, format!("the gradient of the weights '{}' of {part}", parameter.name))));
+        }
+    }
+    Ok(None)
 }
 
 /// PSNR in dB of the first three of `planes` against `target`, unrounded, data range 1; at most 100 dB, where float32 images stop differing.
 fn psnr_db(planes: Tensor<3>, target: Tensor<3>) -> Result<f32> {
     let difference = planes.inner().narrow(0, 0, 3) - target.inner();
     let mse = to_vec((difference.clone() * difference).mean(), "mean squared error")?;
-    Ok(-10.0 * mse.first().copied().unwrap_or(f32::NAN).max(1e-10).log10())
+    Ok(-10.0 * mse.first().copied().unwrap_or(f32::NAN).clamp(1e-10, f32::INFINITY).log10())
 }

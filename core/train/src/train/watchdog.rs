@@ -47,9 +47,12 @@ impl Trouble {
     }
 }
 
-/// Whether every value of `tensor` is finite: a sum is finite only if every summand is. A tensor that cannot be read is not.
-pub(crate) fn is_finite<const D: usize>(tensor: &Tensor<D>) -> bool {
-    tensor.clone().sum().try_into_scalar::<f32>().is_ok_and(f32::is_finite)
+/// Whether every value of `tensor` is finite: a sum is finite only if every summand is. `object` names it in errors.
+///
+/// # Errors
+/// [`Error::Backend`] if the device fails.
+pub(crate) fn is_finite<const D: usize>(tensor: &Tensor<D>, object: &str) -> Result<bool> {
+    Ok(to_vec(tensor.clone().sum(), object)?.iter().all(|sum| sum.is_finite()))
 }
 
 /// Factors of learning rates by part; 1 where a part is not named.
@@ -208,7 +211,7 @@ impl Watchdog {
 /// The first parameter that is not finite.
 fn unsound(state: &TrainState) -> Result<Option<Trouble>> {
     for (name, values) in state.set.iter() {
-        if is_finite(values) {
+        if is_finite(values, name)? {
             continue;
         }
         let width = values.dims()[1].max(1);
@@ -221,7 +224,7 @@ fn unsound(state: &TrainState) -> Result<Option<Trouble>> {
     let deformer = state.deformer.iter().flat_map(|d| d.field.parameters());
     let weights = deformer.map(|p| (DEFORMER, p)).chain(state.appearance.parameters().into_iter().map(|p| (APPEARANCE, p)));
     for (part, parameter) in weights {
-        if !is_finite(&parameter.value) {
+        if !is_finite(&parameter.value, &parameter.name)? {
             return Ok(Some(Trouble::of(part, format!("the weights '{}' of {part}", parameter.name))));
         }
     }

@@ -85,19 +85,19 @@ impl Context<'_> {
         Ok(kept)
     }
 
-    /// Remembers what an opacity reset must come back to. False where it is to be left out: one of the stage was undone, the last one is not back, or the time is
-    /// too short to judge it.
+    /// Remembers what an opacity reset must come back to. False where it is to be left out: one of the stage was undone, the last one is not back, training views
+    /// have no PSNR, or the time is too short to judge it.
     fn begin_reset(&self, state: &mut TrainState, schedule: &Schedule) -> Result<bool> {
         if state.guard.resets_off || schedule.left() < recovery(schedule) {
             return Ok(false);
         }
         let gaussians = state.set.gaussians()?;
         let psnr_db = self.mean_psnr(state, &gaussians, &self.probes(schedule), schedule.sh_degree)?;
-        if state.guard.reset.as_ref().is_some_and(|last| psnr_db < last.psnr_db - MAX_COST_DB) {
+        if !psnr_db.is_finite() || state.guard.reset.as_ref().is_some_and(|last| psnr_db < last.psnr_db - MAX_COST_DB) {
             return Ok(false);
         }
         let logits = to_vec(gaussians.opacity_logits.clone(), OPACITIES)?;
-        state.guard.reset = Some(Reset { iteration: schedule.iteration, psnr_db, logits });
+        state.guard.reset = Some(Reset::new(schedule.iteration, psnr_db, logits));
         // What the reset costs is no loss by removals, and has its own time to come back.
         state.guard.removal = None;
         Ok(true)

@@ -34,7 +34,7 @@ const MAX_COST_DB: f32 = 0.3;
 /// Iterations within which the PSNR must be back after an opacity reset or a removal, at least; and passes over the cameras.
 const RECOVERY: usize = 400;
 const RECOVERY_PASSES: usize = 4;
-/// In [`Reset::logits`]: added since, with an opacity of its own, which an undone reset leaves as it is. Finite, for checkpoints.
+/// In [`Reset::logits`]: added since, with an opacity of its own, which an undone reset leaves as it is; or not finite before it. Finite, for checkpoints.
 const ADDED: f32 = f32::MIN;
 /// Multiple of that time after which a PSNR that is lower is not blamed on removals.
 const GIVE_UP: usize = 3;
@@ -62,6 +62,14 @@ struct Reset {
     psnr_db: f32,
     /// Opacity logits before it, or [`ADDED`] `[N]`.
     logits: Vec<f32>,
+}
+
+impl Reset {
+    /// A reset at `iteration`, before which training views had `psnr_db` and Gaussians the opacity logits `logits`.
+    fn new(iteration: usize, psnr_db: f32, mut logits: Vec<f32>) -> Self {
+        logits.iter_mut().filter(|logit| !logit.is_finite()).for_each(|logit| *logit = ADDED);
+        Self { iteration, psnr_db, logits }
+    }
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -262,6 +270,8 @@ mod tests {
         assert_eq!((-1.0f32).max(after[given]), -1.0);
         plan.restart(OPACITIES);
         assert_eq!(followed(&plan), [1.0, 2.0, 2.0, 2.0], "the opacities of the reset itself");
+        let broken = Reset::new(250, 20.0, vec![f32::NAN, 1.0, f32::INFINITY]);
+        assert_eq!(broken.logits, [ADDED, 1.0, ADDED], "checkpoints refuse what is not finite");
     }
 
     #[test]
