@@ -37,8 +37,10 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, frame: Option<Similar
     raw.validate()?;
     let mut plans = Vec::with_capacity(raw.cameras.len());
     let mut cameras = Vec::with_capacity(raw.cameras.len());
-    for (index, camera) in raw.cameras.iter_mut().enumerate() {
-        let native = match raw.views.iter().find(|v| v.camera == index).map(|v| &v.image) {
+    let mut first_images: Vec<Option<&ImageSource>> = vec![None; raw.cameras.len()];
+    raw.views.iter().rev().for_each(|view| first_images[view.camera] = Some(&view.image));
+    for (camera, image) in raw.cameras.iter_mut().zip(first_images) {
+        let native = match image {
             Some(ImageSource::File { path, .. }) => fit_to_image(camera, image_size(path, limits)?, &mut raw.warnings)?,
             _ => camera.size,
         };

@@ -1,6 +1,6 @@
 //! D-NeRF and Blender scenes: `transforms_train.json` and friends, RGBA images, times in 0..1.
 
-use super::nerfstudio::{Intrinsics, camera, image_path};
+use super::nerfstudio::{Intrinsics, camera, image_path, warn_of_missing_times};
 use cc4dgs_core::reader::files::{file_name, image_size, read_json};
 use cc4dgs_core::{Error, ImageSource, InitBox, Limits, Plugin, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
@@ -56,6 +56,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     } else {
         scene.warnings.push(format!("there is no {test}; nothing is held out"));
     }
+    warn_of_missing_times(&times, &mut scene.warnings);
     scene.rank_times(&times, &path.display().to_string())?;
     scene.init_box = Some(InitBox::Cube { half_share: INIT_HALF_SHARE });
     // The published tables composite over white (4DGS, Swift4D); images without alpha stay as they are.

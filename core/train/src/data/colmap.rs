@@ -40,16 +40,20 @@ pub(crate) enum Model {
     Radial,
     OpenCv,
     OpenCvFisheye,
+    SimpleRadialFisheye,
+    RadialFisheye,
 }
 
 impl Model {
-    const ALL: [(Model, &'static str, i32, usize); 6] = [
+    const ALL: [(Model, &'static str, i32, usize); 8] = [
         (Model::SimplePinhole, "SIMPLE_PINHOLE", 0, 3),
         (Model::Pinhole, "PINHOLE", 1, 4),
         (Model::SimpleRadial, "SIMPLE_RADIAL", 2, 4),
         (Model::Radial, "RADIAL", 3, 5),
         (Model::OpenCv, "OPENCV", 4, 8),
         (Model::OpenCvFisheye, "OPENCV_FISHEYE", 5, 8),
+        (Model::SimpleRadialFisheye, "SIMPLE_RADIAL_FISHEYE", 8, 4),
+        (Model::RadialFisheye, "RADIAL_FISHEYE", 9, 5),
     ];
     /// By COLMAP's number.
     pub(crate) fn from_id(id: i32) -> Option<Self> {
@@ -80,6 +84,8 @@ impl ColmapCamera {
             Model::Radial => ([p[0]; 2], [p[1], p[2]], brown(p[3], p[4], 0.0, 0.0)),
             Model::OpenCv => ([p[0], p[1]], [p[2], p[3]], brown(p[4], p[5], p[6], p[7])),
             Model::OpenCvFisheye => ([p[0], p[1]], [p[2], p[3]], Distortion::Fisheye { radial: [p[4], p[5], p[6], p[7]] }),
+            Model::SimpleRadialFisheye => ([p[0]; 2], [p[1], p[2]], Distortion::Fisheye { radial: [p[3], 0.0, 0.0, 0.0] }),
+            Model::RadialFisheye => ([p[0]; 2], [p[1], p[2]], Distortion::Fisheye { radial: [p[3], p[4], 0.0, 0.0] }),
         }
     }
 }
@@ -87,7 +93,12 @@ impl ColmapCamera {
 /// The folder with `cameras.bin` or `cameras.txt`.
 fn model_folder(path: &Path) -> Option<PathBuf> {
     let candidates = [path.join("sparse/0"), path.join("sparse"), path.join("colmap/sparse/0"), path.to_path_buf()];
-    candidates.into_iter().find(|f| ["bin", "txt"].iter().any(|e| f.join(format!("cameras.{e}")).is_file() && f.join(format!("images.{e}")).is_file()))
+    candidates.into_iter().find(|f| ["bin", "txt"].iter().any(|e| is_complete(f, e)))
+}
+
+/// Whether a folder has cameras and images in the form with this extension.
+fn is_complete(folder: &Path, extension: &str) -> bool {
+    ["cameras", "images"].iter().all(|stem| folder.join(format!("{stem}.{extension}")).is_file())
 }
 
 struct ColmapModel {
@@ -100,7 +111,7 @@ fn read_model(folder: &Path, limits: &Limits) -> Result<ColmapModel> {
     let file = |stem: &str, extension: &str| folder.join(format!("{stem}.{extension}"));
     let named = |path: &Path| path.display().to_string();
     let (cameras, images, points);
-    if file("cameras", "bin").is_file() {
+    if is_complete(folder, "bin") {
         let (c, i, p) = (file("cameras", "bin"), file("images", "bin"), file("points3D", "bin"));
         cameras = colmap_binary::cameras(&named(&c), &read_bytes(&c, limits)?)?;
         images = colmap_binary::images(&named(&i), &read_bytes(&i, limits)?)?;
@@ -142,8 +153,13 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let ColmapModel { cameras, mut images, points } = read_model(&folder, limits)?;
     images.sort_by(|a, b| a.name.cmp(&b.name));
     let mut scene = RawScene { name: file_name(path), points: Some(points), ..Default::default() };
+    if folder != path && folder.ends_with("0") && ["bin", "txt"].iter().any(|e| is_complete(&folder.with_file_name("1"), e)) {
+        let read = format!("there are several models; that of {object} is read, with {} images", images.len());
+        scene.warnings.push(format!("{read} (to read another, give its folder as the path)"));
+    }
     let folders = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()];
-    let image_folder = folders.into_iter().find(|f| f.is_dir()).unwrap_or_else(|| path.join("images"));
+    let has_images = |f: &&PathBuf| images.iter().any(|image| f.join(&image.name).is_file());
+    let image_folder = folders.iter().find(has_images).or_else(|| folders.iter().find(|f| f.is_dir())).unwrap_or(&folders[0]);
     let hold_out = images.len() > 1;
     let mut videos = videos(path, &images, options, limits, &mut scene.warnings)?.into_iter();
     for (index, image) in images.iter().enumerate() {

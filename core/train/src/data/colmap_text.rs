@@ -67,7 +67,11 @@ pub(crate) fn images(object: &str, text: &str) -> Result<Vec<ColmapImage>> {
             return Err(bad(object, n, "the image has no name"));
         }
         images.push(ColmapImage { camera, name, rotation, translation });
-        rows.next();
+        // Where empty lines were removed, this is the next image.
+        if let Some((n, points)) = rows.next().filter(|(_, l)| !l.split_whitespace().count().is_multiple_of(3)) {
+            let count = points.split_whitespace().count();
+            return Err(bad(object, n, format!("{count} values, not three per point: each image needs a line of points after it, which may be empty")));
+        }
     }
     Ok(images)
 }
@@ -88,4 +92,19 @@ pub(crate) fn points(object: &str, text: &str, limits: &Limits) -> Result<RawPoi
         limits.check_gaussians(object, cloud.positions.len() as u64)?;
     }
     Ok(cloud)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_image_in_place_of_the_points_of_the_one_before_is_refused() {
+        let line = |id: u32| format!("{id} 1 0 0 0 0 0 0 1 {id}.png\n");
+        let with = |between: &str| images("t", &format!("# comment\n{}{between}{}", line(1), line(2)));
+        assert_eq!(with("1.5 2.5 -1 3 4 7\n").unwrap().len(), 2);
+        assert_eq!(with("\n").unwrap().len(), 2);
+        let message = with("").unwrap_err().to_string();
+        assert!(message.contains("line 3") && message.contains("10 values"), "{message}");
+    }
 }

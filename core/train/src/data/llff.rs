@@ -7,6 +7,7 @@ use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_byt
 use cc4dgs_core::reader::pose::world_to_camera;
 use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use glam::{DMat3, DVec3};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The images of one camera in time order.
@@ -56,7 +57,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             "it has {} rows, {} cameras were found ({})",
             array.shape[0],
             footage.len(),
-            footage.iter().map(|f| f.name.as_str()).collect::<Vec<_>>().join(", ")
+            footage.iter().take(40).map(|f| f.name.as_str()).collect::<Vec<_>>().join(", ")
         );
         return Err(bad(problem, "Remove the row together with the camera"));
     }
@@ -114,15 +115,26 @@ fn stem(path: &Path) -> String {
 /// Per-camera folders of frames win over videos (someone extracted them), videos over single images.
 fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut Vec<String>) -> Result<Vec<Footage>> {
     let mut found = Vec::new();
+    // The number of the first frame, and a camera that begins with it.
+    let mut first_numbers = BTreeMap::new();
     let is_camera_folder = |p: &Path| p.is_dir() && file_name(p).starts_with("cam");
     for root in [path.to_path_buf(), path.join("frames")] {
         for folder in list_if(&root, is_camera_folder)? {
             let inner = folder.join("images");
-            let files = list(if inner.is_dir() { &inner } else { &folder }, is_image)?;
+            let files = list_if(if inner.is_dir() { &inner } else { &folder }, is_image)?;
             if let Some(first) = files.first() {
                 let (w, h) = image_size(first, limits)?;
+                if let Some(number) = files.iter().filter_map(|path| frame_number(path)).min() {
+                    first_numbers.entry(number).or_insert_with(|| file_name(&folder));
+                }
                 found.push(Footage { name: file_name(&folder), size: [w, h], images: frames(files, warnings) });
             }
+        }
+        if let (Some((low, one)), Some((high, other))) = (first_numbers.first_key_value(), first_numbers.last_key_value())
+            && low < high
+        {
+            let numbers = format!("the frames of {one} begin with number {low}, those of {other} with {high}");
+            warnings.push(format!("{numbers}: the first images of all cameras are taken as one instant"));
         }
         if !found.is_empty() {
             return Ok(found);
@@ -181,6 +193,9 @@ fn frame_number(path: &Path) -> Option<u64> {
     stem[stem.trim_end_matches(|c: char| c.is_ascii_digit()).len()..].parse().ok()
 }
 
+/// Sorted entries for which `keep` is true; none where there is no folder. Hidden files do not count: on some disks macOS writes a `._cam00.mp4` beside
+/// `cam00.mp4`.
 fn list_if(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>> {
-    if folder.is_dir() { list(folder, keep) } else { Ok(Vec::new()) }
+    let shown = |path: &Path| !file_name(path).starts_with('.') && keep(path);
+    if folder.is_dir() { list(folder, shown) } else { Ok(Vec::new()) }
 }

@@ -7,6 +7,7 @@ use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_json
 use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
 use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -54,6 +55,7 @@ struct Frame {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
     time: Option<f64>,
+    mask_path: Option<IgnoredAny>,
 }
 
 impl Intrinsics {
@@ -86,8 +88,11 @@ impl Intrinsics {
     }
 }
 
-/// The file a JSON names, with the usual extensions tried where it names none.
+/// The file a JSON names, with the usual extensions tried where it names none. Backslashes of Windows separate folders, unless a file has them in its name.
 pub(crate) fn image_path(folder: &Path, named: &str) -> PathBuf {
+    if named.contains('\\') && !folder.join(named).is_file() {
+        return image_path(folder, &named.replace('\\', "/"));
+    }
     let path = folder.join(named);
     if has_extension(&path, &["png", "jpg", "jpeg"]) || path.is_file() {
         return path;
@@ -129,7 +134,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let has_times = videos.is_empty();
     let named = |names: &[String]| names.iter().map(|name| plain(name).to_string()).collect::<BTreeSet<_>>();
     let [train, test, validation] = [&transforms.train_filenames, &transforms.test_filenames, &transforms.val_filenames].map(|names| named(names));
-    let named_split = !(train.is_empty() && test.is_empty());
+    let named_split = [&train, &test, &validation].iter().any(|names| !names.is_empty());
     let (mut missing, mut unlisted, mut seen) = (Vec::new(), 0, 0);
     let mut times = Vec::new();
     let of_frame = |frame: &Frame, image_size: &dyn Fn() -> Result<(u32, u32)>, bad: &dyn Fn(String) -> Error| {
@@ -182,7 +187,12 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     if unlisted > 0 {
         scene.warnings.push(format!("{unlisted} images are in none of train_filenames, test_filenames and val_filenames, and were skipped"));
     }
+    let masked = transforms.frames.iter().filter(|frame| frame.mask_path.is_some()).count();
+    if masked > 0 {
+        scene.warnings.push(format!("{masked} images have a mask_path; their masks are not used, and all of each image is trained on"));
+    }
     if has_times {
+        warn_of_missing_times(&times, &mut scene.warnings);
         scene.rank_times(&times, &object)?;
         if merge_fixed_cameras(&mut scene, &times) && !named_split && scene.cameras.len() > 1 {
             // Another instant of a camera that is trained on says nothing of new views.
@@ -190,6 +200,14 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         }
     }
     Ok(scene)
+}
+
+/// Says so where some images state a time and others none: these count as images of time 0.
+pub(crate) fn warn_of_missing_times(times: &[Option<f64>], warnings: &mut Vec<String>) {
+    let missing = times.iter().filter(|time| time.is_none()).count();
+    if (1..times.len()).contains(&missing) {
+        warnings.push(format!("{missing} of {} images state no time and are taken as images of time 0", times.len()));
+    }
 }
 
 /// The name of a file without a leading `./`.
@@ -254,7 +272,10 @@ pub(crate) fn camera(
             let (w, h) = image_size()?;
             (f64::from(w), f64::from(h))
         }
-        (w, h) => return Err(bad(format!("image size w {w:?}, h {h:?} is not a size"))),
+        sides => {
+            let [w, h] = [sides.0, sides.1].map(|side| side.map_or_else(|| "missing".to_string(), |v| v.to_string()));
+            return Err(bad(format!("w is {w} and h is {h}; both must be from 1 to 1000000 pixels, or both left out")));
+        }
     };
     let world_to_camera = matrix4(pose).and_then(|m| from_opengl_camera_to_world(&m)).map_err(bad)?;
     Ok(RawCamera {
@@ -265,4 +286,32 @@ pub(crate) fn camera(
         distortion: intrinsics.distortion().map_err(bad)?,
         world_to_camera,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn backslashes_of_windows_separate_folders() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir(dir.path().join("images")).unwrap();
+        let file = dir.path().join("images/a.png");
+        std::fs::write(&file, "").unwrap();
+        for named in ["images/a.png", "images/a", "images\\a.png", "images\\a"] {
+            assert_eq!(image_path(dir.path(), named), file, "{named}");
+        }
+        assert!(image_path(dir.path(), "./images\\a").is_file() && !image_path(dir.path(), "images\\b").is_file());
+    }
+
+    #[test]
+    fn images_without_a_time_among_others_are_told() {
+        let told = |times: &[Option<f64>]| {
+            let mut warnings = Vec::new();
+            warn_of_missing_times(times, &mut warnings);
+            warnings.join("")
+        };
+        assert!(told(&[Some(0.0), None, Some(1.0)]).starts_with("1 of 3 images state no time"));
+        assert_eq!(told(&[None, None]) + &told(&[Some(0.5)]) + &told(&[]), "");
+    }
 }

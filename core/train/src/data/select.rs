@@ -75,9 +75,13 @@ fn hold_out(raw: &mut RawScene, held_out: &[CameraRef]) -> Result<()> {
         };
         if found.is_empty() {
             let known = raw.cameras.iter().take(40).map(|c| c.name.as_str()).collect::<Vec<_>>().join(", ");
+            let wanted = match reference {
+                CameraRef::Index(index) => index.to_string(),
+                CameraRef::Name(name) => format!("{name:?}"),
+            };
             return Err(Error::parameter(
                 "scene.test_cameras",
-                format!("there is no camera {reference:?}"),
+                format!("there is no camera {wanted}"),
                 format!("The scene has {}: {known}", raw.cameras.len()),
             ));
         }

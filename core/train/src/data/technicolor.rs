@@ -46,13 +46,20 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     }
     // "Trains" and "Train" are both in use.
     let range = FIRST_FRAMES.iter().find(|(name, _)| scene_name.starts_with(name)).map(|&(_, first)| first..first + FRAMES);
-    if let Some(range) = range {
+    if let Some(range) = &range {
         images.retain(|(frame, _), _| range.contains(frame));
     }
     let mut frames: Vec<u32> = images.keys().map(|k| k.0).collect();
     frames.dedup();
     let Some(first) = images.values().next() else {
-        return Err(Error::data(path.display().to_string(), "no image named <Scene>_undist_<frame>_<camera>.png lies in its frame range", "Check the path"));
+        let (problem, remedy) = match range {
+            Some(range) => (
+                format!("it has no image of frames {} to {}, those that {scene_name} is evaluated on", range.start, range.end - 1),
+                "Add these frames, or begin the names of the images with another scene to use all of them",
+            ),
+            None => ("no image is named <Scene>_undist_<frame>_<camera>.png".to_string(), "Check the path"),
+        };
+        return Err(Error::data(path.display().to_string(), problem, remedy));
     };
     let (w, h) = image_size(first, limits)?;
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
@@ -78,6 +85,9 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
         let split = if camera == TEST_CAMERA { Split::Test } else { Split::Train };
         let frame = frames.partition_point(|&f| f < frame);
         scene.views.push(RawView { camera: camera as usize, frame, time: None, split, image: ImageSource::File { path, mask: None } });
+    }
+    if scene.views.iter().all(|view| view.split != Split::Test) {
+        scene.warnings.push(format!("there is no image of camera {TEST_CAMERA}; nothing is held out"));
     }
     Ok(scene)
 }

@@ -102,6 +102,18 @@ fn frames_are_numbered_by_their_names() {
 }
 
 #[test]
+fn frames_that_begin_with_different_numbers_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[2, 17], &llff_rows(&ring(2, 16, 12)))).unwrap();
+    for (c, t) in (0..6).map(|i| (i / 3, i % 3)) {
+        write_image(&dir.path().join(format!("cam{c}/{:04}.png", c + t)), 16, 12, 0);
+    }
+    std::fs::write(dir.path().join("cam0/._0000.png"), "of macOS, no image").unwrap();
+    let scene = load(dir.path()).unwrap();
+    assert!(scene.warnings.iter().any(|w| w.contains("cam0 begin with number 0, those of cam1 with 1")), "{:?}", scene.warnings);
+}
+
+#[test]
 fn a_model_beside_the_poses_that_cannot_be_read_is_left_out() {
     let dir = tempfile::tempdir().unwrap();
     write_llff(dir.path());
@@ -237,6 +249,26 @@ fn colmap_in_both_forms() {
 }
 
 #[test]
+fn colmap_images_are_where_their_names_are_and_other_models_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("scene");
+    write_colmap(&root);
+    // The images move beside the model; a folder images/ above belongs to something else.
+    (0..3).for_each(|i| std::fs::rename(root.join(format!("images/{i}.png")), root.join(format!("{i}.png"))).unwrap());
+    std::fs::remove_dir(root.join("images")).unwrap();
+    write_image(&dir.path().join("images/other.png"), 16, 12, 0);
+    let scene = load(&root).unwrap();
+    assert!(scene.views.len() == 3 && scene.warnings.is_empty(), "{:?}", scene.warnings);
+    std::fs::create_dir(root.join("sparse/1")).unwrap();
+    for file in ["cameras.bin", "images.bin"] {
+        std::fs::copy(root.join("sparse/0").join(file), root.join("sparse/1").join(file)).unwrap();
+    }
+    (0..3).for_each(|i| write_image(&root.join(format!("sparse/1/{i}.png")), 16, 12, 0));
+    let warned = |path: &std::path::Path| load(path).unwrap().warnings.iter().any(|w| w.contains("several models") && w.contains("3 images"));
+    assert!(warned(&root) && !warned(&root.join("sparse/1")));
+}
+
+#[test]
 fn colmap_lenses_are_undone() {
     for (model, parameters) in [
         ("SIMPLE_PINHOLE", "60 32 24"),
@@ -244,6 +276,8 @@ fn colmap_lenses_are_undone() {
         ("RADIAL", "60 32 24 -0.1 0.02"),
         ("OPENCV", "60 61 32 24 -0.1 0.02 0.001 -0.001"),
         ("OPENCV_FISHEYE", "60 61 32 24 0.01 0 0 0"),
+        ("SIMPLE_RADIAL_FISHEYE", "60 32 24 0.01"),
+        ("RADIAL_FISHEYE", "60 32 24 0.01 0.001"),
     ] {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("cameras.txt"), format!("1 {model} 64 48 {parameters}\n")).unwrap();
@@ -340,6 +374,11 @@ fn names_of_a_split_may_begin_with_a_dot() {
     assert_eq!((of(Split::Test), of(Split::Validation)), (vec!["images/0003.png".to_string()], vec!["images/0004.png".into()]));
     assert_eq!(of(Split::Train).len(), 3);
     assert!(scene.warnings.iter().any(|w| w.starts_with("1 images are in none of")), "{:?}", scene.warnings);
+    // Validation images may be named alone.
+    ["train_filenames", "test_filenames"].iter().for_each(|key| document[*key] = serde_json::json!([]));
+    std::fs::write(&file, document.to_string()).unwrap();
+    let scene = load(dir.path()).unwrap();
+    assert_eq!((scene.split(Split::Validation).len(), scene.split(Split::Train).len()), (1, 5));
 }
 
 #[test]

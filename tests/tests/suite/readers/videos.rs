@@ -118,7 +118,7 @@ fn constant_rates_keep_every_frame() {
     images(&cached).take(7).for_each(|image| std::fs::remove_file(image).unwrap());
     assert_eq!(instants(&opened(&dir, &options)).len(), 40);
     assert_eq!(images(&cached).count(), 40);
-    let some = opened(&dir, &SceneOptions { frames: Some([5, 6, 4]), ..options });
+    let some = opened(&dir, &SceneOptions { frames: Some([5, 6, 4]), video_cache: Some(dir.path().join("50%d")), ..options });
     assert_eq!(instants(&some), (0..6).map(|k| (k, vec![Some(5 + 4 * k); 2])).collect());
 }
 

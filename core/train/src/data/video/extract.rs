@@ -152,7 +152,9 @@ impl VideoFrames {
         let turn = turn_of(video, &self.options)?.filter;
         let turn = if turn.is_empty() { String::new() } else { format!("{turn},") };
         let filter = format!("select='{}',{turn}{CONSECUTIVE},scale={}:{}:flags=lanczos", clip.wanted.condition(), clip.size[0], clip.size[1]);
-        let (video_input, count, pattern) = (input(video), clip.wanted.count().to_string(), work.path().join("%06d.png"));
+        // In a pattern, a percent sign of the folder's name is written twice.
+        let outputs = work.path().to_str().map_or_else(|| work.path().to_path_buf(), |folder| PathBuf::from(folder.replace('%', "%%")));
+        let (video_input, count, pattern) = (input(video), clip.wanted.count().to_string(), outputs.join("%06d.png"));
         let before = ["-nostdin", "-v", "error", "-noautorotate", "-protocol_whitelist", "file", "-i"];
         let map = format!("0:{STREAM}");
         let after = ["-map", &map, "-vf", &filter, "-r", "25", "-frames:v", &count];

@@ -74,7 +74,8 @@ fn cache_name(video: &Path, what: &str) -> Result<String> {
     let meta = std::fs::metadata(&full).map_err(|e| Error::io(video, e))?;
     let modified = meta.modified().ok().and_then(|t| t.duration_since(std::time::UNIX_EPOCH).ok()).map(|d| d.as_nanos()).unwrap_or(0);
     let key = Seed::root(0).child(&format!("{}|{}|{modified}|{what}", full.display(), meta.len()));
-    let stem = video.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    // With the key, a long name would be too long for a file.
+    let stem: String = video.file_stem().map(|s| s.to_string_lossy().chars().take(48).collect()).unwrap_or_default();
     Ok(format!("{stem}-{:016x}", key.value()))
 }
 

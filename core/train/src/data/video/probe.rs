@@ -96,10 +96,8 @@ pub(super) fn turn_of(video: &Path, options: &SceneOptions) -> Result<Turn> {
 }
 
 fn ask(video: &Path, options: &SceneOptions, entries: &str) -> Result<Printed> {
-    let ffprobe = match options.ffmpeg.strip_suffix("ffmpeg") {
-        Some(folder) => format!("{folder}ffprobe"),
-        None => "ffprobe".into(),
-    };
+    let beside = |name: &str| options.ffmpeg.strip_suffix(name).map(|folder| format!("{folder}{}", name.replace("ffmpeg", "ffprobe")));
+    let ffprobe = beside("ffmpeg").or_else(|| beside("ffmpeg.exe")).unwrap_or_else(|| "ffprobe".into());
     let arguments = ["-v", "error", "-protocol_whitelist", "file", "-select_streams", STREAM, "-show_entries", entries, "-of", "json=compact=1"];
     let video_input = input(video);
     let mut arguments = arguments.map(OsStr::new).to_vec();
