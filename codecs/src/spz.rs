@@ -60,7 +60,8 @@ impl AttributeCodec for Spz {
         let file = set.reader(FILE)?;
         let mut out = from_spz("spz stream", file.rest(), &context.limits)?.gaussians;
         if out.len() != shape.count || out.sh_degree != shape.sh_degree {
-            return Err(Error::data("spz stream", format!("{} Gaussians of degree {}", out.len(), out.sh_degree), "The file is damaged"));
+            let problem = format!("{} Gaussians of degree {}, {} of degree {} are declared", out.len(), out.sh_degree, shape.count, shape.sh_degree);
+            return Err(Error::data("spz stream", problem, "The file is damaged"));
         }
         let mut beside = set.reader(BESIDE)?;
         let mut next = 0;

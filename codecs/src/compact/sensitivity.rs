@@ -72,7 +72,7 @@ pub fn measure(gaussians: &HostGaussians, classes: &Classes, context: &CodecCont
     let originals = (0..chosen).map(|k| Ok(draw(gaussians, k)?.1)).collect::<Result<Vec<Vec<f32>>>>()?;
     let middles: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
     let mut out = Vec::new();
-    for (name, attribute) in &gaussians.extra {
+    for (name, attribute) in gaussians.extra.iter().filter(|(_, attribute)| attribute.width > 0) {
         let rows = needed(attribute, gaussians.len());
         let spread = moments(attribute, &rows).1;
         let seed = context.seed.child("attributes").child(name);

@@ -21,7 +21,7 @@ const SIZES: usize = 16;
 const SYMBOL_LIMIT: f64 = 192.0;
 const SHAPES: &str = "shapes";
 const VALUES: &str = "values";
-/// Values per byte of the stream that a decoder believes.
+/// Values per byte of the stream that a decoder believes; arrays of zeros take no bytes.
 const PER_BYTE: usize = 4096;
 
 struct Weights {
@@ -124,10 +124,14 @@ impl WeightCodec for Weights {
         let mut arrays = read_shapes(&mut shapes)?;
         let forms = arrays.iter().map(|_| Form::read(&mut shapes)).collect::<Result<Vec<Form>>>()?;
         let most = values.remaining().saturating_mul(PER_BYTE);
-        let total = arrays.iter().try_fold(0usize, |sum, a| sum.checked_add(value_count(&a.shape)?)).filter(|total| *total <= most);
+        let count = |zeros: bool| {
+            let mut counted = arrays.iter().zip(&forms).filter(|(_, form)| zeros || form.largest > 0.0);
+            counted.try_fold(0usize, |sum, (array, _)| sum.checked_add(value_count(&array.shape)?))
+        };
+        let total = count(true).filter(|_| count(false).is_some_and(|coded| coded <= most));
         let Some(total) = total else { return Err(shapes.error(format!("the arrays do not fit the {} bytes of values", values.remaining()))) };
         shapes.finish()?;
-        context.limits.check_bytes("deformer weights", 4 * total as u64)?;
+        context.limits.check_bytes("deformer weights", 4u64.saturating_mul(total as u64))?;
         let (object, length) = ("compact stream 'values'", values.u32()? as usize);
         let tables = Tables::read(object, contexts(arrays.len()), values.take(length)?)?;
         let mut coder = Decoder::new(object, &tables, values.rest())?;
@@ -180,5 +184,22 @@ array_bits = []          # of each array in turn, in place of bits; max-drop cho
             capabilities: &["lossy", "bits=3..16"],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_format::{Limits, Seed, Silent};
+
+    #[test]
+    fn many_zeros_come_back_within_the_limits() {
+        let context = |limits: Limits| CodecContext::new(Seed::root(1), limits, &Silent);
+        let codec = Weights { bits: BITS, array_bits: Vec::new() };
+        let weights = [WeightArray { name: "grid".into(), shape: vec![1 << 18, 2], values: vec![0.0; 1 << 19] }];
+        let streams = codec.encode(&weights, &context(Limits::default())).unwrap();
+        assert!(codec.decode(&streams, &context(Limits::default())).unwrap() == weights);
+        let message = codec.decode(&streams, &context(Limits { max_bytes: 1 << 20, ..Limits::default() })).unwrap_err().to_string();
+        assert!(message.contains("max_bytes"), "{message}");
     }
 }

@@ -1,6 +1,6 @@
 //! What a deformer knows of its scene.
 
-use crate::Seed;
+use crate::{Error, Result, Seed};
 use serde::{Deserialize, Serialize};
 
 /// The properties of a scene that define the meaning of a deformer's weights. Stored in checkpoints and archives.
@@ -16,4 +16,19 @@ pub struct DeformerContext {
     pub sh_degree: usize,
     /// The deformer's node of the seed tree.
     pub seed: Seed,
+}
+
+impl DeformerContext {
+    /// Refuses boxes that are not finite and degrees above 4, before a deformer allocates memory for them; `object` names the file in errors.
+    ///
+    /// # Errors
+    /// [`Error::Data`].
+    pub fn validate(&self, object: &str) -> Result<()> {
+        let problem = match self.box_min.iter().chain(&self.box_max).find(|v| !v.is_finite()) {
+            Some(v) => format!("a corner of its deformer's box is {v}"),
+            None if self.sh_degree > 4 => format!("the spherical-harmonics degree {} of its deformer is over 4", self.sh_degree),
+            None => return Ok(()),
+        };
+        Err(Error::data(object, problem, "The file is damaged; fetch or write it again"))
+    }
 }

@@ -116,6 +116,15 @@ impl Error {
     pub fn failed(object: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self::Failed { object: object.into(), problem: problem.into(), remedy: remedy.into() }
     }
+    /// The error of settings that a file states, which are not the user's mistake; `object` names the file.
+    pub fn of_file(self, object: &str) -> Self {
+        match self {
+            Self::Parameter { object: setting, problem, .. } => {
+                Self::data(object, format!("{setting}: {problem}"), "The file is damaged or of another version; fetch or write it again")
+            }
+            other => other,
+        }
+    }
     /// A [`Error::Io`] about `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Self::Io { path: path.as_ref().to_path_buf(), source }
@@ -133,5 +142,18 @@ impl Error {
             Self::Failed { .. } => 6,
             Self::Interrupted(_) => 130,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Error;
+
+    #[test]
+    fn settings_of_a_file_are_no_mistake_of_the_user() {
+        let error = Error::parameter("codec raw, bits", "unknown field", "See the known keys").of_file("a.cc4d");
+        assert_eq!(error.exit_code(), 3);
+        assert!(error.to_string().starts_with("a.cc4d: codec raw, bits: unknown field. "), "{error}");
+        assert_eq!(Error::limit("a stream", 2, 1, "Raise it").of_file("a.cc4d").exit_code(), 4);
     }
 }

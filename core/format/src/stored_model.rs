@@ -87,7 +87,7 @@ pub fn weight_seed(root: u64) -> Seed {
 /// # Errors
 /// As [`read_gaussians`].
 pub fn read_weights(object: &str, archive: &Archive, entry: &CodecEntry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
-    let codec = (linked::<WeightCodecPlugin>(object, entry)?.build)(&entry.settings)?;
+    let codec = (linked::<WeightCodecPlugin>(object, entry)?.build)(&entry.settings).map_err(|e| e.of_file(object))?;
     let own = |s: Stream| Some(Stream { name: s.name.strip_prefix(FIELD_STREAMS)?.to_string(), bytes: s.bytes });
     let streams: Vec<Stream> = archive.read_kind(StreamKind::Field)?.into_iter().filter_map(own).collect();
     codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events))
@@ -113,7 +113,7 @@ fn linked<P: PluginEntry>(object: &str, entry: &CodecEntry) -> Result<&'static P
 /// The codec of `archive`, which must be linked, and the context of decoding with it.
 fn codec_of<'a>(object: &str, archive: &Archive, limits: &Limits, events: &'a dyn EventSink) -> Result<(Box<dyn AttributeCodec>, CodecContext<'a>)> {
     let (manifest, entry) = (archive.manifest(), &archive.manifest().codec);
-    let codec = (linked::<CodecPlugin>(object, entry)?.build)(&entry.profile, &entry.settings)?;
+    let codec = (linked::<CodecPlugin>(object, entry)?.build)(&entry.profile, &entry.settings).map_err(|e| e.of_file(object))?;
     Ok((codec, CodecContext::new(Seed::root(manifest.provenance.seed).child("codec"), *limits, events)))
 }
 

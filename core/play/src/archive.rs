@@ -19,16 +19,6 @@ use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What is wrong with settings of a file is not the user's mistake.
-fn stored_settings(object: &str, error: Error) -> Error {
-    match error {
-        Error::Parameter { object: setting, problem, .. } => {
-            Error::data(object, format!("{setting}: {problem}"), "The file is damaged or of another version; fetch or write it again")
-        }
-        other => other,
-    }
-}
-
 /// Key of the manifest's `extra` with the plug-in attributes: floats per Gaussian by name. Absent where there are none.
 const ATTRIBUTES: &str = "attributes";
 
@@ -74,7 +64,7 @@ impl Model {
                 check_version(object, "deformer", &entry.name, &entry.version, known)?;
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
-                let mut field = registry.build_deformer(&section, &entry.context, device).map_err(|e| stored_settings(object, e))?;
+                let mut field = registry.build_deformer(&section, &entry.context, device).map_err(|e| e.of_file(object))?;
                 let weights = read_weights(object, archive, &entry.weights, limits, events)?;
                 load_weights(object, field.as_mut(), weights, device)?;
                 Some(ModelDeformer { field, section, context: entry.context.clone() })

@@ -221,9 +221,10 @@ impl ModelHeader {
         let field = match self.deformer {
             None => None,
             Some(DeformerHeader { section, context }) => {
-                let (kind, _) = split_kind("deformer", &section)?;
+                context.validate(&file.object)?;
+                let (kind, _) = split_kind("deformer", &section).map_err(|e| e.of_file(&file.object))?;
                 linked(&file.object, "deformer", &kind, None, registry)?;
-                let mut field = registry.build_deformer(&section, &context, device)?;
+                let mut field = registry.build_deformer(&section, &context, device).map_err(|e| e.of_file(&file.object))?;
                 for parameter in field.parameters_mut() {
                     let len: usize = parameter.shape.iter().product();
                     let values = file.array(&format!("deformer/{}", parameter.name), Some(len))?;

@@ -60,7 +60,10 @@ impl Orbit {
             Camera::look_at(&format!("orbit{i:05}"), self.size, FOV_X, eye, middle, self.up)
         };
         let cameras: Vec<Camera> = (0..self.frames).map(camera).collect();
-        cameras.iter().try_for_each(Camera::validate)?;
+        cameras.iter().try_for_each(Camera::validate).map_err(|_| {
+            let problem = format!("no camera can look at Gaussians around {middle:?} from {distance:e} away; such numbers are too far apart for float64");
+            Error::data("orbit", problem, "Move the model to the origin, or remove Gaussians that are far away")
+        })?;
         Ok(cameras)
     }
     /// Normalised time of a frame, so that time runs from 0 to 1 over the orbit.
@@ -117,6 +120,9 @@ mod tests {
         assert_eq!(small.around(&HostGaussians::default()).unwrap().len(), 2);
         assert!(Orbit { turns: f64::NAN, ..small.clone() }.around(&one).is_err());
         assert!(Orbit { up: [0.0, 0.5, 0.5], ..small.clone() }.around(&one).is_err());
+        let far = HostGaussians { means: vec![1e30; 3], opacity_logits: vec![2.0], ..Default::default() };
+        let message = small.around(&far).unwrap_err().to_string();
+        assert!(message.contains("no camera can look"), "{message}");
         assert!(Orbit { size: (0, 8), ..small }.around(&one).is_err());
     }
 }

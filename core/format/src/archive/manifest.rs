@@ -163,8 +163,8 @@ impl Manifest {
         if !(1..=MOST_FRAMES).contains(&self.frame_count) {
             return Err(damaged(object, format!("frame_count {} is not in 1..{MOST_FRAMES}", self.frame_count)));
         }
-        let context = self.deformer.iter().flat_map(|d| d.context.box_min.iter().chain(&d.context.box_max));
-        let mut numbers = self.time_range.iter().chain(self.box_world.iter().flatten()).chain(&self.background).chain([&self.dynamic_threshold]).chain(context);
+        self.deformer.iter().try_for_each(|d| d.context.validate(object))?;
+        let mut numbers = self.time_range.iter().chain(self.box_world.iter().flatten()).chain(&self.background).chain([&self.dynamic_threshold]);
         // A decimal beyond the range of f32 is parsed as infinity.
         if let Some(v) = numbers.find(|v| !v.is_finite()) {
             return Err(damaged(object, format!("a time, box, colour or threshold is {v}")));
@@ -224,6 +224,16 @@ mod tests {
         let of = |frame_count| Manifest { format_version: FORMAT_VERSION, frame_count, ..Default::default() }.validate("m", &Limits::default());
         assert!(of(1).is_ok() && of(MOST_FRAMES).is_ok());
         assert!(of(0).is_err() && of(MOST_FRAMES + 1).is_err() && of(usize::MAX).is_err());
+    }
+
+    #[test]
+    fn deformers_of_impossible_degrees_and_boxes_are_refused() {
+        let of = |sh_degree: usize, corner: f32| {
+            let context = DeformerContext { box_min: [-1.0; 3], box_max: [corner; 3], frame_count: 1, sh_degree, seed: crate::Seed::root(1) };
+            let deformer = DeformerEntry { name: "d".into(), version: "1".into(), settings: toml::Table::new(), context, weights: CodecEntry::default() };
+            Manifest { format_version: FORMAT_VERSION, frame_count: 1, deformer: Some(deformer), ..Default::default() }.validate("m", &Limits::default())
+        };
+        assert!(of(4, 1.0).is_ok() && of(5, 1.0).is_err() && of(usize::MAX, 1.0).is_err() && of(0, f32::INFINITY).is_err());
     }
 
     #[test]

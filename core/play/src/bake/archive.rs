@@ -48,6 +48,11 @@ pub fn with_additions(archive: &Archive, additions: Additions) -> Result<Vec<u8>
             baked.map(|b| b.streams.clone()).unwrap_or_default()
         }
     };
+    let field = if additions.without_field { Vec::new() } else { archive.read_kind(StreamKind::Field)? };
+    if layer.is_empty() && field.is_empty() {
+        // Nothing moves. Readers take a deformer without weights and layer for a motion that was lost.
+        manifest.deformer = None;
+    }
     let mut writer = ArchiveWriter::new(manifest);
     if let Some(bytes) = additions.poster {
         writer = writer.add(StreamKind::Poster, Stream { name: "poster".into(), bytes });
@@ -57,7 +62,6 @@ pub fn with_additions(archive: &Archive, additions: Additions) -> Result<Vec<u8>
     canonical.sort_by_key(|(stage, _)| *stage);
     let harmonics = canonical.split_off(canonical.partition_point(|(stage, _)| *stage < StreamStage::Harmonics));
     let streams = |staged: Vec<(StreamStage, Stream)>| staged.into_iter().map(|(_, stream)| stream);
-    let field = if additions.without_field { Vec::new() } else { archive.read_kind(StreamKind::Field)? };
     let (motion, unused) = if layer.is_empty() { (field, Vec::new()) } else { (Vec::new(), field) };
     writer = writer.add_all(StreamKind::Canonical, streams(canonical)).add_all(StreamKind::Playback, layer).add_all(StreamKind::Field, motion);
     writer = writer.add_all(StreamKind::Canonical, streams(harmonics)).add_all(StreamKind::Field, unused);
