@@ -47,7 +47,7 @@ impl Model {
     /// training views, and trains the model further while its values are rounded. `field_weights` is the weight codec of the deformer.
     ///
     /// # Errors
-    /// As [`Model::save_with`], and [`Error::Interrupted`](crate::Error::Interrupted) after [`Session::stop`]; nothing is written then.
+    /// As [`Model::save_with`], and [`Error::Interrupted`](crate::Error::Interrupted) where [`Session::stop`] is called meanwhile; nothing is written then.
     pub fn save_tuned(&self, path: impl AsRef<Path>, codec: &str, settings: &toml::Table, field_weights: &str, scene: &Arc<Scene>) -> Result<u64> {
         let session = &self.session;
         let tuner = Tuner::new(TuneJob {
@@ -58,7 +58,7 @@ impl Model {
             device: session.device(),
             limits: session.limits(),
             events: session.events(),
-            stop: session.stopped(),
+            stop: session.stop_flag(),
         });
         self.save_with(path, &ArchiveOptions { codec, settings, field_weights, scene: Some((scene, session.device())), tuner: Some(&tuner) })
     }

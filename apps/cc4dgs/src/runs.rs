@@ -18,12 +18,17 @@ pub enum Existing {
     Overwrite,
 }
 
-/// Refuses a folder that holds a run which would be overwritten unasked, and one to go on from that holds no checkpoint. `remedy` says what to do instead.
+/// Refuses a folder that holds a run which would be overwritten unasked, one to go on from that holds no checkpoint, and a file. `remedy` says what to do
+/// instead.
 ///
 /// # Errors
 /// [`Error::Parameter`] that names the folder and what is found there.
 pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<()> {
-    let refuse = |problem: String| Err(Error::parameter(format!("run folder {}", folder.display()), problem, remedy));
+    let object = format!("run folder {}", folder.display());
+    if folder.is_file() {
+        return Err(Error::parameter(object, "it is a file", "Give another name"));
+    }
+    let refuse = |problem: String| Err(Error::parameter(object, problem, remedy));
     let found = [CHECKPOINT, EVENTS, CONFIG].into_iter().find(|name| folder.join(name).exists());
     match (existing, found) {
         (Existing::Refuse, Some(name)) => refuse(format!("it holds a run already ({name})")),
@@ -44,6 +49,8 @@ mod tests {
         check(Existing::Refuse).unwrap();
         std::fs::write(folder.path().join("notes.txt"), "mine").unwrap();
         check(Existing::Refuse).unwrap();
+        let file = check_folder(&folder.path().join("notes.txt"), Existing::Overwrite, "Pass --overwrite").unwrap_err().to_string();
+        assert!(file.contains("notes.txt: it is a file"), "{file}");
         // A run that ended before its first checkpoint.
         std::fs::write(folder.path().join(CONFIG), "").unwrap();
         assert!(check(Existing::Refuse).is_err());

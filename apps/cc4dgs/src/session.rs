@@ -4,7 +4,7 @@ use crate::Model;
 use crate::runs::{Existing, check_folder};
 use crate::{plugins, scenes};
 use burn::tensor::Device;
-use cc4dgs_core::{Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device};
+use cc4dgs_core::{Error, Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
@@ -61,8 +61,8 @@ impl SessionBuilder {
     /// Collects the linked plug-ins and starts the device.
     ///
     /// # Errors
-    /// [`Error::Parameter`](crate::Error::Parameter) for an unknown device and for two plug-ins of one name,
-    /// [`Error::Unsupported`](crate::Error::Unsupported) for a device that does not answer.
+    /// [`Error::Parameter`] for an unknown device and for two plug-ins of one name,
+    /// [`Error::Unsupported`] for a device that does not answer.
     pub fn build(self) -> Result<Session> {
         let device = parse_device(&self.device)?;
         let (limits, events, stop) = (self.limits, self.events, AtomicBool::new(false));
@@ -106,21 +106,29 @@ impl Session {
     pub fn device(&self) -> &Device {
         &self.shared.device
     }
-    /// Asks a running [`Session::train`] to stop after its current iteration, with a checkpoint where it has a folder. May be called from any thread.
+    /// Asks a running [`Session::train`] to stop after its current iteration, with a checkpoint where it has a folder, and a running [`Model::save_tuned`] to
+    /// write nothing. What begins later is not stopped. May be called from any thread.
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
     }
-    /// Set once [`Session::stop`] was called.
-    pub(crate) fn stopped(&self) -> &AtomicBool {
+    /// The flag that [`Session::stop`] sets, for work that begins now: an earlier stop is forgotten.
+    pub(crate) fn stop_flag(&self) -> &AtomicBool {
+        self.shared.stop.store(false, Ordering::Relaxed);
         &self.shared.stop
     }
     /// The settings of a preset (`demo`, `dnerf+hexplane`) with `key=value` overrides, on this session's device and limits.
     ///
     /// # Errors
-    /// [`Error::Parameter`](crate::Error::Parameter) for unknown presets, unknown keys and values out of range.
+    /// [`Error::Parameter`] for unknown presets, unknown keys and values out of range, and for `auto`, which chooses by looking at a scene: that is
+    /// [`Session::plan`].
     pub fn config(&self, preset: &str, overrides: &[&str]) -> Result<RunConfig> {
         let overrides: Vec<String> = overrides.iter().map(ToString::to_string).collect();
-        Ok(self.adopted(RunConfig::resolve(Some(preset), None, &overrides)?))
+        let layers = Layers::collect(self.registry(), Some(preset), None, &overrides)?;
+        if layers.want_plan() {
+            let remedy = "Call Session::plan with the path of the scene; the override deformer.kind=NAME chooses another method";
+            return Err(Error::parameter(format!("preset '{preset}'"), "it chooses settings by looking at a scene, and none is given", remedy));
+        }
+        Ok(self.adopted(layers.config()?))
     }
     /// Opens the dataset at `path` and chooses the settings of a training by looking at it (the preset `auto`), with `key=value` overrides, on this session's device
     /// and limits. `auto.minutes=5` states the time there is.
@@ -152,7 +160,7 @@ impl Session {
     /// Trains on `scene`. With a folder, checkpoint and configuration are left there; it must not hold a run already.
     ///
     /// # Errors
-    /// [`Error::Interrupted`](crate::Error::Interrupted) after [`Session::stop`], [`Error::Backend`](crate::Error::Backend) when the loss is no longer a
+    /// [`Error::Interrupted`] after [`Session::stop`], [`Error::Backend`] when the loss is no longer a
     /// number, and whatever scene, plug-ins and disk report.
     pub fn train(&self, config: &RunConfig, scene: impl Into<Arc<Scene>>, out: Option<&Path>) -> Result<Model> {
         if let Some(folder) = out {
@@ -172,8 +180,7 @@ impl Session {
     fn run(&self, config: &RunConfig, scene: Arc<Scene>, out: Option<&Path>, resume: bool) -> Result<Model> {
         let config = &self.adopted(config.clone());
         plugins::check(config, self.registry())?;
-        self.shared.stop.store(false, Ordering::Relaxed);
-        let (registry, events, stop) = (self.registry(), self.events(), &self.shared.stop);
+        let (registry, events, stop) = (self.registry(), self.events(), self.stop_flag());
         let (model, _) = train(&TrainJob { config, scene, out: out.map(Path::to_path_buf), resume, registry, events, stop, observer: None })?;
         Ok(Model::new(model, self.clone()))
     }
@@ -203,5 +210,27 @@ impl Session {
     /// As [`evaluate`].
     pub fn evaluate(&self, model: &Model, scene: &Scene, split: Split) -> Result<EvalReport> {
         evaluate(model, scene, Scored::all(split), self.registry(), self.device(), self.events(), &mut |_, _, _, _| Ok(()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_need_a_scene_are_planned() {
+        let session = Session::builder().device("flex").build().unwrap();
+        for preset in ["auto", "auto+hexplane"] {
+            let message = session.config(preset, &[]).err().unwrap().to_string();
+            assert!(message.contains(preset) && message.contains("Session::plan"), "{message}");
+        }
+        session.config("demo", &[]).unwrap();
+    }
+
+    #[test]
+    fn a_stop_is_for_what_runs() {
+        let session = Session::builder().device("flex").build().unwrap();
+        session.stop();
+        assert!(!session.stop_flag().load(Ordering::Relaxed));
     }
 }

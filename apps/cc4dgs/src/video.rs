@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
-const REMEDY: &str = "Install ffmpeg (Debian: apt install ffmpeg), or use the PNG frames without a video";
+const REMEDY: &str = "Install ffmpeg (Debian: apt install ffmpeg), or render PNG frames without a video";
 
 /// The first line `ffmpeg -version` prints, or why there is none.
 ///

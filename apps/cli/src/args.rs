@@ -183,7 +183,7 @@ pub struct Eval {
     /// Also measure LPIPS and FLIP, which take longer than drawing the images.
     #[arg(long)]
     pub perceptual: bool,
-    /// The contact sheet: ground truth, render and error. Without it, it lies beside the JSON file or, for a run, in its folder.
+    /// The contact sheet: ground truth, render and error. Without it, it lies beside the JSON file, in the folder of a run, or beside the model.
     #[arg(long, value_name = "F.png")]
     pub sheet: Option<PathBuf>,
     /// Rows of the contact sheet, evenly spread over the images; 0 draws none.
@@ -223,7 +223,7 @@ pub struct Report {
     /// Columns of the summary tables by their names in the CSV file, such as psnr_db,size_mb,frame_ms; all by default.
     #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
     pub columns: Vec<String>,
-    /// Also write every plot as an SVG file into this folder.
+    /// Also write every plot with two axes as an SVG file into this folder.
     #[arg(long, value_name = "DIR")]
     pub figures: Option<PathBuf>,
 }

@@ -1,5 +1,6 @@
 //! Results go to standard output (for people, or as JSON), everything else to standard error.
 
+use crate::commands::create_parent;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::{Error, Result};
@@ -44,15 +45,14 @@ impl Output {
         match &self.json {
             None => print(&text()),
             Some(path) => {
-                let json = to_json(value)?;
+                let json = to_json(value);
                 if path.as_os_str() == "-" {
-                    return print(&json);
+                    return print(&json?);
                 }
-                if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
-                    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
-                }
-                write_atomically(path, json.as_bytes())?;
-                print(&text())
+                let written = json.and_then(|json| create_parent(path).and_then(|()| write_atomically(path, json.as_bytes())));
+                // What was measured is shown where its file cannot be written, too.
+                print(&text())?;
+                written
             }
         }
     }
@@ -88,6 +88,20 @@ fn is_result(head: &[u8]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_result_is_shown_where_its_file_cannot_be_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let no_folder = folder.path().join("file");
+        std::fs::write(&no_folder, "mine").unwrap();
+        let mut shown = false;
+        let text = || {
+            shown = true;
+            String::new()
+        };
+        assert!(Output::new(Some(no_folder.join("out.json")), true).result(&serde_json::json!({ "psnr_db": 30.5 }), text).is_err());
+        assert!(shown);
+    }
 
     #[test]
     fn json_replaces_results_only() {

@@ -59,19 +59,19 @@ pub struct Shots {
     /// Which side of the dataset's split; with --scene only.
     #[arg(long, value_enum, default_value_t = SplitArg::Test, requires = "scene")]
     pub split: SplitArg,
-    /// Frames: of the orbit (default 60), or at most so many of the dataset, evenly spread.
+    /// Frames: of the orbit (default 60), at most so many of the dataset, evenly spread, or of ply-sequence (default: those of training).
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
-    /// Image size in pixels; for datasets the default is their own.
+    /// Image size in pixels; by default 800x600 for an orbit, for datasets their own.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<(u32, u32)>,
     /// Full turns of the orbit while time runs from 0 to 1.
     #[arg(long, value_name = "TURNS", default_value_t = 1.0, conflicts_with = "scene")]
     pub turns: f64,
-    /// The axis of the world that points up, for the orbit.
+    /// The axis of the world that points up, for the orbit and for gltf.
     #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]
     pub up: UpArg,
-    /// Frames per second of a video.
+    /// Frames per second of a video, and of a page where the model states none.
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=240))]
     pub fps: u32,
 }

@@ -73,7 +73,7 @@ pub struct SweepCollect {
     /// Make tables of what is there, also where cells are missing.
     #[arg(long)]
     pub partial: bool,
-    /// Tables of these results only: scene, method, setting, codec, seed or device; may be given several times.
+    /// Tables of these results only: scene, method, setting, codec, seed, device or split; may be given several times.
     #[arg(long = "where", value_name = "KEY=VALUE")]
     pub conditions: Vec<String>,
 }

@@ -9,6 +9,7 @@ use crate::output::to_json;
 use cc4dgs::runs::{EVENTS, Existing};
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::write_atomically;
+use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Result, Split};
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_train::eval::Scored;
@@ -44,13 +45,15 @@ struct DemoReport {
 
 pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let began = Instant::now();
+    let [archive, sheet, file] = ["model.cc4d", "sheet.png", "report.json"].map(|name| args.out.join(name));
+    // A folder without a run may hold files of these names, too.
+    [&archive, &sheet, &file].into_iter().try_for_each(|path| refuse_existing(path, args.overwrite))?;
     let layers = layers(context, Some("demo"), None, &args.sets, args.device.as_deref())?;
     let scene_path = Path::new("procedural");
     let existing = if args.overwrite { Existing::Overwrite } else { Existing::Refuse };
     let Trained { scene: scene_name, config, report: trained } = train_into(context, &layers, scene_path, &args.out, existing, None)?;
 
     let events = context.listeners(Some((&args.out.join(EVENTS), true)))?;
-    let archive = args.out.join("model.cc4d");
     let loaded = load_model(&args.out, &config.device, &context.registry, &context.limits, &events)?;
     let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None, tuner: None };
     let packed = compress::compress(context, &loaded.model, &options, &archive, &events)?;
@@ -58,7 +61,7 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let scene = open_as_trained(scene_path, &loaded.model, &[], &context.registry, &context.limits)?;
     let plain = Images::default();
     let before = measure(context, &args.out, &loaded, &scene, Scored::all(Split::Test), &plain, &events)?;
-    let images = Images { sheet: Some(args.out.join("sheet.png")), sheet_rows: 6, renders: None };
+    let images = Images { sheet: Some(sheet), sheet_rows: 6, renders: None };
     let unpacked = load_model(&archive, &config.device, &context.registry, &context.limits, &events)?;
     let after = measure(context, &archive, &unpacked, &scene, Scored::all(Split::Test), &images, &events)?;
 
@@ -78,10 +81,10 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
         eval_checkpoint: before,
         eval_archive: after,
     };
-    let file = args.out.join("report.json");
     create_parent(&file)?;
     write_atomically(&file, to_json(&report)?.as_bytes())?;
-    context.output.result(&report, || text(&report, &file))
+    context.output.result(&report, || text(&report, &file))?;
+    report.eval_archive.sheet_error.map_or(Ok(()), Err)
 }
 
 fn text(report: &DemoReport, file: &Path) -> String {

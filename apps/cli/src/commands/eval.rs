@@ -27,6 +27,9 @@ pub struct FullReport {
     pub seconds: f64,
     /// The contact sheet, if one was drawn.
     pub sheet: Option<PathBuf>,
+    /// Why the contact sheet could not be drawn or written. The numbers are reported first.
+    #[serde(skip)]
+    pub sheet_error: Option<Error>,
     #[serde(flatten)]
     pub eval: EvalReport,
     /// Trajectory error per moving body, for built-in scenes with known motion.
@@ -71,7 +74,8 @@ pub fn run(context: &Context, args: &Eval) -> Result<()> {
     earlier.iter().try_for_each(|render| std::fs::remove_file(render).map_err(|e| Error::io(render, e)))?;
     let report =
         measure(context, &args.views.model, &loaded, &scene, Scored { split, max_views: args.max_views, perceptual: args.perceptual }, &images, &events)?;
-    context.output.result(&report, || text(&report))
+    context.output.result(&report, || text(&report))?;
+    report.sheet_error.map_or(Ok(()), Err)
 }
 
 /// Beside the JSON file if there is one, else in the run's folder, else beside the archive.
@@ -148,7 +152,7 @@ pub fn measure(
     let mut comparisons = Vec::with_capacity(rows.len());
     let mut index = 0;
     let report = evaluate(model, scene, scored, &context.registry, &loaded.device, events, &mut |view, truth, render, score| {
-        interrupt::check(stop, "evaluation; nothing was written but finished renders")?;
+        interrupt::check(stop, "evaluation; nothing of it was written but finished renders")?;
         if rows.last() == Some(&index) {
             rows.pop();
             let caption =
@@ -161,9 +165,13 @@ pub fn measure(
         index += 1;
         Ok(())
     })?;
+    let (mut sheet, mut sheet_error) = (images.sheet.clone(), None);
     if let Some(path) = &images.sheet {
         let title = format!("{}: PSNR {:.2} dB  SSIM {:.4}  {:.3} MB", report.scene, report.psnr_db, report.ssim, report.size_mb.total);
-        write_png(path, &comparison_sheet(&comparisons, &SheetOptions { title, ..Default::default() })?)?;
+        let drawn = comparison_sheet(&comparisons, &SheetOptions { title, ..Default::default() });
+        if let Err(e) = drawn.and_then(|image| write_png(path, &image)) {
+            (sheet, sheet_error) = (None, Some(e));
+        }
     }
     for (counter, done, skipped) in [
         ("Gaussians deformed", report.work.deformed, report.work.static_skipped),
@@ -188,7 +196,8 @@ pub fn measure(
         model: model_path.to_path_buf(),
         device: loaded.device_name.clone(),
         seconds: began.elapsed().as_secs_f64(),
-        sheet: images.sheet.clone(),
+        sheet,
+        sheet_error,
         eval: report,
         motion,
         provenance: Provenance {

@@ -29,6 +29,7 @@ pub fn run(context: &Context, args: &Info) -> Result<()> {
     context.output.result(&value, || lines.join("\n"))
 }
 
+/// Paths are stated as text: `json!` panics at one that is not UTF-8.
 fn describe(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     // The built-in scenes are names and not paths.
     let source = if path.exists() { Source::find(path)? } else { None };
@@ -38,7 +39,7 @@ fn describe(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> 
         Some(kind @ (SourceKind::Ply | SourceKind::Spz)) => {
             let model = Model::open(path, &context.registry, &parse_device(DEVICE)?, &context.limits, &Silent)?;
             let size: SizeMb = model.size.into();
-            Ok((json!({ "kind": kind, "path": path, "size_mb": size.total, "gaussians": gaussians(&model.gaussians)? }), None))
+            Ok((json!({ "kind": kind, "path": path.to_string_lossy(), "size_mb": size.total, "gaussians": gaussians(&model.gaussians)? }), None))
         }
         None => Ok((scene(context, path)?, None)),
     }
@@ -80,6 +81,7 @@ fn archive(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)> {
     };
     let manifest = plain(of)?;
     let streams: Vec<StreamSize> = stored.into_iter().map(StreamSize::from).collect();
+    let path = path.to_string_lossy();
     let mut value = json!({ "kind": SourceKind::Archive, "path": path, "size_mb": megabytes(total), "streams": streams, "manifest": manifest });
     if let (false, Value::Object(map)) = (notes.is_empty(), &mut value) {
         map.insert("notes".into(), notes.into());
@@ -109,7 +111,7 @@ fn checkpoint(context: &Context, path: &Path) -> Result<(Value, Option<Storage>)
     };
     let value = json!({
         "kind": SourceKind::Checkpoint,
-        "path": path,
+        "path": path.to_string_lossy(),
         "size_mb": size,
         "gaussians": gaussians(&model.gaussians)?,
         "dynamic_gaussians": moving,
@@ -139,7 +141,7 @@ fn scene(context: &Context, path: &Path) -> Result<Value> {
     let sizes: Vec<String> = sizes.into_iter().map(|(w, h)| format!("{w}x{h}")).collect();
     Ok(json!({
         "kind": "scene",
-        "path": path,
+        "path": path.to_string_lossy(),
         "name": scene.name,
         "cameras": scene.cameras.len(),
         "frames": scene.frame_count,

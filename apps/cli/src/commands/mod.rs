@@ -140,8 +140,11 @@ fn no_window(command: String) -> Error {
     Error::unsupported(command, "the window is left out of this build", remedy)
 }
 
-/// Creates the folder a file will be written to, before any long work that would be lost without it.
+/// Creates the folder that the file `path` will be written to, and refuses a folder in its place, before any long work that would be lost.
 pub fn create_parent(path: &Path) -> Result<()> {
+    if path.is_dir() {
+        return Err(Error::parameter(path.display().to_string(), "it is a folder, and a file is to be written", "Give the name of a file"));
+    }
     match path.parent().filter(|p| !p.as_os_str().is_empty()) {
         Some(folder) => std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e)),
         None => Ok(()),
@@ -175,6 +178,14 @@ mod tests {
         for bad in ["max_gausians=7", "max_bytes=-1", "max_bytes"] {
             assert!(limits(&[bad.into()]).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn a_file_is_not_written_in_place_of_a_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(create_parent(folder.path()).unwrap_err().to_string().contains("it is a folder"));
+        create_parent(&folder.path().join("new/model.cc4d")).unwrap();
+        assert!(folder.path().join("new").is_dir());
     }
 
     #[test]

@@ -47,16 +47,13 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let (shots, background) = shots::choose(context, &args.shots, &args.sets, &loaded.model, true)?;
+    if let Some(path) = &args.mp4 {
+        create_parent(path)?;
+    }
     std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
     earlier.iter().try_for_each(|frame| std::fs::remove_file(frame).map_err(|e| Error::io(frame, e)))?;
     let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(background);
-    let mut video = match &args.mp4 {
-        Some(path) => {
-            create_parent(path)?;
-            Some(VideoWriter::new(path, args.shots.fps))
-        }
-        None => None,
-    };
+    let mut video = args.mp4.as_ref().map(|path| VideoWriter::new(path, args.shots.fps));
     let mut times = Vec::with_capacity(shots.len());
     for (index, (camera, time_norm)) in shots.iter().enumerate() {
         interrupt::check(stop, &format!("after {index} of {} frames in {}", shots.len(), args.out.display()))?;

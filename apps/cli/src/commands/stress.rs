@@ -38,6 +38,8 @@ pub fn run(context: &Context, args: &Stress) -> Result<()> {
         done += 1;
         events.emit(&Event::Progress { task: "stress".into(), done, total: 0 });
     })?;
+    // Ends the bar before the table is printed: how many cases there are is not known.
+    drop(events);
     let failures: Vec<String> = report.failures().map(|c| format!("{}, {}, {}: {}", c.part, c.condition, c.level, c.outcome)).collect();
     let limits: Vec<_> = report.limits().into_iter().map(|(part, condition, level)| json!({ "part": part, "condition": condition, "level": level })).collect();
     let value = json!({ "device": name, "optimizer_steps": job.steps, "deformer_levels": job.deformer_levels, "cases": report.cases, "limits": limits, "failures": failures });

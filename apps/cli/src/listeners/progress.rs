@@ -36,7 +36,7 @@ impl State {
             _ => _ = writeln!(std::io::stderr(), "{line}"),
         }
     }
-    /// The bar of `task`; a new one when the task changes.
+    /// The bar of `task`; a new one when the task changes. A `total` of 0 is not known.
     fn bar(&mut self, task: &str, total: u64, terminal: bool) -> &ProgressBar {
         if self.bar.as_ref().is_none_or(|(name, _)| name != task) {
             self.clear();
@@ -51,7 +51,10 @@ impl State {
             self.bar = Some((task.to_string(), bar));
         }
         let (_, bar) = self.bar.get_or_insert_with(|| (task.to_string(), ProgressBar::hidden()));
-        bar.set_length(total);
+        match total {
+            0 => bar.unset_length(),
+            _ => bar.set_length(total),
+        }
         bar
     }
     fn clear(&mut self) {
@@ -67,9 +70,10 @@ impl State {
         let due = self.last_line.is_none_or(|at| at.elapsed() >= LINE_INTERVAL);
         if !terminal && due {
             self.last_line = Some(Instant::now());
-            self.say(&format!("{task} {done}/{total} eta {}s {message}", eta.as_secs()));
+            let rest = if total > 0 { format!("/{total} eta {}s", eta.as_secs()) } else { String::new() };
+            self.say(&format!("{task} {done}{rest} {message}"));
         }
-        if done >= total {
+        if total > 0 && done >= total {
             self.clear();
         }
     }
@@ -117,7 +121,16 @@ impl EventSink for Progress {
 
 #[cfg(test)]
 mod tests {
-    use super::work;
+    use super::{State, work};
+
+    #[test]
+    fn a_task_of_unknown_length_goes_on_and_others_end() {
+        let mut state = State::default();
+        state.advance("stress", 1, 0, String::new(), false);
+        assert!(state.bar.is_some());
+        state.advance("read", 3, 3, String::new(), false);
+        assert!(state.bar.is_none());
+    }
 
     #[test]
     fn counts_are_worded_by_what_they_count() {

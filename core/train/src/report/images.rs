@@ -37,14 +37,16 @@ pub fn gallery(folder: &Path, scene: &str, rows: &[Row], views: usize) -> Result
     let Some((_, first)) = shown.first() else { return Ok(String::new()) };
     let usable: Vec<usize> = (0..first.images.len()).filter(|i| shown.iter().all(|(_, cell)| file_of(folder, cell, *i).is_some())).collect();
     let wanted = views.min(usable.len());
-    let mut out = String::from(
-        "<h3>Images</h3>\n<p class=\"note\">First seed; per training the codec with the highest PSNR. Squares are enlarged below: where all renders together err most. Whole images are JPEG, squares are exact.</p>\n",
-    );
+    let mut body = String::new();
     for view in (0..wanted).map(|i| usable[i * usable.len() / wanted]) {
-        out += &sheet(folder, scene, &shown, view)?;
+        body += &sheet(folder, scene, &shown, view)?;
     }
-    out += &flicker(folder, &shown)?;
-    Ok(out)
+    body += &flicker(folder, &shown)?;
+    if body.is_empty() {
+        return Ok(body);
+    }
+    let head = "<h3>Images</h3>\n<p class=\"note\">First seed; per training the codec with the highest PSNR. Squares are enlarged below: where all renders together err most. Whole images are JPEG, squares are exact.</p>\n";
+    Ok(head.to_string() + &body)
 }
 
 /// The first seed with files for an image.
@@ -181,7 +183,7 @@ fn sheet(folder: &Path, scene: &str, shown: &[(&Row, &CellResult)], view: usize)
     }
     let title = format!("{scene}, camera {}, frame {}", image.camera, image.frame);
     Ok(format!(
-        "<section class=\"view\"><h4>{}</h4><div class=\"compare\"><div class=\"slider\" hidden><div class=\"pair\"><img class=\"below\" alt=\"ground truth\"><img class=\"above\" alt=\"render\"></div><label>left ground truth, right <select></select> <input type=\"range\" min=\"0\" max=\"100\" value=\"50\" aria-label=\"border between ground truth and render\"></label></div><div class=\"cards\">{body}</div></div><p class=\"note\">Right of each square: mean absolute difference, brightest at {ERROR_SCALE}.</p></section>\n",
+        "<section class=\"view\"><h4>{}</h4><div class=\"compare\"><div class=\"slider\" hidden><div class=\"pair\"><img class=\"below\" alt=\"ground truth\"><img class=\"above\" alt=\"render\"></div><label>left ground truth, right <select></select></label> <input type=\"range\" min=\"0\" max=\"100\" value=\"50\" aria-label=\"border between ground truth and render\"></div><div class=\"cards\">{body}</div></div><p class=\"note\">Right of each square: mean absolute difference, brightest at {ERROR_SCALE}.</p></section>\n",
         html(&title)
     ))
 }

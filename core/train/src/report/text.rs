@@ -52,6 +52,10 @@ pub fn latex(text: &str) -> String {
                 out.push('\\');
                 out.push(c);
             }
+            // In the standard encoding of pdfLaTeX these are other characters.
+            '<' => out.push_str("\\textless{}"),
+            '>' => out.push_str("\\textgreater{}"),
+            '|' => out.push_str("\\textbar{}"),
             '±' => out.push_str("$\\pm$"),
             '–' => out.push_str("--"),
             '×' => out.push_str("$\\times$"),
@@ -94,6 +98,7 @@ mod tests {
         let evil = "<script>alert('1')</script> & \"x\" \u{202e}\u{0}";
         assert_eq!(html(evil), "&lt;script&gt;alert(&#39;1&#39;)&lt;/script&gt; &amp; &quot;x&quot; \u{fffd}\u{fffd}");
         assert_eq!(markdown("a|b_c<d>\n"), "a\\|b\\_c&lt;d&gt;\u{fffd}");
+        assert_eq!(latex("a <b> | c"), "a \\textless{}b\\textgreater{} \\textbar{} c");
         assert_eq!(latex("50% of $x_1$ \\input{y}^~é"), "50\\% of \\$x\\_1\\$ \\textbackslash{}input\\{y\\}\\textasciicircum{}\\textasciitilde{}?");
     }
 

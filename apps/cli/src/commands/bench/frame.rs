@@ -8,7 +8,8 @@ use crate::models::resolved_device;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use cc4dgs_backends::bench::{RoomCase, Workload, growth, room, shrunk};
-use cc4dgs_core::archive::{Provenance, write_atomically};
+use cc4dgs_core::archive::{MAGIC, Provenance, write_atomically};
+use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Camera, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Result, Seed, Similarity, SpatialInput, config, parse_device};
@@ -66,6 +67,9 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     if let (Some(archive), true) = (&args.archive, wanted.len() != 1) {
         let object = format!("--archive {}", archive.display());
         return Err(Error::parameter(object, format!("there are {} cases, and a file holds one", wanted.len()), "Choose one with --case NAME"));
+    }
+    if let Some(archive) = &args.archive {
+        refuse_other_content(archive, "an archive", |head| head.starts_with(&MAGIC))?;
     }
     let stop = interrupt::stop_flag()?;
     for (done, case) in wanted.iter().enumerate() {
