@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Elements per task; rows are never split.
-const CHUNK: usize = 16 << 10;
+const CHUNK: usize = 8 << 10;
 /// From this width on, runs of selected rows are updated one after the other; narrower rows are masked element by element.
 const WIDE_ROW: usize = 16;
 
@@ -28,17 +28,26 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
         if finite && visible.is_none_or(|rows| rows.iter().all(|&r| r != 0)) {
             return dispatch(Update { p, m, v, g, keep: None, scalars });
         }
-        let mut bad = 0;
-        let mut wanted = |row: usize| {
-            let visible = visible.is_none_or(|rows| rows[row] != 0);
-            let row_finite = finite || g[row * width..][..width].iter().all(|v| v.is_finite());
-            bad += u64::from(visible && !row_finite);
-            visible && row_finite
-        };
+        // 1 for rows that move, 0 for others.
+        let mut moves = scratch(p.len() / width);
+        match visible {
+            Some(visible) => moves.iter_mut().zip(visible).for_each(|(moves, &visible)| *moves = if visible != 0 { 1.0 } else { 0.0 }),
+            None => moves.fill(1.0),
+        }
+        if !finite {
+            let mut bad = 0;
+            for (moves, g) in moves.iter_mut().zip(g.chunks_exact(width)).filter(|(moves, _)| **moves != 0.0) {
+                if g.iter().any(|v| !v.is_finite()) {
+                    *moves = 0.0;
+                    bad += 1;
+                }
+            }
+            skipped.fetch_add(bad, Ordering::Relaxed);
+        }
         if width >= WIDE_ROW {
             let mut start = 0;
-            for row in 0..=p.len() / width {
-                if row < p.len() / width && wanted(row) {
+            for row in 0..=moves.len() {
+                if moves.get(row).is_some_and(|moves| *moves != 0.0) {
                     continue;
                 }
                 let run = start * width..row * width;
@@ -47,14 +56,24 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
             }
         } else {
             let mut keep = scratch(p.len());
-            for (row, keep) in keep.chunks_exact_mut(width).enumerate() {
-                keep.fill(f32::from(u8::from(wanted(row))));
+            match width {
+                1 => keep.copy_from_slice(&moves),
+                3 => repeat::<3>(&mut keep, &moves),
+                4 => repeat::<4>(&mut keep, &moves),
+                9 => repeat::<9>(&mut keep, &moves),
+                _ => keep.chunks_exact_mut(width).zip(moves.iter()).for_each(|(keep, moves)| keep.fill(*moves)),
             }
             dispatch(Update { p, m, v, g, keep: Some(&keep), scalars });
         }
-        skipped.fetch_add(bad, Ordering::Relaxed);
     });
     skipped.into_inner()
+}
+
+/// Each of `values`, `W` times.
+fn repeat<const W: usize>(out: &mut [f32], values: &[f32]) {
+    for (out, value) in out.as_chunks_mut::<W>().0.iter_mut().zip(values) {
+        *out = [*value; W];
+    }
 }
 
 /// x * 0 is 0 for finite numbers and NaN for all others.

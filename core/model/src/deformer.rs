@@ -1,6 +1,6 @@
 //! The deformer trait (deformation fields), its inputs and parameters.
 
-use crate::gaussians::CORE_ATTRIBUTES;
+use crate::gaussians::{CORE_ATTRIBUTES, first_rows};
 use crate::{DeformerContext, Error, Offsets, Plugin, Result};
 use burn::tensor::{Device, Int, Tensor};
 use serde::{Deserialize, Serialize};
@@ -110,7 +110,7 @@ impl SpatialInput {
     }
     /// The first `count` Gaussians.
     pub fn first(&self, count: usize) -> Self {
-        self.map(|values| values.clone().narrow(0, 0, count.min(self.len())))
+        self.map(|values| first_rows(values.clone(), count.min(self.len())))
     }
     fn map(&self, change: impl Fn(&Tensor<2>) -> Tensor<2>) -> Self {
         Self { means_world: change(&self.means_world), attributes: self.attributes.iter().map(&change).collect() }

@@ -117,6 +117,14 @@ impl DensityPlan {
         });
         self.report.removed = self.report.removed.saturating_sub(rows.len());
     }
+    /// Puts the new rows into another order: row `order[k]` becomes row k. `order` holds every row once.
+    pub fn reorder(&mut self, order: &[usize]) {
+        let mut moved_to = vec![0; order.len()];
+        order.iter().enumerate().for_each(|(new, &row)| moved_to[row] = new);
+        self.parents = order.iter().map(|&row| self.parents[row]).collect();
+        self.fresh = order.iter().map(|&row| self.fresh[row]).collect();
+        self.values.iter_mut().flat_map(|set| &mut set.rows).for_each(|row| *row = moved_to[*row]);
+    }
     /// Starts the optimizer state of `attribute` anew in all rows (opacity resets).
     pub fn restart(&mut self, attribute: &str) {
         self.restarted.push(attribute.into());
@@ -286,6 +294,10 @@ mod tests {
         assert_eq!(plan.removed(3), [0]);
         plan.restore(&[0]);
         assert!(plan.removed(3).is_empty() && plan.parents() == [2, 1, 0]);
+        plan.reorder(&[1, 2, 0]);
+        let after = plan.apply(&g).unwrap().to_host().unwrap();
+        assert_eq!((after.opacity_logits, after.extra["label"].values.clone()), (vec![7.0, 0.0, 2.0], vec![11.0, 10.0, 12.0]));
+        assert_eq!(plan.fresh(), [true, false, false]);
     }
 
     #[test]

@@ -127,6 +127,17 @@ impl Gaussians {
     }
 }
 
+/// The first `count` rows of `values` `[N,…]`, as one piece: derivatives of burn's `narrow` go row by row.
+pub fn first_rows<const D: usize>(values: Tensor<D>, count: usize) -> Tensor<D> {
+    let mut dims = values.dims();
+    if dims[0] == count {
+        return values;
+    }
+    let [all, some] = [dims[0], count].map(|rows| rows * dims[1..].iter().product::<usize>());
+    dims[0] = count;
+    values.reshape([all]).narrow(0, 0, some).reshape(dims)
+}
+
 /// Reads a float tensor back, row-major; `object` names it in errors.
 ///
 /// # Errors

@@ -236,6 +236,8 @@ fn static_gaussians_cost_no_field_time() {
     assert!(model.render.focal.is_some_and(|focal| (longest..longest + 0.011).contains(&focal)), "{:?}, {longest}", model.render);
     let still = (report.gaussians - report.dynamic_gaussians) as u64;
     assert!(still > 0 && report.dynamic_gaussians > 0, "{report:?}");
+    // Training keeps what moves first, whatever density control does.
+    assert_eq!(model.moving.rows(&model.gaussians.dynamic_scores), Some((0..report.dynamic_gaussians).collect()));
     assert_eq!((player.work.deformed, player.work.static_skipped), (report.dynamic_gaussians as u64, still));
     assert_eq!(player.work.spatial.gaussians, report.dynamic_gaussians as u64);
     // Frames are updated in place unless the last one is still referenced; the result is the same in both cases.

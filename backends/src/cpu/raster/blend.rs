@@ -6,6 +6,7 @@ use super::scratch::{Entry, Workspace, set_len};
 use super::{RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
 use crate::cpu::simd::{Lanes, dispatch, prefetch, vectorized};
 use pulp::{Simd, WithSimd};
+use std::mem::MaybeUninit;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Sigma up to which the exponential is evaluated; alpha is far below 1/255 beyond.
@@ -14,6 +15,8 @@ pub const SIGMA_MAX: f32 = 87.0;
 pub const AHEAD: usize = 6;
 /// Planes of the output.
 const PLANES: usize = 5;
+/// Ranks per task of [`max_weights`].
+const RANKS: usize = 2048;
 
 /// Numbers per pixel of one tile, row-major.
 pub type TilePlane = [f32; TILE_PIXELS];
@@ -24,8 +27,9 @@ pub fn column_centers(origin_x: usize) -> [f32; TILE] {
     std::array::from_fn(|x| (origin_x + x) as f32 + 0.5)
 }
 
-/// Blends every tile into `planes` `[5,H,W]` and saves what the backward pass needs. Returns the number of (Gaussian, pixel) evaluations.
-pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, planes: &mut [f32]) -> u64 {
+/// Blends every tile into `planes` `[5,H,W]`, of which every element is written, and saves what the backward pass needs. Returns the number of (Gaussian, pixel)
+/// evaluations.
+pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleConstants, workspace: &mut Workspace, planes: &mut [MaybeUninit<f32>]) -> u64 {
     let tiles_x = settings.width.div_ceil(TILE);
     let tiles = tiles_x * settings.height.div_ceil(TILE);
     let buffers = &mut **workspace;
@@ -81,11 +85,15 @@ pub fn blend_all(background: [f32; 3], settings: &RasterSettings, rules: &RuleCo
 /// The largest weight of each of `n` Gaussians over all its pairs.
 pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
     let mut out = vec![0.0f32; n];
-    for (rank, splat) in workspace.ranked.iter().enumerate() {
-        let pairs = workspace.pair_start[rank] as usize..workspace.pair_start[rank + 1] as usize;
-        let weights = workspace.list_index_of_pair[pairs].iter().map(|&index| workspace.pair_weights[index as usize]);
-        out[splat.index as usize] = weights.fold(0.0, f32::max);
-    }
+    let shared = SharedMut::new(&mut out);
+    run_tasks(workspace.ranked.len().div_ceil(RANKS), |task| {
+        for (rank, splat) in workspace.ranked.iter().enumerate().skip(task * RANKS).take(RANKS) {
+            let pairs = workspace.pair_start[rank] as usize..workspace.pair_start[rank + 1] as usize;
+            let weights = workspace.list_index_of_pair[pairs].iter().map(|&index| workspace.pair_weights[index as usize]);
+            // SAFETY: a Gaussian has one rank.
+            unsafe { shared.slice(splat.index as usize, 1)[0] = weights.fold(0.0, f32::max) };
+        }
+    });
     out
 }
 
@@ -141,7 +149,7 @@ impl<'a> TileState<'a> {
         settings: &RasterSettings,
         background: [f32; 3],
         transmittance: &mut [f32],
-        rows: impl Fn(usize, usize, usize) -> &'p mut [f32],
+        rows: impl Fn(usize, usize, usize) -> &'p mut [MaybeUninit<f32>],
     ) {
         for ((left, running), stopped) in transmittance.iter_mut().zip(&self.running).zip(&self.stopped) {
             // A running transmittance of NaN marks a stopped pixel.
@@ -154,13 +162,15 @@ impl<'a> TileState<'a> {
             let transmittance = &transmittance[at.clone()];
             for (c, background) in background.into_iter().enumerate() {
                 for ((value, sum), left) in rows(c, from, width).iter_mut().zip(&self.sums[c][at.clone()]).zip(transmittance) {
-                    *value = sum + left * background;
+                    value.write(sum + left * background);
                 }
             }
             for (value, left) in rows(3, from, width).iter_mut().zip(transmittance) {
-                *value = 1.0 - left;
+                value.write(1.0 - left);
             }
-            rows(4, from, width).copy_from_slice(&self.sums[3][at]);
+            for (value, depth) in rows(4, from, width).iter_mut().zip(&self.sums[3][at]) {
+                value.write(*depth);
+            }
         }
     }
     /// From here on `stop_at` is read.

@@ -114,8 +114,11 @@ fn forward_in_pool(splats: &SplatArrays, settings: &RasterSettings) -> Result<Fo
     let mut radii = vec![0i64; splats.len()];
     project::project_all(splats, settings, &camera, &rules, &mut workspace, &mut radii)?;
     tiles::build_lists(settings, &rules, &mut workspace, &radii);
-    let mut planes = vec![0.0f32; 5 * settings.width * settings.height];
-    let pixel_pairs = blend::blend_all(splats.background, settings, &rules, &mut workspace, &mut planes);
+    let count = 5 * settings.width * settings.height;
+    let mut planes = Vec::with_capacity(count);
+    let pixel_pairs = blend::blend_all(splats.background, settings, &rules, &mut workspace, &mut planes.spare_capacity_mut()[..count]);
+    // SAFETY: the capacity is there, and every element was written.
+    unsafe { planes.set_len(count) };
     let max_weights = if settings.max_weights { blend::max_weights(splats.len(), &workspace) } else { Vec::new() };
     let work = RenderWork { visible: workspace.ranked.len() as u64, tile_pairs: workspace.list.len() as u64, pixel_pairs };
     Ok(Forward { planes, radii, max_weights, work, workspace })

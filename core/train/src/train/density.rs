@@ -3,7 +3,30 @@
 use super::guard::broken_rows;
 use super::{Context, TrainState};
 use crate::gaussian_set::GaussianSet;
+use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{DensityPlan, Error, Event, Result, Schedule};
+use cc4dgs_play::Moving;
+
+const SCORES: &str = "dynamic_scores";
+
+/// Puts the rows of `plan` that move first, in their order, and the others behind them. What moves is then one piece of every array, and an iteration gathers
+/// nothing.
+pub(super) fn moving_first(plan: &mut DensityPlan, state: &TrainState) -> Result<()> {
+    let Moving::Scored { .. } = state.moving else { return Ok(()) };
+    let old = to_vec(state.set.get(SCORES)?.clone(), SCORES)?;
+    let mut scores: Vec<f32> = plan.parents().iter().map(|&parent| old[parent]).collect();
+    for set in plan.values().iter().filter(|set| set.attribute == SCORES) {
+        set.rows.iter().zip(&set.values).for_each(|(&row, &score)| scores[row] = score);
+    }
+    let Some(mut order) = state.moving.rows(&scores) else { return Ok(()) };
+    let mut still = vec![true; scores.len()];
+    order.iter().for_each(|&row| still[row] = false);
+    order.extend((0..still.len()).filter(|&row| still[row]));
+    if order.iter().enumerate().any(|(k, &row)| k != row) {
+        plan.reorder(&order);
+    }
+    Ok(())
+}
 
 impl Context<'_> {
     /// What the density control wants after an optimizer step: new values of all rows, then a plan for the rows themselves.
@@ -29,6 +52,17 @@ impl Context<'_> {
             state.density.executed(&plan, &self.device)?;
         }
         self.guard_reset(state, schedule)
+    }
+
+    /// Puts what moves first, where a stage begins with new statistics and a new optimizer state.
+    pub(super) fn order_rows(&self, state: &mut TrainState) -> Result<()> {
+        let mut plan = DensityPlan::unchanged(state.set.len());
+        moving_first(&mut plan, state)?;
+        if !plan.keeps_all(state.set.len()) {
+            state.set = GaussianSet::from_gaussians(&plan.apply(&state.set.gaussians()?)?);
+            state.invalidate_rows();
+        }
+        Ok(())
     }
 
     /// Removes the Gaussians with a value that is not finite, which are not drawn and cannot be stored: after the last round of a density control nobody else does.

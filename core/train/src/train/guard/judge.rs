@@ -1,5 +1,6 @@
 //! Judges plans by what they cost on training views.
 
+use super::super::density::moving_first;
 use super::super::{Context, TrainState};
 use super::{MAX_COST_DB, Removal, Reset, Standing, recovery};
 use crate::sample::spread_views;
@@ -19,7 +20,7 @@ const INVISIBLE_LOGIT: f32 = -30.0;
 pub(super) const OPACITIES: &str = "opacity_logits";
 
 impl Context<'_> {
-    /// Weakens what `plan` removes, and remembers what it resets. Call before the plan is carried out.
+    /// Weakens what `plan` removes, remembers what it resets, and puts what moves first. Call before the plan is carried out.
     pub(crate) fn guard_plan(&self, plan: &mut DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let count = state.set.len();
         state.guard.read_views()?;
@@ -32,6 +33,7 @@ impl Context<'_> {
         if plan.restarted().iter().any(|name| name == OPACITIES) && !self.begin_reset(state, schedule)? {
             *plan = without_reset(plan);
         }
+        moving_first(plan, state)?;
         state.guard.follow(plan, schedule.iteration);
         Ok(())
     }
