@@ -23,6 +23,7 @@ pub mod reader;
 mod registry;
 mod scene;
 mod schedule;
+mod sum;
 
 // burn draws its random numbers with it; the feature that this crate asks for makes it work in browsers.
 #[cfg(target_arch = "wasm32")]
@@ -60,3 +61,4 @@ pub use reader::{
 pub use registry::Registry;
 pub use scene::{FrameSource, PointCloud, Scene, Split, View};
 pub use schedule::{REFERENCE_ITERATIONS, Schedule, Settled, Stage};
+pub use sum::ordered_sum;

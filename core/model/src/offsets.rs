@@ -1,5 +1,6 @@
 //! Offsets, the output of a deformer, and their application to Gaussians.
 
+use crate::gaussians::{first_rows, to_vec};
 use crate::{Error, Gaussians, Result};
 use burn::tensor::{Int, Tensor};
 
@@ -71,11 +72,23 @@ impl Offsets {
             _ => Ok(()),
         }
     }
-    /// Refuses offsets that are not finite. Reads one number per head back from the device.
+    /// Refuses offsets that are not finite; see [`Offsets::broken_head`].
     ///
     /// # Errors
     /// [`Error::Backend`] that names `deformer` and the head.
     pub fn check_finite(&self, deformer: &str) -> Result<()> {
+        let Some(head) = self.broken_head(deformer)? else { return Ok(()) };
+        Err(Error::backend(
+            format!("deformer {deformer}, head {head}"),
+            "its offsets are not finite",
+            "Lower the deformer's learning rates, or limit what the head returns",
+        ))
+    }
+    /// The first head that is not finite. Reads one number per head back from the device.
+    ///
+    /// # Errors
+    /// [`Error::Backend`] that names `deformer` and the head, if the device fails.
+    pub fn broken_head(&self, deformer: &str) -> Result<Option<&'static str>> {
         fn sum<const D: usize>(tensor: &Option<Tensor<D>>) -> Option<Tensor<1>> {
             tensor.as_ref().map(|t| t.clone().sum())
         }
@@ -91,15 +104,12 @@ impl Offsets {
         ];
         for (head, sum) in heads {
             // A sum is finite only if every summand is; shader compilers do not optimise it away.
-            if let Some(total) = sum.map(|t| t.into_scalar::<f32>()).filter(|total| !total.is_finite()) {
-                return Err(Error::backend(
-                    format!("deformer {deformer}, head {head}"),
-                    format!("its offsets sum to {total}"),
-                    "Lower the deformer's learning rates, or limit what the head returns",
-                ));
+            let Some(sum) = sum else { continue };
+            if to_vec(sum, &format!("deformer {deformer}, head {head}"))?.iter().any(|total| !total.is_finite()) {
+                return Ok(Some(head));
             }
         }
-        Ok(())
+        Ok(None)
     }
     /// Applies the offsets to the Gaussians with the indices `rows` `[M]`; `None` means the first M. All other Gaussians are returned unchanged.
     ///
@@ -197,8 +207,8 @@ impl Offsets {
     }
     /// The offsets of the first `count` Gaussians.
     pub fn first(self, count: usize) -> Self {
-        let two = |head: Option<Tensor<2>>| head.map(|t| t.narrow(0, 0, count));
-        let one = |head: Option<Tensor<1>>| head.map(|t| t.narrow(0, 0, count));
+        let two = |head: Option<Tensor<2>>| head.map(|t| first_rows(t, count));
+        let one = |head: Option<Tensor<1>>| head.map(|t| first_rows(t, count));
         Self {
             means: two(self.means),
             log_scales: two(self.log_scales),
@@ -208,7 +218,7 @@ impl Offsets {
             unit_quaternions: self.unit_quaternions,
             opacity_logits: one(self.opacity_logits),
             opacity_log_factor: one(self.opacity_log_factor),
-            sh: self.sh.map(|t| t.narrow(0, 0, count)),
+            sh: self.sh.map(|t| first_rows(t, count)),
         }
     }
     /// All heads concatenated as one matrix `[M, total width]`, for regularisers; `None` without heads.
@@ -256,8 +266,7 @@ fn fading(logits: Tensor<1>, factor: Tensor<1>) -> Tensor<1> {
 /// The values of the Gaussians `rows`, or of the first `count`.
 fn select<const D: usize>(values: &Tensor<D>, rows: Option<&Tensor<1, Int>>, count: usize) -> Tensor<D> {
     match rows {
-        None if count == values.dims()[0] => values.clone(),
-        None => values.clone().narrow(0, 0, count),
+        None => first_rows(values.clone(), count),
         Some(rows) => {
             let mut dims = values.dims();
             dims[0] = rows.dims()[0];
@@ -293,6 +302,30 @@ fn add<const D: usize>(base: Tensor<D>, offset: Option<Tensor<D>>, rows: Option<
         }
         None if m == n => base + offset,
         None if m == 0 => base,
-        None => Tensor::cat(vec![base.clone().narrow(0, 0, m) + offset, base.narrow(0, m, n - m)], 0),
+        None => {
+            let mut rest = base.dims();
+            rest[0] = n - m;
+            let rest = Tensor::zeros(rest, &base.device());
+            base + Tensor::cat(vec![offset, rest], 0)
+        }
+    }
+}
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+    use burn::tensor::Device;
+
+    #[test]
+    fn the_first_head_that_is_not_finite_is_named() {
+        let filled = |value: f32| Some(Tensor::<2>::full([4, 3], value, &Device::flex()));
+        let of = |means: f32, scales: f32| Offsets { means: filled(means), scales: filled(scales), ..Offsets::default() };
+        assert_eq!(of(0.5, 1.0).broken_head("d").unwrap(), None);
+        assert_eq!(Offsets::default().broken_head("d").unwrap(), None);
+        assert_eq!(of(0.5, f32::NAN).broken_head("d").unwrap(), Some("scales"));
+        assert_eq!(of(f32::INFINITY, f32::NAN).broken_head("d").unwrap(), Some("means"));
+        assert!(of(0.5, 1.0).check_finite("d").is_ok());
+        let error = of(0.5, f32::NAN).check_finite("d").unwrap_err();
+        assert!(error.to_string().starts_with("deformer d, head scales: its offsets are not finite"), "{error}");
     }
 }

@@ -1,7 +1,8 @@
 //! Reading of untrusted files: sizes are checked before memory is allocated.
 
 use crate::{Error, Image8, Limits, Result};
-use image::{DynamicImage, ImageReader};
+use image::error::ImageFormatHint;
+use image::{DynamicImage, ImageError, ImageReader};
 use serde::de::DeserializeOwned;
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read};
@@ -84,9 +85,9 @@ pub fn list(folder: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<PathBuf>>
     Ok(found)
 }
 
-/// Whether the extension is that of an image this build decodes, and the file exists.
+/// Whether the extension is that of an image this build decodes, and the file exists. The `._` files that macOS writes beside images are none.
 pub fn is_image(path: &Path) -> bool {
-    has_extension(path, &["png", "jpg", "jpeg"]) && path.is_file()
+    has_extension(path, &["png", "jpg", "jpeg"]) && !file_name(path).starts_with("._") && path.is_file()
 }
 
 /// Whether the extension, in lower case, is one of `known`.
@@ -103,6 +104,16 @@ fn image_error(path: &Path, e: impl std::fmt::Display) -> Error {
     Error::data(path.display().to_string(), format!("not a readable image: {e}"), "Fetch the file again, or remove it from the dataset")
 }
 
+/// The error of an image that is not decoded. Fetching a file of another format again does not help.
+fn not_decoded(path: &Path, e: ImageError) -> Error {
+    match &e {
+        ImageError::Unsupported(unsupported) if matches!(unsupported.format_hint(), ImageFormatHint::Exact(_)) => {
+            Error::data(path.display().to_string(), format!("not a readable image: {e}"), "Convert it to PNG or JPEG, the formats that are read")
+        }
+        _ => image_error(path, &e),
+    }
+}
+
 /// Width and height in pixels from an image's header.
 ///
 /// # Errors
@@ -110,7 +121,7 @@ fn image_error(path: &Path, e: impl std::fmt::Display) -> Error {
 pub fn image_size(path: &Path, limits: &Limits) -> Result<(u32, u32)> {
     let file = File::open(path).map_err(|e| Error::io(path, e))?;
     let reader = ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(|e| Error::io(path, e))?;
-    let (w, h) = reader.into_dimensions().map_err(|e| image_error(path, e))?;
+    let (w, h) = reader.into_dimensions().map_err(|e| not_decoded(path, e))?;
     limits.check_pixels(&path.display().to_string(), u64::from(w), u64::from(h))?;
     Ok((w, h))
 }
@@ -126,12 +137,12 @@ pub fn read_png_or_jpeg(path: &Path, limits: &Limits) -> Result<Image8> {
     }
     let mut reader = ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?;
     let (w, h) =
-        ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?.into_dimensions().map_err(|e| image_error(path, e))?;
+        ImageReader::new(Cursor::new(&bytes)).with_guessed_format().map_err(|e| Error::io(path, e))?.into_dimensions().map_err(|e| not_decoded(path, e))?;
     limits.check_pixels(&path.display().to_string(), u64::from(w), u64::from(h))?;
     let mut caps = image::Limits::default();
     caps.max_alloc = Some(limits.max_bytes);
     reader.limits(caps);
-    let decoded = reader.decode().map_err(|e| image_error(path, e))?;
+    let decoded = reader.decode().map_err(|e| not_decoded(path, e))?;
     let (width, height) = (decoded.width(), decoded.height());
     let (channels, data) = match decoded {
         DynamicImage::ImageRgb8(i) => (3, i.into_raw()),
@@ -174,6 +185,34 @@ mod tests {
         assert!((2..whole.len()).all(|end| jpeg_is_cut(&whole[..end])));
         let followed = [&whole[..], &[0, 1, 0xff, 0xda, 0, 0, 0xff]].concat();
         assert!(!jpeg_is_cut(&followed), "what follows is not of the image");
+    }
+
+    #[test]
+    fn other_formats_are_to_be_converted_and_damaged_files_to_be_fetched() {
+        let folder = tempfile::tempdir().unwrap();
+        let of = |name: &str, bytes: &[u8]| {
+            let path = folder.path().join(name);
+            std::fs::write(&path, bytes).unwrap();
+            let errors = [image_size(&path, &Limits::default()).unwrap_err(), read_png_or_jpeg(&path, &Limits::default()).unwrap_err()];
+            errors.map(|e| e.to_string())
+        };
+        let others: [(&str, &[u8]); 3] = [("a.webp", b"RIFF\x1a\0\0\0WEBPVP8L"), ("a.bmp", b"BM\x46\0\0\0\0\0"), ("a.tiff", b"II*\0\x08\0\0\0")];
+        for (name, bytes) in others {
+            assert!(of(name, bytes).iter().all(|e| e.contains(name) && e.contains("Convert it to PNG or JPEG")), "{:?}", of(name, bytes));
+        }
+        for damaged in [of("a.png", b"\x89PNG\r\n\x1a\n"), of("b.png", b"<html>")] {
+            assert!(damaged.iter().all(|e| e.contains("Fetch the file again")), "{damaged:?}");
+        }
+    }
+
+    #[test]
+    fn what_macos_writes_beside_images_is_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let of = |name: &str| {
+            std::fs::write(folder.path().join(name), "").unwrap();
+            is_image(&folder.path().join(name))
+        };
+        assert!(of("a.png") && of(".b.JPG") && !of("._a.png") && !of("a.txt"));
     }
 
     #[test]

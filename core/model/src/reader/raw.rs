@@ -86,7 +86,7 @@ pub struct RawView {
     pub camera: usize,
     /// Frame index in the dataset, 0-based.
     pub frame: usize,
-    /// The dataset's own time, 0..1; views without one get frame index / number of frames.
+    /// The dataset's own time, 0..1; views without one get frame index / (number of frames - 1): 0 at the first frame, 1 at the last.
     pub time: Option<f64>,
     /// The dataset's own split.
     pub split: Split,

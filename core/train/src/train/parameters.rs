@@ -2,7 +2,7 @@
 
 use crate::gaussian_set::log_linear;
 use burn::tensor::{Gradients, Tensor};
-use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings};
+use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings, ordered_sum};
 
 /// The learning rate of `group` at `progress` in 0..1 of the stage; `extent` is that of the cameras.
 pub(crate) fn rate(group: &ParameterGroup, progress: f64, extent: f64) -> f64 {
@@ -31,7 +31,7 @@ pub(crate) fn update(
     let mut gradient_of: Vec<Option<Tensor<1>>> = parameters.iter().map(|p| p.value.grad(gradients)).collect();
     for (g, group) in groups.iter().enumerate().filter(|(_, group)| group.clip_norm > 0.0) {
         let members: Vec<usize> = parameters.iter().enumerate().filter(|(_, p)| p.group == g).map(|(i, _)| i).collect();
-        let squares = members.iter().filter_map(|&i| gradient_of[i].clone()).map(|t| (t.clone() * t).sum());
+        let squares = members.iter().filter_map(|&i| gradient_of[i].clone()).map(|t| ordered_sum(t.clone() * t));
         let Some(total) = squares.reduce(|a, b| a + b) else { continue };
         // clip / max(norm, clip): one number on the device, no read-back.
         let scale = total.sqrt().clamp_min(group.clip_norm).recip().mul_scalar(group.clip_norm);

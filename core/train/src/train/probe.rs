@@ -3,7 +3,21 @@
 use super::{Context, TrainState};
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Gaussians, Result, SpatialInput, Splats};
+use cc4dgs_core::{Gaussians, Result, SpatialInput, Splats, ordered_sum};
+
+/// Mean of all `values`, the same bits whatever the number of threads; `object` names it in errors.
+pub(super) fn mean<const D: usize>(values: Tensor<D>, object: &str) -> Result<f32> {
+    let count = values.dims().iter().product::<usize>();
+    Ok(to_vec(ordered_sum(values), object)?.first().copied().unwrap_or(f32::NAN) / count as f32)
+}
+
+/// PSNR in dB of `image` against `target`, both `[3,H,W]`, unrounded, data range 1; at most 100 dB, where float32 images stop differing.
+pub(super) fn psnr_db(image: Tensor<3>, target: Tensor<3>) -> Result<f32> {
+    let difference = image - target;
+    let error = mean(difference.clone() * difference, "mean squared error")?;
+    // Unlike `max`, `clamp` leaves NaN as it is.
+    Ok(-10.0 * error.clamp(1e-10, f32::INFINITY).log10())
+}
 
 impl Context<'_> {
     /// Renders what the cameras of views record at given times (0..1). `gaussians` have the rows of `state`. Hands the index of each request and planes
@@ -46,10 +60,7 @@ impl Context<'_> {
         let mut scores = Vec::with_capacity(views.len());
         self.draw(state, gaussians, &requests, sh_degree, |index, image| {
             let target = self.rasterizer.upload(&self.job.scene.frame(views[index])?, rgb, &self.device);
-            let difference = image - target;
-            let mse = to_vec((difference.clone() * difference).mean(), "mean squared error")?;
-            // Unlike `max`, `clamp` leaves NaN as it is.
-            scores.push(-10.0 * mse.first().copied().unwrap_or(f32::NAN).clamp(1e-10, f32::INFINITY).log10());
+            scores.push(psnr_db(image, target)?);
             Ok(())
         })?;
         Ok(scores)
@@ -58,5 +69,20 @@ impl Context<'_> {
     pub(crate) fn mean_psnr(&self, state: &mut TrainState, gaussians: &Gaussians, views: &[usize], sh_degree: usize) -> Result<f32> {
         let scores = self.psnr_of_views(state, gaussians, views, sh_degree)?;
         Ok(scores.iter().sum::<f32>() / scores.len().max(1) as f32)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::Device;
+
+    #[test]
+    fn psnr_ends_at_a_hundred_and_keeps_nan() {
+        let image = |value: f32| Tensor::<3>::full([3, 4, 5], value, &Device::flex());
+        let of = |value: f32| psnr_db(image(value), image(0.5)).unwrap();
+        assert!((of(0.6) - 20.0).abs() < 1e-4, "{}", of(0.6));
+        assert!((of(0.5) - 100.0).abs() < 1e-4, "{}", of(0.5));
+        assert!(of(f32::NAN).is_nan());
     }
 }

@@ -10,6 +10,27 @@ pub struct Record {
     pub(crate) log: LogRecord,
     /// Scores of the model on its way through the main stage.
     pub(crate) scores: Vec<Score>,
+    /// What the watchdog did in the stage under way; at its default between stages.
+    #[serde(skip_serializing_if = "Attempts::is_none")]
+    pub(crate) attempts: Attempts,
+}
+
+/// What the watchdog did in a stage. Absent from the checkpoints of older versions and of runs without trouble.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub(crate) struct Attempts {
+    /// Every iteration up to this one is checked.
+    pub checked_until: usize,
+    /// Times that a learning rate was lowered.
+    pub lowered: usize,
+    /// Times that the run went back to find a cause.
+    pub repeated: usize,
+}
+
+impl Attempts {
+    fn is_none(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 /// What the log of a stage smooths. Floats are stored as their bits, because JSON has no infinity.
@@ -37,4 +58,18 @@ pub(crate) struct Score {
     /// PSNR between the blurred images and the blurred truth; absent in older checkpoints.
     #[serde(default)]
     pub blurred_db: Option<f64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attempts_come_back_and_are_absent_without_trouble() {
+        let text = serde_json::to_string(&Record::default()).unwrap();
+        assert!(!text.contains("attempts"), "{text}");
+        assert_eq!(serde_json::from_str::<Record>(&text).unwrap(), Record::default());
+        let record = Record { attempts: Attempts { checked_until: 130, lowered: 2, repeated: 1 }, ..Record::default() };
+        assert_eq!(serde_json::from_str::<Record>(&serde_json::to_string(&record).unwrap()).unwrap(), record);
+    }
 }

@@ -72,6 +72,7 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
                 load_weights("re-fitted weights", field.field.as_mut(), found.weights, job.device)?;
             }
             model.gaussians = found.gaussians;
+            model.size = model.float32_size();
             psnr_after_db = psnr;
         } else {
             share *= 0.5;

@@ -28,6 +28,7 @@ impl Context<'_> {
         if state.iteration == 0 {
             if stage != Stage::Coarse {
                 self.remove_broken(state)?;
+                self.order_rows(state)?;
             }
             state.begin_stage(&self.device);
             if stage == Stage::Main {
@@ -105,6 +106,7 @@ impl Context<'_> {
         }
         log.finish(events);
         state.record.log = Default::default();
+        state.record.attempts = Default::default();
         if stage == Stage::Main && state.iteration > resumed_at {
             self.simplify(state)?;
         }

@@ -118,14 +118,15 @@ impl TrainState {
         let attributes = deformer.field.attributes().iter().map(|a| Ok(rows.select(self.set.get(&a.name)?.clone()))).collect::<Result<_>>()?;
         Ok(SpatialInput { means_world: rows.select(self.set.get("means")?.clone()), attributes })
     }
-    /// Pairs of neighbouring moving Gaussians as of the last change of the set; `None` where there are none.
-    pub(super) fn current_neighbours(&mut self, device: &Device) -> Result<Option<Neighbours>> {
-        if self.neighbours.is_none() {
-            let rows = self.moving_rows(device)?;
-            let means = to_vec(rows.select(self.set.get("means")?.clone()), "means")?;
-            self.neighbours = Neighbours::of(&means, device);
+    /// The neighbouring moving Gaussians as of the last change of the set.
+    pub(super) fn current_neighbours(&mut self, device: &Device) -> Result<Neighbours> {
+        if let Some(neighbours) = &self.neighbours {
+            return Ok(neighbours.clone());
         }
-        Ok(self.neighbours.clone())
+        let rows = self.moving_rows(device)?;
+        let neighbours = Neighbours::of(&to_vec(rows.select(self.set.get("means")?.clone()), "means")?, device);
+        self.neighbours = Some(neighbours.clone());
+        Ok(neighbours)
     }
     /// To be called whenever Gaussians or scores changed.
     pub fn invalidate_rows(&mut self) {

@@ -2,6 +2,7 @@
 
 use super::dropout;
 use super::log::Log;
+use super::probe::psnr_db;
 use super::smoothness::{flicker, smoothness};
 use super::watchdog::{Trouble, is_finite};
 use super::{Context, TrainState, parameters};
@@ -41,7 +42,7 @@ impl Context<'_> {
         let moves = state.deformer.as_ref().is_some_and(|d| !d.field.is_static()) && rows.count() > 0;
         self.decide_smoothness(state, schedule, moves)?;
 
-        let mut neighbours = if moves && train.strain > 0.0 { state.current_neighbours(&self.device)? } else { None };
+        let mut neighbours = if moves && train.strain > 0.0 { Some(state.current_neighbours(&self.device)?) } else { None };
         let learns = |name: &str| match name {
             "dynamic_scores" => false,
             "sh_rest" => schedule.iteration.is_multiple_of(train.sh_every),
@@ -87,15 +88,16 @@ impl Context<'_> {
             let drawn = match (offsets.next(), &state.deformer) {
                 (Some(offsets), Some(deformer)) => {
                     offsets.check(deformer.name(), rows.count())?;
-                    if read || check {
-                        // The check names the head; the way out is the watchdog's.
-                        if let Err(Error::Backend { object, .. }) = offsets.check_finite(deformer.name()) {
-                            return Ok(Some(Trouble::of("deformer", format!("the offsets of {object}"))));
-                        }
+                    if (read || check)
+                        && let Some(head) = offsets.broken_head(deformer.name())?
+                    {
+                        return Ok(Some(Trouble::of("deformer", format!("the offsets of deformer {}, head {head}", deformer.name()))));
                     }
                     // At the time of the first view: at all of them, strain would take longer than the deformer's functions of time.
-                    if let (Some(neighbours), Some(means)) = (neighbours.take(), &offsets.means) {
-                        let term = neighbours.strain(means.clone()).mul_scalar(train.strain);
+                    if let (Some(neighbours), Some(means)) = (neighbours.take(), &offsets.means)
+                        && let Some(strain) = neighbours.strain(means.clone())
+                    {
+                        let term = strain.mul_scalar(train.strain);
                         total = Some(total.map_or(term.clone(), |sum| sum + term));
                     }
                     offsets.apply(deformer.name(), &gaussians, rows.indices())?
@@ -122,7 +124,7 @@ impl Context<'_> {
                 return Ok(Some(Trouble::new(part.unwrap_or_else(|| format!("the image of camera {}", camera.name)))));
             }
             if read {
-                log.psnr(psnr_db(planes, target)?);
+                log.psnr(psnr_db(planes.inner().narrow(0, 0, 3), target.inner())?);
             }
             let loss = loss.div_scalar(batch.len() as f32);
             total = Some(match total {
@@ -299,11 +301,4 @@ fn broken_gradient(state: &TrainState, of_gaussians: &[(String, Tensor<2>)], gra
         }
     }
     Ok(None)
-}
-
-/// PSNR in dB of the first three of `planes` against `target`, unrounded, data range 1; at most 100 dB, where float32 images stop differing.
-fn psnr_db(planes: Tensor<3>, target: Tensor<3>) -> Result<f32> {
-    let difference = planes.inner().narrow(0, 0, 3) - target.inner();
-    let mse = to_vec((difference.clone() * difference).mean(), "mean squared error")?;
-    Ok(-10.0 * mse.first().copied().unwrap_or(f32::NAN).clamp(1e-10, f32::INFINITY).log10())
 }

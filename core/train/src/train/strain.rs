@@ -11,11 +11,18 @@ const FAR: f32 = 4.0;
 /// Least squared distance over the canonical one: the root has no gradient at 0.
 const LEAST: f32 = 1e-8;
 
-/// Pairs of neighbouring moving Gaussians.
+/// Neighbouring moving Gaussians.
 #[derive(Clone, Debug)]
 pub struct Neighbours {
     /// The canonical centres they were found by `[3 M]`.
     means: Arc<Vec<f32>>,
+    /// `None` where no pair is near enough.
+    pairs: Option<Pairs>,
+}
+
+/// Pairs of neighbours.
+#[derive(Clone, Debug)]
+struct Pairs {
     first: Tensor<1, Int>,
     second: Tensor<1, Int>,
     /// From the second to the first, in the canonical space, over their distance `[P,3]`.
@@ -24,9 +31,9 @@ pub struct Neighbours {
     inverse: Tensor<2>,
 }
 
-impl Neighbours {
-    /// The three nearest neighbours of every Gaussian of `means` `[3 M]`; `None` where no pair is near enough.
-    pub fn of(means: &[f32], device: &Device) -> Option<Self> {
+impl Pairs {
+    /// See [`Neighbours::of`].
+    fn of(means: &[f32], device: &Device) -> Option<Self> {
         let points: Vec<[f32; 3]> = means.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
         if points.len() < 2 || points.iter().flatten().any(|v| !v.is_finite()) {
             return None;
@@ -50,12 +57,18 @@ impl Neighbours {
             near.iter().flat_map(|&&(i, j, d)| (0..3).map(move |k| (i, j, d, k))).map(|(i, j, d, k)| (points[i][k] - points[j][k]) / d).collect();
         let inverse: Vec<f32> = near.iter().map(|pair| 1.0 / pair.2).collect();
         Some(Self {
-            means: Arc::new(means.to_vec()),
             first: index(|pair| pair.0),
             second: index(|pair| pair.1),
             directions: Tensor::from_data(TensorData::new(directions, [count, 3]), device),
             inverse: Tensor::from_data(TensorData::new(inverse, [count, 1]), device),
         })
+    }
+}
+
+impl Neighbours {
+    /// The three nearest neighbours of every Gaussian of `means` `[3 M]`.
+    pub fn of(means: &[f32], device: &Device) -> Self {
+        Self { means: Arc::new(means.to_vec()), pairs: Pairs::of(means, device) }
     }
     /// The canonical centres they were found by `[3 M]`, for checkpoints: centres have moved since.
     pub fn means(&self) -> &[f32] {
@@ -63,12 +76,14 @@ impl Neighbours {
     }
     /// Mean over the pairs of s^2 / (1 + s^2), with the change s of their distance as a share of the canonical one: squared where it is small, bounded where neighbours
     /// belong to things that part (Geman and McClure's function). `offsets` are those of the centres `[M,3]`.
-    pub fn strain(&self, offsets: Tensor<2>) -> Tensor<1> {
-        let difference = offsets.clone().select(0, self.first.clone()) - offsets.select(0, self.second.clone());
-        let apart = Tensor::from_inner(self.directions.clone()) + difference * Tensor::from_inner(self.inverse.clone());
+    /// `None` without pairs.
+    pub fn strain(&self, offsets: Tensor<2>) -> Option<Tensor<1>> {
+        let Pairs { first, second, directions, inverse } = self.pairs.as_ref()?;
+        let difference = offsets.clone().select(0, first.clone()) - offsets.select(0, second.clone());
+        let apart = Tensor::from_inner(directions.clone()) + difference * Tensor::from_inner(inverse.clone());
         let stretch = (apart.clone() * apart).sum_dim(1).clamp_min(LEAST).sqrt().sub_scalar(1.0);
         let squares = stretch.clone() * stretch;
-        (squares.clone() / squares.add_scalar(1.0)).mean()
+        Some((squares.clone() / squares.add_scalar(1.0)).mean())
     }
 }
 
@@ -81,7 +96,7 @@ mod tests {
     fn rigid_motion_costs_nothing_and_stretching_what_it_stretches() {
         let device = Device::flex().autodiff();
         let means: Vec<f32> = (0..30).flat_map(|i| [(i % 5) as f32, (i / 5) as f32, 0.3 * (i % 3) as f32]).collect();
-        let neighbours = Neighbours::of(&means, &Device::flex()).unwrap();
+        let neighbours = Neighbours::of(&means, &Device::flex());
         let strain = |to: &dyn Fn([f32; 3]) -> [f32; 3]| {
             let offsets: Vec<f32> = means
                 .chunks_exact(3)
@@ -91,7 +106,7 @@ mod tests {
                 })
                 .collect();
             let offsets = Tensor::<2>::from_data(TensorData::new(offsets, [30, 3]), &device);
-            to_vec(neighbours.strain(offsets), "strain").unwrap()[0]
+            to_vec(neighbours.strain(offsets).unwrap(), "strain").unwrap()[0]
         };
         let (sin, cos) = 0.7f32.sin_cos();
         assert!(strain(&|[x, y, z]| [cos * x - sin * y + 4.0, sin * x + cos * y, z - 2.0]) < 1e-9);
@@ -99,6 +114,10 @@ mod tests {
         assert!((stretched - 0.01 / 1.01).abs() < 1e-4, "{stretched}");
         let apart = strain(&|[x, y, z]| [100.0 * x, 100.0 * y, 100.0 * z]);
         assert!((0.99..=1.0).contains(&apart), "{apart}");
-        assert!(Neighbours::of(&[0.0; 3], &Device::flex()).is_none() && Neighbours::of(&[f32::NAN; 6], &Device::flex()).is_none());
+        for lonely in [&[0.0; 3][..], &[0.0; 6], &[f32::NAN; 6]] {
+            let neighbours = Neighbours::of(lonely, &Device::flex());
+            assert_eq!(neighbours.means().len(), lonely.len());
+            assert!(neighbours.strain(Tensor::zeros([lonely.len() / 3, 3], &device)).is_none());
+        }
     }
 }

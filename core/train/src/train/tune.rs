@@ -2,6 +2,7 @@
 
 use super::log::Log;
 use super::losses::LossTerms;
+use super::probe::mean;
 use super::pyramid::Pyramid;
 use super::rounded::Rounded;
 use super::sampler::Sampler;
@@ -11,7 +12,6 @@ use crate::gaussian_set::GaussianSet;
 use crate::sample::spread_views;
 use crate::schedule::StageLengths;
 use burn::tensor::{Device, Tensor, TensorData};
-use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
     AppearanceContext, CodecContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, Stream, TuneModel,
     TunedModel, Tuning, WeightArray, WeightCodec, config, psnr_of,
@@ -192,7 +192,7 @@ impl<'a> Tuner<'a> {
         let mut sum = 0.0;
         context.draw(state, &set, &requests, gaussians.sh_degree, |index, image| {
             let target = context.rasterizer.upload(&scene.frame(views[index])?, background, self.job.device);
-            sum += f64::from(to_vec((image - target).abs().mean(), "mean error")?.first().copied().unwrap_or(f32::NAN));
+            sum += f64::from(mean((image - target).abs(), "mean error")?);
             Ok(())
         })?;
         Ok(sum / views.len().max(1) as f64)
@@ -307,8 +307,7 @@ impl TuneModel for Tuner<'_> {
             context.draw(state, &set, &requests, gaussians.sh_degree, |index, image| {
                 let target = context.rasterizer.upload(&scene.frame(views[index])?, background, self.job.device);
                 let difference = image.clamp(0.0, 1.0) - target;
-                let error = to_vec((difference.clone() * difference).mean(), "mean squared error")?.first().copied().unwrap_or(f32::NAN);
-                sum += psnr_of(f64::from(error));
+                sum += psnr_of(f64::from(mean(difference.clone() * difference, "mean squared error")?));
                 Ok(())
             })
         })?;

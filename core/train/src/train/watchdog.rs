@@ -9,6 +9,7 @@
 //! Single broken Gaussians are no trouble: they are not drawn, and density control removes them, or the trainer before it writes a checkpoint. A run without
 //! trouble computes nothing else than without this module.
 
+use super::record::Attempts;
 use super::{Context, TrainState};
 use crate::gaussian_set::GaussianSet;
 use crate::train::{Guard, Neighbours};
@@ -138,20 +139,17 @@ impl Good {
 /// The watchdog of one stage.
 pub(crate) struct Watchdog {
     good: Good,
-    /// Every iteration up to this one is checked.
-    checked_until: usize,
-    lowered: usize,
-    repeated: usize,
+    attempts: Attempts,
 }
 
 impl Watchdog {
     /// `state` is good: nothing of the stage happened yet, or it comes from a checkpoint.
     pub fn new(state: &TrainState) -> Self {
-        Self { good: Good::of(state), checked_until: 0, lowered: 0, repeated: 0 }
+        Self { good: Good::of(state), attempts: state.record.attempts }
     }
     /// Whether every value of this iteration is to be checked.
     pub fn checks(&self, iteration: usize) -> bool {
-        iteration <= self.checked_until
+        iteration <= self.attempts.checked_until
     }
     /// After an iteration of `length`: looks at the parameters where it is time for it, and goes back where `trouble` was found before or is found now. `saves`
     /// says that the state is about to be written.
@@ -166,7 +164,11 @@ impl Watchdog {
             trouble => trouble,
         };
         match trouble {
-            Some(trouble) => self.go_back(context, state, trouble),
+            Some(trouble) => {
+                self.go_back(context, state, trouble)?;
+                state.record.attempts = self.attempts;
+                Ok(())
+            }
             None => {
                 if due {
                     self.good = Good::of(state);
@@ -180,10 +182,10 @@ impl Watchdog {
         let (iteration, stage) = (state.iteration, state.stage.name());
         let what = format!("{} at iteration {iteration} of stage {stage}", trouble.what);
         let warn = |message: String| context.job.events.emit(&Event::Warning { object: "watchdog".into(), message });
-        if self.lowered >= ATTEMPTS || self.repeated > 2 * ATTEMPTS {
+        if self.attempts.lowered >= ATTEMPTS || self.attempts.repeated > 2 * ATTEMPTS {
             return Err(Error::backend(
                 what,
-                format!("it is not finite, after learning rates were lowered {} times", self.lowered),
+                format!("it is not finite, after learning rates were lowered {} times", self.attempts.lowered),
                 "Lower the learning rates (train.lr), choose another deformer or loss, or look at the images of this scene",
             ));
         }
@@ -195,12 +197,12 @@ impl Watchdog {
         let back = self.good.iteration;
         // The first broken value is known only where every value before it was checked.
         if !self.checks(iteration) && iteration > back + 1 {
-            self.repeated += 1;
-            self.checked_until = iteration;
+            self.attempts.repeated += 1;
+            self.attempts.checked_until = iteration;
             warn(format!("{what}: it is not finite; back to iteration {back}, to find its source"));
             return Ok(());
         }
-        self.lowered += 1;
+        self.attempts.lowered += 1;
         let factor = state.rates.of(&part) * LOWERED;
         state.rates.0.insert(part.clone(), factor);
         warn(format!("{what}: it is not finite; back to iteration {back}, and {part} learns {factor} times as fast as configured"));
