@@ -10,6 +10,8 @@ use serde::Deserialize;
 const ROW: usize = 64;
 /// Largest 8-bit code.
 const PEAK: f32 = 127.0;
+/// Largest scale of a row: files may hold the code -128, too.
+const MOST_SCALE: f32 = f32::MAX / 128.0;
 /// The one stream: names and shapes, then all values.
 const WEIGHTS: &str = "weights";
 
@@ -51,7 +53,12 @@ impl Precision {
             }
             Self::Int8 => {
                 for row in values.chunks(ROW) {
-                    let scale = row.iter().fold(0.0f32, |m, v| m.max(v.abs())) / PEAK;
+                    let largest = row.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+                    let scale = largest / PEAK;
+                    if scale > MOST_SCALE {
+                        let problem = format!("{largest:e} is over the limit of int8 ({:e})", PEAK * MOST_SCALE);
+                        return Err(Error::parameter(format!("weights '{name}'"), problem, "Store the weights as fp32"));
+                    }
                     out.extend(scale.to_le_bytes());
                     // A scale that underflows to 0 means that all values are zero.
                     out.extend(row.iter().map(|v| if scale > 0.0 { (v / scale).round().clamp(-PEAK, PEAK) as i8 as u8 } else { 0 }));
@@ -76,8 +83,8 @@ impl Precision {
                 while values.len() < count {
                     let scale = reader.f32()?;
                     let row = reader.take(ROW.min(count - values.len()))?;
-                    if !(0.0..=f32::MAX / 128.0).contains(&scale) {
-                        return Err(reader.error(format!("a row of weights has the scale {scale}, expected a finite number of at least 0")));
+                    if !(0.0..=MOST_SCALE).contains(&scale) {
+                        return Err(reader.error(format!("a row of weights has the scale {scale:e}, expected a number from 0 to {MOST_SCALE:e}")));
                     }
                     values.extend(row.iter().map(|&b| f32::from(b as i8) * scale));
                 }
@@ -194,6 +201,11 @@ mod tests {
         }
         assert!(Precision::Fp16.write("w", &[1e6], &mut Vec::new()).is_err());
         assert!(Precision::Int8.read(&mut ByteReader::new("w", &[0, 0, 192, 127, 5]), 1).is_err(), "a scale that is not a number");
+        let mut bytes = Vec::new();
+        Precision::Int8.write("w", &[PEAK * 0.99 * MOST_SCALE], &mut bytes).unwrap();
+        assert!(Precision::Int8.read(&mut ByteReader::new("w", &bytes), 1).unwrap()[0].is_finite());
+        let error = Precision::Int8.write("w", &[1.0, -f32::MAX], &mut Vec::new()).unwrap_err().to_string();
+        assert!(error.contains("weights 'w': 3.4028235e38 is over the limit of int8"), "{error}");
     }
 
     #[test]

@@ -72,22 +72,26 @@ impl Camera {
     /// # Errors
     /// [`Error::Data`] that names the camera.
     pub fn validate(&self) -> Result<()> {
-        let bad = |problem: String| Err(Error::data(format!("camera {}", self.name), problem, "Check the dataset's calibration file"));
+        let Some(problem) = self.problem() else { return Ok(()) };
+        Err(Error::data(format!("camera {}", self.name), problem, "Check the dataset's calibration file"))
+    }
+    /// What [`Camera::validate`] refuses.
+    pub(crate) fn problem(&self) -> Option<String> {
         if self.width == 0 || self.height == 0 {
-            return bad(format!("image size {}x{} is empty", self.width, self.height));
+            return Some(format!("image size {}x{} is empty", self.width, self.height));
         }
         let numbers = [self.fx, self.fy, self.cx, self.cy];
         if numbers.iter().chain(self.world_to_camera.iter().flatten()).any(|v| !v.is_finite()) {
-            return bad("a parameter is not finite".into());
+            return Some("a parameter is not finite".into());
         }
         if self.fx <= 0.0 || self.fy <= 0.0 {
-            return bad(format!("focal length ({}, {}) is not positive", self.fx, self.fy));
+            return Some(format!("focal length ({}, {}) is not positive", self.fx, self.fy));
         }
         let (r, _) = self.rotation_translation();
         let error = (r * r.transpose() - DMat3::IDENTITY).to_cols_array().iter().fold(0.0f64, |a, v| a.max(v.abs()));
         if error > 1e-3 || r.determinant() < 0.0 {
-            return bad(format!("world_to_camera is not rigid (orthogonality error {error:.2e}, determinant {:.3})", r.determinant()));
+            return Some(format!("world_to_camera is not rigid (orthogonality error {error:.2e}, determinant {:.3})", r.determinant()));
         }
-        Ok(())
+        None
     }
 }

@@ -52,6 +52,16 @@ pub enum Error {
         /// What works instead.
         remedy: String,
     },
+    /// Memory ran out where there is no error of the system to pass on, such as in another process.
+    #[error("{object}: {problem}. {remedy}")]
+    OutOfMemory {
+        /// The work.
+        object: String,
+        /// What happened.
+        problem: String,
+        /// How to need less, or to have more.
+        remedy: String,
+    },
     /// An error of the operating system.
     #[error("{path}: {source}. Check that the path exists and may be read or written")]
     Io {
@@ -108,6 +118,10 @@ impl Error {
     pub fn unsupported(object: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self::Unsupported { object: object.into(), problem: problem.into(), remedy: remedy.into() }
     }
+    /// A [`Error::OutOfMemory`].
+    pub fn out_of_memory(object: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self::OutOfMemory { object: object.into(), problem: problem.into(), remedy: remedy.into() }
+    }
     /// A [`Error::Backend`].
     pub fn backend(object: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self::Backend { object: object.into(), problem: problem.into(), remedy: remedy.into() }
@@ -137,7 +151,7 @@ impl Error {
             Self::Data { .. } => 3,
             Self::Io { source, .. } if source.kind() == std::io::ErrorKind::OutOfMemory => 4,
             Self::Io { .. } => 3,
-            Self::Limit { .. } => 4,
+            Self::Limit { .. } | Self::OutOfMemory { .. } => 4,
             Self::Backend { .. } => 5,
             Self::Failed { .. } => 6,
             Self::Interrupted(_) => 130,

@@ -21,20 +21,22 @@ struct PairCapacity {
 }
 
 impl PairCapacity {
-    fn note(&mut self, count: Tensor<1, Int>) {
+    fn note(&mut self, count: Tensor<1, Int>) -> Result<()> {
         self.frames += 1;
         self.most = Some(match self.most.take() {
             Some(most) => most.max_pair(count),
             None => count,
         });
         if self.capacity.is_none() || self.frames.is_multiple_of(LOOK_EVERY) {
-            let most = self.most.take().map_or(0, |most| most.into_scalar::<i64>().max(0)) as f64;
+            let failed = |e| Error::backend("number of (Gaussian, tile) pairs", format!("reading it back failed: {e:?}"), "Try another device (--device flex)");
+            let most = self.most.take().map_or(Ok(0), |most| most.try_into_scalar::<i64>()).map_err(failed)?.max(0) as f64;
             let wanted = (most * SPARE) as usize + 1024;
             // The capacity shrinks too, once it is twice what is needed: sorting takes time for all of it.
             if self.capacity.is_none_or(|capacity| most as usize > capacity || wanted * 2 < capacity || most * 1.1 > capacity as f64) {
                 self.capacity = Some(wanted);
             }
         }
+        Ok(())
     }
 }
 
@@ -212,6 +214,8 @@ impl<'a> Player<'a> {
         };
         let offsets = field.field.deform(features, time_norm)?;
         let offsets = if self.shortcuts.static_gating { offsets } else { offsets.first(self.moving) };
+        // What `apply_over` refuses is refused while the frame is whole.
+        offsets.check(field.name(), self.moving_gaussians.len())?;
         // The frame is written in place. A caller who kept the last one keeps a copy of its own.
         let nothing = self.moving_gaussians.clone();
         let frame = std::mem::replace(&mut self.frame, nothing);
@@ -254,7 +258,7 @@ impl<'a> Player<'a> {
         let settings = RenderSettings { pair_capacity: self.pair_capacity.capacity, ..self.settings.clone() };
         let output = self.rasterizer.render(&splats, camera, &settings)?;
         if let Some(count) = &output.stats.pair_count {
-            self.pair_capacity.note(count.clone());
+            self.pair_capacity.note(count.clone())?;
         }
         Ok(output)
     }

@@ -35,6 +35,10 @@ pub struct PruneReport {
 
 /// Contribution of each Gaussian: the mean over training views, at their times, of the sum over pixels of its squared blending weight (with what shines through it).
 pub fn contributions(model: &Model, scene: &Scene, registry: &Registry, device: &Device, events: &dyn EventSink) -> Result<Vec<f64>> {
+    // Without Gaussians there is nothing to differentiate by.
+    if model.gaussians.is_empty() {
+        return Ok(Vec::new());
+    }
     let services = ModelServices::new(model, registry, device)?;
     let views = SceneViews::new(scene);
     let chosen = views.len().min(VIEWS);
@@ -101,7 +105,10 @@ pub fn prune(model: &mut Model, scene: &Scene, max_drop_db: f64, registry: &Regi
     }
     let rest = kept(enough);
     drop(services);
-    model.gaussians = rest;
+    if enough < n {
+        model.gaussians = rest;
+        model.size = model.float32_size();
+    }
     let views = judges.len().min(JUDGES);
     Ok(PruneReport { before: n, after: enough, psnr_before_db, psnr_after_db, psnr_refit_alone_db: None, judged_by, views })
 }

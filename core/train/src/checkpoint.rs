@@ -125,7 +125,7 @@ impl Checkpoint {
             if self.arrays.strain.len() != 3 * moving {
                 return Err(damaged(format!("strain is measured by {} numbers for {moving} moving Gaussians", self.arrays.strain.len())));
             }
-            state.neighbours = Neighbours::of(&self.arrays.strain, &self.device);
+            state.neighbours = Some(Neighbours::of(&self.arrays.strain, &self.device));
         }
         Ok(state)
     }

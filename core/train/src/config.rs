@@ -36,7 +36,7 @@ pub struct RunConfig {
     /// The rasterizer plug-in: `kind` and its settings.
     #[serde(default = "default_rasterizer")]
     pub rasterizer: toml::Table,
-    /// The deformation field plug-in: `kind` and its settings.
+    /// The deformer plug-in: `kind` and its settings.
     #[serde(default = "cdf")]
     pub deformer: toml::Table,
     /// The density control plug-in: `kind` and its settings.

@@ -1,4 +1,4 @@
-//! The built-in presets: a family of datasets, and on top of it, if another field than the family's is wanted, a method (`n3dv+hexplane`).
+//! The built-in presets: a family of datasets, and on top of it, if another deformer than the family's is wanted, a method (`n3dv+hexplane`).
 //!
 //! They are plug-ins like a third party's. [`cc4dgs_core::Registry::preset`] puts the layers together.
 
@@ -54,7 +54,7 @@ families! {
 }
 
 methods! {
-    "cdf", "the paper's field", "CC-4DGS";
+    "cdf", "the paper's deformer", "CC-4DGS";
     "swift4d", "Swift4D's joint hash grid", "Swift4D (Wu et al. 2025)";
     "grid4d", "Grid4D's four hash grids", "Grid4D (Xu et al. 2024)";
     "hexplane", "4DGS's planes", "4DGS (Wu et al. 2024)";
@@ -62,7 +62,7 @@ methods! {
     "deform-mlp", "Deformable 3DGS's network", "Deformable 3DGS (Yang et al. 2024)";
     "free-time", "velocities and lives of Gaussians", "FreeTimeGS; FreeTimeGS++; SharpTimeGS";
     "native-4d", "4D-GS's Gaussians of space and time", "4D-GS (Yang et al. 2024)";
-    "cdf-basis", "this project's field, linear in functions of time", "this project";
+    "cdf-basis", "this project's deformer, linear in functions of time", "this project";
     "none", "no deformation", "Kerbl et al. 2023 (3DGS)";
 }
 
@@ -83,7 +83,7 @@ mod tests {
                 assert_eq!(config.preset, name);
                 if method == "+hexplane" {
                     assert_eq!(config.deformer["kind"].as_str(), Some("hexplane"));
-                    assert!(!config.deformer.contains_key("capacity"), "{name} keeps the family's field settings");
+                    assert!(!config.deformer.contains_key("capacity"), "{name} keeps the family's settings of the deformer");
                 }
             }
         }

@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 
-use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory};
+use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory, ordered_sum};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -16,7 +16,7 @@ impl LossTerm for MeanSquare {
         let difference = input.planes.clone().narrow(0, 0, 3) - input.target.clone();
         // Divided before the sum, which would overflow where the mean does not.
         let share = difference.mul_scalar(1.0 / (input.target.dims().iter().product::<usize>().max(1) as f64).sqrt());
-        Ok(Some(share.clone().mul(share).sum()))
+        Ok(Some(ordered_sum(share.clone().mul(share))))
     }
 }
 

@@ -58,6 +58,24 @@ impl Presentation {
         if self.cameras.len() > MAX_CAMERAS {
             return Err(Error::limit(object, self.cameras.len() as u64, MAX_CAMERAS as u64, "Store fewer capture cameras"));
         }
-        self.home.iter().chain(&self.cameras).try_for_each(Camera::validate)
+        match self.home.iter().chain(&self.cameras).find_map(|camera| Some((camera, camera.problem()?))) {
+            Some((camera, problem)) => bad(format!("camera {}: {problem}", camera.name)),
+            None => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_damaged_camera_is_an_error_of_the_file() {
+        let camera = Camera::look_at("c1", (8, 8), 1.0, [3.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
+        let of = |fx: f64| Presentation { cameras: vec![Camera { fx, ..camera.clone() }], ..Presentation::default() }.validate("manifest of a.cc4d");
+        assert!(of(camera.fx).is_ok());
+        let error = of(-1.0).unwrap_err().to_string();
+        assert!(error.starts_with("manifest of a.cc4d: camera c1: focal length (-1") && error.contains("The file is damaged"), "{error}");
+        assert!(!error.contains("calibration"), "{error}");
     }
 }

@@ -50,11 +50,19 @@ pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn Ex
     Ok((exported, bytes))
 }
 
-/// Refuses a `path` that exists, unless it may be replaced. A link that leads nowhere exists, too. Call it before long work.
+/// Refuses a `path` to which a file cannot be written: that of a folder, and one that exists, unless it may be replaced. A link that leads nowhere exists, too.
+/// Call it before long work.
 ///
 /// # Errors
 /// [`Error::Parameter`].
 pub fn refuse_existing(path: &Path, overwrite: bool) -> Result<()> {
+    if path.is_dir() {
+        return Err(Error::parameter(path.display().to_string(), "it is a folder, and a file is to be written", "Give the name of a file"));
+    }
+    refuse_unasked(path, overwrite)
+}
+
+fn refuse_unasked(path: &Path, overwrite: bool) -> Result<()> {
     if overwrite || path.symlink_metadata().is_err() {
         return Ok(());
     }
@@ -88,7 +96,6 @@ pub fn refuse_other_content(path: &Path, kind: &str, is_kind: impl FnOnce(&[u8])
 /// Refuses a `path` that may not be replaced.
 fn check(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
     let refuse = |problem: &str, remedy: &str| Err(Error::parameter(path.display().to_string(), problem, remedy));
-    refuse_existing(path, overwrite)?;
     let Ok(found) = std::fs::symlink_metadata(path) else { return Ok(()) };
     match target {
         ExportTarget::File(_) if found.is_dir() => refuse("it is a folder, and this format is a file", "Give the name of a file"),
@@ -98,9 +105,9 @@ fn check(path: &Path, target: ExportTarget, overwrite: bool) -> Result<()> {
                 let problem = format!("the folder also holds {}, which is not of this format ({})", other.display(), names.join(", "));
                 refuse(&problem, "Give another folder; only exports are replaced")
             }
-            None => Ok(()),
+            None => refuse_unasked(path, overwrite),
         },
-        ExportTarget::File(_) | ExportTarget::FileOrFolder { .. } => Ok(()),
+        ExportTarget::File(_) | ExportTarget::FileOrFolder { .. } => refuse_unasked(path, overwrite),
     }
 }
 
@@ -191,6 +198,29 @@ mod tests {
         assert!(run("x", false, dir, "deep/many", true).unwrap_err().to_string().contains("notes.md"));
         assert!(run("x", false, file, "deep/many", true).is_err());
         assert!(run("x", false, dir, "deep/one.txt", true).is_err());
+    }
+
+    #[test]
+    fn what_overwriting_cannot_replace_is_refused_without_proposing_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a.txt");
+        std::fs::write(&file, "mine").unwrap();
+        let mut source = Nothing(crate::conformance::export_facts(0, 0));
+        let mut run = |target, path: &Path, overwrite| export(&Text("x", false), target, &mut source, path, overwrite).map(|_| ());
+        for overwrite in [false, true] {
+            let refused = [
+                refuse_existing(folder.path(), overwrite),
+                run(ExportTarget::File("txt"), folder.path(), overwrite),
+                run(ExportTarget::Folder(&["b.txt"]), folder.path(), overwrite),
+                run(ExportTarget::Folder(&["b.txt"]), &file, overwrite),
+            ];
+            for message in refused.map(|refused| refused.unwrap_err().to_string()) {
+                assert!(!message.contains("--overwrite") && message.contains("Give "), "{message}");
+            }
+        }
+        assert!(refuse_existing(&file, false).unwrap_err().to_string().contains("--overwrite"));
+        refuse_existing(&file, true).unwrap();
+        assert_eq!(std::fs::read(&file).unwrap(), b"mine");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
 use crate::sample::spread_views;
 use crate::schedule::StageLengths;
-use crate::train::{Context, Score, TrainJob, TrainState};
+use crate::train::{Context, Score, TrainState};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
@@ -89,7 +89,7 @@ impl Watch {
         let cap = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).and_then(|cap| usize::try_from(cap).ok());
         // A static scene may well state one time for all images; it is no cause of anything while the model is good.
         let mut doubts = self.doubts.clone();
-        if let Some(warning) = same_time(context.job).filter(|_| end.psnr_db < GOOD_ENOUGH_DB) {
+        if let Some(warning) = same_time(&context.job.scene.warnings).filter(|_| end.psnr_db < GOOD_ENOUGH_DB) {
             doubts.push(Finding::doubt(Subject::Times, warning.clone(), "Give each image its time"));
         }
         let verdict = Evidence {
@@ -162,7 +162,7 @@ impl Watch {
             (_, _, END) => vec![*now],
             _ => return None,
         };
-        let one_time = same_time(context.job).is_some();
+        let one_time = same_time(&context.job.scene.warnings).is_some();
         // On the way only by clear margins: learning rates that fall at the end gain a decibel.
         let doubts = match percent {
             END => Doubts { any: one_time || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times)), one_time },
@@ -189,12 +189,11 @@ impl Watch {
     fn failure(&self, context: &Context, problem: String) -> Error {
         let iterations = context.job.config.train.iterations;
         let kept = kept(context);
-        let scene = &context.job.scene;
-        match (self.doubts.first(), same_time(context.job).or(scene.warnings.first())) {
+        match (self.doubts.first(), suspicion(&context.job.scene.warnings)) {
             (Some(doubt), _) => Error::failed("training", format!("{problem}. The likely cause: {}", doubt.problem), doubt.remedy.clone()),
-            (None, Some(warning)) => {
+            (None, Some(suspicion)) => {
                 let remedy = format!("Correct the dataset, or train longer (train.iterations). {kept} = false accepts such models");
-                Error::failed("training", format!("{problem}. The likely cause: {warning}"), remedy)
+                Error::failed("training", format!("{problem}. {suspicion}"), remedy)
             }
             (None, None) => {
                 let remedy = format!(
@@ -226,8 +225,17 @@ fn kept(context: &Context) -> &'static str {
 }
 
 /// The reader's warning that all images state one time.
-fn same_time<'a>(job: &'a TrainJob) -> Option<&'a String> {
-    job.scene.warnings.iter().find(|warning| warning.starts_with(SAME_TIME))
+fn same_time(warnings: &[String]) -> Option<&String> {
+    warnings.iter().find(|warning| warning.starts_with(SAME_TIME))
+}
+
+/// What the reader's warnings say about the cause of a failure: one time for all images is likely to be it, any other may be.
+fn suspicion(warnings: &[String]) -> Option<String> {
+    match same_time(warnings) {
+        Some(warning) => Some(format!("The likely cause: {warning}")),
+        None if warnings.is_empty() => None,
+        None => Some(format!("The cause may be among what the reader warned of: {}", warnings.join("; "))),
+    }
 }
 
 /// PSNR in dB of the validation views: those of `train.validation`, or else some of the reader's own. An image of the latter that cannot be read is a warning,
@@ -288,6 +296,15 @@ fn slope(planes: &[f32], width: usize) -> f64 {
 mod tests {
     use super::*;
     use crate::config::TrainConfig;
+
+    #[test]
+    fn no_warning_is_the_likely_cause_for_its_place_in_the_alphabet() {
+        let of = |warnings: &[&str]| suspicion(&warnings.iter().map(ToString::to_string).collect::<Vec<_>>());
+        let (missing, times) = ("3 of 9 images are missing", format!("{SAME_TIME}, 0"));
+        assert_eq!(of(&[]), None);
+        assert_eq!(of(&[missing, "times are even"]).unwrap(), format!("The cause may be among what the reader warned of: {missing}; times are even"));
+        assert_eq!(of(&[missing, &times]).unwrap(), format!("The likely cause: {times}"));
+    }
 
     #[test]
     fn scores_count_once_frames_and_pixels_are_there() {

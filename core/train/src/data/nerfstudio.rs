@@ -98,7 +98,7 @@ pub(crate) fn image_path(folder: &Path, named: &str) -> PathBuf {
         return path;
     }
     let with = |extension: &str| folder.join(format!("{named}.{extension}"));
-    ["png", "jpg", "jpeg"].iter().map(|e| with(e)).find(|p| p.is_file()).unwrap_or_else(|| with("png"))
+    ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"].iter().map(|e| with(e)).find(|p| p.is_file()).unwrap_or_else(|| with("png"))
 }
 
 inventory::submit! {
@@ -302,6 +302,8 @@ mod tests {
             assert_eq!(image_path(dir.path(), named), file, "{named}");
         }
         assert!(image_path(dir.path(), "./images\\a").is_file() && !image_path(dir.path(), "images\\b").is_file());
+        std::fs::write(dir.path().join("images/r_0.PNG"), "").unwrap();
+        assert!(image_path(dir.path(), "./images/r_0").is_file());
     }
 
     #[test]

@@ -155,8 +155,22 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
         latex += &table.latex();
     }
     body += "</div>\n";
-    let figures = scenes.iter().flat_map(|(scene, rows)| charts::files(scene, rows, &key, &trained)).collect();
+    let mut figures: Vec<(String, String)> = scenes.iter().flat_map(|(scene, rows)| charts::files(scene, rows, &key, &trained)).collect();
+    number_equals(&mut figures);
     Ok(Report { html: page::page(&title, &body), csv: tables::csv(&scenes), markdown, latex, figures, cells: results.len() })
+}
+
+/// Numbers the second and later of equal names: they lack the punctuation and the case of their scenes.
+fn number_equals(figures: &mut [(String, String)]) {
+    let mut taken = std::collections::BTreeSet::new();
+    for (name, _) in figures {
+        let stem = name.trim_end_matches(".svg").to_string();
+        let mut number = 1;
+        while !taken.insert(name.clone()) {
+            number += 1;
+            *name = format!("{stem}-{number}.svg");
+        }
+    }
 }
 
 /// The quantities with these keys.

@@ -158,6 +158,13 @@ fn times_of_trainings_on_other_devices_are_marked() {
 }
 
 #[test]
+fn plots_of_scenes_that_differ_in_punctuation_have_names_of_their_own() {
+    let mut figures = ["a-b.svg", "a-b-2.svg", "a-b.svg", "c.svg", "a-b.svg"].map(|name| (name.to_string(), String::new()));
+    number_equals(&mut figures);
+    assert_eq!(figures.map(|(name, _)| name), ["a-b.svg", "a-b-2.svg", "a-b-3.svg", "c.svg", "a-b-4.svg"]);
+}
+
+#[test]
 fn a_report_replaces_reports_only() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), &sweep(folder.path()));
