@@ -74,7 +74,8 @@ fn main() -> Result<()> {
     }
     let config = session.config("demo", &[&format!("train.iterations={iterations}")])?;
     let model = session.train(&config, session.read_scene("procedural:tiny", &config.scene)?, None)?;
-    let size = |codec: &str| model.save(std::env::temp_dir().join(format!("{codec}.cc4d")), codec);
+    let folder = tempfile::tempdir().map_err(|e| Error::io(std::env::temp_dir(), e))?;
+    let size = |codec: &str| model.save(folder.path().join(format!("{codec}.cc4d")), codec);
     println!("raw: {} bytes, rounded: {} bytes", size("raw")?, size("rounded")?);
     Ok(())
 }

@@ -3,14 +3,17 @@
 //! `cargo run --release --example compare -- MODEL OTHER [FRAMES [WIDTH]]`
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
-use cc4dgs::{Orbit, Result, Session};
+use cc4dgs::{Error, Orbit, Result, Session};
 
 fn main() -> Result<()> {
     let mut arguments = std::env::args().skip(1);
     let mut path = || arguments.next().unwrap_or_else(|| "runs/example".into());
     let (first, second) = (path(), path());
-    let mut number = |other: u32| arguments.next().and_then(|n| n.parse().ok()).unwrap_or(other);
-    let (frames, width) = (number(12), number(800));
+    let mut number = |name: &str, other: u32| match arguments.next() {
+        Some(n) => n.parse::<u32>().map_err(|_| Error::parameter(name, format!("'{n}' is no number"), format!("Give a whole number, such as {other}"))),
+        None => Ok(other),
+    };
+    let (frames, width) = (number("FRAMES", 12)?, number("WIDTH", 800)?);
 
     let session = Session::new()?;
     let (a, b) = (session.open(first)?, session.open(second)?);

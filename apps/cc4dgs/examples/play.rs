@@ -3,14 +3,17 @@
 //! `cargo run --release --example play -- MODEL FOLDER [FRAMES]`. The model is the folder of a run, a checkpoint, an archive, a PLY or an SPZ file.
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
-use cc4dgs::{Orbit, Result, Session, video, write_png};
+use cc4dgs::{Error, Orbit, Result, Session, video, write_png};
 use std::path::PathBuf;
 
 fn main() -> Result<()> {
     let mut arguments = std::env::args().skip(1);
     let model = arguments.next().unwrap_or_else(|| "runs/example".into());
     let folder = PathBuf::from(arguments.next().unwrap_or_else(|| "runs/frames".into()));
-    let frames = arguments.next().and_then(|n| n.parse().ok()).unwrap_or(24);
+    let frames = match arguments.next() {
+        Some(n) => n.parse::<usize>().map_err(|_| Error::parameter("FRAMES", format!("'{n}' is no number"), "Give a whole number, such as 24"))?,
+        None => 24,
+    };
 
     let session = Session::new()?;
     let model = session.open(model)?;

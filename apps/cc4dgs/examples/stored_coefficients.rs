@@ -9,7 +9,7 @@
 
 use cc4dgs::core::burn::tensor::{Tensor, TensorData};
 use cc4dgs::core::gaussians::to_vec;
-use cc4dgs::core::{Deformer, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, parse_device};
+use cc4dgs::core::{Deformer, Error, Limits, Offsets, Parameter, ParameterGroup, Registry, Result, Silent, SpatialFeatures, SpatialInput, Split, parse_device};
 use cc4dgs::play::Model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs::train::eval::{Scored, evaluate};
@@ -72,7 +72,10 @@ fn entropy(values: &[i64]) -> f64 {
 fn main() -> Result<()> {
     let mut args = std::env::args().skip(1);
     let (model, scene) = (args.next().unwrap_or_default(), args.next().unwrap_or_default());
-    let views = args.next().and_then(|v| v.parse().ok()).unwrap_or(20);
+    let views = match args.next() {
+        Some(n) => n.parse::<usize>().map_err(|_| Error::parameter("VIEWS", format!("'{n}' is no number"), "Give a whole number, such as 20"))?,
+        None => 20,
+    };
     let (registry, limits, device) = (Registry::collect()?, Limits::default(), parse_device("flex")?);
     let load = || Model::open(model.as_ref(), &registry, &device, &limits, &Silent);
     let plain = load()?;

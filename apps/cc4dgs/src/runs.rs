@@ -18,11 +18,11 @@ pub enum Existing {
     Overwrite,
 }
 
-/// Refuses a folder that holds a run which would be overwritten unasked, one to go on from that holds no checkpoint, and a file. `remedy` says what to do
-/// instead.
+/// Refuses a folder that holds a run which would be overwritten unasked, one to go on from that holds no checkpoint, a file, and a place that cannot be written.
+/// `remedy` says what to do instead. Nothing is created.
 ///
 /// # Errors
-/// [`Error::Parameter`] that names the folder and what is found there.
+/// [`Error::Parameter`] that names the folder and what is found there; [`Error::Io`] for a place that cannot be written.
 pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<()> {
     let object = format!("run folder {}", folder.display());
     if folder.is_file() {
@@ -34,8 +34,14 @@ pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<(
         (Existing::Refuse, Some(name)) => refuse(format!("it holds a run already ({name})")),
         // The checkpoint is what is looked for first.
         (Existing::Resume, found) if found != Some(CHECKPOINT) => refuse("nothing to resume, it has no checkpoint".into()),
-        _ => Ok(()),
+        _ => check_writable(folder),
     }
+}
+
+/// Tries to write beside what will be there; a file without a name leaves nothing behind.
+fn check_writable(folder: &Path) -> Result<()> {
+    let there = folder.ancestors().find(|place| place.exists()).unwrap_or(Path::new("."));
+    tempfile::tempfile_in(there).map(drop).map_err(|e| Error::io(there, e))
 }
 
 #[cfg(test)]
@@ -51,6 +57,11 @@ mod tests {
         check(Existing::Refuse).unwrap();
         let file = check_folder(&folder.path().join("notes.txt"), Existing::Overwrite, "Pass --overwrite").unwrap_err().to_string();
         assert!(file.contains("notes.txt: it is a file"), "{file}");
+        // A file in the way stops administrators, too.
+        let below = check_folder(&folder.path().join("notes.txt/deep/run"), Existing::Refuse, "Pass --overwrite").unwrap_err();
+        assert!(matches!(below, Error::Io { .. }) && below.to_string().contains("notes.txt: "), "{below}");
+        check_folder(&folder.path().join("deep/run"), Existing::Refuse, "Pass --overwrite").unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is created");
         // A run that ended before its first checkpoint.
         std::fs::write(folder.path().join(CONFIG), "").unwrap();
         assert!(check(Existing::Refuse).is_err());

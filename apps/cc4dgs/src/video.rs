@@ -25,6 +25,12 @@ pub fn frame_name(index: usize) -> String {
     format!("frame_{index:05}.png")
 }
 
+/// The names of [`frame_name`] in the folder `frames` as ffmpeg's pattern, in which a percent sign of the folder's name is written twice.
+fn pattern(frames: &Path) -> PathBuf {
+    let folder = frames.to_str().map_or_else(|| frames.to_path_buf(), |folder| PathBuf::from(folder.replace('%', "%%")));
+    folder.join("frame_%05d.png")
+}
+
 /// Makes the video `out` of the first `count` images in `frames`, named by [`frame_name`], at `fps` images per second; it appears complete or not at all.
 ///
 /// # Errors
@@ -32,7 +38,7 @@ pub fn frame_name(index: usize) -> String {
 pub fn encode(frames: &Path, count: usize, fps: u32, out: &Path) -> Result<()> {
     let part = temporary(out)?;
     let mut command = ffmpeg();
-    command.args(["-framerate", &fps.to_string(), "-start_number", "0", "-i"]).arg(frames.join("frame_%05d.png")).args(["-frames:v", &count.to_string()]);
+    command.args(["-framerate", &fps.to_string(), "-start_number", "0", "-i"]).arg(pattern(frames)).args(["-frames:v", &count.to_string()]);
     let output = command.args(CODEC).arg(&part).stdin(Stdio::null()).output().map_err(absent)?;
     check(&output)?;
     part.persist(out).map_err(|e| Error::io(out, e.error))
@@ -189,4 +195,30 @@ fn check(output: &Output) -> Result<()> {
     let said = String::from_utf8_lossy(&output.stderr);
     let problem = format!("it ended with {}: {}", output.status, said.trim().lines().last().unwrap_or("no message"));
     Err(Error::backend("ffmpeg", problem, "Render PNG frames and encode them by hand"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percent_signs_of_a_folder_are_no_pattern() {
+        for (folder, expected) in [("frames", "frames/frame_%05d.png"), ("50%d of a/b%", "50%%d of a/b%%/frame_%05d.png")] {
+            assert_eq!(pattern(Path::new(folder)), Path::new(expected));
+        }
+    }
+
+    #[test]
+    fn frames_of_any_folder_become_a_video() {
+        if ffmpeg_version().is_err() {
+            eprintln!("ffmpeg is absent: skipped");
+            return;
+        }
+        let root = tempfile::tempdir().unwrap();
+        let (frames, out) = (root.path().join("100%d"), root.path().join("a.mp4"));
+        let image = Image8 { width: 16, height: 16, channels: 3, data: vec![128; 16 * 16 * 3] };
+        (0..2).for_each(|index| cc4dgs_train::images::write_png(frames.join(frame_name(index)), &image).unwrap());
+        encode(&frames, 2, 5, &out).unwrap();
+        assert!(out.metadata().unwrap().len() > 100);
+    }
 }

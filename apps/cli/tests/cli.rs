@@ -82,6 +82,24 @@ fn mistakes_end_with_their_own_exit_code() {
     let missing = fail(&["decompress", text(&folder.path().join("missing.cc4d")), "--out", text(&out)], 2);
     assert!(missing.contains("missing.cc4d: no such file") && missing.contains("the folder of a run"), "{missing}");
     fail(&["--limit", "max_gausians=3", "doctor"], 2);
+    // Options without effect and wrong names are noticed before anything is read.
+    for (args, part) in [
+        ("decompress x --no-dynamic --out y.spz", "name a file that ends in .ply"),
+        ("export ply x --frames 3 --out y.ply", "ply-sequence"),
+        ("export sog x --fps 3 --out y.sog", "sog holds one instant"),
+        ("render x --fps 3 --out y", "--mp4"),
+        ("compress x --codec kwantize --out y.cc4d", "quantize"),
+        ("compress x --codec raw --set bitz=3 --out y.cc4d", "bitz"),
+    ] {
+        let said = fail(&args.split(' ').collect::<Vec<_>>(), 2);
+        assert!(said.contains(part), "{args}: {said}");
+    }
+    #[cfg(unix)]
+    {
+        let name: &std::ffi::OsStr = std::os::unix::ffi::OsStrExt::from_bytes(b"\xff");
+        let output = cc4dgs().args(["demo", "-q", "--out"]).arg(folder.path().join(name)).output().unwrap();
+        assert!(output.status.code() == Some(2) && common::said(&output).contains("not UTF-8"), "{}", common::said(&output));
+    }
     let output = run(&["info", text(&broken), "--json"]);
     let object: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!((output.status.code(), &object["error"]["exit_code"]), (Some(3), &Value::from(3)));

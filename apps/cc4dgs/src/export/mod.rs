@@ -101,12 +101,13 @@ impl ExportJob<'_> {
     /// Writes the file or folder; it appears complete or not at all.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for unknown formats, settings and times, for a time where the format holds all of them, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
+    /// [`Error::Parameter`] for unknown formats, settings and times, for an axis whose length is not 1, for a time where the format holds all of them, and for a name that exists without `overwrite`; [`Error::Interrupted`]; what the format
     /// cannot hold; what device and disk report.
     pub fn run(&self) -> Result<ExportReport> {
         let plugin = self.registry.exporter(self.format)?;
         let exporter = (plugin.build)(self.settings)?;
         check_time(self.registry, plugin, self.request.time_norm)?;
+        check_up(self.request.up)?;
         let mut source = ModelSource::new(self)?;
         let lost = exporter.loses(source.facts());
         let (exported, bytes) = export(exporter.as_ref(), plugin.target, &mut source, self.out, self.overwrite)?;
@@ -145,6 +146,16 @@ pub fn check_time(registry: &Registry, plugin: &ExporterPlugin, time_norm: Optio
     Ok(())
 }
 
+/// Refuses an upward axis whose length is not 1.
+fn check_up(up: [f64; 3]) -> Result<()> {
+    let length = up.iter().map(|v| v * v).sum::<f64>().sqrt();
+    if (length - 1.0).abs() <= 1e-3 {
+        return Ok(());
+    }
+    let remedy = "Give one of x, y and z with its sign, such as [0, 0, 1]";
+    Err(Error::parameter("up", format!("{up:?} has the length {length}, and an axis has 1"), remedy))
+}
+
 /// A model as exporters see it.
 struct ModelSource<'a> {
     job: &'a ExportJob<'a>,
@@ -176,6 +187,10 @@ impl<'a> ModelSource<'a> {
         };
         Ok(Self { job, player, facts })
     }
+    /// Ends the export where the user wants to stop; `when` says how far it is.
+    fn check_stop(&self, when: &str) -> Result<()> {
+        if self.job.stop.load(Ordering::Relaxed) { Err(Error::Interrupted(format!("{when} of {}", self.job.out.display()))) } else { Ok(()) }
+    }
 }
 
 impl ExportSource for ModelSource<'_> {
@@ -203,6 +218,7 @@ impl ExportSource for ModelSource<'_> {
             Some(path) => Stored::open(path, Storage::default(), around)?,
             None => Stored::of_model(model, Storage::default(), around)?,
         };
+        self.check_stop("before baking the motion")?;
         let up = request.cameras.is_empty().then_some(request.up);
         let before = stored.presentation(&request.cameras, up)?;
         let shown = if request.cameras.is_empty() { before.clone() } else { presented(&stored.model, &request.cameras, None)? };
@@ -214,9 +230,7 @@ impl ExportSource for ModelSource<'_> {
         Ok(stored.playable(options, around)?.bytes)
     }
     fn progress(&mut self, done: usize, total: usize) -> Result<()> {
-        if self.job.stop.load(Ordering::Relaxed) {
-            return Err(Error::Interrupted(format!("after {done} of {total} parts of {}", self.job.out.display())));
-        }
+        self.check_stop(&format!("after {done} of {total} parts"))?;
         self.job.events.emit(&Event::Progress { task: format!("export {}", self.job.format), done: done as u64, total: total as u64 });
         Ok(())
     }
@@ -245,5 +259,21 @@ impl Model {
             stop: &AtomicBool::new(false),
         }
         .run()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_axes_of_length_one_point_up() {
+        for up in [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]] {
+            check_up(up).unwrap();
+        }
+        for up in [[0.0; 3], [0.0, 2.0, 0.0], [f64::NAN, 0.0, 1.0], [f64::INFINITY, 0.0, 0.0]] {
+            let message = check_up(up).unwrap_err().to_string();
+            assert!(message.starts_with("up: ") && message.contains("[0, 0, 1]"), "{message}");
+        }
     }
 }

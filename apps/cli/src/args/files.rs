@@ -71,9 +71,16 @@ pub struct Shots {
     /// The axis of the world that points up, for the orbit and for gltf.
     #[arg(long, value_enum, default_value_t = UpArg::Z, allow_hyphen_values = true)]
     pub up: UpArg,
-    /// Frames per second of a video, and of a page where the model states none.
-    #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=240))]
-    pub fps: u32,
+    /// Frames per second of a video, and of a page where the model states none [default: 30].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=240))]
+    pub fps: Option<u32>,
+}
+
+impl Shots {
+    /// Frames per second.
+    pub fn rate(&self) -> u32 {
+        self.fps.unwrap_or(30)
+    }
 }
 
 #[derive(Debug, Args)]

@@ -63,13 +63,14 @@ static NEVER: AtomicBool = AtomicBool::new(false);
 
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
     refuse_existing(&args.out, args.overwrite)?;
+    let mut settings = toml::Table::new();
+    config::set_all(&mut settings, &args.sets)?;
+    // Unknown names and settings are refused before anything is read.
+    context.registry.build_codec(&args.codec, &settings)?;
+    FieldWeights::parse(&args.field_weights, &context.registry)?;
     let events = context.listeners(None)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     say_what_is_lost(context, &args.model, &events)?;
-    let mut settings = toml::Table::new();
-    config::set_all(&mut settings, &args.sets)?;
-    // An unknown name is refused before the scene is read.
-    FieldWeights::parse(&args.field_weights, &context.registry)?;
     let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?.map(Arc::new);
     // A PLY says nothing of what is behind it.
     loaded.model.background = loaded.model.background.or(scene.as_ref().and_then(|scene| scene.background));

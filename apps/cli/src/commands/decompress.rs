@@ -5,13 +5,15 @@ use crate::args::Decompress;
 use crate::interrupt;
 use crate::models::load_model;
 use cc4dgs::export::{ExportJob, ExportRequest};
-use cc4dgs_core::Result;
+use cc4dgs_core::{Error, Result};
 
 pub fn run(context: &Context, args: &Decompress) -> Result<()> {
     let format = if args.out.extension().is_some_and(|e| e.eq_ignore_ascii_case("spz")) { "spz" } else { "ply" };
     let mut settings = toml::Table::new();
     if format == "ply" {
         settings.insert("dynamic".into(), (!args.no_dynamic).into());
+    } else if args.no_dynamic {
+        return Err(Error::parameter("--no-dynamic", "SPZ files hold no dynamic scores", "Leave it out, or name a file that ends in .ply"));
     }
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;

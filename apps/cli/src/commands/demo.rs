@@ -10,7 +10,7 @@ use cc4dgs::runs::{EVENTS, Existing};
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Result, Split};
+use cc4dgs_core::{Error, Result, Split};
 use cc4dgs_play::ArchiveOptions;
 use cc4dgs_train::eval::Scored;
 use cc4dgs_train::train::TrainReport;
@@ -45,6 +45,10 @@ struct DemoReport {
 
 pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let began = Instant::now();
+    if args.out.to_str().is_none() {
+        let object = format!("--out {}", args.out.display());
+        return Err(Error::parameter(object, "the name is not UTF-8, and report.json states it", "Give another name"));
+    }
     let [archive, sheet, file] = ["model.cc4d", "sheet.png", "report.json"].map(|name| args.out.join(name));
     // A folder without a run may hold files of these names, too.
     [&archive, &sheet, &file].into_iter().try_for_each(|path| refuse_existing(path, args.overwrite))?;

@@ -1,11 +1,11 @@
 //! `cc4dgs export`.
 
 use super::Context;
-use crate::args::Export;
+use crate::args::{Export, Shots};
 use crate::models::load_model;
 use crate::{interrupt, shots};
 use cc4dgs::export::{ExportJob, ExportRequest, check_time};
-use cc4dgs_core::{Error, ExportTarget, Result, config};
+use cc4dgs_core::{Error, ExportTarget, ExporterPlugin, Registry, Result, config};
 use cc4dgs_play::source::{Source, SourceKind};
 use std::path::Path;
 
@@ -18,6 +18,7 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
     context.registry.build_exporter(&args.format, &settings)?;
     check_name(&args.out, plugin.target, &args.format)?;
     check_time(&context.registry, plugin, args.time)?;
+    check_clock(&context.registry, plugin, &args.shots)?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     let images = plugin.info.capabilities.contains(&"images");
@@ -33,7 +34,7 @@ pub fn run(context: &Context, args: &Export) -> Result<()> {
     let request = ExportRequest {
         time_norm: args.time,
         frames: args.shots.frames.map(|n| n as usize),
-        frames_per_second: f64::from(args.shots.fps),
+        frames_per_second: f64::from(args.shots.rate()),
         up: args.shots.up.into(),
         shots,
         background,
@@ -72,6 +73,19 @@ pub fn finish(context: &Context, job: &ExportJob) -> Result<()> {
         let first = format!("{}: {what}, {:.3} MB", report.file.display(), report.size_mb);
         [first, report.lost.clone()].into_iter().chain(report.notes.clone()).collect::<Vec<_>>().join("\n")
     })
+}
+
+/// Refuses a number of frames and their rate for a format of one instant, which has no use for them.
+fn check_clock(registry: &Registry, plugin: &ExporterPlugin, shots: &Shots) -> Result<()> {
+    let is_still = |plugin: &ExporterPlugin| plugin.info.capabilities.contains(&"still");
+    match shots.frames.map(|_| "--frames").or(shots.fps.map(|_| "--fps")) {
+        Some(option) if is_still(plugin) => {
+            let others: Vec<&str> = registry.exporters().filter(|p| !is_still(p)).map(|p| p.info.name).collect();
+            let remedy = format!("Leave it out, or choose a format of more: {}", others.join(", "));
+            Err(Error::parameter(option, format!("{} holds one instant", plugin.info.name), remedy))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Other programs go by the ending of a file.

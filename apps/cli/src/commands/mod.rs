@@ -27,6 +27,7 @@ mod watch;
 use crate::args::{BenchWhat, Cli, Command, SweepWhat};
 use crate::listeners::Progress;
 use crate::output::Output;
+use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Error, EventSink, Fanout, Limits, Registry, Result, config};
 use cc4dgs_train::event_log::JsonLines;
 use std::path::Path;
@@ -142,9 +143,7 @@ fn no_window(command: String) -> Error {
 
 /// Creates the folder that the file `path` will be written to, and refuses a folder in its place, before any long work that would be lost.
 pub fn create_parent(path: &Path) -> Result<()> {
-    if path.is_dir() {
-        return Err(Error::parameter(path.display().to_string(), "it is a folder, and a file is to be written", "Give the name of a file"));
-    }
+    refuse_existing(path, true)?;
     match path.parent().filter(|p| !p.as_os_str().is_empty()) {
         Some(folder) => std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e)),
         None => Ok(()),

@@ -34,6 +34,8 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
         // Before any frame: an hour of rendering should not end in a missing program.
         video::ffmpeg_version()?;
         refuse_existing(path, args.overwrite)?;
+    } else if args.shots.fps.is_some() {
+        return Err(Error::parameter("--fps", "it is the rate of a video, and none is asked for", "Leave it out, or add --mp4 F.mp4"));
     }
     let earlier = frames_in(&args.out)?;
     if let Some(frame) = earlier.first().filter(|_| !args.overwrite) {
@@ -53,7 +55,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
     earlier.iter().try_for_each(|frame| std::fs::remove_file(frame).map_err(|e| Error::io(frame, e)))?;
     let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(background);
-    let mut video = args.mp4.as_ref().map(|path| VideoWriter::new(path, args.shots.fps));
+    let mut video = args.mp4.as_ref().map(|path| VideoWriter::new(path, args.shots.rate()));
     let mut times = Vec::with_capacity(shots.len());
     for (index, (camera, time_norm)) in shots.iter().enumerate() {
         interrupt::check(stop, &format!("after {index} of {} frames in {}", shots.len(), args.out.display()))?;

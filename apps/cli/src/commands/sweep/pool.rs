@@ -217,14 +217,19 @@ impl Pool<'_> {
         let rest = if more > 0 { format!("; and {more} more") } else { String::new() };
         let object = format!("sweep {}", self.folder.root().display());
         let problem = format!("{} of {} trainings failed: {}{rest}", self.failed.len(), self.plan.trainings.len(), named.join("; "));
-        let remedy = "The folder logs has what each said; running the sweep again tries these and nothing else";
-        match self.failed.first().map_or(1, |(_, failure)| failure.exit_code) {
-            2 => Error::parameter(object, problem, remedy),
-            3 => Error::data(object, problem, remedy),
-            4 => Error::io(self.folder.root(), std::io::Error::new(std::io::ErrorKind::OutOfMemory, problem)),
-            INTERRUPTED => Error::Interrupted(problem),
-            _ => Error::backend(object, problem, remedy),
-        }
+        of_exit_code(self.failed.first().map_or(1, |(_, failure)| failure.exit_code), object, problem)
+    }
+}
+
+/// The error with the exit code of a process that failed.
+fn of_exit_code(code: u8, object: String, problem: String) -> Error {
+    let remedy = "The folder logs has what each said; running the sweep again tries these and nothing else";
+    match code {
+        2 => Error::parameter(object, problem, remedy),
+        3 => Error::data(object, problem, remedy),
+        4 => Error::out_of_memory(object, problem, format!("{remedy}. Fewer --jobs leave more memory to each, --limit raises limits")),
+        INTERRUPTED => Error::Interrupted(problem),
+        _ => Error::backend(object, problem, remedy),
     }
 }
 
@@ -282,6 +287,17 @@ mod tests {
         let crate::args::Command::Sweep(sweep) = &cli.command else { panic!("{:?}", cli.command) };
         let SweepWhat::Run(run) = &sweep.what else { panic!("{:?}", sweep.what) };
         assert_eq!((run.dir.as_path(), run.index, run.no_wait, run.processes), (Path::new("my sweep"), Some(7), true, 3));
+    }
+
+    #[test]
+    fn failures_keep_their_exit_code_and_name_the_logs() {
+        for code in [2, 3, 4, 5, INTERRUPTED] {
+            let error = of_exit_code(code, "sweep a".into(), "1 of 2 trainings failed: b: c".into());
+            let said = error.to_string();
+            assert!(error.exit_code() == code && said.contains("1 of 2 trainings failed") && !said.contains("Check that the path"), "{said}");
+            assert_eq!(said.starts_with("sweep a: ") && said.contains("The folder logs"), code != INTERRUPTED, "{said}");
+        }
+        assert!(of_exit_code(4, String::new(), String::new()).to_string().contains("--jobs"));
     }
 
     #[test]
