@@ -2,9 +2,11 @@
 
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{
-    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Plugin, Result, SpatialFeatures,
-    SpatialInput, conformance,
+    AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, ExtraAttribute, HostGaussians, Offsets, Parameter, ParameterGroup, Plugin,
+    Registry, Result, Seed, Similarity, SpatialFeatures, SpatialInput, conformance,
 };
+use cc4dgs_play::model::ModelDeformer;
+use cc4dgs_play::{Model, Moving, Player, RenderConfig, default_rasterizer};
 
 /// The error in [`Velocities`].
 #[derive(Clone, Copy, PartialEq)]
@@ -15,6 +17,7 @@ enum Mistake {
     DetachedRegularizer,
     NameTwice,
     WrongShape,
+    LateShape,
     Panic,
     TimeNotChecked,
     MissingAttributes,
@@ -48,6 +51,7 @@ impl Deformer for Velocities {
         let means = features.mul_scalar(time_norm);
         let means = match self.0 {
             Mistake::WrongShape => means.narrow(1, 0, 2),
+            Mistake::LateShape if time_norm > 0.5 => means.narrow(1, 0, 2),
             Mistake::NotFinite => means.div_scalar(0.0),
             Mistake::Panic if time_norm > 0.5 => panic!("a mistake"),
             _ => means,
@@ -115,4 +119,37 @@ fn mistakes_are_found() {
     }
     let found = findings(with!(None), "speed = 1.0");
     assert!(found.contains("schema"), "a schema that is not the default's TOML:\n{found}");
+}
+
+#[test]
+fn a_frame_survives_offsets_of_a_wrong_shape() {
+    let gaussians = HostGaussians {
+        means: vec![0.0; 12],
+        log_scales: vec![-3.0; 12],
+        quaternions: [1.0, 0.0, 0.0, 0.0].repeat(4),
+        opacity_logits: vec![0.0; 4],
+        sh_dc: vec![0.0; 12],
+        dynamic_scores: vec![1.0, 0.0, 1.0, 0.0],
+        extra: [("velocity".to_string(), ExtraAttribute::exact(3, vec![1.0; 12]))].into(),
+        ..Default::default()
+    };
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: 0, seed: Seed::root(1) };
+    let model = Model {
+        gaussians,
+        field: Some(ModelDeformer { field: Box::new(Velocities(Mistake::LateShape)), section: toml::Table::new(), context }),
+        moving: Moving::Scored { zeta: 0.5 },
+        render: RenderConfig::default(),
+        background: None,
+        rasterizer: default_rasterizer(),
+        frame_count: 2,
+        normalisation: Similarity::IDENTITY,
+        provenance: Default::default(),
+        size: Default::default(),
+    };
+    let mut player = Player::new(&model, &Registry::collect().unwrap(), &Device::flex()).unwrap();
+    let mut at = |time| player.gaussians_at(time).and_then(|gaussians| gaussians.to_host());
+    let whole = at(0.25).unwrap();
+    assert!(at(0.75).unwrap_err().to_string().contains("head means"));
+    assert_eq!(whole.len(), 4);
+    assert!(at(0.25).unwrap() == whole, "the frame has lost what does not move");
 }

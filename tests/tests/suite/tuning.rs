@@ -161,6 +161,12 @@ fn pruning_with_refit_keeps_fewer_within_the_same_loss() {
     assert_eq!(refitted.gaussians.len(), with.after);
     let drop = before - bench.psnr(&refitted);
     assert!(drop <= LIMIT_DB + 1e-3, "{drop} dB");
+    assert_eq!(refitted.size, refitted.float32_size());
+    let most = prune(&mut plain, scene, 50.0, registry, device, &Silent).unwrap();
+    assert!(most.after < most.before && plain.size == plain.float32_size(), "{most:?}");
+    plain.gaussians = plain.gaussians.select(&[]);
+    let none = prune(&mut plain, scene, LIMIT_DB, registry, device, &Silent).unwrap();
+    assert_eq!((none.before, none.after), (0, 0));
     prune_and_refit(&mut again, scene, LIMIT_DB, 60, &job).unwrap();
     assert!(again.gaussians == refitted.gaussians, "two runs differ");
 

@@ -1,5 +1,6 @@
-//! Plug-ins that cc4dgs knows nothing of: two deformers, density control, a loss term, a reader and presets.
+//! Plug-ins that cc4dgs knows nothing of: two deformers, density control, an exporter, a loss term, a reader and presets.
 
+mod csv;
 mod faint;
 mod preset;
 mod relocate;

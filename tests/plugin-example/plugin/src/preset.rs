@@ -1,4 +1,4 @@
-//! `demo+swaying`, `dnerf+swaying` and so on: a family's settings with the field of this crate.
+//! `demo+swaying`, `dnerf+swaying` and so on: a family's settings with the deformer of this crate.
 
 use cc4dgs_core::{Plugin, PresetPlugin, PresetRole, inventory};
 
@@ -7,7 +7,7 @@ inventory::submit! {
         info: Plugin {
             name: "swaying",
             version: "1",
-            summary: "the field sway; everything moves",
+            summary: "the deformer sway; everything moves",
             paper: "an example",
             schema: "[all.deformer]\nkind = \"sway\"\n[all.train]\ndynamic = \"all\"\n[dnerf.deformer]\ncycles = 2.0\n",
             capabilities: &["method"],

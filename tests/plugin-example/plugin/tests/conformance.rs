@@ -1,6 +1,8 @@
 //! The suites that cc4dgs runs on its own plug-ins.
 
 use cc4dgs_core::burn::tensor::Device;
+use cc4dgs_core::exporter::export;
+use cc4dgs_core::format::conformance::MovingModel;
 use cc4dgs_core::{Registry, conformance, parse_device, toml::Table};
 use sway as _;
 
@@ -36,6 +38,51 @@ fn the_density_control_conforms() {
 fn the_loss_conforms() {
     let registry = Registry::collect().unwrap();
     assert_eq!(findings(|device| conformance::loss(registry.loss("faint").unwrap(), &Table::new(), &registry, device)), "");
+}
+
+#[test]
+fn the_exporter_conforms() {
+    let registry = Registry::collect().unwrap();
+    let csv = registry.exporter("csv").unwrap();
+    for settings in ["", "min_opacity = 0.7"] {
+        let findings = conformance::exporter(csv, &settings.parse::<Table>().unwrap());
+        assert!(findings.is_empty(), "{settings}\n{}", findings.join("\n"));
+    }
+    for refused in ["min_opacity = -0.1", "min_opacity = 1.5", "min_opacity = nan", "min_opacity = 'half'"] {
+        assert!((csv.build)(&refused.parse::<Table>().unwrap()).is_err(), "{refused}");
+    }
+}
+
+/// What the exporter `csv` writes of `model`.
+fn table(mut model: MovingModel, settings: &str) -> String {
+    let registry = Registry::collect().unwrap();
+    let csv = registry.exporter("csv").unwrap();
+    let exporter = (csv.build)(&settings.parse::<Table>().unwrap()).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("table.csv");
+    export(exporter.as_ref(), csv.target, &mut model, &path, false).unwrap();
+    std::fs::read_to_string(path).unwrap()
+}
+
+#[test]
+fn a_table_has_a_line_for_every_gaussian_that_is_wanted() {
+    let header = "x,y,z,scale_x,scale_y,scale_z,qw,qx,qy,qz,opacity,red,green,blue\n";
+    assert_eq!(table(MovingModel::new(0, 0), ""), header);
+    let two = || {
+        MovingModel::new(2, 0).with_gaussians(|g| {
+            g.means = vec![1.0, 2.0, 3.0, -4.0, 0.5, 3e37];
+            g.log_scales = vec![0.0; 6];
+            g.quaternions = vec![1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 0.0];
+            // The second cannot be seen.
+            g.opacity_logits = vec![0.0, -200.0];
+            g.sh_dc = vec![0.0; 6];
+        })
+    };
+    let first = "1,2,3,1,1,1,1,0,0,0,0.5,0.5,0.5,0.5\n";
+    let second = "-4,0.5,30000000000000000000000000000000000000,1,1,1,0,0,2,0,0,0.5,0.5,0.5\n";
+    assert_eq!(table(two(), ""), format!("{header}{first}{second}"));
+    assert_eq!(table(two(), "min_opacity = 0.1"), format!("{header}{first}"));
+    assert_eq!(table(MovingModel::new(9, 4).with(|facts| facts.time_norm = Some(0.5)), "").lines().count(), 10);
 }
 
 /// A dataset of the reader `rig`: two cameras, one held out, two frames.
