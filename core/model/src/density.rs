@@ -120,7 +120,7 @@ impl DensityPlan {
     /// Puts the new rows into another order: row `order[k]` becomes row k. `order` holds every row once.
     ///
     /// # Panics
-    /// For an `order` of another length, or with a row that the plan does not have.
+    /// Where `order` names a row that the plan does not have.
     pub fn reorder(&mut self, order: &[usize]) {
         let mut moved_to = vec![0; order.len()];
         order.iter().enumerate().for_each(|(new, &row)| moved_to[row] = new);
