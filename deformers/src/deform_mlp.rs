@@ -1,6 +1,7 @@
 //! The deformer of Deformable-3DGS: a network of eight layers on positionally encoded centre and time (Yang et al. 2024).
 //!
-//! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code.
+//! Scale changes are added after the exponential and rotations to the normalised quaternion, as in the published code. The last layers start at zero, so that
+//! nothing moves at first; the published ones are random.
 
 use crate::parts::centres::{check_time, finite};
 use crate::parts::settings::{bounded, not_negative, within};
@@ -90,12 +91,13 @@ impl DeformMlp {
         let chain = |first: usize, widths: &[usize]| -> Vec<(usize, usize)> {
             std::iter::once(first).chain(widths.iter().copied()).zip(widths.iter().copied()).collect()
         };
-        let add = |name: &str, pairs| parameter(format!("net.{name}"), Part::Net, 0, layers(name, pairs), device);
-        let heads = OUTPUTS.iter().map(|&out| (w, out));
-        let mut parameters =
-            vec![add("before", chain(input, &before.trunk)), add("after", chain(after.input, &after.trunk).into_iter().chain(heads).collect())];
+        let add = |name: &str, values| parameter(format!("net.{name}"), Part::Net, 0, values, device);
+        let mut last = layers("after", chain(after.input, &after.trunk));
+        // Published heads are random: their first offsets move what stands still, and short runs never put it back.
+        last.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(w, out)));
+        let mut parameters = vec![add("before", layers("before", chain(input, &before.trunk))), add("after", last)];
         if time.is_some() {
-            parameters.push(add("time", chain(of_time, &TIME_WIDTHS)));
+            parameters.push(add("time", layers("time", chain(of_time, &TIME_WIDTHS))));
         }
         Ok(Self { settings, before: Arc::new(before), after: Arc::new(after), time: time.map(Arc::new), parameters })
     }
@@ -152,7 +154,7 @@ inventory::submit! {
             summary: "a deep network on encoded centre and time",
             paper: "Deformable 3DGS (Yang et al. 2024)",
             schema: SCHEMA,
-            capabilities: &["differentiable", "cached-spatial"],
+            capabilities: &["differentiable", "starts-as-identity", "cached-spatial"],
         },
         build,
     }

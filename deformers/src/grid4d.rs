@@ -3,7 +3,7 @@
 //! Motion is rigid and additive, R(q) x + t; scale changes are added after the exponential, rotations to the normalised quaternion. Positions are normalised
 //! by the deformer's box rather than by a fixed bound per dataset, and so are the perturbations of the smoothness term. R(q) passes no gradient to the canonical
 //! centre. The published term starts after densification on N3DV and also perturbs times on most D-NeRF scenes; here it acts from the first iteration of the main
-//! stage, and times are not perturbed.
+//! stage, and times are not perturbed. The last layers start at zero, so that nothing moves at first; the published ones are random.
 
 use crate::parts::centres::{check_time, column, finite, in_box};
 use crate::parts::settings::{bounded, not_negative, within};
@@ -153,13 +153,19 @@ impl Grid4d {
         };
         let mut parameters = vec![table("xyz", &space)];
         parameters.extend(NAMES.map(|name| table(name, &time)));
-        let mut add = |name: &str, layers: Vec<(usize, usize)>| {
-            let values = layers.into_iter().enumerate().flat_map(|(i, (a, b))| weights::torch(seed.child(name).index(i as u64), a, b)).collect();
-            parameters.push(parameter(format!("net.{name}"), Part::Net, NET, values, device));
+        let layers = |name: &str, pairs: &[(usize, usize)]| -> Vec<f32> {
+            pairs.iter().enumerate().flat_map(|(i, &(a, b))| weights::torch(seed.child(name).index(i as u64), a, b)).collect()
         };
-        add("attention", vec![(space.width(), s.width)]);
-        add("temporal", vec![(3 * time.width(), s.width)]);
-        add("heads", std::iter::repeat_n((s.width, s.width), s.depth).chain(OUTPUTS.map(|out| (s.width, out))).collect());
+        // Published heads are random: their first offsets move what stands still, and short runs never put it back.
+        let mut heads = layers("heads", &vec![(s.width, s.width); s.depth]);
+        heads.extend(OUTPUTS.iter().flat_map(|&out| weights::zeros(s.width, out)));
+        for (name, values) in [
+            ("attention", layers("attention", &[(space.width(), s.width)])),
+            ("temporal", layers("temporal", &[(3 * time.width(), s.width)])),
+            ("heads", heads),
+        ] {
+            parameters.push(parameter(format!("net.{name}"), Part::Net, NET, values, device));
+        }
         let (space, time, attention, temporal, network) = (Arc::new(space), Arc::new(time), Arc::new(attention), Arc::new(temporal), Arc::new(network));
         Ok(Self { context: context.clone(), space, time, attention, temporal, network, parameters, settings })
     }
@@ -268,7 +274,7 @@ inventory::submit! {
             summary: "four 3D hash grids, spatial attention over temporal features, rigid motion",
             paper: "Grid4D (Xu et al. 2024)",
             schema: SCHEMA,
-            capabilities: &["differentiable", "cached-spatial", "regularized"],
+            capabilities: &["differentiable", "starts-as-identity", "cached-spatial", "regularized"],
         },
         build,
     }
