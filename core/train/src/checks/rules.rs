@@ -15,6 +15,9 @@ const DOUBT_MARGIN_DB: f64 = 3.0;
 /// because what is missing is detail; of things that move the blurred images differ, too: 23 with 32.
 const ONE_TIME_DB: f64 = 26.0;
 const ONE_TIME_BLURRED_DB: f64 = 37.0;
+/// A run whose main stage makes its images worse than this against those that it began with has failed, dB: a deformer that does not start as the identity may cost
+/// some, and rounds of density control do.
+const MOST_LOSS_DB: f64 = 2.0;
 /// A run has failed that ends more than this below its best earlier score, dB.
 const MOST_FALL_DB: f64 = 6.0;
 /// Shorter runs are not judged, in iterations.
@@ -57,10 +60,13 @@ pub(super) enum Shortfall {
     Images(String),
     /// Pixels that move.
     Motion(String),
+    /// Whole images, against those before the main stage.
+    Still(String),
 }
 
-/// The first of `rules` that every one of `scores` breaks; the last score is the present one.
-pub(super) fn shortfall(scores: &[Score], baselines: &Baselines, rules: Rules, doubts: Doubts) -> Option<Shortfall> {
+/// The first of `rules` that every one of `scores` breaks; the last score is the present one. `still_db` is the score before the first iteration of the main
+/// stage, when nothing moved.
+pub(super) fn shortfall(scores: &[Score], still_db: Option<f64>, baselines: &Baselines, rules: Rules, doubts: Doubts) -> Option<Shortfall> {
     let now = scores.last()?;
     let always = |below: &dyn Fn(&Score) -> bool| scores.iter().all(below);
     let images = |words: &str, db: f64| Some(Shortfall::Images(format!("training views reach {:.1} dB, {words} ({db:.1} dB)", now.psnr_db)));
@@ -80,6 +86,9 @@ pub(super) fn shortfall(scores: &[Score], baselines: &Baselines, rules: Rules, d
     if doubts.one_time && always(&|s| s.psnr_db < ONE_TIME_DB && s.blurred_db.is_none_or(|db| db < ONE_TIME_BLURRED_DB)) {
         return images("less than static scenes do", ONE_TIME_DB);
     }
+    if let Some(still) = still_db.filter(|still| weak && always(&|s| s.psnr_db < still - MOST_LOSS_DB)) {
+        return Some(Shortfall::Still(format!("training views reach {:.1} dB, less than the still scene before the main stage ({still:.1} dB)", now.psnr_db)));
+    }
     let mean_image = baselines.mean_image_db?;
     let behind = |s: &Score| match (s.moving_db, s.frozen_db) {
         (Some(moving), Some(frozen)) => moving < mean_image.min(GOOD_ENOUGH_DB) && moving < frozen + MOTION_GAIN_DB,
@@ -94,7 +103,7 @@ pub(super) fn shortfall(scores: &[Score], baselines: &Baselines, rules: Rules, d
 /// before `complete` do not count: the iteration of the main stage after which no frames and pixels are added.
 pub(super) fn collapse(scores: &[Score], complete: usize, lengths: &StageLengths, baselines: &Baselines) -> Option<String> {
     let (end, earlier) = scores.split_last()?;
-    let counts = |score: &&Score| lengths.scored_at(score.percent) >= complete;
+    let counts = |score: &&Score| score.percent > 0 && lengths.scored_at(score.percent) >= complete;
     let best = earlier.iter().filter(counts).max_by(|a, b| a.psnr_db.total_cmp(&b.psnr_db))?;
     if best.psnr_db - end.psnr_db <= MOST_FALL_DB {
         return None;
@@ -158,7 +167,7 @@ mod tests {
         let (follows, still) = ([24.0, 17.0], [16.0, 15.9]);
         let of = |rules, any, scores: &[(f64, [f64; 2])]| {
             let scores: Vec<Score> = scores.iter().map(|&(psnr, moving)| score(psnr, moving)).collect();
-            shortfall(&scores, &baselines, rules, Doubts { any, one_time: false })
+            shortfall(&scores, None, &baselines, rules, Doubts { any, one_time: false })
         };
         let images = |found: Option<Shortfall>, words: &str| matches!(&found, Some(Shortfall::Images(said)) if said.contains(words));
         assert!(images(of(Rules::Baselines, false, &[(11.0, still)]), "reach 11.0 dB, less than the mean colour of each image (12.0 dB)"));
@@ -173,17 +182,24 @@ mod tests {
         assert_eq!((of(Rules::All, false, &[(25.0, still), (26.0, follows)]), of(Rules::Baselines, false, &[(26.0, still)])), (None, None));
         // Scores of older checkpoints have no moving pixels at 85 %.
         let unknown = Score { moving_db: None, frozen_db: None, ..score(26.0, still) };
-        assert_eq!(shortfall(&[score(25.0, still), unknown], &baselines, Rules::All, Doubts::default()), None);
+        assert_eq!(shortfall(&[score(25.0, still), unknown], None, &baselines, Rules::All, Doubts::default()), None);
         let one_time = Doubts { any: true, one_time: true };
-        let at_one_time = |rules, last| shortfall(&[score(24.0, follows), score(last, follows)], &baselines, rules, one_time);
+        let at_one_time = |rules, last| shortfall(&[score(24.0, follows), score(last, follows)], None, &baselines, rules, one_time);
         assert!(images(at_one_time(Rules::All, 25.0), "reach 25.0 dB, less than static scenes do (26.0 dB)"));
         assert_eq!((at_one_time(Rules::All, 26.5), at_one_time(Rules::Baselines, 25.0)), (None, None));
         let lacks_detail = Score { blurred_db: Some(41.0), ..score(25.0, follows) };
         let moved = Score { blurred_db: Some(32.0), ..lacks_detail };
-        assert_eq!(shortfall(&[lacks_detail, lacks_detail], &baselines, Rules::All, one_time), None);
-        assert!(images(shortfall(&[moved, moved], &baselines, Rules::All, one_time), "less than static scenes do"));
+        assert_eq!(shortfall(&[lacks_detail, lacks_detail], None, &baselines, Rules::All, one_time), None);
+        assert!(images(shortfall(&[moved, moved], None, &baselines, Rules::All, one_time), "less than static scenes do"));
+        // A main stage that makes the still scene worse.
+        let after = |still, rules, scores: [f64; 2]| shortfall(&scores.map(|psnr| score(psnr, follows)), Some(still), &baselines, rules, Doubts::default());
+        assert!(matches!(after(25.4, Rules::All, [21.0, 21.5]), Some(Shortfall::Still(said)) if said.contains("reach 21.5 dB") && said.contains("(25.4 dB)")));
+        assert_eq!(
+            (after(25.4, Rules::All, [21.0, 23.5]), after(25.4, Rules::Baselines, [21.0, 21.5]), after(40.0, Rules::All, [31.0, 31.0])),
+            (None, None, None)
+        );
         // Images without detail: the blurred ones are better than anything.
         let smooth = Baselines { blur_db: 40.0, ..baselines };
-        assert_eq!(shortfall(&[score(31.0, follows)], &smooth, Rules::All, one_time), None);
+        assert_eq!(shortfall(&[score(31.0, follows)], None, &smooth, Rules::All, one_time), None);
     }
 }

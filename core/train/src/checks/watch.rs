@@ -11,8 +11,9 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
-/// Where the main stage is scored, percent, but never before its length is settled. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the scores
-/// at `HALF` and at `END` decide at the end, where it must not be far below any earlier one either.
+/// Where the main stage is scored, percent; but for `START`, never before its length is settled. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the
+/// scores at `HALF` and at `END` decide at the end, where it must not be far below any earlier one either. What was there at `START` must not get worse.
+const START: usize = 0;
 const HALF: usize = 50;
 const LATE: usize = 85;
 const END: usize = 100;
@@ -44,6 +45,14 @@ impl Watch {
             }
         }
         Ok(watch)
+    }
+    /// To be called before the first iteration of the main stage; scores the model that it begins with.
+    pub fn before_main(&mut self, context: &Context, state: &mut TrainState) -> Result<()> {
+        if self.rules == Some(Rules::All) {
+            self.score(context, state, START)?;
+            state.record.scores.clone_from(&self.scores);
+        }
+        Ok(())
     }
     /// To be called after every iteration; scores the model at half and at 85 % of the main stage, once its length is settled. Returns the error of a run that has
     /// failed at both: it is to be stopped.
@@ -172,8 +181,16 @@ impl Watch {
             END => format!("after {} iterations", context.lengths.total()),
             _ => format!("stopped at iteration {} of {} of the main stage, where", state.iteration, context.lengths.length(Stage::Main)),
         };
-        let problem = match shortfall(&deciding, &yardstick.baselines, rules, doubts)? {
+        let problem = match shortfall(&deciding, self.at(START).map(|s| s.psnr_db), &yardstick.baselines, rules, doubts)? {
             Shortfall::Images(words) => format!("{place} {words}"),
+            Shortfall::Still(words) => {
+                let remedy = format!(
+                    "The deformer makes the scene worse: try lower learning rates (those of the deformer, train.lr), more iterations, or another deformer. {} = false \
+                     accepts such models",
+                    kept(context)
+                );
+                return Some(Error::failed("training", format!("{place} {words}"), remedy));
+            }
             Shortfall::Motion(words) if state.moving == Moving::Nothing || state.deformer.as_ref().is_none_or(|d| d.field.is_static()) => {
                 if percent == END {
                     let remedy = "the scene moves, and this run holds everything still. Choose a deformer and train.dynamic = \"auto\"";

@@ -34,6 +34,7 @@ impl Context<'_> {
             if stage == Stage::Main {
                 self.begin_main(state)?;
                 self.add_key_frames(state)?;
+                watch.before_main(self, state)?;
             }
         }
         let first = self.lengths.schedule(stage, state.iteration + 1);
