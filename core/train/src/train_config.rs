@@ -7,6 +7,8 @@ use serde::{Deserialize, Serialize};
 /// Bounds of `train.stretch`. What happens at a third of the main stage still lies after its first fifth; a stage never ends before its length is settled.
 pub(crate) const LEAST_STRETCH: f64 = 0.7;
 pub(crate) const MOST_STRETCH: f64 = 4.0;
+/// Iterations of all stages together: `auto` plans no fewer, and no main stage is made so short that fewer are left.
+pub(crate) const LEAST_ITERATIONS: usize = 250;
 
 /// The frames that the coarse stage sees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

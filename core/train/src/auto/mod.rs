@@ -6,6 +6,7 @@ mod choose;
 mod facts;
 mod memory;
 mod overlap;
+mod skips;
 
 pub use choose::{Choice, Machine};
 pub use facts::{Arrangement, Facts};
@@ -15,6 +16,7 @@ pub use overlap::Overlap;
 use crate::config::{Dynamic, RunConfig};
 use crate::data;
 use crate::layers::Layers;
+use crate::train_config::LEAST_ITERATIONS;
 use calibrate::{Timing, calibrate};
 use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, auto_device, config};
 use serde::{Deserialize, Serialize};
@@ -33,7 +35,9 @@ const DECODING_SHARE: f64 = 0.1;
 /// Least share of the time for iterations, however long the plan and the first points take.
 const LEAST_SHARE: f64 = 0.4;
 /// Fewest and most iterations.
-const ITERATIONS: [f64; 2] = [500.0, 200_000.0];
+const ITERATIONS: [f64; 2] = [LEAST_ITERATIONS as f64, 200_000.0];
+/// Iterations below which each has fewer views instead.
+const ENOUGH: f64 = 500.0;
 /// Share of moving pixels that is expected where no camera stands still.
 const UNKNOWN_MOTION: f32 = 0.1;
 /// What an iteration of the coarse and the score stage takes of one of the main stage where nothing moves: Gaussians are fewer, and colours simpler.
@@ -180,7 +184,8 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
     let seen = format!("{}: {} training images of {width}x{height} pixels, {} frames", facts.arrangement.describe(), facts.views, facts.frames);
     let noun = if matches!(facts.arrangement, Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere) { "positions" } else { "cameras" };
     let overlap = facts.overlap.iter().map(|overlap| overlap.describe(noun)).collect();
-    config.auto.plan = [vec![seen], overlap, plan.lines(layers)].concat();
+    let skips = skips::describe(&config, registry)?.into_iter().collect();
+    config.auto.plan = [vec![seen], overlap, plan.lines(layers), skips].concat();
     if (config.train.iterations as f64) < SHORT {
         config
             .auto
@@ -211,16 +216,22 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
     let none = config.deformer.get("kind").and_then(|k| k.as_str()) == Some("none");
     let moving = if none { 0.0 } else { moving };
     let (field, view) = (moving * timing.shared, timing.still + moving * timing.per_time);
-    let views = batch.map_or((field / (FIELD_VIEWS * view)).round().clamp(1.0, MOST_VIEWS), |batch| batch as f64);
-    let ms = (1.0 - main) * EARLY * timing.still + main * (field + views * view);
-    let count = (left * 60_000.0 / ms).clamp(ITERATIONS[0], ITERATIONS[1]);
+    let ms = |views: f64| (1.0 - main) * EARLY * timing.still + main * (field + views * view);
+    let fit = |views: f64| left * 60_000.0 / ms(views);
+    let wanted = batch.map_or((field / (FIELD_VIEWS * view)).round().clamp(1.0, MOST_VIEWS), |batch| batch as f64);
+    let mut views = wanted;
+    while batch.is_none() && views > 1.0 && fit(views) < ENOUGH {
+        views -= 1.0;
+    }
+    let count = fit(views).clamp(ITERATIONS[0], ITERATIONS[1]);
     let count = if count > 2000.0 { (count / 100.0).floor() * 100.0 } else { count.floor() };
     let rates = [("train.batch", toml::Value::Integer(views as i64)), ("train.coarse_batch", 1.into()), ("train.lr.batch_power", 0.5.into())];
+    let fewer = if views < wanted { format!("; with more views, fewer than {ENOUGH:.0} iterations fit into the time") } else { String::new() };
     let mut choices = vec![
-        Choice { settings: rates.to_vec(), reason: format!("what views share of the deformer takes {field:.0} ms, a view {view:.0} ms") },
+        Choice { settings: rates.to_vec(), reason: format!("what views share of the deformer takes {field:.0} ms, a view {view:.0} ms{fewer}") },
         Choice {
             settings: vec![("train.iterations", toml::Value::Integer(count as i64))],
-            reason: format!("{left:.1} of {minutes} minutes at about {ms:.0} ms per iteration on this machine"),
+            reason: format!("{left:.1} of {minutes} minutes at about {:.0} ms per iteration on this machine", ms(views)),
         },
     ];
     if count >= COOLED {
@@ -250,6 +261,42 @@ mod tests {
         assert_eq!(plan.lines(&layers), ["train.zeta = 2.5 (because)"]);
         let config = layers.over(&plan.table).config().unwrap();
         assert_eq!((config.train.batch, config.train.zeta), (3, 2.5));
+    }
+
+    /// Views per iteration and iterations where `left` minutes are left, with the times that `cdf` took on the capture `turntable`.
+    fn planned(left: f64, batch: Option<usize>) -> (i64, i64) {
+        let registry = Registry::collect().unwrap();
+        let mut config = Layers::collect(&registry, Some(PRESET), None, &[]).unwrap().config().unwrap();
+        (config.train.shares, config.train.dynamic) = ([2.0, 0.0, 18.0], Dynamic::All);
+        let facts = Facts {
+            arrangement: Arrangement::OneCameraAnywhere,
+            views: 100,
+            cameras: 64,
+            frames: 120,
+            size: [192, 192],
+            points: 0,
+            transparent: 0.0,
+            plain: None,
+            mean: None,
+            detail: 0.11,
+            moving: None,
+            occupied: None,
+            noise: None,
+            exposure: None,
+            overlap: None,
+        };
+        let timing = Timing { still: 4.0, shared: 193.0, per_time: 59.0, start: 0.0 };
+        let choices = lengths(&facts, &config, timing, 3.0, left, batch);
+        let value = |key: &str| choices.iter().flat_map(|c| &c.settings).find(|(k, _)| *k == key).and_then(|(_, value)| value.as_integer()).unwrap();
+        (value("train.batch"), value("train.iterations"))
+    }
+
+    #[test]
+    fn an_iteration_has_fewer_views_where_too_few_iterations_fit() {
+        assert_eq!(planned(12.0, None), (6, 1400), "what fits is left as it is");
+        assert_eq!((planned(2.4, None), planned(1.45, None)), ((2, 501), (1, 377)));
+        assert_eq!(planned(0.5, None), (1, LEAST_ITERATIONS as i64));
+        assert_eq!(planned(2.4, Some(6)), (6, 280), "stated views are left as they are");
     }
 
     #[test]

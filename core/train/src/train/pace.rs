@@ -7,7 +7,7 @@
 
 use super::folder::write_settings;
 use super::{Context, TrainState};
-use crate::train_config::{LEAST_STRETCH, MOST_STRETCH};
+use crate::train_config::{LEAST_ITERATIONS, LEAST_STRETCH, MOST_STRETCH};
 use cc4dgs_core::{Event, Result, Schedule, Stage};
 use std::time::Instant;
 
@@ -22,12 +22,16 @@ const GROWTH_POWER: f64 = 0.7;
 /// What a later iteration takes, as a share of one of those that are timed. Without it, runs of two to ten minutes ended after 85 to 94 % of their time; a few
 /// captures get dearer instead and take up to a sixth too long.
 const LATER: f64 = 0.94;
-/// Iterations of a run that is not made shorter.
-const LEAST_ITERATIONS: usize = 500;
 
 /// How much longer than now an iteration takes on average, when there are `now` Gaussians and will be at most `most`.
 pub(crate) fn growth(now: usize, most: usize) -> f64 {
     (MEAN_GAUSSIANS * most as f64 / now.max(1) as f64).max(1.0).powf(GROWTH_POWER)
+}
+
+/// The least factor by which a main stage of `main` iterations may be stretched, in a run of `total`.
+fn least_stretch(total: usize, main: usize) -> f64 {
+    let others = total.saturating_sub(main);
+    (LEAST_ITERATIONS.saturating_sub(others) as f64 / main.max(1) as f64).clamp(LEAST_STRETCH, 1.0)
 }
 
 /// Times a main stage until its length is settled.
@@ -58,7 +62,7 @@ impl Pace {
         let each = usual(&self.seconds).filter(|_| iteration == last)? / together as f64;
         let most = context.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(gaussians, |most| most.max(1) as usize);
         let left = self.ends.saturating_duration_since(Instant::now()).as_secs_f64() / (LATER * growth(gaussians, most) * each);
-        let least = if context.lengths.total() <= LEAST_ITERATIONS { 1.0 } else { LEAST_STRETCH };
+        let least = least_stretch(context.lengths.total(), context.lengths.planned());
         Some(((last as f64 + left) / schedule.length as f64).clamp(least, MOST_STRETCH))
     }
 }
@@ -95,6 +99,14 @@ mod tests {
         assert_eq!(usual(&[]), None);
         assert_eq!(usual(&[2.0, 1.0, 3.0]), Some(2.0));
         assert_eq!(usual(&[1.0, 1.0, 40.0, 1.0, 1.0]), Some(1.0));
+    }
+
+    #[test]
+    fn short_runs_are_shortened_to_the_fewest_iterations_at_most() {
+        assert_eq!((least_stretch(28_000, 20_000), least_stretch(500, 450)), (LEAST_STRETCH, LEAST_STRETCH));
+        assert_eq!((least_stretch(60, 43), least_stretch(LEAST_ITERATIONS, 225)), (1.0, 1.0));
+        assert!((30.0 + 270.0 * least_stretch(300, 270) - LEAST_ITERATIONS as f64).abs() < 1e-9);
+        assert_eq!(least_stretch(500, 0), LEAST_STRETCH);
     }
 
     #[test]
