@@ -9,7 +9,7 @@ use cc4dgs_core::{DensityPlan, Error, Result, ViewStatistics};
 pub(super) struct Statistics {
     /// Sum of the norms of screen gradients, in normalised device coordinates, and views that saw the Gaussian `[N,2]`.
     pub gradients: Tensor<2>,
-    /// Largest blending weight since the last weight pruning `[N]`.
+    /// Largest blending weight since the last weight pruning; 0 in controls that do not prune by it `[N]`.
     pub max_weight: Tensor<1>,
 }
 
@@ -18,8 +18,8 @@ impl Statistics {
     pub fn zeros(count: usize, device: &Device) -> Self {
         Self { gradients: Tensor::zeros([count, 2], device), max_weight: Tensor::zeros([count], device) }
     }
-    /// Adds one view: its absolute screen gradients where they were collected, else the signed ones.
-    pub fn add(&mut self, view: &ViewStatistics) -> Result<()> {
+    /// Adds the screen gradients of one view: the absolute ones where they were collected, else the signed ones.
+    pub fn add_gradients(&mut self, view: &ViewStatistics) -> Result<()> {
         if let Some(gradient) = view.absolute_screen_gradient.as_ref().or(view.screen_gradient.as_ref()) {
             // Converts the gradient per pixel of a loss divided by the number of views to the gradient of the view's own loss per unit of normalised device coordinates.
             let scale = view.views as f32 * 0.5;
@@ -28,10 +28,13 @@ impl Statistics {
             let sums = std::mem::replace(&mut self.gradients, Tensor::empty([0, 2], &gradient.device()));
             self.gradients = add_gradients(sums, view.radii.clone(), gradient.clone(), scale)?;
         }
+        Ok(())
+    }
+    /// Raises the largest blending weights to those of one view, where they were collected.
+    pub fn add_weights(&mut self, view: &ViewStatistics) {
         if let Some(weights) = &view.max_weights {
             self.max_weight.inplace(|largest| largest.max_pair(weights.clone()));
         }
-        Ok(())
     }
     /// Mean norm of the screen gradient over the views that saw a Gaussian; 0 where none did `[N]`.
     pub fn mean_gradients(&self) -> Result<Vec<f32>> {

@@ -119,7 +119,9 @@ impl DensityControl for CloneSplit {
         wanted
     }
     fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
-        self.statistics.add(view)
+        self.statistics.add_gradients(view)?;
+        self.statistics.add_weights(view);
+        Ok(())
     }
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
         let due = self.settings.due(schedule);

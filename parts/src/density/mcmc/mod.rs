@@ -140,7 +140,7 @@ impl DensityControl for Mcmc {
         wanted
     }
     fn observe(&mut self, view: &ViewStatistics) -> Result<()> {
-        self.statistics.add(view)?;
+        self.statistics.add_gradients(view)?;
         self.weights.add(view)?;
         if self.settings.decay > 0.0 {
             // Of several views one is enough.
@@ -285,6 +285,25 @@ mod tests {
         control.executed(&plan, &device).unwrap();
         let start = control.state().into_iter().find(|(name, _)| name == "start").unwrap().1;
         assert_eq!(start.into_scalar::<f32>(), 5.0);
+    }
+
+    #[test]
+    fn blending_weights_are_summed_and_the_largest_are_not_kept() {
+        let device = Device::flex();
+        let mut control = build(&toml::Table::new()).unwrap();
+        control.begin_stage(2, &device);
+        let view = ViewStatistics {
+            radii: Tensor::<1, Int>::from_data(TensorData::new(vec![3i64, 3], [2]), &device),
+            screen_gradient: None,
+            absolute_screen_gradient: None,
+            max_weights: Some(Tensor::from_floats([0.5, 0.1], &device)),
+            size: (8, 8),
+            views: 1,
+        };
+        control.observe(&view).unwrap();
+        let sum = |name: &str| control.state().into_iter().find(|(n, _)| n == name).unwrap().1.sum().into_scalar::<f32>();
+        assert!(sum("weights") > 0.0);
+        assert_eq!(sum("max_weight"), 0.0);
     }
 
     #[test]
