@@ -10,11 +10,12 @@ use cc4dgs_play::model::Model as PlayModel;
 use cc4dgs_play::{ArchiveOptions, Player, presentation};
 use cc4dgs_train::images::encode_png;
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 /// Longer side of the poster in pixels.
 const POSTER: u32 = 320;
 
-/// Where plug-ins are found, what the deformer is on, and who listens.
+/// Where plug-ins are found, what the deformer is on, who listens, and who may stop the work.
 #[derive(Clone, Copy)]
 pub struct Surroundings<'a> {
     /// The linked plug-ins.
@@ -25,6 +26,8 @@ pub struct Surroundings<'a> {
     pub limits: &'a Limits,
     /// Receives progress.
     pub events: &'a dyn EventSink,
+    /// Ends baking with [`Error::Interrupted`](crate::Error::Interrupted) once it is set.
+    pub stop: &'a AtomicBool,
 }
 
 /// How models are stored that are no archive yet.
@@ -136,7 +139,7 @@ impl Stored {
             None
         } else {
             let max_error = options.max_error.unwrap_or(MaxError::Pixels(0.1));
-            bake(&self.model, &BakeOptions { max_error, cameras }, around.device, around.events)?
+            bake(&self.model, &BakeOptions { max_error, cameras, stop: around.stop }, around.device, around.events)?
         };
         let poster = match &options.presentation.home {
             Some(home) if options.poster => Some(poster(&self.model, home, around)?),

@@ -9,6 +9,7 @@ use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings};
 use cc4dgs::{Camera, Orbit, Session};
 use cc4dgs_player::{Content, Mode, Renderer, View, request_device};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 const TIMES: [f32; 3] = [0.0, 0.37, 1.0];
 /// Decibels of agreement that are asked for, and iterations that train a model good enough to tell images apart.
@@ -41,7 +42,13 @@ fn archive(session: &Session, folder: &Path, overrides: &[&str], baked: bool) ->
     let model = session.train(&config, scene, None).unwrap();
     let (plain, out) = (folder.join("plain.cc4d"), folder.join("baked.cc4d"));
     model.save(&plain, "quantize:high").unwrap();
-    let around = Surroundings { registry: session.registry(), device: session.device(), limits: session.limits(), events: session.events() };
+    let around = Surroundings {
+        registry: session.registry(),
+        device: session.device(),
+        limits: session.limits(),
+        events: session.events(),
+        stop: &AtomicBool::new(false),
+    };
     let stored = Stored::open(&plain, Storage::default(), around).unwrap();
     let presentation = stored.presentation(&[], None).unwrap();
     let options = PlayableOptions { max_error: Some(MaxError::Pixels(0.1)), cameras: &[], presentation, poster: false, without_field: false, baked };

@@ -212,8 +212,8 @@ impl ExportSource for ModelSource<'_> {
         }
     }
     fn playable(&mut self, max_error: MaxError, baked: bool) -> Result<Vec<u8>> {
-        let ExportJob { model, request, registry, device, limits, events, .. } = self.job;
-        let around = Surroundings { registry, device, limits, events: *events };
+        let ExportJob { model, request, registry, device, limits, events, stop, .. } = self.job;
+        let around = Surroundings { registry, device, limits, events: *events, stop };
         let stored = match self.job.archive {
             Some(path) => Stored::open(path, Storage::default(), around)?,
             None => Stored::of_model(model, Storage::default(), around)?,

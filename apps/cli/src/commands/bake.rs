@@ -2,6 +2,7 @@
 
 use super::{Context, create_parent, megabytes};
 use crate::args::Bake;
+use crate::interrupt;
 use crate::shots::capture_cameras;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use cc4dgs_core::archive::{Archive, Presentation, StreamKind, write_atomically};
@@ -40,7 +41,8 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
     }
     let (events, device) = (context.listeners(None)?, parse_device(&args.device)?);
     create_parent(&args.out)?;
-    let around = Surroundings { registry: &context.registry, device: &device, limits: &context.limits, events: &events };
+    let stop = interrupt::stop_flag()?;
+    let around = Surroundings { registry: &context.registry, device: &device, limits: &context.limits, events: &events, stop };
     let storage = storage(args)?;
     let stored = Stored::open(&args.model, storage.unwrap_or_default(), around)?;
     let cameras = match &args.scene {
@@ -62,6 +64,7 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
         let problem = format!("with playback layer and poster the file has {} bytes, {most} are allowed", playable.bytes.len());
         return Err(Error::parameter("--codec", problem, "Bound the model lower, allow a larger --max-error, or leave the poster out (--no-poster)"));
     }
+    interrupt::check(stop, "in baking; nothing was written")?;
     write_atomically(&args.out, &playable.bytes)?;
     let bytes = playable.bytes.len() as u64;
     events.emit(&Event::Saved { path: args.out.display().to_string(), bytes });
@@ -122,6 +125,12 @@ fn text(report: &Report) -> String {
         format!(
             "  {} moving Gaussians, {} samples in {} segments; error at samples up to {:.3} of the bound of {bound}{unit}, between them {:.3}",
             layer.moving, layer.samples, layer.segments, layer.at_samples, layer.between_samples
+        ),
+        format!(
+            "  of {} Gaussians, 99 % are within {:.3} of the bound between samples, and {:.1} % are over it",
+            layer.between_measured,
+            layer.between_p99,
+            100.0 * layer.between_over
         ),
     ];
     lines.extend(layer.heads.iter().map(|h| {

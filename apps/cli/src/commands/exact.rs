@@ -94,13 +94,20 @@ mod tests {
     use cc4dgs::{Image8, Orbit, Session};
     use cc4dgs_player::View;
     use cc4dgs_player::exact::ExactWorker;
+    use std::sync::atomic::AtomicBool;
     use std::sync::mpsc::channel;
     use std::time::Duration;
 
     const PATIENCE: Duration = Duration::from_secs(120);
 
     fn bake(session: &Session, plain: &Path, out: &Path, without_field: bool) {
-        let around = Surroundings { registry: session.registry(), device: session.device(), limits: session.limits(), events: session.events() };
+        let around = Surroundings {
+            registry: session.registry(),
+            device: session.device(),
+            limits: session.limits(),
+            events: session.events(),
+            stop: &AtomicBool::new(false),
+        };
         let stored = Stored::open(plain, Storage::default(), around).unwrap();
         let presentation = stored.presentation(&[], None).unwrap();
         let options = PlayableOptions { max_error: None, cameras: &[], presentation, poster: false, without_field, baked: true };

@@ -11,6 +11,7 @@ use cc4dgs_player::Content;
 use cc4dgs_player::window::{self, Opened, Shown, Start};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 /// How models are opened.
 #[derive(Clone)]
@@ -58,7 +59,8 @@ fn content(path: &Path, options: &Options, registry: &Registry, events: &dyn Eve
         SourceKind::Checkpoint => {}
     }
     let device = parse_device(device)?;
-    let around = Surroundings { registry, device: &device, limits, events };
+    // Ctrl-C ends the process: nothing is written.
+    let around = Surroundings { registry, device: &device, limits, events, stop: &AtomicBool::new(false) };
     let stored = Stored::open(path, Storage { codec: "raw", field_weights: "fp32" }, around)?;
     let presentation = stored.presentation(&[], None)?;
     let options = PlayableOptions { max_error: Some(*max_error), cameras: &[], presentation, poster: false, without_field: true, baked: false };

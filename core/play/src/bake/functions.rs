@@ -1,9 +1,12 @@
 //! Functions of time by singular value decomposition, and the division of time into segments.
 
+use super::check_stop;
 use super::motion::{HeadOffsets, Offsets};
+use cc4dgs_core::Result;
 use cc4dgs_core::playback::{Head, MAX_FUNCTIONS};
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
+use std::sync::atomic::AtomicBool;
 
 /// Root-mean-square error over the tolerance that the choice of segments aims at.
 const AIM: f32 = 0.3;
@@ -33,8 +36,9 @@ pub(super) struct HeadFunctions {
 }
 
 impl HeadFunctions {
-    /// The functions of the samples `span` of `offsets`.
-    pub(super) fn of(offsets: &HeadOffsets, span: RangeInclusive<usize>) -> Self {
+    /// The functions of the samples `span` of `offsets`; an error once `stop` is set.
+    pub(super) fn of(offsets: &HeadOffsets, span: RangeInclusive<usize>, stop: &AtomicBool) -> Result<Self> {
+        check_stop(stop)?;
         let (first, n) = (*span.start(), span.end() - span.start() + 1);
         let (_energies, vectors) = eigen(gram(offsets, first, n), n);
         let (mut values, mut coded, mut peaks) = (Vec::new(), Vec::new(), Vec::new());
@@ -45,7 +49,7 @@ impl HeadFunctions {
             coded.extend(integers);
             peaks.push(peak);
         }
-        Self {
+        Ok(Self {
             head: offsets.head,
             width: offsets.width,
             samples: n,
@@ -54,7 +58,7 @@ impl HeadFunctions {
             coded,
             #[cfg(test)]
             energies: _energies,
-        }
+        })
     }
     /// An estimate of what `moving` Gaussians need in the segment that begins at sample `first`, in numbers: the functions that Gaussians of the sample need,
     /// and the functions themselves.
@@ -82,19 +86,25 @@ impl HeadFunctions {
     }
 }
 
-/// Ends of the segments: sample indices from 0 to `samples` - 1, each the last of one segment and the first of the next.
-pub(super) fn segment_ends(sample: &Offsets, samples: usize, moving: usize) -> Vec<usize> {
+/// Ends of the segments: sample indices from 0 to `samples` - 1, each the last of one segment and the first of the next; an error once `stop` is set.
+pub(super) fn segment_ends(sample: &Offsets, samples: usize, moving: usize, stop: &AtomicBool) -> Result<Vec<usize>> {
     let ends = |count: usize| -> Vec<usize> { (0..=count).map(|k| k * (samples - 1) / count).collect() };
     let allowed = |count: usize| count == 1 || (samples - 1) / count >= FEWEST_SAMPLES;
     let least = (samples - 1).div_ceil(MAX_FUNCTIONS - 1).max(1);
-    let cost = |count: usize| -> f64 {
-        ends(count).windows(2).flat_map(|w| sample.heads.iter().map(|h| HeadFunctions::of(h, w[0]..=w[1]).cost(h, w[0], moving))).sum()
+    let cost = |count: usize| -> Result<f64> {
+        let mut total = 0.0;
+        for span in ends(count).windows(2) {
+            for head in &sample.heads {
+                total += HeadFunctions::of(head, span[0]..=span[1], stop)?.cost(head, span[0], moving);
+            }
+        }
+        Ok(total)
     };
     let counts: Vec<usize> = SEGMENTS.into_iter().filter(|&c| c >= least && allowed(c)).collect();
-    let costs: Vec<f64> = counts.par_iter().map(|&c| cost(c)).collect();
+    let costs: Vec<f64> = counts.par_iter().map(|&c| cost(c)).collect::<Result<_>>()?;
     // A tie goes to fewer segments.
     let best = (0..counts.len()).min_by(|&a, &b| costs[a].total_cmp(&costs[b]));
-    ends(best.map_or(least, |i| counts[i]))
+    Ok(ends(best.map_or(least, |i| counts[i])))
 }
 
 /// Scalar products of the samples `first`.. `first` + `n` with each other, over all Gaussians and numbers: `[n, n]`.
@@ -169,6 +179,9 @@ fn rotate(matrix: &mut [f64], vectors: &mut [f64], n: usize, p: usize, q: usize)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::Error;
+
+    static RUNNING: AtomicBool = AtomicBool::new(false);
 
     fn offsets(rows: usize, samples: usize, value: impl Fn(usize, f64) -> f64) -> HeadOffsets {
         let values = (0..rows).flat_map(|r| (0..samples).map(move |k| (r, k as f64 / (samples - 1) as f64))).map(|(r, t)| value(r, t) as f32).collect();
@@ -178,7 +191,7 @@ mod tests {
     #[test]
     fn a_linear_field_needs_as_many_functions_as_it_has() {
         let linear = offsets(50, 20, |r, t| (r as f64 * 0.7).sin() * 40.0 * t + (r as f64 * 1.3).cos() * 30.0 * (6.0 * t).sin() + 5.0);
-        let functions = HeadFunctions::of(&linear, 0..=19);
+        let functions = HeadFunctions::of(&linear, 0..=19, &RUNNING).unwrap();
         assert!(functions.energies[2] > 1.0 && functions.energies[3] < 1e-4 * functions.energies[2], "{:?}", &functions.energies[..5]);
         let product = |a: usize, b: usize| (0..20).map(|k| functions.values[a * 20 + k] * functions.values[b * 20 + k]).sum::<f32>();
         assert!((product(0, 0) - 1.0).abs() < 1e-3 && product(0, 1).abs() < 1e-3 && (product(19, 19) - 1.0).abs() < 1e-3);
@@ -187,9 +200,11 @@ mod tests {
     #[test]
     fn large_motion_is_divided_and_small_is_not() {
         let still = offsets(40, 61, |r, t| 10.0 * r as f64 * t);
-        assert_eq!(segment_ends(&Offsets { heads: vec![still] }, 61, 1000), [0, 60]);
+        assert_eq!(segment_ends(&Offsets { heads: vec![still] }, 61, 1000, &RUNNING).unwrap(), [0, 60]);
         // Gaussians that each do something of their own at a time of their own.
         let busy = offsets(400, 61, |r, t| 300.0 * (-((t - (r % 60) as f64 / 60.0) * 40.0).powi(2)).exp());
-        assert!(segment_ends(&Offsets { heads: vec![busy] }, 61, 1000).len() > 2);
+        let busy = Offsets { heads: vec![busy] };
+        assert!(segment_ends(&busy, 61, 1000, &RUNNING).unwrap().len() > 2);
+        assert!(matches!(segment_ends(&busy, 61, 1000, &AtomicBool::new(true)), Err(Error::Interrupted(_))));
     }
 }

@@ -1,5 +1,6 @@
 //! The deformer's offsets at even times, in the form of the playback layer and in units of their tolerance.
 
+use super::check_stop;
 use super::tolerance::Tolerances;
 use crate::model::{Model, ModelDeformer};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -7,17 +8,21 @@ use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::playback::Head;
 use cc4dgs_core::{Gaussians, HostGaussians, Result, SpatialInput};
 use rayon::prelude::*;
+use std::sync::atomic::AtomicBool;
 
 /// Positions of a Gaussian at which the nearest camera is looked for.
 const POSITIONS: usize = 9;
 /// Gaussians that the deformer is asked about at a time.
 const BLOCK: usize = 1 << 14;
+/// Numbers of moved Gaussians, all attributes at all times, held at a time: 768 MiB.
+const MOVED_FLOATS: usize = 192 << 20;
 
 /// The moving Gaussians of a model and their deformer.
 pub(super) struct Motion<'a> {
     model: &'a Model,
     field: &'a ModelDeformer,
     device: Device,
+    stop: &'a AtomicBool,
     /// Indices of the moving Gaussians in the model.
     pub(super) rows: Vec<usize>,
     /// The heads that the deformer changes.
@@ -62,14 +67,14 @@ impl Offsets {
 }
 
 impl<'a> Motion<'a> {
-    /// `None` if nothing moves.
-    pub(super) fn of(model: &'a Model, device: &Device) -> Result<Option<Self>> {
+    /// `None` if nothing moves. Once `stop` is set, [`Motion::evaluate`] is an error.
+    pub(super) fn of(model: &'a Model, device: &Device, stop: &'a AtomicBool) -> Result<Option<Self>> {
         let Some(field) = model.field.as_ref().filter(|f| !f.field.is_static()) else { return Ok(None) };
         let rows = model.moving.rows(&model.gaussians.dynamic_scores).unwrap_or_else(|| (0..model.gaussians.len()).collect());
         if rows.is_empty() {
             return Ok(None);
         }
-        let mut motion = Self { model, field, device: device.clone(), rows, heads: Vec::new() };
+        let mut motion = Self { model, field, device: device.clone(), stop, rows, heads: Vec::new() };
         let (_, input) = motion.block(&[0])?;
         let offsets = field.field.deform(field.field.packed(field.field.spatial(&input)?.values), 0.5)?;
         let present = [
@@ -91,6 +96,12 @@ impl<'a> Motion<'a> {
         let n = self.rows.len();
         if n <= count { (0..n).collect() } else { (0..count).map(|i| i * n / count).collect() }
     }
+    /// Gaussians whose attributes at `samples` times are held at a time.
+    fn block_len(&self, samples: usize) -> usize {
+        // Centre, scales, rotation, opacity, colour, score; then harmonics.
+        let attributes = 15 + 3 * sh_rest_len(self.model.gaussians.sh_degree);
+        (MOVED_FLOATS / (attributes * samples.max(1))).clamp(1, BLOCK)
+    }
     /// The moving Gaussians `part` (indices into `rows`) and what the deformer is asked about them.
     fn block(&self, part: &[usize]) -> Result<(HostGaussians, SpatialInput)> {
         let indices: Vec<usize> = part.iter().map(|&i| self.rows[i]).collect();
@@ -106,12 +117,13 @@ impl<'a> Motion<'a> {
         let degree = self.model.gaussians.sh_degree;
         let empty = |&head: &Head| HeadOffsets { head, width: head.width(degree), samples, values: Vec::new(), tolerances: Vec::new() };
         let mut out = Offsets { heads: self.heads.iter().map(empty).collect() };
-        for rows in part.chunks(BLOCK) {
+        for rows in part.chunks(self.block_len(samples)) {
             let (host, input) = self.block(rows)?;
             let canonical = Gaussians::from_host(&HostGaussians { extra: Default::default(), ..host.clone() }, &self.device);
             let features = self.field.field.packed(self.field.field.spatial(&input)?.values);
             let mut moved = Vec::with_capacity(samples);
             for k in 0..samples {
+                check_stop(self.stop)?;
                 let time = if samples > 1 { k as f32 / (samples - 1) as f32 } else { 0.0 };
                 let offsets = self.field.field.deform(features.clone(), time)?;
                 offsets.check_finite(self.field.name())?;

@@ -1,9 +1,12 @@
 //! Coefficients: every Gaussian takes as few functions and as coarse steps as keep it within its tolerance.
 
+use super::check_stop;
 use super::functions::HeadFunctions;
 use super::motion::{HeadOffsets, size_of};
+use cc4dgs_core::Result;
 use cc4dgs_core::playback::{CodedTrack, Head, Track, exponent_step};
 use rayon::prelude::*;
+use std::sync::atomic::AtomicBool;
 
 /// Truncation may use up this much of the tolerance; rounding needs the rest.
 const TRUNCATION: f32 = 0.9;
@@ -22,6 +25,21 @@ struct Row {
     coefficients: Vec<i32>,
     /// Largest error over the tolerance.
     error: f32,
+}
+
+impl Row {
+    /// What players decode, at the samples of the segment, `[samples, width]`.
+    fn decoded(&self, functions: &HeadFunctions) -> Vec<f32> {
+        let (n, width) = (functions.samples, functions.width);
+        let step = exponent_step((COARSEST as f32).exp2(), self.exponent);
+        let mut out = vec![0.0f32; n * width];
+        for (row, function) in self.coefficients.chunks_exact(width).zip(functions.values.chunks_exact(n)) {
+            for (k, f) in function.iter().enumerate() {
+                out[k * width..(k + 1) * width].iter_mut().zip(row).for_each(|(v, &q)| *v += f * (q as f32 * step));
+            }
+        }
+        out
+    }
 }
 
 /// A track that grows by chunks of Gaussians.
@@ -53,16 +71,30 @@ impl TrackBuilder {
     pub(super) fn worst(&self) -> f32 {
         self.rows.iter().map(|r| r.error).fold(0.0, f32::max)
     }
-    /// Adds the Gaussians of `offsets`; the segment begins at its sample `first`.
-    pub(super) fn extend(&mut self, functions: &HeadFunctions, offsets: &HeadOffsets, first: usize) {
+    /// Adds the Gaussians of `offsets`; the segment begins at its sample `first`. An error once `stop` is set.
+    pub(super) fn extend(&mut self, functions: &HeadFunctions, offsets: &HeadOffsets, first: usize, stop: &AtomicBool) -> Result<()> {
         let (row_len, from, n) = (offsets.samples * offsets.width, first * offsets.width, functions.samples * offsets.width);
         let rows: Vec<Row> = offsets
             .values
             .par_chunks_exact(row_len)
             .zip(&offsets.tolerances)
-            .map(|(values, &tolerance)| fit(functions, &values[from..from + n], tolerance))
-            .collect();
+            .map(|(values, &tolerance)| check_stop(stop).map(|()| fit(functions, &values[from..from + n], tolerance)))
+            .collect::<Result<_>>()?;
         self.rows.extend(rows);
+        Ok(())
+    }
+    /// The largest error of the Gaussian `row` half way between the samples of the segment, over its tolerance. The segment begins at sample `first` of the
+    /// layer. `finer` has this Gaussian at index `at`, and twice as many intervals.
+    pub(super) fn error_between(&self, row: usize, functions: &HeadFunctions, first: usize, finer: &HeadOffsets, at: usize) -> f32 {
+        let (width, row_len, tolerance) = (self.width, finer.samples * self.width, finer.tolerances[at]);
+        let wanted = &finer.values[at * row_len..(at + 1) * row_len];
+        let found = self.rows[row].decoded(functions);
+        let error = |k: usize| {
+            let middle = (2 * (first + k) + 1) * width;
+            let mean = |c: usize| 0.5 * (found[k * width + c] + found[(k + 1) * width + c]);
+            size_of(self.head, (0..width).map(|c| wanted[middle + c] - mean(c) / tolerance))
+        };
+        (0..functions.samples.saturating_sub(1)).map(error).fold(0.0, f32::max)
     }
     /// The track as it is stored; `None` if it changes nothing.
     pub(super) fn finish(self, functions: &HeadFunctions) -> Option<CodedTrack> {
@@ -158,9 +190,10 @@ mod tests {
             })
             .collect();
         let offsets = HeadOffsets { head: Head::Means, width: 3, samples, values, tolerances: rows.iter().map(|r| 0.001 * (1 + r) as f32).collect() };
-        let functions = HeadFunctions::of(&offsets, 0..=samples - 1);
+        let functions = HeadFunctions::of(&offsets, 0..=samples - 1, &AtomicBool::new(false)).unwrap();
         let mut builder = TrackBuilder::new(&functions);
-        builder.extend(&functions, &offsets, 0);
+        assert_eq!(builder.extend(&functions, &offsets, 0, &AtomicBool::new(true)).unwrap_err().exit_code(), 130);
+        builder.extend(&functions, &offsets, 0, &AtomicBool::new(false)).unwrap();
         assert!(builder.worst() <= 1.0);
         let coded = builder.finish(&functions).unwrap();
         assert_eq!(coded.ranks[0], 0);

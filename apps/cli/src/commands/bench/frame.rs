@@ -20,7 +20,7 @@ use cc4dgs_play::player::Player;
 use cc4dgs_train::config::RunConfig;
 use serde::Serialize;
 use std::path::Path;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// Frames of the sequence the rooms stand for.
@@ -79,7 +79,7 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
         }
         let (mut model, camera) = room_model(context, case, &config, &device, args)?;
         if let Some(path) = &args.archive {
-            write_playable(context, &model, &camera, &device, &events, path)?;
+            write_playable(context, &model, &camera, &device, &events, stop, path)?;
         }
         cases.push(time_case(context, case.name.to_string(), &mut model, &camera, &device, args)?);
         events.emit(&Event::Progress { task: "bench".into(), done: done as u64 + 1, total: wanted.len() as u64 });
@@ -165,8 +165,8 @@ fn set_in_motion(field: &mut dyn Deformer, means_world: Tensor<2>, motion: f32, 
 }
 
 /// Stores the model with a playback layer; players start from `camera`.
-fn write_playable(context: &Context, model: &Model, camera: &Camera, device: &Device, events: &dyn EventSink, path: &Path) -> Result<()> {
-    let around = Surroundings { registry: &context.registry, device, limits: &context.limits, events };
+fn write_playable(context: &Context, model: &Model, camera: &Camera, device: &Device, events: &dyn EventSink, stop: &AtomicBool, path: &Path) -> Result<()> {
+    let around = Surroundings { registry: &context.registry, device, limits: &context.limits, events, stop };
     let stored = Stored::of_model(model, Storage::default(), around)?;
     let cameras = std::slice::from_ref(camera);
     let presentation = presented(&stored.model, cameras, None)?;
