@@ -19,6 +19,7 @@ mod nerfstudio;
 mod normalise;
 pub mod npy;
 mod panoptic;
+mod ply_points;
 pub mod procedural;
 pub(crate) mod resample;
 mod select;

@@ -1,11 +1,15 @@
 //! nerfstudio and instant-ngp scenes: one `transforms.json`, intrinsics shared or per frame, lens coefficients. Static, unless images
-//! state a `time` (those of a camera that stands still are then frames of one camera) or an entry names a video, which is a camera with all frames of it.
+//! state a `time` (those of a camera that stands still are then frames of one camera) or an entry names a video, which is a camera with all frames of it. The
+//! points of `ply_file_path` are those of the scene.
 
 use super::assemble::fit_to_image;
+use super::ply_points;
 use super::video::{self, Footage};
-use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_json};
+use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_bytes, read_json};
 use cc4dgs_core::reader::pose::{from_opengl_camera_to_world, matrix4};
-use cc4dgs_core::{Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
+use cc4dgs_core::{
+    Distortion, Error, ImageSource, Limits, Plugin, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory,
+};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use std::collections::{BTreeMap, BTreeSet};
@@ -40,6 +44,8 @@ struct Transforms {
     #[serde(flatten)]
     shared: Intrinsics,
     frames: Vec<Frame>,
+    /// Points in the world of the frames' poses: where there is an `applied_transform`, both went through it.
+    ply_file_path: Option<String>,
     #[serde(default)]
     train_filenames: Vec<String>,
     #[serde(default)]
@@ -128,6 +134,11 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let object = file.display().to_string();
     let transforms: Transforms = read_json(&file, limits)?;
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    match transforms.ply_file_path.as_ref().map(|named| points(&object, folder, named, limits)).transpose() {
+        Ok(points) => scene.points = points,
+        // The cameras do not need them.
+        Err(error) => scene.warnings.push(format!("the points of ply_file_path are not used: {error}")),
+    }
     let mut frames: Vec<&Frame> = transforms.frames.iter().collect();
     frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
     let mut videos = videos(&object, &frames, folder, options, limits, &mut scene.warnings)?;
@@ -200,6 +211,20 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         }
     }
     Ok(scene)
+}
+
+/// The points of the PLY that the document `object` names. Backslashes of Windows separate folders, unless a file has them in its name.
+fn points(object: &str, folder: &Path, named: &str, limits: &Limits) -> Result<RawPoints> {
+    let mut file = folder.join(named);
+    if named.contains('\\') && !file.is_file() {
+        file = folder.join(named.replace('\\', "/"));
+    }
+    let name = file.display().to_string();
+    if !file.exists() {
+        let problem = format!("there is no such file, and {object} names it as ply_file_path");
+        return Err(Error::data(name, problem, "Copy it there, or remove the entry to start from other points"));
+    }
+    ply_points::points(&name, &read_bytes(&file, limits)?, limits)
 }
 
 /// Says so where some images state a time and others none: these count as images of time 0.
@@ -304,6 +329,41 @@ mod tests {
         assert!(image_path(dir.path(), "./images\\a").is_file() && !image_path(dir.path(), "images\\b").is_file());
         std::fs::write(dir.path().join("images/r_0.PNG"), "").unwrap();
         assert!(image_path(dir.path(), "./images/r_0").is_file());
+    }
+
+    #[test]
+    fn the_ply_of_points_is_in_the_world_of_the_poses() {
+        let dir = tempfile::tempdir().unwrap();
+        let (named, file) = ("points\\\\sparse_pc.ply", dir.path().join("points/sparse_pc.ply"));
+        std::fs::create_dir(dir.path().join("points")).unwrap();
+        std::fs::write(dir.path().join("a.png"), "").unwrap();
+        let pose = "[[1, 0, 0, 7], [0, 1, 0, 8], [0, 0, 1, 9], [0, 0, 0, 1]]";
+        let applied = "[[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]";
+        let text = format!(
+            r#"{{"fl_x": 8, "w": 8, "h": 6, "ply_file_path": "{named}", "applied_transform": {applied},
+                "frames": [{{"file_path": "a.png", "transform_matrix": {pose}}}]}}"#
+        );
+        std::fs::write(dir.path().join("transforms.json"), text).unwrap();
+        let properties = "property float x\nproperty float y\nproperty float z\nproperty uint8 red\nproperty uint8 green\nproperty uint8 blue\n";
+        let sound = format!("ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n7 8 5 255 0 51\n1 2 3 0 255 0\n");
+        let read = || open(dir.path(), &SceneOptions::default(), &Limits::default()).unwrap();
+        std::fs::write(&file, &sound).unwrap();
+        let scene = read();
+        assert_eq!(scene.warnings, Vec::<String>::new());
+        assert_eq!(scene.points, Some(RawPoints { positions: vec![[7.0, 8.0, 5.0], [1.0, 2.0, 3.0]], colors: vec![[1.0, 0.0, 0.2], [0.0, 1.0, 0.0]] }));
+        assert_eq!(scene.cameras[0].pinhole().center_world(), [7.0, 8.0, 9.0]);
+        // Without its points the scene is still there.
+        let told = || {
+            let scene = read();
+            assert!(scene.points.is_none() && scene.views.len() == 1);
+            scene.warnings.join("")
+        };
+        std::fs::write(&file, &sound[..sound.len() - 8]).unwrap();
+        let damaged = told();
+        assert!(damaged.contains("sparse_pc.ply: it states 2 vertices") && damaged.contains("write it again"), "{damaged}");
+        std::fs::remove_file(&file).unwrap();
+        let missing = told();
+        assert!(missing.contains("sparse_pc.ply: there is no such file") && missing.contains("Copy it there"), "{missing}");
     }
 
     #[test]

@@ -83,6 +83,22 @@ fn panoptic(root: &Path) {
     write_panoptic(root, 2, 2);
 }
 
+/// A nerfstudio scene with a binary PLY of three points.
+fn nerfstudio_with_points(root: &Path) {
+    write_nerfstudio(root, 4);
+    let file = root.join("transforms.json");
+    let mut document: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    document["ply_file_path"] = "points.ply".into();
+    std::fs::write(&file, document.to_string()).unwrap();
+    let properties: String = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"].iter().map(|p| format!("property {p}\n")).collect();
+    let mut ply = format!("ply\nformat binary_little_endian 1.0\nelement vertex 3\n{properties}end_header\n").into_bytes();
+    for i in 0..3u8 {
+        ply.extend([f32::from(i); 3].iter().flat_map(|v| v.to_le_bytes()));
+        ply.extend([i; 3]);
+    }
+    std::fs::write(root.join("points.ply"), ply).unwrap();
+}
+
 #[test]
 fn every_cut_of_every_index_file_is_survived() {
     let victims = [
@@ -191,6 +207,7 @@ damaged! {
     damaged_colmap_cameras: write_colmap, "sparse/0/cameras.bin";
     damaged_colmap_images: write_colmap, "sparse/0/images.bin";
     damaged_colmap_points: write_colmap, "sparse/0/points3D.bin";
+    damaged_ply_points: nerfstudio_with_points, "points.ply";
     damaged_poses_bounds: write_llff, "poses_bounds.npy";
     damaged_transforms: dnerf, "transforms_train.json";
     damaged_meta: panoptic, "train_meta.json";
