@@ -382,10 +382,17 @@ fn skips_are_measured_where_they_apply() {
     };
     let names = |rows: &Value| rows.as_array().unwrap().iter().map(|row| row["off"].as_str().unwrap().to_string()).collect::<Vec<_>>();
     let report = measure(&archive, &["--iterations", "20"]);
-    let frames = ["nothing", "static gating", "feature cache", "feature cache, vertex reuse", "opacity early out", "transmittance early out", "all"];
+    let frames =
+        ["nothing", "static gating", "feature cache", "vertex reuse", "feature cache, vertex reuse", "opacity early out", "transmittance early out", "all"];
     assert_eq!(names(&report["frames"]), frames, "{report}");
+    assert_eq!(report["frames_per_case"], 4, "{report}");
     for row in report["frames"].as_array().unwrap() {
         assert!(row["same_bits"] == true && row["frame"]["median_ms"].as_f64().unwrap() > 0.0, "{row}");
+        assert_eq!(row["largest_difference"], 0.0, "{row}");
+        let first = row["first_frame"]["median_ms"].as_f64().unwrap();
+        assert!(first > 0.0 && first < row["total_frame_ms"].as_f64().unwrap(), "{row}");
+        let [before, peak] = ["memory_before_mb", "peak_memory_mb"].map(|key| row[key].as_f64());
+        assert!(before <= peak && before.is_some() == cfg!(target_os = "linux"), "{row}");
     }
     let steps = names(&report["steps"]);
     assert!(steps.len() > 4 && steps[0] == "nothing" && steps[steps.len() - 1] == "all", "{report}");

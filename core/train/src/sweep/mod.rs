@@ -24,7 +24,7 @@ mod training;
 
 pub use collect::{Collection, Missing, Tables, collect, select, write_tables};
 pub use emit::{EmitOptions, INTERRUPTED, Scheduler, emit};
-pub use facts::{device_facts, fingerprint};
+pub use facts::{PeakMemory, device_facts, fingerprint};
 pub use folder::{Failure, SweepFolder};
 pub use grid::{Axis, CodecAxis, Grid, MethodAxis, MethodKeys, SceneAxis, SceneKeys, ScoredViews, SettingAxis, SettingKeys};
 pub use lock::TrainingLock;

@@ -38,6 +38,8 @@ struct SkipReport<'a> {
     dynamic_gaussians: usize,
     /// Times that all cases took turns.
     rounds: usize,
+    /// Frames measured per case, besides the first of each round.
+    frames_per_case: u32,
     frames: Vec<FrameRow>,
     /// Iterations of every training; 0 where none was asked for.
     iterations: u32,
@@ -121,6 +123,7 @@ pub fn skip(context: &Context, args: &BenchSkip) -> Result<()> {
         gaussians: loaded.model.gaussians.len(),
         dynamic_gaussians: moving,
         rounds,
+        frames_per_case: args.frames,
         frames,
         iterations: args.iterations,
         steps,
@@ -167,9 +170,13 @@ fn text(report: &SkipReport) -> String {
         report.model, report.scene, report.device, report.threads, report.image_size[0], report.image_size[1], report.gaussians, report.dynamic_gaussians
     )];
     let bits = |same: bool| if same { "the same" } else { "others" };
-    lines.push(format!("{:<32} {:>9} {:>9} {:>9} {:>6}  bits", "a frame without", "deform ms", "raster ms", "frame ms", "ratio"));
+    let title = "a frame without";
+    lines.push(format!("{title:<32} deform ms raster ms  frame ms  ratio  first ms  total ms  peak MB difference  bits"));
     lines.extend(report.frames.iter().map(|r| {
-        format!("{:<32} {:>9.2} {:>9.2} {:>9.2} {:>6.2}  {}", r.off, r.field.median_ms, r.raster.median_ms, r.frame.median_ms, r.ratio, bits(r.same_bits))
+        let later = [r.field, r.raster, r.frame].map(|time| format!(" {:>9.2}", time.median_ms)).concat();
+        let whole = format!("{:>9.2} {:>9.2}", r.first_frame.median_ms, r.total_frame_ms);
+        let peak = r.peak_memory_mb.map_or_else(|| "-".to_string(), |mb| format!("{mb:.0}"));
+        format!("{:<32}{later} {:>6.2} {whole} {peak:>8} {:>10.2e}  {}", r.off, r.ratio, r.largest_difference, bits(r.same_bits))
     }));
     if !report.steps.is_empty() {
         let title = format!("{} iterations without", report.iterations);
