@@ -1,5 +1,7 @@
 #!/usr/bin/env python3
-"""Shortens the JSON of `cc4dgs stress` to a row per part and condition: python3 benches/stress_summary.py IN.json OUT.json"""
+"""Shortens the JSON of `cc4dgs stress` to a row per part and condition: python3 benches/stress_summary.py IN.json OUT.json
+
+A row counts its cases, those that are required (where an error is a failure), and those that were refused with an error."""
 import json
 import sys
 
@@ -10,8 +12,10 @@ def main():
     rows = {}
     for case in report["cases"]:
         key = (case["part"], case["condition"])
-        row = rows.setdefault(key, {"part": key[0], "condition": key[1], "cases": 0, "refused": 0, "oracle": case["oracle"], "largest_error": None, "at": None})
+        empty = {"part": key[0], "condition": key[1], "cases": 0, "required": 0, "refused": 0, "oracle": case["oracle"], "largest_error": None, "at": None}
+        row = rows.setdefault(key, empty)
         row["cases"] += 1
+        row["required"] += case["required"]
         row["refused"] += case["outcome"].startswith("error")
         row["oracle"] = row["oracle"] or case["oracle"]
         if case["error"] is not None and (row["largest_error"] is None or case["error"] > row["largest_error"]):

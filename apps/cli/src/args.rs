@@ -261,7 +261,7 @@ pub struct Stress {
     /// Device to test: auto, flex, ndarray, wgpu, cuda.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
-    /// A million optimizer steps instead of twenty thousand.
+    /// A million optimizer steps (twenty thousand or fewer otherwise), and all times of each deformer.
     #[arg(long)]
     pub full: bool,
 }

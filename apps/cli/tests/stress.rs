@@ -23,6 +23,19 @@ fn deformers_are_compared_with_float64_or_with_nothing() {
         let errors: Vec<f64> = compared.iter().filter(|case| case["level"] == "time 0.5").map(|case| case["error"].as_f64().unwrap()).collect();
         assert!(errors.len() == 4 && errors.iter().all(|e| (1e-12..1e-4).contains(e)), "{part}: {errors:?}");
     }
+    // Float32 holds moved scenes worse and worse. That is a limit, not a failure, and the first decades must be drawn on every device.
+    for condition in ["moved scene against the unmoved", "moved scene, turned camera"] {
+        for part in ["rasterizer", "gradients"] {
+            let moved = of(part).into_iter().filter(|case| case["condition"] == condition).collect::<Vec<_>>();
+            let required: Vec<bool> = moved.iter().map(|case| case["required"] == true).collect();
+            assert_eq!(required, [true, true, false, false, false], "{part}, {condition}: {moved:?}");
+            let errors: Vec<f64> = moved.iter().map(|case| case["error"].as_f64().unwrap()).collect();
+            assert!(errors[0] < 1e-3 && errors[4] > 10.0 * errors[0], "{part}, {condition}: {errors:?}");
+        }
+    }
+    let turned = |limit: &&Value| limit["part"] == "rasterizer" && limit["condition"] == "moved scene, turned camera";
+    let limit = report["limits"].as_array().unwrap().iter().find(turned).unwrap();
+    assert!(limit["level"].is_string(), "{limit}");
     for part in ["deformer hexplane", "loss l1"] {
         let alone = of(part);
         assert!(!alone.is_empty() && alone.iter().all(|case| case["oracle"] == "no oracle" && case["error"].is_null()), "{part}: {alone:?}");

@@ -1,6 +1,6 @@
 //! The rasterizer, forward and backward, against the one in float64.
 
-use super::scenes::{Hard, all};
+use super::scenes::{Drawn, all};
 use super::{Compared, FLOAT64, StressCase, StressJob, case};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::format::conformance::uniform;
@@ -17,9 +17,9 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     };
     let (tested, oracle) = (build(job.rasterizer)?, build(job.oracle)?);
     for hard in all() {
-        let compare = |values: fn(&dyn Rasterizer, &Device, &Hard) -> Result<Vec<f32>>| -> Result<Compared> {
-            let exact = values(oracle.as_ref(), job.host, &hard)?;
-            Ok((values(tested.as_ref(), job.device, &hard)?, Some((FLOAT64, exact))))
+        let compare = |values: fn(&dyn Rasterizer, &Device, &Drawn) -> Result<Vec<f32>>| -> Result<Compared> {
+            let exact = values(oracle.as_ref(), job.host, hard.exact.as_ref().unwrap_or(&hard.drawn))?;
+            Ok((values(tested.as_ref(), job.device, &hard.drawn)?, Some((FLOAT64, exact))))
         };
         note(case("rasterizer", hard.condition, &hard.level, || compare(planes)).required_if(hard.ordinary));
         note(case("gradients", hard.condition, &hard.level, || compare(gradients)).required_if(hard.ordinary));
@@ -28,23 +28,23 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
 }
 
 /// Planes of the image.
-fn planes(rasterizer: &dyn Rasterizer, device: &Device, hard: &Hard) -> Result<Vec<f32>> {
-    let g = Gaussians::from_host(&hard.gaussians, device);
-    let output = rasterizer.render(&Splats::from_gaussians(&g, 1), &hard.camera, &RenderSettings::default())?;
+fn planes(rasterizer: &dyn Rasterizer, device: &Device, drawn: &Drawn) -> Result<Vec<f32>> {
+    let g = Gaussians::from_host(&drawn.gaussians, device);
+    let output = rasterizer.render(&Splats::from_gaussians(&g, 1), &drawn.camera, &RenderSettings::default())?;
     // Without depth, whose scale would hide the colours.
     to_vec(output.planes.narrow(0, 0, 4), "planes")
 }
 
 /// Gradients of a weighted sum of the planes with respect to all attributes, each over its largest value, so that all count alike.
-fn gradients(rasterizer: &dyn Rasterizer, device: &Device, hard: &Hard) -> Result<Vec<f32>> {
+fn gradients(rasterizer: &dyn Rasterizer, device: &Device, drawn: &Drawn) -> Result<Vec<f32>> {
     let tracked = device.clone().autodiff();
-    let mut g = Gaussians::from_host(&hard.gaussians, &tracked);
+    let mut g = Gaussians::from_host(&drawn.gaussians, &tracked);
     g.means = g.means.require_grad();
     g.log_scales = g.log_scales.require_grad();
     g.quaternions = g.quaternions.require_grad();
     g.opacity_logits = g.opacity_logits.require_grad();
     g.sh_dc = g.sh_dc.require_grad();
-    let output = rasterizer.render(&Splats::from_gaussians(&g, 1), &hard.camera, &RenderSettings::default())?;
+    let output = rasterizer.render(&Splats::from_gaussians(&g, 1), &drawn.camera, &RenderSettings::default())?;
     let [_, height, width] = output.planes.dims();
     let upstream: Vec<f32> = (0..5 * height * width).map(|k| if k < 4 * height * width { uniform(Seed::root(6), k) } else { 0.0 }).collect();
     let weights = Tensor::<3>::from_data(TensorData::new(upstream, [5, height, width]), &tracked);

@@ -7,13 +7,20 @@ use cc4dgs_core::{Camera, HostGaussians, Seed};
 pub const SIZE: (u32, u32) = (40, 28);
 /// Distance of the camera from the origin.
 const DISTANCE: f64 = 4.0;
+/// A scene and a camera whose axes are those of the world are moved and rounded to float32. The oracle draws them unmoved.
+const MOVED: &str = "moved scene against the unmoved";
+/// The same with the camera at [`TURNED`]: its rotation is not exact in float32, and is multiplied by the large coordinates.
+const MOVED_TURNED: &str = "moved scene, turned camera";
+/// Centre of a camera that looks at the origin along no axis, [`DISTANCE`] away.
+const TURNED: [f64; 3] = [DISTANCE * 2.0 / 3.0, -DISTANCE / 3.0, -DISTANCE * 2.0 / 3.0];
 /// Gaussians of an ordinary scene.
 const COUNT: usize = 60;
 /// Gaussians of equal depth.
 const MANY: usize = 3000;
 
 /// Conditions and levels that are ordinary: every device must draw them. Of families of levels those that nothing speaks against, such as the first decade.
-const ORDINARY: [(&str, &str); 11] = [
+/// Of moved scenes those at which float32 coordinates are finer than a hundredth of a pixel.
+const ORDINARY: [(&str, &str); 15] = [
     ("an ordinary scene", "-"),
     ("coordinates far from the origin", "1e2"),
     ("scales", "1e-2"),
@@ -25,6 +32,10 @@ const ORDINARY: [(&str, &str); 11] = [
     ("equal depths", "3000"),
     ("saturated harmonics", "1e3"),
     ("degenerate cameras", "inside the scene"),
+    (MOVED, "1e2"),
+    (MOVED, "1e3"),
+    (MOVED_TURNED, "1e2"),
+    (MOVED_TURNED, "1e3"),
 ];
 
 /// A condition at one level.
@@ -33,13 +44,33 @@ pub struct Hard {
     pub level: String,
     /// Whether it is one of [`ORDINARY`].
     pub ordinary: bool,
+    /// What the rasterizer under test draws.
+    pub drawn: Drawn,
+    /// What the oracle draws, where it is not the same.
+    pub exact: Option<Drawn>,
+}
+
+/// Gaussians, and the camera that sees them.
+pub struct Drawn {
     pub gaussians: HostGaussians,
     pub camera: Camera,
 }
 
+impl Hard {
+    fn new(condition: &'static str, level: String, drawn: Drawn, exact: Option<Drawn>) -> Self {
+        let ordinary = ORDINARY.contains(&(condition, level.as_str()));
+        Self { condition, level, ordinary, drawn, exact }
+    }
+}
+
 /// A camera at the origin's front, moved by `offset` along every axis.
 fn camera(offset: f64) -> Camera {
-    Camera::look_at("stress", SIZE, 0.9, [offset, offset, offset - DISTANCE], [offset; 3], [0.0, -1.0, 0.0])
+    camera_at([0.0, 0.0, -DISTANCE], offset)
+}
+
+/// A camera at `eye` that looks at the origin, moved by `offset` along every axis.
+fn camera_at(eye: [f64; 3], offset: f64) -> Camera {
+    Camera::look_at("stress", SIZE, 0.9, eye.map(|v| v + offset), [offset; 3], [0.0, -1.0, 0.0])
 }
 
 /// Gaussians of ordinary size in front of the camera.
@@ -77,10 +108,10 @@ pub fn all() -> Vec<Hard> {
     let mut add = |condition: &'static str, level: String, camera: Camera, change: &dyn Fn(&mut HostGaussians)| {
         let mut gaussians = cloud(COUNT);
         change(&mut gaussians);
-        let ordinary = ORDINARY.contains(&(condition, level.as_str()));
-        list.push(Hard { condition, level, ordinary, gaussians, camera });
+        list.push(Hard::new(condition, level, Drawn { gaussians, camera }, None));
     };
     add("an ordinary scene", "-".into(), camera(0.0), &|_| {});
+    // The oracle gets the rounded centres, too, and the camera looks along an axis, so nothing large is rounded after that. `moved` shows what is lost.
     for decade in 2..=6 {
         let offset = 10f64.powi(decade);
         add("coordinates far from the origin", format!("1e{decade}"), camera(offset), &|g| g.means.iter_mut().for_each(|v| *v += offset as f32));
@@ -159,6 +190,23 @@ pub fn all() -> Vec<Hard> {
     }
     let inside = Camera::look_at("inside", SIZE, 0.9, [0.05, 0.02, 0.1], [0.0, 0.3, 1.0], [0.0, -1.0, 0.0]);
     add("degenerate cameras", "inside the scene".into(), inside, &|_| {});
+    list.extend(moved());
+    list
+}
+
+/// The ordinary scene and a camera, moved in float64 and rounded to float32; the oracle draws them as they were. The rounding of coordinates does not cancel.
+fn moved() -> Vec<Hard> {
+    let mut list = Vec::new();
+    for (condition, eye) in [(MOVED, [0.0, 0.0, -DISTANCE]), (MOVED_TURNED, TURNED)] {
+        for decade in 2..=6 {
+            let offset = 10f64.powi(decade);
+            let mut gaussians = cloud(COUNT);
+            gaussians.means.iter_mut().for_each(|v| *v = (f64::from(*v) + offset) as f32);
+            let drawn = Drawn { gaussians, camera: camera_at(eye, offset) };
+            let exact = Drawn { gaussians: cloud(COUNT), camera: camera_at(eye, 0.0) };
+            list.push(Hard::new(condition, format!("1e{decade}"), drawn, Some(exact)));
+        }
+    }
     list
 }
 
@@ -173,5 +221,22 @@ mod tests {
             assert_eq!(tried.iter().filter(|hard| hard.ordinary && hard.condition == condition && hard.level == level).count(), 1, "{condition}, {level}");
         }
         assert_eq!(tried.iter().filter(|hard| hard.ordinary).count(), ORDINARY.len());
+    }
+
+    #[test]
+    fn moved_scenes_are_ordinary_where_float32_is_finer_than_a_hundredth_of_a_pixel() {
+        let list = moved();
+        assert_eq!(list.len(), 10);
+        for hard in &list {
+            let offset: f64 = hard.level.parse().unwrap();
+            let pixel = DISTANCE / hard.drawn.camera.fx;
+            assert_eq!(hard.ordinary, offset * f64::from(f32::EPSILON) < 0.01 * pixel, "{}, {}", hard.condition, hard.level);
+            // The oracle draws the same scene at the origin: only centres and the camera's place differ.
+            let exact = hard.exact.as_ref().unwrap();
+            let means = HostGaussians { means: exact.gaussians.means.clone(), ..hard.drawn.gaussians.clone() };
+            assert_eq!(means, exact.gaussians);
+            let (here, there) = (exact.camera.center_world(), hard.drawn.camera.center_world());
+            assert!((0..3).all(|k| (there[k] - here[k] - offset).abs() < 1e-6), "{here:?} {there:?}");
+        }
     }
 }
