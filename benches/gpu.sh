@@ -4,7 +4,8 @@
 #   benches/gpu.sh [--bin FILE] [--out DIR] [--device NAME] [--scale SHARE] [--data DIR] [--train MINUTES] [--step SECONDS] [--frames N] [--player FILE]
 #
 # FILE is a built cc4dgs (default: target/release/cc4dgs), which may have been carried here from another machine. --scale shrinks images and Gaussians for
-# devices that are slow. --data names a folder with dnerf_mutant and panoptic_basketball; with it and --train, both are trained at full size within the minutes.
+# devices that are slow. --data names a folder with dnerf_mutant and panoptic_basketball; with it and --train, `auto` plans for the minutes and trains each at
+# the published size (mutant 800x800, basketball 640x360 with all frames). A training that takes more than 1.5 times as long is stopped.
 # --player names the example `frames` of the player (cargo build --release -p cc4dgs-player --example frames); with it the player's renderer is timed too.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -93,9 +94,9 @@ if [ -n "$player" ]; then
 fi
 
 if [ -n "$data" ] && [ "$minutes" != 0 ]; then
-    for scene in dnerf_mutant:dnerf panoptic_basketball:panoptic; do
-        path="$data/${scene%%:*}" preset="${scene##*:}" run="$out/${scene%%:*}"
-        step "${scene%%:*}-train" $((60 * minutes)) train --scene "$path" --preset "$preset" --device "$device" --out "$run"
+    for scene in dnerf_mutant:800 panoptic_basketball:640; do
+        path="$data/${scene%%:*}" width="${scene##*:}" run="$out/${scene%%:*}"
+        step "${scene%%:*}-train" $((90 * minutes)) train --scene "$path" --preset auto --minutes "$minutes" --set scene.width="$width" --device "$device" --out "$run"
         [ -f "$run/checkpoint" ] || continue
         step "${scene%%:*}-eval" 300 eval "$run" --scene "$path" --device "$device"
         step "${scene%%:*}-compress" 300 compress "$run" --codec cca:default --out "$run.cc4d" --overwrite

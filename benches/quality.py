@@ -5,10 +5,14 @@
 
 DATA holds `dnerf_mutant` and `panoptic_basketball`. Every run is trained for its minutes of wall time, then evaluated on the test split. An interrupted run is
 resumed from its checkpoint when the script is called again; a finished one is not repeated. With `--curves` every run is trained a second time with views kept
-out of training, and its log holds the curve. The three medians of `bench step` are measured before every run. Results are kept in OUT/rows.json.
+out of training, and its log holds the curve. The three medians of `bench step` are measured before every run. Results are kept in OUT/rows.json, one row per run
+and list of --set; runs with --set have folders of their own, OUT/NAME-HASH. `peak_memory_mb` is the most resident memory of the training's last process, in
+MB of 10^6 bytes.
 """
 import argparse
+import hashlib
 import json
+import os
 import pathlib
 import subprocess
 import sys
@@ -40,8 +44,22 @@ def medians(options, out):
     return json.loads(report.read_text())
 
 
+def measured(arguments, file):
+    """Exit code of a process that writes to `file`, and the most resident memory it had, in MB."""
+    child = subprocess.Popen(arguments, stdout=file, stderr=subprocess.STDOUT)
+    try:
+        _, status, usage = os.wait4(child.pid, 0)
+    except BaseException:
+        child.kill()
+        raise
+    child.returncode = os.waitstatus_to_exitcode(status)
+    return child.returncode, round(usage.ru_maxrss * 1024 / 1e6, 1)
+
+
 def train(options, name, scene, minutes, settings):
-    out = options.out / name
+    # Another list of --set must not resume this one's checkpoint.
+    digest = hashlib.sha256(json.dumps(options.sets).encode()).hexdigest()[:8]
+    out = options.out / (f"{name}-{digest}" if options.sets else name)
     path = str(options.data / scene)
     log = out.with_suffix(".train.log")
     step = medians(options, out)
@@ -58,9 +76,9 @@ def train(options, name, scene, minutes, settings):
     out.with_suffix(".train.json").unlink(missing_ok=True)
     began = time.time()
     with open(log, "a") as file:
-        code = subprocess.run([options.bin, *arguments], stdout=file, stderr=subprocess.STDOUT).returncode
-    row = {"name": name, "scene": scene, "minutes": minutes, "settings": [*settings, *options.sets], "exit": code, "resumed": resumed}
-    row |= {"seconds": round(time.time() - began, 1), "bench_step": step, "curve": curve(out / "events.jsonl")}
+        code, peak = measured([options.bin, *arguments], file)
+    row = {"name": name, "scene": scene, "minutes": minutes, "settings": [*settings, *options.sets], "sets": options.sets, "exit": code, "resumed": resumed}
+    row |= {"seconds": round(time.time() - began, 1), "peak_memory_mb": peak, "bench_step": step, "curve": curve(out / "events.jsonl")}
     report = out.with_suffix(".eval.json")
     report.unlink(missing_ok=True)
     evaluation = [options.bin, "eval", str(out), "--scene", path, "--split", "test", f"--json={report}", "--sheet", str(out.with_suffix(".png")), "--quiet"]
@@ -103,10 +121,12 @@ def main():
         if options.only and name not in options.only.split(","):
             continue
         for name, settings in [(name, settings)] + ([(f"{name}-curve", settings + CURVES)] if options.curves else []):
-            row = next((r for r in rows if r["name"] == name and r["exit"] == 0), None)
+            # Rows of earlier versions have no list of --set of their own.
+            same = [r for r in rows if r["name"] == name and r.get("sets", r["settings"][len(settings):]) == options.sets]
+            row = next((r for r in same if r["exit"] == 0), None)
             if row is None:
                 row = train(options, name, scene, minutes, settings)
-                rows = [r for r in rows if r["name"] != name] + [row]
+                rows = [r for r in rows if r not in same] + [row]
                 kept.write_text(json.dumps(rows, indent=1))
             psnr = row.get("psnr_db")
             print(f"{name:24} {psnr or float('nan'):.2f} dB (aim {aim}), SSIM {row.get('ssim') or float('nan'):.4f}, {row.get('gaussians')} Gaussians, {row['seconds']} s, exit {row['exit']}", flush=True)

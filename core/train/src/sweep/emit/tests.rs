@@ -5,7 +5,7 @@ use super::*;
 use serde_json::Value;
 use yaml_rust::{Yaml, YamlLoader};
 
-/// What the files must have: path, and the value or type. A part of the schedulers' own schemas.
+/// The keys that the files have, each with its value or type. A part of the schedulers' own schemas.
 const SHAPES: &str = include_str!("shapes.json");
 
 fn options() -> EmitOptions {
@@ -41,7 +41,7 @@ fn json(yaml: Yaml) -> Value {
     }
 }
 
-/// What of `shape` the value does not fulfil: objects name required keys; strings that start with `<` are types, anything else is the value itself.
+/// Where the value differs from `shape`: objects name all keys, arrays all items; strings that start with `<` are types, anything else is the value itself.
 fn faults(value: &Value, shape: &Value, place: &str, found: &mut Vec<String>) {
     match shape {
         Value::Object(keys) => {
@@ -51,6 +51,8 @@ fn faults(value: &Value, shape: &Value, place: &str, found: &mut Vec<String>) {
                     None => found.push(format!("{place}.{key} is missing")),
                 }
             }
+            let unknown = value.as_object().into_iter().flatten().filter(|(key, _)| !keys.contains_key(key.as_str()));
+            found.extend(unknown.map(|(key, _)| format!("{place}.{key} is unknown")));
         }
         Value::Array(items) => {
             for (index, inner) in items.iter().enumerate() {
@@ -59,6 +61,8 @@ fn faults(value: &Value, shape: &Value, place: &str, found: &mut Vec<String>) {
                     None => found.push(format!("{place}[{index}] is missing")),
                 }
             }
+            let count = value.as_array().map_or(0, Vec::len);
+            found.extend((items.len()..count).map(|index| format!("{place}[{index}] is unknown")));
         }
         Value::String(text) if text.starts_with('<') => {
             let right = match text.as_str() {
@@ -80,16 +84,32 @@ fn faults(value: &Value, shape: &Value, place: &str, found: &mut Vec<String>) {
 #[test]
 fn yaml_files_have_the_shape_of_their_schedulers() {
     let shapes: Value = serde_json::from_str(SHAPES).unwrap();
-    for (name, scheduler) in [("kubernetes", Scheduler::Kubernetes), ("skypilot", Scheduler::SkyPilot)] {
-        let text = emit(scheduler, &plan(), &options()).unwrap();
-        let value = parse(&text);
+    let check = |text: &str, name: &str| {
         let mut found = Vec::new();
-        faults(&value, &shapes[name], name, &mut found);
-        assert!(found.is_empty(), "{}\n{text}", found.join("\n"));
-        // The check itself finds mistakes.
-        let wrong = parse(&text.replace("completions: 1", "completions: one").replace("cpus: 2+", "cpu: 2+"));
-        faults(&wrong, &shapes[name], name, &mut found);
-        assert_eq!(found.len(), 1, "{name}");
+        faults(&parse(text), &shapes[name], name, &mut found);
+        found.join("\n")
+    };
+    let emitted = |scheduler| emit(scheduler, &plan(), &options()).unwrap();
+    let (kubernetes, skypilot) = (emitted(Scheduler::Kubernetes), emitted(Scheduler::SkyPilot));
+    assert_eq!(check(&kubernetes, "kubernetes"), "", "{kubernetes}");
+    assert_eq!(check(&skypilot, "skypilot"), "", "{skypilot}");
+    // The check itself finds wrong values, misspelt keys, and superfluous keys and items.
+    for (right, wrong, found) in [
+        ("completions: 1", "completions: one", "kubernetes.spec.completions is \"one\", not <count>"),
+        ("backoffLimitPerIndex", "backOffLimit", "kubernetes.spec.backoffLimitPerIndex is missing\nkubernetes.spec.backOffLimit is unknown"),
+        ("        workingDir:", "        tty: true\n        workingDir:", "kubernetes.spec.template.spec.containers[0].tty is unknown"),
+        ("      volumes:", "      - name: second\n      volumes:", "kubernetes.spec.template.spec.containers[1] is unknown"),
+    ] {
+        assert!(kubernetes.contains(right), "{right}");
+        assert_eq!(check(&kubernetes.replacen(right, wrong, 1), "kubernetes"), found);
+    }
+    for (right, wrong, found) in [
+        ("  cpus: 2+", "  cpu: 2+", "skypilot.resources.cpus is missing\nskypilot.resources.cpu is unknown"),
+        ("num_nodes: 1", "num_nodes: 1\nnodes: 1", "skypilot.nodes is unknown"),
+        ("mode: MOUNT", "mode: COPY", "skypilot.file_mounts./data.mode is \"COPY\", not \"MOUNT\""),
+    ] {
+        assert!(skypilot.contains(right), "{right}");
+        assert_eq!(check(&skypilot.replacen(right, wrong, 1), "skypilot"), found);
     }
 }
 
