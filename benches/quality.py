@@ -50,7 +50,11 @@ def measured(arguments, file):
     try:
         _, status, usage = os.wait4(child.pid, 0)
     except BaseException:
-        child.kill()
+        # It was interrupted too, and may be writing its checkpoint.
+        try:
+            child.wait(60)
+        except subprocess.TimeoutExpired:
+            child.kill()
         raise
     child.returncode = os.waitstatus_to_exitcode(status)
     return child.returncode, round(usage.ru_maxrss * 1024 / 1e6, 1)

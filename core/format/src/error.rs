@@ -90,7 +90,7 @@ pub enum Error {
         /// What to try.
         remedy: String,
     },
-    /// The user interrupted. A checkpoint was written before.
+    /// The user interrupted. The message says what was written before.
     #[error("interrupted: {0}")]
     Interrupted(String),
 }

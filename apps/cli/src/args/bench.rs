@@ -102,7 +102,8 @@ pub struct BenchSkip {
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
-    /// Frames measured per case. Each round draws two more before its share: a first one, which is measured by itself, and one to warm up.
+    /// Frames measured per case. Each round draws two more before its share: a first one, which is measured by itself, and one to warm up. The first
+    /// round draws another one before them, in which kernels compile.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub frames: u32,
     /// Times that all cases take turns, so that a machine that slows down slows all of them down; every round trains every case.

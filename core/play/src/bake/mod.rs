@@ -99,14 +99,14 @@ impl BakeReport {
         let remedy = if self.samples_limited {
             format!("motion is too fast for {} samples, the most that this layer gets, so play the model with its deformer", self.samples)
         } else {
-            "state a smaller --max-error, or play the model with its deformer".into()
+            "state a smaller bound (--max-error, or max_error of the exporter web), or play the model with its deformer".into()
         };
         Some(format!(
-            "half way between samples {:.1} % of {} Gaussians are over the bound, the worst at {:.2} times it ({:.2} times at samples): {remedy}",
-            100.0 * self.between_over,
-            self.between_measured,
+            "the worst Gaussian is {:.2} times the bound off at samples and {:.2} times half way between them, where {:.1} % of {} Gaussians are over it: {remedy}",
+            self.at_samples,
             self.between_samples,
-            self.at_samples
+            100.0 * self.between_over,
+            self.between_measured
         ))
     }
 }
@@ -292,7 +292,7 @@ mod tests {
         assert_eq!((report.samples, report.samples_limited, report.between_over, report.between_measured), (513, true, 0.5, 2), "{report:?}");
         assert!(report.at_samples <= KEPT && report.between_samples > 10.0 && report.between_p99 == report.between_samples, "{report:?}");
         let sentence = report.over_bound().unwrap();
-        assert!(sentence.starts_with("half way between samples 50.0 % of 2 Gaussians") && sentence.contains("513 samples"), "{sentence}");
+        assert!(sentence.contains("half way between them, where 50.0 % of 2 Gaussians are over it") && sentence.contains("513 samples"), "{sentence}");
     }
 
     #[test]

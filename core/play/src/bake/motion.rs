@@ -173,8 +173,8 @@ pub(super) fn offsets_of(head: Head, host: &HostGaussians, moved: &[HostGaussian
             let of = |g: &HostGaussians| -> [f32; 4] { std::array::from_fn(|k| g.quaternions[4 * i + k]) };
             let norm = |q: [f32; 4]| q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
             let start = of(host).map(|v| v / norm(of(host)));
-            // Quaternions of any length are the same rotation; one factor for all times keeps what is linear linear.
-            let mean = moved.iter().map(|g| norm(of(g))).sum::<f32>() / moved.len().max(1) as f32;
+            // Quaternions of any length are the same rotation; one factor for all times keeps what is linear linear, and the ends have the same however many are between.
+            let mean = moved.first().zip(moved.last()).map_or(1.0, |(first, last)| 0.5 * (norm(of(first)) + norm(of(last))));
             moved.iter().flat_map(|g| std::array::from_fn::<f32, 4, _>(|k| of(g)[k] / mean - start[k])).collect()
         }
         Head::Opacities => moved.iter().map(|g| sigmoid(g.opacity_logits[i]) - sigmoid(host.opacity_logits[i])).collect(),

@@ -14,7 +14,7 @@ pub(super) fn describe(config: &RunConfig, registry: &Registry) -> Result<Option
     let moves = kind != "none" && full.train.dynamic != Dynamic::None;
     let shares = full.train.batch > 1 && registry.deformer(&kind)?.info.capabilities.contains(&SHARED_OVER_TIMES);
     let skips = [
-        (moves && full.train.dynamic != Dynamic::All, "the deformer for Gaussians whose score says that they stand still (train.dynamic)"),
+        (moves && full.train.dynamic != Dynamic::All, "the deformer for Gaussians that are found to stand still (train.dynamic)"),
         (moves && shares, "the deformer's spatial half for all but one view of an iteration (train.batch)"),
         (moves && is_on(&full.deformer, "vertex_reuse"), "vertices that were decoded for another Gaussian (deformer.vertex_reuse)"),
         (is_on(&full.rasterizer, "opacity_shortcut"), "pixels where a Gaussian's alpha is below 1/255 (rasterizer.opacity_shortcut)"),

@@ -15,8 +15,7 @@ const DOUBT_MARGIN_DB: f64 = 3.0;
 /// because what is missing is detail; of things that move the blurred images differ, too: 23 with 32.
 const ONE_TIME_DB: f64 = 26.0;
 const ONE_TIME_BLURRED_DB: f64 = 37.0;
-/// A run whose main stage makes its images worse than this against those that it began with has failed, dB: a deformer that does not start as the identity may cost
-/// some, and rounds of density control do.
+/// A run has failed whose scores in the main stage are more than this below the score that the stage began with, dB: rounds of density control cost some.
 const MOST_LOSS_DB: f64 = 2.0;
 /// A run has failed that ends more than this below its best earlier score, dB.
 const MOST_FALL_DB: f64 = 6.0;
@@ -65,7 +64,7 @@ pub(super) enum Shortfall {
 }
 
 /// The first of `rules` that every one of `scores` breaks; the last score is the present one. `still_db` is the score before the first iteration of the main
-/// stage, when nothing moved.
+/// stage, when nothing moves yet where the deformer starts as the identity.
 pub(super) fn shortfall(scores: &[Score], still_db: Option<f64>, baselines: &Baselines, rules: Rules, doubts: Doubts) -> Option<Shortfall> {
     let now = scores.last()?;
     let always = |below: &dyn Fn(&Score) -> bool| scores.iter().all(below);

@@ -185,7 +185,7 @@ impl Watch {
             Shortfall::Images(words) => format!("{place} {words}"),
             Shortfall::Still(words) => {
                 let remedy = format!(
-                    "The deformer makes the scene worse: try lower learning rates (those of the deformer, train.lr), more iterations, or another deformer. {} = false \
+                    "The main stage makes the scene worse: try lower learning rates (those of the deformer, train.lr), more iterations, or another deformer. {} = false \
                      accepts such models",
                     kept(context)
                 );
