@@ -230,6 +230,9 @@ pub trait DensityControl: Send {
     fn statistics(&self, schedule: &Schedule) -> Vec<Statistic>;
     /// Receives the statistics of one view, after the backward pass.
     fn observe(&mut self, view: &ViewStatistics) -> Result<()>;
+    /// Called before every [`DensityControl::plan`]: growth must stay `count` Gaussians below its upper bound. That many were removed, and training views do not have
+    /// their earlier PSNR yet. Default: ignored, for controls that replace what they remove in the same plan.
+    fn hold(&mut self, _count: usize) {}
     /// The plan after the optimizer step of an iteration; `None` for no change. The trainer may keep rows that the plan removes (see [`DensityPlan::restore`]), executes
     /// it, and calls [`DensityControl::executed`]. All randomness comes from `seed`, which differs in every iteration.
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>>;

@@ -226,11 +226,11 @@ const MOST: usize = 900;
 /// Views of the statistics between two plans are one in so many iterations.
 const VIEW_EVERY: usize = 10;
 
-fn uniform(seed: Seed, k: usize) -> f32 {
+pub(super) fn uniform(seed: Seed, k: usize) -> f32 {
     (seed.index(k as u64).value() >> 40) as f32 / (1u64 << 24) as f32
 }
 
-fn gaussians(count: usize, device: &Device) -> Gaussians {
+pub(super) fn gaussians(count: usize, device: &Device) -> Gaussians {
     let mut host = HostGaussians { quaternions: [1.0, 0.0, 0.0, 0.0].repeat(count), dynamic_scores: vec![0.0; count], ..Default::default() };
     let draws = |width: usize, from: f32, to: f32| (0..width * count).map(|k| from + (to - from) * uniform(Seed::root(3), k)).collect();
     (host.means, host.log_scales, host.opacity_logits, host.sh_dc) = (draws(3, -1.0, 1.0), draws(3, -6.0, -3.0), draws(1, -2.0, 3.0), draws(3, -1.0, 1.0));

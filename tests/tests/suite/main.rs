@@ -31,6 +31,7 @@ mod raster;
 mod raster_fixtures;
 mod raster_probes;
 mod readers;
+mod regrowth;
 mod session;
 mod shortcuts;
 mod sort;

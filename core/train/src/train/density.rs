@@ -44,6 +44,7 @@ impl Context<'_> {
         }
         // The values may have changed.
         let gaussians = state.set.gaussians()?;
+        state.density.hold(state.guard.held());
         if let Some(mut plan) = state.density.plan(&gaussians, schedule, seed.child("densify").index(index))? {
             plan.check(kind, &gaussians)?;
             drop(gaussians);

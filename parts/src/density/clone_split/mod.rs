@@ -90,6 +90,7 @@ impl Settings {
             grow: iteration > schedule.at(self.from) && iteration < end && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL)),
             prune_weight: self.weight_every > 0 && iteration < end && iteration.is_multiple_of(self.weight_interval(schedule)),
             reset: coarse && self.reset_every > 0 && iteration.is_multiple_of(reset_interval) && schedule.left() >= MIN_RECOVERY,
+            held: 0,
         }
     }
 }
@@ -99,6 +100,8 @@ struct CloneSplit {
     statistics: Statistics,
     /// The actions of the last plan.
     due: Due,
+    /// Places of `max_gaussians` that the next plan leaves empty.
+    held: usize,
 }
 
 impl DensityControl for CloneSplit {
@@ -123,8 +126,11 @@ impl DensityControl for CloneSplit {
         self.statistics.add_weights(view);
         Ok(())
     }
+    fn hold(&mut self, count: usize) {
+        self.held = count;
+    }
     fn plan(&mut self, gaussians: &Gaussians, schedule: &Schedule, seed: Seed) -> Result<Option<DensityPlan>> {
-        let due = self.settings.due(schedule);
+        let due = Due { held: self.held, ..self.settings.due(schedule) };
         self.due = due;
         let mut plan = None;
         let mut logits = None;
@@ -179,7 +185,7 @@ fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
     if settings.every == 0 {
         return Err(Error::parameter("density clone-split: every", "0 iterations", "Give at least 1, or use density.kind = \"none\""));
     }
-    Ok(Box::new(CloneSplit { settings, statistics: Statistics::zeros(0, &Device::flex()), due: Due::default() }))
+    Ok(Box::new(CloneSplit { settings, statistics: Statistics::zeros(0, &Device::flex()), due: Due::default(), held: 0 }))
 }
 
 inventory::submit! {

@@ -19,6 +19,8 @@ pub(super) struct Due {
     pub prune_weight: bool,
     /// Lower all opacities.
     pub reset: bool,
+    /// How many Gaussians growth stays below `max_gaussians`.
+    pub held: usize,
 }
 
 /// A Gaussian to add: its parent, and a standard normal sample if it comes from a split.
@@ -45,7 +47,7 @@ pub(super) fn round(settings: &Settings, statistics: &Statistics, host: &HostGau
 
     let mut plan = DensityPlan::new();
     let mut children: Vec<Child> = Vec::new();
-    let capacity = settings.max_gaussians.saturating_sub(n);
+    let capacity = settings.max_gaussians.saturating_sub(n + due.held);
     let mut wanting: Vec<usize> = (0..n).filter(|&i| due.grow && gradient[i] >= settings.gradient && !dead(i) && !weak(i)).collect();
     // Near the upper bound, those with the largest gradients come first.
     wanting.sort_by(|&a, &b| gradient[b].total_cmp(&gradient[a]).then(a.cmp(&b)));
@@ -160,6 +162,20 @@ mod tests {
         let original = 1.0 - 1.0 / (1.0 + (-1.5f32).exp());
         assert!((passed(true) - original).abs() < 1e-5 && (passed(false) - original * original).abs() < 1e-5);
         assert!(shared_logit(1.0).is_finite() && shared_logit(0.0).is_finite());
+    }
+
+    #[test]
+    fn the_largest_gradients_grow_up_to_the_bound_less_what_is_held() {
+        let device = Device::flex();
+        let mut statistics = Statistics::zeros(3, &device);
+        statistics.gradients = Tensor::from_floats([[1.0, 1.0], [3.0, 1.0], [2.0, 1.0]], &device);
+        let settings = Settings { max_gaussians: 5, ..Settings::default() };
+        let parents = |held: usize| {
+            let due = Due { grow: true, held, ..Default::default() };
+            round(&settings, &statistics, &host_of(3), due, 1.0, Seed::root(1)).unwrap().unwrap().parents().to_vec()
+        };
+        assert_eq!((parents(0), parents(1)), (vec![0, 1, 1, 2, 2], vec![0, 2, 1, 1]));
+        assert_eq!((parents(2), parents(9)), (vec![0, 1, 2], vec![0, 1, 2]));
     }
 
     #[test]

@@ -25,10 +25,13 @@ impl Context<'_> {
         let count = state.set.len();
         state.guard.read_views()?;
         let removed = plan.removed(count);
-        if !removed.is_empty() {
+        if !removed.is_empty() || state.guard.held > 0 {
             let logits = to_vec(state.set.get(OPACITIES)?.clone(), OPACITIES)?;
-            let kept = self.kept_after_all(&removed, &logits, state, schedule)?;
+            let (kept, measured) = self.kept_after_all(&removed, &logits, state, schedule)?;
             plan.restore(&kept);
+            if measured {
+                state.guard.held += count.saturating_sub(plan.len());
+            }
         }
         if plan.restarted().iter().any(|name| name == OPACITIES) && !self.begin_reset(state, schedule)? {
             *plan = without_reset(plan);
@@ -38,20 +41,25 @@ impl Context<'_> {
         Ok(())
     }
 
-    /// Those of the rows `removed` that stay.
-    fn kept_after_all(&self, removed: &[usize], logits: &[f32], state: &mut TrainState, schedule: &Schedule) -> Result<Vec<usize>> {
+    /// Those of the rows `removed` that stay, and whether it was measured what the removal of the others costs. Also looks whether an earlier removal is back.
+    fn kept_after_all(&self, removed: &[usize], logits: &[f32], state: &mut TrainState, schedule: &Schedule) -> Result<(Vec<usize>, bool)> {
         let broken = broken_rows(state)?;
         let (mut kept, mut going) = state.guard.divide(removed, logits, |row| broken[row], schedule);
         let faint = (FAINT / (1.0 - FAINT)).ln();
         let harmless = (going.len() as f64) < PROBED_SHARE * logits.len() as f64 && going.iter().all(|&row| logits[row] < faint);
-        if going.is_empty() || (harmless && state.guard.removal.is_none()) {
+        let free = going.is_empty() || (harmless && state.guard.removal.is_none());
+        if free && state.guard.held == 0 {
             kept.sort_unstable();
-            return Ok(kept);
+            return Ok((kept, false));
         }
         let probes = self.probes(schedule);
         let gaussians = state.set.gaussians()?;
         let psnr_db = self.mean_psnr(state, &gaussians, &probes, schedule.sh_degree)?;
-        match state.guard.standing(psnr_db, schedule) {
+        let standing = state.guard.standing(psnr_db, schedule);
+        state.guard.release(&standing, schedule);
+        let mut measured = false;
+        match standing {
+            _ if free => {}
             Standing::Back(from) if harmless => state.guard.removal = Some(from).filter(|from| from.iteration < schedule.iteration),
             Standing::Back(from) => {
                 while !going.is_empty() {
@@ -70,6 +78,7 @@ impl Context<'_> {
                 }
                 if !going.is_empty() {
                     state.guard.removal = Some(from);
+                    measured = true;
                 }
             }
             Standing::Waiting => kept.append(&mut going),
@@ -84,7 +93,7 @@ impl Context<'_> {
             }
         }
         kept.sort_unstable();
-        Ok(kept)
+        Ok((kept, measured))
     }
 
     /// Remembers what an opacity reset must come back to. False where it is to be left out: one of the stage was undone, the last one is not back, training views
@@ -101,7 +110,7 @@ impl Context<'_> {
         let logits = to_vec(gaussians.opacity_logits.clone(), OPACITIES)?;
         state.guard.reset = Some(Reset::new(schedule.iteration, psnr_db, logits));
         // What the reset costs is no loss by removals, and has its own time to come back.
-        state.guard.removal = None;
+        (state.guard.removal, state.guard.held) = (None, 0);
         Ok(true)
     }
 

@@ -7,6 +7,8 @@
 //! - A removal that costs more than 0.3 dB on training views at once is halved, the most opaque Gaussians being kept, and then left out.
 //! - After a removal that was measured, what training views lost must be back within a stated number of iterations, to within 0.3 dB. Until then removals
 //!   together may cost no more than one; where the PSNR is lower, the next ones are put off. What is not back after three times as long has other causes.
+//! - Where a measured removal made the Gaussians fewer, growth does not replace them until training views have the PSNR of before it, or that time is over
+//!   as above.
 //! - After an opacity reset, the PSNR of training views must be back within the same time; else the opacities return, and the stage has no more resets. A reset
 //!   is left out where this time is not left, and while the last one is not back.
 
@@ -50,6 +52,8 @@ pub struct Guard {
     drawn_since: Option<Tensor<1>>,
     /// The last removal that was measured, until the next one or a reset.
     removal: Option<Removal>,
+    /// Number of removed Gaussians that growth may not replace yet; 0 without a removal.
+    held: usize,
     /// The last opacity reset, until it is judged.
     reset: Option<Reset>,
     /// Whether an opacity reset of the stage was undone.
@@ -112,6 +116,10 @@ impl Guard {
             });
         }
     }
+    /// Number of removed Gaussians that growth may not replace yet: training views have not recovered from their removal.
+    pub(super) fn held(&self) -> usize {
+        self.held
+    }
     /// Views in which each Gaussian was drawn `[N]`.
     fn drawn_until_now(&self) -> Result<Vec<f32>> {
         let Some(since) = &self.drawn_since else { return Ok(self.drawn.clone()) };
@@ -131,6 +139,10 @@ impl Guard {
         if let Some(removal) = &self.removal {
             arrays.push(("removal".into(), vec![removal.iteration as f32, removal.psnr_db, f32::from(removal.reported)]));
         }
+        if self.held > 0 {
+            // Up to 16,777,216 a float32 is exact.
+            arrays.push(("held".into(), vec![self.held as f32]));
+        }
         if let Some(reset) = &self.reset {
             arrays.push(("reset".into(), vec![reset.iteration as f32, reset.psnr_db]));
             arrays.push(("logits".into(), reset.logits.clone()));
@@ -146,12 +158,14 @@ impl Guard {
     /// [`Error::Data`] for arrays of another length or name.
     pub fn restore(state: Vec<(String, Vec<f32>)>, count: usize) -> Result<Self> {
         let damaged = |problem: String| Error::data("checkpoint: guard of density control", problem, "Use another checkpoint of the run");
-        let (mut born, mut drawn, mut removal, mut numbers, mut logits, mut resets_off) = (None, None, None, None, None, None);
+        let (mut born, mut drawn, mut removal, mut held) = (None, None, None, None);
+        let (mut numbers, mut logits, mut resets_off) = (None, None, None);
         for (name, values) in state {
             let (slot, length) = match name.as_str() {
                 "born" => (&mut born, count),
                 "drawn" => (&mut drawn, count),
                 "removal" => (&mut removal, 3),
+                "held" => (&mut held, 1),
                 "reset" => (&mut numbers, 2),
                 "logits" => (&mut logits, count),
                 "resets_off" => (&mut resets_off, 1),
@@ -162,20 +176,24 @@ impl Guard {
             }
             *slot = Some(values);
         }
-        let iteration = |number: f32| number.clamp(0.0, 1e9) as usize;
+        let whole = |number: f32| number.clamp(0.0, 1e9) as usize;
         let reset = match (numbers.as_deref(), logits) {
-            (Some([at, psnr_db]), Some(logits)) => Some(Reset { iteration: iteration(*at), psnr_db: *psnr_db, logits }),
+            (Some([at, psnr_db]), Some(logits)) => Some(Reset { iteration: whole(*at), psnr_db: *psnr_db, logits }),
             (None, None) => None,
             _ => return Err(damaged("half of an opacity reset is missing".into())),
         };
         let removal = match removal.as_deref() {
-            Some([at, psnr_db, reported]) => Some(Removal { iteration: iteration(*at), psnr_db: *psnr_db, reported: *reported > 0.0 }),
+            Some([at, psnr_db, reported]) => Some(Removal { iteration: whole(*at), psnr_db: *psnr_db, reported: *reported > 0.0 }),
             _ => None,
+        };
+        let held = match held.as_deref() {
+            Some([count]) => whole(*count),
+            _ => 0,
         };
         // Older programs counted no views.
         let drawn = drawn.unwrap_or_else(|| vec![0.0; count]);
         let born = born.ok_or_else(|| damaged("'born' is missing".into()))?;
-        Ok(Self { born, drawn, drawn_since: None, removal, reset, resets_off: resets_off.is_some() })
+        Ok(Self { born, drawn, drawn_since: None, removal, held, reset, resets_off: resets_off.is_some() })
     }
     /// The Gaussians are those of `plan` now. Call [`Guard::read_views`] first.
     fn follow(&mut self, plan: &DensityPlan, iteration: usize) {
@@ -220,6 +238,12 @@ impl Guard {
             // Other causes last: smoothness that was switched on, say.
             () if schedule.iteration >= last.iteration + GIVE_UP * recovery(schedule) && psnr_db.is_finite() => Standing::Back(now),
             () => Standing::Waiting,
+        }
+    }
+    /// Growth may replace all removed Gaussians where what their removal cost is back, and losses count from this iteration.
+    fn release(&mut self, standing: &Standing, schedule: &Schedule) {
+        if matches!(standing, Standing::Back(from) if from.iteration == schedule.iteration) {
+            self.held = 0;
         }
     }
 }
@@ -333,5 +357,18 @@ mod tests {
         // What does not come back has other causes.
         assert_eq!(guard.standing(24.6, &at(2200)), Standing::Back(removal(2200, 24.6)));
         assert_eq!(guard.standing(f32::NAN, &at(2200)), Standing::Waiting);
+    }
+
+    #[test]
+    fn growth_is_held_until_what_the_removal_cost_is_back() {
+        let at = |iteration| Schedule { iteration, ..Schedule::main(30_000) };
+        let guard = Guard { removal: Some(Removal { iteration: 1000, psnr_db: 25.0, reported: true }), held: 7, ..Guard::default() };
+        for (psnr_db, iteration, held) in [(24.9, 1100, 7), (24.6, 1399, 7), (25.0, 1100, 0), (24.75, 1400, 0), (24.6, 1400, 7), (24.0, 2200, 0)] {
+            let mut guard = guard.clone();
+            let standing = guard.standing(psnr_db, &at(iteration));
+            guard.release(&standing, &at(iteration));
+            assert_eq!(guard.held(), held, "{psnr_db} dB at {iteration}");
+        }
+        assert_eq!(Guard::restore(guard.state(), 0).unwrap().held(), 7);
     }
 }
