@@ -1,5 +1,6 @@
 //! Models as archives that players without the deformer show: with a playback layer, cameras and a poster.
 
+use crate::Session;
 use crate::play::bake::{AddedMotion, Additions, BakeOptions, BakeReport, MaxError, bake, with_additions};
 use crate::play::source::{Source, SourceKind};
 use burn::tensor::Device;
@@ -28,6 +29,13 @@ pub struct Surroundings<'a> {
     pub events: &'a dyn EventSink,
     /// Ends baking with [`Error::Interrupted`](crate::Error::Interrupted) once it is set.
     pub stop: &'a AtomicBool,
+}
+
+impl<'a> Surroundings<'a> {
+    /// Those of a session.
+    pub fn of(session: &'a Session, stop: &'a AtomicBool) -> Self {
+        Self { registry: session.registry(), device: session.device(), limits: session.limits(), events: session.events(), stop }
+    }
 }
 
 /// How models are stored that are no archive yet.

@@ -42,13 +42,8 @@ fn archive(session: &Session, folder: &Path, overrides: &[&str], baked: bool) ->
     let model = session.train(&config, scene, None).unwrap();
     let (plain, out) = (folder.join("plain.cc4d"), folder.join("baked.cc4d"));
     model.save(&plain, "quantize:high").unwrap();
-    let around = Surroundings {
-        registry: session.registry(),
-        device: session.device(),
-        limits: session.limits(),
-        events: session.events(),
-        stop: &AtomicBool::new(false),
-    };
+    let stop = AtomicBool::new(false);
+    let around = Surroundings::of(session, &stop);
     let stored = Stored::open(&plain, Storage::default(), around).unwrap();
     let presentation = stored.presentation(&[], None).unwrap();
     let options = PlayableOptions { max_error: Some(MaxError::Pixels(0.1)), cameras: &[], presentation, poster: false, without_field: false, baked };

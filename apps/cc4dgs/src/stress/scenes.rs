@@ -231,7 +231,7 @@ mod tests {
             let offset: f64 = hard.level.parse().unwrap();
             let pixel = DISTANCE / hard.drawn.camera.fx;
             assert_eq!(hard.ordinary, offset * f64::from(f32::EPSILON) < 0.01 * pixel, "{}, {}", hard.condition, hard.level);
-            // The oracle draws the same scene at the origin: only centres and the camera's place differ.
+            // The oracle draws the same scene at the origin: only the positions of Gaussians and camera differ.
             let exact = hard.exact.as_ref().unwrap();
             let means = HostGaussians { means: exact.gaussians.means.clone(), ..hard.drawn.gaussians.clone() };
             assert_eq!(means, exact.gaussians);

@@ -101,13 +101,8 @@ mod tests {
     const PATIENCE: Duration = Duration::from_secs(120);
 
     fn bake(session: &Session, plain: &Path, out: &Path, without_field: bool) {
-        let around = Surroundings {
-            registry: session.registry(),
-            device: session.device(),
-            limits: session.limits(),
-            events: session.events(),
-            stop: &AtomicBool::new(false),
-        };
+        let stop = AtomicBool::new(false);
+        let around = Surroundings::of(session, &stop);
         let stored = Stored::open(plain, Storage::default(), around).unwrap();
         let presentation = stored.presentation(&[], None).unwrap();
         let options = PlayableOptions { max_error: None, cameras: &[], presentation, poster: false, without_field, baked: true };

@@ -47,8 +47,9 @@ impl Context<'_> {
         let (mut kept, mut going) = state.guard.divide(removed, logits, |row| broken[row], schedule);
         let faint = (FAINT / (1.0 - FAINT)).ln();
         let harmless = (going.len() as f64) < PROBED_SHARE * logits.len() as f64 && going.iter().all(|&row| logits[row] < faint);
-        let free = going.is_empty() || (harmless && state.guard.removal.is_none());
-        if free && state.guard.held == 0 {
+        // Nothing whose cost has to be measured.
+        let cheap = going.is_empty() || (harmless && state.guard.removal.is_none());
+        if cheap && state.guard.held == 0 {
             kept.sort_unstable();
             return Ok((kept, false));
         }
@@ -59,7 +60,7 @@ impl Context<'_> {
         state.guard.release(&standing, schedule);
         let mut measured = false;
         match standing {
-            _ if free => {}
+            _ if cheap => {}
             Standing::Back(from) if harmless => state.guard.removal = Some(from).filter(|from| from.iteration < schedule.iteration),
             Standing::Back(from) => {
                 while !going.is_empty() {

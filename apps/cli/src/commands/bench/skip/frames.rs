@@ -32,7 +32,7 @@ pub struct FrameRow {
     pub frame: Spread,
     /// Over the frame with nothing switched off.
     pub ratio: f64,
-    /// All frames played once: the median of the first frames, then all measured ones but one, whose place it takes.
+    /// All frames played once: the median of the first frames, and all measured later ones but one.
     pub total_field_ms: f64,
     pub total_frame_ms: f64,
     /// Resident memory of the process, MB (10^6 bytes): before a turn, and at most during it. Of the turn with the smallest peak, because memory that another
@@ -129,7 +129,7 @@ impl Case {
     }
 }
 
-/// Milliseconds of all frames when a first one takes the place of one of the later ones.
+/// Milliseconds of all frames played once: a first one, and all later ones but one.
 fn total(first: Spread, later: &[f64]) -> f64 {
     first.median_ms + later.iter().skip(1).sum::<f64>()
 }
