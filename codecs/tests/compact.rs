@@ -166,6 +166,34 @@ fn the_most_important_gaussians_come_first() {
     assert!(size(&streams) < one + one / 4, "{} bytes in layers, {one} without", size(&streams));
 }
 
+#[test]
+fn degrees_arrive_one_by_one() {
+    let (count, mut some, mut all) = (600, false, false);
+    let mut g = scene(count, 3);
+    // Its steps are among the smallest.
+    let size = |i: usize| g.opacity_logits[i] + g.log_scales[3 * i..3 * i + 3].iter().sum::<f32>();
+    let row = (0..count).max_by(|&a, &b| size(a).total_cmp(&size(b))).unwrap();
+    for layers in [1i64, 3] {
+        let codec = (plugin().build)("", &toml::Table::from_iter([("layers".into(), layers.into())])).unwrap();
+        for value in [0.1, 3e4, 1e6, 3e7, 1e9, 1e20] {
+            // A coefficient of degree 2: large ones are stored exactly, and even larger ones spoil the steps of all rows.
+            g.sh_rest[45 * row + 13] = value;
+            let streams = codec.encode(&g, &context(Some(5.0))).unwrap();
+            let exact = streams.iter().find(|s| s.name == "exact").unwrap().bytes.len();
+            (some, all) = (some || (60..20 * count).contains(&exact), all || exact > 60 * count);
+            let whole = codec.decode(&streams, &context(None)).unwrap();
+            for (degree, coefficients) in [(1, 9), (2, 24), (3, 45)] {
+                let arrived: Vec<Stream> = streams.iter().filter(|s| codec.stage(&s.name) <= StreamStage::Harmonics(degree)).cloned().collect();
+                let mut expected = whole.clone();
+                expected.sh_rest.chunks_exact_mut(45).for_each(|row| row[coefficients..].fill(0.0));
+                let found = codec.decode_stage(&arrived, &context(None)).unwrap();
+                assert!(found == expected, "{value} in {layers} layers: degree {degree} is not the first coefficients of the whole");
+            }
+        }
+    }
+    assert!(some && all, "exact rows of degree 2: some {some}, all {all}");
+}
+
 /// Streams of version 4, in one layer and in three, and what they decode to, written by this test where the variable is set.
 #[test]
 fn stored_streams_decode_to_the_same_bits() {

@@ -21,7 +21,29 @@ IMAGE = """async pose => { cc4dgs.seek(0.6); cc4dgs.gpu.pose = new Float64Array(
 STAGES = """() => { const { gpu } = cc4dgs, { openPart, openHarmonics } = gpu;
     window.stages = [];
     gpu.openPart = (...all) => { stages.push(all.slice(1, 4)); return openPart.apply(gpu, all); };
-    gpu.openHarmonics = download => { stages.push([255, true, true]); openHarmonics.call(gpu, download); }; }"""
+    gpu.openHarmonics = (download, degree) => { stages.push([255, true, degree]); openHarmonics.call(gpu, download, degree); }; }"""
+# Loads a model of which the Gaussians and their motion arrive first, then each degree of harmonics: with time between them, or without. Returns the degrees.
+STEPS = """async ([source, pause]) => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(source)).arrayBuffer());
+    const wasm = await import("./cc4dgs_player.js"), download = new wasm.Download("steps", bytes.length);
+    download.put(0, bytes);
+    const harmonics = JSON.parse(download.streams()).filter(s => s.kind === "harmonics");
+    download.free();
+    let sink, at = 0;
+    const body = new ReadableStream({ start: controller => { sink = controller; } });
+    const send = async (end, ms) => { sink.enqueue(bytes.slice(at, end)); at = end; if (ms) await new Promise(done => setTimeout(done, ms)); };
+    window.fetch = async () => new Response(body, { headers: { "Content-Length": String(bytes.length) } });
+    const loaded = cc4dgs.load("/steps.cc4d");
+    await send(harmonics[0].offset, 3000);
+    for (const { offset, bytes: length } of harmonics.slice(0, -1)) {
+        await send(offset + length, pause);
+        // A degree is shown with what arrives after it has waited.
+        await send(offset + length + 1, pause);
+    }
+    const last = harmonics.at(-1);
+    await send(last.offset + last.bytes, 0);
+    await loaded;
+    window.fetch = fetch;
+    return harmonics.map(s => s.stage); }"""
 
 
 def apart(a, b):
@@ -45,6 +67,7 @@ def main():
         webgl(pages, facts)
         lost(pages, page, facts)
         arriving(pages, page, facts, len(archive), args.layers)
+        degrees(pages, page)
         errors(pages, page)
         told_once(pages)
         refused(pages)
@@ -196,9 +219,11 @@ def arriving(pages, page, facts, total, least_layers):
         other.evaluate(STAGES)
         other.evaluate("cc4dgs.load('/slow-plain.cc4d').then(() => 0)")
         stages = other.evaluate("stages")
-        # Motion false and true, harmonics false and true.
+        # Gaussians in colours of degree 0, then with their motion, then higher degrees up to all (255); those that the next ones overtake are left out.
         layers = [layer for layer, motion, _ in stages if not motion]
-        assert [rest for _, *rest in stages] == [[False, False]] * len(layers) + [[True, False], [True, True]], stages
+        shown = [degree for _, motion, degree in stages if motion]
+        assert [rest for _, *rest in stages] == [[False, 0]] * len(layers) + [[True, degree] for degree in shown], stages
+        assert shown == sorted(set(shown)) and len(shown) > 1 and (shown[0], shown[-1]) == (0, 255), stages
         # The most important Gaussians before the others, where the codec has layers.
         assert layers and layers == sorted(set(layers)) and layers[-1] == 255 and len(layers) >= least_layers, stages
         if backend:
@@ -208,6 +233,22 @@ def arriving(pages, page, facts, total, least_layers):
         other.close()
     say(f"servers without ranges work; slow ones show Gaussians, motion, harmonics; {fetched} of {total} bytes were fetched")
     pages.quiet("loading")
+
+
+def degrees(pages, page):
+    """Each degree of the harmonics is shown, but not one that the next overtakes."""
+    pose = page.evaluate(POSE)
+    whole = page.evaluate(IMAGE, pose)
+    for pause in (3000, 0):
+        other = pages.open()
+        other.evaluate(STAGES)
+        arrived = other.evaluate(STEPS, [MODEL, pause])
+        stages = other.evaluate("stages")
+        assert stages == [[255, True, degree] for degree in [0, *(arrived[:-1] if pause else []), 255]], stages
+        assert other.evaluate(IMAGE, pose) == whole, "harmonics that came degree by degree give another image"
+        other.close()
+    say(f"harmonics are shown degree by degree, in {len(arrived)} steps where each takes its time")
+    pages.quiet("degrees")
 
 
 def errors(pages, page):

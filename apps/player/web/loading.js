@@ -1,9 +1,9 @@
-// Fetches a model and shows what has arrived: poster, then the Gaussians in colours of degree 0, layer by layer, then their motion, then the harmonics. Ranges where the
-// server has them, else the whole file; streams that only the desktop needs are not fetched.
+// Fetches a model and shows what has arrived: poster, then the Gaussians in colours of degree 0, layer by layer, then their motion, then the harmonics, degree by degree.
+// Ranges where the server has them, else the whole file; streams that only the desktop needs are not fetched.
 
 const FIRST = 65536;
-// All layers.
-const BASE = 255;
+// All layers, or all degrees.
+const ALL = 255;
 // Largest file in bytes: `LIMITS` of src/web/mod.rs.
 const MOST_BYTES = 2 ** 30;
 const MAGIC = [0x89, 0x43, 0x43, 0x34, 0x44, 0x0d, 0x0a, 0x1a];
@@ -60,14 +60,18 @@ class Progress {
         this.arrived = 0;
         this.header = 0;
         this.streams = null;
-        this.shown = { poster: false, layer: -1, motion: false, harmonics: false };
+        this.shown = { poster: false, layer: -1, motion: false, degree: 0 };
+        // The degree that waits to be shown, since when, and how long it took to show something last, in milliseconds.
+        this.waiting = { degree: 0, since: 0 };
+        this.took = 0;
     }
-    /// The last layer of which, and of those before, everything is there: -1 for none, BASE for all.
-    get layer() {
-        const missing = this.streams.filter(s => s.kind === "canonical" && this.arrived < s.offset + s.bytes).map(s => s.layer);
+    /// The last stage of `kind` of which, and of those before, everything is there: `none` for none, ALL for all.
+    reached(kind, none) {
+        const streams = this.streams.filter(s => s.kind === kind);
+        const missing = streams.filter(s => this.arrived < s.offset + s.bytes).map(s => s.stage);
+        if (!missing.length) return ALL;
         const first = Math.min(...missing);
-        if (!missing.length) return BASE;
-        return Math.max(-1, ...this.streams.filter(s => s.kind === "canonical" && s.layer < first).map(s => s.layer));
+        return Math.max(none, ...streams.filter(s => s.stage < first).map(s => s.stage));
     }
     end(kind) { return Math.max(0, ...this.streams.filter(s => s.kind === kind).map(s => s.offset + s.bytes)); }
     /// Bytes that a player needs; the rest of the file is not fetched.
@@ -85,22 +89,31 @@ class Progress {
         const { shown, show, download } = this, has = kind => this.arrived >= this.end(kind);
         if (!shown.poster && this.end("poster") && has("poster")) { shown.poster = true; show.poster(download.poster()); }
         show.progress(this.arrived / this.needed, this.arrived);
-        // A file that is there as a whole is decoded once.
-        const all = this.arrived >= this.needed, motion = all || (this.end("playback") > 0 && has("canonical") && has("playback")), { layer } = this;
-        if (motion && !shown.motion) {
-            show.part(download, BASE, true, has("harmonics"), shown.layer < 0);
-            [shown.layer, shown.motion, shown.harmonics] = [BASE, true, has("harmonics")];
-        } else if (layer > shown.layer) {
-            show.part(download, layer, false, layer === BASE && has("harmonics"), shown.layer < 0);
-            shown.layer = layer;
-        } else if (all && !shown.harmonics) {
-            show.harmonics(download);
-            shown.harmonics = true;
+        // All that has arrived at once is shown at once: a file that is there as a whole is decoded once.
+        const motion = has("canonical") && has("playback"), layer = this.reached("canonical", -1), degree = layer === ALL ? this.reached("harmonics", 0) : 0;
+        if (motion && !shown.motion || layer > shown.layer) {
+            this.timed(() => show.part(download, layer, motion, degree, shown.layer < 0));
+            Object.assign(shown, { layer, motion, degree });
+        } else if (degree > shown.degree && this.isDue(degree)) {
+            this.timed(() => show.harmonics(download, degree));
+            shown.degree = degree;
         }
-        return !all;
+        return this.arrived < this.needed;
+    }
+    timed(run) {
+        const began = performance.now();
+        run();
+        this.took = performance.now() - began;
+    }
+    /// Whether the harmonics up to `degree` are shown now. That decodes all that has arrived, so a degree waits for as long as showing takes, and gives way to the
+    /// next one where that is there by then.
+    isDue(degree) {
+        const now = performance.now();
+        if (degree !== this.waiting.degree) this.waiting = { degree, since: now };
+        return degree === ALL || now - this.waiting.since >= this.took;
     }
     finish() {
-        if (!this.shown.harmonics) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
+        if (!this.shown.motion || this.shown.degree < ALL) throw new Error(`only ${this.arrived} of ${this.total} bytes arrived. Load it again.`);
     }
 }
 
@@ -117,7 +130,7 @@ export function checkSize(name, bytes) {
 
 function isArchive(bytes) { return MAGIC.every((b, i) => bytes[i] === b); }
 
-/// Loads `url`; `show` has poster(bytes), part(download, layer, motion, harmonics, first), harmonics(download), whole(name, bytes), progress(share, bytes).
+/// Loads `url`; `show` has poster(bytes), part(download, layer, motion, degree, first), harmonics(download, degree), whole(name, bytes), progress(share, bytes).
 export async function loadUrl(wasm, url, show, signal) {
     const name = nameOf(url);
     const get = async headers => {

@@ -150,7 +150,7 @@ class Page {
         const show = {
             poster: bytes => { if (bytes && !this.facts) this.ui.poster(bytes); },
             part: (download, ...what) => this.loaded(JSON.parse(this.gpu.openPart(download, ...what))),
-            harmonics: download => { this.gpu.openHarmonics(download); this.gl?.loadHarmonics(this.gpu); this.draw(); },
+            harmonics: (download, degree) => { this.gpu.openHarmonics(download, degree); this.gl?.loadHarmonics(this.gpu); this.draw(); },
             whole: (name, bytes) => {
                 // A later load has the page; reading bytes is not interrupted.
                 if (signal.aborted) throw signal.reason;

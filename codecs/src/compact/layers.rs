@@ -84,11 +84,11 @@ pub fn read(meta: &mut ByteReader, count: usize) -> Result<Vec<usize>> {
     Ok(out)
 }
 
-/// When a player needs a stream: harmonics last, extra attributes after all layers, what all layers share first.
+/// When a player needs a stream: harmonics last, one degree after the other, extra attributes after all layers, what all layers share first.
 pub fn stage(name: &str) -> StreamStage {
     let number = |after: &str| after.parse::<u8>().ok();
-    if name.strip_prefix("sh.").is_some_and(|degree| degree != "0" && number(degree).is_some()) {
-        return StreamStage::Harmonics;
+    if let Some(degree) = name.strip_prefix("sh.").and_then(number).filter(|degree| *degree > 0) {
+        return StreamStage::Harmonics(degree);
     }
     if name.starts_with("extra.") || name.strip_prefix(CODED).is_some_and(|rest| rest.is_empty() || rest.starts_with('.')) {
         return StreamStage::BASE;
@@ -132,7 +132,7 @@ mod tests {
         let stages = ["meta", "exact", "means", "sh.0", "means.1", "sh.0.1", "sh.0.5", "extra.a.3", "coded", "coded.a.1", "sh.1", "sh.4"].map(stage);
         let layers = [0, 0, 0, 0, 1, 1, 5].map(StreamStage::Layer);
         assert_eq!(stages[..7], layers);
-        assert_eq!(stages[7..], [[StreamStage::BASE; 3].as_slice(), &[StreamStage::Harmonics; 2]].concat());
+        assert_eq!(stages[7..], [[StreamStage::BASE; 3].as_slice(), &[1, 4].map(StreamStage::Harmonics)].concat());
         assert!(stages.is_sorted());
     }
 }

@@ -30,7 +30,7 @@ struct Rows {
     scales: Vec<[i32; 3]>,
 }
 
-/// Decodes what [`super::write::write`] wrote: all of it, or where it is not `whole` the layers that are there, without harmonics.
+/// Decodes what [`super::write::write`] wrote: all of it, or where it is not `whole` the layers that are there, and where all are the degrees that are there.
 pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<HostGaussians> {
     let (set, mut meta, shape) = open("compact", streams, VERSION, &context.limits)?;
     let geometry = Geometry::read(&mut meta)?;
@@ -46,6 +46,8 @@ pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<H
     let layer_count = if whole { sizes.len() } else { (0..sizes.len()).take_while(complete).count().max(1) };
     let layers = layers::ranges(&sizes[..layer_count]);
     let (n, all) = (sizes[..layer_count].iter().sum::<usize>(), layer_count == sizes.len());
+    let arrived = |degree: &usize| all && set.has(&color_name(*degree));
+    let highest = if whole { shape.sh_degree } else { (1..=shape.sh_degree).take_while(arrived).count() };
     let bytes = streams.iter().map(|s| s.bytes.len() as u64).sum::<u64>();
     if n as u64 > PER_BYTE.saturating_mul(bytes) {
         return Err(meta.error(format!("{n} Gaussians in {bytes} bytes are more than there can be")));
@@ -71,9 +73,8 @@ pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<H
     let (opacities, base) = (coded(OPACITIES, Linear::contexts(1))?, coded(&color_name(0), Linear::contexts(3))?);
     let (first, higher) = degrees.split_at(1);
     let rows_of_all = 0..n;
-    let higher = if whole { higher } else { &[] };
     let coded_higher = |(plan, degree)| Ok((plan, Blocks::read(&set, &color_name(degree), colors::CONTEXTS, slice::from_ref(&rows_of_all))?));
-    let higher: Vec<(&Degree, Blocks)> = higher.iter().zip(1..).map(coded_higher).collect::<Result<_>>()?;
+    let higher: Vec<(&Degree, Blocks)> = higher[..highest].iter().zip(1..).map(coded_higher).collect::<Result<_>>()?;
     let width = 3 * sh_rest_len(shape.sh_degree);
     let (geometry, appearance) = rayon::join(
         || rayon::join(|| rows.means(&means), || rows.quaternions(&rotations)),
@@ -94,12 +95,12 @@ pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<H
     for (width, values) in columns {
         read_exact(&mut exact, (width, 0..width), shape.count, values)?;
     }
-    if whole {
-        let mut at = 0;
-        for (plan, _) in &higher {
-            read_exact(&mut exact, (width, at..at + plan.dims), n, &mut out.sh_rest)?;
-            at += plan.dims;
-        }
+    let mut at = 0;
+    for (plan, _) in &higher {
+        read_exact(&mut exact, (width, at..at + plan.dims), shape.count, &mut out.sh_rest)?;
+        at += plan.dims;
+    }
+    if highest == shape.sh_degree {
         exact.finish()?;
     }
     if whole || all && attributes::complete(&set, &shape) {

@@ -27,13 +27,15 @@ pub struct DeclaredLoss {
 pub enum StreamStage {
     /// More Gaussians, together with the streams of lower layers. Codecs without layers have layer 0 alone.
     Layer(u8),
-    /// Nothing but colour coefficients of degree 1 and up.
-    Harmonics,
+    /// Nothing but the colour coefficients of this degree, 1 and up, together with all layers and the lower degrees.
+    Harmonics(u8),
 }
 
 impl StreamStage {
     /// All layers.
     pub const BASE: Self = Self::Layer(u8::MAX);
+    /// All layers and all degrees. Codecs that store the degrees together have their streams in this stage.
+    pub const WHOLE: Self = Self::Harmonics(u8::MAX);
 }
 
 /// Gaussians to bytes and back (paper Section IV-D for `cca`).
@@ -48,8 +50,8 @@ pub trait AttributeCodec: Send + Sync {
     fn stage(&self, _name: &str) -> StreamStage {
         StreamStage::Layer(0)
     }
-    /// Decodes the streams of [`StreamStage::Layer`], of all layers or of the first ones: the first rows of [`AttributeCodec::decode`]. [`HostGaussians::sh_rest`] is all
-    /// zeros where the codec has streams of [`StreamStage::Harmonics`]. Extra attributes are there where all layers are.
+    /// Decodes the streams of all stages up to one before [`StreamStage::WHOLE`]: the first rows of [`AttributeCodec::decode`]. [`HostGaussians::sh_degree`] is
+    /// that of the whole; coefficients of degrees whose stage is still to come are 0. Extra attributes are there where all layers are.
     fn decode_stage(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
         self.decode(streams, context)
     }

@@ -137,11 +137,14 @@ pub fn canonical_stages(object: &str, archive: &Archive) -> Result<Vec<StreamSta
     Ok(archive.stream_sizes().iter().filter(|s| s.kind == StreamKind::Canonical).map(|s| codec.stage(&s.name)).collect())
 }
 
-/// The Gaussians of the layers up to `stage`: those of [`read_gaussians`] or the first of them, as [`AttributeCodec::decode_stage`] gives them.
+/// The Gaussians up to `stage`: those of [`read_gaussians`], or as much of them as [`AttributeCodec::decode_stage`] gives.
 ///
 /// # Errors
 /// As [`read_gaussians`].
 pub fn read_stage(object: &str, archive: &Archive, stage: StreamStage, limits: &Limits, events: &dyn EventSink) -> Result<HostGaussians> {
+    if stage == StreamStage::WHOLE {
+        return read_gaussians(object, archive, limits, events);
+    }
     let (codec, context) = codec_of(object, archive, limits, events)?;
     let streams = archive.read_those(|info| info.kind == StreamKind::Canonical && codec.stage(&info.name) <= stage)?;
     checked(object, archive, limits, codec.decode_stage(&streams, &context)?, stage >= StreamStage::BASE)

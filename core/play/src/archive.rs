@@ -172,7 +172,7 @@ impl Model {
         // Streams in the order in which a player needs them.
         let assembled = |mut streams: Vec<Stream>, found: &Option<EncodedWeights>| {
             streams.sort_by_key(|s| codec.stage(&s.name));
-            let harmonics = streams.split_off(streams.partition_point(|s| codec.stage(&s.name) < StreamStage::Harmonics));
+            let harmonics = streams.split_off(streams.partition_point(|s| codec.stage(&s.name) <= StreamStage::BASE));
             let field_streams = found.iter().flat_map(|(streams, _)| streams.iter().map(StoredField::stream));
             let first = writer(found).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, field_streams.collect::<Vec<_>>());
             first.add_all(StreamKind::Canonical, harmonics)

@@ -4,7 +4,7 @@ use super::error;
 use crate::{Content, memory};
 use cc4dgs_format::archive::{Archive, StreamKind};
 use cc4dgs_format::playback::PlaybackLayer;
-use cc4dgs_format::{Error, HostGaussians, Limits, Moving, Result, Silent, StoredModel, StreamStage, canonical_stages, read_gaussians, read_stage};
+use cc4dgs_format::{Error, HostGaussians, Limits, Moving, Result, Silent, StoredModel, StreamStage, canonical_stages, read_stage};
 use wasm_bindgen::prelude::*;
 
 /// Bytes of an archive, some of which are still missing. The page fetches ranges, in the order that [`Download::streams`] suggests.
@@ -47,7 +47,8 @@ impl Download {
         let prefix = &self.bytes[..self.bytes.len().min(Archive::PREFIX_BYTES)];
         Ok(Archive::header_end(&self.name, prefix, &super::LIMITS).map_err(error)? as f64)
     }
-    /// The streams as JSON: name, kind, layer, first byte and bytes of each. The header must have arrived. Models that take too much memory are refused.
+    /// The streams as JSON: name, kind, stage (layer of Gaussians, degree of harmonics), first byte and bytes of each. The header must have arrived. Models
+    /// that take too much memory are refused.
     pub fn streams(&mut self) -> std::result::Result<String, JsError> {
         crate::link();
         let name = self.name.clone();
@@ -57,9 +58,9 @@ impl Download {
         let streams = archive.stream_sizes();
         let mut stages = canonical_stages(&name, archive).map_err(error)?.into_iter();
         let mut kind = |kind| match kind {
-            StreamKind::Canonical => match stages.next() {
-                Some(StreamStage::Layer(layer)) => ("canonical", layer),
-                _ => ("harmonics", 0),
+            StreamKind::Canonical => match stages.next().unwrap_or(StreamStage::WHOLE) {
+                StreamStage::Layer(layer) => ("canonical", layer),
+                StreamStage::Harmonics(degree) => ("harmonics", degree),
             },
             StreamKind::Playback => ("playback", 0),
             // The page needs the weights where it computes the motion from them.
@@ -69,8 +70,8 @@ impl Download {
         };
         let mut list = Vec::with_capacity(streams.len());
         for stream in &streams {
-            let (kind, layer) = kind(stream.kind);
-            list.push(serde_json::json!({ "name": stream.name, "kind": kind, "layer": layer, "offset": stream.offset, "bytes": stream.stored_bytes }));
+            let (kind, stage) = kind(stream.kind);
+            list.push(serde_json::json!({ "name": stream.name, "kind": kind, "stage": stage, "offset": stream.offset, "bytes": stream.stored_bytes }));
         }
         Ok(serde_json::Value::from(list).to_string())
     }
@@ -91,8 +92,7 @@ impl Download {
     pub(super) fn gaussians(&mut self, stage: StreamStage, limits: &Limits) -> Result<HostGaussians> {
         crate::link();
         let name = self.name.clone();
-        let archive = self.opened()?;
-        if stage == StreamStage::Harmonics { read_gaussians(&name, archive, limits, &Silent) } else { read_stage(&name, archive, stage, limits, &Silent) }
+        read_stage(&name, self.opened()?, stage, limits, &Silent)
     }
     /// What the archive holds up to `stage`, with motion or still without.
     pub(super) fn content(&mut self, stage: StreamStage, motion: bool, limits: &Limits) -> Result<Content> {

@@ -97,17 +97,18 @@ impl Player {
         let content = Content::read(name, bytes, &LIMITS).map_err(error)?;
         self.show(content, true)
     }
-    /// Shows what has arrived of `download`: the Gaussians up to `layer` (255: all), and where these are there their motion and harmonics. Returns facts as JSON.
+    /// Shows what has arrived of `download`: the Gaussians up to `layer` (255: all), and where these are there their motion, and their harmonics up to `degree`
+    /// (0: none, 255: all). Returns facts as JSON.
     #[wasm_bindgen(js_name = openPart)]
-    pub fn open_part(&mut self, download: &mut Download, layer: u8, motion: bool, harmonics: bool, first: bool) -> Result<String, JsError> {
-        let stage = if harmonics { StreamStage::Harmonics } else { StreamStage::Layer(layer) };
+    pub fn open_part(&mut self, download: &mut Download, layer: u8, motion: bool, degree: u8, first: bool) -> Result<String, JsError> {
+        let stage = if degree > 0 { StreamStage::Harmonics(degree) } else { StreamStage::Layer(layer) };
         let content = download.content(stage, motion, &LIMITS).map_err(error)?;
         self.show(content, first)
     }
-    /// Adds the harmonics of `download` to what `openPart` shows.
+    /// Adds the harmonics of `download` up to `degree` (255: all) to what `openPart` shows.
     #[wasm_bindgen(js_name = openHarmonics)]
-    pub fn open_harmonics(&mut self, download: &mut Download) -> Result<(), JsError> {
-        let gaussians = download.gaussians(StreamStage::Harmonics, &LIMITS).map_err(error)?;
+    pub fn open_harmonics(&mut self, download: &mut Download, degree: u8) -> Result<(), JsError> {
+        let gaussians = download.gaussians(StreamStage::Harmonics(degree), &LIMITS).map_err(error)?;
         match &mut self.output {
             Output::WebGpu { renderer, .. } => renderer.load_harmonics(&gaussians).map_err(error)?,
             Output::Plain { scene: Some(scene), .. } => scene.harmonics = scene.harmonics_of(&gaussians).map_err(error)?,

@@ -17,7 +17,7 @@ const DAMAGES: usize = 24;
 /// - The error of each column is at most the declared one.
 /// - Equal inputs give equal bytes.
 /// - Sets of no Gaussians and of one Gaussian can be stored; Gaussians that are not finite are refused.
-/// - The streams of the first layers hold the first rows of the whole, without harmonics where these have streams of their own.
+/// - The streams of the first stages hold the first rows of the whole; coefficients of degrees that have streams of their own are 0 until their stage.
 /// - Truncated, damaged and missing streams give an error or valid Gaussians within the limits, never a panic.
 ///
 /// `profile` is the part after the colon of `name:profile`; `settings` can make an expensive codec fast.
@@ -176,20 +176,26 @@ fn arrives_in_stages(codec: &dyn AttributeCodec, given: &HostGaussians) -> Resul
     let mut stages: Vec<StreamStage> = streams.iter().map(|s| codec.stage(&s.name)).collect();
     stages.sort_unstable();
     stages.dedup();
-    let (apart, layers) = (stages.contains(&StreamStage::Harmonics), stages.iter().filter(|s| **s < StreamStage::Harmonics));
-    let (mut before, last) = (0, layers.clone().max().copied());
-    for &stage in layers {
+    let apart = stages.iter().any(|s| *s > StreamStage::BASE);
+    let (mut before, last) = (0, stages.iter().copied().filter(|s| *s <= StreamStage::BASE).max());
+    for stage in stages.into_iter().filter(|s| *s < StreamStage::WHOLE) {
         let arrived: Vec<Stream> = streams.iter().filter(|s| codec.stage(&s.name) <= stage).cloned().collect();
         let found = codec.decode_stage(&arrived, &context())?;
-        let (rows, complete) = (found.len(), Some(stage) == last);
+        let (rows, complete) = (found.len(), Some(stage) >= last);
         if rows < before || rows > whole.len() || complete && rows < whole.len() || found.sh_degree != whole.sh_degree {
             return Ok(Some(format!("{stage:?} has {rows} of {} Gaussians; the one before had {before}", whole.len())));
         }
+        let degree = match stage {
+            StreamStage::Layer(_) if apart => 0,
+            StreamStage::Layer(_) => whole.sh_degree,
+            StreamStage::Harmonics(degree) => usize::from(degree).min(whole.sh_degree),
+        };
+        let there = 3 * sh_rest_len(degree);
         for ((name, width, part), (_, _, all)) in found.columns().into_iter().zip(whole.columns()) {
-            let zero = apart && name == "sh_rest";
-            let same = |(a, b): (&f32, &f32)| if zero { *a == 0.0 } else { a.to_bits() == b.to_bits() };
-            if part.len() != rows * width || !part.iter().zip(all).all(same) {
-                return Ok(Some(format!("{name} of {stage:?} is not that of the first rows of the whole, or not zero where harmonics are apart")));
+            let missing = |at: usize| name == "sh_rest" && at % width >= there;
+            let same = |(at, (a, b)): (usize, (&f32, &f32))| if missing(at) { *a == 0.0 } else { a.to_bits() == b.to_bits() };
+            if part.len() != rows * width || !part.iter().zip(all).enumerate().all(same) {
+                return Ok(Some(format!("{name} of {stage:?} is not that of the first rows of the whole, or not zero above the degree of the stage")));
             }
         }
         if complete && found.extra != whole.extra {

@@ -17,7 +17,7 @@ pub const HARMONICS: &str = "sh_rest";
 /// [`crate::AttributeCodec::stage`] of codecs that store this column in a stream of its name, and in others whose names begin with it and a dot.
 pub fn stage_of_column(name: &str) -> StreamStage {
     let harmonics = name.strip_prefix(HARMONICS).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
-    if harmonics { StreamStage::Harmonics } else { StreamStage::Layer(0) }
+    if harmonics { StreamStage::WHOLE } else { StreamStage::Layer(0) }
 }
 
 /// The streams of a decoder, by name.

@@ -60,7 +60,7 @@ pub fn with_additions(archive: &Archive, additions: Additions) -> Result<Vec<u8>
     let mut canonical: Vec<(StreamStage, Stream)> =
         canonical_stages("the archive", archive)?.into_iter().zip(archive.read_kind(StreamKind::Canonical)?).collect();
     canonical.sort_by_key(|(stage, _)| *stage);
-    let harmonics = canonical.split_off(canonical.partition_point(|(stage, _)| *stage < StreamStage::Harmonics));
+    let harmonics = canonical.split_off(canonical.partition_point(|(stage, _)| *stage <= StreamStage::BASE));
     let streams = |staged: Vec<(StreamStage, Stream)>| staged.into_iter().map(|(_, stream)| stream);
     let (motion, unused) = if layer.is_empty() { (field, Vec::new()) } else { (Vec::new(), field) };
     writer = writer.add_all(StreamKind::Canonical, streams(canonical)).add_all(StreamKind::Playback, layer).add_all(StreamKind::Field, motion);
