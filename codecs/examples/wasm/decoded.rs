@@ -1,26 +1,29 @@
 //! What an archive decodes to, as a checksum that must be the same on every machine.
 
-use cc4dgs_format::archive::{Archive, StreamKind};
-use cc4dgs_format::{CodecContext, CodecPlugin, Entries, Limits, Result, Seed, Silent, WeightCodecPlugin};
+use cc4dgs_format::archive::Archive;
+use cc4dgs_format::{HostGaussians, Limits, Result, Silent, canonical_stages, read_gaussians, read_stage, read_weights};
 use xxhash_rust::xxh3::Xxh3;
 
-/// XXH3-64 over the bits of all Gaussians and weights of an archive.
+/// XXH3-64 over the bits of all Gaussians of an archive, of what a player draws at each stage of their arrival, and of all weights.
 pub fn checksum(bytes: Vec<u8>) -> Result<u64> {
     cc4dgs_codecs::link();
-    let limits = Limits::default();
-    let archive = Archive::from_bytes("archive", bytes, &limits)?;
-    let manifest = archive.manifest().clone();
-    let context = CodecContext::new(Seed::root(manifest.provenance.seed), limits, &Silent);
+    let (object, limits) = ("archive", Limits::default());
+    let archive = Archive::from_bytes(object, bytes, &limits)?;
     let mut hash = Xxh3::new();
     let mut add = |values: &[f32]| values.iter().for_each(|v| hash.update(&v.to_bits().to_le_bytes()));
-
-    let codec = (Entries::<CodecPlugin>::collect()?.get(&manifest.codec.name)?.build)(&manifest.codec.profile, &manifest.codec.settings)?;
-    let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
-    gaussians.columns().iter().for_each(|(_, _, values)| add(values));
-    gaussians.extra.values().for_each(|attribute| add(&attribute.values));
-    if let Some(deformer) = manifest.deformer {
-        let codec = (Entries::<WeightCodecPlugin>::collect()?.get(&deformer.weights.name)?.build)(&deformer.weights.settings)?;
-        codec.decode(&archive.read_kind(StreamKind::Field)?, &context)?.iter().for_each(|array| add(&array.values));
+    let mut add_all = |gaussians: &HostGaussians| {
+        gaussians.columns().iter().for_each(|(_, _, values)| add(values));
+        gaussians.extra.values().for_each(|attribute| add(&attribute.values));
+    };
+    add_all(&read_gaussians(object, &archive, &limits, &Silent)?);
+    let mut stages = canonical_stages(object, &archive)?;
+    stages.sort_unstable();
+    stages.dedup();
+    for stage in stages {
+        add_all(&read_stage(object, &archive, stage, &limits, &Silent)?);
+    }
+    if let Some(deformer) = &archive.manifest().deformer {
+        read_weights(object, &archive, &deformer.weights, &limits, &Silent)?.iter().for_each(|array| add(&array.values));
     }
     Ok(hash.digest())
 }

@@ -1,0 +1,92 @@
+#!/usr/bin/env python3
+"""Bytes, seconds and memory of every codec on a PLY file, repeated to a larger model. Each codec is encoded and decoded alone, each in a process of its own.
+
+    benches/codec_speed.py OUT.json --ply FILE.ply [--copies 11] [--example target/release/examples/codec_speed] [--codecs raw,quantize,...] [--threads N]
+                           [--limit SECONDS] [--limits sorted-image=SECONDS,vq=SECONDS]
+
+Needs the built example: cargo build --release -p cc4dgs-codecs --example codec_speed. There is no scene, so that `compact` aims at 50 dB. Seconds are of encoding
+without Zstandard, median and least of --encodes (fewer where a minute is over before), and of decoding, of --decodes. Memory is the most that a process had, in
+MB, the program and what it had read included: before and after encoding, and where it decodes once and has done nothing else. A codec that takes longer than its
+limit has a row that says so. Run it while nothing else does. Writes OUT.json and prints a table.
+"""
+import argparse, json, os, pathlib, subprocess, sys, tempfile
+
+CODECS = "raw,quantize,sorted-image,spz,vq,cca:low,cca:mid,cca:default,compact"
+
+
+def run(args, limit, folder, *arguments):
+    """The document that the example writes; `None` if it takes more than `limit` seconds."""
+    out = folder / "out.json"
+    environment = os.environ | {"ENCODES": str(args.encodes), "DECODES": str(args.decodes), "ARCHIVES": str(folder)}
+    if args.threads:
+        environment["RAYON_NUM_THREADS"] = str(args.threads)
+    environment.pop("DECODED", None)
+    try:
+        ran = subprocess.run([args.example, *map(str, arguments), "--json", out], env=environment, timeout=limit, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    except subprocess.TimeoutExpired:
+        return None
+    if ran.returncode:
+        sys.exit(f"{' '.join(map(str, arguments))}: {ran.stderr.strip()}")
+    return json.loads(out.read_text())
+
+
+def measure(args, codec, limit):
+    """The row of a codec, and what is said of the machine."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name)
+        encoded = run(args, limit, folder, args.ply, args.copies, codec)
+        if encoded is None:
+            return {"codec": codec, "over_the_limit_s": limit}, {}
+        row = encoded.pop("rows")[0]
+        decoded = run(args, limit, folder, next(folder.glob("*.cc4d")), codec)
+        alone = decoded["rows"][0] if decoded else {"over_the_limit_s": limit}
+        assert alone.get("gaussians", row["gaussians"]) == row["gaussians"], codec
+        # Read from the file, and decoded for the first time.
+        names = {"decode_s": "decode_alone_s", "peak_mb": "decode_alone_peak_mb", "over_the_limit_s": "over_the_limit_s"}
+        return row | {new: alone[old] for old, new in names.items() if old in alone}, encoded
+
+
+def table(rows):
+    yield "| codec | bytes per Gaussian | MB | decoded MB | encode s, median (least) | decode s, median (least) | of processor s | peak MB: loaded | encoding | decoding alone |"
+    yield "| --- |" + " ---: |" * 9
+    for r in rows:
+        if "bytes" not in r:
+            yield f"| `{r['codec']}` | over the limit of {r['over_the_limit_s']:g} s |" + " |" * 8
+            continue
+        mb = [f"{r[key] / 1e6:.3f}" for key in ("bytes", "decoded_bytes")]
+        peaks = [str(r.get(key, "over the limit")) for key in ("loaded_peak_mb", "encode_peak_mb", "decode_alone_peak_mb")]
+        encode = f"{r['encode_median_s']:.2f} ({r['encode_least_s']:.2f})"
+        decode = f"{r['decode_median_s']:.3f} ({r['decode_least_s']:.3f})"
+        yield f"| `{r['codec']}` | {r['bytes_per_gaussian']:.2f} | {' | '.join(mb)} | {encode} | {decode} | {r['decode_cpu_least_s']:.3f} | {' | '.join(peaks)} |"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=pathlib.Path, metavar="OUT.json")
+    parser.add_argument("--ply", type=pathlib.Path, required=True)
+    parser.add_argument("--copies", type=int, default=11)
+    parser.add_argument("--example", type=pathlib.Path, default=pathlib.Path("target/release/examples/codec_speed"))
+    parser.add_argument("--codecs", default=CODECS)
+    parser.add_argument("--encodes", type=int, default=3)
+    parser.add_argument("--decodes", type=int, default=9)
+    parser.add_argument("--threads", type=int, help="threads of the example; all processors by default")
+    parser.add_argument("--limit", type=float, default=600, help="seconds that a process may take")
+    parser.add_argument("--limits", default="", help="the same for some codecs: sorted-image=1800,vq=1800")
+    args = parser.parse_args()
+    if not args.example.exists():
+        parser.error(f"{args.example} is not there; build it, or name it with --example")
+    args.example = args.example.resolve()
+    limits = {codec: float(seconds) for codec, seconds in (pair.rsplit("=", 1) for pair in args.limits.split(",") if pair)}
+    commit = subprocess.run(["git", "-C", str(pathlib.Path(__file__).parent), "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip()
+    found = {"ply": args.ply.name, "copies": args.copies, "commit": commit, "rows": []}
+    for codec in args.codecs.split(","):
+        row, machine = measure(args, codec, limits.get(codec, args.limit))
+        found = {**machine, **found, "rows": [*found["rows"], row]}
+        # Whoever stops it keeps what is finished.
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+        print(json.dumps(row), file=sys.stderr)
+    print("\n".join(table(found["rows"])))
+
+
+if __name__ == "__main__":
+    main()
