@@ -31,6 +31,7 @@ def turn(axis, angle):
 CHANGES = {
     "same": (1.0, IDENTITY, [0.0, 0.0, 0.0]),
     "moved-1e3": (1.0, IDENTITY, [1e3, -1e3, 1e3]),
+    "moved-1e4": (1.0, IDENTITY, [1e4, -1e4, 1e4]),
     "moved-1e5": (1.0, IDENTITY, [1e5, -1e5, 1e5]),
     "scaled-1e-4": (1e-4, IDENTITY, [0.0, 0.0, 0.0]),
     "scaled-1e-3": (1e-3, IDENTITY, [0.0, 0.0, 0.0]),
