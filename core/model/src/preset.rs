@@ -39,6 +39,16 @@ impl Registry {
     /// # Errors
     /// [`Error::Parameter`] for an unknown family or method, for a method instead of a family, and for a layer that is not TOML.
     pub fn preset(&self, name: &str) -> Result<toml::Table> {
+        self.resolve(name, None)
+    }
+    /// As [`Registry::preset`], with the sizes that the method has for `dataset` on a graphics card in place of those that it has for the family.
+    ///
+    /// # Errors
+    /// As [`Registry::preset`].
+    pub fn preset_at_full_size(&self, name: &str, dataset: &str) -> Result<toml::Table> {
+        self.resolve(name, Some(dataset))
+    }
+    fn resolve(&self, name: &str, full_size: Option<&str>) -> Result<toml::Table> {
         let (family, method) = name.split_once('+').map_or((name, None), |(family, method)| (family, Some(method)));
         let plugin = self.presets().find(|p| p.info.name == family && p.role != PresetRole::Method);
         let Some((plugin, PresetRole::Family { dataset, small })) = plugin.map(|p| (p, p.role)) else {
@@ -51,6 +61,7 @@ impl Registry {
             }
             return Err(unknown_name("preset", family, self.preset_names(|role| role != PresetRole::Method)));
         };
+        let (dataset, small) = full_size.map_or((dataset, small), |dataset| (dataset, false));
         let mut settings = plugin.layer()?;
         if let Some(method) = method {
             let Some(plugin) = self.presets().find(|p| p.info.name == method && p.role == PresetRole::Method) else {

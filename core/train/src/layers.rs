@@ -8,7 +8,11 @@ use std::path::Path;
 /// What a user said of a run, as one table; what was not said is absent.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Layers {
+    /// All layers.
     table: toml::Table,
+    /// The file over the preset, and the overrides over both.
+    file: toml::Table,
+    sets: Vec<String>,
 }
 
 impl Layers {
@@ -25,14 +29,26 @@ impl Layers {
             None => toml::Table::new(),
         };
         let named = from_file.get("preset").and_then(|p| p.as_str()).filter(|p| !p.is_empty()).map(str::to_string);
-        let mut table = match preset.filter(|p| !p.is_empty()).map(str::to_string).or(named) {
+        let preset = match preset.filter(|p| !p.is_empty()).map(str::to_string).or(named) {
             Some(name) => registry.preset(&name)?,
             None => toml::Table::new(),
         };
-        config::merge(&mut table, &from_file);
-        config::set_all(&mut table, sets)?;
+        Self::of(preset, from_file, sets.to_vec())
+    }
+    fn of(preset: toml::Table, file: toml::Table, sets: Vec<String>) -> Result<Self> {
+        let mut table = preset;
+        config::merge(&mut table, &file);
+        config::set_all(&mut table, &sets)?;
         refuse_renamed(&table)?;
-        Ok(Self { table })
+        Ok(Self { table, file, sets })
+    }
+    /// These layers where a graphics card computes: with the sizes that the preset's method, if any, has for `dataset`. Stated settings stay.
+    ///
+    /// # Errors
+    /// As [`Layers::collect`].
+    pub fn at_full_size(&self, registry: &Registry, dataset: &str) -> Result<Self> {
+        let name = self.table.get("preset").and_then(|p| p.as_str()).unwrap_or_default();
+        Self::of(registry.preset_at_full_size(name, dataset)?, self.file.clone(), self.sets.clone())
     }
     /// The configuration they make, read strictly; what they do not say has its default.
     ///
@@ -53,7 +69,7 @@ impl Layers {
     pub fn over(&self, base: &toml::Table) -> Self {
         let mut table = base.clone();
         config::merge(&mut table, &self.table);
-        Self { table }
+        Self { table, ..self.clone() }
     }
     /// What was said, as one table.
     pub fn table(&self) -> &toml::Table {
@@ -118,5 +134,19 @@ mod tests {
         let base = "[train]\niterations = 3\nbatch = 4".parse().unwrap();
         let config = done.over(&base).config().unwrap();
         assert_eq!((config.train.iterations, config.train.batch), (7, 4));
+    }
+
+    #[test]
+    fn methods_have_their_full_size_on_graphics_cards() {
+        let registry = Registry::collect().unwrap();
+        let layers = Layers::collect(&registry, Some("auto+hexplane"), None, &["deformer.features=7".into()]).unwrap();
+        let integer = |layers: &Layers, key: &str| layers.table()["deformer"].get(key).and_then(toml::Value::as_integer);
+        let full = layers.at_full_size(&registry, "dnerf").unwrap();
+        assert_eq!((integer(&layers, "resolution"), integer(&full, "resolution")), (Some(32), None));
+        assert_eq!((integer(&layers, "time_resolution"), integer(&full, "time_resolution")), (Some(30), Some(75)));
+        assert_eq!((integer(&layers, "features"), integer(&full, "features")), (Some(7), Some(7)));
+        assert!(full.want_plan());
+        let alone = Layers::collect(&registry, Some("auto"), None, &[]).unwrap();
+        assert_eq!(alone.at_full_size(&registry, "n3dv").unwrap(), alone);
     }
 }

@@ -257,6 +257,11 @@ fn all_move(facts: &Facts) -> bool {
     !facts.arrangement.has_several_cameras() && !stands_still(facts) && (stands_alone(facts) || facts.arrangement == Arrangement::OneCameraAnywhere)
 }
 
+/// The published dataset that the scene is most like, whose sizes a method has on a graphics card.
+pub(super) fn dataset_like(facts: &Facts) -> &'static str {
+    if all_move(facts) { "dnerf" } else { "n3dv" }
+}
+
 /// The upper bound of Gaussians.
 fn most_gaussians(facts: &Facts, machine: Machine, minutes: f64) -> f64 {
     // Cameras around a scene, and one that walks through it, see different parts of it.

@@ -150,6 +150,8 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
         plan.add(choice)?;
         scene = read(&layers.over(&plan.table).config()?)?;
     }
+    let full_size = if graphics { Some(layers.at_full_size(registry, choose::dataset_like(&facts))?) } else { None };
+    let layers = full_size.as_ref().unwrap_or(layers);
     let kind = asked.deformer.get("kind").and_then(|k| k.as_str());
     let free = !layers.state("deformer.kind") || kind == Some("free-time");
     for choice in choose::choose(&facts, machine, minutes, free) {
