@@ -17,30 +17,42 @@ POSE = "Array.from(cc4dgs.gpu.pose)"
 # A number for the image from a pose at 0.6.
 IMAGE = """async pose => { cc4dgs.seek(0.6); cc4dgs.gpu.pose = new Float64Array(pose);
     const { data } = await cc4dgs.capture(); return data.reduce((sum, v) => (31 * sum + v) >>> 0, 0); }"""
-# Notes what is shown of a model that arrives.
-STAGES = """() => { const { gpu } = cc4dgs, { openPart, openHarmonics } = gpu;
+# Notes what is shown of a model that arrives, and lets the first take at least so many milliseconds.
+STAGES = """least => { const { gpu } = cc4dgs, { openPart, openHarmonics } = gpu;
     window.stages = [];
-    gpu.openPart = (...all) => { stages.push(all.slice(1, 4)); return openPart.apply(gpu, all); };
+    gpu.openPart = (...all) => {
+        stages.push(all.slice(1, 4));
+        for (const end = performance.now() + least; performance.now() < end;);
+        return openPart.apply(gpu, all);
+    };
     gpu.openHarmonics = (download, degree) => { stages.push([255, true, degree]); openHarmonics.call(gpu, download, degree); }; }"""
-# Loads a model of which the Gaussians and their motion arrive first, then each degree of harmonics: with time between them, or without. Returns the degrees.
-STEPS = """async ([source, pause]) => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(source)).arrayBuffer());
+# Loads a model of which the Gaussians and their motion arrive first, then each degree of harmonics: `patient`ly after the one before is shown, or at once. Returns
+# the degrees.
+STEPS = """async ([source, patient]) => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(source)).arrayBuffer());
     const wasm = await import("./cc4dgs_player.js"), download = new wasm.Download("steps", bytes.length);
     download.put(0, bytes);
     const harmonics = JSON.parse(download.streams()).filter(s => s.kind === "harmonics");
     download.free();
     let sink, at = 0;
     const body = new ReadableStream({ start: controller => { sink = controller; } });
-    const send = async (end, ms) => { sink.enqueue(bytes.slice(at, end)); at = end; if (ms) await new Promise(done => setTimeout(done, ms)); };
+    const sent = end => { sink.enqueue(bytes.slice(at, end)); at = end; };
+    // A degree is shown with what arrives after it has waited.
+    const shown = async (count, byte) => {
+        while (patient && stages.length < count) {
+            await new Promise(done => setTimeout(done, 50));
+            if (byte && at < harmonics.at(-1).offset + harmonics.at(-1).bytes - 1) sent(at + 1);
+        }
+    };
     window.fetch = async () => new Response(body, { headers: { "Content-Length": String(bytes.length) } });
     const loaded = cc4dgs.load("/steps.cc4d");
-    await send(harmonics[0].offset, 3000);
-    for (const { offset, bytes: length } of harmonics.slice(0, -1)) {
-        await send(offset + length, pause);
-        // A degree is shown with what arrives after it has waited.
-        await send(offset + length + 1, pause);
+    sent(harmonics[0].offset);
+    await shown(1, false);
+    for (const [k, { offset, bytes: length }] of harmonics.slice(0, -1).entries()) {
+        sent(Math.max(at, offset + length));
+        await shown(2 + k, true);
     }
     const last = harmonics.at(-1);
-    await send(last.offset + last.bytes, 0);
+    sent(last.offset + last.bytes);
     await loaded;
     window.fetch = fetch;
     return harmonics.map(s => s.stage); }"""
@@ -216,14 +228,14 @@ def arriving(pages, page, facts, total, least_layers):
     pages.complaints[:] = [c for c in pages.complaints if "net::ERR_" not in c]
     for backend in ("", "?backend=webgl"):
         other = pages.open(backend)
-        other.evaluate(STAGES)
+        other.evaluate(STAGES, 0)
         other.evaluate("cc4dgs.load('/slow-plain.cc4d').then(() => 0)")
         stages = other.evaluate("stages")
         # Gaussians in colours of degree 0, then with their motion, then higher degrees up to all (255); those that the next ones overtake are left out.
         layers = [layer for layer, motion, _ in stages if not motion]
         shown = [degree for _, motion, degree in stages if motion]
         assert [rest for _, *rest in stages] == [[False, 0]] * len(layers) + [[True, degree] for degree in shown], stages
-        assert shown == sorted(set(shown)) and len(shown) > 1 and (shown[0], shown[-1]) == (0, 255), stages
+        assert shown == sorted(set(shown)) and len(shown) > 1 and shown[-1] == 255, stages
         # The most important Gaussians before the others, where the codec has layers.
         assert layers and layers == sorted(set(layers)) and layers[-1] == 255 and len(layers) >= least_layers, stages
         if backend:
@@ -239,12 +251,13 @@ def degrees(pages, page):
     """Each degree of the harmonics is shown, but not one that the next overtakes."""
     pose = page.evaluate(POSE)
     whole = page.evaluate(IMAGE, pose)
-    for pause in (3000, 0):
+    for patient in (True, False):
         other = pages.open()
-        other.evaluate(STAGES)
-        arrived = other.evaluate(STEPS, [MODEL, pause])
+        other.evaluate(STAGES, 0 if patient else 1000)
+        arrived = other.evaluate(STEPS, [MODEL, patient])
         stages = other.evaluate("stages")
-        assert stages == [[255, True, degree] for degree in [0, *(arrived[:-1] if pause else []), 255]], stages
+        assert len(arrived) > 1, f"harmonics arrive in one piece: {arrived}"
+        assert stages == [[255, True, degree] for degree in [0, *(arrived[:-1] if patient else []), 255]], stages
         assert other.evaluate(IMAGE, pose) == whole, "harmonics that came degree by degree give another image"
         other.close()
     say(f"harmonics are shown degree by degree, in {len(arrived)} steps where each takes its time")

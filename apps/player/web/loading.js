@@ -61,7 +61,7 @@ class Progress {
         this.header = 0;
         this.streams = null;
         this.shown = { poster: false, layer: -1, motion: false, degree: 0 };
-        // The degree that waits to be shown, since when, and how long it took to show something last, in milliseconds.
+        // The degree that waits to be shown, since when, and how long showing took at most, in milliseconds.
         this.waiting = { degree: 0, since: 0 };
         this.took = 0;
     }
@@ -103,7 +103,7 @@ class Progress {
     timed(run) {
         const began = performance.now();
         run();
-        this.took = performance.now() - began;
+        this.took = Math.max(this.took, performance.now() - began);
     }
     /// Whether the harmonics up to `degree` are shown now. That decodes all that has arrived, so a degree waits for as long as showing takes, and gives way to the
     /// next one where that is there by then.
