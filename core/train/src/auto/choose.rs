@@ -184,6 +184,10 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
         _ => (4, 1.0),
     };
     let mut settings = vec![("deformer.kind", "cdf-basis".into()), ("deformer.time_bands", Value::Integer(bands)), ("deformer.cycles", Value::Float(cycles))];
+    // The penalty that takes unneeded functions out also makes needed ones smaller: without it 0.3 dB more on mutant, 1.1 and 4.1 on its first frame.
+    if facts.arrangement == Arrangement::OneCameraAnywhere {
+        settings.push(("deformer.sparsity", Value::Float(0.0)));
+    }
     if !machine.graphics {
         settings.push(("deformer.capacity", "small".into()));
         let short = is_short(machine, minutes);
