@@ -1,6 +1,7 @@
 //! Deformers, the optimizer, weight codecs and loss terms.
 
-use super::exact::Exact;
+use super::exact::losses::LossValues;
+use super::exact::{Exact, losses};
 use super::{Compared, FLOAT64, StressCase, StressJob, case};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::format::conformance::uniform;
@@ -34,11 +35,12 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     Ok(())
 }
 
-/// Times at the ends and beyond, and centres on the faces of voxels, in the corners of the box, and outside.
+/// Times at the ends and beyond, and centres in the box, on the faces of voxels, in the corners of the box, and outside.
 fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
     let part = format!("deformer {name}");
-    let places: [Place; 4] = [
+    let places: [Place; 5] = [
+        ("centres in the box", true, |i| [0, 1, 2].map(|k| 0.9 * uniform(Seed::root(3).index(i as u64), k))),
         // Multiples of 1/64 lie on the faces of grids of any power of two.
         ("centres on the faces of voxels", true, |i| [i % 9, i / 9 % 9, i / 81].map(|k| k as f32 / 4.0 - 1.0)),
         ("centres at the box", true, |i| [i & 1, i >> 1 & 1, i >> 2 & 1].map(|k| if k == 0 { -1.0 } else { 1.0 })),
@@ -65,19 +67,23 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Re
                 let offsets = deformer.deform(deformer.spatial(&input)?.values, time)?;
                 offsets.concatenated().map_or(Ok(Vec::new()), |all| to_vec(all, "offsets"))
             };
-            let both = || {
-                let found = values(job.device)?;
-                let oracle = match &exact {
-                    Some(exact) => Some((FLOAT64, exact.at(time)?)),
-                    None if job.other_kernels => Some(("float32 on the host", values(job.host)?)),
-                    None => None,
-                };
-                Ok((found, oracle))
-            };
-            note(case(&part, condition, format!("time {time}"), both).required_if(ordinary && (0.0..=1.0).contains(&time)));
+            let exact = || exact.as_ref().map(|exact| exact.at(time)).transpose();
+            let tried = case(&part, condition, format!("time {time}"), || compared(job, values, exact));
+            note(tried.required_if(ordinary && (0.0..=1.0).contains(&time)));
         }
     }
     Ok(())
+}
+
+/// Values on the device under test, and those to compare them with: `exact` ones or, where there are none and the host has other kernels, those on the host.
+fn compared(job: &StressJob, values: impl Fn(&Device) -> Result<Vec<f32>>, exact: impl FnOnce() -> Result<Option<Vec<f32>>>) -> Result<Compared> {
+    let found = values(job.device)?;
+    let oracle = match exact()? {
+        Some(exact) => Some((FLOAT64, exact)),
+        None if job.other_kernels => Some(("float32 on the host", values(job.host)?)),
+        None => None,
+    };
+    Ok((found, oracle))
 }
 
 /// The deformer called `name` with its default settings. Fresh ones are the identity, whatever they are asked, so noise is added to all weights.
@@ -146,30 +152,35 @@ fn weight_codec(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
 /// Images whose values explode. What a loss makes of them is bounded by the watchdog of the trainer; here it must not panic, and be finite where float32 can be.
 fn loss(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) {
     const SIZE: [usize; 2] = [17, 23];
+    let pixels = SIZE[0] * SIZE[1];
+    let draw = |seed: u64, count: usize| -> Vec<f32> { (0..count).map(|k| 0.5 + 0.5 * uniform(Seed::root(seed), k)).collect() };
+    let target = draw(2, 3 * pixels);
+    let host = HostGaussians {
+        means: vec![0.0; 3],
+        log_scales: vec![-2.0; 3],
+        quaternions: vec![1.0, 0.0, 0.0, 0.0],
+        opacity_logits: vec![0.0],
+        sh_dc: vec![0.0; 3],
+        dynamic_scores: vec![0.0],
+        ..Default::default()
+    };
+    let schedule = Schedule::main(100);
     for level in [0.0f32, 1.0, 1e4, 1e10, 1e18] {
-        let exploded = case(&format!("loss {name}"), "exploding images", format!("{level:e}"), || {
+        let planes: Vec<f32> = draw(1, 5 * pixels).into_iter().map(|v| level * v).collect();
+        let values = |device: &Device| -> Result<Vec<f32>> {
             let term = (job.registry.loss(name)?.build)(&toml::Table::new())?;
-            let pixels = SIZE[0] * SIZE[1];
-            let draw = |seed: u64, count: usize| -> Vec<f32> { (0..count).map(|k| 0.5 + 0.5 * uniform(Seed::root(seed), k)).collect() };
-            let planes = draw(1, 5 * pixels).into_iter().map(|v| level * v).collect::<Vec<_>>();
-            let planes = Tensor::<3>::from_data(TensorData::new(planes, [5, SIZE[0], SIZE[1]]), job.device);
-            let target = Tensor::<3>::from_data(TensorData::new(draw(2, 3 * pixels), [3, SIZE[0], SIZE[1]]), job.device);
-            let host = HostGaussians {
-                means: vec![0.0; 3],
-                log_scales: vec![-2.0; 3],
-                quaternions: vec![1.0, 0.0, 0.0, 0.0],
-                opacity_logits: vec![0.0],
-                sh_dc: vec![0.0; 3],
-                dynamic_scores: vec![0.0],
-                ..Default::default()
-            };
-            let gaussians = Gaussians::from_host(&host, job.device);
-            let radii = Tensor::<1, Int>::from_data(TensorData::new(vec![3i64], [1]), job.device);
-            let schedule = Schedule::main(100);
+            let tensor = |values: &[f32]| Tensor::<3>::from_data(TensorData::new(values.to_vec(), [values.len() / pixels, SIZE[0], SIZE[1]]), device);
+            let (planes, target) = (tensor(&planes), tensor(&target));
+            let gaussians = Gaussians::from_host(&host, device);
+            let radii = Tensor::<1, Int>::from_data(TensorData::new(vec![3i64], [1]), device);
             let input = LossInput { planes: &planes, target: &target, gaussians: &gaussians, radii: &radii, time_norm: 0.5, schedule: &schedule };
-            let value = term.value(&input)?.map_or(Ok(vec![0.0]), |value| to_vec(value, "loss"))?;
-            Ok((value, None))
-        });
+            term.value(&input)?.map_or(Ok(vec![0.0]), |value| to_vec(value, "loss"))
+        };
+        let exact = || -> Result<Option<Vec<f32>>> {
+            let input = LossValues { planes: &planes, target: &target, size: SIZE, gaussians: &host, extent: schedule.extent };
+            Ok(losses::value(name, &input).map(|value| vec![value as f32]))
+        };
+        let exploded = case(&format!("loss {name}"), "exploding images", format!("{level:e}"), || compared(job, values, exact));
         note(exploded.required_if(level == 1.0));
     }
 }

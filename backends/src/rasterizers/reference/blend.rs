@@ -34,6 +34,11 @@ fn numbers<T: Real>(item: &Item) -> [T; RECORD] {
     item.numbers.map(T::constant)
 }
 
+/// Whether the tiles that an item is restricted to, if any, hold a pixel.
+fn reaches(item: &Item, column: usize, row: usize) -> bool {
+    item.tiles.is_none_or(|[columns, rows]| (columns[0]..columns[1]).contains(&(column / 16)) && (rows[0]..rows[1]).contains(&(row / 16)))
+}
+
 /// The Gaussians that contribute at a pixel, front to back, and the transmittance left.
 fn touches<T: Real>(items: &[Item], settings: &RasterSettings, column: usize, row: usize) -> (Vec<Touch<T>>, T) {
     let rules = RuleConstants::new(settings);
@@ -42,9 +47,7 @@ fn touches<T: Real>(items: &[Item], settings: &RasterSettings, column: usize, ro
     let mut found = Vec::new();
     let mut left = one;
     for (k, item) in items.iter().enumerate() {
-        if let Some([columns, rows]) = item.tiles
-            && !((columns[0]..columns[1]).contains(&(column / 16)) && (rows[0]..rows[1]).contains(&(row / 16)))
-        {
+        if !reaches(item, column, row) {
             continue;
         }
         let [x, y, a, b, c, opacity, ..] = numbers::<T>(item);
@@ -166,7 +169,8 @@ pub fn blend_backward<T: Real>(items: &[Item], settings: &RasterSettings, backgr
 /// How near the decisions at a pixel are to falling the other way.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Margin {
-    /// The least relative distance of an alpha from 1/255 or from its cap, or of a transmittance from where a pixel stops.
+    /// The least relative distance of an alpha from 1/255 or from its cap, or of a transmittance from where a pixel stops. The transmittance behind capped
+    /// alphas alone does not count, however near: it is a product of constants.
     pub relative: f64,
     /// The least distance of such a decision in units of what rounding to float32 can change it by.
     pub roundings: f64,
@@ -184,13 +188,15 @@ pub fn margins(items: &[Item], settings: &RasterSettings) -> Vec<Margin> {
     for row in 0..settings.height {
         for column in 0..settings.width {
             let mut margin = Margin { relative: f64::INFINITY, roundings: f64::INFINITY };
-            let mut note = |value: f64, threshold: f64, error: f64| {
+            let mut note = |value: f64, threshold: f64, error: f64, constant: bool| {
                 let distance = (value / threshold - 1.0).abs();
-                margin.relative = margin.relative.min(distance);
+                if !constant {
+                    margin.relative = margin.relative.min(distance);
+                }
                 margin.roundings = margin.roundings.min(distance / error);
             };
-            let (mut left, mut error_left) = (1.0f64, 0.0f64);
-            for item in items {
+            let (mut left, mut error_left, mut all_capped) = (1.0f64, 0.0f64, true);
+            for item in items.iter().filter(|item| reaches(item, column, row)) {
                 let [x, y, a, b, c, opacity, ..] = item.numbers;
                 let (dx, dy) = (column as f64 + 0.5 - x, row as f64 + 0.5 - y);
                 let sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy;
@@ -199,15 +205,19 @@ pub fn margins(items: &[Item], settings: &RasterSettings) -> Vec<Margin> {
                 // Relative error of alpha.
                 let error = rounding * (1.0 + terms + slopes);
                 let uncapped = opacity * (-sigma).exp();
-                note(uncapped, least, error);
+                note(uncapped, least, error, false);
                 if sigma < 0.0 || uncapped < least || uncapped.is_nan() {
                     continue;
                 }
-                note(uncapped, cap, error);
+                note(uncapped, cap, error, false);
                 let alpha = uncapped.min(cap);
-                error_left += alpha * error / (1.0 - alpha);
+                // A capped alpha has no error.
+                if uncapped <= cap {
+                    all_capped = false;
+                    error_left += alpha * error / (1.0 - alpha);
+                }
                 let after = left * (1.0 - alpha);
-                note(after, stop, error_left + rounding);
+                note(after, stop, error_left + rounding, all_capped);
                 if after <= stop {
                     break;
                 }

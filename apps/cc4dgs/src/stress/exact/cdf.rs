@@ -1,0 +1,126 @@
+//! `cdf` and `cdf-basis`: features of centres without stored tables (CC-4DGS, Section IV-B), and what becomes of them over time.
+
+use super::grids::{cell, interpolate};
+use super::network::{chain, decoder, dot};
+use super::{Formula, Inputs, Rows, Weights, in_box};
+use cc4dgs_core::{DeformerContext, Result, config, toml};
+use cc4dgs_deformers::cdf::CdfConfig;
+use cc4dgs_deformers::parts::heads::Head;
+use cc4dgs_deformers::parts::voxels::VoxelSettings;
+use std::f64::consts::TAU;
+
+/// Bands, and hidden layers and width of networks, of `cdf-basis`.
+const MOST_BANDS: usize = 6;
+const BASIS_WIDTH: usize = 128;
+const LEARNED: usize = 16;
+const BASIS_HEADS: [(&str, usize); 3] = [("means", 3), ("log_scales", 3), ("quaternions", 4)];
+
+struct Cdf {
+    config: CdfConfig,
+    context: DeformerContext,
+    weights: Weights,
+    /// Voxel features per Gaussian.
+    features: Rows,
+}
+
+struct CdfBasis {
+    bands: usize,
+    weights: Weights,
+    /// Voxel features per Gaussian.
+    features: Rows,
+}
+
+/// `cdf`.
+pub fn build(inputs: Inputs) -> Result<Box<dyn Formula>> {
+    let Inputs { weights, context, points, .. } = inputs;
+    let config: CdfConfig = config::parse_section("deformer cdf", &toml::Table::new())?;
+    let features = voxels(&config.voxels, &context, &points, &weights)?;
+    Ok(Box::new(Cdf { config, context, weights, features }))
+}
+
+/// `cdf-basis`.
+pub fn build_basis(inputs: Inputs) -> Result<Box<dyn Formula>> {
+    let Inputs { weights, context, points, .. } = inputs;
+    let features = voxels(&VoxelSettings::default(), &context, &points, &weights)?;
+    Ok(Box::new(CdfBasis { bands: bands_for(context.frame_count).min(MOST_BANDS), weights, features }))
+}
+
+/// Hash signatures of the eight corners, a decoder per level, trilinear interpolation. Points outside the box are moved to its nearest face.
+fn voxels(settings: &VoxelSettings, context: &DeformerContext, points: &[[f64; 3]], weights: &Weights) -> Result<Rows> {
+    let sizes = settings.sizes()?;
+    let mut rows = vec![Vec::new(); points.len()];
+    for (level, &resolution) in sizes.resolutions.iter().enumerate() {
+        let hash = settings.hash(context, level);
+        let weights = weights.of(&format!("grid.level{level}"))?;
+        let decoded = |vertex: [u32; 3]| {
+            let mut signature = vec![0.0f32; settings.hashes];
+            hash.signatures(&[vertex], &mut signature);
+            decoder(signature.into_iter().map(f64::from).collect(), weights, &sizes.decoder)
+        };
+        for (point, row) in points.iter().zip(&mut rows) {
+            let place = in_box(point, context).map(|x| cell(x.clamp(0.0, 1.0) * f64::from(resolution), resolution - 1));
+            row.extend(interpolate(place, decoded));
+        }
+    }
+    Ok(rows)
+}
+
+impl Formula for Cdf {
+    /// Time features modulate the spatial ones (FiLM), a trunk, and a head per attribute.
+    fn offsets(&self, t: f64) -> Result<Rows> {
+        let sizes = self.config.sizes(&self.context)?;
+        let w = sizes.width;
+        let time = encode(t, sizes.time_bands, |_| 1.0);
+        let mut widths = vec![time.len()];
+        widths.extend(sizes.time.trunk.iter().chain(sizes.time.heads.iter().flatten()));
+        let f_time = chain(time, self.weights.of("net.time")?, &widths, false);
+        let modulation = chain(f_time, self.weights.of("net.film")?, &[w, w, 2 * w], false);
+        let (scale, shift) = modulation.split_at(w);
+        let trunk: Vec<usize> = std::iter::once(w).chain(sizes.network.trunk.iter().copied()).collect();
+        let row = |features: &Vec<f64>| {
+            let mut hidden = chain(features.clone(), self.weights.of("net.spatial")?, &[features.len(), w], false);
+            hidden.iter_mut().zip(scale.iter().zip(shift)).for_each(|(h, (scale, shift))| *h = *h * scale + shift);
+            let hidden = chain(hidden, self.weights.of("net.trunk")?, &trunk, true);
+            let head = |head: &Head| {
+                let widths = [w, w, head.width(self.context.sh_degree)];
+                Ok(chain(hidden.clone(), self.weights.of(&format!("net.head.{}", head.name()))?, &widths, false))
+            };
+            Ok(self.config.network.heads.iter().map(head).collect::<Result<Rows>>()?.concat())
+        };
+        self.features.iter().map(row).collect()
+    }
+}
+
+impl Formula for CdfBasis {
+    /// Coefficients per Gaussian times functions that all share: 1, t, bands, and those of a network.
+    fn offsets(&self, t: f64) -> Result<Rows> {
+        let encoding = encode(t, self.bands, |band| (-(band as f64)).exp2());
+        let w = BASIS_WIDTH;
+        let learned = chain(encoding.clone(), self.weights.of("net.functions")?, &[encoding.len(), w, w, LEARNED], false);
+        let functions = [vec![1.0], encoding, learned].concat();
+        let row = |features: &Vec<f64>| {
+            let hidden = chain(features.clone(), self.weights.of("net.trunk")?, &[features.len(), w, w], true);
+            let mut out = Vec::new();
+            for (name, width) in BASIS_HEADS {
+                let coefficients = chain(hidden.clone(), self.weights.of(&format!("net.head.{name}"))?, &[w, w, width * functions.len()], false);
+                out.extend(coefficients.chunks_exact(functions.len()).map(|own| dot(own, &functions)));
+            }
+            Ok(out)
+        };
+        self.features.iter().map(row).collect()
+    }
+}
+
+/// As `cc4dgs_fields::time::bands_for` says: the highest band is near half the frame count.
+fn bands_for(frames: usize) -> usize {
+    (frames.max(1) as f64).log2().round().clamp(1.0, 16.0) as usize
+}
+
+/// t, then sine and cosine of each doubling frequency times the band's amplitude.
+fn encode(t: f64, bands: usize, amplitude: impl Fn(usize) -> f64) -> Vec<f64> {
+    let pair = |band: usize| {
+        let (sin, cos) = (TAU * (t * (band as f64).exp2()).fract()).sin_cos();
+        [amplitude(band) * sin, amplitude(band) * cos]
+    };
+    std::iter::once(t).chain((0..bands).flat_map(pair)).collect()
+}
