@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 
 METHODS = ["hexplane", "native-4d", "swift4d", "embedding", "grid4d", "deform-mlp"]
@@ -79,8 +80,10 @@ def row(options, method):
             seconds = event["seconds"]
             curve.append([round(seconds), event["stage"], event["iteration"], round(event["psnr_db"], 2)])
     found = json.loads(report.read_text()) if scored else {}
+    config = out / "config.toml"
+    published = tomllib.loads(config.read_text())["train"]["iterations"] if config.exists() else None
     keys = ["psnr_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "psnr_worst_block_db"]
-    return {"method": method, "exit": code, "resumed": resumed, "seconds": round(trained(out), 1), "iterations": done, "published_iterations": options.published,
+    return {"method": method, "exit": code, "resumed": resumed, "seconds": round(trained(out), 1), "iterations": done, "published_iterations": published,
             "threads": options.threads, "jobs": options.jobs, **{key: found.get(key) for key in keys}, "training_views": curve}
 
 
@@ -95,7 +98,6 @@ def main():
     parser.add_argument("--threads", type=int, default=0)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    options.published = 28000
     kept = options.out / "rows.json"
     rows = json.loads(kept.read_text()) if kept.exists() else []
 

@@ -20,8 +20,6 @@ use scenes::Kind;
 const CERTAIN: f64 = 4.0;
 /// Least noise: that of a few roundings. What is summed in another order than in the reference may differ by so much.
 const FLOOR: f64 = 1e-6;
-/// WGSL lets `exp` be off by 3 ulp and more, where that of processors is off by one. Behind alphas near their cap it is what counts.
-const ULP_OF_EXP: f64 = 3.0;
 /// At most one pixel of so many may be left out.
 const LEFT_OUT: usize = 50;
 /// Gaussians of at least this weight somewhere must come in the same order in float32, and reach the same tiles.
@@ -159,7 +157,7 @@ fn check(kind: &Kind) {
         let noises = Found::reference(&made, Precision::Float32, &rounded_out, &upstream).errors(&exact, &kept);
         for (at, (name, device)) in devices.iter().enumerate() {
             let errors = Found::tiles(&made, device, &upstream).errors(&exact, &kept);
-            let times = if *name == "wgpu" { 10.0 * ULP_OF_EXP } else { 10.0 };
+            let times = if *name == "wgpu" { 10.0 * kind.on_wgpu } else { 10.0 };
             for (quantity, (error, &noise)) in errors.into_iter().zip(&noises).enumerate() {
                 rows.push(Row { case: case.clone(), device: at, quantity, error, noise, bar: times * noise.max(FLOOR) });
             }
