@@ -22,6 +22,7 @@ mod golden_raster;
 mod golden_training;
 mod guard;
 mod image;
+mod links;
 mod lives;
 mod lookup;
 mod manifests;
