@@ -57,6 +57,41 @@ STEPS = """async ([source, patient]) => { const { fetch } = window, bytes = new 
     window.fetch = fetch;
     return harmonics.map(s => s.stage); }"""
 
+# Clicks "Copy link"; returns what the button says then.
+COPY = """async () => { const share = [...document.querySelectorAll(".panel button")].find(b => b.textContent === "Copy link");
+    await share.onclick(); return share.textContent; }"""
+# Destroys the page's player while it plays and loads, twice. Returns what it still does half a second later, and what of it is still there.
+DESTROY = """async source => { const player = cc4dgs, { fetch, requestAnimationFrame } = window, { destroy } = GPUDevice.prototype;
+    const later = ms => new Promise(done => setTimeout(done, ms)), problem = promise => promise.then(() => "", e => e.message);
+    let frames = 0, devices = 0, signal = null;
+    window.requestAnimationFrame = run => { frames++; return requestAnimationFrame.call(window, run); };
+    window.fetch = (address, options) => { signal = options?.signal; return fetch(address, options); };
+    GPUDevice.prototype.destroy = function () { devices++; destroy.call(this); };
+    player.play();
+    const loading = player.load(source);
+    while (!frames || !signal) await later(50);
+    const { gpu, gl } = player;
+    player.destroy(), player.destroy();
+    frames = 0;
+    const keys = !document.body.dispatchEvent(new KeyboardEvent("keydown", { key: " ", bubbles: true, cancelable: true }));
+    player.play(), player.seek(0.5), player.step(1), player.reset(), player.goTo(0), player.set("depth", true), player.link();
+    const refused = [await problem(player.load(source)), await problem(player.capture())];
+    await later(500);
+    Object.assign(window, { fetch, requestAnimationFrame });
+    GPUDevice.prototype.destroy = destroy;
+    return { frames, devices, keys, fetching: !signal.aborted, loaded: await loading, refused, memory: gpu.__wbg_ptr !== 0,
+        context: !!gl && !gl.gl.isContextLost(), worker: !!gl?.sorter.worker, elements: document.getElementById("player").childElementCount }; }"""
+# Destroys the page's player while a lost device is replaced. Returns how that ends, and what is left of the player.
+DESTROY_LOST = """() => new Promise(done => { const player = cc4dgs;
+    player.start = () => {
+        delete player.start;
+        const started = player.start(), ended = end => done([end, !!player.gpu, !!player.gl, document.getElementById("player").childElementCount]);
+        player.destroy();
+        started.then(() => ended("it started"), e => ended(e.message));
+        return started;
+    };
+    if (player.gl) player.gl.gl.getExtension("WEBGL_lose_context").loseContext(); else player.gpu.loseDevice(); })"""
+
 
 def apart(a, b):
     return max(abs(x - y) for x, y in zip(a, b))
@@ -87,6 +122,7 @@ def main():
         few_degrees(pages)
         opened_meanwhile(pages)
         second_player(pages)
+        destroyed(pages, facts)
         hopeless(pages)
         broken_module(pages)
         drop(page, facts)
@@ -124,11 +160,17 @@ def playing(page):
     rates = page.evaluate("""async () => { const g = cc4dgs.gpu; const n = 5, began = performance.now();
         for (let i = 0; i < n; i++) { cc4dgs.seek(i / n); cc4dgs.draw(); await g.countVisible(); } return (performance.now() - began) / n; }""")
     say(f"plays; {rates:.1f} ms per frame at {page.evaluate('cc4dgs.ui.canvas.width')}x{page.evaluate('cc4dgs.ui.canvas.height')} on SwiftShader")
-    page.get_by_label("Time", exact=True).fill("0.5")
+    slider = page.get_by_label("Time", exact=True)
+    for plays in (True, False):
+        slider.press(" ")
+        assert page.evaluate("cc4dgs.playing") == plays, "Space on the time slider does not play and pause"
+    slider.fill("0.5")
     assert abs(page.evaluate("cc4dgs.time") - 0.5) < 1e-3
     frame = page.evaluate("cc4dgs.gpu.frame")
-    page.get_by_label("Time", exact=True).press("ArrowRight")
+    slider.press("ArrowRight")
     assert page.evaluate("cc4dgs.gpu.frame") == frame + 1, "an arrow key on the slider is a frame"
+    page.get_by_label("One frame back").press(" ")
+    assert page.evaluate("cc4dgs.gpu.frame") == frame and not page.evaluate("cc4dgs.playing"), "Space on a button presses it alone"
     page.locator("canvas").focus()
     page.keyboard.press(".")
     assert page.evaluate("cc4dgs.time") > 0.5 and not page.evaluate("cc4dgs.playing")
@@ -153,13 +195,30 @@ def navigation(pages, page):
     other = pages.open("?" + link.split("?", 1)[1])
     assert apart(moved, other.evaluate(POSE)) < 1e-3
     assert abs(other.evaluate("cc4dgs.time") - page.evaluate("cc4dgs.time")) < 1e-4
+    followed(other, pose)
     other.close()
     # In a frame of `srcdoc` the address cannot be changed.
-    text = page.evaluate("""async () => { history.replaceState = () => { throw new DOMException("no", "SecurityError"); };
-        const share = [...document.querySelectorAll(".panel button")].find(b => b.textContent === "Copy link");
-        await share.onclick(); delete history.replaceState; return share.textContent; }""")
+    page.evaluate("history.replaceState = () => { throw new DOMException('no', 'SecurityError'); }; 0")
+    text = page.evaluate(COPY)
+    page.evaluate("delete history.replaceState")
     assert text in ("Copied", "Not copied"), text
     say("dragging orbits, the wheel zooms, R resets, a shared link restores time and pose")
+
+
+def followed(page, pose):
+    """A link to the page that is opened in it, which changes the hash alone, is followed; by a player that is a part of the page it is not."""
+    page.evaluate("""async source => { const { createPlayer } = await import("./player.js"), element = document.body.appendChild(document.createElement("div"));
+        window.part = await createPlayer(element, { src: source }); window.changes = 0; window.addEventListener("hashchange", () => { changes++; }); }""", MODEL)
+    stays = page.evaluate("part.time")
+    aim = 0.25 if stays > 0.5 else 0.75
+    page.evaluate(COPY)
+    assert page.evaluate("location.href === cc4dgs.link()"), "the address is not the link that was copied"
+    page.evaluate("hash => { location.hash = hash; }", f"t={aim}&pose={','.join(map(str, pose))}")
+    page.wait_for_function("changes > 0")
+    assert abs(page.evaluate("cc4dgs.time") - aim) < 1e-4 and apart(pose, page.evaluate(POSE)) < 1e-3, "a link that changes the hash alone is not followed"
+    assert page.evaluate("changes") == 1, "copying a link is a jump"
+    assert page.evaluate("part.time") == stays, "a player that is a part of the page follows its links"
+    page.evaluate("part.destroy()")
 
 
 def webgl(pages, facts):
@@ -276,6 +335,27 @@ def errors(pages, page):
     # Missing files are an error of the network that the browser itself logs.
     pages.complaints[:] = [c for c in pages.complaints if "404" not in c]
     pages.quiet("errors")
+
+
+def destroyed(pages, facts):
+    """A player that is destroyed leaves nothing behind, and its element to another one."""
+    for backend in ("", "&backend=webgl"):
+        page = pages.open(f"?src={MODEL}{backend}")
+        left = page.evaluate(DESTROY, "/slow.cc4d")
+        assert all("destroyed" in message for message in left.pop("refused")), "a destroyed player does not refuse what it is asked for"
+        assert left.pop("devices") == (0 if backend else 1) and left.pop("loaded") is None and not any(left.values()), left
+        page.evaluate("import('./player.js').then(async m => { window.cc4dgs = await m.createPlayer(document.getElementById('player')); })")
+        assert page.locator("canvas").count() == 1 and page.evaluate("cc4dgs.facts.gaussians") == facts["gaussians"] and bool(backend) == page.evaluate("!!cc4dgs.gl")
+        page.evaluate("cc4dgs.play()")
+        page.wait_for_function("cc4dgs.time > 0")
+        page.keyboard.press(" ")
+        assert not page.evaluate("cc4dgs.playing"), "keys do not reach the second player of an element"
+        assert page.evaluate("cc4dgs.capture().then(p => p.data.some(v => v > 60 && v < 255))"), "the second player of an element shows nothing"
+        end, *left = page.evaluate(DESTROY_LOST)
+        assert "destroyed" in end and not any(left), f"a recovery goes on after its player was destroyed: {[end, *left]}"
+        page.close()
+    pages.quiet("players that are destroyed")
+    say("a destroyed player leaves nothing behind, and its element to another one")
 
 
 def phone(pages, archive):

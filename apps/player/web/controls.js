@@ -11,6 +11,17 @@ function element(tag, properties = {}, ...children) {
 const labelled = label => ({ attributes: { "aria-label": label }, title: label });
 const megabytes = bytes => (bytes >= 1e6 ? `${(bytes / 1e6).toFixed(2)} MB` : `${(bytes / 1e3).toFixed(1)} kB`);
 
+/// Saves an image of RGBA pixels as the file `download`.
+export async function savePng({ width, height, data }, download) {
+    const canvas = element("canvas", { width, height });
+    canvas.getContext("2d").putImageData(new ImageData(data, width, height), 0, 0);
+    const image = await new Promise(done => canvas.toBlob(done, "image/png"));
+    if (!image) throw new Error(`The image of ${width}x${height} pixels could not be saved as PNG. Choose a lower resolution.`);
+    const href = URL.createObjectURL(image);
+    element("a", { href, download }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 60000);
+}
+
 export function build(container, player) {
     const button = (text, label, onclick) => element("button", { type: "button", textContent: text, onclick, ...labelled(label) });
     const canvas = element("canvas", { tabIndex: 0, ...labelled("3D view. Drag to orbit, wheel or pinch to zoom, shift-drag or two fingers to pan.") });
@@ -99,6 +110,7 @@ export function build(container, player) {
 
     const ui = {
         root, canvas, embedded,
+        remove: () => { ui.poster(null); root.remove(); },
         replaceCanvas: () => { const fresh = ui.canvas.cloneNode(); ui.canvas.replaceWith(fresh); ui.canvas = fresh; },
         title: text => { title.textContent = text; if (!embedded) document.title = `${text} – cc4dgs player`; },
         error: text => say(text, true),

@@ -1,20 +1,21 @@
 // Mouse, touch and keyboard on the canvas.
 
-/// `act` has orbit, look, pan, zoom, fly, and `mode()`, which is "orbit" or "fly".
-export function addGestures(canvas, act) {
+/// `act` has orbit, look, pan, zoom, fly, and `mode()`, which is "orbit" or "fly". Until `signal` aborts.
+export function addGestures(canvas, act, signal) {
+    const listen = (name, run, options) => canvas.addEventListener(name, run, { signal, ...options });
     const pointers = new Map();
     let spread = 0, middle = null;
     const measure = () => {
         const [a, b] = [...pointers.values()];
         return { spread: Math.hypot(a.x - b.x, a.y - b.y), middle: { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2 } };
     };
-    canvas.addEventListener("pointerdown", e => {
+    listen("pointerdown", e => {
         canvas.focus({ preventScroll: true });
         canvas.setPointerCapture(e.pointerId);
         pointers.set(e.pointerId, { x: e.clientX, y: e.clientY });
         if (pointers.size === 2) ({ spread, middle } = measure());
     });
-    canvas.addEventListener("pointermove", e => {
+    listen("pointermove", e => {
         const last = pointers.get(e.pointerId);
         if (!last) return;
         const [dx, dy] = [e.clientX - last.x, e.clientY - last.y];
@@ -37,10 +38,10 @@ export function addGestures(canvas, act) {
         pointers.delete(e.pointerId);
         if (pointers.size === 2) ({ spread, middle } = measure());
     };
-    canvas.addEventListener("pointerup", up);
-    canvas.addEventListener("pointercancel", up);
-    canvas.addEventListener("contextmenu", e => e.preventDefault());
-    canvas.addEventListener("wheel", e => {
+    listen("pointerup", up);
+    listen("pointercancel", up);
+    listen("contextmenu", e => e.preventDefault());
+    listen("wheel", e => {
         e.preventDefault();
         // A notch of a wheel is about 100 pixels, 3 lines or a page.
         const pixels = e.deltaY * [1, 100 / 3, 100][e.deltaMode];
@@ -48,23 +49,27 @@ export function addGestures(canvas, act) {
     }, { passive: false });
 }
 
+// Keys that move a slider.
+const SLIDE = /^(Arrow(Left|Right|Up|Down)|Home|End|PageUp|PageDown)$/;
 const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
 
-/// Keys: held ones fly, others are commands by name. Returns a function that moves by the keys that are held for so many seconds; whether any were.
-export function addKeys(element, act, commands) {
+/// Keys, until `signal` aborts: held ones fly, others are commands by name. Returns a function that moves by the keys that are held for so many seconds; whether any
+/// were.
+export function addKeys(element, act, commands, signal) {
     const held = new Set();
-    element.addEventListener("keydown", e => {
+    const listen = (target, name, run) => target.addEventListener(name, run, { signal });
+    listen(element, "keydown", e => {
         if (e.ctrlKey || e.metaKey || e.altKey || e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
         const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
         if (FLY[key]) { held.add(key); e.preventDefault(); return; }
-        // Buttons and sliders keep the keys they know.
-        const own = e.target.matches("button, input") && (key === " " || key === "Enter" || key.startsWith("Arrow") || key === "Home" || key === "End");
+        // Sliders keep the keys that move them, buttons and boxes those that press them.
+        const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input") && (key === " " || key === "Enter");
         if (commands[key] && !own) { commands[key](); e.preventDefault(); }
     });
-    element.addEventListener("keyup", e => held.delete(e.key.toLowerCase()));
-    element.addEventListener("focusout", () => held.clear());
+    listen(element, "keyup", e => held.delete(e.key.toLowerCase()));
+    listen(element, "focusout", () => held.clear());
     // Where nothing has the focus, nothing loses it with the window.
-    window.addEventListener("blur", () => held.clear());
+    listen(window, "blur", () => held.clear());
     return seconds => {
         for (const key of held) act.fly(...FLY[key].map(v => v * seconds));
         return held.size > 0;

@@ -2,6 +2,7 @@
 //
 //     const player = await createPlayer(element, { src: "model.cc4d", autoplay: true });   // src: an address, a File, or bytes with { name }
 //     player.on("time", ({ time, frame }) => …);  player.seek(0.5);  player.play();  await player.load("other.cc4d");
+//     player.destroy();   // gives the device, memory and the element back
 //
 // Events: "time" { time, frame, seconds }, "loaded" facts, "play" and "pause", "error" and "warning" { message }, "progress" { share, bytes }, "recovered".
 // Without options, the page's address says what to open: ?src=URL&autoplay, and #t=0.5&pose=… as share links have it; ?backend=webgl does without WebGPU.
@@ -10,7 +11,7 @@ import init, * as wasm from "./cc4dgs_player.js";
 import { checkSize, loadUrl, nameOf } from "./loading.js";
 import { addGestures, addKeys } from "./gestures.js";
 import { WebGl } from "./webgl.js";
-import { build } from "./controls.js";
+import { build, savePng } from "./controls.js";
 
 // What exports need of a page: raise it together with PAGE_VERSION in exporters/src/web/page.rs where archives need a newer one.
 export const PAGE_VERSION = 3;
@@ -20,6 +21,8 @@ const MOST_RECOVERIES = 3;
 const KEPT_MS = 60000;
 // How long a lost WebGL2 context is waited for before the page says so, in milliseconds.
 const PATIENCE_MS = 5000;
+
+const gone = () => new Error("This player was destroyed. Make another one with createPlayer.");
 
 let ready;
 
@@ -51,30 +54,37 @@ class Page {
         this.dirty = true;
         this.settings = { speed: 1, looping: true, scale: 1, shDegree: 4, resolution: 1, tint: false, depth: false };
         this.flying = false;
+        // Aborted when the player is destroyed.
+        this.life = new AbortController();
         this.ui = build(container, this);
     }
+    get destroyed() { return this.life.signal.aborted; }
     /// `starting` is the promise of it.
     start() { return this.starting = this.begin(); }
     async begin() {
         await this.startDevice();
+        // Meanwhile it may have ended.
+        if (this.destroyed) { this.release(); throw gone(); }
         this.apply();
         const act = {
             mode: () => (this.flying ? "fly" : "orbit"),
             ...Object.fromEntries(["orbit", "look", "pan", "zoom", "fly"].map(name => [name, (...values) => { this.gpu?.[name](...values); this.dirty = true; }])),
         };
-        const { canvas } = this.ui;
+        const { canvas, embedded, root } = this.ui, { signal } = this.life;
         if (this.attached !== canvas) {
             this.attached = canvas;
-            addGestures(canvas, act);
+            addGestures(canvas, act, signal);
             this.sizes ??= new ResizeObserver(() => this.resize());
             this.sizes.disconnect();
             this.sizes.observe(canvas);
-            canvas.addEventListener("webglcontextlost", e => e.preventDefault());
+            canvas.addEventListener("webglcontextlost", e => e.preventDefault(), { signal });
         }
         if (!this.flyKeys) {
             // On a page of its own the player has the keys before anything was clicked.
-            this.flyKeys = addKeys(this.ui.embedded ? this.ui.root : document, act, this.commands(act));
-            requestAnimationFrame(now => this.loop(now));
+            this.flyKeys = addKeys(embedded ? root : document, act, this.commands(act), signal);
+            // Where the page is open already, a link to it changes the hash alone. "Copy link" replaces the address, of which nobody is told.
+            if (!embedded) window.addEventListener("hashchange", () => this.followLink(), { signal });
+            this.request = requestAnimationFrame(now => this.loop(now));
         }
         this.resize();
     }
@@ -102,14 +112,17 @@ class Page {
         this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height, this.gl.mostWords, this.gl.mostSide);
     }
     async contextRestored() {
-        const restored = new Promise(done => this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true }));
+        const { signal } = this.life;
+        const restored = new Promise((done, stop) => {
+            this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true, signal });
+            signal.addEventListener("abort", () => stop(gone()), { once: true });
+        });
         let told = false;
         const late = setTimeout(() => {
             told = true;
             this.fail(new Error("The graphics device was lost, and the browser has not given WebGL2 back yet. Wait, or reload the page."));
         }, PATIENCE_MS);
-        await restored;
-        clearTimeout(late);
+        try { await restored; } finally { clearTimeout(late); }
         if (told) this.ui.error(null);
     }
     commands(act) {
@@ -131,7 +144,7 @@ class Page {
     }
     fail(e) {
         // What `load` has told, its callers throw on.
-        if (e?.name === "AbortError" || e === this.told) return;
+        if (e?.name === "AbortError" || e === this.told || this.destroyed) return;
         this.told = e;
         const message = (e?.message || String(e)).trim();
         this.ui.error(message);
@@ -140,6 +153,7 @@ class Page {
     // Loading
     /// `first` is for the model that a page opens with: it takes time and pose of the link when it is seen, and plays when it can (`autoplay`).
     async load(source, name, first = null) {
+        if (this.destroyed) throw gone();
         this.abort?.abort();
         this.abort = new AbortController();
         const { signal } = this.abort;
@@ -274,7 +288,8 @@ class Page {
             this.fail(new Error(`The player has stopped (${e.message}). Reload the page.`));
             return;
         }
-        requestAnimationFrame(next => this.loop(next));
+        // A listener may have ended it.
+        if (!this.destroyed) this.request = requestAnimationFrame(next => this.loop(next));
     }
     advance(now) {
         const elapsed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
@@ -285,7 +300,7 @@ class Page {
             if (this.ratio !== window.devicePixelRatio) this.resize();
             const was = this.gpu.playing;
             if (this.gpu.tick(elapsed)) this.timeChanged();
-            if (was && !this.gpu.playing) { this.ui.playing(false); this.emit("pause", {}); }
+            if (was && !this.playing) { this.ui.playing(false); this.emit("pause", {}); }
             if (this.flyKeys(elapsed)) this.dirty = true;
             if (this.dirty) this.draw();
             this.statistics(now);
@@ -295,8 +310,9 @@ class Page {
         if (now - (this.counted ?? 0) < 1000) return;
         const rate = (this.drawn ?? 0) * 1000 / (now - (this.counted ?? now - 1000));
         [this.counted, this.drawn] = [now, 0];
-        if (this.facts && this.ui.wantsStatistics()) {
-            (this.gl ? Promise.resolve(this.gl.visible) : this.gpu.countVisible()).then(visible => this.ui.statistics({ ...this.facts, rate, visible, received: this.received, adapter: this.gl?.name ?? this.gpu?.adapter }));
+        const { facts } = this;
+        if (facts && this.ui.wantsStatistics()) {
+            (this.gl ? Promise.resolve(this.gl.visible) : this.gpu.countVisible()).then(visible => this.ui.statistics({ ...facts, rate, visible, received: this.received, adapter: this.gl?.name ?? this.gpu?.adapter }));
         }
     }
     // A lost device: a new one, and the same model at the same time and pose.
@@ -330,8 +346,29 @@ class Page {
             if (this.losses === losses) this.keptSince = performance.now();
         }
     }
+    /// Gives device and model back.
+    release() {
+        const { gpu, gl } = this;
+        [this.gpu, this.gl] = [null, null];
+        gl?.destroy();
+        // A panic leaves it borrowed.
+        try { gpu?.loseDevice(); gpu?.free(); } catch (e) { console.warn(e); }
+    }
+    /// Ends the player and empties its element. `load` and `capture` reject from then on, other calls do nothing.
+    destroy() {
+        if (this.destroyed) return;
+        this.life.abort();
+        this.abort?.abort();
+        cancelAnimationFrame(this.request);
+        this.sizes?.disconnect();
+        Object.values(this.listeners).forEach(listeners => listeners.clear());
+        [this.source, this.facts, this.shown, this.first] = [null, null, null, null];
+        this.release();
+        this.ui.remove();
+    }
     // Images and links
     async capture(camera, time) {
+        if (this.destroyed) throw gone();
         const json = camera ? JSON.stringify(camera) : undefined;
         if (this.gl) return this.gl.capture(this.gpu, json, time);
         const image = await this.gpu.capture(json, time);
@@ -341,17 +378,8 @@ class Page {
     }
     async savePng() {
         if (!this.facts || !this.gpu) return;
-        const download = `frame_${String(this.gpu.frame).padStart(4, "0")}.png`;
-        try {
-            const { width, height, data } = await this.capture();
-            const canvas = Object.assign(document.createElement("canvas"), { width, height });
-            canvas.getContext("2d").putImageData(new ImageData(data, width, height), 0, 0);
-            const image = await new Promise(done => canvas.toBlob(done, "image/png"));
-            if (!image) throw new Error(`The image of ${width}x${height} pixels could not be saved as PNG. Choose a lower resolution.`);
-            const href = URL.createObjectURL(image);
-            Object.assign(document.createElement("a"), { href, download }).click();
-            setTimeout(() => URL.revokeObjectURL(href), 60000);
-        } catch (e) { this.fail(e); }
+        const name = `frame_${String(this.gpu.frame).padStart(4, "0")}.png`;
+        try { await savePng(await this.capture(), name); } catch (e) { this.fail(e); }
     }
     link() {
         const url = new URL(location.href);

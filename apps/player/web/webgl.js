@@ -186,6 +186,11 @@ export class WebGl {
     }
     /// Ends the worker. The context stays that of the canvas.
     free() { this.sorter?.close(); }
+    /// Gives the context up too.
+    destroy() {
+        this.free();
+        if (!this.gl.isContextLost()) this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+    }
     get name() {
         const info = this.gl.getExtension("WEBGL_debug_renderer_info");
         return `WebGL2 ${info ? this.gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""}`;

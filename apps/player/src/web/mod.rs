@@ -238,7 +238,7 @@ impl Player {
     pub fn lost(&self) -> bool {
         matches!(&self.output, Output::WebGpu { lost, .. } if lost.load(Ordering::Relaxed))
     }
-    /// Loses the device on purpose, for tests.
+    /// Loses the device on purpose: when a player is destroyed, and in tests.
     #[wasm_bindgen(js_name = loseDevice)]
     pub fn lose_device(&self) {
         if let Output::WebGpu { renderer, .. } = &self.output {
