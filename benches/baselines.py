@@ -5,22 +5,26 @@
 
 Trains `dnerf+METHOD` (published iterations, sizes and rates; 800x800) and interrupts it after --minutes of training. What it has learned until then is evaluated once
 on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Results are in OUT/rows.json, one row per method: iterations
-reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. Called again, it resumes what was cut off and leaves out what is done.
-With --jobs 2 --threads 1 two methods share the machine.
+reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. With --jobs 2 --threads 1 two methods share the machine.
+
+Called again, it resumes what was cut off and leaves out what is done with the same scene, minutes, jobs, threads and program (its SHA-256); runs have folders of
+their own for each of these, OUT/METHOD-HASH. Ctrl-C asks what runs to write its checkpoint and end (exit code 130). A training that fails, or cannot be evaluated,
+has no row, and makes the exit code 1.
 """
 import argparse
+import hashlib
 import json
 import pathlib
 import signal
 import subprocess
 import sys
-import threading
 import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 
+from trainings import TRAINED, Rows, begin, ended, interrupt, sha256
+
 METHODS = ["hexplane", "native-4d", "swift4d", "embedding", "grid4d", "deform-mlp"]
-WRITING = threading.Lock()
 
 
 def events(out):
@@ -39,20 +43,23 @@ def trained(out):
 
 
 def stop(child, seconds):
-    """Lets a training run for so long, then asks it to write its checkpoint and end. Returns its exit code."""
-    try:
-        return child.wait(max(seconds, 1))
-    except subprocess.TimeoutExpired:
-        child.send_signal(signal.SIGINT)
-    try:
-        return child.wait(600)
-    except subprocess.TimeoutExpired:
+    """Lets a training run for so long, then asks it to write its checkpoint and end. Returns its exit code, and whether there is what it was to learn by then."""
+    code = ended(child, seconds)
+    if code is not None:
+        return code, code in TRAINED
+    child.send_signal(signal.SIGINT)
+    code = ended(child, 600)
+    if code is None:
         child.kill()
-        return child.wait()
+        code = child.wait()
+    return code, code in (*TRAINED, 130)
 
 
-def row(options, method):
-    out = options.out / method
+def row(options, stated):
+    """The row of one method: what is stated of it, and how far it came."""
+    method = stated["method"]
+    name = f"{method}-{hashlib.sha256(json.dumps(stated).encode()).hexdigest()[:8]}"
+    out = options.out / name
     resumed = (out / "checkpoint").exists()
     arguments = ["train", "--scene", str(options.scene), "--out", str(out), "--quiet"]
     if resumed:
@@ -62,15 +69,15 @@ def row(options, method):
     if options.threads:
         arguments += ["--threads", str(options.threads)]
     left = 60 * options.minutes - trained(out) if resumed else 60 * options.minutes
-    code = None
+    code, learned = None, True
     if left > 30:
-        with open(options.out / f"{method}.log", "a") as log:
-            code = stop(subprocess.Popen([options.bin, *arguments], stdout=log, stderr=subprocess.STDOUT), left)
-    report = options.out / f"{method}.json"
+        with open(options.out / f"{name}.log", "a") as log:
+            code, learned = stop(begin([options.bin, *arguments], stdout=log, stderr=subprocess.STDOUT), left)
+    report = options.out / f"{name}.json"
     report.unlink(missing_ok=True)
-    evaluation = [options.bin, "eval", str(out), "--scene", str(options.scene), "--split", "test", f"--json={report}", "--sheet", str(options.out / f"{method}.png"), "--quiet"]
-    with open(options.out / f"{method}.eval.log", "w") as log:
-        scored = subprocess.run(evaluation, stdout=log, stderr=subprocess.STDOUT).returncode == 0
+    evaluation = [options.bin, "eval", str(out), "--scene", str(options.scene), "--split", "test", f"--json={report}", "--sheet", str(options.out / f"{name}.png"), "--quiet"]
+    with open(options.out / f"{name}.eval.log", "w") as log:
+        scored = learned and ended(begin(evaluation, stdout=log, stderr=subprocess.STDOUT)) == 0
     steps = [e for e in events(out) if e["event"] == "iteration"]
     stages = {e["stage"]: e["iterations"] for e in events(out) if e["event"] == "stage-started"}
     done = sum(count for stage, count in stages.items() if stage != steps[-1]["stage"]) + steps[-1]["iteration"] if steps else 0
@@ -83,8 +90,8 @@ def row(options, method):
     config = out / "config.toml"
     published = tomllib.loads(config.read_text())["train"]["iterations"] if config.exists() else None
     keys = ["psnr_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "psnr_worst_block_db"]
-    return {"method": method, "exit": code, "resumed": resumed, "seconds": round(trained(out), 1), "iterations": done, "published_iterations": published,
-            "threads": options.threads, "jobs": options.jobs, **{key: found.get(key) for key in keys}, "training_views": curve}
+    return {**stated, "exit": code, "resumed": resumed, "seconds": round(trained(out), 1), "iterations": done, "published_iterations": published,
+            **{key: found.get(key) for key in keys}, "training_views": curve}
 
 
 def main():
@@ -98,24 +105,29 @@ def main():
     parser.add_argument("--threads", type=int, default=0)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    kept = options.out / "rows.json"
-    rows = json.loads(kept.read_text()) if kept.exists() else []
+    rows = Rows(options.out / "rows.json")
 
     def one(method):
-        if any(r["method"] == method and r["psnr_db"] is not None for r in rows):
-            return
+        """Whether the method has a score."""
+        stated = {"method": method, "path": str(options.scene), "minutes": options.minutes, "threads": options.threads, "jobs": options.jobs}
+        stated["binary_sha256"] = sha256(options.bin)
+        if rows.find(stated):
+            return True
         began = time.time()
-        found = row(options, method)
-        with WRITING:
-            rows[:] = [r for r in rows if r["method"] != method] + [found]
-            kept.write_text(json.dumps(rows, indent=1) + "\n")
-            psnr = found["psnr_db"]
-            print(f"{method:12} {found['iterations']:6} of {found['published_iterations']} iterations, {found['seconds']:.0f} s, "
-                  f"{'no score' if psnr is None else f'{psnr:.2f} dB'}, exit {found['exit']}, {time.time() - began:.0f} s in all", flush=True)
+        found = row(options, stated)
+        psnr = found["psnr_db"]
+        if psnr is not None:
+            rows.keep(found)
+        print(f"{method:12} {found['iterations']:6} of {found['published_iterations']} iterations, {found['seconds']:.0f} s, "
+              f"{'no score' if psnr is None else f'{psnr:.2f} dB'}, exit {found['exit']}, {time.time() - began:.0f} s in all\n", end="", flush=True)
+        return psnr is not None
 
     with ThreadPoolExecutor(options.jobs) as pool:
-        list(pool.map(one, options.only.split(",")))
-    return 1 if any(r["psnr_db"] is None for r in rows) else 0
+        try:
+            scored = list(pool.map(one, options.only.split(",")))
+        except KeyboardInterrupt:
+            return interrupt(pool)
+    return 0 if all(scored) else 1
 
 
 if __name__ == "__main__":

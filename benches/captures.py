@@ -9,31 +9,32 @@ SSIM, Gaussians, seconds, exit code, and the plan. `auto+FIELD` exchanges the de
 is a preset. It is trained again with other numbers of iterations until it takes as long as `auto` took on the scene (`--minutes` with --without-auto), to within a
 quarter; the seventh training counts, whatever it takes. The seconds are those of the training that counts. `--jobs` above 1 makes trainings slower.
 
-Finished rows are kept in OUT/rows.json and not run again. OUT/machine.json has the medians of `bench step`, measured before the first training. Floors are in
-benches/captures.json, for `auto`: `psnr_db` of whole images; `gain_db` over `none`, of whole images or of moving pixels, checked where `none` is trained too. A row
-below a floor makes the exit code 1.
+Finished rows are kept in OUT/rows.json and not run again with the same scene, path, setting, minutes, jobs, threads, --set and program (its SHA-256); a preset's, with
+the same seconds to approach, too. A training that fails, with an exit code other than 0 and 6, or cannot be evaluated, has no row there, and makes the exit code 1.
+Ctrl-C ends what runs (exit code 130), and the next call goes on with the next row. OUT/machine.json has the medians of `bench step`, measured before the first
+training of a program with so many threads. Floors are in benches/captures.json, for `auto`: `psnr_db` of whole images; `gain_db` over `none`, of whole images or of
+moving pixels, checked where `none` is trained too. A row below a floor makes the exit code 1.
 """
 import argparse
 import concurrent.futures
-import hashlib
 import json
 import pathlib
 import subprocess
 import sys
-import threading
 import time
 import tomllib
+
+from trainings import TRAINED, Rows, begin, ended, interrupt, replace, sha256
 
 CAPTURES = ["dome", "rig", "handheld", "photos", "turntable", "sparse", "long", "exposure", "lens", "units", "dark", "appear"]
 SCORES = ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians"]
 STATED = ["minutes", "jobs", "threads", "sets"]
-TRAINED = [0, 6]  # Exit codes of trainings that leave a model; 6 is one below simple baselines.
 
 
 def run(binary, arguments, log):
     began = time.time()
     with open(log, "w") as file:
-        code = subprocess.run([binary, *arguments], stdout=file, stderr=subprocess.STDOUT).returncode
+        code = ended(begin([binary, *arguments], stdout=file, stderr=subprocess.STDOUT))
     return code, time.time() - began
 
 
@@ -46,18 +47,18 @@ def is_planned(setting):
 
 
 def machine(options):
-    """What ran: the version and hash of the binary, and milliseconds of `bench step`, measured again for another binary."""
+    """What ran: the version and hash of the binary, and milliseconds of `bench step`, measured again for another binary or number of threads."""
     path, step = options.out / "machine.json", options.out / "step.json"
-    binary = hashlib.sha256(pathlib.Path(options.bin).read_bytes()).hexdigest()
+    stated = {"binary_sha256": sha256(options.bin), "threads": options.threads}
     kept = json.loads(path.read_text()) if path.exists() else {}
-    if kept.get("binary_sha256") == binary:
+    if stated.items() <= kept.items() and kept["bench_step"] is not None:
         return kept
     version = subprocess.run([options.bin, "--version"], capture_output=True, text=True).stdout.strip()
     arguments = ["bench", "step", "--repeats", "5", "--quiet", f"--json={step}", "--threads", str(options.threads)]
     step.unlink(missing_ok=True)
     code, _ = run(options.bin, arguments, options.out / "step.log")
-    found = {"version": version, "binary_sha256": binary, "bench_step": json.loads(step.read_text()) if code == 0 else None}
-    path.write_text(json.dumps(found, indent=1))
+    found = {"version": version, **stated, "bench_step": json.loads(step.read_text()) if code == 0 else None}
+    replace(path, found)
     return found
 
 
@@ -77,8 +78,14 @@ def train_for(target, train_with):
     return trained, code, seconds
 
 
-def train(options, name, path, setting, target):
-    """One row: what training and evaluation of `path` with `setting` give. `target` returns the seconds that presets get."""
+def is_finished(row):
+    """Whether there is a model and its scores."""
+    return row["exit"] in TRAINED and "psnr_db" in row
+
+
+def train(options, stated):
+    """One row: what is stated of it, and what training and evaluation give."""
+    name, path, setting = (stated[key] for key in ["scene", "path", "setting"])
     out = options.out / f"{name}-{setting.replace('+', '-')}"
     shared = ["--quiet", "--threads", str(options.threads)]
 
@@ -88,18 +95,17 @@ def train(options, name, path, setting, target):
         sets = [word for text in [*options.sets, *sets] for word in ("--set", text)]
         return run(options.bin, ["train", "--scene", path, "--out", str(out), "--overwrite", *shared, *chosen, *planned, *sets], out.with_suffix(".train.log"))
 
-    row = {"scene": name, "setting": setting} | {key: getattr(options, key) for key in STATED}
+    row = dict(stated)
     if is_planned(setting):
         code, seconds = fit()
     else:
-        wanted = target()
-        row["iterations"], code, seconds = train_for(wanted, lambda iterations: fit(f"train.iterations={iterations}"))
-        row["wanted_seconds"] = round(wanted, 1)
+        row["iterations"], code, seconds = train_for(stated["wanted_seconds"], lambda iterations: fit(f"train.iterations={iterations}"))
     row |= {"exit": code, "seconds": round(seconds, 1)}
     if code != 0:
         row["said"] = last_line(out.with_suffix(".train.log"))
     config = out / "config.toml"
-    row["plan"] = tomllib.loads(config.read_text()).get("auto", {}).get("plan", []) if config.exists() else []
+    # What fails early leaves the settings of an earlier training there.
+    row["plan"] = tomllib.loads(config.read_text()).get("auto", {}).get("plan", []) if code in TRAINED and config.exists() else []
     if code in TRAINED:
         report, log = out.with_suffix(".json"), out.with_suffix(".eval.log")
         report.unlink(missing_ok=True)
@@ -159,41 +165,44 @@ def main():
         scenes = [scene for scene in scenes if scene[0] in options.only.split(",")]
     settings = [*([] if options.without_auto else ["auto"]), *options.settings, *(f"auto+{field}" for field in options.fields.split(",") if field)]
     settings = list(dict.fromkeys(settings))
-    kept, lock, found = options.out / "rows.json", threading.Lock(), machine(options)
-    rows = json.loads(kept.read_text()) if kept.exists() else []
+    rows, found = Rows(options.out / "rows.json"), machine(options)
 
     def row_of(name, path, setting, auto):
-        wanted = (name, setting, options.minutes, options.sets)
-        with lock:
-            row = next((r for r in rows if (r["scene"], r["setting"], r["minutes"], r.get("sets", [])) == wanted), None)
+        stated = {"scene": name, "path": path, "setting": setting} | {key: getattr(options, key) for key in STATED} | {"binary_sha256": sha256(options.bin)}
+        if not is_planned(setting):
+            trained = auto is not None and auto.result()["exit"] in TRAINED
+            stated["wanted_seconds"] = round(auto.result()["seconds"] if trained else 60.0 * options.minutes, 1)
+        row = rows.find(stated)
         if row is None:
-            trained = lambda: auto is not None and auto.result()["exit"] in TRAINED
-            row = train(options, name, path, setting, lambda: auto.result()["seconds"] if trained() else 60.0 * options.minutes)
-            with lock:
-                rows.append(row)
-                kept.write_text(json.dumps(rows, indent=1))
+            row = train(options, stated)
+            if is_finished(row):
+                rows.keep(row)
         return row
 
     below, finished = [], []
     print("| scene | setting | PSNR dB | moving pixels | gain over none, dB (moving pixels) | SSIM | Gaussians (moving) | seconds | exit |" + "\n|" + " --- |" * 9)
     with concurrent.futures.ThreadPoolExecutor(max(1, options.jobs)) as pool:
-        started = {}
-        for name, path in scenes:
-            # Presets come last: they wait for the seconds of `auto`.
-            for setting in sorted(settings, key=lambda setting: not is_planned(setting)):
-                started[name, setting] = pool.submit(row_of, name, path, setting, started.get((name, "auto")))
-        for name, _ in scenes:
-            of_scene = {setting: started[name, setting].result() for setting in settings}
-            finished += of_scene.values()
-            print("\n".join(printed(row, of_scene.get("none")) for row in of_scene.values()), flush=True)
-            if "auto" in of_scene:
-                below += missed(of_scene["auto"], of_scene.get("none"), floors.get(name, {}))
+        try:
+            started = {}
+            for name, path in scenes:
+                # Presets come last: they wait for the seconds of `auto`.
+                for setting in sorted(settings, key=lambda setting: not is_planned(setting)):
+                    started[name, setting] = pool.submit(row_of, name, path, setting, started.get((name, "auto")))
+            for name, _ in scenes:
+                of_scene = {setting: started[name, setting].result() for setting in settings}
+                finished += of_scene.values()
+                print("\n".join(printed(row, of_scene.get("none")) for row in of_scene.values()), flush=True)
+                if "auto" in of_scene:
+                    below += missed(of_scene["auto"], of_scene.get("none"), floors.get(name, {}))
+        except KeyboardInterrupt:
+            return interrupt(pool)
     if options.json:
         of_scenes = {name: floors[name] for name, _ in scenes if name in floors}
         whole = {key: getattr(options, key) for key in STATED} | {"machine": found, "rows": finished, "floors": of_scenes, "below": below}
         options.json.write_text(json.dumps(whole, indent=1) + "\n")
-    print("".join(f"below its floor: {text}\n" for text in below), end="", file=sys.stderr)
-    return 1 if below else 0
+    failed = [f"{row['scene']} with {row['setting']}, exit code {row['exit']}: {row.get('said')}" for row in finished if not is_finished(row)]
+    print("".join(f"failed: {text}\n" for text in failed) + "".join(f"below its floor: {text}\n" for text in below), end="", file=sys.stderr)
+    return 1 if below or failed else 0
 
 
 if __name__ == "__main__":

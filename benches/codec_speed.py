@@ -9,7 +9,7 @@ without Zstandard, median and least of --encodes (fewer where a minute is over b
 MB, the program and what it had read included: before and after encoding, and where it decodes once and has done nothing else. A codec that takes longer than its
 limit has a row that says so. Run it while nothing else does. Writes OUT.json and prints a table.
 """
-import argparse, json, os, pathlib, subprocess, sys, tempfile
+import argparse, hashlib, json, os, pathlib, subprocess, sys, tempfile
 
 CODECS = "raw,quantize,sorted-image,spz,vq,cca:low,cca:mid,cca:default,compact"
 
@@ -78,7 +78,9 @@ def main():
     args.example = args.example.resolve()
     limits = {codec: float(seconds) for codec, seconds in (pair.rsplit("=", 1) for pair in args.limits.split(",") if pair)}
     commit = subprocess.run(["git", "-C", str(pathlib.Path(__file__).parent), "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip()
-    found = {"ply": args.ply.name, "copies": args.copies, "commit": commit, "rows": []}
+    # The commit is that of the repository; the example may be older.
+    digest = hashlib.sha256(args.example.read_bytes()).hexdigest()
+    found = {"ply": args.ply.name, "copies": args.copies, "commit": commit, "example_sha256": digest, "rows": []}
     for codec in args.codecs.split(","):
         row, machine = measure(args, codec, limits.get(codec, args.limit))
         found = {**machine, **found, "rows": [*found["rows"], row]}

@@ -5,6 +5,7 @@
 #
 #   benches/exports.sh MODEL SCENE OUT
 #
+# What an earlier call left in OUT is replaced.
 # Needs node with npm (which downloads the packages into OUT/tools, or into the folder that CC4DGS_TOOLS names) and ffmpeg. CC4DGS names the program.
 set -euo pipefail
 model=$1 scene=$2 out=$3
@@ -12,7 +13,7 @@ program=${CC4DGS:-target/release/cc4dgs}
 tools=${CC4DGS_TOOLS:-$out/tools}
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 mkdir -p "$out" "$tools"
-if ! [ -d "$tools/node_modules/gsplat" ]; then
+if ! [ -d "$tools/node_modules/gsplat" ] || ! [ -d "$tools/node_modules/gltf-validator" ] || ! [ -d "$tools/node_modules/@playcanvas/splat-transform" ]; then
     npm install --silent --prefix "$tools" @playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10 gsplat@1.2.9
 fi
 transform=(node "$tools/node_modules/@playcanvas/splat-transform/bin/cli.mjs" -w -q)
@@ -31,7 +32,7 @@ export_as splatv model.splatv
 export_as mp4 model.mp4 --frames 12 --size 320x240 --fps 12
 
 render() { # PLY FOLDER
-    "$program" render "$1" --out "$2" --scene "$scene" --frames 6 --device flex -q >/dev/null
+    "$program" render "$1" --out "$2" --scene "$scene" --frames 6 --overwrite --device flex -q >/dev/null
 }
 render "$out/model.ply" "$out/frames/own"
 

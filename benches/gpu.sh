@@ -4,13 +4,15 @@
 #   benches/gpu.sh [--bin FILE] [--out DIR] [--device NAME] [--scale SHARE] [--data DIR] [--train MINUTES] [--step SECONDS] [--frames N] [--player FILE]
 #
 # FILE is a built cc4dgs (default: target/release/cc4dgs), which may have been carried here from another machine. --scale shrinks images and Gaussians for
-# devices that are slow. --data names a folder with dnerf_mutant and panoptic_basketball; with it and --train, `auto` plans for the minutes and trains each at
-# the published size (mutant 800x800, basketball 640x360 with all frames). A training that takes more than 1.5 times as long is stopped.
+# devices that are slow. --data, a folder with dnerf_mutant and panoptic_basketball, and --train, minutes such as 0.5, go together: `auto` plans for the minutes and
+# trains each at the published size (mutant 800x800, basketball 640x360 with all frames). A training that takes more than 1.5 times as long is stopped.
+# Other steps are stopped after --step seconds (120), and keep what they measured until then. The exit code is 1 if a step fails, and 130 after Ctrl-C. What a call is
+# to measure is removed from DIR before it begins.
 # --player names the example `frames` of the player (cargo build --release -p cc4dgs-player --example frames); with it the player's renderer is timed too.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-bin=target/release/cc4dgs out="benches/results/$(date -u +%Y-%m-%d)-gpu" device=wgpu scale=1 data="" player="" minutes=0 limit=120 frames=50
+bin=target/release/cc4dgs out="benches/results/$(date -u +%Y-%m-%d)-gpu" device=wgpu scale=1 data="" player="" minutes="" limit=120 frames=50
 while [ $# -gt 1 ]; do
     case "$1" in
         --bin) bin=$2 ;;
@@ -26,42 +28,76 @@ while [ $# -gt 1 ]; do
     esac
     shift 2
 done
-repeats=$((frames < 10 ? frames : 10))
 [ $# = 0 ] || { echo "option $1 lacks a value" >&2; exit 2; }
+# positive OPTION VALUE
+positive() {
+    awk -v v="$2" 'BEGIN { exit !(v ~ /^[0-9]*[.]?[0-9]+(e[-+]?[0-9]+)?$/ && v + 0 > 0) }' || { echo "$1 wants a positive number, not \"$2\"" >&2; exit 2; }
+}
+positive --scale "$scale"
+positive --step "$limit"
+positive --frames "$frames"
+case "$frames" in *[!0-9]* | 0*) echo "--frames wants a whole number, not \"$frames\"" >&2; exit 2 ;; esac
+if [ -n "$minutes" ]; then
+    positive --train "$minutes"
+    [ -n "$data" ] || { echo "--train wants --data, the folder of the scenes" >&2; exit 2; }
+elif [ -n "$data" ]; then
+    echo "--data wants --train, the minutes of each training" >&2
+    exit 2
+fi
+repeats=$((frames < 10 ? frames : 10))
 [ -x "$bin" ] || { echo "$bin is not there; name a built cc4dgs with --bin" >&2; exit 2; }
 bin=$(realpath "$bin")
 mkdir -p "$out"
 out=$(realpath "$out")
 export XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-${TMPDIR:-/tmp}}"
 
+scenes=(dnerf_mutant:800 panoptic_basketball:640)
+# Results of an earlier call, of another program say, must not pass for those of this one.
+rm -f "$out"/{doctor,step,frame,frame-basis,train-step,field,loss,sort,kernels-{frame,step,field}{,-stopped},growth}.{json,log}
+[ -z "$player" ] || rm -f "$out"/{player-model,player}.{json,log} "$out/player.cc4d"
+for scene in ${minutes:+"${scenes[@]%%:*}"}; do
+    rm -f "$out/$scene"-{train,eval,compress,eval-compressed}.{json,log} "$out/$scene.cc4d" "$out/$scene/checkpoint"
+done
+
 failed=0
-# step NAME SECONDS COMMAND…: runs within the time, keeps table and JSON, goes on whatever happens.
+# step NAME SECONDS COMMAND…: runs within the time, keeps table and JSON, goes on whatever happens. Ends as `timeout` does: 124 where the time was over.
 step() {
     local name=$1 seconds=$2 began=$SECONDS
     shift 2
     echo "== $name"
-    rm -f "$out/$name.json"
-    timeout --signal=INT --kill-after=30 "$seconds" "$bin" "$@" "--json=$out/$name.json" 2>"$out/$name.log"
+    # In the foreground, Ctrl-C reaches the program.
+    timeout --foreground --signal=INT --kill-after=30 "$seconds" "$bin" "$@" "--json=$out/$name.json" 2>"$out/$name.log"
     local status=$?
-    if [ $status = 124 ] || [ $status = 130 ]; then
+    if [ $status = 130 ]; then
+        echo "   interrupted"
+        exit 130
+    elif [ $status = 124 ]; then
         echo "   stopped after $((SECONDS - began)) s"
     elif [ $status != 0 ]; then
         echo "   FAILED with exit code $status:"
         tail -3 "$out/$name.log"
         failed=1
     fi
+    return $status
 }
 
 # kernels NAME COMMAND…: the same with every kernel timed by itself (CubeCL's profile, read from the working folder, waits after each); the JSON is launches and
-# milliseconds per kernel. Whole times are not comparable with those of other steps.
+# milliseconds per kernel, NAME-stopped.json where the time was over. Whole times are not comparable with those of other steps.
 kernels() {
-    local name=$1 folder
+    local name=$1 folder status
     shift
     folder=$(mktemp -d)
     printf '[profiling]\nlogger = { level = "full", file = "%s/log" }\n' "$folder" >"$folder/cubecl.toml"
     pushd "$folder" >/dev/null
     step "$name" "$limit" "$@"
+    status=$?
     popd >/dev/null
+    rm -f "$out/$name.json"
+    case $status in
+        0) [ -f "$folder/log" ] || { echo "   FAILED: no kernel was timed"; failed=1; } ;;
+        124) name+=-stopped ;;
+        *) rm -f "$folder/log" ;;
+    esac
     [ -f "$folder/log" ] || { rm -rf "$folder"; return; }
     grep -aoE '^\| [0-9.]+[^ ]*s +\| [A-Za-z0-9_:]+' "$folder/log" |
         sed -E 's/^\| ([0-9.]+)([^ ]*s) +\| .*::([A-Za-z0-9_]+):?$/\3 \1 \2/' |
@@ -89,14 +125,17 @@ step growth "$limit" bench frame --device "$device" --growth --scale "$scale" --
 if [ -n "$player" ]; then
     step player-model 300 bench frame --device flex --case n3dv --scale "$scale" --motion 0.05 --frames 1 --set deformer.kind=cdf-basis --archive "$out/player.cc4d"
     echo "== player"
-    timeout --kill-after=10 "$limit" "$player" "$out/player.cc4d" --frames "$frames" >"$out/player.json" 2>"$out/player.log" || { tail -3 "$out/player.log"; failed=1; }
+    timeout --foreground --kill-after=10 "$limit" "$player" "$out/player.cc4d" --frames "$frames" >"$out/player.json" 2>"$out/player.log" ||
+        { tail -3 "$out/player.log"; rm -f "$out/player.json"; failed=1; }
     rm -f "$out/player.cc4d"
 fi
 
-if [ -n "$data" ] && [ "$minutes" != 0 ]; then
-    for scene in dnerf_mutant:800 panoptic_basketball:640; do
+if [ -n "$minutes" ]; then
+    longest=$(awk -v m="$minutes" 'BEGIN { s = 90 * m; printf "%d", (s > int(s) ? int(s) + 1 : s) }')
+    for scene in "${scenes[@]}"; do
         path="$data/${scene%%:*}" width="${scene##*:}" run="$out/${scene%%:*}"
-        step "${scene%%:*}-train" $((90 * minutes)) train --scene "$path" --preset auto --minutes "$minutes" --set scene.width="$width" --device "$device" --out "$run"
+        # One that failed late or was stopped leaves a checkpoint, too.
+        step "${scene%%:*}-train" "$longest" train --scene "$path" --overwrite --preset auto --minutes "$minutes" --set scene.width="$width" --device "$device" --out "$run"
         [ -f "$run/checkpoint" ] || continue
         step "${scene%%:*}-eval" 300 eval "$run" --scene "$path" --device "$device"
         step "${scene%%:*}-compress" 300 compress "$run" --codec cca:default --out "$run.cc4d" --overwrite

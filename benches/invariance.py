@@ -4,13 +4,15 @@
     benches/invariance.py SCENE OUT [--bin FILE] [--preset NAME] [--iterations N] [--device NAME] [--seeds N] [--only NAME,NAME] [--set KEY=VALUE]...
 
 SCENE is a D-NeRF/Blender folder (transforms_train.json) or a PanopticSports folder (train_meta.json). Copies hold changed metadata and links to the images.
-Each copy is trained with one seed, the unchanged scene with --seeds seeds. OUT/invariance.json holds all numbers. Needs Python 3 alone.
+Each copy is trained with one seed, the unchanged scene with --seeds seeds. Runs and copies of an earlier call are replaced. OUT/invariance.json holds all numbers. The
+exit code is 1 if a training or an evaluation failed. Needs Python 3 alone.
 """
 import argparse
 import json
 import math
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 
@@ -70,11 +72,10 @@ def world_to_camera(change, m):
 
 def copy(source, target, change):
     """Links everything but the files with poses, which are rewritten."""
-    target.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
     for entry in source.iterdir():
         link = target / entry.name
-        if link.is_symlink() or link.exists():
-            link.unlink()
         if entry.name.startswith("transforms_") and entry.suffix == ".json":
             document = json.loads(entry.read_text())
             for frame in document["frames"]:
@@ -117,7 +118,7 @@ def main():
             sets = [f"seed={seed}", f"train.iterations={args.iterations}", *args.sets]
             options = [part for assignment in sets for part in ("--set", assignment)]
             scene = str(args.out / name / "scene")
-            train = ["train", "--scene", scene, "--preset", preset, "--device", args.device, "--out", str(run), *options]
+            train = ["train", "--scene", scene, "--preset", preset, "--device", args.device, "--out", str(run), "--overwrite", *options]
             report = args.out / name / f"eval-{seed}.json"
             report.unlink(missing_ok=True)
             measure = ["eval", str(run), "--scene", scene, "--device", args.device, "--sheet-rows", "0", f"--json={report}"]

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """Long trainings of published scenes with `auto`, each scored once on its test views, with curves of validation PSNR against wall time.
 
-    python3 benches/quality.py OUT --bin BIN --data DATA [--only mutant-5,...] [--threads N] [--set KEY=VALUE ...] [--curves]
+    python3 benches/quality.py OUT --bin BIN --data DATA [--only mutant-5,...] [--threads N] [--minutes M] [--set KEY=VALUE ...] [--curves]
 
-DATA holds `dnerf_mutant` and `panoptic_basketball`. Every run is trained for its minutes of wall time, then evaluated on the test split. An interrupted run is
-resumed from its checkpoint when the script is called again; a finished one is not repeated. With `--curves` every run is trained a second time with views kept
-out of training, and its log holds the curve. The three medians of `bench step` are measured before every run. Results are kept in OUT/rows.json, one row per run
-and list of --set; runs with --set have folders of their own, OUT/NAME-HASH. `peak_memory_mb` is the most resident memory of the training's last process, in
-MB of 10^6 bytes.
+DATA holds `dnerf_mutant` and `panoptic_basketball`. Every run is trained for its minutes of wall time, then evaluated on the test split. An interrupted run is resumed from its checkpoint when
+the script is called again; a finished one is not repeated. With `--curves` every run is trained a second time with views kept out of training, and its log holds the
+curve. The three medians of `bench step` are measured before every run. `--minutes` plans the runs for another time than their own. Results are kept in
+OUT/rows.json, one row per run, list of --set, minutes, threads, data folder and program (its SHA-256); each has a folder of its own, OUT/NAME-HASH. What fails has no
+row and makes the exit code 1, as does a run below its aim. `peak_memory_mb` is the most resident memory of the training's last process, in MB of 10^6 bytes.
 """
 import argparse
 import hashlib
@@ -18,6 +18,8 @@ import subprocess
 import sys
 import time
 import tomllib
+
+from trainings import TRAINED, Rows, sha256
 
 # Name, scene, minutes, settings, and the PSNR in dB it is meant to reach.
 RUNS = [
@@ -60,11 +62,12 @@ def measured(arguments, file):
     return child.returncode, round(usage.ru_maxrss * 1024 / 1e6, 1)
 
 
-def train(options, name, scene, minutes, settings):
-    # Another list of --set must not resume this one's checkpoint.
-    digest = hashlib.sha256(json.dumps(options.sets).encode()).hexdigest()[:8]
-    out = options.out / (f"{name}-{digest}" if options.sets else name)
-    path = str(options.data / scene)
+def train(options, stated, settings):
+    """The row of a run: what is stated of it, and what it reached; without a PSNR where it failed."""
+    digest = hashlib.sha256(json.dumps(stated).encode()).hexdigest()[:8]
+    # What states anything else must not resume this one's checkpoint.
+    out = options.out / f"{stated['name']}-{digest}"
+    path = str(options.data / stated["scene"])
     log = out.with_suffix(".train.log")
     step = medians(options, out)
     arguments = ["train", "--scene", path, "--out", str(out), "--quiet", f"--json={out.with_suffix('.train.json')}"]
@@ -72,7 +75,7 @@ def train(options, name, scene, minutes, settings):
     if resumed:
         arguments += ["--resume"]
     else:
-        arguments += ["--overwrite", "--minutes", str(minutes)]
+        arguments += ["--overwrite", "--minutes", str(stated["minutes"])]
         for text in [*settings, "train.checkpoint_every=2000", *options.sets]:
             arguments += ["--set", text]
     if options.threads:
@@ -81,13 +84,13 @@ def train(options, name, scene, minutes, settings):
     began = time.time()
     with open(log, "a") as file:
         code, peak = measured([options.bin, *arguments], file)
-    row = {"name": name, "scene": scene, "minutes": minutes, "settings": [*settings, *options.sets], "sets": options.sets, "exit": code, "resumed": resumed}
+    row = {**stated, "exit": code, "resumed": resumed}
     row |= {"seconds": round(time.time() - began, 1), "peak_memory_mb": peak, "bench_step": step, "curve": curve(out / "events.jsonl")}
     report = out.with_suffix(".eval.json")
     report.unlink(missing_ok=True)
     evaluation = [options.bin, "eval", str(out), "--scene", path, "--split", "test", f"--json={report}", "--sheet", str(out.with_suffix(".png")), "--quiet"]
     with open(out.with_suffix(".eval.log"), "w") as file:
-        if code == 0 and subprocess.run(evaluation, stdout=file, stderr=subprocess.STDOUT).returncode == 0:
+        if code in TRAINED and subprocess.run(evaluation, stdout=file, stderr=subprocess.STDOUT).returncode == 0:
             found = json.loads(report.read_text())
             keys = ["psnr_db", "psnr_dynamic_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "psnr_worst_block_db", "lost_blocks"]
             row |= {key: found.get(key) for key in keys}
@@ -115,23 +118,23 @@ def main():
     parser.add_argument("--only", default="", help="names of runs, with commas")
     parser.add_argument("--threads", type=int, default=0, help="threads of each training; 0 takes all cores")
     parser.add_argument("--curves", action="store_true")
+    parser.add_argument("--minutes", type=float, help="what every run is planned for, in place of its own time")
     parser.add_argument("--set", dest="sets", action="append", default=[], help="handed to every training")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    kept = options.out / "rows.json"
-    rows = json.loads(kept.read_text()) if kept.exists() else []
+    rows = Rows(options.out / "rows.json")
     below = []
     for name, scene, minutes, settings, aim in RUNS:
         if options.only and name not in options.only.split(","):
             continue
         for name, settings in [(name, settings)] + ([(f"{name}-curve", settings + CURVES)] if options.curves else []):
-            # Rows of earlier versions have no list of --set of their own.
-            same = [r for r in rows if r["name"] == name and r.get("sets", r["settings"][len(settings):]) == options.sets]
-            row = next((r for r in same if r["exit"] == 0), None)
+            stated = {"name": name, "scene": scene, "path": str(options.data / scene), "minutes": options.minutes or minutes}
+            stated |= {"settings": [*settings, *options.sets], "threads": options.threads, "binary_sha256": sha256(options.bin)}
+            row = rows.find(stated)
             if row is None:
-                row = train(options, name, scene, minutes, settings)
-                rows = [r for r in rows if r not in same] + [row]
-                kept.write_text(json.dumps(rows, indent=1))
+                row = train(options, stated, settings)
+                if row.get("psnr_db") is not None:
+                    rows.keep(row)
             psnr = row.get("psnr_db")
             print(f"{name:24} {psnr or float('nan'):.2f} dB (aim {aim}), SSIM {row.get('ssim') or float('nan'):.4f}, {row.get('gaussians')} Gaussians, {row['seconds']} s, exit {row['exit']}", flush=True)
             if psnr is None or psnr < aim:

@@ -19,6 +19,9 @@ WIDTH, HEIGHT = 1366, 1500
 def main():
     page_file, out = pathlib.Path(sys.argv[1]).resolve(), pathlib.Path(sys.argv[2])
     out.mkdir(parents=True, exist_ok=True)
+    # Screens of a longer report must not pass for this one's.
+    for old in out.glob("screen-[0-9][0-9]*.png"):
+        old.unlink()
     problems, requests = [], []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"], headless=True)

@@ -5,8 +5,9 @@
                         [--set KEY=VALUE]...
 
 SCENE is a nerfstudio folder (transforms.json), a D-NeRF/Blender folder (transforms_train.json) or a PanopticSports folder (train_meta.json). Copies hold changed
-metadata and links to the images. A damaged run should end with an error that names the cause; the unchanged one ("same") with exit code 0. OUT/sabotage.json holds
-exit codes, last sentences, warnings and PSNR. The exit code of this program is the number of runs that did not end as they should. Needs Python 3 alone.
+metadata and links to the images. A damaged run should end with an error that names the cause (exit code 3: what is wrong with the data, or 6: a model that is no good;
+some may train if they are warned about); the unchanged one ("same") with exit code 0. OUT/sabotage.json holds exit codes, last sentences, warnings and PSNR. The exit
+code of this program is the number of runs that did not end as they should. Needs Python 3 alone.
 """
 import argparse
 import json
@@ -56,6 +57,10 @@ def png_or_jpeg_size(path):
             return width, height
         at += 2 + length
     sys.exit(f"{path}: neither PNG nor JPEG")
+
+
+# Exit codes of data and of models that are refused. Others are mistakes in the call, crashes and interruptions, which tell nothing of the data.
+REFUSED = (3, 6)
 
 
 class Transforms:
@@ -240,8 +245,8 @@ def main():
         results.append({"damage": name, "exit": ended.returncode, "last": last, "warnings": warnings, "psnr_db": psnr})
         # Half of the images may be enough, and a static scene needs no times; the run must say so all the same, and the model must be no blur.
         spoken = {"half-missing": "missing", "no-times": "time"}.get(name)
-        warned = spoken is not None and any(spoken in warning for warning in warnings) and (psnr or 0.0) >= args.floor
-        expected = ended.returncode == 0 if name == "same" else ended.returncode != 0 or warned
+        warned = ended.returncode == 0 and spoken is not None and any(spoken in warning for warning in warnings) and (psnr or 0.0) >= args.floor
+        expected = ended.returncode == 0 if name == "same" else ended.returncode in REFUSED or warned
         wrong += not expected
         shown = "     -" if psnr is None else f"{psnr:6.2f}"
         print(f"{name:<13} exit {ended.returncode:>3} {shown} dB  {'' if expected else 'UNEXPECTED '}{last}", flush=True)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Float32 bytes of deformers as published: a model of each method after one iteration on a tiny built-in scene, whose weights have the size of any scene's.
+"""Float32 bytes of deformers as published: a model of each method after three iterations on a tiny built-in scene, whose weights have the size of any scene's.
 
     python3 benches/storage.py CC4DGS OUT.json [--family n3dv]
 """

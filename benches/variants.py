@@ -2,9 +2,13 @@
 """Compares settings at equal wall time on validation views, never on test views.
 
     python3 benches/variants.py OUT --bin BIN --minutes 3 --scene rig=procedural:captures/rig:7 --variant 'batch=train.batch=4;train.lr.batch_power=0.5' [--seeds 2]
+                                [--set KEY=VALUE ...] [--preset NAME] [--views N] [--threads N]
 
 Every scene is trained with the preset (`auto`) as it is, called `base`, and with each variant's settings on top. The plan gives each variant as many iterations as
-take the same time. Rows are kept in OUT/rows.json and not run again; a table of validation PSNR, and what each variant gains on `base`, is printed at the end.
+take the same time. A line with validation PSNR, and what the variant gains on `base`, is printed for each training.
+
+Rows are kept in OUT/rows.json and not run again with the same scene, path, variant, --set, preset, views, threads, minutes, seed and program (its SHA-256). Trainings
+that fail, with exit codes other than 0 and 6, have no row there, and make the exit code 1.
 """
 import argparse
 import json
@@ -13,12 +17,16 @@ import subprocess
 import sys
 import time
 
+from trainings import TRAINED, Rows, sha256
 
-def train(options, scene, path, name, settings, seed):
-    out = options.out / f"{scene}-{name}-{seed}"
+
+def train(options, stated):
+    """The row of one training: what is stated of it, and what it gave."""
+    seed, settings = stated["seed"], stated["settings"]
+    out = options.out / f"{stated['scene']}-{stated['variant']}-{seed}"
     report = out.with_suffix(".json")
     report.unlink(missing_ok=True)
-    arguments = ["train", "--scene", path, "--out", str(out), "--overwrite", "--quiet", "--preset", options.preset, f"--json={report}"]
+    arguments = ["train", "--scene", stated["path"], "--out", str(out), "--overwrite", "--quiet", "--preset", options.preset, f"--json={report}"]
     if options.minutes > 0:
         arguments += ["--minutes", str(options.minutes)]
     if options.threads:
@@ -28,7 +36,7 @@ def train(options, scene, path, name, settings, seed):
     began = time.time()
     with open(out.with_suffix(".log"), "w") as log:
         code = subprocess.run([options.bin, *arguments], stdout=log, stderr=subprocess.STDOUT).returncode
-    row = {"scene": scene, "variant": name, "settings": settings, "seed": seed, "minutes": options.minutes, "exit": code, "seconds": round(time.time() - began, 1)}
+    row = stated | {"exit": code, "seconds": round(time.time() - began, 1)}
     if report.exists():
         found = json.loads(report.read_text())
         verdict = found.get("verdict") or {}
@@ -56,23 +64,27 @@ def main():
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     variants = [("base", [])] + [(text.split("=", 1)[0], text.split("=", 1)[1].split(";")) for text in options.variant]
-    kept = options.out / "rows.json"
-    rows = json.loads(kept.read_text()) if kept.exists() else []
-    table = {}
+    rows = Rows(options.out / "rows.json")
+    shared = {key: getattr(options, key) for key in ["sets", "preset", "views", "threads", "minutes"]}
+    table, failed = {}, []
     for scene, path in (text.split("=", 1) for text in options.scene):
         for seed in range(options.seeds):
             for name, settings in variants:
-                same = lambda r: (r["scene"], r["variant"], r["settings"], r["seed"], r["minutes"]) == (scene, name, settings, seed, options.minutes)
-                row = next((r for r in rows if same(r)), None)
+                stated = {"scene": scene, "path": path, "variant": name, "settings": settings, "seed": seed, **shared, "binary_sha256": sha256(options.bin)}
+                row = rows.find(stated)
                 if row is None:
-                    row = train(options, scene, path, name, settings, seed)
-                    rows.append(row)
-                    kept.write_text(json.dumps(rows, indent=1))
+                    row = train(options, stated)
+                    if row["exit"] in TRAINED:
+                        rows.keep(row)
+                    else:
+                        failed.append(f"{scene}-{name}-{seed}")
                 table[scene, name, seed] = row.get("validation")
                 base = table[scene, "base", seed]
                 gain = f"{row['validation'] - base:+.2f}" if row.get("validation") and base else "-"
                 print(f"{scene:12} {name:16} seed {seed}: validation {row.get('validation') or float('nan'):.2f} dB ({gain}), training {row.get('train') or float('nan'):.2f} dB, "
                       f"{row.get('gaussians')} Gaussians ({row.get('moving_gaussians')} move), {row.get('iterations')} iterations, {row['seconds']} s, exit {row['exit']}", flush=True)
+    print("".join(f"failed: {name}, see {options.out / name}.log\n" for name in failed), end="", file=sys.stderr)
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -1,0 +1,78 @@
+"""What scripts share that train: rows in a file, so that nothing is trained again under the same program and settings, and what happens on Ctrl-C."""
+import hashlib
+import json
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+
+TRAINED = (0, 6)  # Exit codes of trainings that leave a model; 6 is one below simple baselines.
+INTERRUPTED = threading.Event()  # Set once Ctrl-C was pressed: threads begin nothing more.
+
+
+def sha256(program):
+    """Of the file that runs as `program`: a rebuilt one is another program."""
+    file = shutil.which(program)
+    if file is None:
+        sys.exit(f"{program} is not there, or cannot be run")
+    return hashlib.sha256(pathlib.Path(file).read_bytes()).hexdigest()
+
+
+def replace(file, document):
+    """Writes JSON; whoever is interrupted meanwhile keeps what was there."""
+    partial = file.with_name(file.name + ".partial")
+    partial.write_text(json.dumps(document, indent=1) + "\n")
+    partial.replace(file)
+
+
+class Rows:
+    """Finished rows in a JSON file. Each states what it depends on, beside what was measured."""
+
+    def __init__(self, file):
+        self.file, self.lock = file, threading.Lock()
+        self.rows = json.loads(file.read_text()) if file.exists() else []
+
+    def find(self, stated):
+        """The row that states the same. Rows of earlier versions of a script state less, and are not found."""
+        with self.lock:
+            return next((row for row in self.rows if stated.items() <= row.items()), None)
+
+    def keep(self, row):
+        with self.lock:
+            self.rows.append(row)
+            replace(self.file, self.rows)
+
+
+def begin(arguments, **streams):
+    """The process, unless Ctrl-C was pressed."""
+    if INTERRUPTED.is_set():
+        raise KeyboardInterrupt
+    return subprocess.Popen(arguments, **streams)
+
+
+def ended(child, seconds=None):
+    """Exit code of a process, or `None` if it takes more than `seconds`. Ctrl-C interrupts it, too: it gets a minute to write its checkpoint, and nothing goes on."""
+    try:
+        code = child.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return None
+    except BaseException:
+        try:
+            child.wait(60)
+        except subprocess.TimeoutExpired:
+            child.kill()
+        raise
+    # In a thread: the process may be told before the main thread is.
+    if INTERRUPTED.wait(1 if code in (130, -signal.SIGINT) else 0):
+        raise KeyboardInterrupt
+    return code
+
+
+def interrupt(pool):
+    """To be called on Ctrl-C, which the processes that threads of `pool` wait for get, too: what has not begun never will."""
+    INTERRUPTED.set()
+    pool.shutdown(wait=False, cancel_futures=True)
+    print("interrupted; waiting for processes to end", file=sys.stderr)
+    return 130
