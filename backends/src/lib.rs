@@ -56,7 +56,7 @@ mod cube {
     mod adam;
     mod basis;
     mod cross_entropy;
-    mod field;
+    pub(crate) mod field;
     mod image;
     mod life;
     mod lookup;

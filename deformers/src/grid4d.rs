@@ -15,7 +15,7 @@ use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup};
 use cc4dgs_core::{
     Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, SpatialFeatures, SpatialInput,
-    config, inventory,
+    config, inventory, ordered_sum,
 };
 use rand::Rng;
 use serde::Deserialize;
@@ -256,7 +256,7 @@ impl Deformer for Grid4d {
         let shift: Vec<f32> = (0..3 * m).map(|_| random.random_range(-s.smooth_delta..=s.smooth_delta)).collect();
         let here = in_box(input.means_world.clone(), &self.context);
         let there = here.clone() + Tensor::<2>::from_data(TensorData::new(shift, [m, 3]), &here.device());
-        let squares = |a: Tensor<2>, b: Tensor<2>| (a - b).powi_scalar(2).sum().mul_scalar(s.smooth_weight / m as f32);
+        let squares = |a: Tensor<2>, b: Tensor<2>| ordered_sum((a - b).powi_scalar(2)).mul_scalar(s.smooth_weight / m as f32);
         let still = squares(lookup(self.weight(0), here.clone(), &self.space)?, lookup(self.weight(0), there.clone(), &self.space)?);
         Ok(Some(still + squares(self.with_time(&here, time_norm)?, self.with_time(&there, time_norm)?)))
     }

@@ -12,7 +12,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{Error, Result};
 use std::sync::Arc;
 
@@ -226,6 +226,7 @@ pub fn mlp_relu_flat(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -
         return Err(Error::parameter("network", format!("input [{m},{width}] for layers {shape:?}"), "Give at least one row and widths that fit"));
     }
     check_weights("network", weights.dims()[0], shape.parameter_count())?;
+    check_rows(&x.device(), shape, m)?;
     Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone())))
 }
 
@@ -236,6 +237,21 @@ pub(super) fn split_heads(flat: &Tensor<1>, rows: usize, widths: &[usize]) -> Ve
     }
     let heads = split(flat.clone(), widths.iter().map(|width| rows * width).collect());
     heads.into_iter().zip(widths).map(|(head, &width)| head.reshape([rows, width])).collect()
+}
+
+/// An error if an array of the network with this many rows is more than one binding of `device` holds.
+#[cfg(feature = "cube")]
+fn check_rows(device: &Device, shape: &ReluShape, rows: usize) -> Result<()> {
+    let plain = device.clone().without_autodiff();
+    let burn::backend::DispatchDevice::Cube(own) = plain.as_dispatch() else { return Ok(()) };
+    let floats = crate::cube::field::widest_row(shape, crate::cube::tensor::shared_bytes(&own.client()));
+    check_binding(device, "network", "points", rows, floats * size_of::<f32>())
+}
+
+/// An error if an array is more than one binding of the device holds. Processors have no such limit.
+#[cfg(not(feature = "cube"))]
+fn check_rows(_: &Device, _: &ReluShape, _: usize) -> Result<()> {
+    Ok(())
 }
 
 fn check_weights(object: &str, got: usize, want: usize) -> Result<()> {

@@ -180,5 +180,6 @@ pub fn bce_with_logits_loss(planes: Tensor<3>, mask: Tensor<2>) -> Result<Tensor
     if c == 0 || [mh, mw] != [h, w] {
         return Err(Error::parameter("score loss", format!("planes [{c},{h},{w}] against mask [{mh},{mw}]"), "Give a mask of the rendered size"));
     }
+    check_binding(&planes.device(), "score loss", "pixels", h * w, c * size_of::<f32>())?;
     Ok(Tensor::from_dispatch(<Dispatch as PhotometricOps>::bce_with_logits(planes.into_dispatch(), mask.into_dispatch())))
 }

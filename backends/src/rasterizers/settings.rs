@@ -1,10 +1,12 @@
 //! Checks the inputs of a render and converts them to the form of the operation.
 
-use crate::ops::rasterize::RasterSettings;
+use crate::ops::rasterize::{RasterSettings, TILE};
 use cc4dgs_core::{BLUR_RANGE, Camera, Error, RenderSettings, Result, SplatColors, Splats, blur_at};
 
 /// Pixels of the largest image drawn.
 const MAX_PIXELS: u64 = 1 << 28;
+/// Pixels of the longest side: kernels for GPUs pack ranges of tiles in 16 bits.
+const MAX_SIDE: u64 = u16::MAX as u64 * TILE as u64;
 
 /// Checks shapes, camera and degree, and gathers the numbers of a render.
 pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettings) -> Result<RasterSettings> {
@@ -12,6 +14,10 @@ pub fn raster_settings(splats: &Splats, camera: &Camera, settings: &RenderSettin
     let pixels = u64::from(camera.width) * u64::from(camera.height);
     if pixels > MAX_PIXELS {
         return Err(Error::limit(format!("image of camera {}", camera.name), pixels, MAX_PIXELS, "Render a smaller image"));
+    }
+    let side = u64::from(camera.width.max(camera.height));
+    if side > MAX_SIDE {
+        return Err(Error::limit(format!("longest side of the image of camera {}", camera.name), side, MAX_SIDE, "Render a smaller image"));
     }
     let [n, _] = splats.means.dims();
     let shape = |name: &str, seen: &[usize], wanted: &[usize]| {

@@ -1,7 +1,8 @@
 //! Drops functions of time that a trained deformer hardly uses, and heads without effect: fewer bytes to store and fewer coefficients to read per frame.
 //!
-//! A function's part in a head's offsets is measured on the scene's own Gaussians and times, not on weights: the root-mean-square of its coefficients times
-//! its own. Functions are dropped from the smallest part on, as long as the sum of what is dropped stays below a share of the head's offsets.
+//! A function's part in a head's offsets is measured on all of the scene's own Gaussians and times, not on weights: the root-mean-square of its coefficients
+//! times its own. Functions are dropped from the smallest part on, as long as the root-mean-square of all that is dropped stays below a share of that of the
+//! head's offsets.
 
 use super::{CdfBasis, NET};
 use crate::parts::heads::Head;
@@ -36,21 +37,14 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
     for at_time in field.functions_by_head(times, &device)? {
         functions.push(to_vec(at_time.inner(), "functions")?);
     }
-    let count = field.shape.functions();
-    let flat: Vec<f32> = functions.concat();
-    let of_functions = mean_squares(&flat, count);
 
     let (mut plans, mut lines) = (Vec::new(), Vec::new());
     let (mut column, mut first) = (0, 0);
     for (&head, &(width, own)) in field.settings.heads.iter().zip(&field.shape.groups) {
         let coefficients = &values[m * column..m * (column + width * own)];
-        // Mean square over Gaussians, outputs and times of c φ, per function.
-        let strength = mean_squares(coefficients, own);
-        let part = |f: usize| strength[f] * of_functions[first + f];
-        let parts: Vec<f64> = (0..own).map(part).collect();
-        let whole = combined_square(coefficients, (width, own), &functions, first);
-        let scale = field.scale_of(head);
-        let kept = if whole.sqrt() < negligible(head) * scale { Vec::new() } else { keep(&parts, whole * field.settings.unused.powi(2)) };
+        let effects = effects(coefficients.chunks_exact(own), functions.iter().map(|at| &at[first..first + own]), own);
+        let (whole, least) = (effects.iter().sum::<f64>(), negligible(head) * field.scale_of(head));
+        let kept = if whole < least * least { Vec::new() } else { keep(&effects, own, whole * field.settings.unused.powi(2)) };
         if kept.is_empty() {
             lines.push(format!("{} has no effect and is dropped", head.name()));
         } else if kept.len() < own {
@@ -70,44 +64,45 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
     Ok(Some(Simplified { settings: small.section.clone(), field: Box::new(small), message }))
 }
 
-/// The mean square of every column of rows `[_, columns]`.
-fn mean_squares(values: &[f32], columns: usize) -> Vec<f64> {
-    let mut sums = vec![0.0f64; columns];
-    for row in values.chunks_exact(columns) {
-        sums.iter_mut().zip(row).for_each(|(s, v)| *s += f64::from(*v).powi(2));
-    }
-    let rows = (values.len() / columns).max(1) as f64;
-    sums.into_iter().map(|s| s / rows).collect()
+/// How each pair of a head's `count` functions adds to the mean square of its offsets over Gaussians, outputs and times `[count, count]`: mean of c cᵀ times mean
+/// of φ φᵀ, entry by entry. The sum over all pairs is the whole mean square, that over the pairs of some functions the mean square of what these add.
+fn effects<'a>(coefficients: impl Iterator<Item = &'a [f32]>, functions: impl Iterator<Item = &'a [f32]>, count: usize) -> Vec<f64> {
+    let (of_coefficients, of_functions) = (mean_products(coefficients, count), mean_products(functions, count));
+    of_coefficients.iter().zip(&of_functions).map(|(c, f)| c * f).collect()
 }
 
-/// The mean square of a head's offsets, over at most a thousand Gaussians.
-fn combined_square(coefficients: &[f32], (width, own): (usize, usize), functions: &[Vec<f32>], first: usize) -> f64 {
-    let rows = coefficients.len() / (width * own);
-    let (mut sum, mut terms) = (0.0, 0u64);
-    for coefficients in coefficients.chunks_exact(width * own).step_by(rows.div_ceil(1000)).flat_map(|row| row.chunks_exact(own)) {
-        for phi in functions {
-            let offset: f64 = coefficients.iter().zip(&phi[first..first + own]).map(|(c, f)| f64::from(c * f)).sum();
-            sum += offset * offset;
-            terms += 1;
+/// The mean over `rows` of the products of each two of their `count` numbers `[count, count]`.
+fn mean_products<'a>(rows: impl Iterator<Item = &'a [f32]>, count: usize) -> Vec<f64> {
+    let (mut sums, mut wide, mut seen) = (vec![0.0f64; count * count], vec![0.0f64; count], 0u64);
+    for row in rows {
+        wide.iter_mut().zip(row).for_each(|(wide, v)| *wide = f64::from(*v));
+        for (i, (sums, a)) in sums.chunks_exact_mut(count).zip(&wide).enumerate() {
+            // The other half of the products is the same.
+            sums[i..].iter_mut().zip(&wide[i..]).for_each(|(sum, b)| *sum += a * b);
+        }
+        seen += 1;
+    }
+    let mean = |(i, j): (usize, usize)| sums[i.min(j) * count + i.max(j)] / seen.max(1) as f64;
+    (0..count * count).map(|k| mean((k / count, k % count))).collect()
+}
+
+/// The functions to keep of `count`, so that what the others add has a mean square of at most `allowed`.
+fn keep(effects: &[f64], count: usize, allowed: f64) -> Vec<usize> {
+    let part = |f: usize| effects[f * count + f];
+    let mut order: Vec<usize> = (0..count).collect();
+    order.sort_by(|&a, &b| part(a).total_cmp(&part(b)));
+    let mut left_out: Vec<usize> = Vec::new();
+    let mut square = 0.0;
+    for f in order {
+        square += part(f) + 2.0 * left_out.iter().map(|&g| effects[f * count + g]).sum::<f64>();
+        // Not a number is no reason to drop anything.
+        if square <= allowed {
+            left_out.push(f);
+        } else {
+            break;
         }
     }
-    sum / terms.max(1) as f64
-}
-
-/// The indices to keep so that the parts of the others sum to less than `allowed`.
-fn keep(parts: &[f64], allowed: f64) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..parts.len()).collect();
-    order.sort_by(|&a, &b| parts[a].total_cmp(&parts[b]));
-    let mut left_out = 0.0;
-    let mut kept: Vec<usize> = order
-        .into_iter()
-        .filter(|&f| {
-            left_out += parts[f];
-            left_out > allowed
-        })
-        .collect();
-    kept.sort_unstable();
-    kept
+    (0..count).filter(|f| !left_out.contains(f)).collect()
 }
 
 /// The deformer with the planned functions only: the same weights without the columns of the others.

@@ -7,7 +7,7 @@ use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
 use cc4dgs_backends::ops::columns::beside;
 use cc4dgs_backends::ops::life::{LEAST_FALLOFF, LifeAt, LifeRules, lives};
-use cc4dgs_core::{AttributeSpec, Error, LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, Result, gate_value};
+use cc4dgs_core::{AttributeSpec, Error, LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, Result, gate_value, ordered_sum};
 use serde::{Deserialize, Serialize};
 
 /// Where lives start and how they are learned.
@@ -115,8 +115,9 @@ impl Life {
     }
     /// The mean of 1 - gate with its weight, from the values of `life_gate` `[M,1]`.
     pub fn regularizer(&self, gates: Tensor<2>) -> Option<Tensor<1>> {
-        let open = (self.settings.gate_weight > 0.0 && gates.dims()[0] > 0).then(|| sigmoid(gates.mul_scalar(LIFE_GATE_STEEPNESS)).mean());
-        Some(open?.neg().add_scalar(1.0).mul_scalar(self.settings.gate_weight))
+        let [count, _] = gates.dims();
+        let open = || ordered_sum(sigmoid(gates.mul_scalar(LIFE_GATE_STEEPNESS))).div_scalar(count as f32);
+        Some((self.settings.gate_weight > 0.0 && count > 0).then(open)?.neg().add_scalar(1.0).mul_scalar(self.settings.gate_weight))
     }
 }
 

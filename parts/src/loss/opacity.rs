@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 use burn::tensor::activation::sigmoid;
-use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory};
+use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory, ordered_sum};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -16,7 +16,7 @@ impl LossTerm for MeanOpacity {
         if input.gaussians.is_empty() {
             return Ok(None);
         }
-        Ok(Some(sigmoid(input.gaussians.opacity_logits.clone()).mean()))
+        Ok(Some(ordered_sum(sigmoid(input.gaussians.opacity_logits.clone())).div_scalar(input.gaussians.opacity_logits.dims()[0] as f32)))
     }
 }
 

@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 
-use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory};
+use cc4dgs_core::{LossInput, LossPlugin, LossTerm, Plugin, Result, config, inventory, ordered_sum};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -16,7 +16,9 @@ impl LossTerm for MeanScale {
         if input.gaussians.is_empty() {
             return Ok(None);
         }
-        Ok(Some(input.gaussians.log_scales.clone().exp().mean().div_scalar(input.schedule.extent.max(f32::MIN_POSITIVE))))
+        let scales = input.gaussians.log_scales.clone().exp();
+        let count = scales.dims().iter().product::<usize>();
+        Ok(Some(ordered_sum(scales).div_scalar(count as f32).div_scalar(input.schedule.extent.max(f32::MIN_POSITIVE))))
     }
 }
 

@@ -2,6 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::bench::random_gaussians;
+use cc4dgs_backends::ops::photometric::bce_with_logits_loss;
 use cc4dgs_backends::rasterizers::reference::ReferenceRasterizer;
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_backends::{cap_bindings, cap_shared_memory};
@@ -100,6 +101,7 @@ fn draw(rasterizer: &dyn Rasterizer, case: &Case, device: &Device, upstream: &[f
 
 #[test]
 fn every_device_draws_the_edges_like_the_reference() {
+    let _held = crate::alone();
     let devices = devices();
     for (k, case) in cases().iter().enumerate() {
         let pixels = (case.size.0 * case.size.1) as usize;
@@ -136,6 +138,7 @@ fn every_device_draws_the_edges_like_the_reference() {
 /// Gaussians in a plane parallel to the image, up to a few millionths: rounding makes their depth order differ between devices.
 #[test]
 fn near_ties_of_depth_are_drawn_in_one_order() {
+    let _held = crate::alone();
     let (width, height) = (48u32, 32u32);
     let camera = Camera::look_at("ties", (width, height), 1.0, [1.7, -2.3, -6.1], [0.1, 0.2, 0.3], [0.1, -1.0, 0.2]);
     let (forward, eye) = (camera.forward_world(), camera.center_world());
@@ -165,6 +168,7 @@ fn near_ties_of_depth_are_drawn_in_one_order() {
 /// million would.
 #[test]
 fn small_adapters_change_nothing_or_are_an_error() {
+    let _held = crate::alone();
     let case = |count| Case {
         name: "small adapter",
         gaussians: changed(count, 11, |g| g.log_scales.fill(-4.5)),
@@ -175,13 +179,21 @@ fn small_adapters_change_nothing_or_are_an_error() {
     let upstream = noise(Seed::root(91), 5 * 64 * 48);
     for (name, device) in devices().into_iter().filter(|(name, _)| *name == "wgpu") {
         let whole = draw(&TileRasterizer, &case(10_000), &device, &upstream);
-        let _held = crate::LIMITS.lock().unwrap();
         cap_bindings(1 << 20);
         let parts = draw(&TileRasterizer, &case(10_000), &device, &upstream);
         let many = Gaussians::from_host(&case(20_000).gaussians, &device);
         let camera = Camera::look_at("stress", (64, 48), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
         let refused = TileRasterizer.render(&Splats::from_gaussians(&many, 3), &camera, &RenderSettings::default());
+        // 300 x 200 pixels have 5 planes of 240,000 bytes.
+        let wide = Camera::look_at("wide", (300, 200), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
+        let few = Gaussians::from_host(&case(10).gaussians, &device);
+        let too_wide = TileRasterizer.render(&Splats::from_gaussians(&few, 3), &wide, &RenderSettings::default());
+        let masked = bce_with_logits_loss(Tensor::zeros([5, 200, 300], &device), Tensor::zeros([200, 300], &device));
         cap_bindings(u64::MAX);
+        for (what, refused) in [("render", too_wide.map(|_| ())), ("score loss", masked.map(|_| ()))] {
+            let message = refused.expect_err("60,000 pixels need more").to_string();
+            assert!(message.contains(what) && message.contains("60000") && message.contains("pixels"), "{name}: {message}");
+        }
         assert!(whole == parts, "{name}: images or gradients differ");
         cap_shared_memory(16 << 10);
         let (image, gradients) = draw(&TileRasterizer, &case(10_000), &device, &upstream);
@@ -201,6 +213,7 @@ fn small_adapters_change_nothing_or_are_an_error() {
 
 #[test]
 fn capacity_for_pairs_changes_nothing_unless_it_is_too_small() {
+    let _held = crate::alone();
     let gaussians = changed(800, 12, |_| {});
     let camera = Camera::look_at("stress", (80, 48), 1.0, [0.0, 0.0, -7.0], [0.0; 3], [0.0, -1.0, 0.0]);
     for (name, device) in devices() {

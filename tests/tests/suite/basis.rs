@@ -177,6 +177,67 @@ fn what_a_scene_does_not_use_is_left_out() {
     }
 }
 
+/// What is dropped from a deformer with these coefficients, head after head, row by row, per output those of the functions 1, t, and two bands of two.
+fn dropped(heads: &str, rows: usize, coefficients: Vec<f32>, times: &[f32]) -> String {
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
+    let text = format!("levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 0\ntime_bands = 2\nheads = {heads}");
+    let plugin = Registry::collect().unwrap().deformer("cdf-basis").unwrap();
+    let field = (plugin.build)(&config::parse_table("test", &text).unwrap(), &context, &Device::flex()).unwrap();
+    let columns = coefficients.len() / rows;
+    let features = Tensor::<2>::from_data(TensorData::new(coefficients, [rows, columns]), &Device::flex());
+    field.simplified(features, times).unwrap().map(|simple| simple.message).unwrap_or_default()
+}
+
+#[test]
+fn a_head_that_one_gaussian_uses_is_kept() {
+    let (rows, own) = (3000, 6);
+    // Centres use the constant; the scales of a single Gaussian use everything.
+    let mut coefficients: Vec<f32> = (0..2 * 3 * own * rows).map(|k| if k < 3 * own * rows && k % own == 0 { 0.3 } else { 0.0 }).collect();
+    let moving = 3 * own * (rows + 1000);
+    coefficients[moving..moving + 3 * own].fill(0.5);
+    let message = dropped("['means', 'log_scales']", rows, coefficients.clone(), &[0.1, 0.35, 0.8]);
+    assert!(message.contains("means keeps 1 of 6") && !message.contains("log_scales"), "{message}");
+    coefficients[moving..moving + 3 * own].fill(1e-4);
+    let message = dropped("['means', 'log_scales']", rows, coefficients, &[0.1, 0.35, 0.8]);
+    assert!(message.contains("log_scales has no effect"), "{message}");
+}
+
+#[test]
+fn what_is_dropped_together_is_below_the_share_together() {
+    let (rows, share) = (10, 0.0068);
+    // At the end of the sequence, the constant, t and the first cosine are 1. Two shares as squares are below 0.01², their sum is not.
+    let message = dropped("['means']", rows, [share, share, 0.0, 1.0, 0.0, 0.0].repeat(3 * rows), &[1.0]);
+    assert!(message.contains("means keeps 2 of 6"), "{message}");
+    // Where they take from each other, they go together.
+    let message = dropped("['means']", rows, [share, -share, 0.0, 1.0, 0.0, 0.0].repeat(3 * rows), &[1.0]);
+    assert!(message.contains("means keeps 1 of 6"), "{message}");
+    let broken = dropped("['means']", rows, [f32::NAN, 0.0, 0.0, 1.0, 0.0, 0.0].repeat(3 * rows), &[1.0]);
+    assert!(broken.is_empty(), "{broken}");
+}
+
+#[test]
+fn a_moment_alone_is_that_moment_among_others() {
+    let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
+    let text = "levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 5\ntime_bands = 3\nheads = ['means']";
+    let section = config::parse_table("test", text).unwrap();
+    let plugin = Registry::collect().unwrap().deformer("cdf-basis").unwrap();
+    for (name, device) in devices() {
+        let mut field = (plugin.build)(&section, &context, &device).unwrap();
+        for (k, parameter) in field.parameters_mut().into_iter().enumerate() {
+            let len = parameter.value.dims()[0];
+            parameter.value = Tensor::from_data(TensorData::new(noise(80 + k as u64, len), [len]), &device);
+        }
+        let points = Tensor::<2>::from_data(TensorData::new(noise(60, 300), [100, 3]), &device);
+        let features = field.spatial(&SpatialInput::new(points)).unwrap().values;
+        let bits = |offsets: Offsets| to_vec(offsets.means.unwrap(), "means").unwrap().into_iter().map(f32::to_bits).collect::<Vec<u32>>();
+        let times = [0.0, 0.137, 0.5, 0.731, 1.0];
+        let together = field.deform_all(features.clone(), &times).unwrap();
+        for (time, among) in times.into_iter().zip(together) {
+            assert!(bits(field.deform(features.clone(), time).unwrap()) == bits(among), "{name}: other bits at {time}");
+        }
+    }
+}
+
 /// The group lasso compared with its definition (penalties times norms) and its gradient with finite differences, on every device.
 #[test]
 fn the_lasso_pulls_every_function_by_its_price() {

@@ -29,14 +29,24 @@ fn relu_backward(grad: &mut [f32], output: &[f32]) {
     }
 }
 
-/// The outputs of all layers for one block of `x` `[count, input]`.
-fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], count: usize, outputs: &mut [Scratch]) {
+/// `values` with zeros behind, where they are fewer than `len`. Blocks are padded so that the result of a row does not depend on how many rows there are.
+fn padded(values: &[f32], len: usize) -> Option<Scratch> {
+    (values.len() < len).then(|| {
+        let mut whole = scratch(len);
+        whole[..values.len()].copy_from_slice(values);
+        whole[values.len()..].fill(0.0);
+        whole
+    })
+}
+
+/// The outputs of all layers for one block `x` `[BLOCK, input]`.
+fn block_forward(layers: &[Layer], weights: &[f32], x: &[f32], outputs: &mut [Scratch]) {
     for (i, layer) in layers.iter().enumerate() {
         let (before, rest) = outputs.split_at_mut(i);
-        let out = &mut rest[0][..count * layer.output];
+        let out: &mut [f32] = &mut rest[0];
         let input: &[f32] = layer.parent.map_or(x, |p| &before[p]);
         fill_rows(out, &weights[layer.bias.clone()]);
-        matmul(out, input, &weights[layer.weight.clone()], (count, layer.input, layer.output), true);
+        matmul(out, input, &weights[layer.weight.clone()], (BLOCK, layer.input, layer.output), true);
         if layer.relu {
             vectorized(
                 #[inline(always)]
@@ -58,7 +68,7 @@ pub fn forward(shape: &ReluShape, weights: &[f32], x: &[f32]) -> Vec<f32> {
     row_blocks(&mut out, &widths, count, BLOCK).into_par_iter().zip(x.par_chunks(BLOCK * shape.input)).for_each(|(mut outs, x)| {
         let count = x.len() / shape.input;
         let mut outputs: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
-        block_forward(&layers, weights, x, count, &mut outputs);
+        block_forward(&layers, weights, padded(x, BLOCK * shape.input).as_deref().unwrap_or(x), &mut outputs);
         for (layer, output) in layers.iter().zip(&outputs) {
             if let Some(slot) = layer.slot {
                 outs[slot].copy_from_slice(&output[..count * layer.output]);
@@ -86,12 +96,19 @@ pub fn backward(shape: &ReluShape, weights: &[f32], x: &[f32], grad: &[f32], wan
         let mut outputs: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
         let mut grads: Vec<Scratch> = layers.iter().map(|l| scratch(BLOCK * l.output)).collect();
         for (b, x) in x.chunks(BLOCK * shape.input).enumerate() {
-            let rows = x.len() / shape.input;
-            block_forward(&layers, weights, x, rows, &mut outputs);
+            let (rows, whole) = (x.len() / shape.input, padded(x, BLOCK * shape.input));
+            let inputs = whole.as_deref().unwrap_or(x);
+            block_forward(&layers, weights, inputs, &mut outputs);
             let first = i * run + b * BLOCK;
             load_output_grads(&layers, &mut grads, grad, count, first, rows);
             let sink = if wants_input { &mut sink[b * BLOCK * shape.input..][..x.len()] } else { &mut sink[..0] };
-            block_backward(&layers, &back, x, rows, &outputs, &mut grads, &mut total, sink);
+            match padded(sink, if wants_input { BLOCK * shape.input } else { 0 }) {
+                Some(mut of_inputs) => {
+                    block_backward(&layers, &back, inputs, &outputs, &mut grads, &mut total, &mut of_inputs);
+                    sink.copy_from_slice(&of_inputs[..sink.len()]);
+                }
+                None => block_backward(&layers, &back, inputs, &outputs, &mut grads, &mut total, sink),
+            }
         }
         total
     };
@@ -99,33 +116,25 @@ pub fn backward(shape: &ReluShape, weights: &[f32], x: &[f32], grad: &[f32], wan
     (grad_x, sum_in_order(parts))
 }
 
-/// Sets the gradient of every layer's output: the given one where the layer is an output, zero elsewhere.
+/// Sets the gradient of every layer's output: the given one where the layer is an output, zero elsewhere and behind the last of the `rows`.
 fn load_output_grads(layers: &[Layer], grads: &mut [Scratch], grad: &[f32], count: usize, first: usize, rows: usize) {
     let mut at = 0;
     for (layer, own) in layers.iter().zip(grads) {
-        let own = &mut own[..rows * layer.output];
+        let (given, behind) = own.split_at_mut(rows * layer.output);
         if layer.slot.is_some() {
-            own.copy_from_slice(&grad[at + first * layer.output..][..own.len()]);
+            given.copy_from_slice(&grad[at + first * layer.output..][..given.len()]);
             at += count * layer.output;
         } else {
-            own.fill(0.0);
+            given.fill(0.0);
         }
+        behind.fill(0.0);
     }
 }
 
-fn block_backward(
-    layers: &[Layer],
-    back: &[Vec<f32>],
-    x: &[f32],
-    rows: usize,
-    outputs: &[Scratch],
-    grads: &mut [Scratch],
-    total: &mut [f32],
-    grad_x: &mut [f32],
-) {
+fn block_backward(layers: &[Layer], back: &[Vec<f32>], x: &[f32], outputs: &[Scratch], grads: &mut [Scratch], total: &mut [f32], grad_x: &mut [f32]) {
     for (i, layer) in layers.iter().enumerate().rev() {
         let (before, rest) = grads.split_at_mut(i);
-        let own = &mut rest[0][..rows * layer.output];
+        let own: &mut [f32] = &mut rest[0];
         if layer.relu {
             vectorized(
                 #[inline(always)]
@@ -133,17 +142,44 @@ fn block_backward(
             );
         }
         let input: &[f32] = layer.parent.map_or(x, |p| &outputs[p]);
-        add_transposed_matmul(&mut total[layer.weight.clone()], input, own, (rows, layer.input, layer.output));
+        add_transposed_matmul(&mut total[layer.weight.clone()], input, own, (BLOCK, layer.input, layer.output));
         vectorized(
             #[inline(always)]
             || add_column_sums(&mut total[layer.bias.clone()], own),
         );
         let target: &mut [f32] = match layer.parent {
-            Some(p) => &mut before[p][..rows * layer.input],
+            Some(p) => &mut before[p],
             None if grad_x.is_empty() => continue,
             None => &mut *grad_x,
         };
         // Layers are visited in one order, so sums over heads are fixed too.
-        matmul(target, own, &back[i], (rows, layer.output, layer.input), true);
+        matmul(target, own, &back[i], (BLOCK, layer.output, layer.input), true);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_do_not_depend_on_how_many_there_are() {
+        let shape = ReluShape { input: 9, trunk: vec![33, 20], heads: vec![vec![24, 3], vec![11]] };
+        let numbers = |count: usize, step: f32| (0..count).map(|k| (k as f32 * step).sin() * 0.4).collect::<Vec<f32>>();
+        let most = 2 * BLOCK + 5;
+        let (weights, x) = (numbers(shape.parameter_count(), 0.91), numbers(most * 9, 0.37));
+        let (of_first, of_second) = (numbers(most * 3, 0.53), numbers(most * 11, 0.71));
+        // Outputs of both heads, and the gradient of the input.
+        let run = |rows: usize| {
+            let (x, grad) = (&x[..rows * 9], [&of_first[..rows * 3], &of_second[..rows * 11]].concat());
+            let outputs = forward(&shape, &weights, x);
+            let (of_input, _) = backward(&shape, &weights, x, &grad, true);
+            (outputs[..rows * 3].to_vec(), outputs[rows * 3..].to_vec(), of_input)
+        };
+        let whole = run(most);
+        for rows in [1, 2, 7, 100, BLOCK, BLOCK + 1] {
+            let (first, second, of_input) = run(rows);
+            assert!(first == whole.0[..rows * 3] && second == whole.1[..rows * 11], "outputs of {rows} rows");
+            assert!(of_input == whole.2[..rows * 9], "gradient of {rows} rows");
+        }
     }
 }

@@ -193,9 +193,8 @@ impl WithSimd for GradientChunk<'_> {
                 for (row, value) in screen.iter_mut().zip(record) {
                     row[lane] = value;
                 }
-                let clamps = self.settings.sh_degree.is_some();
                 for c in 0..3 {
-                    screen[RECORD + c][lane] = if clamps && splat.color[c] <= 0.0 { 0.0 } else { 1.0 };
+                    screen[RECORD + c][lane] = if splat.clamped[c] { 0.0 } else { 1.0 };
                 }
             }
             // The records of the next group are scattered over the lists: prefetch them.

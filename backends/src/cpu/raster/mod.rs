@@ -73,6 +73,8 @@ pub struct ScreenSplat {
     pub opacity: f32,
     /// Red, green, blue.
     pub color: [f32; 3],
+    /// Which of them were negative and are clamped at zero.
+    pub clamped: [bool; 3],
     /// Camera depth in world units.
     pub depth: f32,
     /// Half of the width in which alpha can reach 1/255, pixels.

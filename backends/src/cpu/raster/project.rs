@@ -231,6 +231,7 @@ impl ProjectChunk<'_> {
             conic: [v[2], v[3], v[4]],
             opacity: v[5],
             color: [0.0; 3],
+            clamped: [false; 3],
             depth: self.camera.depth(&self.splats.means[3 * index..3 * index + 3]),
             half_width: v[6],
             index: index as u32,
@@ -246,7 +247,12 @@ impl ProjectChunk<'_> {
             #[inline(always)]
             |c| if clamps { color[c].max(0.0) } else { color[c] },
         );
-        let splat = ScreenSplat { color: shown, ..self.slots[slot] };
+        // A colour of exactly zero is not clamped: without its gradient, what is black could never change.
+        let clamped = each(
+            #[inline(always)]
+            |c| clamps && color[c] < 0.0,
+        );
+        let splat = ScreenSplat { color: shown, clamped, ..self.slots[slot] };
         // False for NaN as well.
         if color.iter().all(|c| c.abs() < COLOR_LIMIT) {
             self.slots[*kept] = splat;

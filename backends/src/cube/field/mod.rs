@@ -9,6 +9,7 @@ mod program;
 mod voxels;
 
 pub use gradients::add_segments;
+pub use network::widest_row;
 
 use crate::ops::corners::{CornerOps, CornersBegun, GridBox};
 use crate::ops::field::{Decoder, FieldKernels, FieldOps, ReluShape};

@@ -42,6 +42,8 @@ const TRUNK: usize = 0;
 const HEAD: usize = 1;
 /// For gradients of outputs that are wider than a tile, which are loaded in pieces.
 const PIECE: usize = 2;
+/// Rows of a plan that is made only to look at its widths.
+const ANY_ROWS: usize = 16;
 
 impl Tree {
     fn new(shape: &ReluShape, rows: usize) -> Self {
@@ -57,6 +59,11 @@ impl Tree {
         let source = l.parent.map_or(TRUNK, |p| self.tile(p));
         Step::Multiply { source, target, input: l.input, output: l.output, weights: l.weight.start, bias: Some(l.bias.start), relu: l.relu, add: false }
     }
+    /// All layers.
+    fn forwards(&self) -> Program {
+        let step = |i: usize| self.forward(i, self.slots[i].map_or(Target::Tile(self.tile(i)), Target::Out));
+        Program((0..self.layers.len()).map(step).collect())
+    }
     /// From the gradient of layer `i`'s output, of which the source tile holds some columns, to that of its input.
     fn backward(&self, i: usize, source: usize, columns: std::ops::Range<usize>, target: Target, add: bool) -> Step {
         let l = &self.layers[i];
@@ -69,12 +76,22 @@ impl Tree {
     }
 }
 
+/// Floats per row of the largest array that the kernels bind, forwards or backwards, on a device with so much shared memory.
+pub fn widest_row(shape: &ReluShape, shared_bytes: usize) -> usize {
+    let tree = Tree::new(shape, ANY_ROWS);
+    let ends = shape.output_widths().iter().sum::<usize>().max(shape.input);
+    let fits = |program: Program| program.layout(shape.input, ANY_ROWS, shared_bytes).is_some();
+    if fits(tree.forwards()) && fits(plan(&tree, ANY_ROWS, true).program) {
+        return ends;
+    }
+    // Layer by layer, each of them has an array.
+    tree.layers.iter().map(|l| l.output).fold(ends, usize::max)
+}
+
 /// Flat outputs, head after head.
 pub fn forward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape) -> CubeTensor {
     let rows = x.meta.shape()[0];
-    let tree = Tree::new(shape, rows);
-    let step = |i: usize| tree.forward(i, tree.slots[i].map_or(Target::Tile(tree.tile(i)), Target::Out));
-    let program = Program((0..tree.layers.len()).map(step).collect());
+    let program = Tree::new(shape, rows).forwards();
     let Some(layout) = program.layout_on(x, shape.input, rows) else { return run(x, weights, shape, rows).1 };
     let flat = floats(x, [rows * shape.output_widths().iter().sum::<usize>()]);
     program.run(layout, Input::Rows(x, shape.input), weights, weights, &flat, &(0..rows));
@@ -164,7 +181,7 @@ pub fn backward(x: &CubeTensor, weights: &CubeTensor, shape: &ReluShape, grad: &
     let gradient = floats(weights, [tree.weights]);
     let all: Vec<Dense> = tree.layers.iter().map(dense).collect();
     let both = gradients::with_transposed(weights, &all);
-    for part in parts(x, rows, plan(&tree, 16, wants_input).floats.div_ceil(16)) {
+    for part in parts(x, rows, plan(&tree, ANY_ROWS, wants_input).floats.div_ceil(ANY_ROWS)) {
         let Plan { program, saved, of_input: input_at, floats: length } = plan(&tree, part.len(), wants_input);
         let buffer = &floats(x, [length]);
         program.run(layout, Input::Rows(x, shape.input), &both, grad, buffer, &part);

@@ -94,7 +94,6 @@ pub fn backward(
                 means.clone().into_buffer_arg(),
                 rows_of(&sh_rest, &rows, width).into_buffer_arg(),
                 lists.cam.clone().into_buffer_arg(),
-                lists.splats.clone().into_buffer_arg(),
                 screen.clone().into_buffer_arg(),
                 d_colors.clone().into_buffer_arg(),
                 if wants_rest { rows_of(&d_rest, &rows, width) } else { d_rest.clone() }.into_buffer_arg(),

@@ -105,7 +105,7 @@ pub fn blend_tiles(
             let full = full_alpha(&drawn, at, px - drawn[at + AT_X], py - drawn[at + AT_Y]);
             if full > 0.0 {
                 let alpha = select(full < alpha_max, full, alpha_max);
-                let after = left - alpha * left;
+                let after = left * (1.0f32 - alpha);
                 if after <= TRANSMITTANCE_STOP {
                     running = false;
                     stop = first + g;

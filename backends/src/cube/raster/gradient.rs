@@ -2,7 +2,7 @@
 
 use super::geometry::{CENTER, project, project_backward};
 use super::harmonics::{basis, basis_backward};
-use super::project::{KEY_TILES, KEYS, activated_opacity, activated_scales, quaternion, view_direction};
+use super::project::{KEY_CLAMPED, KEY_TILES, KEYS, activated_opacity, activated_scales, quaternion, view_direction};
 use super::vector::{V3, add, dot, load3, scale, store3, v3};
 use crate::cube::tensor::{THREADS, compensated_sum, sum_of_threads};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD};
@@ -60,6 +60,17 @@ pub fn sum_records(records: &[f32], start_of_gaussian: &[u32], keys: &[u32], spl
             for k in 0..4usize {
                 screen[to + AT_COLOR + k] = sums[AT_COLOR + k];
             }
+            // What was clamped at zero passes nothing.
+            let clamped = keys[KEYS * i + KEY_CLAMPED];
+            if (clamped & 1u32) != 0u32 {
+                screen[to + AT_COLOR] = 0.0;
+            }
+            if (clamped & 2u32) != 0u32 {
+                screen[to + AT_COLOR + 1] = 0.0;
+            }
+            if (clamped & 4u32) != 0u32 {
+                screen[to + AT_COLOR + 2] = 0.0;
+            }
             screen[to + AT_DRAWN] = 1.0;
         } else {
             #[unroll]
@@ -96,7 +107,6 @@ pub fn color_backward(
     means: &[f32],
     sh_rest: &[f32],
     cam: &[f32],
-    splats: &[f32],
     screen: &mut [f32],
     d_colors: &mut [f32],
     d_rest: &mut [f32],
@@ -116,9 +126,7 @@ pub fn color_backward(
         let mut blue = screen[from + 2];
         if comptime!(harmonics) {
             let seen = red != 0.0 || green != 0.0 || blue != 0.0;
-            // What was clamped at zero passes nothing.
-            let at = RECORD * i + AT_COLOR;
-            let d = v3(select(splats[at] > 0.0, red, 0.0f32), select(splats[at + 1] > 0.0, green, 0.0f32), select(splats[at + 2] > 0.0, blue, 0.0f32));
+            let d = v3(screen[from], screen[from + 1], screen[from + 2]);
             red = 0.0;
             green = 0.0;
             blue = 0.0;

@@ -8,8 +8,8 @@ use crate::ops::rasterize::camera::{ALPHA_MIN, FAR, SHORTEST_QUATERNION};
 use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT_X, AT_Y, RECORD, TILE};
 use cubecl::prelude::*;
 
-/// Columns of what sorting needs of a Gaussian.
-pub const KEYS: usize = 4;
+/// Columns of what sorting needs of a Gaussian, and of which of its colours are clamped.
+pub const KEYS: usize = 5;
 /// Column of the depth key.
 pub const KEY_DEPTH: usize = 0;
 /// Column of the number of tiles.
@@ -18,6 +18,9 @@ pub const KEY_TILES: usize = 1;
 pub const KEY_COLUMNS: usize = 2;
 /// Column of the first and end tile along y, packed in halves.
 pub const KEY_ROWS: usize = 3;
+/// Column of the channels that were negative and are clamped at zero: 1 for red, 2 for green, 4 for blue. Colours cannot say it themselves: 0 may be exact, and
+/// compilers may ignore the sign of a zero.
+pub const KEY_CLAMPED: usize = 4;
 /// Sigma by which footprints are enlarged, so that rounding never cuts off a pixel that blending would count.
 const CUTOFF_MARGIN: f32 = 0.005;
 /// Colours of this size and above count as infinite: their sums could overflow.
@@ -102,7 +105,7 @@ fn all_finite(mean: V3, s: V3, q: V4, opacity: f32, p: Projected) -> bool {
         && is_finite(p.center_y)
 }
 
-/// Screen records `[N,10]` with the radius (0 if culled) in place of the colour, which [`color_gaussians`] adds; sorting keys `[N,4]`.
+/// Screen records `[N,10]` with the radius (0 if culled) in place of the colour, which [`color_gaussians`] adds; sorting keys `[N,5]`.
 #[cube(launch)]
 pub fn project_gaussians(
     means: &[f32],
@@ -177,6 +180,7 @@ pub fn project_gaussians(
         keys[key + KEY_TILES] = select(drawn, length_of(columns) * length_of(rows), 0u32);
         keys[key + KEY_COLUMNS] = columns;
         keys[key + KEY_ROWS] = rows;
+        keys[key + KEY_CLAMPED] = 0u32;
         // Integer radii stay below 2^31, as in Inria's code.
         splats[at + AT_COLOR] = select(drawn, select(radius < 1e9, radius, 1e9f32), 0.0f32);
     }
@@ -231,6 +235,8 @@ pub fn color_gaussians(
                 is_finite(red) && is_finite(green) && is_finite(blue) && red.abs() < COLOR_LIMIT && green.abs() < COLOR_LIMIT && blue.abs() < COLOR_LIMIT;
             if finite {
                 if comptime!(harmonics) {
+                    let (of_red, of_green, of_blue) = (select(red < 0.0, 1u32, 0u32), select(green < 0.0, 2u32, 0u32), select(blue < 0.0, 4u32, 0u32));
+                    keys[KEYS * i + KEY_CLAMPED] = of_red | of_green | of_blue;
                     red = select(red > 0.0, red, 0.0f32);
                     green = select(green > 0.0, green, 0.0f32);
                     blue = select(blue > 0.0, blue, 0.0f32);

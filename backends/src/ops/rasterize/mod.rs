@@ -5,7 +5,7 @@ pub mod camera;
 mod cpu;
 mod settings;
 
-use super::limits::{over_binding, unread};
+use super::limits::{check_binding, over_binding, unread};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, DispatchDevice, ExtensionType, backend_extension};
 use burn::tensor::{Device, Int, Tensor};
@@ -79,6 +79,9 @@ impl Refusal {
         }
     }
 }
+
+/// Planes of a render: the largest arrays with a number per pixel.
+const PLANES: usize = 5;
 
 /// What the forward pass of a device returns.
 #[derive(ExtensionType)]
@@ -230,6 +233,7 @@ fn check_device(device: &Device, method: Method, shortcuts: Shortcuts) -> Result
 pub fn rasterize(inputs: RasterInputs, settings: RasterSettings, method: Method) -> Result<RenderOutput> {
     let device = inputs.means.device();
     check_device(&device, method, settings.shortcuts)?;
+    check_binding(&device, "render", "pixels", settings.width * settings.height, PLANES * size_of::<f32>())?;
     // What is absent still needs a tensor: probes are never read, and no background is black.
     let absent = || Tensor::<1>::empty([3], &device).into_dispatch();
     let black = || Tensor::<1>::zeros([3], &device).into_dispatch();

@@ -4,7 +4,7 @@ use crate::config::TrainConfig;
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::frame_time;
-use cc4dgs_core::{Deformer, DeformerContext, Result, Seed, SpatialInput};
+use cc4dgs_core::{Deformer, DeformerContext, Result, Seed, SpatialInput, ordered_sum};
 use rand::Rng;
 
 /// Flicker of the field's motion: rms of its second difference from frame to frame over the rms of its deviation from the mean.
@@ -62,7 +62,7 @@ pub fn smoothness(
     Ok(match (d, d_shifted) {
         (Some(a), Some(b)) => {
             let difference = a - b;
-            Some((difference.clone() * difference).sum().mul_scalar(weight))
+            Some(ordered_sum(difference.clone() * difference).mul_scalar(weight))
         }
         _ => None,
     })
@@ -74,7 +74,7 @@ mod tests {
     use burn::tensor::Device;
     use cc4dgs_core::{DeformerWork, Offsets, Parameter, ParameterGroup, SpatialFeatures};
 
-    /// Moves everything along x by a function of time, scaled by the canonical x.
+    /// Moves everything away from the origin by a function of time, scaled by the canonical centre, and changes colours likewise.
     struct Along(fn(f32) -> f32);
 
     impl Deformer for Along {
@@ -82,7 +82,9 @@ mod tests {
             Ok(SpatialFeatures { values: input.means_world.clone(), work: DeformerWork::default() })
         }
         fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
-            Ok(Offsets { means: Some(features.mul_scalar(self.0(time_norm))), ..Offsets::default() })
+            let moved = features.mul_scalar(self.0(time_norm));
+            let sh = moved.clone().reshape([-1, 1, 3]).repeat_dim(1, 16);
+            Ok(Offsets { means: Some(moved), sh: Some(sh), ..Offsets::default() })
         }
         fn parameters(&self) -> Vec<&Parameter> {
             Vec::new()
@@ -122,5 +124,23 @@ mod tests {
         let (half, whole) = (term(|t| t, 0.5), term(|t| t, 1.0));
         assert!(half > 0.0 && (whole / half - 2.0).abs() < 1e-4, "{half} and {whole}");
         assert_eq!(term(|_| 0.0, 1.0), 0.0);
+    }
+
+    #[test]
+    fn the_penalty_does_not_depend_on_threads() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 30, sh_degree: 3, seed: Seed::root(1) };
+        let config = TrainConfig { smooth_delta: 0.1, ..TrainConfig::default() };
+        // More than 4 Mi numbers of a quarter of the Gaussians, from where burn adds in parallel.
+        let count: usize = 4 * ((4 << 20) / 51 + 1);
+        let centres: Vec<f32> = (0..3 * count as u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 8) as f32 * 1e-7).collect();
+        let found = [1, 2, 3, 5].map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let input = SpatialInput::new(Tensor::from_data(TensorData::new(centres.clone(), [count, 3]), &Device::flex()));
+                let term = smoothness(&Along(|t| t), &context, &input, 0.5, &config, 1.0, Seed::root(3)).unwrap().unwrap();
+                to_vec(term, "smoothness").unwrap()[0]
+            })
+        });
+        assert!(found[0] > 0.0 && found.iter().all(|term| term.to_bits() == found[0].to_bits()), "{found:?}");
     }
 }

@@ -170,7 +170,7 @@ impl DensityControl for Mcmc {
         // A round starts over; so do the statistics when somebody else changed the rows.
         if own || !plan.keeps_all(before) {
             self.statistics = Statistics::zeros(plan.len(), device);
-            self.weights = self.weights.after(plan, device)?;
+            self.weights = self.weights.after(plan, own, device)?;
         }
         Ok(())
     }
@@ -272,6 +272,7 @@ inventory::submit! {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::HostGaussians;
 
     #[test]
     fn what_others_add_is_no_growth() {
@@ -285,6 +286,39 @@ mod tests {
         control.executed(&plan, &device).unwrap();
         let start = control.state().into_iter().find(|(name, _)| name == "start").unwrap().1;
         assert_eq!(start.into_scalar::<f32>(), 5.0);
+    }
+
+    #[test]
+    fn only_rounds_of_its_own_age_the_blending_weights() {
+        let device = Device::flex();
+        let mut control = build(&toml::from_str("every = 1\nmax_gaussians = 3").unwrap()).unwrap();
+        control.begin_stage(2, &device);
+        let rounds = |control: &dyn DensityControl| {
+            let found = control.state().into_iter().find(|(name, _)| name == "rounds").unwrap().1;
+            to_vec(found, "rounds").unwrap()
+        };
+        // Points of key frames, say; then broken rows are removed.
+        let mut added = DensityPlan::unchanged(2);
+        added.copy(0);
+        control.executed(&added, &device).unwrap();
+        let mut removed = DensityPlan::new();
+        removed.keep(1);
+        removed.keep(2);
+        control.executed(&removed, &device).unwrap();
+        assert_eq!(rounds(control.as_ref()), [0.0, 0.0]);
+        let host = HostGaussians {
+            means: vec![0.0; 6],
+            log_scales: vec![-3.0; 6],
+            quaternions: [1.0, 0.0, 0.0, 0.0].repeat(2),
+            opacity_logits: vec![0.0; 2],
+            sh_dc: vec![0.0; 6],
+            dynamic_scores: vec![0.0; 2],
+            ..Default::default()
+        };
+        let schedule = Schedule { iteration: 1000, ..Schedule::main(20_000) };
+        let plan = control.plan(&Gaussians::from_host(&host, &device), &schedule, Seed::root(1)).unwrap().unwrap();
+        control.executed(&plan, &device).unwrap();
+        assert_eq!(rounds(control.as_ref()), [1.0, 1.0]);
     }
 
     #[test]

@@ -40,12 +40,13 @@ impl Weights {
         rows.truncate(most);
         Ok(rows)
     }
-    /// What the Gaussians of `plan` start the next round with; new ones with nothing.
-    pub fn after(&self, plan: &DensityPlan, device: &Device) -> Result<Self> {
+    /// What the Gaussians of `plan` go on with; new ones with nothing. Only a `round` of this control leaves a share and counts: plans of others come at any time.
+    pub fn after(&self, plan: &DensityPlan, round: bool, device: &Device) -> Result<Self> {
+        let (share, passed) = if round { (MEMORY, 1.0) } else { (1.0, 0.0) };
         let (old, rows) = (to_vec(self.sums.clone(), "blending weights")?, || plan.parents().iter().zip(plan.fresh()));
-        let of = |(&parent, &fresh): (&usize, &bool)| std::array::from_fn::<f32, 3, _>(|k| if fresh { 0.0 } else { MEMORY * old[3 * parent + k] });
+        let of = |(&parent, &fresh): (&usize, &bool)| std::array::from_fn::<f32, 3, _>(|k| if fresh { 0.0 } else { share * old[3 * parent + k] });
         let sums = Tensor::from_data(TensorData::new(rows().flat_map(of).collect(), [plan.len(), 3]), device);
-        Ok(Self { sums, rounds: rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + 1.0 }).collect() })
+        Ok(Self { sums, rounds: rows().map(|(&parent, &fresh)| if fresh { 0.0 } else { self.rounds[parent] + passed }).collect() })
     }
 }
 
@@ -75,8 +76,12 @@ mod tests {
         plan.keep(1);
         plan.copy(0);
         plan.keep(0);
-        let mut after = weights.after(&plan, &device).unwrap();
+        let mut after = weights.after(&plan, true, &device).unwrap();
         assert_eq!((after.rounds.as_slice(), after.smallest(9).unwrap()), (&[4.0, 0.0, 4.0][..], vec![0, 2]));
+        // A plan of somebody else takes nothing from what is known.
+        let other = weights.after(&plan, false, &device).unwrap();
+        assert_eq!((other.rounds.as_slice(), other.smallest(9).unwrap()), (&[3.0, 0.0, 3.0][..], vec![0, 2]));
+        assert_eq!(to_vec(other.sums, "sums").unwrap()[..3], to_vec(weights.sums.clone(), "sums").unwrap()[3..6]);
         (0..3).for_each(|_| after.add(&view(&[0.9, 0.0, 0.1], &[1, 1, 1])).unwrap());
         assert_eq!(after.smallest(9).unwrap(), [2, 0]);
     }

@@ -155,11 +155,10 @@ fn check(kind: &Kind) {
         let exact = Found::reference(&made, Precision::Float64, &out, &upstream);
         assert!(out.pairs > 0 && exact.gradients[0].iter().any(|v| *v != 0.0), "{case}: nothing is drawn");
         let noises = Found::reference(&made, Precision::Float32, &rounded_out, &upstream).errors(&exact, &kept);
-        for (at, (name, device)) in devices.iter().enumerate() {
+        for (at, (_, device)) in devices.iter().enumerate() {
             let errors = Found::tiles(&made, device, &upstream).errors(&exact, &kept);
-            let times = if *name == "wgpu" { 10.0 * kind.on_wgpu } else { 10.0 };
             for (quantity, (error, &noise)) in errors.into_iter().zip(&noises).enumerate() {
-                rows.push(Row { case: case.clone(), device: at, quantity, error, noise, bar: times * noise.max(FLOOR) });
+                rows.push(Row { case: case.clone(), device: at, quantity, error, noise, bar: 10.0 * noise.max(FLOOR) });
             }
         }
     }

@@ -24,24 +24,21 @@ pub struct Kind {
     pub seeds: u64,
     /// A pixel counts where every decision is farther than this from its threshold, relatively.
     pub robust: f64,
-    /// How many times as far as on processors results may be off on wgpu.
-    pub on_wgpu: f64,
     make: fn(&Draw) -> Case,
 }
 
-pub const FEW: Kind = Kind { name: "a", rules: TWO_RULES, seeds: 4, robust: ROBUST, on_wgpu: 1.0, make: few };
-pub const ORDINARY: Kind = Kind { name: "b", rules: TWO_RULES, seeds: 4, robust: ROBUST, on_wgpu: 1.0, make: ordinary };
-pub const ANTIALIASED: Kind = Kind { name: "b2", rules: GSPLAT, seeds: 6, robust: ROBUST, on_wgpu: 1.0, make: antialiased };
-pub const DEGREE_4: Kind = Kind { name: "b4", rules: GSPLAT, seeds: 6, robust: ROBUST, on_wgpu: 1.0, make: degree_4 };
-pub const CROWDED: Kind = Kind { name: "c", rules: TWO_RULES, seeds: 2, robust: ROBUST, on_wgpu: 1.0, make: crowded };
+pub const FEW: Kind = Kind { name: "a", rules: TWO_RULES, seeds: 4, robust: ROBUST, make: few };
+pub const ORDINARY: Kind = Kind { name: "b", rules: TWO_RULES, seeds: 4, robust: ROBUST, make: ordinary };
+pub const ANTIALIASED: Kind = Kind { name: "b2", rules: GSPLAT, seeds: 6, robust: ROBUST, make: antialiased };
+pub const DEGREE_4: Kind = Kind { name: "b4", rules: GSPLAT, seeds: 6, robust: ROBUST, make: degree_4 };
+pub const CROWDED: Kind = Kind { name: "c", rules: TWO_RULES, seeds: 2, robust: ROBUST, make: crowded };
 /// Peaks are 1e-4 from 1/255, so the golden files leave out half as much, too.
-pub const FAINT: Kind = Kind { name: "d_alpha_threshold", rules: TWO_RULES, seeds: 4, robust: 0.5 * ROBUST, on_wgpu: 1.0, make: faint };
-pub const CAPPED: Kind = Kind { name: "d_clamp_tie", rules: ALL_RULES, seeds: 4, robust: ROBUST, on_wgpu: 1.0, make: capped };
-pub const EQUAL_DEPTHS: Kind = Kind { name: "d_identical_depths", rules: TWO_RULES, seeds: 4, robust: ROBUST, on_wgpu: 1.0, make: equal_depths };
-pub const INSIDE: Kind = Kind { name: "d_inside_cloud", rules: TWO_RULES, seeds: 6, robust: ROBUST, on_wgpu: 1.0, make: inside };
-pub const NEEDLE: Kind = Kind { name: "d_needles", rules: TWO_RULES, seeds: 8, robust: ROBUST, on_wgpu: 1.0, make: needles };
-/// Behind alphas near their cap, a relative error of alpha grows by 1 / (1 - alpha), and WGSL lets `exp` be off by 3 ulp and more.
-pub const OPAQUE: Kind = Kind { name: "d_opaque_stack", rules: ALL_RULES, seeds: 4, robust: ROBUST, on_wgpu: 3.0, make: opaque };
+pub const FAINT: Kind = Kind { name: "d_alpha_threshold", rules: TWO_RULES, seeds: 4, robust: 0.5 * ROBUST, make: faint };
+pub const CAPPED: Kind = Kind { name: "d_clamp_tie", rules: ALL_RULES, seeds: 4, robust: ROBUST, make: capped };
+pub const EQUAL_DEPTHS: Kind = Kind { name: "d_identical_depths", rules: TWO_RULES, seeds: 4, robust: ROBUST, make: equal_depths };
+pub const INSIDE: Kind = Kind { name: "d_inside_cloud", rules: TWO_RULES, seeds: 6, robust: ROBUST, make: inside };
+pub const NEEDLE: Kind = Kind { name: "d_needles", rules: TWO_RULES, seeds: 8, robust: ROBUST, make: needles };
+pub const OPAQUE: Kind = Kind { name: "d_opaque_stack", rules: ALL_RULES, seeds: 4, robust: ROBUST, make: opaque };
 
 impl Kind {
     /// How many cases there are.

@@ -1,0 +1,81 @@
+//! Where rasterizers decide: colours of exactly zero, and images too long for them.
+
+use burn::tensor::{Tensor, TensorData};
+use cc4dgs_backends::rasterizers::tile::TileRasterizer;
+use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::{Camera, Error, Gaussians, HostGaussians, Rasterizer, RenderSettings, SplatColors, Splats};
+use cc4dgs_tests::{devices, poison};
+
+/// A Gaussian straight ahead at distance 4, where harmonics of degree 1 along z are exactly their constant.
+fn ahead(sh_dc: [f32; 3], along_z: [f32; 3]) -> (HostGaussians, Camera) {
+    let host = HostGaussians {
+        means: vec![0.0; 3],
+        log_scales: vec![-1.0; 3],
+        quaternions: vec![1.0, 0.0, 0.0, 0.0],
+        opacity_logits: vec![0.0],
+        sh_dc: sh_dc.to_vec(),
+        sh_rest: [[0.0; 3], along_z, [0.0; 3]].concat(),
+        dynamic_scores: vec![0.0],
+        sh_degree: 1,
+        ..Default::default()
+    };
+    let mut camera = Camera::look_at("ahead", (8, 8), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, -1.0, 0.0]);
+    camera.world_to_camera = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]];
+    (host, camera)
+}
+
+#[test]
+fn a_colour_of_exactly_zero_is_not_clamped() {
+    // 0.5 + C0 * -3.504505 rounds to -C1, with and without fused multiply-add, and C1 makes it 0. Green is positive, blue is negative.
+    let (host, camera) = ahead([-3.504505, 0.3, -3.0], [1.0, 0.0, 0.0]);
+    for (name, device) in devices() {
+        poison(&device);
+        let mut g = Gaussians::from_host(&host, &device.autodiff());
+        g.sh_dc = g.sh_dc.require_grad();
+        g.sh_rest = g.sh_rest.require_grad();
+        let out = TileRasterizer.render(&Splats::from_gaussians(&g, 1), &camera, &RenderSettings::default()).unwrap();
+        let gradients = out.planes.clone().sum().backward();
+        let image = to_vec(out.planes.inner(), "planes").unwrap();
+        let largest = |plane: usize| image[64 * plane..64 * (plane + 1)].iter().fold(0.0f32, |most, v| most.max(v.abs()));
+        assert!(largest(0) == 0.0 && largest(1) > 0.1 && largest(2) == 0.0, "{name}: {:?}", [largest(0), largest(1), largest(2)]);
+        let of_dc = to_vec(g.sh_dc.grad(&gradients).unwrap(), "gradient").unwrap();
+        assert!(of_dc[0] > 0.0 && of_dc[0] == of_dc[1] && of_dc[2] == 0.0, "{name}: {of_dc:?}");
+        let of_z = &to_vec(g.sh_rest.grad(&gradients).unwrap(), "gradient").unwrap()[3..6];
+        assert!(of_z[0] > 0.0 && of_z[0] == of_z[1] && of_z[2] == 0.0, "{name}: {of_z:?}");
+    }
+}
+
+#[test]
+fn images_too_long_for_ranges_of_tiles_are_refused() {
+    let (host, camera) = ahead([0.0; 3], [0.0; 3]);
+    let most = 16 * u32::from(u16::MAX);
+    for (name, device) in devices() {
+        let splats = Splats::from_gaussians(&Gaussians::from_host(&host, &device), 1);
+        let draw = |(width, height): (u32, u32)| {
+            // In the last tile.
+            let cx = f64::from(width) - 2.0;
+            TileRasterizer.render(&splats, &Camera { width, height, cx, cy: 0.5, ..camera.clone() }, &RenderSettings::default())
+        };
+        for size in [(most + 1, 1), (1, most + 1)] {
+            let error = draw(size).map(|_| ()).unwrap_err();
+            assert!(matches!(error, Error::Limit { .. }) && error.to_string().contains(&most.to_string()), "{name}: {error}");
+        }
+        let planes = to_vec(draw((most, 1)).unwrap().planes, "planes").unwrap();
+        let alphas = &planes[3 * most as usize..4 * most as usize];
+        assert!(alphas[most as usize - 2] > 0.1 && alphas[0] == 0.0, "{name}: nothing is drawn in the last tile");
+    }
+}
+
+#[test]
+fn colours_without_harmonics_have_gradients_whatever_their_sign() {
+    let (host, camera) = ahead([0.0; 3], [0.0; 3]);
+    for (name, device) in devices() {
+        let tracked = device.autodiff();
+        let colors = Tensor::<2>::from_data(TensorData::new(vec![-0.5f32, 0.0, 0.5], [1, 3]), &tracked).require_grad();
+        let mut splats = Splats::from_gaussians(&Gaussians::from_host(&host, &tracked), 1);
+        splats.colors = SplatColors::Direct(colors.clone());
+        let out = TileRasterizer.render(&splats, &camera, &RenderSettings::default()).unwrap();
+        let found = to_vec(colors.grad(&out.planes.sum().backward()).unwrap(), "gradient").unwrap();
+        assert!(found[0] > 0.0 && found.iter().all(|g| *g == found[0]), "{name}: {found:?}");
+    }
+}
