@@ -17,6 +17,7 @@ use cc4dgs_format::{Error, Result};
 pub mod cca;
 mod compact;
 mod grid_sort;
+mod jacobi;
 pub mod kmeans;
 pub mod morton;
 mod quantize;

@@ -161,7 +161,7 @@ inventory::submit! {
         info: Plugin {
             name: "quantize",
             version: "2",
-            summary: "each component quantised separately to 6 to 16 bits, no training",
+            summary: "each component quantised separately to 4 to 16 bits, or float32, no training",
             paper: "uniform quantisation",
             schema: SCHEMA,
             capabilities: &["lossy", "reorders", "profiles=default,high"],

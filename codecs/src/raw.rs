@@ -47,7 +47,7 @@ fn decode(streams: &[Stream], context: &CodecContext, harmonics: bool) -> Result
         *values = if name == HARMONICS && !harmonics { vec![0.0; shape.count * width] } else { from_planes(set.reader(name)?, shape.count, width)? };
     }
     shape.read_extra(&set, &mut out)?;
-    out.validate("decoded Gaussians", &context.limits)?;
+    out.validate_read("decoded Gaussians", &context.limits)?;
     Ok(out)
 }
 

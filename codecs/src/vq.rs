@@ -6,7 +6,7 @@ use crate::{kmeans, morton};
 use cc4dgs_format::storage::{
     ESCAPES, HARMONICS, Shape, assemble, close,
     column::{self, Target},
-    from_planes, interleave, load, open, skip, split, stage_of_column, store, to_planes,
+    from_planes, interleave, load, open, relative_rms, skip, split, stage_of_column, store, to_planes,
 };
 use cc4dgs_format::{
     AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Seed, Stream, StreamStage, config, inventory, unknown_name,
@@ -25,6 +25,8 @@ const BOOK_LOSS: f64 = 0.5;
 /// Bits of the uniform quantiser that replaces a codebook, and the share of values that may be stored as outliers.
 const REPLACEMENT_BITS: u8 = 8;
 const TAIL: f64 = 1e-3;
+/// Most rows of the sample: settings are read where numbers of memory have 32 bits, too.
+const MOST_SAMPLE: usize = 1_000_000_000;
 
 const SCHEMA: &str = "\
 codebook = 4096          # rows of a codebook, at most 65536
@@ -68,7 +70,7 @@ impl Vq {
         }
         let labels = kmeans::assign(rows, width, &book).labels;
         let decoded: Vec<f32> = labels.iter().flat_map(|&l| book[l as usize * width..(l as usize + 1) * width].to_vec()).collect();
-        (column::relative_rms(rows, &decoded) <= BOOK_LOSS).then_some((book, labels))
+        (relative_rms(rows, &decoded) <= BOOK_LOSS).then_some((book, labels))
     }
 }
 
@@ -165,11 +167,11 @@ pub(crate) fn build(profile: &str, settings: &toml::Table) -> Result<Box<dyn Att
         return Err(unknown_name("profile of codec vq", profile, ["default"].into_iter()));
     }
     let settings: Settings = config::parse_section("codec vq", settings)?;
-    if !(1..=1 << 16).contains(&settings.codebook) || !(1..=1000).contains(&settings.iterations) || settings.sample == 0 {
+    if !(1..=1 << 16).contains(&settings.codebook) || !(1..=1000).contains(&settings.iterations) || !(1..=MOST_SAMPLE).contains(&settings.sample) {
         return Err(Error::parameter(
             "codec vq",
             format!("{settings:?}"),
-            "Use a codebook of 1 to 65536 rows, 1 to 1000 iterations and a sample of at least 1",
+            "Use a codebook of 1 to 65536 rows, 1 to 1000 iterations and a sample of 1 to 1000000000 rows",
         ));
     }
     Ok(Box::new(Vq(settings)))
@@ -186,5 +188,20 @@ inventory::submit! {
             capabilities: &["lossy", "reorders", "profiles=default"],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_32_bits_do_not_hold_are_refused() {
+        let sample = |rows: i64| build("", &toml::Table::from_iter([("sample".into(), rows.into())]));
+        assert!(sample(1).is_ok() && sample(1_000_000_000).is_ok());
+        for rows in [0, 1_000_000_001, 1 << 32] {
+            let message = sample(rows).err().unwrap().to_string();
+            assert!(message.contains("a sample of 1 to 1000000000 rows"), "{message}");
+        }
     }
 }

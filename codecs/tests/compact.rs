@@ -1,7 +1,9 @@
 //! `compact`: the conformance suite, a stored file that must stay readable, motion, and sizes.
 #![allow(clippy::unwrap_used, reason = "a test that meets an error should stop there, in helpers too")]
 
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, Entries, HostGaussians, Limits, Seed, Silent, Stream, StreamStage, conformance, toml};
+use cc4dgs_format::{
+    AttributeCodec, CodecContext, CodecPlugin, Entries, ExtraAttribute, HostGaussians, Limits, Seed, Silent, Stream, StreamStage, conformance, toml,
+};
 
 fn plugin() -> &'static CodecPlugin {
     cc4dgs_codecs::link();
@@ -58,6 +60,24 @@ fn columns_without_spread_are_exact() {
         let wrong: Vec<&str> = columns.filter(|((_, _, a), (_, _, b))| a != b).map(|((name, _, _), _)| name).collect();
         assert!(wrong.is_empty(), "{count} times {value}: {wrong:?}");
     }
+}
+
+#[test]
+fn a_few_gaussians_far_away_do_not_spoil_the_centres_of_the_others() {
+    let (count, codec, limits) = (10_000, codec(""), context(Some(5.0)));
+    let mut g = scene(count, 0);
+    g.log_scales.fill(-5.0);
+    (0..100).for_each(|i| g.means[3 * i] = if i % 2 == 0 { 1e5 } else { -1e5 });
+    g.extra.insert("row".into(), ExtraAttribute::exact(1, (0..count).map(|i| i as f32).collect()));
+    let streams = codec.encode(&g, &limits).unwrap();
+    let found = codec.decode(&streams, &limits).unwrap();
+    let given = g.select(&found.extra["row"].values.iter().map(|v| *v as usize).collect::<Vec<usize>>());
+    let worst = given.means.iter().zip(&found.means).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    // Steps are at most about a standard deviation.
+    assert!(worst < (-5.0f32).exp(), "a centre is {worst} off");
+    // Those far away are stored as they are, and few others.
+    let exact = streams.iter().find(|s| s.name == "exact").unwrap().bytes.len();
+    assert!((1600..3200).contains(&exact), "{exact} bytes");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! `spz`: Niantic's SPZ. The file itself is [`cc4dgs_format::spz`].
 
 use crate::still;
-use cc4dgs_format::spz::{SpzOptions, to_spz};
+use cc4dgs_format::spz::{SpzOptions, remarks, to_spz};
 use cc4dgs_format::{ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, Plugin, Result, config, inventory};
 use serde::Deserialize;
 use std::path::Path;
@@ -35,7 +35,7 @@ impl Exporter for Spz {
         let gaussians = still::instant(source, "SPZ")?;
         let options = SpzOptions { version: self.version, sh1_bits: self.sh1_bits, sh_rest_bits: self.sh_rest_bits, antialiased: source.facts().antialiased };
         still::write(path, &to_spz(&gaussians, &options)?)?;
-        let notes = vec![format!("SPZ version {}", self.version)];
+        let notes = [vec![format!("SPZ version {}", self.version)], remarks(&gaussians)].concat();
         Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree, frames: 1, notes })
     }
 }

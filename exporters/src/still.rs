@@ -3,6 +3,8 @@
 use cc4dgs_format::{Error, ExportFacts, ExportSource, HostGaussians, Limits, Result};
 use std::path::Path;
 
+pub use cc4dgs_format::gaussians::unit_quaternion as unit;
+
 /// The Gaussians of the instant that is asked for, refused where they are invalid.
 pub fn instant(source: &mut dyn ExportSource, format: &str) -> Result<HostGaussians> {
     let time = source.facts().time_norm;
@@ -51,12 +53,6 @@ pub fn sentence(facts: &ExportFacts, parts: &[(bool, &str)]) -> String {
         [most @ .., last] => format!(", without {} and {last}", most.join(", ")),
     };
     format!("{}{rest}.", facts.still())
-}
-
-/// The quaternion (w,x,y,z) with length one; `None` where it has no length, and the Gaussian is not drawn.
-pub fn unit(q: &[f32; 4]) -> Option<[f32; 4]> {
-    let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-    (norm > 1e-15 && norm.is_finite()).then(|| q.map(|v| (f64::from(v) / norm) as f32))
 }
 
 /// Opacity in 0..1.

@@ -1,7 +1,7 @@
 //! Every exporter of this crate with the conformance suite.
 
 use cc4dgs_exporters::web::{PAGE_FILES, PAGE_VERSION};
-use cc4dgs_format::{Entries, ExporterPlugin, config, conformance};
+use cc4dgs_format::{Entries, ExporterPlugin, HostGaussians, config, conformance};
 
 #[test]
 fn every_exporter_conforms() {
@@ -34,6 +34,21 @@ fn formats_that_hold_degree_4_say_that_most_viewers_do_not() {
         let says = |degree| exporter.loses(&conformance::export_facts(3, degree)).contains("most viewers harmonics over degree 3");
         assert!(says(4) && !says(3), "{name}");
     }
+}
+
+#[test]
+fn spz_says_what_its_ranges_and_steps_lose() {
+    let exporters = Entries::<ExporterPlugin>::collect().unwrap();
+    let exporter = (exporters.get("spz").unwrap().build)(&toml::Table::new()).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let notes = |change: fn(&mut HostGaussians)| {
+        let mut model = conformance::MovingModel::new(30, 1).with_gaussians(change);
+        exporter.write(&mut model, &folder.path().join("model.spz")).unwrap().notes
+    };
+    assert_eq!(notes(|_| {}), ["SPZ version 4"]);
+    let told = notes(|g| (g.log_scales[4], g.means[7]) = (-12.0, 1e6));
+    assert_eq!(told[1], "limited to the range of the format: 1 scales (e^-10 to e^5.94)");
+    assert!(told.len() == 3 && told[2].starts_with("centres are in steps of 0.125, "), "{told:?}");
 }
 
 #[test]

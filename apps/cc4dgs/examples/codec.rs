@@ -40,7 +40,7 @@ impl AttributeCodec for Rounded {
             *values = from_planes(set.reader(name)?, shape.count, width)?;
         }
         shape.read_extra(&set, &mut out)?;
-        out.validate("decoded Gaussians", &context.limits)?;
+        out.validate_read("decoded Gaussians", &context.limits)?;
         Ok(out)
     }
     fn losses(&self) -> Vec<DeclaredLoss> {

@@ -11,7 +11,7 @@ use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::storage::{
     StreamSet,
     column::{self, Column, Target},
-    interleave, load, split, store,
+    interleave, load, relative_rms, split, store,
 };
 use cc4dgs_format::{CodecContext, Event, HostGaussians, Result, Stream};
 use half::f16;
@@ -169,7 +169,7 @@ fn autoencode(gaussians: &HostGaussians, known: &HostGaussians, profile: &Profil
     let codebook = kmeans::cluster(&samples, width, profile.codebook, CODEBOOK_ITERATIONS, context.seed.child("codebook"));
     let labels: Vec<u8> = kmeans::assign(&residuals, width, &codebook).labels.into_iter().map(|l| l as u8).collect();
     let coded = reconstruct(&network, &statistics, &normalisation, known, &z, Some((&labels, &codebook)));
-    let loss = column::relative_rms(rows, &coded);
+    let loss = relative_rms(rows, &coded);
 
     let mut form = Form::new(AUTOENCODER);
     normalisation.write(&mut form.meta);

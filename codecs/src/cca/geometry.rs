@@ -5,7 +5,7 @@ use cc4dgs_format::archive::ByteReader;
 use cc4dgs_format::storage::{
     StreamSet,
     column::{self, Column, Target},
-    interleave, load, split, store,
+    interleave, load, relative_rms, split, store,
 };
 use cc4dgs_format::{HostGaussians, Result, Stream};
 
@@ -34,7 +34,7 @@ pub(super) fn encode(gaussians: &HostGaussians, profile: &Profile, meta: &mut Ve
     known.dynamic_scores = put("dynamic_scores", vec![column::encode(&gaussians.dynamic_scores, score)]);
     let columns: Vec<Column> = unit_and_norm(&gaussians.quaternions).iter().map(|c| column::encode(c, scalar)).collect();
     let product = times_norm(&columns.iter().map(|c| column::dequantise(c, n)).collect::<Vec<_>>(), n);
-    if column::relative_rms(&gaussians.quaternions, &product) <= profile.scalar_loss {
+    if relative_rms(&gaussians.quaternions, &product) <= profile.scalar_loss {
         put(QUATERNIONS, columns);
         known.quaternions = product;
     } else {

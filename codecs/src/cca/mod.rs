@@ -98,7 +98,7 @@ fn decode(streams: &[Stream], context: &CodecContext, harmonics: bool) -> Result
         out.sh_rest = vec![0.0; shape.count * 3 * sh_rest_len(shape.sh_degree)];
     }
     shape.read_extra(&set, &mut out)?;
-    out.validate("decoded Gaussians", &context.limits)?;
+    out.validate_read("decoded Gaussians", &context.limits)?;
     Ok(out)
 }
 

@@ -4,39 +4,22 @@
 //! linear one is useful after any number of training steps, even none.
 
 use super::network::{HALF, Layer};
+use crate::jacobi;
 use cc4dgs_format::Seed;
 use rand::Rng;
 
 /// Eigenvalues, largest first, and eigenvectors (one per row) of the symmetric matrix `a` `[n,n]`, by cyclic Jacobi rotations.
 pub(super) fn eigen(mut a: Vec<f64>, n: usize) -> (Vec<f64>, Vec<f64>) {
-    let mut v = vec![0.0; n * n];
-    (0..n).for_each(|i| v[i * n + i] = 1.0);
+    let mut v = jacobi::identity(n);
     let scale = a.iter().fold(0.0f64, |m, x| m.max(x.abs()));
     for _ in 0..60 {
         let mut off = 0.0f64;
         for p in 0..n {
             for q in p + 1..n {
-                let apq = a[p * n + q];
-                off = off.max(apq.abs());
-                if apq.abs() <= 1e-15 * scale {
-                    continue;
-                }
-                let theta = (a[q * n + q] - a[p * n + p]) / (2.0 * apq);
-                let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
-                let c = 1.0 / (t * t + 1.0).sqrt();
-                let s = t * c;
-                for k in 0..n {
-                    let (x, y) = (a[k * n + p], a[k * n + q]);
-                    a[k * n + p] = c * x - s * y;
-                    a[k * n + q] = s * x + c * y;
-                }
-                for k in 0..n {
-                    let (x, y) = (a[p * n + k], a[q * n + k]);
-                    a[p * n + k] = c * x - s * y;
-                    a[q * n + k] = s * x + c * y;
-                    let (x, y) = (v[p * n + k], v[q * n + k]);
-                    v[p * n + k] = c * x - s * y;
-                    v[q * n + k] = s * x + c * y;
+                let apq = a[p * n + q].abs();
+                off = off.max(apq);
+                if apq > 1e-15 * scale {
+                    jacobi::rotate(&mut a, &mut v, n, p, q);
                 }
             }
         }

@@ -91,7 +91,7 @@ pub struct Settings {
     /// Upper bound on the passes over the Gaussians.
     pub epochs: usize,
     /// Upper bound on the training samples in total.
-    pub sample_budget: usize,
+    pub sample_budget: u64,
     /// In place of [`Profile::latent_bits`].
     pub latent_bits: Option<u8>,
     /// In place of [`Profile::codebook`].
@@ -112,7 +112,7 @@ impl Settings {
     /// Reads a configuration table; unknown keys and values out of range are errors.
     pub fn parse(table: &toml::Table) -> Result<Self> {
         let settings: Self = config::parse_section("codec cca", table)?;
-        if !(1..=100_000).contains(&settings.epochs) || !(1..=10_000_000_000).contains(&(settings.sample_budget as u64)) {
+        if !(1..=100_000).contains(&settings.epochs) || !(1..=10_000_000_000).contains(&settings.sample_budget) {
             return Err(Error::parameter(
                 "codec cca",
                 format!("epochs {} or sample_budget {} is out of range", settings.epochs, settings.sample_budget),
@@ -133,6 +133,14 @@ impl Settings {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sample_budgets_over_32_bits_are_read_on_every_target() {
+        // A type of 64 bits: pages read the settings of archives, too.
+        let budget = |text: &str| -> Result<u64> { Ok(Settings::parse(&text.parse().unwrap())?.sample_budget) };
+        assert_eq!(budget("sample_budget = 10000000000").unwrap(), 10_000_000_000);
+        assert!(budget("sample_budget = 10000000001").is_err() && budget("sample_budget = 0").is_err());
+    }
 
     #[test]
     fn a_budget_is_varied_alone() {

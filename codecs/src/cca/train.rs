@@ -29,7 +29,7 @@ const COVARIANCE_ROWS: usize = 100_000;
 pub(super) fn train(data: &Data, bits: u8, settings: &Settings, seed: Seed, events: &dyn EventSink) -> (Vec<f32>, Vec<f32>) {
     let net = Net::new(data.width);
     let n = data.len();
-    let samples = settings.epochs.saturating_mul(n).min(settings.sample_budget);
+    let samples = settings.epochs.saturating_mul(n).min(usize::try_from(settings.sample_budget).unwrap_or(usize::MAX));
     let batch = (samples / STEPS_WANTED).clamp(BATCH_LEAST, BATCH_MOST);
     let steps = samples.div_ceil(batch).max(STEPS_LEAST);
     let mut parameters = principal_start(data, &net, seed.child("start"));

@@ -22,8 +22,9 @@ const NORMS: std::ops::Range<f64> = 0.2..5.0;
 /// Log-scales and opacity logits of larger magnitude are stored exactly.
 const LOG_SCALE_LIMIT: f32 = 60.0;
 const LOGIT_LIMIT: f32 = 60.0;
-/// Share of the centres at either end of an axis that may lie outside of the grid, if the grid is too coarse otherwise.
-const OUTSIDE: f64 = 5e-4;
+/// Shares of the centres at either end of an axis that may lie outside of the grid, where they are stored exactly, and how many times coarser a grid with fewer
+/// outside may be.
+const OUTSIDE: [(f64, f64); 4] = [(0.0, 1.0), (5e-4, 1.0), (5e-3, 2.0), (5e-2, 4.0)];
 
 /// Steps, grid and transforms: everything that decides how values are rounded.
 pub struct Plan {
@@ -244,38 +245,90 @@ pub fn coefficients(gaussians: &HostGaussians, degree: usize) -> Vec<f32> {
     gaussians.sh_rest.chunks_exact(width).flat_map(|row| &row[from..to]).copied().collect()
 }
 
-/// Chooses the grid of the centres: `relative` is the step of class 0 over the middle scale.
+/// Chooses the grid of the centres: `relative` is the step of class 0 over the middle scale. A grid of so many cells may be too small for them; then some are
+/// left out, or cells are larger than wanted, and steps of larger Gaussians and coarser classes are doubled less often.
 fn grid(geometry: &mut Geometry, gaussians: &HostGaussians, importance: &Importance, relative: f64) {
     let relative = relative.clamp(1e-9, 0.5);
     let middle: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
     // Below half a pixel all Gaussians look alike.
     let pixel = if importance.pixels_per_unit > 0.0 { libm::log(0.5 / importance.pixels_per_unit) } else { -60.0 };
     let floor = pixel.max(median(&middle) - 6.0).clamp(-60.0, 60.0);
-    geometry.size_floor = (floor / std::f64::consts::LN_2 * 65536.0) as i64;
-    let mut cell = relative * libm::exp(floor);
-    geometry.class_limit = libm::log2(LARGEST_STEP / relative).clamp(0.0, 15.0) as u8;
-    let cells = f64::from(1u32 << GRID_BITS);
-    let mut axes: Vec<Vec<f64>> = (0..3).map(|k| gaussians.means.iter().skip(k).step_by(3).map(|&v| f64::from(v)).collect()).collect();
+    let (cell, cells) = ((relative * libm::exp(floor)).max(1e-30), f64::from(1u32 << GRID_BITS));
+    let mut axes: [Vec<f64>; 3] = std::array::from_fn(|k| gaussians.means.iter().skip(k).step_by(3).map(|&v| f64::from(v)).collect());
     axes.iter_mut().for_each(|axis| axis.sort_unstable_by(f64::total_cmp));
-    for cut in [0.0, OUTSIDE] {
-        let mut largest = 0.0f64;
-        for (axis, corner) in axes.iter().zip(&mut geometry.corner) {
-            let last = axis.len().saturating_sub(1);
-            let skip = (cut * axis.len() as f64).ceil() as usize;
-            let (low, high) = match axis.get(skip.min(last)).zip(axis.get(last.saturating_sub(skip))) {
-                Some((&low, &high)) if low <= high => (low, high),
-                _ => (0.0, 0.0),
-            };
-            let margin = if cut > 0.0 { 0.02 * (high - low) } else { 0.0 };
-            *corner = low - margin;
-            largest = largest.max(high - low + 2.0 * margin);
+    let mut best = f64::INFINITY;
+    for (cut, cost) in OUTSIDE {
+        let spans = axes.each_ref().map(|axis| span(axis, cut));
+        let growth = spans.iter().map(|[low, high]| (high - low) / ((cells - 2.0) * cell)).fold(1.0, f64::max);
+        if growth * cost >= best {
+            continue;
         }
-        if largest / cell < cells - 2.0 {
-            break;
-        }
-        if cut > 0.0 {
-            cell = largest / (cells - 2.0);
+        best = growth * cost;
+        geometry.cell = growth * cell;
+        // Beside the middle ones there is room for some of those that may lie outside.
+        geometry.corner = spans.map(|[low, high]| if cut > 0.0 { 0.5 * (low + high) - 0.5 * cells * geometry.cell } else { low });
+        let octaves = libm::log2(growth);
+        geometry.size_floor = ((floor / std::f64::consts::LN_2 + octaves) * 65536.0) as i64;
+        geometry.class_limit = (libm::log2(LARGEST_STEP / relative) - octaves).clamp(0.0, 15.0) as u8;
+    }
+}
+
+/// What is left of sorted values without the share `cut` at either end.
+fn span(sorted: &[f64], cut: f64) -> [f64; 2] {
+    let last = sorted.len().saturating_sub(1);
+    let skip = (cut * sorted.len() as f64).ceil() as usize;
+    match sorted.get(skip.min(last)).zip(sorted.get(last.saturating_sub(skip))) {
+        Some((&low, &high)) if low <= high => [low, high],
+        _ => [0.0; 2],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::importance::Steps;
+    use super::*;
+
+    /// The grid of Gaussians on the x axis, all with a standard deviation of 1, where a pixel is a hundredth.
+    fn grid_of(x: impl Iterator<Item = f32>) -> Geometry {
+        let means: Vec<f32> = x.flat_map(|x| [x, 0.0, 0.0]).collect();
+        let weights = vec![1.0; means.len() / 3];
+        let gaussians = HostGaussians { log_scales: vec![0.0; means.len()], means, ..Default::default() };
+        let (shapes, steps) = (weights.clone(), Steps::default());
+        let importance = Importance { weights, shapes, samples: 1.0, pixels_per_unit: 100.0, steps, attributes: Vec::new() };
+        let mut geometry = Geometry {
+            scale_origin: 0.0,
+            scale_step: std::f32::consts::LN_2,
+            rotation_step: 1.0,
+            opacity_step: 1.0,
+            corner: [0.0; 3],
+            cell: 1.0,
+            size_floor: 0,
+            class_limit: 0,
+            scale_limit: 0,
+            opacity_limit: 0,
+        };
+        grid(&mut geometry, &gaussians, &importance, 0.1);
+        geometry
+    }
+
+    #[test]
+    fn a_few_far_away_lie_outside_of_the_grid() {
+        let near = || (0..1000).map(|i| 0.02 * i as f32 - 10.0);
+        let (usual, found) = (grid_of(near()), grid_of(near().chain([1e6; 4])));
+        assert!((usual.corner[0] + 10.0).abs() < 1e-9 && (usual.cell - 5e-4).abs() < 1e-9, "{usual:?}");
+        assert_eq!((found.cell, found.size_floor, found.class_limit), (usual.cell, usual.size_floor, usual.class_limit));
+        assert!(near().all(|x| found.key(&[x, 0.0, 0.0], 0).is_some()) && found.key(&[1e6, 0.0, 0.0], 0).is_none());
+    }
+
+    #[test]
+    fn larger_cells_do_not_enlarge_steps_that_are_large_already() {
+        let wide = grid_of((0..1000).map(|i| 200.0 * i as f32 - 1e5));
+        assert!((0.08..0.11).contains(&wide.cell), "{}", wide.cell);
+        for (octave, class) in (-8..=12).flat_map(|octave| (0..=8u8).map(move |class| (octave, class))) {
+            let step = wide.cell * f64::from(1u32 << wide.position_shift([octave; 3], class));
+            let wanted = 0.1 * libm::exp2(f64::from(octave)).max(0.005) * f64::from(1u32 << class.min(3));
+            assert!(step <= wide.cell.max(1.5 * wanted), "octave {octave}, class {class}: {step} instead of {wanted}");
+            assert!(class > 0 || octave < 2 || step > wanted / 1.5, "octave {octave}: {step} instead of {wanted}");
         }
     }
-    geometry.cell = cell.max(1e-30);
 }

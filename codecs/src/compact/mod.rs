@@ -28,7 +28,7 @@ mod write;
 
 pub(crate) use weights::build as build_weights;
 
-use cc4dgs_format::storage::relative_rms;
+use cc4dgs_format::storage::column_loss;
 use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, StreamStage, inventory};
 use colors::Choices;
 use encode::{Classes, Factors, Plan};
@@ -97,9 +97,9 @@ impl Job<'_> {
             let (attempt, order) = self.attempt_planned(gaussians, plan, quality)?;
             let expected = gaussians.select(&order);
             let mut kept = true;
-            for (((name, _, before), (_, _, after)), factor) in expected.columns().into_iter().zip(attempt.decoded.columns()).zip(&mut factors) {
+            for (((name, width, before), (_, _, after)), factor) in expected.columns().into_iter().zip(attempt.decoded.columns()).zip(&mut factors) {
                 let allowed = LOSSES.iter().find(|l| l.0 == name).map_or(0.0, |l| l.1);
-                let lost = relative_rms(before, after);
+                let lost = column_loss(name, before, after, width);
                 // A small part of it is left for what rounding adds.
                 if lost.is_nan() || lost > 0.999 * allowed {
                     *factor *= if halvings < HALVINGS { 0.5 } else { 0.0 };

@@ -107,7 +107,7 @@ pub fn read(streams: &[Stream], context: &CodecContext, whole: bool) -> Result<H
         let Rows { geometry, classes, shapes, moving, scales, .. } = rows;
         attributes::read(&set, &shape, &RowFacts { geometry, classes, shapes, moving, scales }, &mut out)?;
     }
-    out.validate("decoded Gaussians", &context.limits)?;
+    out.validate_read("decoded Gaussians", &context.limits)?;
     Ok(out)
 }
 

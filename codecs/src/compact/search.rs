@@ -158,14 +158,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
     let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
-    let refusal = tuner.map(|t| t.refusal()).transpose()?.flatten();
-    if let Some(why) = &refusal {
-        if settings.finetune_wanted {
-            return Err(Error::parameter("codec compact.finetune", format!("the model cannot be fine-tuned: {why}"), "Leave it out"));
-        }
-        context.events.emit(&Event::Warning { object: object.into(), message: format!("the model is not fine-tuned: {why}") });
-    }
-    if let Some(tuner) = tuner.filter(|_| refusal.is_none()) {
+    if let Some(tuner) = tuner {
         match tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)? {
             Tuned::Better(attempt) => return Ok(*attempt),
             // It was measured on more views, and with the deformer's weights as they are stored.

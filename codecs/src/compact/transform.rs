@@ -1,5 +1,7 @@
 //! A Karhunen-Loève transform with an 8-bit basis.
 
+use crate::jacobi;
+
 /// Steps of a basis vector's component.
 const UNIT: f64 = 127.0;
 
@@ -25,7 +27,7 @@ pub fn basis(rows: &[f64], dims: usize, weights: &[f64]) -> Basis {
     let vectors = eigenvectors(&mut moments, dims);
     let mut order: Vec<usize> = (0..dims).collect();
     order.sort_by(|&a, &b| moments[b * dims + b].total_cmp(&moments[a * dims + a]).then(a.cmp(&b)));
-    order.into_iter().flat_map(|v| (0..dims).map(move |i| (i, v))).map(|(i, v)| libm::round(UNIT * vectors[i * dims + v]) as i8).collect()
+    order.into_iter().flat_map(|v| (0..dims).map(move |i| (i, v))).map(|(i, v)| libm::round(UNIT * vectors[v * dims + i]) as i8).collect()
 }
 
 /// Turns vectors into coordinates: `[dims,dims]` (row-major), the inverse of the transposed basis.
@@ -67,10 +69,10 @@ pub fn identity(dims: usize) -> Basis {
     (0..dims * dims).map(|k| if k % dims == k / dims { 127 } else { 0 }).collect()
 }
 
-/// Jacobi's method: `matrix` becomes diagonal; returns the eigenvectors as columns.
+/// Makes `matrix` diagonal; returns the eigenvectors as rows.
 fn eigenvectors(matrix: &mut [f64], n: usize) -> Vec<f64> {
     const SWEEPS: usize = 30;
-    let mut vectors: Vec<f64> = (0..n * n).map(|k| f64::from(u8::from(k % n == k / n))).collect();
+    let mut vectors = jacobi::identity(n);
     let total: f64 = matrix.iter().map(|v| v * v).sum();
     for _ in 0..SWEEPS {
         let off: f64 = (0..n * n).filter(|k| k % n != k / n).map(|k| matrix[k] * matrix[k]).sum();
@@ -80,23 +82,8 @@ fn eigenvectors(matrix: &mut [f64], n: usize) -> Vec<f64> {
         }
         for p in 0..n {
             for q in p + 1..n {
-                let apq = matrix[p * n + q];
-                if apq == 0.0 {
-                    continue;
-                }
-                let theta = (matrix[q * n + q] - matrix[p * n + p]) / (2.0 * apq);
-                let t = libm::copysign(1.0, theta) / (theta.abs() + (theta * theta + 1.0).sqrt());
-                let c = 1.0 / (t * t + 1.0).sqrt();
-                let s = t * c;
-                for k in 0..n {
-                    let (a, b) = (matrix[k * n + p], matrix[k * n + q]);
-                    (matrix[k * n + p], matrix[k * n + q]) = (c * a - s * b, s * a + c * b);
-                }
-                for k in 0..n {
-                    let (a, b) = (matrix[p * n + k], matrix[q * n + k]);
-                    (matrix[p * n + k], matrix[q * n + k]) = (c * a - s * b, s * a + c * b);
-                    let (a, b) = (vectors[k * n + p], vectors[k * n + q]);
-                    (vectors[k * n + p], vectors[k * n + q]) = (c * a - s * b, s * a + c * b);
+                if matrix[p * n + q] != 0.0 {
+                    jacobi::rotate(matrix, &mut vectors, n, p, q);
                 }
             }
         }

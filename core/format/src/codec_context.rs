@@ -36,7 +36,7 @@ impl<'a> CodecContext<'a> {
     }
 }
 
-/// The training views of a scene. Images are decoded on demand. Held-out views are not included.
+/// The training views of a scene, in an order in which every so many are of all cameras. Images are decoded on demand. Held-out views are not included.
 pub trait TrainingViews {
     /// The number of views.
     fn len(&self) -> usize;

@@ -87,6 +87,12 @@ pub struct HostGaussians {
     pub extra: BTreeMap<String, ExtraAttribute>,
 }
 
+/// The quaternion with length one; `None` where it has no length, and the Gaussian is not drawn.
+pub fn unit_quaternion(q: &[f32; 4]) -> Option<[f32; 4]> {
+    let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    (norm > 1e-15 && norm.is_finite()).then(|| q.map(|v| (f64::from(v) / norm) as f32))
+}
+
 /// Index of the first value that is not finite. Blocks are looked at whole, which compilers turn into vector instructions.
 fn first_not_finite(values: &[f32]) -> Option<usize> {
     const BLOCK: usize = 1024;
@@ -148,11 +154,22 @@ impl HostGaussians {
         let of_row = |width: usize, values: &[f32]| values[row * width..(row + 1) * width].iter().all(|v| v.is_finite());
         self.columns().iter().all(|(_, width, values)| of_row(*width, values)) && self.extra.values().all(|a| of_row(a.width, &a.values))
     }
-    /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite. `object` names the Gaussians in errors.
+    /// Refuses arrays of unequal length, a degree above 4, counts over `limits`, and values that are not finite, of Gaussians that a program made. `object` names
+    /// them in errors.
     ///
     /// # Errors
     /// [`Error::Data`], [`Error::Limit`], and [`Error::Parameter`] for impossible tolerances or flags of extra attributes.
     pub fn validate(&self, object: &str, limits: &Limits) -> Result<()> {
+        self.check(object, limits, "Correct the program that made them")
+    }
+    /// [`HostGaussians::validate`] of Gaussians that were read from a file or decoded: then the file is at fault.
+    ///
+    /// # Errors
+    /// As [`HostGaussians::validate`].
+    pub fn validate_read(&self, object: &str, limits: &Limits) -> Result<()> {
+        self.check(object, limits, "The file is damaged; fetch or write it again")
+    }
+    fn check(&self, object: &str, limits: &Limits, remedy: &str) -> Result<()> {
         let n = self.len();
         limits.check_gaussians(object, n as u64)?;
         if self.sh_degree > 4 {
@@ -161,14 +178,10 @@ impl HostGaussians {
         let extra = self.extra.iter().map(|(name, a)| (name.as_str(), a.width, &a.values));
         for (name, width, values) in self.columns().into_iter().chain(extra) {
             if values.len() != n * width {
-                return Err(Error::data(
-                    object,
-                    format!("{name} has {} values, {} Gaussians need {}", values.len(), n, n * width),
-                    "The file is damaged; fetch it again",
-                ));
+                return Err(Error::data(object, format!("{name} has {} values, {n} Gaussians need {}", values.len(), n * width), remedy));
             }
             if let Some(i) = first_not_finite(values) {
-                return Err(Error::data(object, format!("{name} of Gaussian {} is {}", i / width.max(1), values[i]), "Remove non-finite Gaussians first"));
+                return Err(Error::data(object, format!("{name} of Gaussian {} is {}", i / width.max(1), values[i]), remedy));
             }
         }
         for (name, a) in &self.extra {
@@ -199,7 +212,28 @@ impl HostGaussians {
 
 #[cfg(test)]
 mod tests {
-    use super::HostGaussians;
+    use super::{HostGaussians, unit_quaternion};
+    use crate::Limits;
+
+    #[test]
+    fn whose_fault_invalid_gaussians_are_is_said() {
+        let short = HostGaussians { opacity_logits: vec![0.0; 2], means: vec![0.0; 3], ..Default::default() };
+        let mut odd = HostGaussians { opacity_logits: vec![f32::NAN], ..Default::default() };
+        odd.columns_mut().into_iter().filter(|(name, _, _)| *name != "opacity_logits").for_each(|(_, width, values)| values.resize(width, 0.0));
+        for (bad, problem) in [(short, "means has 3 values, 2 Gaussians need 6"), (odd, "opacity_logits of Gaussian 0 is NaN")] {
+            let made = bad.validate("these", &Limits::default()).unwrap_err().to_string();
+            assert_eq!(made, format!("these: {problem}. Correct the program that made them"));
+            let read = bad.validate_read("a.cc4d", &Limits::default()).unwrap_err().to_string();
+            assert_eq!(read, format!("a.cc4d: {problem}. The file is damaged; fetch or write it again"));
+        }
+    }
+
+    #[test]
+    fn quaternions_without_a_length_have_no_unit() {
+        assert_eq!(unit_quaternion(&[0.0, -3.0, 0.0, 4.0]), Some([0.0, -0.6, 0.0, 0.8]));
+        assert_eq!(unit_quaternion(&[1e-30; 4]), None);
+        assert_eq!(unit_quaternion(&[f32::NAN; 4]), None);
+    }
 
     #[test]
     fn few_gaussians_far_away_do_not_decide_how_large_a_model_is() {

@@ -42,7 +42,7 @@ pub use gaussians::{ExtraAttribute, GaussianFile, HostGaussians, NeededRows};
 pub use image::Image8;
 pub use limits::Limits;
 pub use moving::Moving;
-pub use plugin::{Entries, Plugin, PluginEntry, by_likeness, split_kind, unknown_name};
+pub use plugin::{Entries, Plugin, PluginEntry, by_likeness, check_linked, split_kind, unknown_name};
 pub use rules::{BLUR, BLUR_RANGE, Rules, blur_at};
 pub use seed::Seed;
 pub use similarity::Similarity;

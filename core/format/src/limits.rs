@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
-    /// Largest decoded size of one object (a stream, an image, an array), in bytes.
+    /// Largest decoded size of one object (a stream, the streams that are read together, an image, an array), in bytes.
     pub max_bytes: u64,
     /// Largest number of Gaussians (or points) of one model.
     pub max_gaussians: u64,

@@ -104,6 +104,23 @@ pub fn unknown_name<'a>(kind: &str, name: &str, known: impl Iterator<Item = &'a 
     Error::parameter(format!("{kind} '{name}'"), "unknown name", remedy)
 }
 
+/// Refuses the plug-in `name` of a `kind`, which the file `object` needs, if it is not among the `linked` ones, or reads another version than the `stored` one.
+///
+/// # Errors
+/// [`Error::Unsupported`] that says which program to use.
+pub fn check_linked<'a>(object: &str, kind: &str, name: &str, stored: Option<&str>, linked: impl Iterator<Item = &'a Plugin>) -> Result<()> {
+    let linked: Vec<&Plugin> = linked.collect();
+    let Some(plugin) = linked.iter().find(|p| p.name == name) else {
+        let names: Vec<&str> = linked.iter().map(|p| p.name).collect();
+        let remedy = format!("Use a program that links the crate of this {kind}; this one links {}", names.join(", "));
+        let version = stored.map_or_else(String::new, |version| format!(" (version {version})"));
+        return Err(Error::unsupported(object, format!("it needs the {kind} '{name}'{version}, which is not linked into this program"), remedy));
+    };
+    let Some(stored) = stored.filter(|stored| *stored != plugin.version) else { return Ok(()) };
+    let remedy = format!("This program reads version {}", plugin.version);
+    Err(Error::unsupported(format!("{object}: {kind} {name}"), format!("version {stored} of its stored form"), remedy))
+}
+
 /// Splits a plug-in section into its `kind` and the other settings. `object` is the section's name in errors.
 ///
 /// # Errors
@@ -119,7 +136,19 @@ pub fn split_kind(object: &str, section: &toml::Table) -> Result<(String, toml::
 
 #[cfg(test)]
 mod tests {
-    use super::unknown_name;
+    use super::{Plugin, check_linked, unknown_name};
+
+    #[test]
+    fn plug_ins_that_are_missing_or_of_another_version_are_told_apart() {
+        let known = ["cdf", "none"].map(|name| Plugin { name, version: "2", summary: "", paper: "", schema: "", capabilities: &[] });
+        let of = |name: &str, stored: Option<&str>| check_linked("a.cc4d", "weight codec", name, stored, known.iter()).map_err(|e| e.to_string());
+        assert_eq!([of("cdf", Some("2")), of("none", None)], [Ok(()), Ok(())]);
+        let missing = of("cfd", Some("2")).unwrap_err();
+        assert!(missing.contains("the weight codec 'cfd' (version 2), which is not linked") && missing.contains("links cdf, none"), "{missing}");
+        assert!(of("cfd", None).unwrap_err().contains("the weight codec 'cfd', which is not linked"));
+        let other = of("cdf", Some("1")).unwrap_err();
+        assert_eq!(other, "a.cc4d: weight codec cdf: version 1 of its stored form. This program reads version 2");
+    }
 
     #[test]
     fn unknown_names_list_near_matches() {

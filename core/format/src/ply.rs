@@ -45,7 +45,7 @@ pub fn from_bytes(object: &str, bytes: &[u8], limits: &Limits) -> Result<Gaussia
     }
     let layout = Layout::find(object, &header)?;
     let gaussians = layout.gather(&body[..claimed as usize], header.stride);
-    gaussians.validate(object, limits)?;
+    gaussians.validate_read(object, limits)?;
     let mut remarks = Vec::new();
     if layout.dynamic.is_none() {
         remarks.push("there is no property 'dynamic'; all dynamic scores are 0".to_string());

@@ -2,7 +2,7 @@
 
 use crate::archive::{Archive, CodecEntry, Manifest, StreamKind};
 use crate::playback::PlaybackLayer;
-use crate::plugin::{Entries, PluginEntry};
+use crate::plugin::{Entries, PluginEntry, check_linked};
 use crate::{
     AttributeCodec, CodecContext, CodecPlugin, Error, EventSink, HostGaussians, Limits, Moving, Result, Seed, Silent, Stream, StreamStage, WeightArray,
     WeightCodecPlugin,
@@ -95,19 +95,9 @@ pub fn read_weights(object: &str, archive: &Archive, entry: &CodecEntry, limits:
 
 /// The linked plug-in that `object` names, of the version that it names.
 fn linked<P: PluginEntry>(object: &str, entry: &CodecEntry) -> Result<&'static P> {
-    let (linked, kind) = (Entries::<P>::collect()?, P::KIND.replace('-', " "));
-    let Some(plugin) = linked.iter().find(|p| p.info().name == entry.name) else {
-        let names: Vec<&str> = linked.iter().map(|p| p.info().name).collect();
-        let remedy = format!("Use a program that links the crate of this {kind}; this one links {}", names.join(", "));
-        let problem = format!("it needs the {kind} '{}' (version {}), which is not linked into this program", entry.name, entry.version);
-        return Err(Error::unsupported(object, problem, remedy));
-    };
-    let known = plugin.info().version;
-    if known != entry.version {
-        let problem = format!("version {} of its stored form", entry.version);
-        return Err(Error::unsupported(format!("{object}: {kind} {}", entry.name), problem, format!("This program reads version {known}")));
-    }
-    Ok(plugin)
+    let linked = Entries::<P>::collect()?;
+    check_linked(object, &P::KIND.replace('-', " "), &entry.name, Some(&entry.version), linked.facts().map(|(_, plugin)| plugin))?;
+    linked.get(&entry.name)
 }
 
 /// The codec of `archive`, which must be linked, and the context of decoding with it.
@@ -152,7 +142,7 @@ pub fn read_stage(object: &str, archive: &Archive, stage: StreamStage, limits: &
 
 /// `gaussians`, where they are what the manifest says, or the first of them.
 fn checked(object: &str, archive: &Archive, limits: &Limits, gaussians: HostGaussians, all: bool) -> Result<HostGaussians> {
-    gaussians.validate(object, limits)?;
+    gaussians.validate_read(object, limits)?;
     let (manifest, found) = (archive.manifest(), gaussians.len() as u64);
     if found > manifest.gaussian_count || all && found < manifest.gaussian_count || gaussians.sh_degree != manifest.sh_degree {
         let problem = format!(

@@ -51,13 +51,9 @@ pub struct Tuning<'a> {
     pub bits_per_octave: f64,
 }
 
-/// Trains a model further on its training views. A deformer's weights are rounded as their own codec stores them.
+/// Trains a model further on its training views: on their images, or on images of its own where it was trained with colours per camera. A deformer's weights are
+/// rounded as their own codec stores them.
 pub trait TuneModel {
-    /// Why the model cannot be trained further, if it cannot.
-    ///
-    /// # Errors
-    /// What the model's configuration reports.
-    fn refusal(&self) -> Result<Option<String>>;
     /// `gaussians` with the weights of the model.
     ///
     /// # Errors

@@ -162,7 +162,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
         ("flipped_stream.cc4d", flipped_stream, "checksum"),
         ("flipped_header.cc4d", flipped_header, "checksum of the header"),
         ("header_claims_4gb.cc4d", header_claim, "4294967295 bytes is claimed"),
-        ("header_decodes_to_4gb.cc4d", with_claim(u32::MAX), "4294967295 decoded bytes were declared"),
+        ("header_decodes_to_4gb.cc4d", with_claim(u32::MAX), "4294967295 is over the limit of 16777216"),
         ("header_decodes_to_more.cc4d", with_claim(99), "99 decoded bytes were declared"),
         ("header_is_no_frame.cc4d", with_stored_header(&[9; 40], &[]), "Zstandard frame"),
         ("manifest_deep.cc4d", with_manifest(deep.as_bytes()), "limit of 64"),
@@ -308,6 +308,12 @@ fn limits_are_obeyed() {
     let few = Limits { max_gaussians: 2, ..Limits::default() };
     assert!(matches!(read_all(&sound(), &few), Err(Error::Limit { value: 3, limit: 2, .. })));
     assert!(matches!(ply::from_bytes("t", &sound_ply(), &few), Err(Error::Limit { value: 3, limit: 2, .. })));
+    // Streams that are read together count together.
+    let three = (0..3u8).map(|i| Stream { name: format!("s{i}"), bytes: vec![i; 4000] });
+    let bytes = ArchiveWriter::new(manifest()).add_all(StreamKind::Canonical, three).to_bytes().unwrap();
+    let archive = Archive::from_bytes("t", bytes, &Limits { max_bytes: 10_000, ..Limits::default() }).unwrap();
+    assert_eq!(archive.read_stream("s1").unwrap(), vec![1; 4000]);
+    assert!(matches!(archive.read_kind(StreamKind::Canonical), Err(Error::Limit { value: 12_000, limit: 10_000, .. })));
     let shallow = Limits { max_depth: 1, ..Limits::default() };
     assert!(matches!(read_all(&sound(), &shallow), Err(Error::Limit { .. })));
 }

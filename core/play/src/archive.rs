@@ -7,6 +7,7 @@ use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::{Archive, ArchiveWriter, CodecEntry, Manifest, StreamKind};
+use cc4dgs_core::format::check_linked;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
@@ -60,8 +61,7 @@ impl Model {
                 return Err(Error::data(object, problem, "Fetch it again, or compress the run that it was made of"));
             }
             Some(entry) => {
-                let known = linked(object, "deformer", &entry.name, Some(&entry.version), registry)?;
-                check_version(object, "deformer", &entry.name, &entry.version, known)?;
+                linked(object, "deformer", &entry.name, Some(&entry.version), registry)?;
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
                 let mut field = registry.build_deformer(&section, &entry.context, device).map_err(|e| e.of_file(object))?;
@@ -254,27 +254,14 @@ fn json(value: &impl Serialize) -> Result<Value> {
     serde_json::to_string(value).and_then(|text| serde_json::from_str(&text)).map_err(|e| Error::backend("archive manifest", e.to_string(), "Report this"))
 }
 
-/// The version of the linked plug-in that the file `object` names, or an error that says what to link. `version` is the stored one, where the file has it.
-pub(crate) fn linked(object: &str, kind: &str, name: &str, version: Option<&str>, registry: &Registry) -> Result<&'static str> {
-    let plugins = registry.plugins();
-    let known: Vec<_> = plugins.into_iter().filter(|(k, _)| *k == kind).map(|(_, p)| p).collect();
-    known.iter().find(|p| p.name == name).map(|p| p.version).ok_or_else(|| {
-        let names: Vec<&str> = known.iter().map(|p| p.name).collect();
-        let remedy = format!("Use a program that links the crate of this {kind}; this one links {}", names.join(", "));
-        let version = version.map_or_else(String::new, |version| format!(" (version {version})"));
-        Error::unsupported(object, format!("it needs the {kind} '{name}'{version}, which is not linked into this program"), remedy)
-    })
+/// Refuses a plug-in that the file `object` names, where it is not linked, or reads another version than the stored one, if the file has it.
+pub(crate) fn linked(object: &str, kind: &str, name: &str, version: Option<&str>, registry: &Registry) -> Result<()> {
+    let known = registry.plugins().into_iter().filter(|(of, _)| *of == kind).map(|(_, plugin)| plugin);
+    check_linked(object, kind, name, version, known)
 }
 
 fn codec_seed(root: u64) -> Seed {
     Seed::root(root).child("codec")
-}
-
-fn check_version(object: &str, kind: &str, name: &str, stored: &str, known: &str) -> Result<()> {
-    if stored == known {
-        return Ok(());
-    }
-    Err(Error::unsupported(format!("{object}: {kind} {name}"), format!("version {stored} of its stored form"), format!("This program reads version {known}")))
 }
 
 /// The weights of `field`.

@@ -263,7 +263,7 @@ impl ModelHeader {
                 host.extra.insert(name.clone(), ExtraAttribute::exact(*width, values));
             }
         }
-        host.validate(&file.object, limits)?;
+        host.validate_read(&file.object, limits)?;
         if host.len() != self.gaussians {
             return Err(file.damaged(format!("the header says {} Gaussians, the arrays hold {}", self.gaussians, host.len())));
         }

@@ -90,11 +90,11 @@ impl FieldWeights {
             Ok::<_, Error>(Attempt { streams, settings, drop })
         };
         let counts: Vec<usize> = weights.iter().map(|w| w.values.len()).collect();
-        let (bits, found) = search_bits(&counts, range, limit, &mut attempt)?;
         let object = format!("weight codec {}", self.name);
+        let (bits, found) = search_bits(&object, &counts, range, limit, &mut attempt)?;
         let text: Vec<String> = bits.iter().map(f64::to_string).collect();
         let message = format!("{} bits, PSNR {:.4} dB lower on {} training views ({limit} dB allowed)", text.join(", "), found.drop, views.len().min(VIEWS));
-        context.events.emit(&if found.drop > limit { Event::Warning { object, message } } else { Event::Note { object, message } });
+        context.events.emit(&Event::Note { object, message });
         Ok((found.streams, found.settings))
     }
 }
@@ -177,12 +177,22 @@ struct Attempt {
 }
 
 /// The fewest bits per array, in quarters, that lose at most `limit` dB; arrays have `counts` values. A bit less doubles errors and quadruples the loss. Where
-/// the sum of bits is smallest, the loss of each array is in proportion to its values. The most bits are taken even if they lose more.
-fn search_bits(counts: &[usize], range: RangeInclusive<i64>, limit: f64, attempt: &mut dyn FnMut(&[f64]) -> Result<Attempt>) -> Result<(Vec<f64>, Attempt)> {
+/// the sum of bits is smallest, the loss of each array is in proportion to its values. It is an error of `object` if the most bits lose more.
+fn search_bits(
+    object: &str,
+    counts: &[usize],
+    range: RangeInclusive<i64>,
+    limit: f64,
+    attempt: &mut dyn FnMut(&[f64]) -> Result<Attempt>,
+) -> Result<(Vec<f64>, Attempt)> {
     let (least, most) = (*range.start() as f64, *range.end() as f64);
     let finest = vec![most; counts.len()];
     let first = attempt(&finest)?;
-    if first.drop > limit || counts.is_empty() {
+    if first.drop > limit {
+        let problem = format!("weights of {most} bits, the most there are, lose {:.2e} dB on training views, {limit} dB are allowed", first.drop);
+        return Err(Error::parameter(object, problem, "Allow more, or store the weights as fp32"));
+    }
+    if counts.is_empty() {
         return Ok((finest, first));
     }
     let probe = (least + PROBED * (most - least)).round();
@@ -237,13 +247,14 @@ mod tests {
             let drop = bits.iter().zip(matter).map(|(b, m)| m * 0.25f64.powf(*b)).sum();
             Ok(Attempt { streams: Vec::new(), settings: toml::Table::new(), drop })
         };
-        let (bits, found) = search_bits(&counts, 3..=16, 0.064, &mut attempt).unwrap();
+        let (bits, found) = search_bits("weights", &counts, 3..=16, 0.064, &mut attempt).unwrap();
         assert!(found.drop <= 0.064 && found.drop > 0.032, "{bits:?} lose {}", found.drop);
         assert_eq!(bits[1] - bits[0], 3.0, "{bits:?}");
         assert!(tried.get() < 10, "{} attempts", tried.get());
-        // Nothing is accurate enough: the most bits.
-        let (bits, _) = search_bits(&counts, 3..=16, 1e-12, &mut attempt).unwrap();
-        assert_eq!(bits, [16.0; 2]);
+        // Nothing is accurate enough.
+        let refused = search_bits("weights", &counts, 3..=16, 1e-12, &mut attempt).err().unwrap();
+        let expected = "weights of 16 bits, the most there are, lose 4.92e-7 dB on training views, 0.000000000001 dB are allowed";
+        assert!(matches!(refused, Error::Parameter { .. }) && refused.to_string().contains(expected), "{refused}");
     }
 
     #[test]

@@ -38,6 +38,9 @@ pub const MAGIC: [u8; 8] = *b"\x89CC4D\r\n\x1a";
 /// Bytes before the header: magic, version, header length, header checksum.
 const PREFIX_BYTES: usize = 24;
 
+/// Most bytes of a header, decoded: hundreds of times those of a manifest and a directory.
+const LARGEST_HEADER: u32 = 16 << 20;
+
 /// Purpose of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StreamKind {

@@ -1,7 +1,7 @@
 //! Reading of an archive: manifest and directory once, then any stream separately.
 
 use super::packing::{Encoding, unpack};
-use super::{ByteReader, FORMAT_VERSION, MAGIC, Manifest, PREFIX_BYTES, StreamKind};
+use super::{ByteReader, FORMAT_VERSION, LARGEST_HEADER, MAGIC, Manifest, PREFIX_BYTES, StreamKind};
 use crate::{Error, Limits, Result, Stream, unknown_name};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
@@ -73,6 +73,14 @@ fn damaged(object: &str, problem: String) -> Error {
     Error::data(object, problem, "The file is damaged; fetch or write it again")
 }
 
+/// Refuses headers of more bytes than any writer makes.
+fn check_header(object: &str, bytes: u64) -> Result<()> {
+    if bytes <= u64::from(LARGEST_HEADER) {
+        return Ok(());
+    }
+    Err(Error::limit(object, bytes, u64::from(LARGEST_HEADER), "The file is damaged; fetch or write it again"))
+}
+
 /// An open archive. The manifest and the directory are checked on opening, each stream when it is read.
 pub struct Archive {
     object: String,
@@ -108,7 +116,9 @@ impl Archive {
         }
         reader.u32()?;
         let header = u64::from(reader.u32()?);
-        limits.check_bytes(&format!("header of {object}"), header)?;
+        let what = format!("header of {object}");
+        limits.check_bytes(&what, header)?;
+        check_header(&what, header)?;
         Ok(Self::PREFIX_BYTES as u64 + header)
     }
     /// Bytes before the header.
@@ -139,6 +149,7 @@ impl Archive {
         let what = format!("header of {object}");
         let mut reader = ByteReader::new(&what, &header);
         let plain_len = u64::from(reader.u32()?);
+        check_header(&what, plain_len)?;
         let plain = unpack(&what, reader.rest().to_vec(), Encoding::Zstd, 0, plain_len, limits)?;
         let mut reader = ByteReader::new(what, &plain);
         let manifest_len = reader.u32()? as usize;
@@ -166,13 +177,15 @@ impl Archive {
             None => Err(unknown_name(&format!("{}: stream", self.object), name, self.entries.iter().map(|e| e.info.name.as_str()))),
         }
     }
-    /// Reads all streams of `kind`, in file order.
+    /// Reads all streams of `kind`, in file order. The limit on bytes is one of all of them together.
     pub fn read_kind(&self, kind: StreamKind) -> Result<Vec<Stream>> {
         self.read_those(|info| info.kind == kind)
     }
-    /// Reads the streams that are `wanted`, in file order.
+    /// Reads the streams that are `wanted`, in file order. The limit on bytes is one of all of them together.
     pub(crate) fn read_those(&self, wanted: impl Fn(&StreamInfo) -> bool) -> Result<Vec<Stream>> {
         let entries: Vec<&Entry> = self.entries.iter().filter(|e| wanted(&e.info)).collect();
+        let total = entries.iter().fold(0u64, |sum, e| sum.saturating_add(e.info.decoded_bytes));
+        self.limits.check_bytes(&format!("{} streams of {}", entries.len(), self.object), total)?;
         entries.into_par_iter().map(|e| Ok(Stream { name: e.info.name.clone(), bytes: self.read_entry(e)? })).collect()
     }
     fn read_entry(&self, entry: &Entry) -> Result<Vec<u8>> {
@@ -217,4 +230,33 @@ fn read_directory(reader: &mut ByteReader, start: u64, total: u64) -> Result<Vec
         return Err(reader.error(format!("{} bytes follow the last stream", total - offset)));
     }
     Ok(entries)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::ArchiveWriter;
+    use super::*;
+
+    #[test]
+    fn headers_that_are_too_large_are_neither_written_nor_read() {
+        let with_note = |bytes: usize| {
+            let mut manifest = Manifest { frame_count: 1, ..Default::default() };
+            manifest.extra.insert("note".into(), "x".repeat(bytes).into());
+            ArchiveWriter::new(manifest).to_bytes()
+        };
+        let most = LARGEST_HEADER as usize;
+        let bytes = with_note(most - 4096).unwrap();
+        assert!(bytes.len() < 20_000 && Archive::from_bytes("t", bytes, &Limits::default()).is_ok());
+        assert!(matches!(with_note(most), Err(Error::Limit { .. })));
+        // One that decodes to a byte more: nothing is decoded.
+        let plain = vec![b' '; most + 1];
+        let header = [(plain.len() as u32).to_le_bytes().to_vec(), crate::archive::zstandard::compress(&plain).unwrap()].concat();
+        let length = (header.len() as u32).to_le_bytes();
+        let bytes = [&MAGIC[..], &FORMAT_VERSION.to_le_bytes(), &length, &xxh3_64(&header).to_le_bytes(), &header].concat();
+        let error = Archive::from_bytes("t", bytes, &Limits::default()).err().unwrap();
+        assert!(matches!(error, Error::Limit { value: 16_777_217, limit: 16_777_216, .. }), "{error}");
+        // Nor is one fetched.
+        let prefix = [&MAGIC[..], &FORMAT_VERSION.to_le_bytes(), &u32::MAX.to_le_bytes(), &[0; 8]].concat();
+        assert!(matches!(Archive::header_end("t", &prefix, &Limits::default()), Err(Error::Limit { limit: 16_777_216, .. })));
+    }
 }

@@ -2,7 +2,7 @@
 
 use super::packing::pack;
 use super::zstandard::compress;
-use super::{FORMAT_VERSION, MAGIC, Manifest, StreamKind};
+use super::{FORMAT_VERSION, LARGEST_HEADER, MAGIC, Manifest, StreamKind};
 use crate::{Error, Result, Stream};
 use rayon::prelude::*;
 use std::path::Path;
@@ -53,8 +53,9 @@ impl ArchiveWriter {
             plain.extend((packed.bytes.len() as u64).to_le_bytes());
             plain.extend(xxh3_64(&packed.bytes).to_le_bytes());
         }
-        let plain_len = u32::try_from(plain.len())
-            .map_err(|_| Error::limit("archive header", plain.len() as u64, u64::from(u32::MAX), "Shorten the manifest's configuration and extras"))?;
+        let plain_len = u32::try_from(plain.len()).ok().filter(|len| *len <= LARGEST_HEADER);
+        let plain_len = plain_len
+            .ok_or_else(|| Error::limit("archive header", plain.len() as u64, u64::from(LARGEST_HEADER), "Shorten the manifest's configuration and extras"))?;
         let header = [plain_len.to_le_bytes().to_vec(), compress(&plain)?].concat();
         let mut out = Vec::with_capacity(super::PREFIX_BYTES + header.len() + packed.iter().map(|p| p.bytes.len()).sum::<usize>());
         out.extend(MAGIC);

@@ -61,9 +61,11 @@ impl CodedTrack {
     fn order(ranks: &[u8], width: usize) -> impl Iterator<Item = usize> {
         let starts = Track::starts_of(ranks);
         let most = ranks.iter().copied().max().unwrap_or(0);
-        let users: Vec<(u8, u32)> = ranks.iter().copied().zip(starts).filter(|(rank, _)| *rank > 0).collect();
+        let mut users: Vec<(u8, u32)> = ranks.iter().copied().zip(starts).collect();
         (0..most).flat_map(move |f| {
-            let of_function: Vec<u32> = users.iter().filter(|(rank, _)| *rank > f).map(|(_, start)| start + u32::from(f)).collect();
+            // Who does not use this one uses none of the later ones, so that the work is the number of coefficients.
+            users.retain(|(rank, _)| *rank > f);
+            let of_function: Vec<u32> = users.iter().map(|(_, start)| start + u32::from(f)).collect();
             (0..width).flat_map(move |c| of_function.clone().into_iter().map(move |at| at as usize * width + c))
         })
     }
@@ -268,6 +270,19 @@ mod tests {
             assert!(PlaybackLayer::decode(&streams, count, degree, &Limits::default()).is_err());
         }
         assert!(PlaybackLayer::decode(&streams, 10, 1, &Limits { max_bytes: 8, ..Limits::default() }).is_err());
+    }
+
+    #[test]
+    fn coefficients_are_stored_function_by_function() {
+        let (ranks, width) = ([0u8, 3, 1, 0, 2, 3, 255], 2);
+        let starts = Track::starts_of(&ranks);
+        let mut expected = Vec::new();
+        for (f, c) in (0..255u8).flat_map(|f| [(f, 0), (f, 1)]) {
+            let users = ranks.iter().zip(&starts).filter(|(rank, _)| **rank > f);
+            expected.extend(users.map(|(_, start)| (*start as usize + usize::from(f)) * width + c));
+        }
+        assert_eq!(CodedTrack::order(&ranks, width).collect::<Vec<usize>>(), expected);
+        assert_eq!(CodedTrack::order(&[0, 0], width).count(), 0);
     }
 
     #[test]

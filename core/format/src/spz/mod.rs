@@ -86,6 +86,11 @@ pub fn to_spz(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Vec<u8>
     if options.version == 3 { gzip::write(&packed) } else { frames::write(&packed) }
 }
 
+/// What [`to_spz`] limits or rounds coarsely, in words: values outside of the ranges of the format, and centres in steps that are large beside the Gaussians.
+pub fn remarks(gaussians: &HostGaussians) -> Vec<String> {
+    values::remarks(gaussians)
+}
+
 /// What an SPZ file of version 2, 3 or 4 holds; dynamic scores are zero. `object` names the file in errors.
 ///
 /// # Errors
@@ -93,7 +98,7 @@ pub fn to_spz(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Vec<u8>
 pub fn from_spz(object: &str, bytes: &[u8], limits: &Limits) -> Result<GaussianFile> {
     let packed = if bytes.starts_with(&PLAIN_MAGIC) { frames::read(object, bytes, limits)? } else { gzip::read(object, bytes, limits)? };
     let gaussians = values::unpack(&packed);
-    gaussians.validate(object, limits)?;
+    gaussians.validate_read(object, limits)?;
     Ok(GaussianFile { gaussians, antialiased: packed.flags & ANTIALIASED != 0, remarks: Vec::new() })
 }
 

@@ -1,7 +1,7 @@
 //! The quantisation of SPZ: bytes per attribute.
 
 use super::{ANTIALIASED, Packed, SpzOptions};
-use crate::gaussians::sh_rest_len;
+use crate::gaussians::{sh_rest_len, unit_quaternion};
 use crate::{Error, HostGaussians, Result};
 use std::f32::consts::FRAC_1_SQRT_2;
 
@@ -13,6 +13,58 @@ pub const LARGEST: f32 = 8_388_607.0;
 const COLOR: f32 = 0.15;
 /// Largest code of a quaternion component from version 3 on.
 const COMPONENT: f32 = 511.0;
+/// Steps of centres are coarse from this share of a Gaussian's standard deviation on.
+const COARSE: f32 = 0.1;
+
+/// Codes of 8 bits, before they are rounded and limited.
+fn scale_code(log_scale: f32) -> f32 {
+    (log_scale + 10.0) * 16.0
+}
+fn color_code(coefficient: f32) -> f32 {
+    (coefficient * COLOR + 0.5) * 255.0
+}
+fn harmonic_code(coefficient: f32) -> f32 {
+    coefficient * 128.0 + 128.0
+}
+
+/// 2^`exponent`, for exponents of normal numbers.
+fn power_of_two(exponent: i32) -> f32 {
+    f32::from_bits(((127 + exponent) as u32) << 23)
+}
+
+/// Largest absolute coordinate.
+fn farthest(gaussians: &HostGaussians) -> f32 {
+    gaussians.means.iter().fold(0.0, |a, v| a.max(v.abs()))
+}
+
+/// Fractional bits of coordinates up to `farthest`.
+fn fraction_of(farthest: f32) -> u8 {
+    (0..=MOST_FRACTION).rev().find(|&bits| farthest * power_of_two(i32::from(bits)) <= LARGEST).unwrap_or(0)
+}
+
+/// What a file does not hold of `gaussians`, in words: values outside of its ranges, and centres in steps that are coarse for such Gaussians.
+pub(super) fn remarks(gaussians: &HostGaussians) -> Vec<String> {
+    let outside = |values: &[f32], code: fn(f32) -> f32| values.iter().filter(|v| !(0.0..=255.0).contains(&code(**v).round())).count();
+    let counts = [
+        (outside(&gaussians.log_scales, scale_code), "scales (e^-10 to e^5.94)"),
+        (outside(&gaussians.sh_dc, color_code), "coefficients of degree 0 (±3.33)"),
+        (outside(&gaussians.sh_rest, harmonic_code), "coefficients of higher degrees (±1)"),
+    ];
+    let limited: Vec<String> = counts.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}")).collect();
+    let mut out = Vec::new();
+    if !limited.is_empty() {
+        out.push(format!("limited to the range of the format: {}", limited.join(", ")));
+    }
+    let mut log_scales = gaussians.log_scales.clone();
+    if let Some(middle) = log_scales.len().checked_sub(1).map(|last| last / 2) {
+        let size = libm::expf(*log_scales.select_nth_unstable_by(middle, f32::total_cmp).1);
+        let step = power_of_two(-i32::from(fraction_of(farthest(gaussians))));
+        if step > COARSE * size {
+            out.push(format!("centres are in steps of {step}, coarse beside the median standard deviation of {size:.2e}"));
+        }
+    }
+    out
+}
 
 /// Whether spherical-harmonics coefficient `k` (from 1) changes sign if y and z do: the powers of y and z add up to an odd number.
 fn is_odd(k: usize) -> bool {
@@ -32,7 +84,7 @@ pub(super) fn pack(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Pa
     if u32::try_from(count).is_err() {
         return Err(Error::limit("SPZ file", count as u64, u64::from(u32::MAX), "Prune the model"));
     }
-    let farthest = gaussians.means.iter().fold(0.0f32, |a, v| a.max(v.abs()));
+    let farthest = farthest(gaussians);
     if farthest > LARGEST {
         return Err(Error::data(
             "Gaussians to write as SPZ",
@@ -40,16 +92,16 @@ pub(super) fn pack(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Pa
             "Remove far outliers, or use another codec",
         ));
     }
-    let fraction = (0..=MOST_FRACTION).rev().find(|&bits| farthest * f32::from(bits).exp2() <= LARGEST).unwrap_or(0);
-    let scale = f32::from(fraction).exp2();
+    let fraction = fraction_of(farthest);
+    let scale = power_of_two(i32::from(fraction));
     let fixed = |value: f32| ((value * scale).round() as i32).to_le_bytes();
     let positions = gaussians.means.as_chunks::<3>().0.iter().flat_map(|point| turned(*point)).flat_map(|v| fixed(v).into_iter().take(3)).collect();
     let byte = |v: f32| v.round().clamp(0.0, 255.0) as u8;
-    let unit: Vec<Option<[f32; 4]>> = gaussians.quaternions.as_chunks::<4>().0.iter().map(|q| normalized(*q)).collect();
+    let unit: Vec<Option<[f32; 4]>> = gaussians.quaternions.as_chunks::<4>().0.iter().map(unit_quaternion).collect();
     // A quaternion of norm zero is not drawn, so its Gaussian is stored with an opacity of zero.
     let alphas = gaussians.opacity_logits.iter().zip(&unit).map(|(o, q)| if q.is_some() { byte(255.0 / (1.0 + libm::expf(-o))) } else { 0 }).collect();
-    let colors = gaussians.sh_dc.iter().map(|c| byte((c * COLOR + 0.5) * 255.0)).collect();
-    let scales = gaussians.log_scales.iter().map(|s| byte((s + 10.0) * 16.0)).collect();
+    let colors = gaussians.sh_dc.iter().map(|c| byte(color_code(*c))).collect();
+    let scales = gaussians.log_scales.iter().map(|s| byte(scale_code(*s))).collect();
     let rotations = unit.iter().flat_map(|q| {
         let [w, x, y, z] = q.unwrap_or([1.0, 0.0, 0.0, 0.0]);
         pack_rotation([x, -y, -z, w]).to_le_bytes()
@@ -76,7 +128,7 @@ pub(super) fn pack(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Pa
 /// The Gaussians of quantised attributes; dynamic scores are zero.
 pub(super) fn unpack(packed: &Packed) -> HostGaussians {
     let [positions, alphas, colors, scales, rotations, harmonics] = &packed.streams;
-    let scale = 1.0 / f32::from(packed.fraction).exp2();
+    let scale = power_of_two(-i32::from(packed.fraction));
     let coordinate = |b: &[u8; 3]| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 * scale;
     let means = positions.as_chunks::<9>().0.iter().flat_map(|p| turned([0, 3, 6].map(|k| coordinate(&[p[k], p[k + 1], p[k + 2]])))).collect();
     // Half a step inside, where the logit is finite.
@@ -104,11 +156,6 @@ fn turned([x, y, z]: [f32; 3]) -> [f32; 3] {
     [x, -y, -z]
 }
 
-fn normalized(q: [f32; 4]) -> Option<[f32; 4]> {
-    let norm = q.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-    (norm > 1e-15 && norm.is_finite()).then(|| q.map(|v| (f64::from(v) / norm) as f32))
-}
-
 /// Packs (x,y,z,w): two bits for the index of the largest component, then sign and nine bits for each of the others in order.
 fn pack_rotation(q: [f32; 4]) -> u32 {
     let largest = (0..4).fold(0, |a, k| if q[k].abs() > q[a].abs() { k } else { a });
@@ -134,7 +181,7 @@ fn with_largest(small: [f32; 3], index: usize) -> [f32; 4] {
     let rest = (1.0 - small.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
     let mut others = small.into_iter();
     let q = std::array::from_fn(|k| if k == index { rest } else { others.next().unwrap_or(0.0) });
-    normalized(q).unwrap_or([0.0, 0.0, 0.0, 1.0])
+    unit_quaternion(&q).unwrap_or([0.0, 0.0, 0.0, 1.0])
 }
 
 #[cfg(test)]
@@ -142,9 +189,29 @@ mod tests {
     use super::*;
 
     #[test]
+    fn powers_of_two_are_exact() {
+        assert_eq!([0, 1, 20, -1, -24].map(power_of_two), [1.0, 2.0, 1_048_576.0, 0.5, 1.0 / 16_777_216.0]);
+    }
+
+    #[test]
+    fn values_outside_of_the_ranges_and_coarse_steps_are_told() {
+        // The last values that are held, and the first that are not.
+        let mut gaussians = HostGaussians { log_scales: vec![-10.0, 5.9375, -5.0], sh_dc: vec![-3.33, 3.33, 0.0], ..Default::default() };
+        (gaussians.means, gaussians.sh_rest) = (vec![10.0, 0.0, 0.0], vec![-1.0, 127.0 / 128.0, 0.0]);
+        assert!(remarks(&gaussians).is_empty() && remarks(&HostGaussians::default()).is_empty());
+        (gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest) = (vec![-10.1, 6.0, -5.0], vec![-3.4, 0.0, 0.0], vec![1.1, -1.1, 0.0]);
+        let counts = "2 scales (e^-10 to e^5.94), 1 coefficients of degree 0 (±3.33), 2 coefficients of higher degrees (±1)";
+        assert_eq!(remarks(&gaussians), [format!("limited to the range of the format: {counts}")]);
+        // 24 bits for 2e5 units: six of them are left for fractions.
+        gaussians.means[1] = -1e5;
+        let told = remarks(&gaussians);
+        assert!(told.len() == 2 && told[1].starts_with("centres are in steps of 0.015625, "), "{told:?}");
+    }
+
+    #[test]
     fn rotations_come_back_within_a_step() {
         for k in 0..2000u32 {
-            let q = normalized(std::array::from_fn(|c| ((k * 7 + c as u32 * 131) as f32 * 0.37).sin())).unwrap();
+            let q = unit_quaternion(&std::array::from_fn(|c| ((k * 7 + c as u32 * 131) as f32 * 0.37).sin())).unwrap();
             let back = unpack_rotation(pack_rotation(q));
             let along: f32 = q.iter().zip(back).map(|(a, b)| a * b).sum();
             assert!(1.0 - along.abs() < 3e-6, "{q:?} became {back:?}");

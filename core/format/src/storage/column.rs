@@ -3,6 +3,7 @@
 //! Uniform quantisers span percentiles of the values, a little widened; the few values outside are stored exactly in a list of escapes, so that
 //! an outlier neither widens the steps of the others nor is clamped. If the error is over the allowed loss, more bits are used.
 
+use super::loss::{central_loss, relative_rms};
 use super::mulaw;
 use crate::Result;
 use crate::archive::ByteReader;
@@ -71,7 +72,7 @@ pub fn encode(values: &[f32], target: Target) -> Column {
     for form in [wanted, uniform(values, 16, target.tail)] {
         let column = quantise(values, form);
         let decoded = dequantise(&column, values.len());
-        if relative_rms(values, &decoded) <= target.loss && central_loss(values, &decoded) <= target.loss {
+        if relative_rms(values, &decoded) <= target.loss && central_loss(values, &decoded, 1) <= target.loss {
             return column;
         }
     }
@@ -97,9 +98,11 @@ pub fn encode_within(values: &[f32], tolerance: f32) -> Column {
     quantise(values, Form::Exact)
 }
 
-/// Encodes `values` without loss.
+/// Encodes `values` without loss, bit for bit.
 pub fn encode_exact(values: &[f32]) -> Column {
-    constant(values).unwrap_or_else(|| quantise(values, Form::Exact))
+    // 0 and -0 are equal, and have different bits.
+    let same = values.iter().all(|v| v.to_bits() == values[0].to_bits());
+    constant(values).filter(|_| same).unwrap_or_else(|| quantise(values, Form::Exact))
 }
 
 fn constant(values: &[f32]) -> Option<Column> {
@@ -279,29 +282,6 @@ pub fn read_escapes(reader: &mut ByteReader) -> Result<Vec<(u32, f32)>> {
     Ok(rows.into_iter().zip(values).collect())
 }
 
-/// Root-mean-square error over the standard deviation of the values; 0 if they are equal, NaN if a value is not finite.
-pub fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
-    let n = values.len().max(1) as f64;
-    let error: f64 = values.iter().zip(decoded).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>() / n;
-    if error == 0.0 && values.len() == decoded.len() {
-        return 0.0;
-    }
-    let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
-    let variance = values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n;
-    if values.len() == decoded.len() { (error / variance).sqrt() } else { f64::NAN }
-}
-
-/// [`relative_rms`] of the values between the 5th and the 95th percentile. Outliers enlarge the standard deviation and would hide
-/// the errors of the other values.
-fn central_loss(values: &[f32], decoded: &[f32]) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_unstable_by(f32::total_cmp);
-    let cut = sorted.len() / 20;
-    let (low, high) = (sorted[cut], sorted[sorted.len() - 1 - cut]);
-    let (inner, inner_decoded): (Vec<f32>, Vec<f32>) = values.iter().zip(decoded).filter(|(v, _)| (low..=high).contains(*v)).unzip();
-    relative_rms(&inner, &inner_decoded)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -336,6 +316,15 @@ mod tests {
         let values: Vec<f32> = (0..1000).map(|i| if i % 50 == 0 { 1e4 } else { (i % 7) as f32 }).collect();
         let decoded = dequantise(&encode(&values, TARGET), values.len());
         assert!(values.iter().zip(&decoded).all(|(a, b)| (a - b).abs() < 0.2));
+    }
+
+    #[test]
+    fn exact_columns_keep_the_sign_of_zero() {
+        for values in [vec![0.0f32, -0.0, 0.0], vec![-0.0; 3], vec![]] {
+            let decoded = dequantise(&encode_exact(&values), values.len());
+            assert!(decoded.len() == values.len() && decoded.iter().zip(&values).all(|(a, b)| a.to_bits() == b.to_bits()), "{values:?}: {decoded:?}");
+        }
+        assert!(encode_exact(&[-0.0; 3]).codes.is_empty());
     }
 
     #[test]

@@ -38,7 +38,8 @@ pub fn write_shapes(arrays: &[WeightArray], out: &mut Vec<u8>) -> Result<()> {
     Ok(())
 }
 
-/// Reads what [`write_shapes`] wrote; `values` are empty. The number of values ([`value_count`]) is untrusted; compare it with the bytes left before allocating.
+/// Reads what [`write_shapes`] wrote; `values` are empty. The number of values ([`value_count`]) is untrusted; compare it with the bytes left, or with limits, before
+/// allocating.
 pub fn read_shapes(reader: &mut ByteReader) -> Result<Vec<WeightArray>> {
     let count = reader.u32()?;
     let (mut arrays, mut names) = (Vec::new(), BTreeSet::new());

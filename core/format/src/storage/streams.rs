@@ -77,7 +77,7 @@ pub fn close(set: &StreamSet, shape: &Shape, read: [ByteReader; 2], mut out: Hos
         reader.finish()?;
     }
     shape.read_extra(set, &mut out)?;
-    out.validate("decoded Gaussians", limits)?;
+    out.validate_read("decoded Gaussians", limits)?;
     Ok(out)
 }
 

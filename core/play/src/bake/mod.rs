@@ -29,7 +29,8 @@ use tolerance::Tolerances;
 
 /// Gaussians that the functions are found from.
 const SAMPLED_ROWS: usize = 3072;
-/// Floats of offsets held at a time.
+/// Floats of offsets held at a time. The sample that the functions are found from has so many at one time per frame, and more in proportion where there are
+/// more times ([`choose_samples`]).
 const FLOATS: usize = 24 << 20;
 /// Samples per frame at most, but any sequence may have so many: functions are shared by all Gaussians.
 const SAMPLES_PER_FRAME: usize = 8;

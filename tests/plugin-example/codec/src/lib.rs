@@ -42,7 +42,7 @@ impl AttributeCodec for Half {
             stream.finish()?;
         }
         shape.read_extra(&set, &mut out)?;
-        out.validate("decoded Gaussians", &context.limits)?;
+        out.validate_read("decoded Gaussians", &context.limits)?;
         Ok(out)
     }
     fn losses(&self) -> Vec<DeclaredLoss> {

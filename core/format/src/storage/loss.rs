@@ -1,0 +1,73 @@
+//! How much of a column storage loses.
+
+/// Root-mean-square error over the standard deviation of the values; 0 if they are equal, NaN if a value is not finite.
+pub fn relative_rms(values: &[f32], decoded: &[f32]) -> f64 {
+    if values.len() == decoded.len() { ratio(squares(values, decoded), values.len()) } else { f64::NAN }
+}
+
+/// [`relative_rms`] of the values between the 5th and the 95th percentile of each component of `rows` `[N,width]`, in deviations from the mean of that
+/// component. Outliers, and components around different means, enlarge the standard deviation of a column and would hide the errors of the other values.
+pub fn central_loss(rows: &[f32], decoded: &[f32], width: usize) -> f64 {
+    if rows.len() != decoded.len() {
+        return f64::NAN;
+    }
+    let (mut sums, mut count) = ([0.0f64; 2], 0usize);
+    for component in 0..width {
+        let of = |rows: &[f32]| rows.iter().skip(component).step_by(width).copied().collect::<Vec<f32>>();
+        let (values, decoded) = (of(rows), of(decoded));
+        let Some(last) = values.len().checked_sub(1) else { continue };
+        let (mut ordered, cut) = (values.clone(), values.len() / 20);
+        let low = *ordered.select_nth_unstable_by(cut, f32::total_cmp).1;
+        let high = *ordered.select_nth_unstable_by(last - cut, f32::total_cmp).1;
+        let (inner, inner_decoded): (Vec<f32>, Vec<f32>) = values.iter().zip(&decoded).filter(|(v, _)| (low..=high).contains(*v)).unzip();
+        sums.iter_mut().zip(squares(&inner, &inner_decoded)).for_each(|(sum, of_component)| *sum += of_component);
+        count += inner.len();
+    }
+    ratio(sums, count)
+}
+
+/// What the column `name` of Gaussians lost: [`relative_rms`], and for centres [`central_loss`] where it is larger. A few Gaussians far away must not hide the
+/// errors of all others.
+pub fn column_loss(name: &str, rows: &[f32], decoded: &[f32], width: usize) -> f64 {
+    let whole = relative_rms(rows, decoded);
+    let central = if name == "means" { central_loss(rows, decoded, width) } else { 0.0 };
+    // NaN stays.
+    if central > whole { central } else { whole }
+}
+
+/// The sums of squared errors and of squared deviations from the mean.
+fn squares(values: &[f32], decoded: &[f32]) -> [f64; 2] {
+    let error = values.iter().zip(decoded).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>();
+    let mean = values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len().max(1) as f64;
+    [error, values.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>()]
+}
+
+/// The root-mean-square error over the standard deviation, of the sums of `count` values.
+fn ratio([error, deviation]: [f64; 2], count: usize) -> f64 {
+    let n = count.max(1) as f64;
+    if error == 0.0 { 0.0 } else { ((error / n) / (deviation / n)).sqrt() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_of_centres_do_not_hide_behind_a_few_far_away() {
+        let near = |i: usize, k: usize| (i as f32 * 0.37 + k as f32).sin();
+        let spoiled = |rows: &[f32]| rows.iter().map(|v| if v.abs() < 1e4 { v + 0.05 } else { *v }).collect::<Vec<f32>>();
+        let mut rows: Vec<f32> = (0..1000).flat_map(|i| [near(i, 0), near(i, 1), near(i, 2)]).collect();
+        let usual = column_loss("means", &rows, &spoiled(&rows), 3);
+        assert!((0.05..0.1).contains(&usual), "{usual}");
+        (0..10).for_each(|i| rows[3 * i] = if i % 2 == 0 { 1e5 } else { -1e5 });
+        let decoded = spoiled(&rows);
+        assert!(relative_rms(&rows, &decoded) < 1e-4 && column_loss("log_scales", &rows, &decoded, 3) < 1e-4);
+        assert!(column_loss("means", &rows, &decoded, 3) > 0.05);
+        // Nor far from the origin.
+        let moved: Vec<f32> = (0..1000).flat_map(|i| [near(i, 0) + 1000.0, near(i, 1), near(i, 2)]).collect();
+        assert!(relative_rms(&moved, &spoiled(&moved)) < 1e-3 && column_loss("means", &moved, &spoiled(&moved), 3) > 0.05);
+        // What cannot be compared is within no bound.
+        assert!(column_loss("means", &rows, &rows[3..], 3).is_nan() && column_loss("means", &[1.0; 3], &[f32::NAN; 3], 3).is_nan());
+        assert_eq!(column_loss("means", &[], &[], 3), 0.0);
+    }
+}
