@@ -8,13 +8,15 @@ use std::path::Path;
 /// Keys of `[scene]` that a stored configuration must not choose: programs to run, folders to write, memory to take.
 const OURS_ALONE: [&str; 3] = ["ffmpeg", "video_cache", "cache_mb"];
 
-/// Opens the dataset at `path` with the scene options that `model` was trained with, and `sets` (`scene.key=value`) laid over them.
+/// Opens the dataset at `path` with the scene options that `model` was trained with, and `sets` (`scene.key=value`) laid over them. Other frames keep
+/// the times that they have in the training.
 ///
 /// # Errors
-/// [`Error::Parameter`] for an assignment that is no scene option, and whatever the reader reports.
+/// [`Error::Parameter`] for an assignment that is no scene option and frames outside of the time of training, and whatever the reader reports.
 pub fn open_as_trained(path: &Path, model: &Model, sets: &[String], registry: &Registry, limits: &Limits) -> Result<Scene> {
     let stored = &model.provenance.config;
-    let scene = data::open_in(path, &options_as_trained(stored, sets)?, &model.normalisation, registry, limits)?;
+    let trained = data::Trained { normalisation: model.normalisation, frames: options_as_trained(stored, &[])?.frames };
+    let scene = data::open_in(path, &options_as_trained(stored, sets)?, &trained, registry, limits)?;
     let count = stored.get("train").and_then(|t| t.get("validation")).and_then(toml::Value::as_integer).unwrap_or(0);
     // Another scene may be too small for it; it then has no validation views.
     Ok(data::hold_out(&scene, usize::try_from(count).unwrap_or(0)).unwrap_or(scene))

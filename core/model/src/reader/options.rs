@@ -87,7 +87,7 @@ pub struct SceneOptions {
     pub test_split: String,
     /// The `ffmpeg` command for video input; `ffprobe` is expected in the same folder.
     pub ffmpeg: String,
-    /// Folder for frames extracted from videos; the system's temporary folder if absent.
+    /// Folder for frames extracted from videos; if absent, one of the user's own among temporary files.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub video_cache: Option<PathBuf>,
     /// `auto` finds constant frame offsets between videos of up to 5 s, from their first 900 frames; `off` does not look for any.

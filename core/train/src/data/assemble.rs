@@ -1,5 +1,6 @@
 //! From what a reader hands over to a [`Scene`]: the steps all scenes share.
 
+use super::Trained;
 use super::align::align;
 use super::camera_box::camera_box;
 use super::frames::{Job, Plan, SceneFrames};
@@ -19,17 +20,17 @@ const FARTHEST: f64 = 1e9;
 
 /// The scene a reader parsed, with frames and cameras chosen, lenses undone and images brought to the size the options ask for.
 ///
-/// The scene is in the normalised frame of its cameras, or in the one that is given.
+/// The scene is in the normalised frame of its cameras and on a clock of its own, or in those of a model.
 ///
 /// Errors: [`Error::Parameter`] for options that choose nothing, [`Error::Data`] for a scene that is not sound, [`Error::Limit`] for images over `limits`.
-pub fn assemble(mut raw: RawScene, options: &SceneOptions, frame: Option<Similarity>, limits: &Limits) -> Result<Scene> {
+pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trained>, limits: &Limits) -> Result<Scene> {
     if let Some(v) = raw.views.iter().find(|v| v.camera >= raw.cameras.len()) {
         return Err(Error::data(raw.name, format!("an image names camera {} of {}", v.camera, raw.cameras.len()), "Check the dataset's index files"));
     }
     // Before views are chosen: the frame must not depend on the options.
-    let frame = frame.unwrap_or_else(|| normalisation(&raw));
+    let frame = trained.map_or_else(|| normalisation(&raw), |t| t.normalisation);
     align(&mut raw, options, limits)?;
-    let views = select(&mut raw, options)?;
+    let views = select(&mut raw, options, trained)?;
     if !views.iter().any(|v| v.split == Split::Train) {
         let hint = raw.warnings.last().cloned().unwrap_or_default();
         return Err(Error::data(raw.name, format!("there is no training image. {hint}"), "Check the path, scene.frames and scene.test_cameras"));

@@ -119,15 +119,20 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     let mut first_numbers = BTreeMap::new();
     let is_camera_folder = |p: &Path| p.is_dir() && file_name(p).starts_with("cam");
     for root in [path.to_path_buf(), path.join("frames")] {
+        let mut cameras = Vec::new();
         for folder in list_if(&root, is_camera_folder)? {
             let inner = folder.join("images");
-            let files = list_if(if inner.is_dir() { &inner } else { &folder }, is_image)?;
+            cameras.push((file_name(&folder), list_if(if inner.is_dir() { &inner } else { &folder }, is_image)?));
+        }
+        // Where one camera has every second number, its images are those of every second instant.
+        let step = cameras.iter().filter_map(|(_, files)| least_step(files)).min();
+        for (name, files) in cameras {
             if let Some(first) = files.first() {
                 let (w, h) = image_size(first, limits)?;
                 if let Some(number) = files.iter().filter_map(|path| frame_number(path)).min() {
-                    first_numbers.entry(number).or_insert_with(|| file_name(&folder));
+                    first_numbers.entry(number).or_insert_with(|| name.clone());
                 }
-                found.push(Footage { name: file_name(&folder), size: [w, h], images: frames(files, warnings) });
+                found.push(Footage { name, size: [w, h], images: frames(files, step, warnings) });
             }
         }
         if let (Some((low, one)), Some((high, other))) = (first_numbers.first_key_value(), first_numbers.last_key_value())
@@ -151,7 +156,7 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     let images = path.join("images");
     for file in list_if(&images, is_image)? {
         let (w, h) = image_size(&file, limits)?;
-        found.push(Footage { name: stem(&file), size: [w, h], images: frames(vec![file], warnings) });
+        found.push(Footage { name: stem(&file), size: [w, h], images: frames(vec![file], None, warnings) });
     }
     if found.is_empty() {
         let remedy = "Put cam00.mp4 …, folders cam00/ … of frames, or images/ beside poses_bounds.npy";
@@ -160,16 +165,17 @@ fn footage(path: &Path, options: &SceneOptions, limits: &Limits, warnings: &mut 
     Ok(found)
 }
 
-/// The images of a camera, one per instant. Files whose names end in numbers come in the order of these, `frame_2` before `frame_10`, and a number that is missing
-/// is an instant without an image.
-fn frames(mut files: Vec<PathBuf>, warnings: &mut Vec<String>) -> Vec<Option<ImageSource>> {
+/// The images of a camera, one per instant. Files whose names end in numbers come in the order of these, `frame_2` before `frame_10`. Instants are `step` numbers
+/// apart, and one whose number is missing has no image.
+fn frames(mut files: Vec<PathBuf>, step: Option<u64>, warnings: &mut Vec<String>) -> Vec<Option<ImageSource>> {
+    let step = step.filter(|_| least_step(&files).is_some());
     let image = |path| Some(ImageSource::File { path, mask: None });
     if files.iter().all(|path| frame_number(path).is_some()) {
         files.sort_by_key(|path| frame_number(path));
     }
     let numbers: Vec<u64> = files.iter().filter_map(|path| frame_number(path)).collect();
     let steps = || numbers.windows(2).map(|pair| pair[1] - pair[0]);
-    let (Some(&first), Some(step)) = (numbers.first(), steps().min().filter(|step| *step > 0)) else { return files.into_iter().map(image).collect() };
+    let (Some(&first), Some(step)) = (numbers.first(), step) else { return files.into_iter().map(image).collect() };
     let slot = |number: u64| ((number - first) / step) as usize;
     let count = numbers.last().map_or(0, |&last| slot(last).saturating_add(1));
     // Numbers of another meaning, such as times, have no steps or leave most of them out.
@@ -185,6 +191,13 @@ fn frames(mut files: Vec<PathBuf>, warnings: &mut Vec<String>) -> Vec<Option<Ima
         images[slot(number)] = image(path);
     }
     images
+}
+
+/// The least difference of the numbers of `files`; none where two are equal, or fewer than two have any.
+fn least_step(files: &[PathBuf]) -> Option<u64> {
+    let mut numbers: Vec<u64> = files.iter().filter_map(|path| frame_number(path)).collect();
+    numbers.sort_unstable();
+    numbers.windows(2).map(|pair| pair[1] - pair[0]).min().filter(|step| *step > 0)
 }
 
 /// The number at the end of a file's name.

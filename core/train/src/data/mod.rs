@@ -44,9 +44,24 @@ pub fn open(path: &Path, options: &SceneOptions, registry: &Registry, limits: &L
     assemble(read(path, options, registry, limits)?, options, None, limits)
 }
 
-/// Opens the scene at `path` in the frame of a model that was trained on it: other frames or cameras of a dataset would be given another frame of their own.
-pub fn open_in(path: &Path, options: &SceneOptions, normalisation: &Similarity, registry: &Registry, limits: &Limits) -> Result<Scene> {
-    assemble(read(path, options, registry, limits)?, options, Some(*normalisation), limits)
+/// What a model knows of the scene that it was trained on.
+#[derive(Clone, Copy, Debug)]
+pub struct Trained {
+    /// From the coordinates of the dataset to those of the model.
+    pub normalisation: Similarity,
+    /// The option `frames` of its training: the first of these frames is at time 0, the last at time 1.
+    pub frames: Option<[usize; 3]>,
+}
+
+/// Opens the scene at `path` in the coordinates and on the clock of a model that was trained on it: other frames or cameras of a dataset would be given their
+/// own.
+///
+/// Errors: as [`open`]; [`Error::Parameter`] for frames before the first or after the last one of the training.
+pub fn open_in(path: &Path, options: &SceneOptions, trained: &Trained, registry: &Registry, limits: &Limits) -> Result<Scene> {
+    // A built-in scene shows all of its time in any number of frames.
+    let samples = |frames: &[usize; 3]| procedural::name_of(path).is_some() && matches!(frames, [0, count, 1] if *count > 0);
+    let trained = Trained { frames: trained.frames.filter(|frames| !samples(frames)), ..*trained };
+    assemble(read(path, options, registry, limits)?, options, Some(&trained), limits)
 }
 
 fn read(path: &Path, options: &SceneOptions, registry: &Registry, limits: &Limits) -> Result<RawScene> {

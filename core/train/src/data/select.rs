@@ -1,11 +1,28 @@
 //! Which views of a dataset a scene has: frames, held-out cameras, missing images, the cap on training views.
 
-use cc4dgs_core::playback::frame_time;
+use super::Trained;
 use cc4dgs_core::{CameraRef, Error, ImageSource, RawScene, RawView, Result, SceneOptions, Split, View};
 
-/// Applies the options that choose views to `raw`, sorts its views by frame, then camera, drops cameras that show nothing, and returns the chosen views.
-pub(super) fn select(raw: &mut RawScene, options: &SceneOptions) -> Result<Vec<View>> {
-    choose_frames(raw, options)?;
+/// How far beyond the first and last time of training a time may be and still count as that time.
+const SAME: f64 = 1e-6;
+
+/// Applies the options that choose views to `raw`, sorts its views by frame, then camera, drops cameras that show nothing, and returns the chosen views. Their
+/// times are 0 for the first frame and 1 for the last: of the chosen ones, or of those that a model was trained on.
+pub(super) fn select(raw: &mut RawScene, options: &SceneOptions, trained: Option<&Trained>) -> Result<Vec<View>> {
+    let available = count(&raw.views);
+    for view in &mut raw.views {
+        view.time.get_or_insert(view.frame as f64 / available.saturating_sub(1).max(1) as f64);
+    }
+    let trained_on = match trained.map(|t| t.frames).filter(|frames| *frames != options.frames) {
+        Some(frames) => {
+            let mut views = raw.views.clone();
+            keep_frames(&mut views, frames);
+            views.retain(|v| absent(v).is_none());
+            Some(ends(&views))
+        }
+        None => None,
+    };
+    choose_frames(raw, options, available)?;
     drop_missing(raw);
     if let Some(held_out) = &options.test_cameras {
         hold_out(raw, held_out)?;
@@ -13,50 +30,75 @@ pub(super) fn select(raw: &mut RawScene, options: &SceneOptions) -> Result<Vec<V
     raw.views.sort_by_key(|v| (v.frame, v.camera));
     cap_training_views(raw, options.max_views);
     drop_unused_cameras(raw);
-    let times = times_norm(&raw.views);
-    Ok(raw.views.iter().zip(times).map(|(v, time_norm)| View { camera: v.camera, frame: v.frame, time_norm, split: v.split }).collect())
-}
-
-/// Times of views, 0 for the first frame and 1 for the last: those that are stated, or even ones.
-fn times_norm(views: &[RawView]) -> Vec<f32> {
-    let count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
-    let times: Vec<f64> = views.iter().map(|v| v.time.unwrap_or_else(|| f64::from(frame_time(v.frame, count)))).collect();
-    let (first, last) = times.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &t| (a.min(t), b.max(t)));
+    let (first, last) = trained_on.unwrap_or_else(|| ends(&raw.views));
     let length = if last > first { last - first } else { 1.0 };
-    times.iter().map(|t| ((t - first) / length) as f32).collect()
+    let time_of = |view: &RawView| (time(view) - first) / length;
+    // Times that are not finite are refused with the rest of the scene.
+    if let Some(view) = raw.views.iter().find(|v| !(-SAME..=1.0 + SAME).contains(&time_of(v))).filter(|_| trained_on.is_some()) {
+        let problem = format!("image {} of the chosen ones was taken outside of the time that the model was trained on", view.frame);
+        return Err(Error::parameter("scene.frames", problem, "Choose frames between the first and the last one of its training"));
+    }
+    // Only frames other than those of training are beyond, and by rounding alone.
+    let view = |v: &RawView| View { camera: v.camera, frame: v.frame, time_norm: time_of(v).clamp(0.0, 1.0) as f32, split: v.split };
+    Ok(raw.views.iter().map(view).collect())
 }
 
-fn choose_frames(raw: &mut RawScene, options: &SceneOptions) -> Result<()> {
-    let Some([start, count, stride]) = options.frames else { return Ok(()) };
-    let available = raw.views.iter().map(|v| v.frame + 1).max().unwrap_or(0);
-    raw.views.retain_mut(|v| {
+/// Frames of `views`.
+fn count(views: &[RawView]) -> usize {
+    views.iter().map(|v| v.frame + 1).max().unwrap_or(0)
+}
+
+/// When an image was taken, on the dataset's own clock.
+fn time(view: &RawView) -> f64 {
+    view.time.unwrap_or_default()
+}
+
+/// The first and the last time of `views`.
+fn ends(views: &[RawView]) -> (f64, f64) {
+    views.iter().map(time).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), t| (a.min(t), b.max(t)))
+}
+
+/// Keeps the views of the frames that are chosen by first frame, number and stride, and numbers these anew.
+fn keep_frames(views: &mut Vec<RawView>, frames: Option<[usize; 3]>) {
+    let Some([start, count, stride]) = frames else { return };
+    views.retain_mut(|v| {
         let Some(offset) = v.frame.checked_sub(start) else { return false };
         let rank = offset / stride;
         v.frame = rank;
         offset % stride == 0 && (count == 0 || rank < count)
     });
+}
+
+/// The file of a view that does not exist.
+fn absent(view: &RawView) -> Option<&std::path::Path> {
+    match &view.image {
+        ImageSource::File { path, .. } if !path.is_file() => Some(path),
+        _ => None,
+    }
+}
+
+fn choose_frames(raw: &mut RawScene, options: &SceneOptions, available: usize) -> Result<()> {
+    let Some([start, wanted, stride]) = options.frames else { return Ok(()) };
+    keep_frames(&mut raw.views, options.frames);
     if raw.views.is_empty() {
         return Err(Error::parameter(
             "scene.frames",
-            format!("[{start}, {count}, {stride}] selects nothing of {available} frames"),
+            format!("[{start}, {wanted}, {stride}] selects nothing of {available} frames"),
             "Choose frames that exist",
         ));
     }
-    let found = raw.views.iter().map(|v| v.frame + 1).max().unwrap_or(0);
-    if count > found {
-        raw.warnings.push(format!("scene.frames asks for {count} frames from {start} on, {found} exist"));
+    let found = count(&raw.views);
+    if wanted > found {
+        raw.warnings.push(format!("scene.frames asks for {wanted} frames from {start} on, {found} exist"));
     }
     Ok(())
 }
 
 fn drop_missing(raw: &mut RawScene) {
     let mut missing = Vec::new();
-    raw.views.retain(|v| match &v.image {
-        ImageSource::File { path, .. } if !path.is_file() => {
-            missing.push(path.display().to_string());
-            false
-        }
-        _ => true,
+    raw.views.retain(|v| {
+        missing.extend(absent(v).map(|path| path.display().to_string()));
+        absent(v).is_none()
     });
     if !missing.is_empty() {
         missing.sort();

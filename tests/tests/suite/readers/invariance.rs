@@ -4,6 +4,7 @@ use super::common::*;
 use cc4dgs_core::{Camera, HostGaussians, Limits, Registry, Scene, Seed, Silent, Split, parse_device};
 use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::data::Trained;
 use cc4dgs_train::data::procedural::ProceduralScene;
 use cc4dgs_train::eval::{Scored, evaluate};
 use cc4dgs_train::init::initialise;
@@ -248,7 +249,8 @@ fn a_model_brings_its_frame_to_other_choices_of_the_dataset() {
     let options = cc4dgs_core::SceneOptions { frames: Some([0, 1, 1]), ..options() };
     assert_eq!(open(root.path(), &options, &Limits::default()).unwrap().normalisation, whole.normalisation);
     let other = cc4dgs_core::Similarity::centred([1e5, -1e5, 1e5], 0.5);
-    let found = cc4dgs_train::data::open_in(root.path(), &options, &other, &registry, &Limits::default()).unwrap();
+    let found =
+        cc4dgs_train::data::open_in(root.path(), &options, &Trained { normalisation: other, frames: options.frames }, &registry, &Limits::default()).unwrap();
     assert_eq!(found.normalisation, other);
     let (a, b) = (dataset_camera(&found, 0), dataset_camera(&whole, 0));
     assert!((DVec3::from(a.center_world()) - DVec3::from(b.center_world())).length() < 1e-6);

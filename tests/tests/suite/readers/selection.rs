@@ -2,7 +2,9 @@
 
 use super::common::*;
 use cc4dgs_core::reader::files::read_png_or_jpeg;
-use cc4dgs_core::{Background, CameraRef, Limits, SceneOptions, Split};
+use cc4dgs_core::{Background, CameraRef, Error, Limits, Registry, SceneOptions, Split};
+use cc4dgs_train::data::{Trained, open_in};
+use std::path::Path;
 
 #[test]
 fn frames_are_chosen_and_renumbered() {
@@ -58,6 +60,51 @@ fn sizes_follow_the_options() {
     assert_eq!(scene.background, Some([0.0; 3]));
     let small = Limits { max_pixels: 100, ..Default::default() };
     assert_eq!(open(dir.path(), &options, &small).err().unwrap().exit_code(), 4, "16x16 is over 100 pixels");
+}
+
+#[test]
+fn other_frames_keep_the_clock_of_a_training() {
+    let dir = tempfile::tempdir().unwrap();
+    write_panoptic(dir.path(), 2, 9);
+    let stated = tempfile::tempdir().unwrap();
+    write_dnerf(stated.path(), 9, 1, 16);
+    let registry = Registry::collect().unwrap();
+    for path in [dir.path(), stated.path()] {
+        let normalisation = open(path, &SceneOptions::default(), &Limits::default()).unwrap().normalisation;
+        let times = |trained: Option<[usize; 3]>, wanted: Option<[usize; 3]>| {
+            let options = SceneOptions { frames: wanted, ..Default::default() };
+            let scene = open_in(path, &options, &Trained { normalisation, frames: trained }, &registry, &Limits::default())?;
+            let mut times: Vec<f32> = scene.split(Split::Train).into_iter().map(|view| scene.views[view].time_norm).collect();
+            times.dedup();
+            Ok::<_, Error>(times)
+        };
+        assert_eq!(times(None, Some([0, 3, 1])).unwrap(), [0.0, 0.125, 0.25]);
+        assert_eq!(times(None, Some([4, 2, 4])).unwrap(), [0.5, 1.0]);
+        assert_eq!(times(Some([2, 5, 1]), Some([3, 2, 1])).unwrap(), [0.25, 0.5]);
+        assert_eq!(times(Some([2, 5, 1]), Some([2, 5, 1])).unwrap(), [0.0, 0.25, 0.5, 0.75, 1.0]);
+        let beyond = times(Some([2, 5, 1]), None).unwrap_err();
+        assert!(beyond.exit_code() == 2 && beyond.to_string().contains("scene.frames"), "{beyond}");
+    }
+    // The frames of a built-in scene are samples of all of its time, whatever their number.
+    let (path, options) = (Path::new("procedural:tiny"), SceneOptions { frames: Some([0, 5, 1]), ..Default::default() });
+    let trained = Trained { normalisation: open(path, &options, &Limits::default()).unwrap().normalisation, frames: Some([0, 3, 1]) };
+    let scene = open_in(path, &options, &trained, &registry, &Limits::default()).unwrap();
+    let last = scene.views.iter().map(|view| view.time_norm).fold(0.0, f32::max);
+    assert_eq!((scene.frame_count, last), (5, 1.0));
+}
+
+#[test]
+fn cameras_of_different_rates_are_matched_by_their_numbers() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy(&[2, 17], &llff_rows(&ring(2, 16, 12)))).unwrap();
+    (0..9).for_each(|t| write_image(&dir.path().join(format!("cam0/{t:04}.png")), 16, 12, t as u8));
+    (0..9).step_by(2).for_each(|t| write_image(&dir.path().join(format!("cam1/{t:04}.png")), 16, 12, t as u8));
+    let scene = open(dir.path(), &SceneOptions { test_cameras: Some(Vec::new()), ..Default::default() }, &Limits::default()).unwrap();
+    assert_eq!((scene.frame_count, scene.views.len()), (9, 14));
+    for (view, v) in scene.views.iter().enumerate() {
+        assert_eq!(usize::from(scene.frame(view).unwrap().data[2]), v.frame);
+    }
+    assert!(scene.warnings.iter().any(|w| w.contains("cam1") && w.contains("4 of 9 frames")), "{:?}", scene.warnings);
 }
 
 #[test]

@@ -126,7 +126,7 @@ impl VideoFrames {
         let clip = self.clips.get(video).ok_or_else(bug)?;
         let rank = clip.wanted.rank(frame).ok_or_else(bug)?;
         let what = format!("{}|{:?}", clip.wanted.condition(), clip.size);
-        let folder = cache_folder(&self.options).join(cache_name(video, &what)?);
+        let folder = cache_folder(&self.options)?.join(cache_name(video, &what)?);
         // A poisoned lock only means that another extraction failed; this one may do better.
         let _guard = clip.busy.lock().unwrap_or_else(|e| e.into_inner());
         if !folder.is_dir() {
@@ -145,7 +145,7 @@ impl VideoFrames {
     }
 
     fn decode(&self, video: &Path, clip: &Clip, folder: &Path) -> Result<()> {
-        let cache = cache_folder(&self.options);
+        let cache = cache_folder(&self.options)?;
         std::fs::create_dir_all(&cache).map_err(|e| Error::io(&cache, e))?;
         let work = tempfile::tempdir_in(&cache).map_err(|e| Error::io(&cache, e))?;
         // The display matrix is applied here, because versions of ffmpeg differ in what they do with it.

@@ -64,8 +64,28 @@ fn input(video: &Path) -> OsString {
 }
 
 /// The folder for what is computed from videos.
-fn cache_folder(options: &SceneOptions) -> PathBuf {
-    options.video_cache.clone().unwrap_or_else(|| std::env::temp_dir().join("cc4dgs-frames"))
+fn cache_folder(options: &SceneOptions) -> Result<PathBuf> {
+    options.video_cache.clone().map_or_else(usual_cache_folder, Ok)
+}
+
+/// A folder for temporary files that is the user's alone: on a shared machine everyone may write beside it.
+#[cfg(unix)]
+fn usual_cache_folder() -> Result<PathBuf> {
+    use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+    let base = std::env::temp_dir();
+    let user = tempfile::tempfile().and_then(|file| file.metadata()).map_err(|e| Error::io(&base, e))?.uid();
+    let folder = base.join(format!("cc4dgs-frames-{user}"));
+    let failed = |e| Error::io(&folder, e);
+    std::fs::DirBuilder::new().recursive(true).mode(0o700).create(&folder).map_err(failed)?;
+    if std::fs::symlink_metadata(&folder).map_err(failed)?.uid() == user {
+        return Ok(folder);
+    }
+    Err(Error::parameter("scene.video_cache", format!("{} belongs to another user", folder.display()), "Name a folder of your own for the frames of videos"))
+}
+
+#[cfg(not(unix))]
+fn usual_cache_folder() -> Result<PathBuf> {
+    Ok(std::env::temp_dir().join("cc4dgs-frames"))
 }
 
 /// A name in the cache that changes with the video and with `what` is computed from it.
@@ -86,7 +106,12 @@ fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64) -> Result<V
     // A file, because a pipe that nobody reads would stop the command.
     let mut messages = tempfile::tempfile().map_err(failed)?;
     let stderr = messages.try_clone().map_err(failed)?;
-    let mut child = Command::new(program).args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr).spawn().map_err(|e| {
+    let mut command = Command::new(program);
+    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr);
+    // Ctrl-C is for this program, which ends after the video.
+    #[cfg(unix)]
+    std::os::unix::process::CommandExt::process_group(&mut command, 0);
+    let mut child = command.spawn().map_err(|e| {
         Error::unsupported(
             object(),
             format!("the command {program} could not be started ({e})"),

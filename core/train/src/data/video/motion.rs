@@ -54,7 +54,7 @@ fn difference(a: &[u8], b: &[u8]) -> f32 {
 /// The first `count` frames of a video, small and grey, one after the other; fewer if it has fewer. Kept in the cache.
 fn small_images(video: &Path, count: usize, options: &SceneOptions) -> Result<Vec<u8>> {
     let most = (count * SIZE[0] * SIZE[1]) as u64;
-    let cache = cache_folder(options);
+    let cache = cache_folder(options)?;
     let file = cache.join(format!("{}.grey", cache_name(video, &format!("grey {SIZE:?} {count}"))?));
     if let Ok(bytes) = std::fs::read(&file)
         && bytes.len() as u64 <= most
