@@ -6,6 +6,7 @@ use super::probe::mean;
 use super::pyramid::Pyramid;
 use super::rounded::Rounded;
 use super::sampler::Sampler;
+use super::targets::Targets;
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
@@ -69,6 +70,7 @@ pub struct TuneJob<'a> {
 pub struct Tuner<'a> {
     pub(super) job: TuneJob<'a>,
     choices: OnceCell<Choices>,
+    targets: OnceCell<Targets>,
     adopted: RefCell<Option<(Vec<WeightArray>, f64)>>,
 }
 
@@ -83,7 +85,19 @@ struct Choices {
 impl<'a> Tuner<'a> {
     /// A tuner of `job.model`.
     pub fn new(job: TuneJob<'a>) -> Self {
-        Self { job, choices: OnceCell::new(), adopted: RefCell::default() }
+        Self { job, choices: OnceCell::new(), targets: OnceCell::new(), adopted: RefCell::default() }
+    }
+    /// The same tuner with images to train on that are there already.
+    pub(super) fn with_targets(self, targets: Targets) -> Self {
+        Self { targets: OnceCell::from(targets), ..self }
+    }
+    /// The images to train on.
+    pub(super) fn targets(&self) -> Result<&Targets> {
+        if let Some(known) = self.targets.get() {
+            return Ok(known);
+        }
+        let found = Targets::of(&self.job)?;
+        Ok(self.targets.get_or_init(|| found))
     }
     fn choices(&self) -> Result<&Choices> {
         if let Some(known) = self.choices.get() {
@@ -115,8 +129,8 @@ impl<'a> Tuner<'a> {
     }
     /// Calls `work` with the parts of a training and the state of `model`.
     pub(super) fn with_state<T>(&self, model: &TunedModel, seed: Seed, work: impl FnOnce(&Context, &mut TrainState) -> Result<T>) -> Result<T> {
-        let TuneJob { scene, registry, device, events, stop, .. } = &self.job;
-        let config = &self.choices()?.config;
+        let TuneJob { registry, device, events, stop, .. } = &self.job;
+        let (config, scene) = (&self.choices()?.config, &self.targets()?.scene);
         let training_camera = training_cameras(scene);
         let parts = Parts {
             appearance: registry.build_appearance(&config.appearance, &AppearanceContext { cameras: training_camera.len(), seed }, device)?,
@@ -185,8 +199,8 @@ impl<'a> Tuner<'a> {
     }
     /// Mean absolute error of `gaussians`, as they are, on a few training views.
     fn mean_error(&self, context: &Context, state: &mut TrainState, gaussians: &HostGaussians) -> Result<f64> {
-        let scene = &self.job.scene;
-        let views = spread_views(scene, &scene.split(Split::Train), PROBES);
+        let Targets { scene, views } = self.targets()?;
+        let views = spread_views(scene, views, PROBES);
         let set = GaussianSet::new(gaussians, self.job.device).gaussians()?;
         let (background, requests) = (self.choices()?.config.background()?, views.iter().map(|&v| (v, scene.views[v].time_norm)).collect::<Vec<_>>());
         let mut sum = 0.0;
@@ -244,25 +258,19 @@ pub(super) fn rate_at(done: f64) -> f64 {
 }
 
 impl TuneModel for Tuner<'_> {
-    fn refusal(&self) -> Result<Option<String>> {
-        let config: RunConfig = config::parse_section("configuration of the model", &self.job.model.provenance.config)?;
-        let kind = config.appearance.get("kind").and_then(|kind| kind.as_str()).unwrap_or("none");
-        let why = "it was trained with colours per camera, which models do not keep; without them, further training would fit the colours of single cameras";
-        Ok((kind != "none").then(|| format!("{why} (appearance '{kind}')")))
-    }
     fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
         let weights = self.moving_field().map(|f| weights_of(f.field.as_ref())).transpose()?.unwrap_or_default();
         Ok(TunedModel { gaussians: gaussians.clone(), weights })
     }
     fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel> {
-        let (device, scene) = (self.job.device, &self.job.scene);
+        let device = self.job.device;
         let weight_settings = self.weight_settings(tuning.weight_steps)?;
         self.with_state(from, tuning.seed, |context, state| {
             let mut fixed = Fixed { steps: columns(&tuning.rounding.steps(&from.gaussians)?, device), size: BTreeMap::new(), rate: 0.0 };
             let lost = self.mean_error(context, state, &tuning.rounding.round(&from.gaussians)?)? - self.mean_error(context, state, &from.gaussians)?;
             // Where all steps are as large as they should be, an octave more of them costs as much as it saves; a step's error adds in proportion to its square.
             let per_bit = tuning.size_weight * 2.0 * std::f64::consts::LN_2 * lost.max(0.0) / tuning.bits_per_octave;
-            let mut sampler = Sampler::new(scene.split(Split::Train), tuning.seed.child("views"), BATCH);
+            let mut sampler = Sampler::new(self.targets()?.views.clone(), tuning.seed.child("views"), BATCH);
             // Nothing is logged.
             let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);
             for iteration in 1..=tuning.iterations {
