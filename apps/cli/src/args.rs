@@ -136,7 +136,7 @@ pub struct Compress {
     /// Codec, with its profile after a colon, such as compact:max-drop=0.05dB or compact:max-size=5MB.
     #[arg(long, value_name = "NAME[:PROFILE]", default_value = "cca:default")]
     pub codec: String,
-    /// Override a setting of the codec; may be given several times.
+    /// Override a setting of the codec (finetune=0), or with --scene a scene option (scene.width=800); may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
     /// Weight codec of the deformer, such as fp32, fp16, int8, compact, compact:bits=6 or compact:max-drop=0.01dB; see `cc4dgs plugins`.
@@ -177,7 +177,7 @@ pub struct ModelViews {
 pub struct Eval {
     #[command(flatten)]
     pub views: ModelViews,
-    /// Measure at most so many images, evenly spread; 0 measures all.
+    /// Measure at most so many images, spread over cameras and frames; 0 measures all.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub max_views: usize,
     /// Also measure LPIPS and FLIP, which take longer than drawing the images.
@@ -186,7 +186,7 @@ pub struct Eval {
     /// The contact sheet: ground truth, render and error. Without it, it lies beside the JSON file, in the folder of a run, or beside the model.
     #[arg(long, value_name = "F.png")]
     pub sheet: Option<PathBuf>,
-    /// Rows of the contact sheet, evenly spread over the images; 0 draws none.
+    /// Rows of the contact sheet, spread over cameras and frames; 0 draws none.
     #[arg(long, value_name = "N", default_value_t = 6)]
     pub sheet_rows: usize,
     /// Also write every render as a PNG file into this folder, 00000.png and on. It must be new or empty.

@@ -1,9 +1,10 @@
 //! The cameras and times that a command renders: an orbit around the model, or the views of a dataset.
 
 use crate::args::Shots;
-use crate::commands::{Context, evenly};
+use crate::commands::Context;
 use cc4dgs::Orbit;
 use cc4dgs::scenes::open_as_trained;
+use cc4dgs_core::sample::spread_views;
 use cc4dgs_core::{Camera, Error, Result, Split};
 use cc4dgs_play::model::Model;
 use std::path::Path;
@@ -29,11 +30,11 @@ pub fn choose(context: &Context, args: &Shots, sets: &[String], model: &Model, i
         return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Render the other split"));
     }
     let wanted = args.frames.map_or(views.len(), |n| n as usize);
-    let shot = |i: usize| {
-        let camera = scene.camera(views[i]);
-        (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[views[i]].time_norm)
+    let shot = |view: usize| {
+        let camera = scene.camera(view);
+        (args.size.map_or_else(|| camera.clone(), |(w, h)| camera.resized(w, h)), scene.views[view].time_norm)
     };
-    Ok((evenly(views.len(), wanted).into_iter().map(shot).collect(), scene.background))
+    Ok((spread_views(&scene, &views, wanted).into_iter().map(shot).collect(), scene.background))
 }
 
 /// The cameras that recorded the dataset at `path`, as `model` was trained on them with scene options `sets` laid over: those of the training views, each once.

@@ -21,6 +21,7 @@ mod preset;
 mod raster;
 pub mod reader;
 mod registry;
+pub mod sample;
 mod scene;
 mod schedule;
 mod sum;

@@ -3,25 +3,26 @@
 use crate::model::Model;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
+use cc4dgs_core::sample::by_camera;
 use cc4dgs_core::{
     Camera, Deformer, EvaluateDeformer, Gaussians, HostGaussians, Image8, ParameterSpace, Rasterizer, Registry, RenderModel, RenderSettings, RenderedPlanes,
     Result, Scene, Seed, SpatialInput, SplatColors, Splats, Split, TrainingViews,
 };
 
-/// The views of one split of a scene.
+/// The views of one split of a scene, camera after camera ([`by_camera`]): every so many are of all cameras.
 pub struct SceneViews<'a> {
     scene: &'a Scene,
     views: Vec<usize>,
 }
 
 impl<'a> SceneViews<'a> {
-    /// The training views of `scene`, in its order.
+    /// The training views of `scene`.
     pub fn new(scene: &'a Scene) -> Self {
         Self::of(scene, Split::Train)
     }
-    /// The views of `split`, in the order of `scene`.
+    /// The views of `split`.
     pub fn of(scene: &'a Scene, split: Split) -> Self {
-        Self { scene, views: scene.split(split) }
+        Self { scene, views: by_camera(scene, &scene.split(split)) }
     }
 }
 
@@ -146,4 +147,33 @@ impl RenderModel for ModelServices<'_> {
 fn rand_signs(seed: Seed, count: usize) -> Vec<f32> {
     let word = |k: usize| seed.index(k as u64).value();
     (0..count.div_ceil(64)).flat_map(|k| (0..64).map(move |bit| if word(k) >> bit & 1 == 1 { 1.0 } else { -1.0 })).take(count).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::{Error, FrameSource, View};
+    use std::collections::BTreeSet;
+    use std::sync::Arc;
+
+    struct NoImages;
+    impl FrameSource for NoImages {
+        fn load(&self, view: usize) -> Result<Image8> {
+            Err(Error::unsupported(format!("view {view}"), "no images here", "None"))
+        }
+    }
+
+    #[test]
+    fn every_so_many_views_are_of_all_cameras() {
+        let camera = |k: usize| Camera::look_at(&format!("c{k}"), (8, 8), 1.0, [k as f64, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let view = |i: usize| View { camera: i % 4, frame: i / 4, time_norm: (i / 4) as f32 / 11.0, split: Split::Train };
+        let scene = Scene::new("s", (0..4).map(camera).collect(), (0..48).map(view).collect(), Arc::new(NoImages), 0).unwrap();
+        let views = SceneViews::new(&scene);
+        // As codecs choose 12 of them.
+        let chosen: Vec<(&Camera, f32)> = (0..12).map(|k| views.view(k * views.len() / 12)).collect();
+        let cameras: BTreeSet<&str> = chosen.iter().map(|(camera, _)| camera.name.as_str()).collect();
+        let times: BTreeSet<u32> = chosen.iter().map(|(_, time)| time.to_bits()).collect();
+        assert_eq!((views.len(), cameras.len()), (48, 4));
+        assert!(times.len() >= 6, "{times:?}");
+    }
 }

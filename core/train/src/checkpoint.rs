@@ -2,13 +2,14 @@
 
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
+use crate::schedule::StageLengths;
 use crate::train::{Guard, Neighbours, Parts, RateFactors, Record, TrainState};
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::archive::Provenance;
 use cc4dgs_core::{Error, Limits, OptimizerState, Registry, Result, SceneOptions, Similarity, Stage, config};
-use cc4dgs_play::Model;
 use cc4dgs_play::checkpoint::{CheckpointArrays, CheckpointFile, DeformerHeader, FORMAT, ModelHeader};
 use cc4dgs_play::model::ModelSize;
+use cc4dgs_play::{Model, Moving};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -75,6 +76,8 @@ impl Checkpoint {
     /// did not exist yet when the run was started has its default.
     pub fn into_state(self, run: &RunConfig, registry: &Registry, mut parts: Parts) -> Result<TrainState> {
         let stored: RunConfig = config::parse_section("configuration of the checkpoint", &self.model.provenance.config)?;
+        let lengths = StageLengths::new(&stored.train, matches!(self.model.moving, Moving::Scored { .. }), 1.0);
+        let settled = self.training.stage == Stage::Main && self.training.iteration > lengths.settles_at();
         let comparable = |run: &RunConfig| {
             let mut run = run.completed(registry)?;
             // What a run says about itself does not change its result.
@@ -82,8 +85,8 @@ impl Checkpoint {
             // Neither do limits, the memory for images, and where films are decoded.
             let other = SceneOptions::default();
             (run.limits, run.scene.cache_mb, run.scene.ffmpeg, run.scene.video_cache) = (Default::default(), other.cache_mb, other.ffmpeg, other.video_cache);
-            // A checkpoint may be older than what the run found.
-            if stored.train.stretch == 1.0 {
+            // Nothing has depended on it yet: a checkpoint may be older than what the run found.
+            if !settled {
                 run.train.stretch = 1.0;
             }
             config::parse_table("configuration", &run.to_toml()?)

@@ -27,6 +27,9 @@ pub struct RunConfig {
     /// What readers may believe.
     #[serde(default)]
     pub limits: Limits,
+    /// Limits of this machine, in a process that was given some: they decide in place of `limits` what is refused. Never in a file.
+    #[serde(skip)]
+    pub machine_limits: Option<Limits>,
     /// How the scene is read.
     #[serde(default)]
     pub scene: SceneOptions,
@@ -164,6 +167,14 @@ impl RunConfig {
         let wanted = self.scene.background.as_ref().map(|b| b.rgb()).transpose()?.or(self.render.background).or(scene.background);
         settled.render.background = Some(wanted.unwrap_or([1.0; 3]));
         Ok(settled)
+    }
+    /// What readers may believe in this process.
+    pub(crate) fn limits_here(&self) -> &Limits {
+        self.machine_limits.as_ref().unwrap_or(&self.limits)
+    }
+    /// Whether the run is to settle the length of its main stage, by the time that its plan leaves.
+    pub(crate) fn settles_length(&self) -> bool {
+        self.auto.ends.is_some() && self.train.stretch == 1.0
     }
     pub(crate) fn validate(&self) -> Result<()> {
         self.scene.validate()?;

@@ -3,6 +3,7 @@
 use crate::blocks::{BlockScore, UsualImage};
 use crate::config::TrainConfig;
 use crate::masks::{PUBLISHED_SIGMA, dynamic_masks};
+use crate::sample::spread_views;
 use burn::tensor::Device;
 use cc4dgs_core::metrics::{FLIP_PIXELS_PER_DEGREE, FrameSet, Metric, Rounding, SsimConvention, installed_lpips};
 use cc4dgs_core::{Event, EventSink, Image8, Registry, Result, Scene, Split};
@@ -136,7 +137,7 @@ pub struct EvalReport {
 pub struct Scored {
     /// The side of the split.
     pub split: Split,
-    /// At most so many views, evenly spread; 0 is all.
+    /// At most so many views, spread over cameras and frames; 0 is all.
     pub max_views: usize,
     /// Whether LPIPS and FLIP are computed too. They cost more than drawing the image: about 0.2 s for 400x400 pixels, 0.9 s for 800x800, on one core.
     pub perceptual: bool,
@@ -146,6 +147,11 @@ impl Scored {
     /// All views of a side of the split, by PSNR and structural similarity.
     pub fn all(split: Split) -> Self {
         Self { split, max_views: 0, perceptual: false }
+    }
+    /// The views of `scene` that are scored, in the order in which they are.
+    pub fn views(&self, scene: &Scene) -> Vec<usize> {
+        let all = scene.split(self.split);
+        if self.max_views == 0 { all } else { spread_views(scene, &all, self.max_views) }
     }
 }
 
@@ -166,12 +172,8 @@ pub fn evaluate(
     events: &dyn EventSink,
     on_image: &mut OnImage,
 ) -> Result<EvalReport> {
-    let Scored { split, max_views, perceptual } = scored;
-    let mut views = scene.split(split);
-    let in_split = views.len();
-    if max_views > 0 && views.len() > max_views {
-        views = (0..max_views).map(|i| views[i * views.len() / max_views]).collect();
-    }
+    let Scored { split, perceptual, .. } = scored;
+    let (views, in_split) = (scored.views(scene), scene.split(split).len());
     if views.is_empty() {
         return Err(cc4dgs_core::Error::parameter(
             "--split",

@@ -13,10 +13,19 @@ use std::time::Instant;
 pub const EVENTS: &str = "events.jsonl";
 
 /// Appends events to a file, each with the seconds since the command began. A line is written at once and whole, so that the log can be followed
-/// and survives a crash.
+/// and survives a crash. The log of an earlier run stays as it is until the first stage of training begins, or a command that does not train: what is refused
+/// before that leaves it.
 pub struct JsonLines {
-    file: Mutex<File>,
+    log: Mutex<Log>,
+    /// Whether lines follow those of the earlier run, or take their place.
+    append: bool,
     began: Instant,
+}
+
+struct Log {
+    file: File,
+    /// Lines that wait for the first stage, or for a command that does not train.
+    waiting: Option<String>,
 }
 
 #[derive(Serialize)]
@@ -32,22 +41,39 @@ impl JsonLines {
     /// # Errors
     /// [`Error::Io`].
     pub fn open(path: &Path, append: bool) -> Result<Self> {
+        let failed = |e| Error::io(path, e);
         if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
             std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         }
-        let file = OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path).map_err(|e| Error::io(path, e))?;
-        Ok(Self { file: Mutex::new(file), began: Instant::now() })
+        let file = OpenOptions::new().create(true).append(true).open(path).map_err(failed)?;
+        let holds_a_run = file.metadata().map_err(failed)?.len() > 0;
+        Ok(Self { log: Mutex::new(Log { file, waiting: holds_a_run.then(String::new) }), append, began: Instant::now() })
     }
 }
 
 impl EventSink for JsonLines {
     fn emit(&self, event: &Event) {
         let line = Line { seconds: (self.began.elapsed().as_secs_f64() * 1e3).round() / 1e3, event };
-        if let (Ok(mut text), Ok(mut file)) = (serde_json::to_string(&line), self.file.lock()) {
-            text.push('\n');
-            // A full disk must not end a training run; the checkpoint will report it.
-            file.write_all(text.as_bytes()).ok();
+        let (Ok(mut text), Ok(mut log)) = (serde_json::to_string(&line), self.log.lock()) else { return };
+        text.push('\n');
+        if let Some(mut waiting) = log.waiting.take() {
+            waiting.push_str(&text);
+            let begins = match event {
+                Event::StageStarted { .. } => true,
+                Event::RunStarted { command, .. } => command != "train",
+                _ => false,
+            };
+            if !begins {
+                log.waiting = Some(waiting);
+                return;
+            }
+            text = waiting;
+            if !self.append {
+                log.file.set_len(0).ok();
+            }
         }
+        // A full disk must not end a training run; the checkpoint will report it.
+        log.file.write_all(text.as_bytes()).ok();
     }
 }
 
@@ -165,13 +191,26 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run/events.jsonl");
         let event = Event::Saved { path: "x".into(), bytes: 7 };
-        JsonLines::open(&path, false).unwrap().emit(&event);
-        JsonLines::open(&path, true).unwrap().emit(&event);
-        let text = std::fs::read_to_string(&path).unwrap();
-        let lines: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
-        assert_eq!(lines.len(), 2, "{text}");
-        assert!(lines.iter().all(|l| l["event"] == "saved" && l["bytes"] == 7 && l["seconds"].is_f64()), "{text}");
-        JsonLines::open(&path, false).unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), "");
+        let lines = || -> Vec<serde_json::Value> {
+            let text = std::fs::read_to_string(&path).unwrap();
+            text.lines().map(|l| serde_json::from_str(l).unwrap()).collect()
+        };
+        let log = |append: bool, events: &[&Event]| {
+            let log = JsonLines::open(&path, append).unwrap();
+            events.iter().for_each(|event| log.emit(event));
+            lines()
+        };
+        assert_eq!(log(false, &[&event, &event]).len(), 2);
+        assert!(lines().iter().all(|l| l["event"] == "saved" && l["bytes"] == 7 && l["seconds"].is_f64()), "{:?}", lines());
+        // What is refused before its first stage leaves the log of the run.
+        let begins = Event::StageStarted { stage: "coarse".into(), iterations: 1, gaussians: 1 };
+        assert_eq!(log(true, &[&event]).len(), 2);
+        assert_eq!(log(false, &[&event]).len(), 2);
+        assert_eq!(log(true, &[&event, &begins, &event]).len(), 5);
+        assert_eq!(log(false, &[&event, &begins]).len(), 2);
+        assert_eq!(lines()[1]["event"], "stage-started");
+        // `demo` scores into the log of its training.
+        let scores = Event::RunStarted { command: "eval".into(), device: "flex".into(), seed: 0 };
+        assert_eq!(log(true, &[&event, &scores]).len(), 4);
     }
 }

@@ -50,6 +50,16 @@ impl Layers {
         let name = self.table.get("preset").and_then(|p| p.as_str()).unwrap_or_default();
         Self::of(registry.preset_at_full_size(name, dataset)?, self.file.clone(), self.sets.clone())
     }
+    /// These layers with further overrides over them.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] for text that is not `key=value`.
+    pub fn with(&self, sets: &[String]) -> Result<Self> {
+        let mut layers = self.clone();
+        config::set_all(&mut layers.table, sets)?;
+        layers.sets.extend_from_slice(sets);
+        Ok(layers)
+    }
     /// The configuration they make, read strictly; what they do not say has its default.
     ///
     /// # Errors

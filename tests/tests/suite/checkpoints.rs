@@ -1,34 +1,75 @@
-//! Checkpoints that were damaged: an error, or the same model; never another one.
+//! Checkpoints that were damaged: an error, or the same model; never another one. And which settings a run may be given when it goes on.
 
 use burn::tensor::{Device, Tensor};
-use cc4dgs_core::{HostGaussians, Limits, Registry, Result, Seed};
+use cc4dgs_core::{Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Seed, Silent};
 use cc4dgs_play::Model;
 use cc4dgs_play::checkpoint::{CHECKPOINT, CheckpointArrays, CheckpointFile, FORMAT, read_model};
 use cc4dgs_train::checkpoint::load;
 use cc4dgs_train::config::RunConfig;
-use cc4dgs_train::train::{TrainJob, train};
+use cc4dgs_train::train::{TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A run in `folder`, at the smallest size, that `events` may stop.
+fn run(folder: &Path, sets: &[&str], resume: bool, events: &dyn EventSink, stop: &AtomicBool) -> Result<TrainReport> {
+    let registry = Registry::collect().unwrap();
+    let sets: Vec<String> = ["scene.width=24", "scene.height=24", "init.count=60"].iter().chain(sets).map(ToString::to_string).collect();
+    let config = RunConfig::resolve(Some("demo"), None, &sets)?;
+    let scene = Arc::new(cc4dgs_train::data::open(Path::new("procedural"), &config.scene, &registry, &config.limits)?);
+    let out = Some(folder.to_path_buf());
+    train(&TrainJob { config: &config, scene, out, resume, registry: &registry, events, stop, observer: None }).map(|(_, report)| report)
+}
+
+/// Stops a run after an iteration of its main stage.
+struct StopAt<'a>(usize, &'a AtomicBool);
+
+impl EventSink for StopAt<'_> {
+    fn emit(&self, event: &Event) {
+        if matches!(event, Event::Iteration { stage, iteration, .. } if stage == "main" && *iteration == self.0) {
+            self.1.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+#[test]
+fn the_length_of_a_main_stage_may_be_set_until_it_is_settled() {
+    let folder = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    // 40 iterations of the main stage; its length is settled after 8 of them.
+    let sets = ["train.iterations=50", "train.shares=[1,0,4]", "train.dynamic=all", "train.log_every=1"];
+    let with = |stretch: &'static str| [&sets[..], &[stretch]].concat();
+    let bytes = |name: &str| std::fs::read(folder.path().join(name).join(CHECKPOINT)).unwrap();
+    let stopped = |name: &str, sets: &[&str], iteration: usize| {
+        let stop = AtomicBool::new(false);
+        let interrupted = run(&folder.path().join(name), sets, false, &StopAt(iteration, &stop), &stop);
+        assert!(matches!(interrupted, Err(Error::Interrupted(_))), "{interrupted:?}");
+    };
+    let resumed = |name: &str, sets: &[&str]| run(&folder.path().join(name), sets, true, &Silent, &never);
+    let whole = run(&folder.path().join("whole"), &with("train.stretch=1.4"), false, &Silent, &never).unwrap();
+    assert_eq!(whole.iterations, 10 + 56);
+    for (name, iteration) in [("early", 5), ("last", 8)] {
+        stopped(name, &sets, iteration);
+        assert_eq!(resumed(name, &with("train.stretch=1.4")).unwrap().iterations, 66);
+        assert!(bytes(name) == bytes("whole"), "{name}");
+    }
+    for (name, iteration) in [("next", 9), ("late", 30)] {
+        stopped(name, &sets, iteration);
+        let refused = resumed(name, &with("train.stretch=1.4")).unwrap_err().to_string();
+        assert!(refused.contains("--resume") && refused.contains("train.stretch was 1.0 and is 1.4"), "{refused}");
+        assert_eq!(resumed(name, &sets).unwrap().iterations, 50);
+    }
+    // A length that was settled at another value is not given up either.
+    stopped("stretched", &with("train.stretch=1.4"), 20);
+    assert!(resumed("stretched", &sets).unwrap_err().to_string().contains("train.stretch was 1.4 and is 1.0"));
+}
 
 /// The checkpoint of a short run with a deformer that keeps attributes, in `folder`.
-fn checkpoint(folder: &Path, registry: &Registry) -> Vec<u8> {
+fn checkpoint(folder: &Path) -> Vec<u8> {
     let deformer = ["kind=embedding", "gaussian_features=6", "time_features=10", "time_rows=9", "coarse_rows=4", "width=16"];
-    let mut sets: Vec<String> = deformer.map(|set| format!("deformer.{set}")).into();
-    sets.extend(["scene.width=24", "scene.height=24", "train.iterations=24", "init.count=60"].map(String::from));
-    let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
-    let scene = cc4dgs_train::data::open(Path::new("procedural"), &config.scene, registry, &config.limits).unwrap();
-    let job = TrainJob {
-        config: &config,
-        scene: Arc::new(scene),
-        out: Some(folder.to_path_buf()),
-        resume: false,
-        registry,
-        events: &cc4dgs_core::Silent,
-        stop: &AtomicBool::new(false),
-        observer: None,
-    };
-    train(&job).unwrap();
+    let sets: Vec<String> = deformer.iter().map(|set| format!("deformer.{set}")).chain(["train.iterations=24".into()]).collect();
+    let sets: Vec<&str> = sets.iter().map(String::as_str).collect();
+    run(folder, &sets, false, &Silent, &AtomicBool::new(false)).unwrap();
     std::fs::read(folder.join(CHECKPOINT)).unwrap()
 }
 
@@ -45,7 +86,7 @@ fn contents(model: &Model) -> (HostGaussians, Vec<f32>, String) {
 fn a_damaged_checkpoint_is_refused_or_the_same() {
     let registry = Registry::collect().unwrap();
     let (folder, device, limits) = (tempfile::tempdir().unwrap(), Device::flex(), Limits::default());
-    let sound = checkpoint(folder.path(), &registry);
+    let sound = checkpoint(folder.path());
     let path = folder.path().join("damaged");
     let open = |bytes: &[u8]| -> Result<Model> {
         std::fs::write(&path, bytes).unwrap();

@@ -4,6 +4,7 @@ use super::readers::common::{load, options, real};
 use cc4dgs::{backends as _, codecs as _, deformers as _, parts as _};
 use cc4dgs_core::{Camera, Error, Event, EventSink, FrameSource, Image8, Limits, Recorder, Registry, Result, Scene, SceneOptions, Similarity, Split, View};
 use cc4dgs_play::Model;
+use cc4dgs_play::checkpoint::{CHECKPOINT, CheckpointFile};
 use cc4dgs_train::checks::{Finding, Judgement, Severity, Subject, check_scene};
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::data::{self, procedural::NAMES};
@@ -11,6 +12,7 @@ use cc4dgs_train::train::{TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 /// Images of another scene, changed.
 struct Changed<F>(Arc<Scene>, F);
@@ -156,15 +158,23 @@ fn images_cameras_and_times_without_sense_are_found() {
     found("frames out of order", &mixed, Subject::Times, Severity::Doubt);
 }
 
-/// A run of a thousand iterations at the smallest size, in the folder `out` if there is one; it is interrupted once `stops` says so of an event.
-fn run_in(scene: &Arc<Scene>, sets: &[&str], out: Option<&Path>, resume: bool, stops: fn(&Event) -> bool) -> (Result<(Model, TrainReport)>, Vec<Event>) {
+/// A run of a thousand iterations at the smallest size.
+fn configured(sets: &[&str]) -> RunConfig {
     let base = ["train.iterations=1000", "init.count=200", "density={kind='none'}", "train.time_ramp=0.0", "device=flex"];
     let sets: Vec<String> = base.iter().chain(sets).map(ToString::to_string).collect();
-    let config = RunConfig::resolve(Some("demo"), None, &sets).unwrap();
+    RunConfig::resolve(Some("demo"), None, &sets).unwrap()
+}
+
+/// The run of [`configured`], in the folder `out` if there is one; it is interrupted once `stops` says so of an event.
+fn run_in(scene: &Arc<Scene>, sets: &[&str], out: Option<&Path>, resume: bool, stops: fn(&Event) -> bool) -> (Result<(Model, TrainReport)>, Vec<Event>) {
+    run_as(&configured(sets), scene, out, resume, stops)
+}
+
+fn run_as(config: &RunConfig, scene: &Arc<Scene>, out: Option<&Path>, resume: bool, stops: fn(&Event) -> bool) -> (Result<(Model, TrainReport)>, Vec<Event>) {
     let registry = Registry::collect().unwrap();
     let listener = Listener { heard: Recorder::default(), stops, stop: AtomicBool::new(false) };
     let (out, scene, events, stop) = (out.map(Path::to_path_buf), scene.clone(), &listener, &listener.stop);
-    let trained = train(&TrainJob { config: &config, scene, out, resume, registry: &registry, events, stop, observer: None });
+    let trained = train(&TrainJob { config, scene, out, resume, registry: &registry, events, stop, observer: None });
     (trained, listener.heard.events())
 }
 
@@ -221,7 +231,7 @@ fn a_run_that_learns_nothing_stops_on_its_way() {
     let (scene, folder) = (builtin("tiny"), tempfile::tempdir().unwrap());
     let [whole, parts] = ["whole", "parts"].map(|name| folder.path().join(name));
     // No score stage: the main stage has 800 iterations.
-    let sets = [&LEARNS_NOTHING[..], &["train.shares=[1,0,4]", "train.checkpoint_every=0", "train.log_every=10"]].concat();
+    let sets = [&LEARNS_NOTHING[..], &["train.shares=[1,0,4]", "train.dynamic=none", "train.checkpoint_every=0", "train.log_every=10"]].concat();
     let last_iteration =
         |events: &[Event]| events.iter().filter_map(|e| if let Event::Iteration { iteration, .. } = e { Some(*iteration) } else { None }).next_back();
 
@@ -267,6 +277,34 @@ fn short_runs_are_judged_at_their_end_and_shorter_ones_are_not() {
     assert!(matches!(verdicts(&events)[..], [said] if said.contains("299 iterations are too few")), "{events:?}");
     let (_, events) = with(&LEARNS_NOTHING[..1], "train.checks=false");
     assert!(verdicts(&events).is_empty());
+}
+
+#[test]
+fn a_run_is_judged_by_the_length_that_it_gets() {
+    let (scene, folder) = (builtin("tiny"), tempfile::tempdir().unwrap());
+    // 264 iterations of the main stage are planned.
+    let sets = [&LEARNS_NOTHING[..], &["train.iterations=330", "train.shares=[1,0,4]", "train.dynamic=none", "train.checkpoint_every=0"]].concat();
+    // What comes of it where there is so much time, and when it was scored.
+    let ended = |seconds: u64| {
+        let mut config = configured(&sets);
+        config.auto.ends = Instant::now().checked_add(Duration::from_secs(seconds));
+        let out = folder.path().join(seconds.to_string());
+        let (trained, events) = run_as(&config, &scene, Some(&out), false, |_| false);
+        let header: serde_json::Value = CheckpointFile::read(&out.join(CHECKPOINT), &Limits::default()).unwrap().header().unwrap();
+        let scores = header["training"]["record"]["scores"].as_array().unwrap().iter().map(|score| score["percent"].as_u64().unwrap()).collect::<Vec<_>>();
+        (trained, events, scores)
+    };
+    let (long, _, scores) = ended(36_000);
+    let error = long.err().unwrap().to_string();
+    assert!(error.contains("stopped at iteration 897 of 1056 of the main stage"), "{error}");
+    assert_eq!(scores, [0, 50, 85]);
+    let (short, events, scores) = ended(0);
+    assert!(short.unwrap().1.verdict.is_none() && scores.is_empty(), "{scores:?}");
+    assert!(matches!(verdicts(&events)[..], [said] if said.contains("251 iterations are too few")), "{events:?}");
+    // The same from a file that states the length.
+    let (stated, _) = run(&scene, &[&sets[..], &["train.iterations=120", "train.stretch=4.0"]].concat());
+    let error = stated.err().unwrap().to_string();
+    assert!(error.contains("after 408 iterations training views reach"), "{error}");
 }
 
 #[test]

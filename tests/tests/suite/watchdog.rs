@@ -138,6 +138,16 @@ fn the_part_that_runs_away_is_slowed_down() {
 }
 
 #[test]
+fn checkpoints_on_the_way_change_nothing_where_there_is_trouble() {
+    let [rare, often] = ["train.checkpoint_every=0", "train.checkpoint_every=7"]
+        .map(|every| run("opaque", &["train.lr.opacity=3.0", "density={kind='none'}", "train.iterations=280", every]));
+    let lowered = |run: &Run| run.warnings.iter().filter(|w| w.contains("learns")).cloned().collect::<Vec<_>>();
+    assert!(!lowered(&rare).is_empty());
+    assert_eq!(lowered(&rare), lowered(&often));
+    assert!(rare.outcome.unwrap() == often.outcome.unwrap(), "checkpoints on the way gave other bytes");
+}
+
+#[test]
 fn a_single_broken_gaussian_is_removed_before_the_model_is_stored() {
     let counts = [false, true].map(|breaks| {
         let session = Session::builder().device("flex").build().unwrap();

@@ -121,7 +121,7 @@ pub struct BenchAgree {
     /// Devices, or DEVICE/RASTERIZER where it is not to be the model's rasterizer; all are compared with the first.
     #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "flex,ndarray,wgpu")]
     pub devices: Vec<String>,
-    /// Draw at most this many views, evenly spread; 0 is all.
+    /// Draw at most this many views, spread over cameras and frames; 0 is all.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub max_views: usize,
 }

@@ -23,6 +23,9 @@ pub struct Bake {
     /// The dataset that the model was trained on: its cameras are those of --max-error, and players offer them. Without it, an orbit round the model.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
+    /// Scene options over those the model was trained with, such as scene.ffmpeg=/opt/ffmpeg/bin/ffmpeg; with --scene only; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE", requires = "scene")]
+    pub sets: Vec<String>,
     /// Codec of the Gaussians, where MODEL is no archive yet [default: quantize:high].
     #[arg(long, value_name = "NAME[:PROFILE]")]
     pub codec: Option<String>,

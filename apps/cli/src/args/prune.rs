@@ -23,6 +23,9 @@ pub struct Prune {
     /// Replace F.cc4d where it exists.
     #[arg(long)]
     pub overwrite: bool,
+    /// Scene options over those the model was trained with, such as scene.ffmpeg=/opt/ffmpeg/bin/ffmpeg; may be given several times.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub sets: Vec<String>,
     /// Device to render on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,

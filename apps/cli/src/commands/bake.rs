@@ -46,7 +46,7 @@ pub fn run(context: &Context, args: &Bake) -> Result<()> {
     let storage = storage(args)?;
     let stored = Stored::open(&args.model, storage.unwrap_or_default(), around)?;
     let cameras = match &args.scene {
-        Some(scene) => capture_cameras(context, scene, &[], &stored.model)?,
+        Some(scene) => capture_cameras(context, scene, &args.sets, &stored.model)?,
         None => stored.archive.manifest().presentation.cameras.clone(),
     };
     let presentation = shown(args, &stored, &cameras)?;

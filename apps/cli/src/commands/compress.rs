@@ -6,7 +6,7 @@ use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::{Archive, Presentation, StreamInfo, StreamKind, write_atomically};
 use cc4dgs_core::exporter::refuse_existing;
-use cc4dgs_core::{Event, EventSink, Result, TuneModel, config, read_gaussians, read_weights};
+use cc4dgs_core::{Error, Event, EventSink, Result, TuneModel, config, read_gaussians, read_weights};
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelSize;
 use cc4dgs_play::source::{Source, SourceKind};
@@ -64,14 +64,19 @@ static NEVER: AtomicBool = AtomicBool::new(false);
 pub fn run(context: &Context, args: &Compress) -> Result<()> {
     refuse_existing(&args.out, args.overwrite)?;
     let mut settings = toml::Table::new();
-    config::set_all(&mut settings, &args.sets)?;
+    let (scene_sets, codec_sets): (Vec<String>, Vec<String>) = args.sets.iter().cloned().partition(|set| set.starts_with("scene."));
+    if args.scene.is_none() && !scene_sets.is_empty() {
+        return Err(Error::parameter("--set", "scene options without --scene", "Name the dataset that the model was trained on"));
+    }
+    config::set_all(&mut settings, &codec_sets)?;
     // Unknown names and settings are refused before anything is read.
     context.registry.build_codec(&args.codec, &settings)?;
     FieldWeights::parse(&args.field_weights, &context.registry)?;
     let events = context.listeners(None)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     say_what_is_lost(context, &args.model, &events)?;
-    let scene = args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &[], &context.registry, &context.limits)).transpose()?.map(Arc::new);
+    let scene =
+        args.scene.as_ref().map(|path| open_as_trained(path, &loaded.model, &scene_sets, &context.registry, &context.limits)).transpose()?.map(Arc::new);
     // A PLY says nothing of what is behind it.
     loaded.model.background = loaded.model.background.or(scene.as_ref().and_then(|scene| scene.background));
     let tuner = scene.as_ref().map(|scene| {

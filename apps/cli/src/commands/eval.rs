@@ -1,11 +1,12 @@
 //! `cc4dgs eval`.
 
-use super::{Context, evenly, lies_in};
+use super::{Context, lies_in};
 use crate::args::Eval;
 use crate::interrupt;
 use crate::models::{Loaded, load_model};
 use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::exporter::refuse_other_content;
+use cc4dgs_core::sample::spread_views;
 use cc4dgs_core::{Error, Event, EventSink, Limits, Result, Scene, Split};
 use cc4dgs_train::data::procedural::{self, ProceduralScene};
 use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
@@ -145,16 +146,12 @@ pub fn measure(
     for message in &scene.warnings {
         events.emit(&Event::Warning { object: scene.name.clone(), message: message.clone() });
     }
-    let in_split = scene.split(scored.split).len();
-    let measured = if scored.max_views == 0 { in_split } else { scored.max_views.min(in_split) };
-    let mut rows = if images.sheet.is_some() { evenly(measured, images.sheet_rows) } else { Vec::new() };
-    rows.reverse();
+    let rows = if images.sheet.is_some() { spread_views(scene, &scored.views(scene), images.sheet_rows) } else { Vec::new() };
     let mut comparisons = Vec::with_capacity(rows.len());
     let mut index = 0;
     let report = evaluate(model, scene, scored, &context.registry, &loaded.device, events, &mut |view, truth, render, score| {
         interrupt::check(stop, "evaluation; nothing of it was written but finished renders")?;
-        if rows.last() == Some(&index) {
-            rows.pop();
+        if rows.contains(&view) {
             let caption =
                 format!("{} frame {} t {:.3}  PSNR {:.2} dB  SSIM {:.4}", score.camera, score.frame, scene.views[view].time_norm, score.psnr_db, score.ssim);
             comparisons.push(Comparison { caption, reference: truth.clone(), render: render.clone() });

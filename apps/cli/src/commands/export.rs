@@ -75,9 +75,12 @@ pub fn finish(context: &Context, job: &ExportJob) -> Result<()> {
     })
 }
 
-/// Refuses a number of frames and their rate for a format of one instant, which has no use for them.
+/// Refuses a number of frames and their rate for a format of one instant, and a number of frames for a player: they have no use for them.
 fn check_clock(registry: &Registry, plugin: &ExporterPlugin, shots: &Shots) -> Result<()> {
     let is_still = |plugin: &ExporterPlugin| plugin.info.capabilities.contains(&"still");
+    if shots.frames.is_some() && plugin.info.capabilities.contains(&"player") {
+        return Err(Error::parameter("--frames", format!("{} plays the whole time of a model", plugin.info.name), "Leave it out"));
+    }
     match shots.frames.map(|_| "--frames").or(shots.fps.map(|_| "--fps")) {
         Some(option) if is_still(plugin) => {
             let others: Vec<&str> = registry.exporters().filter(|p| !is_still(p)).map(|p| p.info.name).collect();

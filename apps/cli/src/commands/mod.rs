@@ -162,11 +162,6 @@ pub fn megabytes(bytes: u64) -> f64 {
     bytes as f64 / 1e6
 }
 
-/// `wanted` of 0..`len`, evenly spread from the first on; all of them if there are fewer.
-pub fn evenly(len: usize, wanted: usize) -> Vec<usize> {
-    if wanted >= len { (0..len).collect() } else { (0..wanted).map(|i| i * len / wanted).collect() }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -185,12 +180,5 @@ mod tests {
         assert!(create_parent(folder.path()).unwrap_err().to_string().contains("it is a folder"));
         create_parent(&folder.path().join("new/model.cc4d")).unwrap();
         assert!(folder.path().join("new").is_dir());
-    }
-
-    #[test]
-    fn evenly_covers_without_repeating() {
-        assert_eq!(evenly(10, 3), [0, 3, 6]);
-        assert_eq!(evenly(2, 5), [0, 1]);
-        assert_eq!(evenly(5, 0), [0usize; 0]);
     }
 }

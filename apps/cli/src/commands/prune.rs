@@ -33,7 +33,7 @@ pub fn run(context: &Context, args: &Prune) -> Result<()> {
     create_parent(&args.out)?;
     let mut loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
     say_what_is_lost(context, &args.model, &events)?;
-    let scene = open_as_trained(&args.scene, &loaded.model, &[], &context.registry, &context.limits)?;
+    let scene = open_as_trained(&args.scene, &loaded.model, &args.sets, &context.registry, &context.limits)?;
     // A PLY says nothing of what is behind it.
     loaded.model.background = loaded.model.background.or(scene.background);
     let (registry, limits, events) = (&context.registry, &context.limits, &events);

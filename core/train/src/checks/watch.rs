@@ -4,15 +4,18 @@ use super::baselines::{MovingPixels, Yardstick, blurred, psnr_db};
 use super::rules::{Doubts, GOOD_ENOUGH_DB, LEAST_ITERATIONS, Rules, Shortfall, collapse, shortfall};
 use super::verdict::{Evidence, Verdict};
 use super::{Finding, Subject};
+use crate::config::TrainConfig;
 use crate::sample::spread_views;
 use crate::schedule::StageLengths;
 use crate::train::{Context, Score, TrainState};
+use crate::train_config::MOST_STRETCH;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Error, Event, Result, SAME_TIME, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
-/// Where the main stage is scored, percent; but for `START`, never before its length is settled. A run stops at `LATE` if it has failed at `HALF` and at `LATE`; the
-/// scores at `HALF` and at `END` decide at the end, where it must not be far below any earlier one either. What was there at `START` must not get worse.
+/// Where the main stage is scored, percent; but for `START`, never before its length is settled, which decides what the rules are. A run stops at `LATE` if it
+/// has failed at `HALF` and at `LATE`; the scores at `HALF` and at `END` decide at the end, where it must not be far below any earlier one either. What was
+/// there at `START` must not get worse.
 const START: usize = 0;
 const HALF: usize = 50;
 const LATE: usize = 85;
@@ -23,8 +26,6 @@ const VALIDATION_VIEWS: usize = 24;
 /// Follows one run.
 pub(crate) struct Watch {
     doubts: Vec<Finding>,
-    /// `None` for runs that are not judged.
-    rules: Option<Rules>,
     yardstick: Option<Yardstick>,
     scores: Vec<Score>,
 }
@@ -35,10 +36,8 @@ impl Watch {
     /// # Errors
     /// [`Error::Failed`] again, where `state` comes from the checkpoint of a run that stopped because it had failed.
     pub fn new(context: &Context, doubts: Vec<Finding>, state: &TrainState) -> Result<Self> {
-        let train = &context.job.config.train;
-        let rules = if train.checks { Rules::of(train.iterations, context.lengths.planned() * train.batch, context.training_camera.len()) } else { None };
-        let mut watch = Self { doubts, rules, yardstick: None, scores: state.record.scores.clone() };
-        if watch.rules == Some(Rules::All) && state.stage == Stage::Main && state.iteration == context.lengths.scored_at(LATE) && watch.at(LATE).is_some() {
+        let mut watch = Self { doubts, yardstick: None, scores: state.record.scores.clone() };
+        if rules(context) == Some(Rules::All) && state.stage == Stage::Main && state.iteration == context.lengths.scored_at(LATE) && watch.at(LATE).is_some() {
             watch.measure_baselines(context)?;
             if let Some(failure) = watch.failure_at(LATE, context, state) {
                 return Err(failure);
@@ -46,9 +45,13 @@ impl Watch {
         }
         Ok(watch)
     }
-    /// To be called before the first iteration of the main stage; scores the model that it begins with.
+    /// To be called before the first iteration of the main stage; scores the model that it begins with, where the stage has or may get the length for it.
     pub fn before_main(&mut self, context: &Context, state: &mut TrainState) -> Result<()> {
-        if self.rules == Some(Rules::All) {
+        let (config, mut longest) = (context.job.config, context.lengths.clone());
+        if config.settles_length() {
+            longest.stretch_main(MOST_STRETCH);
+        }
+        if rules_of(&config.train, &longest, context.training_camera.len()) == Some(Rules::All) {
             self.score(context, state, START)?;
             state.record.scores.clone_from(&self.scores);
         }
@@ -57,7 +60,16 @@ impl Watch {
     /// To be called after every iteration; scores the model at half and at 85 % of the main stage, once its length is settled. Returns the error of a run that has
     /// failed at both: it is to be stopped.
     pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, schedule: &Schedule) -> Result<Option<Error>> {
-        if self.rules.is_none() || schedule.stage != Stage::Main {
+        if schedule.stage != Stage::Main || !context.job.config.train.checks {
+            return Ok(None);
+        }
+        let rules = rules(context);
+        if schedule.iteration == context.lengths.settles_at() && rules != Some(Rules::All) {
+            // The stage did not get the length that this score is for.
+            self.scores.retain(|score| score.percent != START);
+            state.record.scores.clone_from(&self.scores);
+        }
+        if rules.is_none() {
             return Ok(None);
         }
         // Both are due where the length is settled late and gets shorter.
@@ -74,9 +86,10 @@ impl Watch {
     pub fn conclude(&mut self, context: &Context, state: &mut TrainState) -> Result<Option<Verdict>> {
         let train = &context.job.config.train;
         let note = |message: String| context.job.events.emit(&Event::Note { object: "verdict".into(), message });
-        if self.rules.is_none() {
+        if rules(context).is_none() {
             if train.checks {
-                note(format!("none: {} iterations are too few to be judged, which needs at least {LEAST_ITERATIONS}", train.iterations));
+                let total = context.lengths.total();
+                note(format!("none: {total} iterations are too few to be judged, which needs at least {LEAST_ITERATIONS}"));
             }
             return Ok(None);
         }
@@ -164,7 +177,7 @@ impl Watch {
     }
     /// The error of a run that has failed at `percent`, of which the baselines are measured. A deformer that is static by choice is warned of, at the end.
     fn failure_at(&self, percent: usize, context: &Context, state: &TrainState) -> Option<Error> {
-        let (rules, yardstick, now) = (self.rules?, self.yardstick.as_ref()?, self.at(percent)?);
+        let (rules, yardstick, now) = (rules(context)?, self.yardstick.as_ref()?, self.at(percent)?);
         let deciding: Vec<Score> = match (self.at(HALF), rules, percent) {
             (Some(half), Rules::All, END) => vec![*half, *now],
             (Some(half), Rules::All, _) if !grows_late(context) => vec![*half, *now],
@@ -222,6 +235,16 @@ impl Watch {
             }
         }
     }
+}
+
+/// The rules for the run of `context`, by the length that its main stage has now; `None` for runs that are not judged.
+fn rules(context: &Context) -> Option<Rules> {
+    rules_of(&context.job.config.train, &context.lengths, context.training_camera.len())
+}
+
+/// The rules for a run of so many cameras with stages of these `lengths`.
+fn rules_of(train: &TrainConfig, lengths: &StageLengths, cameras: usize) -> Option<Rules> {
+    Rules::of(lengths.total(), lengths.length(Stage::Main) * train.batch, cameras).filter(|_| train.checks)
 }
 
 /// Whether frames or pixels are still added at the score on the way, or were until shortly before it.
@@ -312,7 +335,18 @@ fn slope(planes: &[f32], width: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::TrainConfig;
+
+    #[test]
+    fn the_length_that_a_main_stage_has_decides_the_rules() {
+        let rules = |iterations, stretch| {
+            let train = TrainConfig { iterations, stretch, ..Default::default() };
+            rules_of(&train, &StageLengths::new(&train, true, 1.0), 10)
+        };
+        assert_eq!((rules(280, 1.0), rules(280, 4.0), rules(330, 4.0)), (None, Some(Rules::Baselines), Some(Rules::All)));
+        assert_eq!((rules(330, 0.7), rules(1120, 0.7), rules(1120, 1.0)), (None, Some(Rules::Baselines), Some(Rules::All)));
+        let unchecked = TrainConfig { checks: false, ..Default::default() };
+        assert_eq!(rules_of(&unchecked, &StageLengths::new(&unchecked, true, 1.0), 10), None);
+    }
 
     #[test]
     fn no_warning_is_the_likely_cause_for_its_place_in_the_alphabet() {

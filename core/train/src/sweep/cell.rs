@@ -12,7 +12,7 @@ use crate::config::RunConfig;
 use crate::data;
 use crate::eval::{EvalReport, Scored, evaluate};
 use crate::images::write_png;
-use crate::sample::spread;
+use crate::sample::spread_views;
 use crate::train::{TuneJob, Tuner};
 use burn::tensor::Device;
 use cc4dgs_core::archive::{Archive, StreamKind};
@@ -45,7 +45,8 @@ impl<'a> Trained<'a> {
         let limits = worker.limits_over(&config.limits)?;
         let device = parse_device(&config.device)?;
         let model = Model::open(&folder.training(&training.id), worker.registry, &device, &limits, worker.events)?;
-        let scene = data::open_in(&locate(&training.data.path)?, &scene_options(&config, worker.processes), &model.normalisation, worker.registry, &limits)?;
+        let trained = data::Trained { normalisation: model.normalisation, frames: config.scene.frames };
+        let scene = data::open_in(&locate(&training.data.path)?, &scene_options(&config, worker.processes), &trained, worker.registry, &limits)?;
         let scene = Arc::new(data::hold_out(&scene, config.train.validation)?);
         Ok(Self { training, finished, config, limits, device, model, scene })
     }
@@ -80,11 +81,10 @@ impl<'a> Trained<'a> {
         let decode_seconds = began.elapsed().as_secs_f64();
 
         let split = plan.split.into();
-        let in_split = self.scene.split(split).len();
-        let count = if plan.max_views == 0 { in_split } else { plan.max_views.min(in_split) };
-        let kept = spread(&(0..count).collect::<Vec<_>>(), plan.images);
         let scored = Scored { split, max_views: plan.max_views, perceptual: true };
-        let (mut images, mut frame_ms_each) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        let views = scored.views(&self.scene);
+        let kept = spread_views(&self.scene, &views, plan.images);
+        let (mut images, mut frame_ms_each) = (Vec::with_capacity(views.len()), Vec::with_capacity(views.len()));
         let began = Instant::now();
         let mut image_size = [0, 0];
         let report = evaluate(&decoded, &self.scene, scored, worker.registry, &self.device, worker.events, &mut |view, truth, render, score| {
@@ -96,7 +96,7 @@ impl<'a> Trained<'a> {
                 let name = format!("images/{owner}/{number:05}.png");
                 write_png(folder.root().join(&name), image).map(|()| name)
             };
-            let keeps = kept.contains(&index);
+            let keeps = kept.contains(&view);
             if index == 0 {
                 image_size = [truth.width, truth.height];
             }

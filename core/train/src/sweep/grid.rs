@@ -191,10 +191,10 @@ pub struct Grid {
     /// Size: iterations of a training.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub iterations: Option<usize>,
-    /// Score at most so many images, evenly spread; 0 scores all.
+    /// Score at most so many images, spread over cameras and frames; 0 scores all.
     #[serde(default)]
     pub max_views: usize,
-    /// Images of each cell that are kept as PNG files beside their ground truth, evenly spread.
+    /// Images of each cell that are kept as PNG files beside their ground truth, spread in the same way.
     #[serde(default = "two")]
     pub images: usize,
     /// Settings of every training, `key=value`.

@@ -52,7 +52,7 @@ pub struct Worker<'a> {
     pub events: &'a dyn EventSink,
     /// Set to stop at a safe point.
     pub stop: &'a AtomicBool,
-    /// Limits of this machine over those of the grid, each `KEY=VALUE`. They decide what is refused and change no result.
+    /// Limits of this machine over those of the grid, each `KEY=VALUE`. They decide what is refused, change no result and are in none.
     pub limits: &'a [String],
     /// Processes that share the memory of this machine, this one included: each keeps images decoded in a third of an equal part at most.
     pub processes: usize,
@@ -98,16 +98,13 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let log = JsonLines::open(&run.join(EVENTS), begun)?;
     let events = Both(&log, worker.events);
     let limits: Vec<String> = worker.limits.iter().map(|limit| format!("limits.{limit}")).collect();
-    let (config, scene) = if begun {
-        auto::open_shared(&path, &Layers::collect(worker.registry, None, Some(&own), &limits)?, worker.registry, &events, worker.processes)?
-    } else {
-        let layers = Layers::collect(worker.registry, Some(&training.preset), None, &[&training.sets[..], &limits].concat())?;
-        let (mut config, scene) = auto::open_shared(&path, &layers, worker.registry, &events, worker.processes)?;
-        if !layers.state("train.checkpoint_every") {
-            config.train.checkpoint_every = (config.train.iterations / CHECKPOINTS).clamp(CHECKPOINT_EVERY[0], CHECKPOINT_EVERY[1]);
-        }
-        (config, scene)
-    };
+    let layers = if begun { Layers::collect(worker.registry, None, Some(&own), &[])? } else { training.layers(worker.registry)? };
+    let (mut config, scene) = auto::open_shared(&path, &layers.with(&limits)?, worker.registry, &events, worker.processes)?;
+    // Results do not depend on the machine: what is written, and how many points a run begins with, has the limits of the grid.
+    config.machine_limits = Some(std::mem::replace(&mut config.limits, layers.config()?.limits));
+    if !begun && !layers.state("train.checkpoint_every") {
+        config.train.checkpoint_every = (config.train.iterations / CHECKPOINTS).clamp(CHECKPOINT_EVERY[0], CHECKPOINT_EVERY[1]);
+    }
     let devices = note_device(&run.join(DEVICES), begun, training_device(&config.device))?;
     let job =
         TrainJob { config: &config, scene, out: Some(run.clone()), resume, registry: worker.registry, events: &events, stop: worker.stop, observer: None };

@@ -33,7 +33,7 @@ pub(super) fn write_settings(out: &Path, config: &RunConfig) -> Result<()> {
 /// # Errors
 /// [`Error::Parameter`] for a checkpoint of another scene, and whatever reading it reports.
 pub(super) fn resumed(job: &TrainJob, path: &Path, device: &Device, parts: Parts) -> Result<TrainState> {
-    let stored = checkpoint::load(path, job.registry, device, &job.config.limits)?;
+    let stored = checkpoint::load(path, job.registry, device, job.config.limits_here())?;
     let (now, then) = (job.scene.normalisation, stored.normalisation());
     if now != then {
         return Err(Error::parameter(

@@ -9,6 +9,7 @@ mod guard;
 mod key_frames;
 mod log;
 mod losses;
+mod moving;
 mod observe;
 mod pace;
 mod parameters;
@@ -28,6 +29,7 @@ mod stage;
 mod state;
 mod step;
 mod strain;
+mod targets;
 mod tune;
 mod validate;
 mod watchdog;
@@ -47,7 +49,7 @@ pub use watchdog::RateFactors;
 
 use crate::checkpoint;
 use crate::checks::{Verdict, Watch, examine};
-use crate::config::{Dynamic, RunConfig};
+use crate::config::RunConfig;
 use crate::data::hold_out;
 use crate::gaussian_set::GaussianSet;
 use crate::init::initialise;
@@ -58,6 +60,7 @@ use cc4dgs_core::{AppearanceContext, Event, EventSink, Rasterizer, Registry, Res
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::{Model, Moving};
 use losses::LossTerms;
+use moving::decide_moving;
 use pyramid::Pyramid;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -154,7 +157,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         job.events.emit(&Event::Warning { object: job.scene.name.clone(), message: message.clone() });
     }
     let doubts = if config.train.checks { examine(&job.scene, config.background()?, job.events)? } else { Vec::new() };
-    let moving = decide_moving(job);
+    let moving = decide_moving(&config.train, &job.scene)?;
     let training_camera = training_cameras(&job.scene);
     let parts = Parts {
         appearance: job.registry.build_appearance(
@@ -244,23 +247,4 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
 fn training_cameras(scene: &Scene) -> BTreeMap<usize, usize> {
     let used: std::collections::BTreeSet<usize> = scene.split(Split::Train).into_iter().map(|view| scene.views[view].camera).collect();
     used.into_iter().enumerate().map(|(index, camera)| (camera, index)).collect()
-}
-
-/// Whether everything, nothing, or what the dynamic scores say may move.
-fn decide_moving(job: &TrainJob) -> Moving {
-    let train = &job.config.train;
-    let mut frames_of_camera: BTreeMap<usize, usize> = BTreeMap::new();
-    for view in job.scene.split(Split::Train) {
-        *frames_of_camera.entry(job.scene.views[view].camera).or_default() += 1;
-    }
-    let can_score = frames_of_camera.values().any(|&frames| frames >= 2);
-    let static_scene = job.scene.frame_count <= 1;
-    match train.dynamic {
-        _ if static_scene => Moving::Nothing,
-        Dynamic::None => Moving::Nothing,
-        Dynamic::All => Moving::Everything,
-        Dynamic::Score => Moving::Scored { zeta: train.zeta },
-        Dynamic::Auto if can_score => Moving::Scored { zeta: train.zeta },
-        Dynamic::Auto => Moving::Everything,
-    }
 }

@@ -46,7 +46,7 @@ impl Pace {
     /// For a stage that begins; `None` where no time was planned or the length is settled.
     pub fn new(context: &Context, stage: Stage, state: &TrainState) -> Option<Self> {
         let config = context.job.config;
-        let ends = config.auto.ends.filter(|_| stage == Stage::Main && state.iteration == 0 && config.train.stretch == 1.0)?;
+        let ends = config.auto.ends.filter(|_| stage == Stage::Main && state.iteration == 0 && config.settles_length())?;
         Some(Self { ends, since: None, seconds: Vec::new() })
     }
     /// To be called after every iteration: the factor by which the main stage is to be stretched, once it is known.

@@ -47,7 +47,7 @@ impl Sampler {
         }
         (0..size)
             .map(|b| {
-                let position = index * self.batch + b;
+                let position = index * size + b;
                 let epoch = position / n;
                 if self.epoch.as_ref().is_none_or(|(e, _)| *e != epoch) {
                     let mut order = self.views.clone();
@@ -98,6 +98,16 @@ mod tests {
         }
         let mut late = Sampler::new((10..17).collect(), Seed::root(1), 2);
         assert_eq!(late.batch(5), drawn[10..12]);
+    }
+
+    #[test]
+    fn a_batch_of_more_views_than_there_are_has_every_view_once() {
+        let mut sampler = Sampler::new((10..13).collect(), Seed::root(1), 5);
+        for index in 0..4 {
+            let mut drawn = sampler.batch(index);
+            drawn.sort_unstable();
+            assert_eq!(drawn, [10, 11, 12], "iteration {index}");
+        }
     }
 
     #[test]

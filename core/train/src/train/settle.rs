@@ -9,8 +9,8 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Camera, Event, Result, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
-/// When it is looked at: thirds of the main stage.
-const THIRDS: [usize; 2] = [1, 2];
+/// When it is looked at: shares of the main stage.
+const SHARES: [f64; 2] = [1.0 / 3.0, 2.0 / 3.0];
 /// Times over the sequence, and training cameras, at which motion is looked at.
 const TIMES: usize = 13;
 const CAMERAS: usize = 24;
@@ -23,9 +23,8 @@ impl Context<'_> {
     /// Makes Gaussians static that move by less than `train.settle` pixels in every training camera, when the iteration is due.
     pub(crate) fn settle(&self, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
         let most_px = self.job.config.train.settle;
-        let due = THIRDS.iter().any(|third| schedule.iteration == schedule.length * third / 3);
         let Moving::Scored { zeta } = state.moving else { return Ok(()) };
-        if most_px <= 0.0 || schedule.stage != Stage::Main || !due {
+        if most_px <= 0.0 || schedule.stage != Stage::Main || !is_due(schedule) {
             return Ok(());
         }
         let rows = state.moving_rows(&self.device)?;
@@ -68,6 +67,11 @@ impl Context<'_> {
     }
 }
 
+/// Whether it is looked at after this iteration of the main stage.
+fn is_due(schedule: &Schedule) -> bool {
+    SHARES.iter().any(|&share| schedule.iteration == schedule.iteration_at(share) as usize)
+}
+
 /// Raises each of `most` to the value beside it.
 fn raise(most: &mut [f32], values: &[f32]) {
     most.iter_mut().zip(values).for_each(|(m, v)| *m = m.max(*v));
@@ -83,6 +87,24 @@ fn pixels_per_unit(camera: &Camera, mean: [f64; 3]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::TrainConfig;
+    use crate::schedule::StageLengths;
+
+    #[test]
+    fn a_main_stage_is_looked_at_twice_whatever_its_length_becomes() {
+        let due = |image_growth: f64, stretch: f64| -> Vec<usize> {
+            let lengths = StageLengths::new(&TrainConfig { iterations: 2800, image_growth, stretch, ..Default::default() }, true, 1.0);
+            (1..=lengths.length(Stage::Main)).filter(|&iteration| is_due(&lengths.schedule(Stage::Main, iteration))).collect()
+        };
+        assert_eq!(due(0.0, 1.0), [666, 1333]);
+        // The length is settled after 400 iterations, in the second case after 1,200 of the 2,000 that were planned.
+        assert_eq!(due(0.0, 4.0).len(), 2);
+        assert_eq!((due(0.6, 2.0).len(), due(0.6, 2.0)[0]), (2, 666));
+        for length in 3..3000 {
+            let thirds = (1..=length).filter(|&iteration| is_due(&Schedule { iteration, ..Schedule::main(length) }));
+            assert!(thirds.eq([length / 3, 2 * length / 3]), "{length}");
+        }
+    }
 
     #[test]
     fn pixels_fall_with_depth() {

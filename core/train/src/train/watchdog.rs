@@ -1,8 +1,9 @@
 //! Finds values that are not finite at their source, goes back to the last good state, and lowers the learning rate of what caused them.
 //!
-//! - Every 100 iterations, and before a checkpoint is written, all parameters are looked at; the loss is looked at whenever it is logged. What is sound is remembered.
+//! - Every 100 iterations, and before a checkpoint is written, all parameters are looked at; the loss is looked at whenever it is logged. What is sound every 100
+//!   iterations is remembered, and nothing else: where the run goes back to does not depend on when it writes checkpoints and logs.
 //! - Where something is not finite, the run goes back and repeats the iterations with a check of every loss, gradient and parameter, so that the first broken value
-//!   is found. Iterations depend on seeds alone, so they repeat exactly.
+//!   is found. Iterations depend on seeds alone, so they repeat exactly, and it is the same value whenever the trouble was noticed.
 //! - The part that it belongs to, or else the part that grew most since the good state, learns a quarter as fast from then on.
 //! - After a few attempts the run ends with an error that names the source.
 //!
@@ -151,16 +152,16 @@ impl Watchdog {
     pub fn checks(&self, iteration: usize) -> bool {
         iteration <= self.attempts.checked_until
     }
-    /// After an iteration of `length`: looks at the parameters where it is time for it, and goes back where `trouble` was found before or is found now. `saves`
-    /// says that the state is about to be written.
+    /// After an iteration of `length`: looks at the parameters where it is time for it or where the state is about to be written, which `saves` says, and goes back
+    /// where `trouble` was found before or is found now.
     ///
     /// # Errors
     /// [`Error::Backend`] that names the source, after too many attempts.
     pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, trouble: Option<Trouble>, length: usize, saves: bool) -> Result<()> {
         let iteration = state.iteration;
-        let due = iteration.is_multiple_of(EVERY) || iteration == length || saves;
+        let due = iteration.is_multiple_of(EVERY) || iteration == length;
         let trouble = match trouble {
-            None if due || self.checks(iteration) => unsound(state)?,
+            None if due || saves || self.checks(iteration) => unsound(state)?,
             trouble => trouble,
         };
         match trouble {
@@ -195,8 +196,8 @@ impl Watchdog {
         };
         self.good.restore(state, context)?;
         let back = self.good.iteration;
-        // The first broken value is known only where every value before it was checked.
-        if !self.checks(iteration) && iteration > back + 1 {
+        // The first broken value is known only where every value before it was checked, those of this iteration too.
+        if !self.checks(iteration) {
             self.attempts.repeated += 1;
             self.attempts.checked_until = iteration;
             warn(format!("{what}: it is not finite; back to iteration {back}, to find its source"));

@@ -1,9 +1,10 @@
 //! Whether devices draw the same images.
 
 use crate::args::BenchAgree;
-use crate::commands::{Context, evenly};
+use crate::commands::Context;
 use crate::models::load_model;
 use cc4dgs::scenes::open_as_trained;
+use cc4dgs_core::sample::spread_views;
 use cc4dgs_core::{Error, Result};
 use cc4dgs_train::agreement::{Agreement, agreement};
 use serde::Serialize;
@@ -38,7 +39,7 @@ pub fn agree(context: &Context, args: &BenchAgree) -> Result<()> {
         return Err(Error::parameter("--split", format!("{} has no such view", scene.name), "Compare the views of the other split"));
     }
     let wanted = if args.max_views == 0 { views.len() } else { args.max_views };
-    let views: Vec<usize> = evenly(views.len(), wanted).into_iter().map(|i| views[i]).collect();
+    let views = spread_views(&scene, &views, wanted);
     let devices = agreement(&models, &scene, &views, &context.registry, &events)?;
     let report = AgreeReport { version: env!("CARGO_PKG_VERSION"), model: args.views.model.display().to_string(), scene: scene.name.clone(), devices };
     context.output.result(&report, || text(&report))

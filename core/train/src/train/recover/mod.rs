@@ -10,7 +10,7 @@ mod tracks;
 
 use super::{Context, TrainState};
 use crate::masks::blur;
-use crate::sample::spread;
+use crate::sample::spread_views;
 use blobs::blobs;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Event, LIFE_ATTRIBUTES, Result, Schedule, Split, Stage};
@@ -97,7 +97,7 @@ impl Context<'_> {
     /// Training views and what the model does not draw of them.
     fn lost(&self, state: &mut TrainState, schedule: &Schedule) -> Result<Vec<Lost>> {
         let scene = &self.job.scene;
-        let views = spread(&scene.split(Split::Train), VIEWS);
+        let views = spread_views(scene, &scene.split(Split::Train), VIEWS);
         let background = self.job.config.background()?;
         let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
         let gaussians = state.set.gaussians()?;

@@ -1,0 +1,100 @@
+//! A few of many, evenly spread.
+
+use crate::Scene;
+use std::collections::BTreeMap;
+
+/// Share of its frames by which the views of a camera are turned against those of the one before: multiples of the golden ratio are spread over 0..1.
+const TURN: f64 = 0.618_033_988_749_895;
+
+/// At most `most` of `items`, from the middles of equal parts.
+pub fn spread<T: Copy>(items: &[T], most: usize) -> Vec<T> {
+    let n = items.len();
+    if n <= most { items.to_vec() } else { (0..most).map(|i| items[(2 * i + 1) * n / (2 * most)]).collect() }
+}
+
+/// At most `most` of `items`, the first of each of equal parts.
+pub fn spread_from_first<T: Copy>(items: &[T], most: usize) -> Vec<T> {
+    let n = items.len();
+    if n <= most { items.to_vec() } else { (0..most).map(|i| items[i * n / most]).collect() }
+}
+
+/// `views` of `scene` camera after camera, the frames of each turned against those of the one before. Scenes have their views by frame, where every so many are
+/// often of one camera; in this order they are of all cameras, and of many frames.
+pub fn by_camera(scene: &Scene, views: &[usize]) -> Vec<usize> {
+    let mut of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    views.iter().for_each(|&view| of_camera.entry(scene.views[view].camera).or_default().push(view));
+    let mut order = Vec::with_capacity(views.len());
+    for (k, mut own) in of_camera.into_values().enumerate() {
+        let turn = ((k as f64 * TURN).fract() * own.len() as f64) as usize;
+        own.rotate_left(turn);
+        order.append(&mut own);
+    }
+    order
+}
+
+/// At most `most` of `views`, spread over cameras and over frames, in ascending order where some are left out.
+pub fn spread_views(scene: &Scene, views: &[usize], most: usize) -> Vec<usize> {
+    if views.len() <= most {
+        return views.to_vec();
+    }
+    let mut chosen = spread(&by_camera(scene, views), most);
+    chosen.sort_unstable();
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Camera, Error, FrameSource, Image8, Result, Split, View};
+    use std::collections::BTreeSet;
+    use std::sync::Arc;
+
+    struct NoImages;
+    impl FrameSource for NoImages {
+        fn load(&self, view: usize) -> Result<Image8> {
+            Err(Error::unsupported(format!("view {view}"), "no images here", "None"))
+        }
+    }
+
+    /// Views by frame, as readers give them.
+    fn scene(cameras: usize, frames: usize) -> Scene {
+        let camera = |k: usize| Camera::look_at(&format!("c{k}"), (8, 8), 1.0, [k as f64, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let view = |i: usize| View { camera: i % cameras, frame: i / cameras, time_norm: 0.0, split: Split::Train };
+        Scene::new("s", (0..cameras).map(camera).collect(), (0..cameras * frames).map(view).collect(), Arc::new(NoImages), 0).unwrap()
+    }
+
+    #[test]
+    fn views_are_spread_over_cameras_and_frames() {
+        for (cameras, frames, most) in [(20, 300, 3), (20, 150, 24), (8, 300, 24), (24, 10, 24), (2, 240, 8), (1, 100, 3)] {
+            let scene = scene(cameras, frames);
+            let chosen = spread_views(&scene, &scene.split(Split::Train), most);
+            let seen: BTreeSet<usize> = chosen.iter().map(|&v| scene.views[v].camera).collect();
+            let times: BTreeSet<usize> = chosen.iter().map(|&v| 4 * scene.views[v].frame / frames).collect();
+            assert_eq!((chosen.len(), seen.len()), (most, cameras.min(most)), "{cameras} cameras, {frames} frames");
+            assert!(chosen.is_sorted() && times.len() >= if most < 8 { 2 } else { 3 }, "{cameras} cameras, {frames} frames: {times:?}");
+        }
+    }
+
+    #[test]
+    fn every_so_many_views_by_camera_are_of_all_cameras() {
+        let scene = scene(4, 12);
+        let all = scene.split(Split::Train);
+        let order = by_camera(&scene, &all);
+        let cameras = |views: &[usize]| views.iter().map(|&v| scene.views[v].camera).collect::<BTreeSet<usize>>().len();
+        assert_eq!((cameras(&spread_from_first(&all, 12)), cameras(&spread_from_first(&order, 12))), (1, 4));
+        let frames: BTreeSet<usize> = spread_from_first(&order, 12).into_iter().map(|v| scene.views[v].frame).collect();
+        assert!(frames.len() >= 6, "{frames:?}");
+        let mut sorted = order;
+        sorted.sort_unstable();
+        assert_eq!(sorted, all);
+    }
+
+    #[test]
+    fn samples_are_spread() {
+        let hundred: Vec<usize> = (0..100).collect();
+        assert_eq!(spread(&hundred, 4), [12, 37, 62, 87]);
+        assert_eq!(spread_from_first(&hundred, 4), [0, 25, 50, 75]);
+        assert_eq!((spread(&[3, 4, 5], 5), spread_from_first(&[3, 4, 5], 5)), (vec![3, 4, 5], vec![3, 4, 5]));
+        assert!(spread(&hundred, 0).is_empty() && spread_from_first::<usize>(&[], 3).is_empty());
+    }
+}
