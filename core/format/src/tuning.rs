@@ -51,7 +51,7 @@ pub struct Tuning<'a> {
     pub bits_per_octave: f64,
 }
 
-/// Trains a model further on its training views: on their images, or on images of its own where it was trained with colours per camera. A deformer's weights are
+/// Trains a model further on its training views: on their images, in the colours of the model where it was trained with colours per camera. A deformer's weights are
 /// rounded as their own codec stores them.
 pub trait TuneModel {
     /// `gaussians` with the weights of the model.

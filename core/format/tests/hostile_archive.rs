@@ -164,7 +164,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
         ("header_claims_4gb.cc4d", header_claim, "4294967295 bytes is claimed"),
         ("header_decodes_to_4gb.cc4d", with_claim(u32::MAX), "4294967295 is over the limit of 16777216"),
         ("header_decodes_to_more.cc4d", with_claim(99), "99 decoded bytes were declared"),
-        ("header_is_no_frame.cc4d", with_stored_header(&[9; 40], &[]), "Zstandard frame"),
+        ("header_is_no_frame.cc4d", with_stored_header(&[&[9, 0, 0, 0][..], &[9; 36]].concat(), &[]), "Zstandard frame"),
         ("manifest_deep.cc4d", with_manifest(deep.as_bytes()), "limit of 64"),
         ("manifest_not_json.cc4d", with_manifest(b"{\"format_version\":"), "manifest"),
         ("manifest_huge_count.cc4d", with_manifest(huge.as_bytes()), "max_gaussians"),

@@ -2,7 +2,6 @@
 
 use super::log::Log;
 use super::sampler::Sampler;
-use super::targets::Targets;
 use super::tune::{TuneJob, Tuner};
 use crate::config::RunConfig;
 use cc4dgs_core::{Error, Recorder, Registry, Result, Scene, Schedule, Seed, Split, Stage, TuneModel, config, parse_device};
@@ -35,8 +34,8 @@ pub(crate) fn share_per_view(model: &Model, scene: &Arc<Scene>, views: usize, re
         events: &events,
         stop: &stop,
     });
-    // Which images these are makes no difference to the time.
-    let tuner = tuner.with_targets(Targets { scene: scene.clone(), views: scene.split(Split::Train) });
+    // Their colours make no difference to the time.
+    let tuner = tuner.with_targets(scene.clone());
     let seed = Seed::root(run.seed).child("cost");
     tuner.with_state(&tuner.start(&model.gaussians)?, seed, |context, state| {
         let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);

@@ -36,7 +36,7 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
     let judged_by = if scene.split(Split::Validation).is_empty() { Split::Train } else { Split::Validation };
     let before = model.gaussians.len();
     let seed = Seed::root(model.provenance.seed).child("refit");
-    // They are what the model was before anything is removed.
+    // By the colours that the model has before anything is removed.
     let targets = job.tuner(model, scene).targets()?.clone();
     let (psnr_before_db, psnr_refit_alone_db) = {
         let tuner = job.tuner(model, scene).with_targets(targets.clone());
@@ -105,12 +105,12 @@ impl<'a> RefitJob<'a> {
 /// Trains `gaussians` and the weights of the tuner's model for `iterations`, at rates that rise and fall.
 fn refit(tuner: &Tuner<'_>, gaussians: &HostGaussians, iterations: usize, seed: Seed) -> Result<TunedModel> {
     let from = tuner.start(gaussians)?;
-    let (targets, events, stop) = (tuner.targets()?, tuner.job.events, tuner.job.stop);
+    let (scene, events, stop) = (&tuner.job.scene, tuner.job.events, tuner.job.stop);
     tuner.with_state(&from, seed, |context, state: &mut TrainState| {
-        let mut sampler = Sampler::new(targets.views.clone(), seed.child("views"), BATCH);
+        let mut sampler = Sampler::new(scene.split(Split::Train), seed.child("views"), BATCH);
         // Nothing is logged.
         let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);
-        let schedule = Schedule { extent: targets.scene.extent(), sh_degree: gaussians.sh_degree, ..Schedule::main(2) };
+        let schedule = Schedule { extent: scene.extent(), sh_degree: gaussians.sh_degree, ..Schedule::main(2) };
         let names: Vec<String> = state.set.iter().map(|(name, _)| format!("gaussians/{name}")).collect();
         for iteration in 1..=iterations {
             if stop.load(Ordering::Relaxed) {

@@ -6,7 +6,7 @@ use super::probe::mean;
 use super::pyramid::Pyramid;
 use super::rounded::Rounded;
 use super::sampler::Sampler;
-use super::targets::Targets;
+use super::targets::targets;
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
@@ -70,7 +70,7 @@ pub struct TuneJob<'a> {
 pub struct Tuner<'a> {
     pub(super) job: TuneJob<'a>,
     choices: OnceCell<Choices>,
-    targets: OnceCell<Targets>,
+    targets: OnceCell<Arc<Scene>>,
     adopted: RefCell<Option<(Vec<WeightArray>, f64)>>,
 }
 
@@ -87,16 +87,16 @@ impl<'a> Tuner<'a> {
     pub fn new(job: TuneJob<'a>) -> Self {
         Self { job, choices: OnceCell::new(), targets: OnceCell::new(), adopted: RefCell::default() }
     }
-    /// The same tuner with images to train on that are there already.
-    pub(super) fn with_targets(self, targets: Targets) -> Self {
+    /// The same tuner with the scene whose images it trains on.
+    pub(super) fn with_targets(self, targets: Arc<Scene>) -> Self {
         Self { targets: OnceCell::from(targets), ..self }
     }
-    /// The images to train on.
-    pub(super) fn targets(&self) -> Result<&Targets> {
+    /// The scene with the images to train on.
+    pub(super) fn targets(&self) -> Result<&Arc<Scene>> {
         if let Some(known) = self.targets.get() {
             return Ok(known);
         }
-        let found = Targets::of(&self.job)?;
+        let found = targets(&self.job)?;
         Ok(self.targets.get_or_init(|| found))
     }
     fn choices(&self) -> Result<&Choices> {
@@ -130,7 +130,7 @@ impl<'a> Tuner<'a> {
     /// Calls `work` with the parts of a training and the state of `model`.
     pub(super) fn with_state<T>(&self, model: &TunedModel, seed: Seed, work: impl FnOnce(&Context, &mut TrainState) -> Result<T>) -> Result<T> {
         let TuneJob { registry, device, events, stop, .. } = &self.job;
-        let (config, scene) = (&self.choices()?.config, &self.targets()?.scene);
+        let (config, scene) = (&self.choices()?.config, self.targets()?);
         let training_camera = training_cameras(scene);
         let parts = Parts {
             appearance: registry.build_appearance(&config.appearance, &AppearanceContext { cameras: training_camera.len(), seed }, device)?,
@@ -199,8 +199,8 @@ impl<'a> Tuner<'a> {
     }
     /// Mean absolute error of `gaussians`, as they are, on a few training views.
     fn mean_error(&self, context: &Context, state: &mut TrainState, gaussians: &HostGaussians) -> Result<f64> {
-        let Targets { scene, views } = self.targets()?;
-        let views = spread_views(scene, views, PROBES);
+        let scene = self.targets()?;
+        let views = spread_views(scene, &scene.split(Split::Train), PROBES);
         let set = GaussianSet::new(gaussians, self.job.device).gaussians()?;
         let (background, requests) = (self.choices()?.config.background()?, views.iter().map(|&v| (v, scene.views[v].time_norm)).collect::<Vec<_>>());
         let mut sum = 0.0;
@@ -270,7 +270,7 @@ impl TuneModel for Tuner<'_> {
             let lost = self.mean_error(context, state, &tuning.rounding.round(&from.gaussians)?)? - self.mean_error(context, state, &from.gaussians)?;
             // Where all steps are as large as they should be, an octave more of them costs as much as it saves; a step's error adds in proportion to its square.
             let per_bit = tuning.size_weight * 2.0 * std::f64::consts::LN_2 * lost.max(0.0) / tuning.bits_per_octave;
-            let mut sampler = Sampler::new(self.targets()?.views.clone(), tuning.seed.child("views"), BATCH);
+            let mut sampler = Sampler::new(self.job.scene.split(Split::Train), tuning.seed.child("views"), BATCH);
             // Nothing is logged.
             let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);
             for iteration in 1..=tuning.iterations {
@@ -305,7 +305,8 @@ impl TuneModel for Tuner<'_> {
             Some(factor) => self.rounded_weights(weights, &self.weight_settings(factor)?)?,
             None => weights.to_vec(),
         };
-        let scene = &self.job.scene;
+        // Images of cameras with colours of their own would hide what is lost.
+        let scene = self.targets()?;
         let views = judges(scene);
         let model = TunedModel { gaussians: gaussians.clone(), weights };
         let mut sum = 0.0;
