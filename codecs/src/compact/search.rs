@@ -158,7 +158,12 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
     let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
-    if let Some(tuner) = tuner {
+    let caution = tuner.filter(|_| !settings.finetune_wanted).map(|t| t.caution()).transpose()?.flatten();
+    if let Some(why) = &caution {
+        let message = format!("the model is not fine-tuned: {why}. --set finetune={} does it all the same", settings.finetune);
+        context.events.emit(&Event::Warning { object: object.into(), message });
+    }
+    if let Some(tuner) = tuner.filter(|_| caution.is_none()) {
         match tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)? {
             Tuned::Better(attempt) => return Ok(*attempt),
             // It was measured on more views, and with the deformer's weights as they are stored.

@@ -54,6 +54,11 @@ pub struct Tuning<'a> {
 /// Trains a model further on its training views: on their images, in the colours of the model where it was trained with colours per camera. A deformer's weights are
 /// rounded as their own codec stores them.
 pub trait TuneModel {
+    /// Why the model should not be trained further unless the user asks for it, if so.
+    ///
+    /// # Errors
+    /// What the model's configuration reports.
+    fn caution(&self) -> Result<Option<String>>;
     /// `gaussians` with the weights of the model.
     ///
     /// # Errors

@@ -160,9 +160,11 @@ fn colours_per_camera_are_not_learned_by_models_that_were_trained_with_some() {
         prune_and_refit(&mut copy, scene, LIMIT_DB, 60, &job).unwrap();
         bench.psnr(&copy) - before
     };
+    assert_eq!(tinted.tuner(&model, &tinted.never).caution().unwrap(), None);
     let plain = [tuned(&model), refitted(&model)];
     let affine = toml::Table::from_iter([("kind".into(), "affine".into())]);
     model.provenance.config.insert("appearance".into(), affine.into());
+    assert!(tinted.tuner(&model, &tinted.never).caution().unwrap().is_some(), "it is fine-tuned unasked");
     let own = [tuned(&model), refitted(&model)];
     println!(
         "{before:.2} dB; fine-tuned and re-fitted on images with tints {plain:+.2?} dB, as a model that was trained with colours per camera {own:+.2?} dB"

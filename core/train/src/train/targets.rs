@@ -8,7 +8,7 @@ use super::tune::TuneJob;
 use crate::config::RunConfig;
 use crate::sample::spread;
 use cc4dgs_core::{Error, Event, FrameSource, Image8, Result, Scene, Split, config};
-use cc4dgs_play::Player;
+use cc4dgs_play::{Model, Player};
 use glam::{DMat3, DMat4, DVec3, DVec4};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,14 +22,22 @@ const IDENTITY: f64 = 1e-4;
 /// Transforms of a smaller determinant are not undone: what they do to colours is noise.
 const LEAST_DETERMINANT: f64 = 1e-3;
 
+/// Whether `model` was trained with colours per camera.
+///
+/// # Errors
+/// [`Error::Parameter`] for a configuration of another version.
+pub(super) fn had_colours_per_camera(model: &Model) -> Result<bool> {
+    let config: RunConfig = config::parse_section("configuration of the model", &model.provenance.config)?;
+    Ok(config.appearance.get("kind").and_then(|kind| kind.as_str()).unwrap_or("none") != "none")
+}
+
 /// The scene of `job` with the images to train on.
 ///
 /// # Errors
 /// [`Error::Interrupted`], and what scene and device report.
 pub(super) fn targets(job: &TuneJob) -> Result<Arc<Scene>> {
     let scene = &job.scene;
-    let config: RunConfig = config::parse_section("configuration of the model", &job.model.provenance.config)?;
-    if config.appearance.get("kind").and_then(|kind| kind.as_str()).unwrap_or("none") == "none" {
+    if !had_colours_per_camera(job.model)? {
         return Ok(scene.clone());
     }
     let mut views: BTreeMap<usize, Vec<usize>> = BTreeMap::new();

@@ -6,7 +6,7 @@ use super::probe::mean;
 use super::pyramid::Pyramid;
 use super::rounded::Rounded;
 use super::sampler::Sampler;
-use super::targets::targets;
+use super::targets::{had_colours_per_camera, targets};
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
 use crate::config::RunConfig;
 use crate::gaussian_set::GaussianSet;
@@ -258,6 +258,10 @@ pub(super) fn rate_at(done: f64) -> f64 {
 }
 
 impl TuneModel for Tuner<'_> {
+    fn caution(&self) -> Result<Option<String>> {
+        let why = "it was trained with colours per camera; what such models gain on training views may be lost on others";
+        Ok(had_colours_per_camera(self.job.model)?.then(|| why.into()))
+    }
     fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
         let weights = self.moving_field().map(|f| weights_of(f.field.as_ref())).transpose()?.unwrap_or_default();
         Ok(TunedModel { gaussians: gaussians.clone(), weights })
