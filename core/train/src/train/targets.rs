@@ -64,12 +64,18 @@ pub(super) fn targets(job: &TuneJob) -> Result<Arc<Scene>> {
 }
 
 /// The affine transform of colours that is best in the sense of least squares.
-#[derive(Default)]
 struct Fit {
     /// Sums of products of the colours before (and 1), with each other and with the colours after.
     products: DMat4,
     with_after: [DVec4; 3],
     count: usize,
+}
+
+impl Default for Fit {
+    fn default() -> Self {
+        // The default of a matrix is the identity.
+        Self { products: DMat4::ZERO, with_after: [DVec4::ZERO; 3], count: 0 }
+    }
 }
 
 impl Fit {
