@@ -19,7 +19,7 @@ import sys
 import time
 import tomllib
 
-from trainings import TRAINED, Rows, sha256
+from trainings import TRAINED, Rows, let_end, sha256
 
 # Name, scene, minutes, settings, and the PSNR in dB it is meant to reach.
 RUNS = [
@@ -52,11 +52,7 @@ def measured(arguments, file):
     try:
         _, status, usage = os.wait4(child.pid, 0)
     except BaseException:
-        # It was interrupted too, and may be writing its checkpoint.
-        try:
-            child.wait(60)
-        except subprocess.TimeoutExpired:
-            child.kill()
+        let_end(child)
         raise
     child.returncode = os.waitstatus_to_exitcode(status)
     return child.returncode, round(usage.ru_maxrss * 1024 / 1e6, 1)

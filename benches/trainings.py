@@ -52,6 +52,14 @@ def begin(arguments, **streams):
     return subprocess.Popen(arguments, **streams)
 
 
+def let_end(child):
+    """Gives a process that was interrupted, too, a minute to write its checkpoint."""
+    try:
+        child.wait(60)
+    except subprocess.TimeoutExpired:
+        child.kill()
+
+
 def ended(child, seconds=None):
     """Exit code of a process, or `None` if it takes more than `seconds`. Ctrl-C interrupts it, too: it gets a minute to write its checkpoint, and nothing goes on."""
     try:
@@ -59,10 +67,7 @@ def ended(child, seconds=None):
     except subprocess.TimeoutExpired:
         return None
     except BaseException:
-        try:
-            child.wait(60)
-        except subprocess.TimeoutExpired:
-            child.kill()
+        let_end(child)
         raise
     # In a thread: the process may be told before the main thread is.
     if INTERRUPTED.wait(1 if code in (130, -signal.SIGINT) else 0):
