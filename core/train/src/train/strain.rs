@@ -11,56 +11,92 @@ const FAR: f32 = 4.0;
 /// Least squared distance over the canonical one: the root has no gradient at 0.
 const LEAST: f32 = 1e-8;
 
+/// Neighbours of one Gaussian at most; those nearest to each other count first. Three are looked for, and each may be found by others.
+const MOST: usize = 8;
+
 /// Neighbouring moving Gaussians.
 #[derive(Clone, Debug)]
 pub struct Neighbours {
     /// The canonical centres they were found by `[3 M]`.
     means: Arc<Vec<f32>>,
     /// `None` where no pair is near enough.
-    pairs: Option<Pairs>,
+    lists: Option<Lists>,
 }
 
-/// Pairs of neighbours.
+/// The neighbours of each of M Gaussians, `most` of them; whoever has fewer has itself instead, with a weight of 0. Everybody is among the neighbours of its neighbours,
+/// so that the gradient of a Gaussian is a sum over its own list: nothing is scattered, which burn does with one thread per column on graphics cards.
 #[derive(Clone, Debug)]
-struct Pairs {
-    first: Tensor<1, Int>,
-    second: Tensor<1, Int>,
-    /// From the second to the first, in the canonical space, over their distance `[P,3]`.
-    directions: Tensor<2>,
-    /// One over their distance `[P,1]`.
-    inverse: Tensor<2>,
+struct Lists {
+    most: usize,
+    /// Rows of the neighbours `[M most]`.
+    rows: Tensor<1, Int>,
+    /// From the neighbour to the Gaussian, in the canonical space, over their distance `[M,most,3]`.
+    directions: Tensor<3>,
+    /// One over their distance `[M,most,1]`.
+    inverse: Tensor<3>,
+    /// 2 where both are among the three nearest of the other, else 1, over the sum of the weights of all pairs `[M,most,1]`.
+    weights: Tensor<3>,
 }
 
-impl Pairs {
+/// Pairs of neighbours (i, j, their distance, 1 or 2), nearest first, with i < j; see [`Neighbours::of`].
+fn pairs(points: &[[f32; 3]]) -> Vec<(usize, usize, f32, f32)> {
+    let mut pairs: Vec<(usize, usize, f32, f32)> = nearest::<3>(points)
+        .iter()
+        .enumerate()
+        .flat_map(|(i, found)| found.iter().map(move |n| (i, n.index as usize, n.squared.sqrt())))
+        .filter(|(_, _, distance)| distance.is_finite() && *distance > 0.0)
+        .map(|(i, j, distance)| (i.min(j), i.max(j), distance, 1.0))
+        .collect();
+    let mut distances: Vec<f32> = pairs.iter().map(|pair| pair.2).collect();
+    distances.sort_unstable_by(f32::total_cmp);
+    let most = distances.get(distances.len() / 2).map_or(0.0, |median| FAR * median);
+    pairs.retain(|pair| pair.2 <= most);
+    pairs.sort_unstable_by(|a, b| a.2.total_cmp(&b.2).then((a.0, a.1).cmp(&(b.0, b.1))));
+    // Found from both sides.
+    pairs.dedup_by(|later, kept| {
+        let same = (later.0, later.1) == (kept.0, kept.1);
+        kept.3 += if same { later.3 } else { 0.0 };
+        same
+    });
+    pairs
+}
+
+impl Lists {
     /// See [`Neighbours::of`].
     fn of(means: &[f32], device: &Device) -> Option<Self> {
         let points: Vec<[f32; 3]> = means.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
         if points.len() < 2 || points.iter().flatten().any(|v| !v.is_finite()) {
             return None;
         }
-        let pairs: Vec<(usize, usize, f32)> = nearest::<3>(&points)
-            .iter()
-            .enumerate()
-            .flat_map(|(i, found)| found.iter().map(move |n| (i, n.index as usize, n.squared.sqrt())))
-            .filter(|(_, _, distance)| distance.is_finite() && *distance > 0.0)
-            .collect();
-        let mut distances: Vec<f32> = pairs.iter().map(|pair| pair.2).collect();
-        distances.sort_unstable_by(f32::total_cmp);
-        let most = FAR * distances.get(distances.len() / 2)?;
-        let near: Vec<&(usize, usize, f32)> = pairs.iter().filter(|pair| pair.2 <= most).collect();
-        let count = near.len();
-        let index = |pick: fn(&(usize, usize, f32)) -> usize| {
-            let rows: Vec<i64> = near.iter().map(|pair| pick(pair) as i64).collect();
-            Tensor::<1, Int>::from_data(TensorData::new(rows, [count]), device)
-        };
-        let directions: Vec<f32> =
-            near.iter().flat_map(|&&(i, j, d)| (0..3).map(move |k| (i, j, d, k))).map(|(i, j, d, k)| (points[i][k] - points[j][k]) / d).collect();
-        let inverse: Vec<f32> = near.iter().map(|pair| 1.0 / pair.2).collect();
+        let mut lists: Vec<Vec<(usize, f32, f32)>> = vec![Vec::new(); points.len()];
+        let mut total = 0.0f32;
+        for (i, j, distance, weight) in pairs(&points) {
+            if lists[i].len() < MOST && lists[j].len() < MOST {
+                lists[i].push((j, distance, weight));
+                lists[j].push((i, distance, weight));
+                total += weight;
+            }
+        }
+        let most = lists.iter().map(Vec::len).max().filter(|&most| most > 0)?;
+        let count = most * points.len();
+        let (mut rows, mut directions, mut inverse, mut weights) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for (i, list) in lists.iter().enumerate() {
+            for slot in 0..most {
+                // Of length 1 where there is no neighbour, as if neither had moved.
+                let (j, distance, weight) = list.get(slot).copied().unwrap_or((i, f32::INFINITY, 0.0));
+                rows.push(j as i64);
+                directions.extend((0..3).map(|k| if weight > 0.0 { (points[i][k] - points[j][k]) / distance } else { f32::from(u8::from(k == 0)) }));
+                inverse.push(1.0 / distance);
+                weights.push(weight / total);
+            }
+        }
+        let array = |values: Vec<f32>, width: usize| Tensor::<3>::from_data(TensorData::new(values, [points.len(), most, width]), device);
         Some(Self {
-            first: index(|pair| pair.0),
-            second: index(|pair| pair.1),
-            directions: Tensor::from_data(TensorData::new(directions, [count, 3]), device),
-            inverse: Tensor::from_data(TensorData::new(inverse, [count, 1]), device),
+            most,
+            rows: Tensor::from_data(TensorData::new(rows, [count]), device),
+            directions: array(directions, 3),
+            inverse: array(inverse, 1),
+            weights: array(weights, 1),
         })
     }
 }
@@ -68,7 +104,7 @@ impl Pairs {
 impl Neighbours {
     /// The three nearest neighbours of every Gaussian of `means` `[3 M]`.
     pub fn of(means: &[f32], device: &Device) -> Self {
-        Self { means: Arc::new(means.to_vec()), pairs: Pairs::of(means, device) }
+        Self { means: Arc::new(means.to_vec()), lists: Lists::of(means, device) }
     }
     /// The canonical centres they were found by `[3 M]`, for checkpoints: centres have moved since.
     pub fn means(&self) -> &[f32] {
@@ -78,12 +114,18 @@ impl Neighbours {
     /// belong to things that part (Geman and McClure's function). `offsets` are those of the centres `[M,3]`.
     /// `None` without pairs.
     pub fn strain(&self, offsets: Tensor<2>) -> Option<Tensor<1>> {
-        let Pairs { first, second, directions, inverse } = self.pairs.as_ref()?;
-        let difference = offsets.clone().select(0, first.clone()) - offsets.select(0, second.clone());
-        let apart = Tensor::from_inner(directions.clone()) + difference * Tensor::from_inner(inverse.clone());
-        let stretch = (apart.clone() * apart).sum_dim(1).clamp_min(LEAST).sqrt().sub_scalar(1.0);
+        let Lists { most, rows, directions, inverse, weights } = self.lists.as_ref()?;
+        let constant = |values: &Tensor<3>| Tensor::from_inner(values.clone());
+        let count = offsets.dims()[0];
+        // Each pair is in two lists. Neighbours are taken as constants: a Gaussian's own list then gives its whole gradient.
+        let others = offsets.clone().inner().select(0, rows.clone()).reshape([count, *most, 3]);
+        let difference = offsets.reshape([count, 1, 3]) - constant(&others);
+        let apart = constant(directions) + difference * constant(inverse);
+        let stretch = (apart.clone() * apart).sum_dim(2).clamp_min(LEAST).sqrt().sub_scalar(1.0);
         let squares = stretch.clone() * stretch;
-        Some((squares.clone() / squares.add_scalar(1.0)).mean())
+        let twice = (squares.clone() / squares.add_scalar(1.0) * constant(weights)).sum();
+        let once = Tensor::from_inner(twice.clone().inner().mul_scalar(0.5));
+        Some(twice - once)
     }
 }
 
@@ -114,6 +156,20 @@ mod tests {
         assert!((stretched - 0.01 / 1.01).abs() < 1e-4, "{stretched}");
         let apart = strain(&|[x, y, z]| [100.0 * x, 100.0 * y, 100.0 * z]);
         assert!((0.99..=1.0).contains(&apart), "{apart}");
+        // The gradient is that of the value, though neighbours are constants in it.
+        let wiggle: Vec<f32> = (0..90).map(|k| 0.2 * (0.7 * k as f32).sin()).collect();
+        let at = |values: &[f32]| neighbours.strain(Tensor::from_data(TensorData::new(values.to_vec(), [30, 3]), &device)).unwrap();
+        let offsets = Tensor::<2>::from_data(TensorData::new(wiggle.clone(), [30, 3]), &device).require_grad();
+        let gradient = to_vec(offsets.grad(&neighbours.strain(offsets.clone()).unwrap().backward()).unwrap(), "gradient").unwrap();
+        for k in [0, 31, 47, 89] {
+            let moved = |by: f32| {
+                let mut values = wiggle.clone();
+                values[k] += by;
+                to_vec(at(&values), "strain").unwrap()[0]
+            };
+            let expected = (moved(1e-2) - moved(-1e-2)) / 2e-2;
+            assert!((gradient[k] - expected).abs() < 2e-4, "{k}: {} {expected}", gradient[k]);
+        }
         for lonely in [&[0.0; 3][..], &[0.0; 6], &[f32::NAN; 6]] {
             let neighbours = Neighbours::of(lonely, &Device::flex());
             assert_eq!(neighbours.means().len(), lonely.len());
