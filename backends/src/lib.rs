@@ -12,6 +12,7 @@ pub mod ops {
     pub mod adam;
     mod autodiff;
     pub mod basis;
+    pub mod colors;
     pub mod columns;
     pub mod corners;
     pub mod field;
@@ -31,6 +32,7 @@ pub mod ops {
 pub mod cpu {
     pub mod adam;
     pub mod basis;
+    pub mod colors;
     pub mod columns;
     pub mod cross_entropy;
     pub mod heads;
@@ -55,6 +57,7 @@ pub mod cpu {
 mod cube {
     mod adam;
     mod basis;
+    mod colors;
     mod cross_entropy;
     pub(crate) mod field;
     mod image;

@@ -166,8 +166,7 @@ impl BasisBackward for CubeBackend {
         let (c, g) = (coefficients.into_buffer_arg(), grad.into_buffer_arg());
         let (p, parts) = (plan.into_buffer_arg(), partial.clone().into_buffer_arg());
         function_parts::launch(&client, workgroups_for(segments * count), dim, c, g, p, parts, rows as u32, shape.outputs() as u32, count as u32);
-        let (parts, sums) = (partial.into_buffer_arg(), out.clone().into_buffer_arg());
-        add_segments::launch(&client, workgroups_for(count), dim, parts, sums, count as u32, segments as u32, 0, false);
+        add_segments(partial, &out, count, segments, 0, false);
         out
     }
 }

@@ -4,6 +4,7 @@
 //! common to all cameras out of the Gaussians. Held-out cameras see the rendered image, which is the mean.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use cc4dgs_backends::ops::colors::{NUMBERS, affine_colors};
 use cc4dgs_core::{Appearance, AppearanceContext, AppearancePlugin, Error, Parameter, ParameterGroup, Part, Plugin, Result, config, inventory};
 use serde::Deserialize;
 
@@ -11,8 +12,8 @@ const SCHEMA: &str = "\
 lr = 1e-3                # learning rate of matrices and offsets
 identity = 1e-3          # weight of the squared distance from the identity, mean over cameras (FreeTimeGS++: 1e-3)
 ";
-/// Weights per camera: nine of the matrix, three of the offset.
-const NUMBERS: usize = 12;
+/// The transform that changes nothing: the rows of the matrix, then the offset.
+const IDENTITY: [f32; NUMBERS] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
 
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -48,13 +49,9 @@ impl Appearance for Affine {
         if camera >= self.cameras {
             return Err(Error::parameter("appearance affine", format!("camera {camera} of {}", self.cameras), "Report this as a defect"));
         }
-        let [count, height, width] = planes.dims();
         let own = self.differences().narrow(0, camera, 1).reshape([NUMBERS]);
-        let matrix = own.clone().narrow(0, 0, 9).reshape([3, 3]);
-        let offset = own.narrow(0, 9, 3).reshape([3, 1]);
-        let rgb = planes.clone().narrow(0, 0, 3).reshape([3, height * width]);
-        let recorded = (rgb.clone() + matrix.matmul(rgb) + offset).reshape([3, height, width]);
-        Ok(Tensor::cat(vec![recorded, planes.narrow(0, 3, count - 3)], 0))
+        let identity = Tensor::from_floats(IDENTITY, &own.device());
+        affine_colors(planes, own + identity)
     }
     fn parameters(&self) -> Vec<&Parameter> {
         self.parameters.iter().collect()

@@ -11,6 +11,7 @@ mod checkpoints;
 mod checks;
 mod codec_context;
 mod codecs;
+mod colors;
 mod columns;
 mod conformance;
 mod end_to_end;

@@ -187,19 +187,45 @@ fn norm_parts(
     }
 }
 
-/// Adds the segments up, into `gradient` at `at`, on top of what is there if `add`.
+/// Columns and slices of a workgroup of [`add_segments`].
+const COLUMNS: usize = 32;
+const SLICES: usize = THREADS as usize / COLUMNS;
+
+/// Adds the segments up, into `gradient` at `at`, on top of what is there if `add`. A workgroup has few columns: slices of the segments, then the slices.
 #[cube(launch)]
-pub fn add_segments(partial: &[f32], gradient: &mut [f32], width: u32, segments: u32, at: u32, #[comptime] add: bool) {
-    if ABSOLUTE_POS < width as usize {
-        let mut sum = 0.0f32;
-        for segment in 0..segments as usize {
-            sum += partial[segment * width as usize + ABSOLUTE_POS];
+fn add_segments_kernel(partial: &[f32], gradient: &mut [f32], width: u32, segments: u32, at: u32, #[comptime] add: bool) {
+    let mut slices = Shared::<[f32]>::new_slice(comptime!(COLUMNS * SLICES));
+    let thread = UNIT_POS as usize;
+    let (slice, width) = (thread / COLUMNS, width as usize);
+    let column = CUBE_POS * COLUMNS + thread % COLUMNS;
+    let mut sum = 0.0f32;
+    if column < width {
+        let mut segment = slice;
+        while segment < segments as usize {
+            sum += partial[segment * width + column];
+            segment += SLICES;
+        }
+    }
+    slices[thread] = sum;
+    sync_cube();
+    if slice == 0 && column < width {
+        let mut total = 0.0f32;
+        #[unroll]
+        for k in 0..SLICES {
+            total += slices[k * COLUMNS + thread];
         }
         if comptime!(add) {
-            sum += gradient[at as usize + ABSOLUTE_POS];
+            total += gradient[at as usize + column];
         }
-        gradient[at as usize + ABSOLUTE_POS] = sum;
+        gradient[at as usize + column] = total;
     }
+}
+
+/// Adds up `segments` rows of `width` floats of `partial`, into `gradient` from `at` on, on top of what is there if `add`.
+pub fn add_segments(partial: CubeTensor, gradient: &CubeTensor, width: usize, segments: usize, at: usize, add: bool) {
+    let (p, to) = (partial.into_buffer_arg(), gradient.clone().into_buffer_arg());
+    let (client, count) = (gradient.client.clone(), spread(width.div_ceil(COLUMNS)));
+    add_segments_kernel::launch(&client, count, dim(), p, to, width as u32, segments as u32, at as u32, add);
 }
 
 /// The weights, then each matrix transposed at its own index: plan `[layers, 3]` holds index, inputs and outputs.
@@ -259,8 +285,7 @@ impl Sums<'_> {
         self.listed.map_or_else(|| (signed(self.gradient.clone()), 0), |(vertices, first)| (vertices.clone(), first as u32))
     }
     fn finish(&self, partial: CubeTensor, width: usize, segments: usize, at: usize) {
-        let (p, to) = (partial.into_buffer_arg(), self.gradient.clone().into_buffer_arg());
-        add_segments::launch(&self.gradient.client, workgroups_for(width), dim(), p, to, width as u32, segments as u32, at as u32, self.add);
+        add_segments(partial, self.gradient, width, segments, at, self.add);
     }
     /// Gradient of W and b of layer `l` from its input and the gradient of its output.
     pub fn of_layer(&self, x: Rows, dy: Rows, l: Dense) {

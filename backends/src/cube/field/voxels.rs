@@ -103,17 +103,36 @@ fn interpolate_corners(features: &[f32], corners: &[i32], weights: &[f32], out: 
     }
 }
 
-/// Gradient `[U,F]` of the features: each vertex visits its slots in order, so nothing is scattered.
+/// Slices of the slots of a vertex where vertices have many.
+const SLICES: usize = 8;
+
+/// Gradient `[U,F]` of the features: each vertex visits its slots in order, in `slices` slices that are added up in order, so nothing is scattered.
 #[cube(launch)]
-fn gather_gradients(grad: &[f32], weights: &[f32], slots: &[i32], starts: &[i32], out: &mut [f32], width: u32) {
-    if ABSOLUTE_POS < out.len() {
-        let (vertex, f) = (ABSOLUTE_POS / width as usize, ABSOLUTE_POS % width as usize);
-        let mut sum = 0.0f32;
-        for index in starts[vertex] as u32..starts[vertex + 1] as u32 {
-            let slot = slots[index as usize] as usize;
+fn gather_gradients(grad: &[f32], weights: &[f32], slots: &[i32], starts: &[i32], out: &mut [f32], width: u32, #[comptime] slices: usize) {
+    let mut sums = Shared::<[f32]>::new_slice(THREADS as usize);
+    let per = comptime!(THREADS as usize / slices);
+    let thread = UNIT_POS as usize;
+    let (slice, item) = (thread / per, CUBE_POS * per + thread % per);
+    let mut sum = 0.0f32;
+    if item < out.len() {
+        let (vertex, f) = (item / width as usize, item % width as usize);
+        let mut index = starts[vertex] as usize + slice;
+        let end = starts[vertex + 1] as usize;
+        while index < end {
+            let slot = slots[index] as usize;
             sum += weights[slot] * grad[slot / 8 * width as usize + f];
+            index += slices;
         }
-        out[ABSOLUTE_POS] = sum;
+    }
+    sums[thread] = sum;
+    sync_cube();
+    if slice == 0 && item < out.len() {
+        let mut total = 0.0f32;
+        #[unroll]
+        for k in 0..slices {
+            total += sums[k * per + thread];
+        }
+        out[item] = total;
     }
 }
 
@@ -203,8 +222,10 @@ pub fn interpolate_backward(grad: CubeTensor, weights: CubeTensor, slots: CubeTe
     let vertices = starts.meta.shape().num_elements().saturating_sub(1);
     let out = floats(&grad, [vertices, width]);
     let client = grad.client.clone();
+    // Few vertices are few threads, each with many slots.
+    let slices = if slots.meta.shape().num_elements() >= 2 * SLICES * vertices { SLICES } else { 1 };
     let (g, w) = (grad.into_buffer_arg(), weights.into_buffer_arg());
     let (s, st, o) = (slots.into_buffer_arg(), starts.into_buffer_arg(), out.clone().into_buffer_arg());
-    gather_gradients::launch(&client, workgroups_for(vertices * width), CubeDim::new_1d(THREADS), g, w, s, st, o, width as u32);
+    gather_gradients::launch(&client, workgroups_for(vertices * width * slices), CubeDim::new_1d(THREADS), g, w, s, st, o, width as u32, slices);
     out
 }

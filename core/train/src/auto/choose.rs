@@ -9,6 +9,9 @@ use toml::Value;
 const PIXELS_PER_THREAD_MINUTE: f64 = 1.0e4;
 /// How many threads a graphics card stands for.
 const GRAPHICS_THREADS: f64 = 100.0;
+/// Minutes of a graphics card from which fields have their full size. An H200 takes 50 ms for all views of an iteration with it for 60,000 moving Gaussians, and 3
+/// to 4 ms per view for the rest.
+const FULL_SIZE_MINUTES: f64 = 10.0;
 /// Images up to this much larger than that are left as they are.
 const SPARE: f64 = 1.4;
 /// Fewest pixels that images are reduced to.
@@ -162,7 +165,8 @@ fn key_frames(facts: &Facts, machine: Machine, minutes: f64) -> Option<usize> {
         return None;
     }
     let image = facts.pixels().min(MOST_MATCHED_PIXELS) * facts.cameras as f64;
-    let affordable = MATCHING_SHARE * 60.0 * minutes * machine.speed() / (SECONDS_PER_MATCHED_PIXEL * image.max(1.0));
+    // Images are matched by the processor on every machine.
+    let affordable = MATCHING_SHARE * 60.0 * minutes * machine.threads.max(1) as f64 / (SECONDS_PER_MATCHED_PIXEL * image.max(1.0));
     let points = (1.0 - AT_START) * most_gaussians(facts, machine, minutes) / LEAST_KEY_POINTS;
     let every = (facts.frames as f64 / affordable.min(points).max(1.0)).ceil().max(LEAST_KEY_INTERVAL) as usize;
     (every <= MOST_KEY_INTERVAL && facts.frames >= 2 * every).then_some(every)
@@ -190,7 +194,7 @@ fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize
     if short && facts.arrangement == Arrangement::OneCameraAnywhere {
         settings.push(("deformer.sparsity", Value::Float(0.0)));
     }
-    if !machine.graphics {
+    if !machine.graphics || minutes < FULL_SIZE_MINUTES {
         settings.push(("deformer.capacity", "small".into()));
         let resolutions: &[i64] = if short { &[8, 16, 32] } else { &[8, 16, 32, 64] };
         settings.push(("deformer.resolutions", Value::Array(resolutions.iter().map(|&r| Value::Integer(r)).collect())));

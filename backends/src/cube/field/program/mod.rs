@@ -140,6 +140,18 @@ impl Layout {
     fn threads(&self) -> usize {
         self.tile * self.per_row
     }
+    /// Columns that all threads together compute at once.
+    fn columns(&self) -> usize {
+        self.per_row * BLOCK * BLOCK
+    }
+    /// Inputs of a multiplication that are staged at a time.
+    fn chunk(&self) -> usize {
+        if self.per_row > 4 { 4 } else { 8 }
+    }
+    /// Bytes of shared memory.
+    fn bytes(&self) -> usize {
+        4 * (self.tile * (self.stride * self.tiles + PARTS) + self.chunk() * (self.tile + self.columns()))
+    }
 }
 
 /// The floats that the scales of [`Step::Norm`] take for so many rows, whatever the layout: each thread saves its own.
@@ -150,7 +162,7 @@ pub fn scales(rows: usize) -> usize {
 
 /// 0..`rows` in parts for which `floats_per_row` fit a buffer of moderate size. Parts start at multiples of 64 rows.
 pub fn parts(like: &CubeTensor, rows: usize, floats_per_row: usize) -> Vec<Range<usize>> {
-    const MODERATE: u64 = 256 << 20;
+    const MODERATE: u64 = 512 << 20;
     let fit = binding_bytes(&like.client).min(MODERATE) / (4 * floats_per_row.max(1)) as u64;
     let step = (fit as usize / 64 * 64).max(64);
     (0..rows).step_by(step).map(|first| first..(first + step).min(rows)).collect()
@@ -174,10 +186,10 @@ impl Program {
         let widest = in_place.max().unwrap_or(0);
         // A layer that overwrites its own tile must be done in one pass: as many threads as blocks.
         let per_row = widest.div_ceil(BLOCK * BLOCK).max(2).next_power_of_two();
-        let fits = |tile: &usize| 4 * tile * (stride * tiles + PARTS) <= shared_bytes && per_row <= PARTS && tile * per_row <= MAX_THREADS;
+        let fits = |layout: &Layout| layout.bytes() <= shared_bytes && per_row <= PARTS && layout.threads() <= MAX_THREADS;
         let least = TILES[TILES.len() - 1];
-        let tile = TILES.into_iter().filter(fits).find(|&tile| tile == least || rows >= tile * ENOUGH_WORKGROUPS)?;
-        Some(Layout { tile, stride, tiles, per_row })
+        let layouts = TILES.map(|tile| Layout { tile, stride, tiles, per_row });
+        layouts.into_iter().filter(fits).find(|layout| layout.tile == least || rows >= layout.tile * ENOUGH_WORKGROUPS)
     }
     /// The layout on the device of `like`.
     pub fn layout_on(&self, like: &CubeTensor, input: usize, rows: usize) -> Option<Layout> {

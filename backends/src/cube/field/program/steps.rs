@@ -10,8 +10,11 @@ use crate::cube::field::decoder::signature;
 use cc4dgs_fields::networks::LAYER_NORM_EPSILON as EPSILON;
 use cubecl::prelude::*;
 
-/// Rows and columns a thread computes: 64 sums for 16 loads.
+/// Rows and columns a thread computes.
 pub const BLOCK: usize = 8;
+
+/// Four floats that one instruction loads.
+type Four = Vector<f32, Const<4>>;
 
 /// Whether a row of `vertices` `[U,3]` holds one; rows without a vertex come last.
 #[cube]
@@ -41,6 +44,9 @@ pub fn run_steps(
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
     let mut tiles = Shared::<[f32]>::new_slice(comptime!(layout.tile * layout.stride * layout.tiles));
     let mut partial = Shared::<[f32]>::new_slice(comptime!(PARTS * layout.tile));
+    // What a multiplication works on: four inputs of a row, or their weights to a column, in a vector; `[chunk / 4, tile]` and `[chunk / 4, columns]`.
+    let mut rows = Shared::<[Four]>::new_slice(comptime!(layout.chunk() / 4 * layout.tile));
+    let mut factors = Shared::<[Four]>::new_slice(comptime!(layout.chunk() / 4 * layout.columns()));
     let (first, count, start) = (CUBE_POS * tile, count as usize, start as usize);
     let inputs = inputs as usize;
     let mut steps = steps as usize;
@@ -66,7 +72,7 @@ pub fn run_steps(
         let at = FIELDS * step;
         let kind = plan[at + KIND];
         if kind == MULTIPLY {
-            multiply(&mut tiles, weights, plan, out, at, first, count, layout);
+            multiply(&mut tiles, &mut rows, &mut factors, weights, plan, out, at, first, count, layout);
         } else if kind == LOAD {
             load(&mut tiles, given, plan, at, first, count, start, layout);
         } else if kind == SAVE {
@@ -82,56 +88,118 @@ pub fn run_steps(
     }
 }
 
-/// A thread computes a block of rows and, `across` apart, a few columns, so that neighbouring threads read neighbouring weights.
+/// Brings the inputs from `i` on of every row, and their weights to `columns` columns from `first` on, into shared memory; zeros where they end.
 #[cube]
-fn multiply(tiles: &mut Shared<[f32]>, weights: &[f32], plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+fn stage(
+    rows: &mut Shared<[Four]>,
+    factors: &mut Shared<[Four]>,
+    tiles: &Shared<[f32]>,
+    weights: &[f32],
+    source: usize,
+    matrix: usize,
+    i: usize,
+    input: usize,
+    first: usize,
+    columns: usize,
+    output: usize,
+    #[comptime] layout: Layout,
+) {
+    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
+    let mut index = UNIT_POS as usize;
+    while index < comptime!(layout.chunk() / 4 * layout.tile) {
+        let (r, from) = (index % tile, i + index / tile * 4);
+        let mut four = Four::new(0.0f32);
+        #[unroll]
+        for v in 0..4usize {
+            if from + v < input {
+                four.insert(v, tiles[source + r * stride + from + v]);
+            }
+        }
+        rows[index] = four;
+        index += comptime!(layout.threads());
+    }
+    let mut index = UNIT_POS as usize;
+    while index < comptime!(layout.chunk() / 4) * columns {
+        let (column, from) = (first + index % columns, i + index / columns * 4);
+        let mut four = Four::new(0.0f32);
+        #[unroll]
+        for v in 0..4usize {
+            if from + v < input && column < output {
+                four.insert(v, weights[matrix + (from + v) * output + column]);
+            }
+        }
+        factors[index] = four;
+        index += comptime!(layout.threads());
+    }
+}
+
+/// A thread computes a block of rows and, `across` apart, a few columns. Inputs and weights go through shared memory in vectors of four, chunk by chunk: a thread does
+/// 256 multiplications for 16 loads.
+#[cube]
+fn multiply(
+    tiles: &mut Shared<[f32]>,
+    rows: &mut Shared<[Four]>,
+    factors: &mut Shared<[Four]>,
+    weights: &[f32],
+    plan: &[u32],
+    out: &mut [f32],
+    at: usize,
+    first: usize,
+    count: usize,
+    #[comptime] layout: Layout,
+) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
     let (source, target) = (plan[at + TILE] as usize, plan[at + TARGET] as usize);
     let (input, output) = (plan[at + WIDTH] as usize, plan[at + OUTPUT] as usize);
     let (matrix, bias, flags) = (plan[at + WEIGHTS] as usize, plan[at + BIAS], plan[at + FLAGS]);
     let result = plan[at + AT] as usize;
-    let threads = comptime!(layout.threads());
-    let across = output.div_ceil(BLOCK);
-    let blocks = across * comptime!(layout.tile / BLOCK);
-    for pass in 0..blocks.div_ceil(threads) {
-        let block = pass * threads + UNIT_POS as usize;
-        let active = block < blocks;
-        let (row, column) = (block / across * BLOCK, block % across);
+    let (all, most) = (output.div_ceil(BLOCK), comptime!(layout.columns() / BLOCK));
+    for pass in 0..all.div_ceil(most) {
+        let left = all - pass * most;
+        let across = select(left < most, left, most);
+        let begin = pass * comptime!(layout.columns());
+        let thread = UNIT_POS as usize;
+        let active = thread < across * comptime!(layout.tile / BLOCK);
+        let (row, column) = (thread / across * BLOCK, thread % across);
         let mut sums = Array::<f32>::new(comptime!(BLOCK * BLOCK));
-        if active {
-            #[unroll]
-            for k in 0..comptime!(BLOCK * BLOCK) {
-                sums[k] = 0.0f32;
-            }
-            let mut own = Array::<usize>::new(BLOCK);
-            #[unroll]
-            for c in 0..BLOCK {
-                // Columns beyond the last repeat it; they are not written.
-                own[c] = matrix + select(column + c * across < output, column + c * across, output - 1);
-            }
-            let from = source * (tile * stride) + row * stride;
-            let mut factors = Array::<f32>::new(BLOCK);
-            for i in 0..input {
+        #[unroll]
+        for k in 0..comptime!(BLOCK * BLOCK) {
+            sums[k] = 0.0f32;
+        }
+        for chunk in 0..input.div_ceil(comptime!(layout.chunk())) {
+            // Every thread is done with the chunk before.
+            sync_cube();
+            let i = chunk * comptime!(layout.chunk());
+            stage(rows, factors, &*tiles, weights, source * (tile * stride), matrix, i, input, begin, across * BLOCK, output, layout);
+            sync_cube();
+            if active {
                 #[unroll]
-                for c in 0..BLOCK {
-                    factors[c] = weights[own[c] + i * output];
-                }
-                #[unroll]
-                for r in 0..BLOCK {
-                    let value = tiles[from + r * stride + i];
+                for k in 0..comptime!(layout.chunk() / 4) {
+                    let mut own = Array::<Four>::new(BLOCK);
+                    #[unroll]
+                    for r in 0..BLOCK {
+                        own[r] = rows[k * tile + row + r];
+                    }
                     #[unroll]
                     for c in 0..BLOCK {
-                        sums[r * BLOCK + c] = fma(value, factors[c], sums[r * BLOCK + c]);
+                        let four = factors[k * (across * BLOCK) + column + c * across];
+                        #[unroll]
+                        for v in 0..4usize {
+                            let factor = four.extract(v);
+                            #[unroll]
+                            for r in 0..BLOCK {
+                                sums[r * BLOCK + c] = fma(own[r].extract(v), factor, sums[r * BLOCK + c]);
+                            }
+                        }
                     }
                 }
             }
         }
-        // Every thread has read before any writes to the same tile.
-        sync_cube();
+        // All of the source has been staged before any thread writes to the same tile.
         if active {
             #[unroll]
             for c in 0..BLOCK {
-                let own = column + c * across;
+                let own = begin + column + c * across;
                 if own < output {
                     let mut shift = 0.0f32;
                     if bias != NONE {

@@ -79,3 +79,15 @@ fn images_shrink_to_the_time() {
     assert!((500..700).contains(&width), "{width}");
     assert!(image_size([1920, 1080], &SceneOptions { width: 700, ..options }, MACHINE, 10.0).is_none());
 }
+
+#[test]
+fn short_runs_on_graphics_cards_have_small_fields_and_match_images_with_the_processor() {
+    let card = Machine { graphics: true, ..MACHINE };
+    let object = Facts { transparent: 0.5, ..facts(Arrangement::OneCameraAnywhere) };
+    for (minutes, small) in [(3.0, true), (30.0, false)] {
+        assert_eq!(value(&choose(&object, card, minutes, true), "deformer.capacity").is_some(), small, "{minutes}");
+    }
+    let rig = Facts { frames: 300, ..facts(Arrangement::Rig) };
+    let every = |threads| key_frames(&rig, Machine { threads, ..card }, 3.0);
+    assert!(every(16) < every(2) || every(2).is_none(), "{:?} {:?}", every(16), every(2));
+}
