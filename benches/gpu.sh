@@ -53,7 +53,7 @@ export XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-${TMPDIR:-/tmp}}"
 
 scenes=(dnerf_mutant:800 panoptic_basketball:640)
 # Results of an earlier call, of another program say, must not pass for those of this one.
-rm -f "$out"/{doctor,step,frame,frame-basis,train-step,field,loss,sort,kernels-{frame,step,field}{,-stopped},growth}.{json,log}
+rm -f "$out"/{doctor,step,frame,frame-basis,train-step,field,loss,sort,kernels-{frame,step,field,train-turntable,train-exposure}{,-stopped},growth}.{json,log}
 [ -z "$player" ] || rm -f "$out"/{player-model,player}.{json,log} "$out/player.cc4d"
 for scene in ${minutes:+"${scenes[@]%%:*}"}; do
     rm -f "$out/$scene"-{train,eval,compress,eval-compressed}.{json,log} "$out/$scene.cc4d" "$out/$scene/checkpoint"
@@ -110,16 +110,24 @@ kernels() {
 
 step doctor 60 doctor
 moving=$(awk "BEGIN { n = int(40000 * $scale); print (n > 1 ? n : 1) }")
+# The same field in burn's primitives, which takes a hundred times as long, decides how many it can be compared for.
+compared=$((moving / 20 + 1))
 step step "$limit" bench step --device "$device" --repeats "$repeats"
 step frame "$limit" bench frame --device "$device" --scale "$scale" --frames "$frames"
 step frame-basis "$limit" bench frame --device "$device" --scale "$scale" --frames "$frames" --set deformer.kind=cdf-basis
 step train-step "$limit" bench step --device "$device" --case n3dv --scale "$scale" --repeats "$repeats"
-step field "$limit" bench field --device "$device" --gaussians "$moving" --repeats "$repeats"
+step field "$limit" bench field --device "$device" --gaussians "$compared" --repeats "$repeats"
 step loss "$limit" bench loss --device "$device" --megapixels "$(awk "BEGIN { print 1.4 * $scale \",\" 2.2 * $scale }")"
 step sort "$limit" bench sort --device "$device" --pairs "$(awk "BEGIN { print int(1000000 * $scale) \",\" int(4000000 * $scale) }")"
 kernels kernels-frame bench frame --device "$device" --case n3dv --scale "$scale" --frames "$frames"
 kernels kernels-step bench step --device "$device" --case n3dv --scale "$scale" --repeats "$repeats"
-kernels kernels-field bench field --device "$device" --gaussians "$moving" --repeats "$repeats"
+kernels kernels-field bench field --device "$device" --gaussians "$compared" --repeats "$repeats"
+# Trainings of a moment: of an object that moves, and with colours of cameras.
+for capture in turntable exposure; do
+    kernels "kernels-train-$capture" "$limit" train --scene "procedural:captures/$capture" --overwrite --preset auto --device "$device" --out "$out/run-$capture" \
+        --set train.iterations=$((10 + frames)) --set density.max_gaussians=$((moving / 4 + 1)) --set init.count=$((moving / 4 + 1))
+    rm -rf "$out/run-$capture"
+done
 step growth "$limit" bench frame --device "$device" --growth --scale "$scale" --frames "$frames"
 
 if [ -n "$player" ]; then
