@@ -1,6 +1,6 @@
 //! The fused Adam step on the device: one sweep decides which rows move, a second one moves them.
 
-use super::tensor::{THREADS, is_finite, owned, upload, workgroups_for};
+use super::tensor::{THREADS, constant, is_finite, owned, signed, workgroups_for, zeros};
 use crate::ops::adam::{AdamOps, AdamScalars};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
@@ -57,7 +57,7 @@ fn move_rows(
 }
 
 fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visible: Option<CubeTensor>, s: &AdamScalars) -> [CubeTensor; 4] {
-    let skipped = upload(&grad, &[0i32], DType::I32);
+    let skipped = signed(zeros(&grad, 1));
     let shape = param.meta.shape().clone();
     let (n, rows) = (shape.num_elements(), shape[0]);
     if n == 0 {
@@ -77,7 +77,7 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
         workgroups_for(rows),
         dim,
         grad.clone().into_buffer_arg(),
-        if masked { visible.into_buffer_arg() } else { upload(&grad, &[0i32], DType::I32).into_buffer_arg() },
+        if masked { visible.into_buffer_arg() } else { constant(&grad, &[0i32], DType::I32).into_buffer_arg() },
         moves.clone().into_buffer_arg(),
         skipped.clone().into_buffer_arg(),
         width,

@@ -1,7 +1,7 @@
 //! Combinations of shared functions on the device.
 
 use super::field::add_segments;
-use super::tensor::{THREADS, floats, upload, workgroups_for};
+use super::tensor::{THREADS, constant, floats, workgroups_for};
 use crate::ops::basis::{BasisBackward, BasisOps, BasisShape, Combinations};
 use burn::backend::ops::FloatTensorOps;
 use burn::backend::tensor::FloatTensor;
@@ -129,7 +129,7 @@ impl BasisOps for CubeBackend {
         let coefficients = if by_columns { coefficients } else { into_contiguous(coefficients) };
         let out = floats(&coefficients, [rows * shape.outputs()]);
         let client = coefficients.client.clone();
-        let plan = upload(&coefficients, &plan(shape), DType::U32);
+        let plan = constant(&coefficients, &plan(shape), DType::U32);
         let (count, dim) = (workgroups_for(rows * shape.outputs()), CubeDim::new_1d(THREADS));
         let (c, f, p, o) = (coefficients.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
         combine_outputs::launch(&client, count, dim, c, f, p, o, rows as u32, shape.outputs() as u32, by_columns);
@@ -141,7 +141,7 @@ impl BasisOps for CubeBackend {
 fn coefficient_gradient(functions: FloatTensor<CubeBackend>, grad: FloatTensor<CubeBackend>, rows: usize, shape: &BasisShape) -> FloatTensor<CubeBackend> {
     let (functions, grad) = (into_contiguous(functions), into_contiguous(grad));
     let client = grad.client.clone();
-    let plan = upload(&grad, &plan(shape), DType::U32);
+    let plan = constant(&grad, &plan(shape), DType::U32);
     let out = floats(&grad, [rows, shape.coefficients()]);
     let (count, dim) = (workgroups_for(rows * shape.outputs()), CubeDim::new_1d(THREADS));
     let (g, f, p, o) = (grad.into_buffer_arg(), functions.into_buffer_arg(), plan.into_buffer_arg(), out.clone().into_buffer_arg());
@@ -160,7 +160,7 @@ impl BasisBackward for CubeBackend {
         let (rows, count) = (coefficients.meta.shape()[0], shape.functions());
         let client = coefficients.client.clone();
         let dim = CubeDim::new_1d(THREADS);
-        let plan = upload(&coefficients, &plan(shape), DType::U32);
+        let plan = constant(&coefficients, &plan(shape), DType::U32);
         let segments = rows.div_ceil(SEGMENT);
         let (partial, out) = (floats(&grad, [segments, count]), floats(&grad, [count]));
         let (c, g) = (coefficients.into_buffer_arg(), grad.into_buffer_arg());

@@ -1,11 +1,12 @@
 //! 8-bit images to planes and back.
 
-use super::tensor::{THREADS, empty, floats, signed, upload, workgroups_for};
+use super::tensor::{THREADS, constant, empty, floats, signed, workgroups_for};
 use crate::ops::image::ImageOps;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::tensor::CubeTensor;
 use cc4dgs_core::Image8;
 use cubecl::prelude::*;
 use std::sync::Arc;
@@ -59,9 +60,16 @@ impl ImageOps for CubeBackend {
     fn planes(like: FloatTensor<Self>, image: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
         let (width, height) = (image.width as usize, image.height as usize);
         let planes = floats(&like, [3, height, width]);
-        let words: Vec<u32> = image.data.chunks(4).map(|b| b.iter().rev().fold(0, |word, &byte| word << 8 | u32::from(byte))).collect();
+        let count = image.data.len().div_ceil(4);
+        let mut padded = Vec::new();
+        if image.data.len() % 4 != 0 {
+            padded = image.data.clone();
+            padded.resize(4 * count, 0);
+        }
+        let words = like.client.create_from_slice(if padded.is_empty() { &image.data } else { &padded });
+        let words = CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), [count].into(), words, DType::U32);
         let client = like.client.clone();
-        let (w, b) = (upload(&like, &words, DType::U32).into_buffer_arg(), upload(&like, &background, DType::F32).into_buffer_arg());
+        let (w, b) = (words.into_buffer_arg(), constant(&like, &background, DType::F32).into_buffer_arg());
         let pixels = width * height;
         unpack::launch(
             &client,

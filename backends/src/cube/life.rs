@@ -1,6 +1,6 @@
 //! Lives on the device: a thread per Gaussian, for all times.
 
-use super::tensor::{THREADS, floats, upload, workgroups_for};
+use super::tensor::{THREADS, constant, floats, workgroups_for};
 use crate::ops::life::{HIDDEN, LEAST_FALLOFF, LifeBackward, LifeOps, LifeRules, MOST_LOG, OUTPUTS, WIDTH};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
@@ -152,7 +152,7 @@ impl LifeOps for CubeBackend {
         let rows = attributes.meta.shape()[0];
         let out = floats(&attributes, [rows * OUTPUTS * rules.times_norm.len()]);
         let client = attributes.client.clone();
-        let times = upload(&attributes, &rules.times_norm, DType::F32);
+        let times = constant(&attributes, &rules.times_norm, DType::F32);
         let (count, dim) = (workgroups_for(rows), CubeDim::new_1d(THREADS));
         let (a, t, o) = (attributes.into_buffer_arg(), times.into_buffer_arg(), out.clone().into_buffer_arg());
         forward::launch(&client, count, dim, a, t, o, rows as u32, rules.hidden_below, rules.gated_velocity);
@@ -166,7 +166,7 @@ impl LifeBackward for CubeBackend {
         let rows = attributes.meta.shape()[0];
         let out = floats(&attributes, [rows, WIDTH]);
         let client = attributes.client.clone();
-        let times = upload(&attributes, &rules.times_norm, DType::F32);
+        let times = constant(&attributes, &rules.times_norm, DType::F32);
         let (count, dim) = (workgroups_for(rows), CubeDim::new_1d(THREADS));
         let (a, t, g, o) = (attributes.into_buffer_arg(), times.into_buffer_arg(), grad.into_buffer_arg(), out.clone().into_buffer_arg());
         backward::launch(&client, count, dim, a, t, g, o, rows as u32, rules.hidden_below, rules.gated_velocity);

@@ -1,7 +1,7 @@
 //! Interpolated lookups in grids of stored features; the arithmetic of `cpu::lookup`.
 
 use super::sort::sort_pairs;
-use super::tensor::{THREADS, empty, floats, upload, workgroups_for};
+use super::tensor::{THREADS, constant, empty, floats, workgroups_for};
 use crate::ops::lookup::{GridShape, LookupBackward, LookupOps, MAX_DIMS, Outside, PRIMES};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
@@ -180,7 +180,7 @@ impl LookupOps for CubeBackend {
         let m = points.meta.shape()[0];
         let out = floats(&points, [m, shape.width()]);
         let client = points.client.clone();
-        let levels = upload(&points, &words(&shape), DType::U32);
+        let levels = constant(&points, &words(&shape), DType::U32);
         look_up::launch(
             &client,
             workgroups_for(m * shape.width()),
@@ -203,7 +203,7 @@ impl LookupBackward for CubeBackend {
         let client = points.client.clone();
         let dim = CubeDim::new_1d(THREADS);
         let count = (points.meta.shape()[0] * shape.levels.len()) << shape.dims;
-        let levels = upload(&points, &words(&shape), DType::U32);
+        let levels = constant(&points, &words(&shape), DType::U32);
         let (rows, slots) = (empty(&points, [count], DType::U32), empty(&points, [count], DType::U32));
         rows_of_slots::launch(
             &client,

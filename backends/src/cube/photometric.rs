@@ -3,7 +3,7 @@
 //! Four sweeps over the image: horizontal blur of x, y, x^2, y^2, xy; vertical blur, SSIM and its derivatives; the same two blurs of the derivatives.
 //! Sums are taken per workgroup and then by one workgroup, in a fixed order, so that every run gives the same bytes.
 
-use super::tensor::{THREADS, compensated_sum, floats, sum_of_threads, upload, workgroups_for};
+use super::tensor::{THREADS, compensated_sum, constant, floats, sum_of_threads, upload, workgroups_for};
 use crate::ops::photometric::{MOMENTS, PhotometricKernels, PhotometricOps};
 use burn::backend::TensorMetadata;
 use burn::backend::tensor::FloatTensor;
@@ -241,7 +241,7 @@ impl PhotometricKernels for CubeBackend {
         if pixels == 0 {
             return (upload(&planes, &[0.0f32], DType::F32), upload(&planes, &[0.0f32; 3], DType::F32), none(&planes));
         }
-        let taps = upload(&planes, &window(), DType::F32);
+        let taps = constant(&planes, &window(), DType::F32);
         let dim = CubeDim::new_1d(THREADS);
         let moments = floats(&planes, [3 * MOMENTS as usize * pixels]);
         let args = || (planes.clone().into_buffer_arg(), target.clone().into_buffer_arg(), taps.clone().into_buffer_arg());

@@ -1,13 +1,17 @@
 //! Device buffers: outputs, uploads, and how launches are spread.
 
 use burn::tensor::{DType, Shape};
+use burn_cubecl::CubeDevice;
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::ops::numeric::zeros_client;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::client::Client;
 use cubecl::prelude::*;
+use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{LazyLock, Mutex, PoisonError};
+use std::thread::ThreadId;
 
 /// Threads of a workgroup in kernels with one item per thread.
 pub const THREADS: u32 = 256;
@@ -47,6 +51,39 @@ pub fn zeros(like: &CubeTensor, count: usize) -> CubeTensor {
 pub fn upload<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> CubeTensor {
     let buffer = like.client.create_from_slice(T::as_bytes(values));
     CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), Shape::from([values.len()]), buffer, dtype)
+}
+
+/// Constants of up to so many bytes are kept, and so many bytes of them in all.
+const LARGEST_KEPT: usize = 64 << 10;
+const MOST_KEPT: usize = 8 << 20;
+
+/// Constants by thread (a thread has its own stream of launches), device and type, and how many bytes they have.
+#[derive(Default)]
+struct Kept {
+    arrays: HashMap<(ThreadId, CubeDevice, DType), HashMap<Vec<u8>, CubeTensor>>,
+    bytes: usize,
+}
+
+static KEPT: LazyLock<Mutex<Kept>> = LazyLock::new(Mutex::default);
+
+/// As [`upload`], for what no kernel writes to. The same values are uploaded once: CubeCL submits all launches before an upload, which costs many times a launch.
+pub fn constant<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> CubeTensor {
+    let bytes = T::as_bytes(values);
+    if bytes.len() > LARGEST_KEPT {
+        return upload(like, values, dtype);
+    }
+    let key = (std::thread::current().id(), like.device.clone(), dtype);
+    let mut kept = KEPT.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(tensor) = kept.arrays.get(&key).and_then(|arrays| arrays.get(bytes)) {
+        return tensor.clone();
+    }
+    let tensor = upload(like, values, dtype);
+    if kept.bytes + bytes.len() > MOST_KEPT {
+        *kept = Kept::default();
+    }
+    kept.bytes += bytes.len();
+    kept.arrays.entry(key).or_default().insert(bytes.to_vec(), tensor.clone());
+    tensor
 }
 
 static BINDING_CAP: AtomicU64 = AtomicU64::new(u64::MAX);

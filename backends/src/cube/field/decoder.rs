@@ -4,7 +4,7 @@ use super::activation::{mish, mish_derivative};
 use super::gradients::{self, Rows, Sums};
 use super::layers::{self, Dense};
 use super::program::{Input, Program, SavedNorm, Step, Target, parts, scales};
-use crate::cube::tensor::{THREADS, floats, upload, workgroups_for};
+use crate::cube::tensor::{THREADS, constant, floats, upload, workgroups_for};
 use crate::ops::field::Decoder;
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
@@ -112,7 +112,7 @@ fn norm_mish_backward(y: &mut [f32], weights: &[f32], d: &mut [f32], dz: &mut [f
 fn signature_rows(vertices: &CubeTensor, hash: &LevelHash, rows: usize) -> CubeTensor {
     let hashes = hash.len();
     let out = floats(vertices, [rows * hashes]);
-    let constants = upload(vertices, &hash.constants(), DType::U32);
+    let constants = constant(vertices, &hash.constants(), DType::U32);
     let client = vertices.client.clone();
     let (v, c, o) = (vertices.clone().into_buffer_arg(), constants.into_buffer_arg(), out.clone().into_buffer_arg());
     let scale = 2.0 / (hash.modulus() - 1) as f32;

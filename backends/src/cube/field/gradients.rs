@@ -2,7 +2,7 @@
 
 use super::layers::Dense;
 use super::program::is_vertex;
-use crate::cube::tensor::{THREADS, binding_bytes, floats, signed, spread, upload, workgroups_for};
+use crate::cube::tensor::{THREADS, binding_bytes, constant, floats, signed, spread, workgroups_for};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
@@ -352,7 +352,7 @@ pub fn with_transposed(weights: &CubeTensor, layers: &[Dense]) -> CubeTensor {
     let count = weights.meta.shape().num_elements();
     let both = floats(weights, [2 * count]);
     let plan: Vec<u32> = layers.iter().flat_map(|l| [l.at as u32, l.input as u32, l.output as u32]).collect();
-    let plan = upload(weights, &plan, DType::U32);
+    let plan = constant(weights, &plan, DType::U32);
     let client = weights.client.clone();
     let (w, p, b) = (weights.clone().into_buffer_arg(), plan.into_buffer_arg(), both.clone().into_buffer_arg());
     append_transposed::launch(&client, workgroups_for(2 * count), dim(), w, p, b, layers.len() as u32);

@@ -1,7 +1,7 @@
 //! Grid corners of points, which of them are the same, and interpolation between them.
 
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{THREADS, empty, floats, signed, upload, workgroups_for};
+use crate::cube::tensor::{THREADS, constant, empty, floats, signed, upload, workgroups_for};
 use crate::ops::corners::{CornersBegun, GridBox};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -143,7 +143,7 @@ pub fn begin(points: &CubeTensor, grid: GridBox, reuse: bool) -> CornersBegun<Cu
     let dim = CubeDim::new_1d(THREADS);
     let scale = (0..3).map(|d| if grid.max[d] > grid.min[d] { grid.resolution as f32 / (grid.max[d] - grid.min[d]) } else { 0.0 });
     let numbers: Vec<f32> = grid.min.into_iter().chain(scale).collect();
-    let grid_buffer = upload(points, &numbers, DType::F32);
+    let grid_buffer = constant(points, &numbers, DType::F32);
     let (keys, slots) = (empty(points, [slots_count], DType::U32), empty(points, [slots_count], DType::U32));
     let weights = floats(points, [slots_count]);
     find_corners::launch(

@@ -3,7 +3,7 @@
 use super::blend;
 use super::gradient::{self, AT_OFFSET, GEOMETRY, OF_CAMERA, OF_MEAN, OF_OPACITY, OF_QUATERNION, OF_SCALES, SCREEN};
 use super::{DIM, Lists, rest_width};
-use crate::cube::tensor::{floats, row_blocks, rows_of, shared_bytes, spread, upload, workgroups_for, zeros};
+use crate::cube::tensor::{constant, floats, row_blocks, rows_of, shared_bytes, spread, workgroups_for, zeros};
 use crate::ops::rasterize::camera::{RuleConstants, camera_to_world};
 use crate::ops::rasterize::{AT_X, GradientRequest, RasterGradients, RasterSettings, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
@@ -139,7 +139,7 @@ pub fn backward(
             gradient::sum_rows::launch(&client, count, DIM(), from, to, n as u32, stride as u32, first as u32);
         }
         // Nothing is read back here: a backward pass could not return the error of a failed read.
-        let inverse = upload(&means, &camera_to_world(&settings.world_to_camera), DType::F32);
+        let inverse = constant(&means, &camera_to_world(&settings.world_to_camera), DType::F32);
         let (sums, offset, inverse) = (of_camera.into_buffer_arg(), of_offset.into_buffer_arg(), inverse.into_buffer_arg());
         gradient::camera_matrix::launch(&client, workgroups_for(16), DIM(), sums, offset, inverse, out.clone().into_buffer_arg());
         out

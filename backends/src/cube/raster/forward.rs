@@ -7,7 +7,7 @@ use super::lists::{self, BACKGROUND};
 use super::project::{self, KEYS};
 use super::{DIM, Lists, read_word, rest_width, words};
 use crate::cube::sort::{exclusive_sums, sort_pairs};
-use crate::cube::tensor::{binding_bytes, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for, zeros};
+use crate::cube::tensor::{binding_bytes, constant, empty, floats, row_blocks, rows_of, spread, upload, workgroups_for, zeros};
 use crate::ops::rasterize::camera::{CameraConstants, RuleConstants};
 use crate::ops::rasterize::{MAX_TILE_PAIRS, RECORD, RasterSettings, Rasterized, Refusal, Saved, SplatTensors, TILE, TILE_PIXELS};
 use burn::tensor::DType;
@@ -37,7 +37,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     let (tiles_x, tiles_y) = (width.div_ceil(TILE), height.div_ceil(TILE));
     let tiles = tiles_x * tiles_y;
     let (constants, rules) = (CameraConstants::new(settings), RuleConstants::new(settings));
-    let cam = upload(&means, &camera_buffer(&constants, &rules, width, height), DType::F32);
+    let cam = constant(&means, &camera_buffer(&constants, &rules, width, height), DType::F32);
     let (splats, keys) = (floats(&means, [n, RECORD]), empty(&means, [n, KEYS], DType::U32));
     let radii = empty(&means, [n], DType::I32);
     let raw = settings.space == ParameterSpace::Raw;
@@ -89,7 +89,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     let start_of_gaussian = words(&means, n);
     let counts = words(&means, n);
     let mut order = index.clone();
-    let mut total = upload(&means, &[0u32], DType::U32);
+    let mut total = constant(&means, &[0u32], DType::U32);
     if n > 0 {
         lists::depth_keys::launch(
             &client,

@@ -7,7 +7,7 @@ mod steps;
 
 pub use steps::is_vertex;
 
-use crate::cube::tensor::{binding_bytes, shared_bytes, spread, upload};
+use crate::cube::tensor::{binding_bytes, shared_bytes, spread};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cc4dgs_fields::hash::LevelHash;
@@ -213,7 +213,7 @@ impl Program {
             }
         };
         let hashed = vertices.is_some();
-        let plan = upload(weights, &plan, DType::U32);
+        let plan = crate::cube::tensor::constant(weights, &plan, DType::U32);
         let vertices = vertices.unwrap_or_else(|| crate::cube::tensor::signed(plan.clone()));
         // SAFETY: rows beyond the last are neither read nor written; columns and indices are in bounds because weights, inputs and result have the sizes that
         // the steps were made for, which the operations check.
