@@ -1,4 +1,4 @@
-//! The fused Adam step on the device: one sweep decides which rows move, a second one moves them.
+//! The fused Adam step on the device: one sweep. Wide rows have a sweep before it that decides which of them move.
 
 use super::tensor::{THREADS, constant, is_finite, owned, signed, workgroups_for, zeros};
 use crate::ops::adam::{AdamOps, AdamScalars};
@@ -9,26 +9,37 @@ use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// moves`[row]` is 1 where the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite.
+/// Rows up to so wide are looked at by each of their values.
+const NARROW: usize = 4;
+
+/// Whether the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite, where `counts`.
+#[cube]
+fn moves_row(grad: &[f32], visible: &[i32], skipped: &mut [Atomic<i32>], row: usize, width: u32, counts: bool, #[comptime] masked: bool) -> bool {
+    let mut wanted = true;
+    if comptime!(masked) {
+        wanted = visible[row] != 0;
+    }
+    let mut finite = true;
+    for k in 0..width as usize {
+        finite = finite && is_finite(grad[row * width as usize + k]);
+    }
+    if counts && wanted && !finite {
+        skipped[0].fetch_add(1i32);
+    }
+    wanted && finite
+}
+
+/// moves`[row]` is 1 where the row moves.
 #[cube(launch)]
 fn rows_that_move(grad: &[f32], visible: &[i32], moves: &mut [u32], skipped: &mut [Atomic<i32>], width: u32, #[comptime] masked: bool) {
     let row = ABSOLUTE_POS;
     if row < moves.len() {
-        let mut wanted = true;
-        if comptime!(masked) {
-            wanted = visible[row] != 0;
-        }
-        let mut finite = true;
-        for k in 0..width as usize {
-            finite = finite && is_finite(grad[row * width as usize + k]);
-        }
-        if wanted && !finite {
-            skipped[0].fetch_add(1i32);
-        }
-        moves[row] = select(wanted && finite, 1u32, 0u32);
+        let own = moves_row(grad, visible, skipped, row, width, true, masked);
+        moves[row] = select(own, 1u32, 0u32);
     }
 }
 
+/// Moves all values of the rows that move: those of `moves`, or of narrow rows what they find themselves.
 #[cube(launch)]
 fn move_rows(
     param: &mut [f32],
@@ -36,6 +47,8 @@ fn move_rows(
     v: &mut [f32],
     grad: &[f32],
     moves: &[u32],
+    visible: &[i32],
+    skipped: &mut [Atomic<i32>],
     width: u32,
     beta1: f32,
     beta2: f32,
@@ -44,15 +57,21 @@ fn move_rows(
     step_size: f32,
     inverse_sqrt_correction: f32,
     epsilon: f32,
+    #[comptime] narrow: bool,
+    #[comptime] masked: bool,
 ) {
     let at = ABSOLUTE_POS;
-    if at < param.len() && moves[at / width as usize] != 0 {
-        let g = grad[at];
-        let first = beta1 * m[at] + one_minus_beta1 * g;
-        let second = beta2 * v[at] + one_minus_beta2 * g * g;
-        m[at] = first;
-        v[at] = second;
-        param[at] -= step_size * first / (second.sqrt() * inverse_sqrt_correction + epsilon);
+    if at < param.len() {
+        let row = at / width as usize;
+        let own = if comptime!(narrow) { moves_row(grad, visible, skipped, row, width, at % width as usize == 0, masked) } else { moves[row] != 0 };
+        if own {
+            let g = grad[at];
+            let first = beta1 * m[at] + one_minus_beta1 * g;
+            let second = beta2 * v[at] + one_minus_beta2 * g * g;
+            m[at] = first;
+            v[at] = second;
+            param[at] -= step_size * first / (second.sqrt() * inverse_sqrt_correction + epsilon);
+        }
     }
 }
 
@@ -67,22 +86,17 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
     let [param, m, v] = [param, m, v].map(owned);
     let grad = into_contiguous(grad);
     let client = grad.client.clone();
-    let moves = super::tensor::empty(&grad, [rows], DType::U32);
-    let masked = visible.is_some();
-    // Not read without a mask, but a binding needs a buffer.
-    let visible = visible.map_or_else(|| skipped.clone(), into_contiguous);
+    let (narrow, masked) = (width as usize <= NARROW, visible.is_some());
+    // What is not read needs a buffer of its kind.
+    let nothing = || constant(&grad, &[0i32], DType::I32);
+    let visible = visible.map_or_else(nothing, into_contiguous);
+    let moves = if narrow { constant(&grad, &[0u32], DType::U32) } else { super::tensor::empty(&grad, [rows], DType::U32) };
     let dim = CubeDim::new_1d(THREADS);
-    rows_that_move::launch(
-        &client,
-        workgroups_for(rows),
-        dim,
-        grad.clone().into_buffer_arg(),
-        if masked { visible.into_buffer_arg() } else { constant(&grad, &[0i32], DType::I32).into_buffer_arg() },
-        moves.clone().into_buffer_arg(),
-        skipped.clone().into_buffer_arg(),
-        width,
-        masked,
-    );
+    if !narrow {
+        let (g, seen) = (grad.clone().into_buffer_arg(), visible.clone().into_buffer_arg());
+        let (to, count) = (moves.clone().into_buffer_arg(), skipped.clone().into_buffer_arg());
+        rows_that_move::launch(&client, workgroups_for(rows), dim, g, seen, to, count, width, masked);
+    }
     move_rows::launch(
         &client,
         workgroups_for(n),
@@ -92,6 +106,8 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
         v.clone().into_buffer_arg(),
         grad.into_buffer_arg(),
         moves.into_buffer_arg(),
+        visible.into_buffer_arg(),
+        skipped.clone().into_buffer_arg(),
         width,
         s.beta1,
         s.beta2,
@@ -100,6 +116,8 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
         s.step_size,
         s.inverse_sqrt_correction,
         s.epsilon,
+        narrow,
+        masked,
     );
     [param, m, v, skipped]
 }

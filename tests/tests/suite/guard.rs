@@ -147,6 +147,10 @@ fn configured(does: &str, iterations: usize) -> RunConfig {
         format!("train.iterations={iterations}"),
         "device=flex".into(),
         "train.shares=[1.0, 0.0, 1.0]".into(),
+        // The bounds below are of four views per step.
+        "train.batch=4".into(),
+        "train.coarse_batch=0".into(),
+        "train.lr.batch_power=0".into(),
         "init.count=400".into(),
         "deformer.kind=none".into(),
     ];
