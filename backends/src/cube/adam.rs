@@ -63,7 +63,7 @@ fn move_rows(
     let at = ABSOLUTE_POS;
     if at < param.len() {
         let row = at / width as usize;
-        let own = if comptime!(narrow) { moves_row(grad, visible, skipped, row, width, at % width as usize == 0, masked) } else { moves[row] != 0 };
+        let own = if comptime!(narrow) { moves_row(grad, visible, skipped, row, width, at == row * width as usize, masked) } else { moves[row] != 0 };
         if own {
             let g = grad[at];
             let first = beta1 * m[at] + one_minus_beta1 * g;

@@ -62,7 +62,7 @@ impl ImageOps for CubeBackend {
         let planes = floats(&like, [3, height, width]);
         let count = image.data.len().div_ceil(4);
         let mut padded = Vec::new();
-        if image.data.len() % 4 != 0 {
+        if !image.data.len().is_multiple_of(4) {
             padded = image.data.clone();
             padded.resize(4 * count, 0);
         }
