@@ -28,7 +28,7 @@ pub fn forward(planes: &[f32], transform: &[f32], pixels: usize) -> Vec<f32> {
         for (c, out) in out.into_iter().enumerate() {
             let [a, b, d, offset] = [transform[3 * c], transform[3 * c + 1], transform[3 * c + 2], transform[9 + c]];
             for (((value, r), g), blue) in out.iter_mut().zip(own[0]).zip(own[1]).zip(own[2]) {
-                *value = d.mul_add(*blue, b.mul_add(*g, a.mul_add(*r, offset)));
+                *value = offset + a * r + b * g + d * blue;
             }
         }
     });
@@ -43,7 +43,7 @@ pub fn planes_gradient(transform: &[f32], grad: &[f32], pixels: usize) -> Vec<f3
         for (k, out) in out.into_iter().enumerate() {
             let [a, b, d] = [transform[k], transform[3 + k], transform[6 + k]];
             for (((value, r), g), blue) in out.iter_mut().zip(own[0]).zip(own[1]).zip(own[2]) {
-                *value = d.mul_add(*blue, b.mul_add(*g, a * r));
+                *value = a * r + b * g + d * blue;
             }
         }
     });
@@ -60,9 +60,9 @@ pub fn transform_gradient(planes: &[f32], grad: &[f32], pixels: usize) -> Vec<f3
             let mut sums = [0.0f64; NUMBERS];
             for (c, of) in of.into_iter().enumerate() {
                 for (k, own) in own.into_iter().enumerate() {
-                    sums[3 * c + k] = dot(of, own);
+                    sums[3 * c + k] = sum(of.iter().zip(own).map(|(g, x)| f64::from(*g) * f64::from(*x)));
                 }
-                sums[9 + c] = of.iter().map(|g| f64::from(*g)).sum();
+                sums[9 + c] = sum(of.iter().map(|g| f64::from(*g)));
             }
             sums
         })
@@ -70,6 +70,13 @@ pub fn transform_gradient(planes: &[f32], grad: &[f32], pixels: usize) -> Vec<f3
     (0..NUMBERS).map(|k| parts.iter().map(|part| part[k]).sum::<f64>() as f32).collect()
 }
 
-fn dot(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+/// A sum in eight interleaved parts, so that additions do not wait for each other.
+fn sum(mut values: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let mut parts = [0.0f64; 8];
+    while values.len() > 0 {
+        for (part, value) in parts.iter_mut().zip(&mut values) {
+            *part += value;
+        }
+    }
+    parts.iter().sum()
 }

@@ -9,7 +9,7 @@ use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
-/// Rows up to so wide are looked at by each of their values.
+/// Upper bound on the values of a row for which every value checks the whole row; wider rows are checked once, by a launch before.
 const NARROW: usize = 4;
 
 /// Whether the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite, where `counts`.

@@ -53,9 +53,11 @@ pub fn upload<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -> 
     CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), Shape::from([values.len()]), buffer, dtype)
 }
 
-/// Constants of up to so many bytes are kept, and so many bytes of them in all.
+/// Upper bound on the bytes of a constant that is kept, and of all of them together.
 const LARGEST_KEPT: usize = 64 << 10;
 const MOST_KEPT: usize = 8 << 20;
+/// Bytes that a constant is taken to need besides its values: at most 8,192 are kept, however small they are.
+const OVERHEAD: usize = 1 << 10;
 
 /// Constants by thread (a thread has its own stream of launches), device and type, and how many bytes they have.
 #[derive(Default)]
@@ -78,10 +80,11 @@ pub fn constant<T: CubeElement>(like: &CubeTensor, values: &[T], dtype: DType) -
         return tensor.clone();
     }
     let tensor = upload(like, values, dtype);
-    if kept.bytes + bytes.len() > MOST_KEPT {
+    let bytes_needed = bytes.len() + OVERHEAD;
+    if kept.bytes + bytes_needed > MOST_KEPT {
         *kept = Kept::default();
     }
-    kept.bytes += bytes.len();
+    kept.bytes += bytes_needed;
     kept.arrays.entry(key).or_default().insert(bytes.to_vec(), tensor.clone());
     tensor
 }

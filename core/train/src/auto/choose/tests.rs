@@ -87,7 +87,8 @@ fn short_runs_on_graphics_cards_have_small_fields_and_match_images_with_the_proc
     for (minutes, small) in [(3.0, true), (30.0, false)] {
         assert_eq!(value(&choose(&object, card, minutes, true), "deformer.capacity").is_some(), small, "{minutes}");
     }
-    let rig = Facts { frames: 300, ..facts(Arrangement::Rig) };
+    let rig = Facts { frames: 300, detail: 0.9, ..facts(Arrangement::Rig) };
     let every = |threads| key_frames(&rig, Machine { threads, ..card }, 3.0);
-    assert!(every(16) < every(2) || every(2).is_none(), "{:?} {:?}", every(16), every(2));
+    // Key frames further apart on fewer threads.
+    assert!(every(16).is_some() && every(16) < every(2), "{:?} {:?}", every(16), every(2));
 }
