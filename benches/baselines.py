@@ -4,7 +4,8 @@
     python3 benches/baselines.py OUT --bin BIN --scene DATA/dnerf_mutant [--minutes 60] [--only hexplane,...] [--jobs 1] [--threads N]
 
 Trains `dnerf+METHOD` (published iterations, sizes and rates; 800x800) and interrupts it after --minutes of training. What it has learned until then is evaluated once
-on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Results are in OUT/rows.json, one row per method: iterations
+on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Images are on the background that the method is
+published on, black or white. Results are in OUT/rows.json, one row per method: iterations
 reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. With --jobs 2 --threads 1 two methods share the machine.
 
 Called again, it resumes what was cut off and leaves out what is done with the same scene, minutes, jobs, threads and program (its SHA-256); runs have folders of
@@ -25,6 +26,9 @@ from concurrent.futures import ThreadPoolExecutor
 from trainings import TRAINED, Rows, begin, ended, interrupt, sha256
 
 METHODS = ["hexplane", "native-4d", "swift4d", "embedding", "grid4d", "deform-mlp"]
+# What is behind the transparent images in the published runs of a method, where it is not the white of the preset.
+BLACK = "render.background=[0.0,0.0,0.0]"
+BACKGROUNDS = dict.fromkeys(["native-4d", "grid4d", "deform-mlp"], BLACK)
 
 
 def events(out):
@@ -66,6 +70,7 @@ def row(options, stated):
         arguments += ["--resume"]
     else:
         arguments += ["--overwrite", "--preset", f"dnerf+{method}", "--set", "scene.width=800", "--set", "train.checkpoint_every=500"]
+        arguments += ["--set", BACKGROUNDS[method]] if method in BACKGROUNDS else []
     if options.threads:
         arguments += ["--threads", str(options.threads)]
     left = 60 * options.minutes - trained(out) if resumed else 60 * options.minutes
@@ -110,7 +115,7 @@ def main():
     def one(method):
         """Whether the method has a score."""
         stated = {"method": method, "path": str(options.scene), "minutes": options.minutes, "threads": options.threads, "jobs": options.jobs}
-        stated["binary_sha256"] = sha256(options.bin)
+        stated |= {"background": "black" if method in BACKGROUNDS else "white", "binary_sha256": sha256(options.bin)}
         if rows.find(stated):
             return True
         began = time.time()

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Times the page of the player in Chromium with SwiftShader, and the tile renderer beside it: player.py PAGE [--program cc4dgs] [--native frames] [--case n3dv] [--out FILE].
 
-PAGE is the folder of apps/player/build-web. The model is a room of `cc4dgs bench frame`, as large as published scenes: 335,000 Gaussians at 1352x1014, of which
+PAGE is the folder of apps/player/build-web. The model is the synthetic scene of `cc4dgs bench frame`, as large as published scenes: 335,000 Gaussians at 1352x1014, of which
 12 % move. It is stored with a playback layer (`--archive`), and page and tile renderer look from the same camera. Prints JSON: bytes of the bundle (gzipped) and of
 the archive, milliseconds from the last byte to the first frame, and milliseconds per frame of WebGPU, of WebGL2 and of the tile renderer on the device `flex`,
 deformer included; the medians of alternating rounds. Frames of WebGL2 do not wait for the worker that sorts. With --native (the example `frames` of the player), also
@@ -33,7 +33,7 @@ FRAME = """async frames => {
 }"""
 
 
-def room(args, frames, *more):
+def synthetic_scene(args, frames, *more):
     """What `cc4dgs bench frame` says of the case."""
     command = [args.program, "--quiet", "bench", "frame", "--case", args.case, "--scale", args.scale, "--motion", "0.05", "--device", "flex"]
     ran = subprocess.run([*command, "--set", f"deformer.kind={args.deformer}", "--frames", str(frames), *more, "--json"], capture_output=True, text=True)
@@ -56,8 +56,8 @@ def main():
     parser.add_argument("--scale", default="1"), parser.add_argument("--deformer", default="cdf-basis"), parser.add_argument("--native"), parser.add_argument("--out")
     args = parser.parse_args()
     folder = tempfile.TemporaryDirectory()
-    archive = pathlib.Path(folder.name) / "room.cc4d"
-    case = room(args, 1, "--archive", str(archive))
+    archive = pathlib.Path(folder.name) / "scene.cc4d"
+    case = synthetic_scene(args, 1, "--archive", str(archive))
     width, height = case["width"], case["height"]
     address, archive_bytes = serve(args.page, archive, "model.cc4d")
     files = [f for f in pathlib.Path(args.page).iterdir() if f.suffix in (".wasm", ".js", ".css", ".html")]
@@ -82,7 +82,7 @@ def main():
             for name, page in pages.items():
                 page.bring_to_front()
                 times[name].append(page.evaluate(FRAME, FRAMES))
-            case = room(args, FRAMES)
+            case = synthetic_scene(args, FRAMES)
             times["tile"].append(case["field"]["median_ms"] + case["raster"]["median_ms"])
             if args.native:
                 found = native(args, archive, out["size"])

@@ -195,9 +195,9 @@ impl Deformer for Embedding {
             return Ok(heads::offsets(&self.settings.heads, empty, self.sh_degree));
         }
         let mut outputs: Option<Vec<Tensor<2>>> = None;
-        for (place, rows) in [(1, self.settings.coarse_rows), (2, self.fine_rows())] {
+        for (index, rows) in [(1, self.settings.coarse_rows), (2, self.fine_rows())] {
             let input = Tensor::cat(vec![features.clone(), self.time_row(time_norm, rows).repeat_dim(0, m)], 1);
-            let own = mlp_relu(input, self.parameters[place].value.clone(), &self.network)?;
+            let own = mlp_relu(input, self.parameters[index].value.clone(), &self.network)?;
             outputs = Some(match outputs {
                 None => own,
                 Some(coarse) => coarse.into_iter().zip(own).map(|(a, b)| a + b).collect(),

@@ -169,8 +169,8 @@ impl Grid4d {
         let (space, time, attention, temporal, network) = (Arc::new(space), Arc::new(time), Arc::new(attention), Arc::new(temporal), Arc::new(network));
         Ok(Self { context: context.clone(), space, time, attention, temporal, network, parameters, settings })
     }
-    fn weight(&self, place: usize) -> Tensor<1> {
-        self.parameters[place].value.clone()
+    fn weight(&self, index: usize) -> Tensor<1> {
+        self.parameters[index].value.clone()
     }
     /// Features of the three grids with time at positions `[M,3]` in 0..1 of the box, concatenated.
     fn with_time(&self, position: &Tensor<2>, time_norm: f32) -> Result<Tensor<2>> {

@@ -117,8 +117,8 @@ pub fn features<'w>(settings: &VoxelSettings, context: &DeformerContext, means: 
     for (level, &resolution) in sizes.resolutions.iter().enumerate() {
         let weights = weights(level)?;
         let hash = settings.hash(context, level);
-        let places: Vec<Place> = means.as_chunks::<3>().0.iter().map(|mean| Place::of(mean, context, resolution)).collect();
-        let mut rows: BTreeMap<[u32; 3], usize> = places.iter().flat_map(Place::corners).map(|(vertex, _)| (vertex, 0)).collect();
+        let cells: Vec<Cell> = means.as_chunks::<3>().0.iter().map(|mean| Cell::of(mean, context, resolution)).collect();
+        let mut rows: BTreeMap<[u32; 3], usize> = cells.iter().flat_map(Cell::corners).map(|(vertex, _)| (vertex, 0)).collect();
         rows.values_mut().enumerate().for_each(|(row, at)| *at = row);
         let vertices: Vec<[u32; 3]> = rows.keys().copied().collect();
         let mut decoded = vec![0.0; vertices.len() * own];
@@ -127,9 +127,9 @@ pub fn features<'w>(settings: &VoxelSettings, context: &DeformerContext, means: 
             hash.signatures(vertices, &mut signatures);
             decoded.copy_from_slice(&decode(&sizes.decoder, weights, signatures));
         });
-        out.par_chunks_exact_mut(width).zip(&places).for_each(|(out, place)| {
+        out.par_chunks_exact_mut(width).zip(&cells).for_each(|(out, cell)| {
             let out = &mut out[level * own..(level + 1) * own];
-            for (vertex, weight) in place.corners() {
+            for (vertex, weight) in cell.corners() {
                 let row = rows.get(&vertex).copied().unwrap_or(0);
                 out.iter_mut().zip(&decoded[row * own..]).for_each(|(o, v)| *o += weight * v);
             }
@@ -139,12 +139,12 @@ pub fn features<'w>(settings: &VoxelSettings, context: &DeformerContext, means: 
 }
 
 /// Where a centre lies in a grid.
-struct Place {
+struct Cell {
     cell: [u32; 3],
     part: [f32; 3],
 }
 
-impl Place {
+impl Cell {
     /// Points outside of the box are moved to its nearest face, what is no number to the lower one.
     fn of(mean: &[f32; 3], context: &DeformerContext, resolution: u32) -> Self {
         let at: [f32; 3] = std::array::from_fn(|d| {

@@ -18,11 +18,11 @@ pub enum Existing {
     Overwrite,
 }
 
-/// Refuses a folder that holds a run which would be overwritten unasked, one to go on from that holds no checkpoint, a file, and a place that cannot be written.
+/// Refuses a folder that holds a run which would be overwritten unasked, one to go on from that holds no checkpoint, a file, and a folder that cannot be written.
 /// `remedy` says what to do instead. Nothing is created.
 ///
 /// # Errors
-/// [`Error::Parameter`] that names the folder and what is found there; [`Error::Io`] for a place that cannot be written.
+/// [`Error::Parameter`] that names the folder and what is found there; [`Error::Io`] for a folder that cannot be written.
 pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<()> {
     let object = format!("run folder {}", folder.display());
     if folder.is_file() {
@@ -40,7 +40,7 @@ pub fn check_folder(folder: &Path, existing: Existing, remedy: &str) -> Result<(
 
 /// Tries to write beside what will be there; a file without a name leaves nothing behind.
 fn check_writable(folder: &Path) -> Result<()> {
-    let there = folder.ancestors().find(|place| place.exists()).unwrap_or(Path::new("."));
+    let there = folder.ancestors().find(|path| path.exists()).unwrap_or(Path::new("."));
     tempfile::tempfile_in(there).map(drop).map_err(|e| Error::io(there, e))
 }
 

@@ -123,12 +123,12 @@ mod tests {
         assert!(check(folder.path()).is_err());
         // What is written may be written again.
         let object = serde_json::json!({ "scores": [{ "psnr_db": 30.5 }], "text": "a\n  {\nb" });
-        for (value, place) in [(object.clone(), ""), (serde_json::json!([object, object]), "/1")] {
+        for (value, pointer) in [(object.clone(), ""), (serde_json::json!([object, object]), "/1")] {
             let text = to_json(&value).unwrap();
             let read: serde_json::Value = serde_json::from_str(&text).unwrap();
-            let mark = read.pointer(&format!("{place}/{MARK}")).and_then(serde_json::Value::as_str);
-            assert_eq!((mark, text.matches("\"cc4dgs\"").count()), (Some(env!("CARGO_PKG_VERSION")), if place.is_empty() { 1 } else { 2 }), "{text}");
-            assert_eq!(read.pointer(&format!("{place}/text")), Some(&object["text"]));
+            let mark = read.pointer(&format!("{pointer}/{MARK}")).and_then(serde_json::Value::as_str);
+            assert_eq!((mark, text.matches("\"cc4dgs\"").count()), (Some(env!("CARGO_PKG_VERSION")), if pointer.is_empty() { 1 } else { 2 }), "{text}");
+            assert_eq!(read.pointer(&format!("{pointer}/text")), Some(&object["text"]));
             std::fs::write(&file, text).unwrap();
             check(&file).unwrap();
         }

@@ -354,18 +354,18 @@ fn the_doctor_finds_the_rasterizers_right() {
 }
 
 #[test]
-fn rooms_become_archives_that_play() {
+fn synthetic_scenes_become_archives_that_play() {
     let folder = tempfile::tempdir().unwrap();
-    let archive = folder.path().join("room.cc4d");
+    let archive = folder.path().join("scene.cc4d");
     let small =
         ["bench", "frame", "--scale", "0.001", "--frames", "1", "--device", "flex", "--set", "deformer.kind=cdf-basis", "-q", "--archive", text(&archive)];
     assert!(fail(&small, 2).contains("--case"));
     succeed(&[&small[..], &["--case", "n3dv", "--motion", "0.05"]].concat());
-    let room = json_of(&["info", text(&archive), "--json"]);
-    assert_eq!(room["manifest"]["gaussian_count"], 335, "{room}");
-    assert!(room["manifest"]["presentation"]["cameras"].as_array().unwrap().len() == 1, "{room}");
-    let kinds: Vec<&Value> = room["streams"].as_array().unwrap().iter().map(|stream| &stream["kind"]).collect();
-    assert!(kinds.iter().any(|kind| kind.as_str().is_some_and(|k| k.eq_ignore_ascii_case("playback"))), "{room}");
+    let info = json_of(&["info", text(&archive), "--json"]);
+    assert_eq!(info["manifest"]["gaussian_count"], 335, "{info}");
+    assert!(info["manifest"]["presentation"]["cameras"].as_array().unwrap().len() == 1, "{info}");
+    let kinds: Vec<&Value> = info["streams"].as_array().unwrap().iter().map(|stream| &stream["kind"]).collect();
+    assert!(kinds.iter().any(|kind| kind.as_str().is_some_and(|k| k.eq_ignore_ascii_case("playback"))), "{info}");
 }
 
 #[test]

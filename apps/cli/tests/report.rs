@@ -64,6 +64,6 @@ fn evaluation_says_why_lpips_is_absent_and_measures_flip() {
     assert!((report["metrics"]["flip"]["pixels_per_degree"].as_f64().unwrap() - 67.02).abs() < 0.01);
     let doctor = run(&["doctor", "--json"]);
     let doctor: Value = serde_json::from_slice(&doctor.stdout).unwrap();
-    assert_eq!(doctor["lpips"]["places"], serde_json::json!(["/no/such/weights.safetensors"]));
+    assert_eq!(doctor["lpips"]["paths"], serde_json::json!(["/no/such/weights.safetensors"]));
     assert!(doctor["lpips"]["source"].is_null() && doctor["lpips"]["absent"].as_str().unwrap().contains("/no/such"));
 }

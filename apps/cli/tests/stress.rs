@@ -29,7 +29,7 @@ fn deformers_and_loss_terms_are_compared_with_float64() {
             // Rounding is visible and small: an oracle that computes the same would be off by nothing, another formula by more. The exception are zeros: this
             // deformer moves nothing outside the box.
             let zeros = part == "deformer swift4d-hash" && condition.contains("outside");
-            // Float32 rounds a place in the box by up to 3e-8, and its product with the cells of a level by half an ulp. On the finest level of swift4d-hash
+            // Float32 rounds a position in the box by up to 3e-8, and its product with the cells of a level by half an ulp. On the finest level of swift4d-hash
             // (524,287 cells per axis) each is up to 0.016 cells, on that of grid4d (2,047 cells) 6e-5. In the other conditions both are exact there.
             let most = match part {
                 "deformer swift4d-hash" if condition == "centres in the box" => 0.02,

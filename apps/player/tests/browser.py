@@ -82,6 +82,9 @@ DESTROY = """async source => { const player = cc4dgs, { fetch, requestAnimationF
     return { frames, devices, keys, fetching: !signal.aborted, loaded: await loading, refused, memory: gpu.__wbg_ptr !== 0,
         context: !!gl && !gl.gl.isContextLost(), worker: !!gl?.sorter.worker, elements: document.getElementById("player").childElementCount }; }"""
 # Destroys the page's player while a lost device is replaced. Returns how that ends, and what is left of the player.
+# A second player, inside of a page whose first one is the page's own.
+INSIDE = """import('./player.js').then(async m => { const box = document.body.appendChild(document.createElement('div'));
+    box.style.cssText = 'position:fixed;left:0;top:0;width:160px;height:120px'; window.inner = await m.createPlayer(box); })"""
 DESTROY_LOST = """() => new Promise(done => { const player = cc4dgs;
     player.start = () => {
         delete player.start;
@@ -350,6 +353,11 @@ def destroyed(pages, facts):
         page.wait_for_function("cc4dgs.time > 0")
         page.keyboard.press(" ")
         assert not page.evaluate("cc4dgs.playing"), "keys do not reach the second player of an element"
+        page.evaluate(INSIDE)
+        page.evaluate("cc4dgs.play(); inner.play(); inner.ui.canvas.focus()")
+        page.keyboard.press(" ")
+        assert page.evaluate("[cc4dgs.playing, inner.playing]") == [True, False], "a key of a player inside of the page reached the page's own player"
+        page.evaluate("cc4dgs.pause(); inner.destroy()")
         assert page.evaluate("cc4dgs.capture().then(p => p.data.some(v => v > 60 && v < 255))"), "the second player of an element shows nothing"
         end, *left = page.evaluate(DESTROY_LOST)
         assert "destroyed" in end and not any(left), f"a recovery goes on after its player was destroyed: {[end, *left]}"

@@ -3,7 +3,7 @@
 mod scene;
 mod workload;
 
-pub use scene::{ROOM_CASES, RoomCase, growth, room, shrunk};
+pub use scene::{SCENE_CASES, SceneCase, growth, shrunk, synthetic_scene};
 pub use workload::{Workload, random_gaussians, step_camera};
 
 use crate::cpu::simd::{Lanes, dispatch};

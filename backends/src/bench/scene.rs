@@ -1,4 +1,4 @@
-//! A synthetic room with people, of the size of published scenes: Gaussians on walls, floor and moving bodies, with the statistics of a trained scene.
+//! A synthetic scene (people in a room), of the size of published scenes: Gaussians on walls, floor and moving bodies, with the statistics of a trained scene.
 
 use super::workload::uniform;
 use super::{StepCase, Workload};
@@ -6,9 +6,9 @@ use cc4dgs_core::gaussians::sh_rest_len;
 use cc4dgs_core::{Camera, HostGaussians, Seed};
 use std::borrow::Cow;
 
-/// Size of a room.
+/// Size of a synthetic scene.
 #[derive(Clone, Debug, PartialEq)]
-pub struct RoomCase {
+pub struct SceneCase {
     /// For tables.
     pub name: Cow<'static, str>,
     /// Size of the images and number of Gaussians.
@@ -17,29 +17,29 @@ pub struct RoomCase {
     pub dynamic_share: f32,
 }
 
-/// Rooms of the size of published scenes.
-pub const ROOM_CASES: [RoomCase; 2] = [
-    RoomCase { name: Cow::Borrowed("n3dv"), size: StepCase { width: 1352, height: 1014, gaussians: 335_000 }, dynamic_share: 0.12 },
-    RoomCase { name: Cow::Borrowed("technicolor"), size: StepCase { width: 2048, height: 1088, gaussians: 335_000 }, dynamic_share: 0.12 },
+/// Synthetic scenes of the size of published scenes.
+pub const SCENE_CASES: [SceneCase; 2] = [
+    SceneCase { name: Cow::Borrowed("n3dv"), size: StepCase { width: 1352, height: 1014, gaussians: 335_000 }, dynamic_share: 0.12 },
+    SceneCase { name: Cow::Borrowed("technicolor"), size: StepCase { width: 2048, height: 1088, gaussians: 335_000 }, dynamic_share: 0.12 },
 ];
 
 /// Gaussians and megapixels along which costs are followed.
 const GROWTH: ([usize; 8], [f64; 6]) = ([10_000, 30_000, 100_000, 335_000, 1_000_000, 2_000_000, 3_000_000, 5_000_000], [0.1, 0.3, 1.0, 2.0, 4.0, 8.0]);
 
-/// The first room with ever more Gaussians, then with ever larger images.
-pub fn growth() -> Vec<RoomCase> {
-    let [room, _] = ROOM_CASES;
-    let gaussians = GROWTH.0.map(|n| RoomCase { name: format!("{}k", n / 1000).into(), size: StepCase { gaussians: n, ..room.size }, ..room });
+/// The first scene with ever more Gaussians, then with ever larger images.
+pub fn growth() -> Vec<SceneCase> {
+    let [first, _] = SCENE_CASES;
+    let gaussians = GROWTH.0.map(|n| SceneCase { name: format!("{}k", n / 1000).into(), size: StepCase { gaussians: n, ..first.size }, ..first });
     let pixels = GROWTH.1.map(|megapixels| {
         let width = (megapixels * 1e6 * 4.0 / 3.0).sqrt().round();
-        let size = StepCase { width: width as u32, height: (megapixels * 1e6 / width).round() as u32, ..room.size };
-        RoomCase { name: format!("{megapixels} MP").into(), size, ..room }
+        let size = StepCase { width: width as u32, height: (megapixels * 1e6 / width).round() as u32, ..first.size };
+        SceneCase { name: format!("{megapixels} MP").into(), size, ..first }
     });
     gaussians.into_iter().chain(pixels).collect()
 }
 
 /// `case` with a share of its pixels and Gaussians.
-pub fn shrunk(case: &RoomCase, share: f64) -> RoomCase {
+pub fn shrunk(case: &SceneCase, share: f64) -> SceneCase {
     let shrink = |v: f64, by: f64| (v * by).round().max(1.0);
     let side = share.sqrt();
     let size = StepCase {
@@ -47,7 +47,7 @@ pub fn shrunk(case: &RoomCase, share: f64) -> RoomCase {
         height: shrink(f64::from(case.size.height), side) as u32,
         gaussians: shrink(case.size.gaussians as f64, share) as usize,
     };
-    RoomCase { size, ..case.clone() }
+    SceneCase { size, ..case.clone() }
 }
 
 /// Gaussians the statistics below were measured on: `panoptic_basketball` trained for 12,000 iterations.
@@ -67,8 +67,8 @@ const BODIES: u64 = 4;
 /// Dynamic score of what moves and of what does not.
 const SCORES: [f32; 2] = [10.0, -10.0];
 
-/// The room of `case`; the same for the same seed. Gaussians that move come first.
-pub fn room(case: &RoomCase, seed: Seed) -> Workload {
+/// The scene of `case`; the same for the same seed. Gaussians that move come first.
+pub fn synthetic_scene(case: &SceneCase, seed: Seed) -> Workload {
     let n = case.size.gaussians;
     let moving = (n as f32 * case.dynamic_share).round() as usize;
     let normal = |seed: Seed, k: u64| {
@@ -76,11 +76,11 @@ pub fn room(case: &RoomCase, seed: Seed) -> Workload {
         let (u, v) = (0.5 + 0.5 * uniform(seed, 2 * k), uniform(seed, 2 * k + 1));
         (-2.0 * u.max(1e-7).ln()).sqrt() * (std::f32::consts::PI * v).cos()
     };
-    let place = seed.child("place");
+    let positions = seed.child("place");
     let body_of = seed.child("bodies");
     let mut means = Vec::with_capacity(3 * n);
     for i in 0..n as u64 {
-        let [u, v, w] = std::array::from_fn(|k| uniform(place, 3 * i + k as u64));
+        let [u, v, w] = std::array::from_fn(|k| uniform(positions, 3 * i + k as u64));
         if (i as usize) < moving {
             // An ellipsoid's surface per body: 0.3 wide, 1.7 high.
             let body = i % BODIES;

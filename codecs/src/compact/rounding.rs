@@ -37,7 +37,7 @@ impl Rounding for Rounder<'_> {
         }
         for (degree, plan) in self.plan.degrees.iter().enumerate() {
             let steps: Vec<f32> = self.classes.colors.iter().flat_map(|&class| std::iter::repeat_n(plan.step_of(class) as f32, plan.dims)).collect();
-            place(&mut out, degree, &steps);
+            set_coefficients(&mut out, degree, &steps);
         }
         keep_exact(&codes, &zeros_like(gaussians), &mut out);
         out.extra = codes.attributes.iter().map(|coded| (coded.coding.name.clone(), coded.steps())).collect();
@@ -68,7 +68,7 @@ impl Rounding for Rounder<'_> {
         }
         for (degree, plan) in self.plan.degrees.iter().enumerate() {
             let guesses = (degree == 0).then_some(guesses.colors.as_slice());
-            place(&mut out, degree, &plan.bit_slopes(&coefficients(gaussians, degree), &self.classes.colors, guesses));
+            set_coefficients(&mut out, degree, &plan.bit_slopes(&coefficients(gaussians, degree), &self.classes.colors, guesses));
         }
         keep_exact(&codes, &zeros_like(gaussians), &mut out);
         for coded in &codes.attributes {
@@ -137,7 +137,7 @@ pub fn restored(codes: &Integers, gaussians: &HostGaussians) -> HostGaussians {
         let mut rows = vec![0.0; codes.len()];
         let each = rows.chunks_exact_mut(plan.dims).zip(codes.chunks_exact(plan.dims)).zip(&classes.colors);
         each.for_each(|((row, codes), &class)| plan.restore(&basis, codes, class, row));
-        place(&mut out, degree, &rows);
+        set_coefficients(&mut out, degree, &rows);
     }
     keep_exact(codes, gaussians, &mut out);
     out.extra.extend(codes.attributes.iter().map(|coded| (coded.coding.name.clone(), coded.restored())));
@@ -152,7 +152,7 @@ fn zeros_like(gaussians: &HostGaussians) -> HostGaussians {
 }
 
 /// Puts the coefficients of one degree `[N,dims]` where they belong.
-fn place(gaussians: &mut HostGaussians, degree: usize, rows: &[f32]) {
+fn set_coefficients(gaussians: &mut HostGaussians, degree: usize, rows: &[f32]) {
     if degree == 0 {
         gaussians.sh_dc.copy_from_slice(rows);
         return;

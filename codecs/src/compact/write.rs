@@ -150,10 +150,10 @@ fn exact_columns(gaussians: &HostGaussians) -> Vec<(usize, Vec<f32>)> {
 
 fn write_exact(sorted: &HostGaussians, of: &Integers, order: &[usize]) -> Vec<u8> {
     let mut out = Vec::new();
-    let mut place = vec![0u32; order.len()];
-    order.iter().enumerate().for_each(|(at, &i)| place[i] = at as u32);
+    let mut position = vec![0u32; order.len()];
+    order.iter().enumerate().for_each(|(at, &i)| position[i] = at as u32);
     for (rows, (width, values)) in of.exact.iter().zip(exact_columns(sorted)) {
-        let mut rows: Vec<u32> = rows.iter().map(|&i| place[i]).collect();
+        let mut rows: Vec<u32> = rows.iter().map(|&i| position[i]).collect();
         rows.sort_unstable();
         out.extend((rows.len() as u32).to_le_bytes());
         if rows.len() < order.len() {

@@ -26,14 +26,14 @@ pub fn damage() -> impl Strategy<Value = Damage> {
         prop::sample::select(vec![vec![0; 4], vec![255; 4], vec![0, 0, 128, 127], vec![255, 255, 255, 127], vec![0, 0, 0, 128], vec![255; 8]]),
     ];
     // Half of the damages hit the first bytes, where counts are.
-    let place = || prop_oneof![0.0..1.0f64, (0.0..1.0f64).prop_map(|v| 0.05 * v * v)];
+    let share = || prop_oneof![0.0..1.0f64, (0.0..1.0f64).prop_map(|v| 0.05 * v * v)];
     prop_oneof![
-        4 => (place(), 0..8u8).prop_map(|(at, bit)| Damage::Flip(at, bit)),
-        4 => (place(), bytes.clone()).prop_map(|(at, bytes)| Damage::Set(at, bytes)),
-        1 => place().prop_map(Damage::Cut),
-        1 => (place(), bytes).prop_map(|(at, bytes)| Damage::Insert(at, bytes)),
-        1 => (place(), 1..64usize).prop_map(|(at, count)| Damage::Remove(at, count)),
-        1 => (place(), 0..16usize, 1..64usize).prop_map(|(at, other, count)| Damage::Splice(at, other, count)),
+        4 => (share(), 0..8u8).prop_map(|(at, bit)| Damage::Flip(at, bit)),
+        4 => (share(), bytes.clone()).prop_map(|(at, bytes)| Damage::Set(at, bytes)),
+        1 => share().prop_map(Damage::Cut),
+        1 => (share(), bytes).prop_map(|(at, bytes)| Damage::Insert(at, bytes)),
+        1 => (share(), 1..64usize).prop_map(|(at, count)| Damage::Remove(at, count)),
+        1 => (share(), 0..16usize, 1..64usize).prop_map(|(at, other, count)| Damage::Splice(at, other, count)),
         1 => (0..16usize).prop_map(Damage::Swap),
         1 => Just(Damage::Drop),
     ]
@@ -46,12 +46,12 @@ pub fn harm(streams: &mut Vec<Stream>, which: usize, damage: &Damage) {
     }
     let (which, count) = (which % streams.len(), streams.len());
     let other = |k: usize| streams[k % count].bytes.clone();
-    let place = |at: &f64, len: usize| ((at * len as f64) as usize).min(len.saturating_sub(1));
+    let index = |at: &f64, len: usize| ((at * len as f64) as usize).min(len.saturating_sub(1));
     match damage {
         Damage::Splice(at, k, length) => {
             let from = other(*k);
             let bytes = &mut streams[which].bytes;
-            let at = place(at, bytes.len());
+            let at = index(at, bytes.len());
             bytes.iter_mut().skip(at).take(*length).zip(from).for_each(|(to, from)| *to = from);
         }
         Damage::Swap(k) => {
@@ -64,20 +64,20 @@ pub fn harm(streams: &mut Vec<Stream>, which: usize, damage: &Damage) {
             let bytes = &mut streams[which].bytes;
             match damage {
                 Damage::Flip(at, bit) if !bytes.is_empty() => {
-                    let at = place(at, bytes.len());
+                    let at = index(at, bytes.len());
                     bytes[at] ^= 1 << bit;
                 }
                 Damage::Set(at, new) => {
-                    let at = place(at, bytes.len());
+                    let at = index(at, bytes.len());
                     bytes.iter_mut().skip(at).zip(new).for_each(|(to, from)| *to = *from);
                 }
-                Damage::Cut(at) => bytes.truncate(place(at, bytes.len())),
+                Damage::Cut(at) => bytes.truncate(index(at, bytes.len())),
                 Damage::Insert(at, new) => {
-                    let at = place(at, bytes.len());
+                    let at = index(at, bytes.len());
                     bytes.splice(at..at, new.iter().copied());
                 }
                 Damage::Remove(at, length) => {
-                    let at = place(at, bytes.len());
+                    let at = index(at, bytes.len());
                     bytes.drain(at..(at + length).min(bytes.len()));
                 }
                 _ => {}

@@ -60,6 +60,6 @@ pub use reader::{
     Background, CameraRef, Distortion, ImageSource, InitBox, RawCamera, RawPoints, RawScene, RawView, ReaderPlugin, SAME_TIME, SceneOptions, SyncMode,
 };
 pub use registry::Registry;
-pub use scene::{FrameSource, PointCloud, Scene, Split, View};
+pub use scene::{FrameSource, NoImages, PointCloud, Scene, Split, View};
 pub use schedule::{REFERENCE_ITERATIONS, Schedule, Settled, Stage};
 pub use sum::ordered_sum;

@@ -21,10 +21,15 @@ pub fn spread_from_first<T: Copy>(items: &[T], most: usize) -> Vec<T> {
 /// `views` of `scene` camera after camera, the frames of each turned against those of the one before. Scenes have their views by frame, where every so many are
 /// often of one camera; in this order they are of all cameras, and of many frames.
 pub fn by_camera(scene: &Scene, views: &[usize]) -> Vec<usize> {
-    let mut of_camera: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-    views.iter().for_each(|&view| of_camera.entry(scene.views[view].camera).or_default().push(view));
-    let mut order = Vec::with_capacity(views.len());
-    for (k, mut own) in of_camera.into_values().enumerate() {
+    by_group(views, |view| scene.views[view].camera)
+}
+
+/// `items` group after group, those of each turned against those of the one before.
+pub fn by_group<T: Copy, K: Ord>(items: &[T], group: impl Fn(T) -> K) -> Vec<T> {
+    let mut groups: BTreeMap<K, Vec<T>> = BTreeMap::new();
+    items.iter().for_each(|&item| groups.entry(group(item)).or_default().push(item));
+    let mut order = Vec::with_capacity(items.len());
+    for (k, mut own) in groups.into_values().enumerate() {
         let turn = ((k as f64 * TURN).fract() * own.len() as f64) as usize;
         own.rotate_left(turn);
         order.append(&mut own);
@@ -45,16 +50,9 @@ pub fn spread_views(scene: &Scene, views: &[usize], most: usize) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Camera, Error, FrameSource, Image8, Result, Split, View};
+    use crate::{Camera, NoImages, Split, View};
     use std::collections::BTreeSet;
     use std::sync::Arc;
-
-    struct NoImages;
-    impl FrameSource for NoImages {
-        fn load(&self, view: usize) -> Result<Image8> {
-            Err(Error::unsupported(format!("view {view}"), "no images here", "None"))
-        }
-    }
 
     /// Views by frame, as readers give them.
     fn scene(cameras: usize, frames: usize) -> Scene {

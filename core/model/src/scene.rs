@@ -49,6 +49,16 @@ pub trait FrameSource: Send + Sync {
     }
 }
 
+/// The source of a scene that has cameras and times, and no images.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct NoImages;
+
+impl FrameSource for NoImages {
+    fn load(&self, view: usize) -> Result<Image8> {
+        Err(Error::unsupported(format!("the image of view {view}"), "this scene has no images", "Use a scene with images"))
+    }
+}
+
 /// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes; clones share the cache.
 #[derive(Clone)]
 pub struct Scene {

@@ -152,16 +152,9 @@ fn rand_signs(seed: Seed, count: usize) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cc4dgs_core::{Error, FrameSource, View};
+    use cc4dgs_core::{NoImages, View};
     use std::collections::BTreeSet;
     use std::sync::Arc;
-
-    struct NoImages;
-    impl FrameSource for NoImages {
-        fn load(&self, view: usize) -> Result<Image8> {
-            Err(Error::unsupported(format!("view {view}"), "no images here", "None"))
-        }
-    }
 
     #[test]
     fn every_so_many_views_are_of_all_cameras() {

@@ -186,7 +186,8 @@ pub fn evaluate(
     let mut images = Vec::with_capacity(views.len());
     let mut times: Vec<FrameTime> = Vec::with_capacity(views.len());
     let (mut skimage, mut ms_ssim) = (0.0, Some(0.0));
-    let frames = FrameSet { split, count: views.len(), of: in_split };
+    let transparent = scene.frame(views[0])?.channels == 4;
+    let frames = FrameSet { split, count: views.len(), of: in_split, background: transparent.then_some(background) };
     let metric = |m: Metric| m.over(frames.clone());
     let psnr_metric = metric(Metric::psnr(Rounding::EightBit));
     let dynamic_metric = metric(Metric::psnr(Rounding::EightBit).masked());

@@ -181,7 +181,7 @@ mod tests {
             ("clustered", uniform.iter().enumerate().map(far_apart).collect()),
             ("one far outlier", outlier),
             ("all identical", vec![[0.3, -0.2, 7.0]; count]),
-            ("two places", (0..count).map(|i| [(i % 2) as f32, 0.0, 0.0]).collect()),
+            ("two positions", (0..count).map(|i| [(i % 2) as f32, 0.0, 0.0]).collect()),
             ("a cubic grid", (0..count).map(|i| [i % side, i / side % side, i / side / side].map(|v| v as f32)).collect()),
             ("halvings", (0..count).map(|i| [0.5f32.powi((i % 120) as i32), 0.0, 0.0]).collect()),
             ("uniform", uniform),

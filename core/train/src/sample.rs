@@ -1,3 +1,3 @@
 //! A few of many, evenly spread.
 
-pub(crate) use cc4dgs_core::sample::{spread, spread_from_first, spread_views};
+pub(crate) use cc4dgs_core::sample::{by_group, spread, spread_from_first, spread_views};

@@ -124,9 +124,9 @@ fn rebuilt(field: &CdfBasis, plans: &[Plan]) -> Result<CdfBasis> {
         let of_head = field.settings.heads.iter().position(|h| format!("net.head.{}", h.name()) == target.name);
         *target = match of_head {
             None => Parameter { value: source.value.clone(), ..target.clone() },
-            Some(place) => {
+            Some(index) => {
                 let values = to_vec(source.value.clone(), &source.name)?;
-                let kept = head_weights(&values, field.shape.groups[place], field.coefficients.trunk.last().copied().unwrap_or(0), &plans[place].kept);
+                let kept = head_weights(&values, field.shape.groups[index], field.coefficients.trunk.last().copied().unwrap_or(0), &plans[index].kept);
                 parameter(target.name.clone(), Part::Net, NET, kept, &device)
             }
         };

@@ -82,9 +82,9 @@ impl Cdf {
         &self.sizes
     }
 
-    /// The weights of the parameter at index `place` after the decoders.
-    fn net(&self, place: usize) -> Tensor<1> {
-        self.parameters[self.voxels.levels() + place].value.clone()
+    /// The weights of the parameter at index `index` after the decoders.
+    fn net(&self, index: usize) -> Tensor<1> {
+        self.parameters[self.voxels.levels() + index].value.clone()
     }
 
     /// The trunk's weights at `time_norm` (0..1), modulation folded into its first layer.

@@ -9,7 +9,7 @@ mod page;
 use crate::still;
 use cc4dgs_format::playback::MaxError;
 use cc4dgs_format::{Error, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, Plugin, Result, config, inventory};
-pub use page::{PAGE_FILES, PAGE_VARIABLE, PAGE_VERSION, Page, page_places};
+pub use page::{PAGE_FILES, PAGE_VARIABLE, PAGE_VERSION, Page, page_paths};
 use serde::Deserialize;
 use std::path::Path;
 

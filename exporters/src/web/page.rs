@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// Names the folder of the page; nothing else is looked at then.
 pub const PAGE_VARIABLE: &str = "CC4DGS_PAGE";
-/// Name of the folder in the other places.
+/// Name of the folder in the other folders.
 const PAGE_FOLDER: &str = "page";
 /// Files of the page that `apps/player/build-web` makes; `index.html` is written anew.
 pub const PAGE_FILES: [&str; 9] =
@@ -27,7 +27,7 @@ pub struct Page {
 
 /// The folders that [`Page::find`] looks at, in order: the one that the variable `CC4DGS_PAGE` names, or else `page` in [`user_data_folder`], `share/cc4dgs/page`
 /// beside the folder of the program, and `page` in it.
-pub fn page_places() -> Vec<PathBuf> {
+pub fn page_paths() -> Vec<PathBuf> {
     if let Some(folder) = variable_path(PAGE_VARIABLE) {
         return vec![folder];
     }
@@ -37,20 +37,20 @@ pub fn page_places() -> Vec<PathBuf> {
 }
 
 impl Page {
-    /// The page of the first folder of [`page_places`] that exists, else the one that the feature `embed-page` built in.
+    /// The page of the first folder of [`page_paths`] that exists, else the one that the feature `embed-page` built in.
     ///
     /// # Errors
     /// [`Error::Unsupported`] where there is none, and as [`Page::read`].
     pub fn find() -> Result<Self> {
-        let places = page_places();
+        let paths = page_paths();
         let named = variable_path(PAGE_VARIABLE).is_some();
-        if let Some(folder) = places.iter().find(|folder| named || folder.is_dir()) {
+        if let Some(folder) = paths.iter().find(|folder| named || folder.is_dir()) {
             return Self::read(folder);
         }
         if let Some(files) = embedded() {
             return Self { files: PAGE_FILES.into_iter().zip(files).collect(), origin: "this program".into() }.checked();
         }
-        let looked: Vec<String> = places.iter().map(|p| p.display().to_string()).collect();
+        let looked: Vec<String> = paths.iter().map(|p| p.display().to_string()).collect();
         let problem = format!("it is neither built in nor in {}", looked.join(" or "));
         let remedy = format!("Build it with apps/player/build-web FOLDER, then name the folder: {PAGE_VARIABLE}=FOLDER or --set page=FOLDER");
         Err(Error::unsupported("page of the player", problem, remedy))

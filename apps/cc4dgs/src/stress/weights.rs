@@ -17,7 +17,7 @@ const POINTS: usize = 120;
 const VALUES: usize = 64;
 
 /// A condition, whether its centres are ordinary, and the centre with an index.
-type Place = (&'static str, bool, fn(usize) -> [f32; 3]);
+type Centres = (&'static str, bool, fn(usize) -> [f32; 3]);
 
 pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     for (kind, plugin) in job.registry.plugins() {
@@ -39,7 +39,7 @@ pub fn run(job: &StressJob, note: &mut dyn FnMut(StressCase)) -> Result<()> {
 fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Result<()> {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 10, sh_degree: 1, seed: Seed::root(2) };
     let part = format!("deformer {name}");
-    let places: [Place; 5] = [
+    let conditions: [Centres; 5] = [
         ("centres in the box", true, |i| [0, 1, 2].map(|k| 0.9 * uniform(Seed::root(3).index(i as u64), k))),
         // Multiples of 1/64 lie on the faces of grids of any power of two.
         ("centres on the faces of voxels", true, |i| [i % 9, i / 9 % 9, i / 81].map(|k| k as f32 / 4.0 - 1.0)),
@@ -47,8 +47,8 @@ fn deformer(job: &StressJob, name: &str, note: &mut dyn FnMut(StressCase)) -> Re
         ("centres outside the box", false, |i| [0, 1, 2].map(|k| 50.0 * uniform(Seed::root(4).index(i as u64), k))),
         ("centres far outside the box", false, |i| [0, 1, 2].map(|k| 1e30 * uniform(Seed::root(5).index(i as u64), k))),
     ];
-    for (condition, ordinary, place) in places {
-        let means: Vec<f32> = (0..POINTS).flat_map(place).collect();
+    for (condition, ordinary, centre) in conditions {
+        let means: Vec<f32> = (0..POINTS).flat_map(centre).collect();
         let exact = if Exact::knows(name) {
             let deformer = shaken(job, name, &context, job.host)?;
             let columns = attribute_values(deformer.as_ref());

@@ -14,7 +14,7 @@ pub struct Bench {
 pub enum BenchWhat {
     /// A whole static training step: project, rasterize, L1 and SSIM, backward, Adam.
     Step(BenchStep),
-    /// Playback of a room with people as large as published scenes: deformer and rasterizer, frame by frame.
+    /// Playback of a synthetic scene as large as published ones: deformer and rasterizer, frame by frame.
     Frame(BenchFrame),
     /// Playback of a trained model through the cameras of a dataset: deformer and rasterizer, frame by frame.
     Play(BenchPlay),
@@ -134,7 +134,7 @@ pub struct BenchFrame {
     /// Time only this case; may be given again.
     #[arg(long, value_name = "NAME")]
     pub case: Vec<String>,
-    /// In place of the cases: one room with 10 thousand to 5 million Gaussians, then with images of 0.1 to 8 megapixels.
+    /// In place of the cases: one synthetic scene with 10 thousand to 5 million Gaussians, then with images of 0.1 to 8 megapixels.
     #[arg(long)]
     pub growth: bool,
     /// Frames measured per case, after warming up.
@@ -152,7 +152,7 @@ pub struct BenchFrame {
     /// Settings of the deformer or rasterizer, such as deformer.kind=none; may be given several times.
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Root of the seed tree the rooms are made from.
+    /// Root of the seed tree the synthetic scenes are made from.
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
 }
@@ -176,10 +176,10 @@ pub struct BenchStep {
     /// Device to compute on.
     #[arg(long, value_name = "NAME", default_value = "auto")]
     pub device: String,
-    /// In place of the standard cases, a room with people (n3dv, technicolor); may be given again.
+    /// In place of the standard cases, a synthetic scene as large as published ones (n3dv, technicolor); may be given again.
     #[arg(long, value_name = "NAME")]
     pub case: Vec<String>,
-    /// Share of the pixels and Gaussians of rooms to keep.
+    /// Share of the pixels and Gaussians of synthetic scenes to keep.
     #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = positive)]
     pub scale: f64,
     /// Steps measured per case, after warming up.

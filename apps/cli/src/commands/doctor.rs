@@ -2,10 +2,10 @@
 
 use super::Context;
 use burn::tensor::Device;
-use cc4dgs::exporters::web::{Page, page_places};
+use cc4dgs::exporters::web::{Page, page_paths};
 use cc4dgs::video;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::metrics::{WeightsId, installed_lpips, lpips_places};
+use cc4dgs_core::metrics::{WeightsId, installed_lpips, lpips_paths};
 use cc4dgs_core::{Adapter, Camera, DEVICE_NAMES, Error, Gaussians, HostGaussians, RenderSettings, Result, Splats, adapters, auto_device, parse_device};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -45,12 +45,12 @@ struct LpipsReport {
     /// Why there are none.
     absent: Option<&'static str>,
     /// The files that are looked at, in order.
-    places: Vec<PathBuf>,
+    paths: Vec<PathBuf>,
 }
 
 fn lpips() -> LpipsReport {
     let found = installed_lpips();
-    LpipsReport { source: found.map(|f| f.source.clone()).ok(), weights: found.map(|f| f.network.id()).ok(), absent: found.err(), places: lpips_places() }
+    LpipsReport { source: found.map(|f| f.source.clone()).ok(), weights: found.map(|f| f.network.id()).ok(), absent: found.err(), paths: lpips_paths() }
 }
 
 /// The page of the player, which `export web` needs.
@@ -61,12 +61,12 @@ struct PageReport {
     /// Why there is none.
     absent: Option<String>,
     /// The folders that are looked at, in order.
-    places: Vec<PathBuf>,
+    paths: Vec<PathBuf>,
 }
 
 fn page() -> PageReport {
     let found = Page::find();
-    PageReport { source: found.as_ref().map(|p| p.origin.clone()).ok(), absent: found.err().map(|e| e.to_string()), places: page_places() }
+    PageReport { source: found.as_ref().map(|p| p.origin.clone()).ok(), absent: found.err().map(|e| e.to_string()), paths: page_paths() }
 }
 
 #[derive(Serialize)]

@@ -252,7 +252,7 @@ mod tests {
     use super::*;
 
     /// A folder with a scene of one image, and a path in it.
-    fn place() -> (tempfile::TempDir, impl Fn(&str) -> PathBuf) {
+    fn scratch() -> (tempfile::TempDir, impl Fn(&str) -> PathBuf) {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().to_path_buf();
         std::fs::create_dir_all(root.join("scene/images")).unwrap();
@@ -263,7 +263,7 @@ mod tests {
 
     #[test]
     fn a_sheet_replaces_no_model_and_no_image_of_the_scene() {
-        let (_folder, at) = place();
+        let (_folder, at) = scratch();
         let check = |sheet: &str, scene: &str, overwrite| check_sheet(&at(sheet), &at(scene), overwrite).map_err(|e| e.to_string());
         std::fs::write(at("model.cc4d"), b"\x89CC4D\r\n\x1a").unwrap();
         std::fs::write(at("model.test.png"), PNG).unwrap();
@@ -283,7 +283,7 @@ mod tests {
 
     #[test]
     fn renders_replace_renders_only() {
-        let (_folder, at) = place();
+        let (_folder, at) = scratch();
         let earlier = |folder: &str, overwrite| earlier_renders(&at(folder), &at("scene"), overwrite).map_err(|e| e.to_string());
         let nothing: Vec<PathBuf> = Vec::new();
         assert_eq!(earlier("renders", false), Ok(nothing.clone()));

@@ -74,8 +74,8 @@ pub(crate) fn functions(scene: &Scene, time: f32) -> (Vec<f32>, [[u32; 4]; 5]) {
     let Some(layer) = &scene.layer else { return (out, heads) };
     let at = layer.weights_at(time);
     let segment = &layer.segments[at.segment];
-    let places = scene.tracks[at.segment].iter().enumerate().filter_map(|(head, place)| Some((head, (*place)?)));
-    for ((head, (starts, coefficients)), track) in places.zip(&segment.tracks) {
+    let used = scene.tracks[at.segment].iter().enumerate().filter_map(|(head, index)| Some((head, (*index)?)));
+    for ((head, (starts, coefficients)), track) in used.zip(&segment.tracks) {
         heads[head] = [starts, coefficients, out.len() as u32, track.head.width(scene.sh_degree) as u32];
         out.extend(track.functions_at(&at));
     }

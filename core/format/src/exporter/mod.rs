@@ -3,10 +3,10 @@
 //! An exporter reads Gaussians, or rendered images, from an [`ExportSource`] and writes one file or one folder. [`export`] runs it on a temporary name and
 //! renames the result, so that an exporter need not care about interrupted or failed writes.
 
-mod place;
+mod target;
 
 #[cfg(not(target_arch = "wasm32"))]
-pub use place::{export, refuse_existing, refuse_other_content};
+pub use target::{export, refuse_existing, refuse_other_content};
 
 use crate::playback::MaxError;
 use crate::plugin::Plugin;

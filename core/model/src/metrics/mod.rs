@@ -15,7 +15,7 @@ mod psnr;
 mod ssim;
 
 pub use flip::{FLIP_PIXELS_PER_DEGREE, flip, flip_map};
-pub use lpips::{InstalledLpips, LPIPS_FILE, LPIPS_SMALLEST_SIDE, LPIPS_VARIABLE, Lpips, WeightsId, installed_lpips, lpips_places};
+pub use lpips::{InstalledLpips, LPIPS_FILE, LPIPS_SMALLEST_SIDE, LPIPS_VARIABLE, Lpips, WeightsId, installed_lpips, lpips_paths};
 pub use ms_ssim::{MS_SSIM_WEIGHTS, ms_ssim};
 pub use planes::Planes;
 pub use protocol::{FrameSet, MaskRule, Metric, MetricKind, Padding, Protocol, Rounding, Window};

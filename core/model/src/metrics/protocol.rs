@@ -61,7 +61,7 @@ pub enum MaskRule {
 }
 
 /// The images of a scene that a mean is over.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrameSet {
     /// The side of the split.
     pub split: Split,
@@ -69,6 +69,9 @@ pub struct FrameSet {
     pub count: usize,
     /// Number of images of the split.
     pub of: usize,
+    /// What is behind them, RGB in 0..1, where they are transparent: contours are scored on it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub background: Option<[f32; 3]>,
 }
 
 /// Everything that a score depends on besides the images.

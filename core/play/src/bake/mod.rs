@@ -244,8 +244,8 @@ mod tests {
     use cc4dgs_core::archive::Provenance;
     use cc4dgs_core::{DeformerContext, HostGaussians, Seed, Silent, Similarity};
 
-    /// Two Gaussians at `places` on the x axis at even times, over two frames, joined by lines.
-    fn moved(places: &[[f32; 2]], device: &Device) -> Result<Model> {
+    /// Two Gaussians at `positions` on the x axis at even times, over two frames, joined by lines.
+    fn moved(positions: &[[f32; 2]], device: &Device) -> Result<Model> {
         let at = |[a, b]: [f32; 2]| HostGaussians {
             means: vec![a, 0.0, 1.0, b, 0.0, 1.0],
             log_scales: vec![-2.0; 6],
@@ -256,7 +256,7 @@ mod tests {
             ..Default::default()
         };
         let mut gaussians = at([0.0; 2]);
-        let keys: Vec<HostGaussians> = places.iter().map(|place| at(*place)).collect();
+        let keys: Vec<HostGaussians> = positions.iter().map(|position| at(*position)).collect();
         let layer = keyframes(&gaussians, &[0, 1], &keys)?;
         let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 2, sh_degree: 0, seed: Seed::root(1) };
         let field = of_layer("t", layer, &mut gaussians, &[0, 1], &context, device)?;
@@ -288,8 +288,8 @@ mod tests {
         assert_eq!((report.samples, report.samples_limited, report.between_over, report.between_measured), (2, false, 0.0, 2), "{report:?}");
         assert_eq!(report.over_bound(), None);
         // One Gaussian jumps, the other stays where it is.
-        let places: Vec<[f32; 2]> = (0..61).map(|k| [(k * k * 7 % 13) as f32 / 26.0, 0.0]).collect();
-        let report = baked(&moved(&places, &device).unwrap(), false, &device).unwrap().unwrap().report;
+        let positions: Vec<[f32; 2]> = (0..61).map(|k| [(k * k * 7 % 13) as f32 / 26.0, 0.0]).collect();
+        let report = baked(&moved(&positions, &device).unwrap(), false, &device).unwrap().unwrap().report;
         assert_eq!((report.samples, report.samples_limited, report.between_over, report.between_measured), (513, true, 0.5, 2), "{report:?}");
         assert!(report.at_samples <= KEPT && report.between_samples > 10.0 && report.between_p99 == report.between_samples, "{report:?}");
         let sentence = report.over_bound().unwrap();

@@ -21,7 +21,7 @@ pub(super) fn check(scene: &Scene) -> Vec<Finding> {
         1 => "there is one training image only, and depth cannot be known from a single image".to_string(),
         n => format!("all {n} training images were taken from one point, and without parallax depth cannot be known"),
     };
-    let remedy = "Add images from other places, check that the poses are the right ones, and look for warnings about images that were skipped";
+    let remedy = "Add images from other positions, check that the poses are the right ones, and look for warnings about images that were skipped";
     let severity = if scene.points.is_some() { Severity::Doubt } else { Severity::Refuse };
     vec![Finding::new(severity, Subject::Cameras, problem, remedy)]
 }

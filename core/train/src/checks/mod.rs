@@ -34,7 +34,7 @@ pub enum Severity {
 pub enum Subject {
     /// What the images show.
     Images,
-    /// The number and the places of the cameras.
+    /// The number and the positions of the cameras.
     Cameras,
     /// The times of the images.
     Times,

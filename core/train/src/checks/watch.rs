@@ -190,28 +190,28 @@ impl Watch {
             END => Doubts { any: one_time || self.doubts.iter().any(|d| matches!(d.subject, Subject::Poses | Subject::Times)), one_time },
             _ => Doubts::default(),
         };
-        let place = match percent {
+        let when = match percent {
             END => format!("after {} iterations", context.lengths.total()),
             _ => format!("stopped at iteration {} of {} of the main stage, where", state.iteration, context.lengths.length(Stage::Main)),
         };
         let problem = match shortfall(&deciding, self.at(START).map(|s| s.psnr_db), &yardstick.baselines, rules, doubts)? {
-            Shortfall::Images(words) => format!("{place} {words}"),
+            Shortfall::Images(words) => format!("{when} {words}"),
             Shortfall::Still(words) => {
                 let remedy = format!(
                     "The main stage makes the scene worse: try lower learning rates (those of the deformer, train.lr), more iterations, or another deformer. {} = false \
                      accepts such models",
                     kept(context)
                 );
-                return Some(Error::failed("training", format!("{place} {words}"), remedy));
+                return Some(Error::failed("training", format!("{when} {words}"), remedy));
             }
             Shortfall::Motion(words) if state.moving == Moving::Nothing || state.deformer.as_ref().is_none_or(|d| d.field.is_static()) => {
                 if percent == END {
                     let remedy = "the scene moves, and this run holds everything still. Choose a deformer and train.dynamic = \"auto\"";
-                    context.job.events.emit(&Event::Warning { object: "deformer".into(), message: format!("{place} {words}: {remedy}") });
+                    context.job.events.emit(&Event::Warning { object: "deformer".into(), message: format!("{when} {words}: {remedy}") });
                 }
                 return None;
             }
-            Shortfall::Motion(words) => format!("{place} {words}: the deformer does not follow the motion"),
+            Shortfall::Motion(words) => format!("{when} {words}: the deformer does not follow the motion"),
         };
         Some(self.failure(context, problem))
     }

@@ -47,20 +47,13 @@ pub fn hold_out(scene: &Scene, count: usize) -> Result<Scene> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cc4dgs_core::{Camera, FrameSource, Image8, View};
+    use cc4dgs_core::{Camera, NoImages, View};
     use std::sync::Arc;
-
-    struct NoFrames;
-    impl FrameSource for NoFrames {
-        fn load(&self, view: usize) -> Result<Image8> {
-            Err(Error::unsupported(format!("view {view}"), "no images here", "None"))
-        }
-    }
 
     fn scene(cameras: usize, frames: usize) -> Scene {
         let camera = |k: usize| Camera::look_at(&format!("c{k}"), (8, 8), 1.0, [k as f64, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let views = (0..frames).flat_map(|frame| (0..cameras).map(move |camera| View { camera, frame, time_norm: 0.0, split: Split::Train })).collect();
-        Scene::new("s", (0..cameras).map(camera).collect(), views, Arc::new(NoFrames), 0).unwrap()
+        Scene::new("s", (0..cameras).map(camera).collect(), views, Arc::new(NoImages), 0).unwrap()
     }
 
     #[test]

@@ -48,12 +48,12 @@ fn placed(value: f64) -> f64 {
 /// How far ahead of the cameras the scene is, from its points or its box: the median over cameras of the median depth, which a few points at the horizon or
 /// a few odd cameras do not move.
 fn depth_hint(raw: &RawScene, rays: &[(DVec3, DVec3)]) -> Option<f64> {
-    let places: Vec<DVec3> = match (&raw.points, raw.init_box) {
+    let positions: Vec<DVec3> = match (&raw.points, raw.init_box) {
         (Some(points), _) if !points.positions.is_empty() => every(&points.positions, SAMPLE[1]).map(|p| DVec3::from(*p)).collect(),
         (_, Some(cc4dgs_core::InitBox::Corners { low, high })) => vec![0.5 * (DVec3::from(low) + DVec3::from(high))],
         _ => return None,
     };
-    let depths = every(rays, SAMPLE[0]).filter_map(|(c, d)| median(places.iter().map(|p| (*p - *c).dot(*d)).filter(|z| *z > 0.0).collect()));
+    let depths = every(rays, SAMPLE[0]).filter_map(|(c, d)| median(positions.iter().map(|p| (*p - *c).dot(*d)).filter(|z| *z > 0.0).collect()));
     median(depths.collect()).filter(|d| d.is_finite())
 }
 

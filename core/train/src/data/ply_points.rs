@@ -186,11 +186,11 @@ impl Header {
 /// The vertices of the PLY `bytes` with their colours; grey where it has none. `object` names the file in errors.
 pub(crate) fn points(object: &str, bytes: &[u8], limits: &Limits) -> Result<RawPoints> {
     let header = Header::parse(object, bytes, limits)?;
-    let place = header.columns(["x", "y", "z"]).ok_or_else(|| damaged(object, "its vertices lack x, y or z".into()))?;
+    let xyz = header.columns(["x", "y", "z"]).ok_or_else(|| damaged(object, "its vertices lack x, y or z".into()))?;
     let colour = header.columns(["red", "green", "blue"]);
     let mut cloud = RawPoints::default();
     header.vertices(object, &bytes[header.length..], |values| {
-        let position = place.map(|column| values[column]);
+        let position = xyz.map(|column| values[column]);
         if position.iter().any(|v| !(*v as f32).is_finite()) {
             return Err(damaged(object, format!("vertex {} is at {position:?}", cloud.positions.len())));
         }

@@ -4,6 +4,7 @@ use super::charts::best_codecs;
 use super::rows::Row;
 use super::text::{base64, html};
 use crate::images::{encode_png, error_map, heat_color};
+use crate::sample::{by_group, spread_from_first};
 use crate::sweep::{CellResult, ImageResult};
 use cc4dgs_core::{Error, Image8, Result};
 use image::codecs::jpeg::JpegEncoder;
@@ -36,9 +37,10 @@ pub fn gallery(folder: &Path, scene: &str, rows: &[Row], views: usize) -> Result
     let shown: Vec<(&Row, &CellResult)> = best_codecs(rows).into_iter().filter_map(|row| Some((row, shown_cell(folder, row)?))).collect();
     let Some((_, first)) = shown.first() else { return Ok(String::new()) };
     let usable: Vec<usize> = (0..first.images.len()).filter(|i| shown.iter().all(|(_, cell)| file_of(folder, cell, *i).is_some())).collect();
-    let wanted = views.min(usable.len());
+    // In the order of their frames, every so many images are often of one camera.
+    let usable = by_group(&usable, |image| first.images[image].camera.as_str());
     let mut body = String::new();
-    for view in (0..wanted).map(|i| usable[i * usable.len() / wanted]) {
+    for view in spread_from_first(&usable, views) {
         body += &sheet(folder, scene, &shown, view)?;
     }
     body += &flicker(folder, &shown)?;

@@ -59,6 +59,8 @@ quantities! {
     TRAINING_MEMORY: "training_peak_memory_mb", "peak memory of the training", "MB", 0, Lower, |c| c.cost.training_peak_memory_mb;
     CELL_MEMORY: "cell_peak_memory_mb", "peak memory of codec and scoring", "MB", 0, Lower, |c| c.cost.cell_peak_memory_mb;
     GAUSSIANS: "gaussians", "Gaussians", "", 0, Neither, |c| Some(c.gaussians as f64);
+    MOVING: "dynamic_gaussians", "moving Gaussians", "", 0, Neither, |c| Some(c.dynamic_gaussians as f64);
+    ITERATIONS: "iterations", "iterations", "", 0, Neither, |c| Some(c.iterations as f64);
 }
 
 /// Larger numbers than any measurement has: what lies beyond is damage.

@@ -20,8 +20,8 @@ const NAMED: usize = 8;
 pub struct Missing {
     /// The cell.
     pub cell: String,
-    /// Its place in the grid.
-    pub place: String,
+    /// Its values on the axes of the grid.
+    pub axes: String,
     /// Why it is missing.
     pub reason: String,
 }
@@ -77,8 +77,8 @@ pub fn collect(folder: &SweepFolder, plan: &Plan) -> Result<Collection> {
             None => {
                 let state = states.entry(&cell.training).or_insert_with(|| folder.state(&cell.training));
                 let damaged = if folder.result(&cell.id).exists() { "its file is damaged; " } else { "" };
-                let place = trainings.get(cell.training.as_str()).map_or_else(String::new, |t| format!("{} {}", t.label(), cell.codec));
-                missing.push(Missing { cell: cell.id.clone(), place, reason: format!("{damaged}{state}") });
+                let axes = trainings.get(cell.training.as_str()).map_or_else(String::new, |t| format!("{} {}", t.label(), cell.codec));
+                missing.push(Missing { cell: cell.id.clone(), axes, reason: format!("{damaged}{state}") });
             }
         }
     }
@@ -107,7 +107,7 @@ impl Collection {
         if self.missing.is_empty() {
             return Ok(());
         }
-        let named: Vec<String> = self.missing.iter().take(NAMED).map(|m| format!("{} ({}): {}", m.cell, m.place, m.reason)).collect();
+        let named: Vec<String> = self.missing.iter().take(NAMED).map(|m| format!("{} ({}): {}", m.cell, m.axes, m.reason)).collect();
         let more = self.missing.len().saturating_sub(NAMED);
         let rest = if more > 0 { format!("; and {more} more") } else { String::new() };
         let problem = format!("{} of {} cells are missing: {}{rest}", self.missing.len(), self.planned, named.join("; "));

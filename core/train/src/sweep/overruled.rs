@@ -8,19 +8,19 @@ use cc4dgs_core::{Error, Result, config};
 /// grid are meant to take the place of theirs.
 ///
 /// # Errors
-/// [`Error::Parameter`] that names place, key, value and remedy.
+/// [`Error::Parameter`] that names section, key, value and remedy.
 pub(super) fn refuse_overruled(object: &str, grid: &Grid) -> Result<()> {
     let mut lists = vec![("set".to_string(), grid.set.as_slice())];
     lists.extend(lists_of("scene", &grid.scene).chain(lists_of("method", &grid.method)).chain(lists_of("setting", &grid.setting)));
-    for (place, set) in lists {
-        refuse_settings(grid, set).map_err(|error| within(&format!("{object}: {place}"), error))?;
+    for (section, set) in lists {
+        refuse_settings(grid, set).map_err(|error| within(&format!("{object}: {section}"), error))?;
     }
     if grid.minutes.is_none() && grid.iterations.is_none() {
         let mut sizes = sizes_of("scene", &grid.scene).chain(sizes_of("method", &grid.method)).chain(sizes_of("setting", &grid.setting));
-        if let Some((place, size)) = sizes.find(|(_, size)| *size != 1.0) {
+        if let Some((section, size)) = sizes.find(|(_, size)| *size != 1.0) {
             let problem = format!("{size} has no effect: the grid states neither minutes nor iterations that it could multiply");
             let remedy = "Size the grid (minutes or iterations, or the options of these names), or remove size and set train.iterations";
-            return Err(Error::parameter(format!("{object}: {place}, size"), problem, remedy));
+            return Err(Error::parameter(format!("{object}: {section}, size"), problem, remedy));
         }
     }
     if !grid.method.iter().any(|method| method.own.preset.starts_with('+'))
@@ -33,12 +33,12 @@ pub(super) fn refuse_overruled(object: &str, grid: &Grid) -> Result<()> {
     Ok(())
 }
 
-/// The settings of each value of an axis, with their place in the grid.
+/// The settings of each value of an axis, with their section in the grid.
 fn lists_of<'a, T>(axis: &'a str, values: &'a [Axis<T>]) -> impl Iterator<Item = (String, &'a [String])> {
     values.iter().map(move |value| (format!("[[{axis}]] '{}', set", value.name), value.set.as_slice()))
 }
 
-/// The size of each value of an axis, with its place in the grid.
+/// The size of each value of an axis, with its section in the grid.
 fn sizes_of<'a, T>(axis: &'a str, values: &'a [Axis<T>]) -> impl Iterator<Item = (String, f64)> {
     values.iter().map(move |value| (format!("[[{axis}]] '{}'", value.name), value.size))
 }

@@ -50,7 +50,7 @@ pub struct PlannedTraining {
 }
 
 impl PlannedTraining {
-    /// Its place in the grid, for messages.
+    /// Its values on the axes of the grid, for messages.
     pub fn label(&self) -> String {
         format!("{} {} {} seed {}", self.scene, self.method, self.setting, self.seed)
     }
@@ -105,7 +105,7 @@ impl Plan {
     /// Expands `grid`. Every configuration is read strictly; where it is known before the scene is looked at, `check` is asked about it too.
     ///
     /// # Errors
-    /// [`Error::Parameter`] that names the place in the grid, the wrong key or value, and the remedy; [`Error::Io`] for unreadable datasets.
+    /// [`Error::Parameter`] that names the section of the grid, the wrong key or value, and the remedy; [`Error::Io`] for unreadable datasets.
     pub fn expand(grid: &Grid, registry: &Registry, check: &dyn Fn(&RunConfig) -> Result<()>) -> Result<Self> {
         let (version, commit) = code::version();
         let codecs = codecs(grid, registry)?;
@@ -288,9 +288,9 @@ fn at(training: &PlannedTraining, error: Error) -> Error {
 }
 
 /// `error` with where it happened.
-pub(super) fn within(place: &str, error: Error) -> Error {
+pub(super) fn within(section: &str, error: Error) -> Error {
     match error {
-        Error::Parameter { object, problem, remedy } => Error::parameter(format!("{place}: {object}"), problem, remedy),
+        Error::Parameter { object, problem, remedy } => Error::parameter(format!("{section}: {object}"), problem, remedy),
         other => other,
     }
 }

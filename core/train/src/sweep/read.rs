@@ -244,6 +244,8 @@ pub(super) mod tests {
         // Other images belong to another scene, and only there.
         let other_images = |r: &mut CellResult| _ = r.metrics.get_mut("ssim").unwrap().protocol.insert("frames".into(), Value::Null);
         assert!(refused(&other_images).contains("protocols of ssim"));
+        let on_black = |r: &mut CellResult| r.metrics.get_mut("ssim").unwrap().protocol["frames"]["background"] = serde_json::json!([0.0, 0.0, 0.0]);
+        assert!(refused(&on_black).contains("[0.0,0.0,0.0]"));
         let other_scene = cell("other", |r| {
             other_images(r);
             (r.axes.scene, r.image_size) = ("basketball".into(), [640, 360]);

@@ -72,8 +72,8 @@ fn rows(results: &[CellResult]) -> Result<Vec<Row<'_>>> {
         let a = &result.axes;
         let same = rows.entry([&a.scene, &a.method, &a.setting, &a.codec]).or_default();
         if let Some(other) = same.iter().find(|other| other.axes.seed == a.seed) {
-            let place = format!("{} {} {} {} seed {}", a.scene, a.method, a.setting, a.codec, a.seed);
-            let problem = format!("the cells {} and {} have the same place in a grid ({place})", other.id, result.id);
+            let axes = format!("{} {} {} {} seed {}", a.scene, a.method, a.setting, a.codec, a.seed);
+            let problem = format!("the cells {} and {} have the same values on all axes of a grid ({axes})", other.id, result.id);
             return Err(Error::data("table of results", problem, "Make a table of each sweep or version of the program"));
         }
         same.push(result);
@@ -84,7 +84,7 @@ fn rows(results: &[CellResult]) -> Result<Vec<Row<'_>>> {
 /// A Markdown table per scene, and the conditions under which they were measured. Where trainings ran on different devices, their times are marked.
 ///
 /// # Errors
-/// As [`check_comparable`], and [`Error::Data`] for two results of the same place in a grid.
+/// As [`check_comparable`], and [`Error::Data`] for two results with the same values on all axes of a grid.
 pub fn markdown(results: &[CellResult]) -> Result<String> {
     let rows = rows(results)?;
     let Some(first) = results.first() else { return Ok(String::new()) };
@@ -261,6 +261,6 @@ mod tests {
         assert!(markdown(&results).unwrap_err().to_string().contains("devices") && csv(&results).is_err());
         let mut results = two_seeds();
         results[1].axes.seed = 0;
-        assert!(markdown(&results).unwrap_err().to_string().contains("same place"));
+        assert!(markdown(&results).unwrap_err().to_string().contains("same values"));
     }
 }

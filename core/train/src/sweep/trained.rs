@@ -5,7 +5,7 @@ use super::read::describe;
 use super::result::CellResult;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// The devices that the trainings of some results ran on, each numbered by its place.
+/// The devices that the trainings of some results ran on, each numbered by its index.
 pub(crate) struct TrainingDevices<'a> {
     /// By their description: hosts and trainings.
     devices: BTreeMap<String, (BTreeSet<&'a str>, BTreeSet<&'a str>)>,

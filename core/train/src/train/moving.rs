@@ -34,15 +34,8 @@ pub(super) fn decide_moving(train: &TrainConfig, scene: &Scene) -> Result<Moving
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cc4dgs_core::{Camera, FrameSource, Image8, View};
+    use cc4dgs_core::{Camera, NoImages, View};
     use std::sync::Arc;
-
-    struct NoImages;
-    impl FrameSource for NoImages {
-        fn load(&self, view: usize) -> Result<Image8> {
-            Err(Error::unsupported(format!("view {view}"), "no images here", "None"))
-        }
-    }
 
     /// Two cameras that stand still.
     fn scene(frames: usize) -> Scene {

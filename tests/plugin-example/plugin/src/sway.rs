@@ -74,7 +74,7 @@ inventory::submit! {
         info: Plugin {
             name: "sway",
             version: "1",
-            summary: "swings by an amount linear in the place",
+            summary: "swings by an amount linear in the position",
             paper: "an example",
             schema: "cycles = 1.0             # per sequence\nlr = 1e-3                # Adam, times the extent of the cameras\n",
             capabilities: &["differentiable", "starts-as-identity"],

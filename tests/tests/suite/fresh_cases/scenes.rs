@@ -68,9 +68,9 @@ impl Cloud {
     fn case(self, draw: &Draw, view: &View) -> Case {
         let n = self.count;
         let depths = apart(draw.between("depths", self.depths[0], self.depths[1], n));
-        let places = draw.between("places", -0.07, 1.07, 2 * n);
+        let positions = draw.between("places", -0.07, 1.07, 2 * n);
         let parts = Parts {
-            means: places.chunks(2).zip(depths).flat_map(|(shares, z)| view.behind(shares, z)).collect(),
+            means: positions.chunks(2).zip(depths).flat_map(|(shares, z)| view.behind(shares, z)).collect(),
             scales: draw.log_normal("scales", self.scales[0], self.scales[1], 3 * n),
             quaternions: draw.spread("quaternions", 0.6, 4 * n),
             opacities: draw.between("opacities", 0.03, 0.98, n),
@@ -86,9 +86,9 @@ impl Cloud {
 fn few(draw: &Draw) -> Case {
     let view = View::centered([32, 24], 30.0, draw.turned([0.0, 0.0, 3.0]));
     let depths = apart(draw.between("depths", 2.7, 3.3, 3));
-    let places = draw.between("places", 0.35, 0.65, 6);
+    let positions = draw.between("places", 0.35, 0.65, 6);
     let parts = Parts {
-        means: places.chunks(2).zip(depths).flat_map(|(shares, z)| view.behind(shares, z)).collect(),
+        means: positions.chunks(2).zip(depths).flat_map(|(shares, z)| view.behind(shares, z)).collect(),
         scales: draw.between("scales", 0.18, 0.56, 9),
         quaternions: draw.spread("quaternions", 0.85, 12),
         opacities: draw.between("opacities", 0.5, 0.9, 3),
@@ -149,8 +149,8 @@ fn faint(draw: &Draw) -> Case {
 /// Two alphas at their cap, one behind the other: a pixel stops by less than 2e-6 of its transmittance, or by far.
 fn capped(draw: &Draw) -> Case {
     let view = View::centered([40, 40], 40.0, STRAIGHT);
-    let places = draw.between("places", -0.04, 0.04, 4);
-    let sides = [[-0.25 + places[0], places[1]], [0.3 + places[2], places[3]]];
+    let positions = draw.between("places", -0.04, 0.04, 4);
+    let sides = [[-0.25 + positions[0], positions[1]], [0.3 + positions[2], positions[3]]];
     let mut scales = draw.between("large", 1.3, 1.8, 12);
     scales.extend(draw.between("small", 0.18, 0.28, 12));
     let mut opacities = draw.shuffled("opacities", &[1.0, 1.0, 0.9999]);

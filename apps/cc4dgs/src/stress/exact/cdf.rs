@@ -58,8 +58,8 @@ fn voxels(settings: &VoxelSettings, context: &DeformerContext, points: &[[f64; 3
             decoder(signature.into_iter().map(f64::from).collect(), weights, &sizes.decoder)
         };
         for (point, row) in points.iter().zip(&mut rows) {
-            let place = in_box(point, context).map(|x| cell(x.clamp(0.0, 1.0) * f64::from(resolution), resolution - 1));
-            row.extend(interpolate(place, decoded));
+            let cell_at = in_box(point, context).map(|x| cell(x.clamp(0.0, 1.0) * f64::from(resolution), resolution - 1));
+            row.extend(interpolate(cell_at, decoded));
         }
     }
     Ok(rows)

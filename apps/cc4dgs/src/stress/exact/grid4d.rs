@@ -32,7 +32,7 @@ struct Gaussian {
     /// Centre, world units.
     centre: [f64; 3],
     /// The same, with the box as 0..1.
-    place: [f64; 3],
+    in_box_at: [f64; 3],
     /// -1..1 per feature of the hidden layer.
     attention: Vec<f64>,
 }
@@ -43,11 +43,11 @@ pub fn build(inputs: Inputs) -> Result<Box<dyn Formula>> {
     let space = grid(SPACE_LEVELS, SPACE);
     let [table, layer] = [weights.of("grid.xyz")?, weights.of("net.attention")?];
     let gaussian = |point: &[f64; 3]| {
-        let place = in_box(point, &context);
-        let features = space.features(table, place);
+        let in_box_at = in_box(point, &context);
+        let features = space.features(table, in_box_at);
         let widths = [features.len(), WIDTH];
         let attention = chain(features, layer, &widths, false).into_iter().map(|v| 2.0 / (1.0 + (-v).exp()) - 1.0).collect();
-        Gaussian { centre: within_far(point), place, attention }
+        Gaussian { centre: within_far(point), in_box_at, attention }
     };
     let gaussians = points.iter().map(gaussian).collect();
     Ok(Box::new(Grid4d { weights, grid: grid(TIME_LEVELS, TIME), gaussians }))
@@ -71,7 +71,7 @@ impl Formula for Grid4d {
             tables.push((self.weights.of(name)?, axes));
         }
         let row = |gaussian: &Gaussian| -> Vec<f64> {
-            let [x, y, z] = gaussian.place;
+            let [x, y, z] = gaussian.in_box_at;
             let point = [x, y, z, 0.5 + TIME_SHARE * (t - 0.5)];
             let features: Vec<f64> = tables.iter().flat_map(|(table, axes)| self.grid.features(table, axes.map(|axis| point[axis]))).collect();
             let widths = [features.len(), WIDTH];

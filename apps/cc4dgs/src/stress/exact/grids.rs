@@ -71,11 +71,11 @@ impl<const D: usize> HashGrid<D> {
         }
         let mut out = Vec::new();
         for level in &self.levels {
-            let place: [(u32, f64); D] = std::array::from_fn(|d| {
+            let cell_at: [(u32, f64); D] = std::array::from_fn(|d| {
                 let (low, part) = cell(x[d] * level.scale[d] + self.stagger, u32::MAX);
                 (low, if self.smooth { part * part * (3.0 - 2.0 * part) } else { part })
             });
-            out.extend(interpolate(place, |vertex| &table[(level.first + level.row(vertex)) * self.features..][..self.features]));
+            out.extend(interpolate(cell_at, |vertex| &table[(level.first + level.row(vertex)) * self.features..][..self.features]));
         }
         out
     }

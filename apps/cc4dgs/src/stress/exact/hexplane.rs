@@ -51,10 +51,10 @@ impl Formula for HexPlane {
 fn plane(mut table: &[f64], axes: [usize; 2], point: &[f64; 4]) -> Vec<f64> {
     let mut out = Vec::new();
     for size in SIZES {
-        let place = axes.map(|axis| cell(point[axis] * f64::from(size[axis] - 1), size[axis] - 2));
+        let cell_at = axes.map(|axis| cell(point[axis] * f64::from(size[axis] - 1), size[axis] - 2));
         let [across, along] = axes.map(|axis| size[axis] as usize);
         let (own, later) = table.split_at(across * along * FEATURES);
-        out.extend(interpolate(place, |[i, j]| &own[(j as usize * across + i as usize) * FEATURES..][..FEATURES]));
+        out.extend(interpolate(cell_at, |[i, j]| &own[(j as usize * across + i as usize) * FEATURES..][..FEATURES]));
         table = later;
     }
     out

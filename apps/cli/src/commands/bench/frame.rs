@@ -1,13 +1,13 @@
-//! Playback of a room with people: field and rasterizer, frame by frame, and the field's own costs.
+//! Playback of a synthetic scene: field and rasterizer, frame by frame, and the field's own costs.
 
-use super::{Playback, Spread, WARM_UP, rooms, time_playback};
+use super::{Playback, Spread, WARM_UP, scene_cases, time_playback};
 use crate::args::BenchFrame;
 use crate::commands::{Context, create_parent};
 use crate::interrupt;
 use crate::models::resolved_device;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
-use cc4dgs_backends::bench::{RoomCase, Workload, growth, room, shrunk};
+use cc4dgs_backends::bench::{SceneCase, Workload, growth, shrunk, synthetic_scene};
 use cc4dgs_core::archive::{MAGIC, Provenance, write_atomically};
 use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::format::conformance::uniform;
@@ -23,7 +23,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Frames of the sequence the rooms stand for.
+/// Frames of the sequence the scenes stand for.
 const SEQUENCE: usize = 300;
 /// Where the size of a motion is measured.
 const MOTION_TIMES: [f32; 4] = [0.1, 0.35, 0.6, 0.85];
@@ -55,7 +55,7 @@ struct FrameCase {
     field_forward_backward: Spread,
 }
 
-/// Times playback of the rooms.
+/// Times playback of the scenes.
 pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     let device = parse_device(&args.device)?;
     let events = context.listeners(None)?;
@@ -63,7 +63,8 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
     config::set_all(&mut table, &args.set)?;
     let config: RunConfig = config::parse_section("configuration", &table)?;
     let mut cases = Vec::new();
-    let wanted: Vec<RoomCase> = if args.growth { growth().iter().map(|case| shrunk(case, args.scale)).collect() } else { rooms(&args.case, args.scale)? };
+    let wanted: Vec<SceneCase> =
+        if args.growth { growth().iter().map(|case| shrunk(case, args.scale)).collect() } else { scene_cases(&args.case, args.scale)? };
     if let (Some(archive), true) = (&args.archive, wanted.len() != 1) {
         let object = format!("--archive {}", archive.display());
         return Err(Error::parameter(object, format!("there are {} cases, and a file holds one", wanted.len()), "Choose one with --case NAME"));
@@ -77,7 +78,7 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
         if done > 0 && stop.load(Ordering::Relaxed) {
             break;
         }
-        let (mut model, camera) = room_model(context, case, &config, &device, args)?;
+        let (mut model, camera) = scene_model(context, case, &config, &device, args)?;
         if let Some(path) = &args.archive {
             write_playable(context, &model, &camera, &device, &events, stop, path)?;
         }
@@ -103,9 +104,9 @@ pub fn frame(context: &Context, args: &BenchFrame) -> Result<()> {
 }
 
 /// The model of a case, and the camera that looks at it.
-fn room_model(context: &Context, case: &RoomCase, config: &RunConfig, device: &Device, args: &BenchFrame) -> Result<(Model, Camera)> {
+fn scene_model(context: &Context, case: &SceneCase, config: &RunConfig, device: &Device, args: &BenchFrame) -> Result<(Model, Camera)> {
     let seed = Seed::root(args.seed).child("bench").child(&case.name);
-    let Workload { gaussians, camera, .. } = room(case, seed);
+    let Workload { gaussians, camera, .. } = synthetic_scene(case, seed);
     let moving = Moving::Scored { zeta: 0.0 };
     let rows = moving.rows(&gaussians.dynamic_scores).unwrap_or_default();
     let axis = |k: usize, from: f32, pick: fn(f32, f32) -> f32| rows.iter().map(|&i| gaussians.means[3 * i + k]).fold(from, pick);

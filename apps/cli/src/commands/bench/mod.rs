@@ -18,7 +18,7 @@ pub use play::play;
 pub use skip::skip;
 pub use step::step;
 
-use cc4dgs_backends::bench::{ROOM_CASES, RoomCase, shrunk};
+use cc4dgs_backends::bench::{SCENE_CASES, SceneCase, shrunk};
 use cc4dgs_core::{Camera, RenderWork, Result, unknown_name};
 use cc4dgs_play::player::{PlayWork, Player};
 use std::time::Instant;
@@ -39,13 +39,13 @@ pub fn timed(repeats: usize, mut run: impl FnMut() -> Result<()>) -> Result<Spre
     Ok(Spread::of(times))
 }
 
-/// The rooms of these names (all if there are none), shrunk to a share of their pixels and Gaussians.
-pub fn rooms(names: &[String], share: f64) -> Result<Vec<RoomCase>> {
-    if let Some(unknown) = names.iter().find(|name| !ROOM_CASES.iter().any(|c| c.name == name.as_str())) {
-        return Err(unknown_name("--case", unknown, ROOM_CASES.iter().map(|c| c.name.as_ref())));
+/// The synthetic scenes of these names (all if there are none), shrunk to a share of their pixels and Gaussians.
+pub fn scene_cases(names: &[String], share: f64) -> Result<Vec<SceneCase>> {
+    if let Some(unknown) = names.iter().find(|name| !SCENE_CASES.iter().any(|c| c.name == name.as_str())) {
+        return Err(unknown_name("--case", unknown, SCENE_CASES.iter().map(|c| c.name.as_ref())));
     }
-    let wanted = |case: &&RoomCase| names.is_empty() || names.iter().any(|name| case.name == name.as_str());
-    Ok(ROOM_CASES.iter().filter(wanted).map(|case| shrunk(case, share)).collect())
+    let wanted = |case: &&SceneCase| names.is_empty() || names.iter().any(|name| case.name == name.as_str());
+    Ok(SCENE_CASES.iter().filter(wanted).map(|case| shrunk(case, share)).collect())
 }
 
 /// Middle and spread of some times.

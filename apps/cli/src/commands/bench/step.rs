@@ -1,10 +1,10 @@
 //! Whole training steps.
 
-use super::rooms;
+use super::scene_cases;
 use crate::args::BenchStep;
 use crate::commands::Context;
 use crate::models::resolved_device;
-use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, Workload, room, time_step};
+use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, Workload, synthetic_scene, time_step};
 use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device};
 use serde::Serialize;
 
@@ -28,7 +28,7 @@ pub fn step(context: &Context, args: &BenchStep) -> Result<()> {
     let seed = Seed::root(args.seed).child("bench");
     let mut workloads: Vec<Workload> = STANDARD_CASES.iter().map(|case| Workload::random(case, seed)).collect();
     if !args.case.is_empty() {
-        workloads = rooms(&args.case, args.scale)?.iter().map(|case| room(case, seed.child(&case.name))).collect();
+        workloads = scene_cases(&args.case, args.scale)?.iter().map(|case| synthetic_scene(case, seed.child(&case.name))).collect();
     }
     for path in &args.scene {
         workloads.push(Workload::from_fixture(path)?);

@@ -148,7 +148,7 @@ pub fn collect(context: &Context, args: &SweepCollect) -> Result<()> {
     context.output.result(&report, || {
         let mut text = std::fs::read_to_string(&tables.markdown).unwrap_or_default();
         text += &format!("\n{} of {} cells", collection.finished, collection.planned);
-        text += &collection.missing.iter().map(|m| format!("\nmissing: {} ({}): {}", m.cell, m.place, m.reason)).collect::<String>();
+        text += &collection.missing.iter().map(|m| format!("\nmissing: {} ({}): {}", m.cell, m.axes, m.reason)).collect::<String>();
         text += &collection.foreign.iter().map(|name| format!("\nof no cell of the plan: results/{name}")).collect::<String>();
         text + &format!("\nwrote {}, {}, {}", tables.results.display(), tables.markdown.display(), tables.csv.display())
     })

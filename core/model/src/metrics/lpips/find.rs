@@ -7,7 +7,7 @@ use std::sync::{Arc, OnceLock};
 
 /// Names a weights file; nothing else is looked at then.
 pub const LPIPS_VARIABLE: &str = "CC4DGS_LPIPS";
-/// Name of the weights file in the other places.
+/// Name of the weights file in the other folders.
 pub const LPIPS_FILE: &str = "lpips-alexnet.safetensors";
 
 /// The weights of this program, and where they are from.
@@ -21,14 +21,14 @@ pub struct InstalledLpips {
 
 /// The files that [`installed_lpips`] looks at, in order: the one that the variable `CC4DGS_LPIPS` names, or else `lpips-alexnet.safetensors` in the
 /// user's data folder ([`user_data_folder`]) and in the folder of the program.
-pub fn lpips_places() -> Vec<PathBuf> {
+pub fn lpips_paths() -> Vec<PathBuf> {
     if let Some(file) = variable_path(LPIPS_VARIABLE) {
         return vec![file];
     }
     [user_data_folder(), program_folder()].into_iter().flatten().map(|folder| folder.join(LPIPS_FILE)).collect()
 }
 
-/// The weights that this process uses, read once: of the first file of [`lpips_places`] that exists, else those that the feature `embed-lpips` built in.
+/// The weights that this process uses, read once: of the first file of [`lpips_paths`] that exists, else those that the feature `embed-lpips` built in.
 ///
 /// # Errors
 /// A sentence that says why there are none: no file exists, or the first one is unreadable.
@@ -38,9 +38,9 @@ pub fn installed_lpips() -> Result<&'static InstalledLpips, &'static str> {
 }
 
 fn find() -> Result<InstalledLpips, String> {
-    let places = lpips_places();
+    let paths = lpips_paths();
     let named = variable_path(LPIPS_VARIABLE).is_some();
-    if let Some(file) = places.iter().find(|file| named || file.is_file()) {
+    if let Some(file) = paths.iter().find(|file| named || file.is_file()) {
         let network = Lpips::read(file).map_err(|e| format!("LPIPS is not measured: {e}"))?;
         return Ok(InstalledLpips { network: Arc::new(network), source: file.display().to_string() });
     }
@@ -51,7 +51,7 @@ fn find() -> Result<InstalledLpips, String> {
         }
         None => Err(format!(
             "LPIPS is not measured: its weights are neither built in nor at {}. Make the file with benches/lpips_weights.py, or name one in {LPIPS_VARIABLE}",
-            places.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(" or ")
+            paths.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(" or ")
         )),
     }
 }

@@ -7,7 +7,7 @@ mod find;
 mod network;
 mod weights;
 
-pub use find::{InstalledLpips, LPIPS_FILE, LPIPS_VARIABLE, installed_lpips, lpips_places};
+pub use find::{InstalledLpips, LPIPS_FILE, LPIPS_VARIABLE, installed_lpips, lpips_paths};
 pub use weights::WeightsId;
 
 use super::Planes;

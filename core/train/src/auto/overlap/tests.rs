@@ -1,15 +1,8 @@
 //! Overlap of made-up cameras.
 
 use super::*;
-use cc4dgs_core::{Error, FrameSource, Image8, PointCloud, Result, Split, View};
+use cc4dgs_core::{NoImages, PointCloud, Split, View};
 use std::sync::Arc;
-
-struct NoImages;
-impl FrameSource for NoImages {
-    fn load(&self, view: usize) -> Result<Image8> {
-        Err(Error::unsupported(format!("view {view}"), "no images here", "None"))
-    }
-}
 
 fn camera(name: &str, eye: [f64; 3], target: [f64; 3]) -> Camera {
     Camera::look_at(name, (80, 60), 1.0, eye, target, [0.0, 1.0, 0.0])

@@ -70,7 +70,7 @@ fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fus
     let level = view.fine();
     let needed = if set.keys >= 6 { 2 } else { 1 };
     let solid = |p: usize| view.solid(set.foreground, p);
-    let place = |p: usize, inverse: f32| {
+    let point_at = |p: usize, inverse: f32| {
         let (u, v) = ((p % level.width) as f64 + 0.5, (p / level.width) as f64 + 0.5);
         let depth = 1.0 / f64::from(inverse.max(1e-9));
         (view.unproject(level, u, v, depth), depth as f32)
@@ -83,10 +83,10 @@ fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fus
         if map.score[p] < MIN_SCORE || inverse >= nearest || !solid(p) {
             continue;
         }
-        let verdict = ask(set, maps, view, place(p, inverse).0);
+        let verdict = ask(set, maps, view, point_at(p, inverse).0);
         if verdict.agree >= needed && verdict.agree > verdict.through {
             known[p] = verdict.mean(inverse);
-            let (position, depth) = place(p, known[p]);
+            let (position, depth) = point_at(p, known[p]);
             found.matched.push(Candidate { position, color: level.rgb[p], confidence: map.score[p] + 0.1 * verdict.agree as f32, depth });
         }
     }
@@ -103,7 +103,7 @@ fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fus
             continue;
         }
         if smooth[p].is_finite() {
-            let (position, depth) = place(p, smooth[p]);
+            let (position, depth) = point_at(p, smooth[p]);
             let difference = color_difference(set, view, position, level.rgb[p]);
             if difference < MAX_COLOR_DIFFERENCE && ask(set, maps, view, position).through == 0 {
                 found.between.push(Candidate { position, color: level.rgb[p], confidence: -difference, depth });
@@ -116,7 +116,7 @@ fn fuse_view(set: &WorkSet, maps: &[DepthMap], index: usize, seed: Seed) -> (Fus
         let from = if smooth[p].is_finite() && smooth[p] < 0.9 * most { smooth[p] } else { least };
         let tried = (0..GUESSES).map(|i| from + (most - from) * (i as f32 + rng.random::<f32>()) / GUESSES as f32);
         let guess = |inverse: f32| {
-            let (position, depth) = place(p, inverse);
+            let (position, depth) = point_at(p, inverse);
             Candidate { position, color: level.rgb[p], confidence: -color_difference(set, view, position, level.rgb[p]), depth }
         };
         let best = tried.map(guess).max_by(|a, b| a.confidence.total_cmp(&b.confidence));

@@ -82,8 +82,8 @@ impl Tracer {
     }
     /// The nearest surface along a ray with unit direction.
     pub fn hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
-        let (place, hit) = self.nearest(self.placed.iter(), self.metres(origin), direction)?;
-        Some(Hit { object: place.index, distance: hit.distance * self.unit.scale, point: DVec3::from(self.unit.apply(hit.point.to_array())), ..hit })
+        let (placed, hit) = self.nearest(self.placed.iter(), self.metres(origin), direction)?;
+        Some(Hit { object: placed.index, distance: hit.distance * self.unit.scale, point: DVec3::from(self.unit.apply(hit.point.to_array())), ..hit })
     }
     /// The object at the centre of every pixel, row by row.
     pub fn objects_seen(&self, camera: &Camera) -> Vec<Option<usize>> {
@@ -123,7 +123,7 @@ impl Tracer {
                         for sample in 0..n * n {
                             let (origin, direction) = ray(f64::from(x) + offset(sample % n), f64::from(top) + y as f64 + offset(sample / n));
                             let c = match self.nearest(seen.iter().copied(), origin, direction) {
-                                Some((place, hit)) => shade(place, &hit, direction),
+                                Some((placed, hit)) => shade(placed, &hit, direction),
                                 None => self.background.map(f64::from),
                             };
                             sum = [sum[0] + c[0], sum[1] + c[1], sum[2] + c[2]];
@@ -141,26 +141,26 @@ impl Tracer {
     /// The nearest of some objects along a ray in metres; of two at one distance the first.
     fn nearest<'a>(&self, candidates: impl Iterator<Item = &'a Placed>, origin: DVec3, direction: DVec3) -> Option<(&'a Placed, Hit)> {
         let mut nearest: Option<(&Placed, f64, DVec3)> = None;
-        for place in candidates {
+        for placed in candidates {
             // Most objects are missed, and their bounding balls too, which is cheaper to find out.
-            let to = place.pose.translation - origin;
-            let (along, reach) = (to.dot(direction), place.outer_radius * BALL_SLACK);
+            let to = placed.pose.translation - origin;
+            let (along, reach) = (to.dot(direction), placed.outer_radius * BALL_SLACK);
             if to.length_squared() - along * along > reach * reach || nearest.is_some_and(|n| along - reach > n.1) {
                 continue;
             }
-            let (o, d) = if place.pose.rotation == DQuat::IDENTITY {
-                (origin - place.pose.translation, direction)
+            let (o, d) = if placed.pose.rotation == DQuat::IDENTITY {
+                (origin - placed.pose.translation, direction)
             } else {
-                (place.pose.inverse_apply(origin), place.pose.rotation.conjugate() * direction)
+                (placed.pose.inverse_apply(origin), placed.pose.rotation.conjugate() * direction)
             };
-            if let Some((distance, normal)) = place.object.shape.intersect(o, d)
-                && nearest.is_none_or(|n| distance < n.1 || (distance == n.1 && place.index < n.0.index))
+            if let Some((distance, normal)) = placed.object.shape.intersect(o, d)
+                && nearest.is_none_or(|n| distance < n.1 || (distance == n.1 && placed.index < n.0.index))
             {
-                nearest = Some((place, distance, normal));
+                nearest = Some((placed, distance, normal));
             }
         }
-        nearest.map(|(place, distance, normal)| {
-            (place, Hit { object: place.index, distance, point: origin + direction * distance, normal: place.pose.rotation * normal })
+        nearest.map(|(placed, distance, normal)| {
+            (placed, Hit { object: placed.index, distance, point: origin + direction * distance, normal: placed.pose.rotation * normal })
         })
     }
     /// The objects that rays through a rectangle of pixels `[left, top, right, bottom]` can meet: those whose bounding ball meets the cone around the rays.
@@ -169,11 +169,11 @@ impl Tracer {
         let (eye, axis) = ray(x, y);
         let rim = [(left, top), (x, top), (right, top), (left, y), (right, y), (left, bottom), (x, bottom), (right, bottom)];
         let cone = CONE_SLACK * rim.iter().map(|&(u, v)| ray(u, v).1.angle_between(axis)).fold(0.0, f64::max) + 1e-6;
-        let meets = |place: &&Placed| {
-            let to = place.pose.translation - eye;
+        let meets = |placed: &&Placed| {
+            let to = placed.pose.translation - eye;
             let distance = to.length();
-            let in_cone = distance <= place.outer_radius || to.angle_between(axis) <= cone + (place.outer_radius / distance).asin();
-            in_cone && !leads_away(place, eye, axis, cone)
+            let in_cone = distance <= placed.outer_radius || to.angle_between(axis) <= cone + (placed.outer_radius / distance).asin();
+            in_cone && !leads_away(placed, eye, axis, cone)
         };
         let mut seen: Vec<&Placed> = self.placed.iter().filter(meets).collect();
         // The nearest first, so that few are asked once something is hit.
@@ -183,20 +183,20 @@ impl Tracer {
 }
 
 /// Whether all rays of a cone lead away from a box: from beyond one of its faces, further off.
-fn leads_away(place: &Placed, eye: DVec3, axis: DVec3, cone: f64) -> bool {
-    let Shape::Cuboid { half } = place.object.shape else { return false };
-    let (o, d) = (place.pose.inverse_apply(eye), place.pose.rotation.conjugate() * axis);
+fn leads_away(placed: &Placed, eye: DVec3, axis: DVec3, cone: f64) -> bool {
+    let Shape::Cuboid { half } = placed.object.shape else { return false };
+    let (o, d) = (placed.pose.inverse_apply(eye), placed.pose.rotation.conjugate() * axis);
     // The angle to the face's normal stays under a quarter turn.
     let least = (0.5 * PI - cone).max(0.0).cos();
     (0..3).any(|k| o[k].abs() > half[k] && d[k] * o[k].signum() > least && cone < 0.5 * PI)
 }
 
-fn shade(place: &Placed, hit: &Hit, direction: DVec3) -> [f64; 3] {
+fn shade(placed: &Placed, hit: &Hit, direction: DVec3) -> [f64; 3] {
     let light = DVec3::new(0.4, -0.3, 0.87).normalize();
-    let base = place.object.material.texture.color(place.pose.inverse_apply(hit.point));
+    let base = placed.object.material.texture.color(placed.pose.inverse_apply(hit.point));
     let diffuse = 0.40 + 0.60 * hit.normal.dot(light).max(0.0);
     let half = (light - direction).normalize();
-    let highlight = place.object.material.specular * hit.normal.dot(half).max(0.0).powi(24);
+    let highlight = placed.object.material.specular * hit.normal.dot(half).max(0.0).powi(24);
     base.map(|c| (c * diffuse + highlight).min(1.0))
 }
 

@@ -42,27 +42,27 @@ fn json(yaml: Yaml) -> Value {
 }
 
 /// Where the value differs from `shape`: objects name all keys, arrays all items; strings that start with `<` are types, anything else is the value itself.
-fn faults(value: &Value, shape: &Value, place: &str, found: &mut Vec<String>) {
+fn faults(value: &Value, shape: &Value, path: &str, found: &mut Vec<String>) {
     match shape {
         Value::Object(keys) => {
             for (key, inner) in keys {
                 match value.get(key) {
-                    Some(value) => faults(value, inner, &format!("{place}.{key}"), found),
-                    None => found.push(format!("{place}.{key} is missing")),
+                    Some(value) => faults(value, inner, &format!("{path}.{key}"), found),
+                    None => found.push(format!("{path}.{key} is missing")),
                 }
             }
             let unknown = value.as_object().into_iter().flatten().filter(|(key, _)| !keys.contains_key(key.as_str()));
-            found.extend(unknown.map(|(key, _)| format!("{place}.{key} is unknown")));
+            found.extend(unknown.map(|(key, _)| format!("{path}.{key} is unknown")));
         }
         Value::Array(items) => {
             for (index, inner) in items.iter().enumerate() {
                 match value.get(index) {
-                    Some(value) => faults(value, inner, &format!("{place}[{index}]"), found),
-                    None => found.push(format!("{place}[{index}] is missing")),
+                    Some(value) => faults(value, inner, &format!("{path}[{index}]"), found),
+                    None => found.push(format!("{path}[{index}] is missing")),
                 }
             }
             let count = value.as_array().map_or(0, Vec::len);
-            found.extend((items.len()..count).map(|index| format!("{place}[{index}] is unknown")));
+            found.extend((items.len()..count).map(|index| format!("{path}[{index}] is unknown")));
         }
         Value::String(text) if text.starts_with('<') => {
             let right = match text.as_str() {
@@ -73,10 +73,10 @@ fn faults(value: &Value, shape: &Value, place: &str, found: &mut Vec<String>) {
                 other => panic!("unknown type {other}"),
             };
             if !right {
-                found.push(format!("{place} is {value}, not {text}"));
+                found.push(format!("{path} is {value}, not {text}"));
             }
         }
-        other if other != value => found.push(format!("{place} is {value}, not {other}")),
+        other if other != value => found.push(format!("{path} is {value}, not {other}")),
         _ => {}
     }
 }

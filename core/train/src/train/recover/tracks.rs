@@ -1,7 +1,7 @@
 //! Straight tracks through sightings from several cameras at several times: where a compact thing was, and how fast.
 //!
 //! A sighting says that the thing is somewhere on a ray at a time. For a point p with velocity v, the distance to each ray is linear in (p, v), so that three rays
-//! from different places give a track, and more of them give the one of least squares.
+//! from different positions give a track, and more of them give the one of least squares.
 
 use cc4dgs_core::Seed;
 use glam::{DMat3, DVec3};
@@ -240,7 +240,7 @@ mod tests {
             Sighting { image, time, origin, direction: way.normalize(), size: 0.25 / way.length(), pixel: 0.005 }
         };
         let all: Vec<usize> = (0..8).collect();
-        let of = |place: &dyn Fn(f64) -> DVec3| (0..8).map(|i| seen(i, i, place(i as f64))).collect::<Vec<Sighting>>();
+        let of = |position: &dyn Fn(f64) -> DVec3| (0..8).map(|i| seen(i, i, position(i as f64))).collect::<Vec<Sighting>>();
         let passing = of(&|i: f64| DVec3::new(0.5 * i - 2.0, 0.0, -4.0));
         let slow_orbit = of(&|i: f64| DVec3::new(4.0 * (0.05 * i).sin(), 1.0, -4.0 * (0.05 * i).cos()));
         let turning = of(&|_: f64| DVec3::new(0.0, 0.0, -4.0));

@@ -22,7 +22,7 @@ fn shaded(color: Rgb, by: f64) -> Rgb {
 }
 
 /// A placement on the floor, turned about z.
-pub(super) fn place(x: f64, y: f64, turn_rad: f64) -> Pose {
+pub(super) fn pose_at(x: f64, y: f64, turn_rad: f64) -> Pose {
     Pose { rotation: DQuat::from_rotation_z(turn_rad), translation: v(x, y, 0.0) }
 }
 

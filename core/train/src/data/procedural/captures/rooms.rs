@@ -1,6 +1,6 @@
 //! Furnished rooms: walls, floor and ceiling that fill every image, furniture along the walls, and a middle for what the capture is about.
 
-use super::props::{Props, place};
+use super::props::{Props, pose_at};
 use crate::data::procedural::{Object, Pose, Shape, Texture};
 use cc4dgs_core::Seed;
 use glam::{DQuat, DVec3};
@@ -89,7 +89,7 @@ fn along_the_walls(props: &mut Props, door: bool) {
         let along = 2.15 * (column as f64 - 1.0) + props.range(-0.25, 0.25);
         // The door is in the wall at +y, which is not turned.
         let blocked = door && wall == 0 && (along - DOOR[0]).abs() < DOOR[1] + 1.0;
-        let base = wall_frame.then(place(along, HALF - 0.42, props.range(-0.06, 0.06)));
+        let base = wall_frame.then(pose_at(along, HALF - 0.42, props.range(-0.06, 0.06)));
         if !blocked {
             furniture(props, piece, &base);
         }
@@ -102,7 +102,7 @@ fn along_the_walls(props: &mut Props, door: bool) {
         }
     }
     for corner in 0..4 {
-        let at = Pose::turned(DQuat::from_rotation_z(FRAC_PI_2 * f64::from(corner))).then(place(HALF - 0.5, HALF - 0.5, 0.0));
+        let at = Pose::turned(DQuat::from_rotation_z(FRAC_PI_2 * f64::from(corner))).then(pose_at(HALF - 0.5, HALF - 0.5, 0.0));
         if corner % 2 == 0 { props.plant(&at) } else { props.lamp(&at) }
     }
 }
@@ -124,35 +124,35 @@ fn furniture(props: &mut Props, piece: usize, base: &Pose) {
 
 fn open(props: &mut Props) {
     let turn = props.range(-0.4, 0.4);
-    props.rug(&place(0.0, 0.0, turn), [1.0, 0.8]);
+    props.rug(&pose_at(0.0, 0.0, turn), [1.0, 0.8]);
     let (a, b) = (props.range(-0.2, 0.2), props.range(-0.3, 0.3));
-    props.chair(&place(1.45, -1.25 + a, -2.2 + b));
-    let side = place(-1.5, 1.05 + a, 0.5 + b);
+    props.chair(&pose_at(1.45, -1.25 + a, -2.2 + b));
+    let side = pose_at(-1.5, 1.05 + a, 0.5 + b);
     props.table(&side, [0.32, 0.28], 0.55);
     props.vase(&side.then(Pose::at(DVec3::new(0.08, 0.05, 0.55))));
-    props.lamp(&place(-1.0, 1.5 + a, 0.0));
+    props.lamp(&pose_at(-1.0, 1.5 + a, 0.0));
     props.rope(DVec3::new(-HALF, 1.6, 2.6), DVec3::new(1.6, HALF, 2.6), 0.5);
 }
 
 fn table(props: &mut Props) {
-    props.rug(&place(0.0, 1.0, 0.1), [1.3, 0.9]);
-    props.table(&place(0.0, 0.85, 0.0), [0.85, 0.42], 0.76);
-    props.still_life(&place(0.45, 0.85, 0.2).then(Pose::at(DVec3::Z * 0.76)));
-    props.chair(&place(0.05, 1.62, 0.0));
-    props.chair(&place(-1.4, 0.9, 1.9));
-    props.lamp(&place(1.35, 1.5, 0.0));
-    props.plant(&place(-1.5, 2.2, 0.0));
+    props.rug(&pose_at(0.0, 1.0, 0.1), [1.3, 0.9]);
+    props.table(&pose_at(0.0, 0.85, 0.0), [0.85, 0.42], 0.76);
+    props.still_life(&pose_at(0.45, 0.85, 0.2).then(Pose::at(DVec3::Z * 0.76)));
+    props.chair(&pose_at(0.05, 1.62, 0.0));
+    props.chair(&pose_at(-1.4, 0.9, 1.9));
+    props.lamp(&pose_at(1.35, 1.5, 0.0));
+    props.plant(&pose_at(-1.5, 2.2, 0.0));
     props.rope(DVec3::new(-2.4, 1.9, HEIGHT), DVec3::new(2.2, 2.3, HEIGHT), 0.6);
 }
 
 fn still_life(props: &mut Props) {
     let turn = props.range(-0.5, 0.5);
-    props.rug(&place(0.0, 0.0, turn), [1.1, 0.9]);
-    let base = place(0.0, 0.0, turn);
+    props.rug(&pose_at(0.0, 0.0, turn), [1.1, 0.9]);
+    let base = pose_at(0.0, 0.0, turn);
     props.table(&base, [0.75, 0.45], 0.74);
     props.still_life(&base.then(Pose::at(DVec3::Z * 0.74)));
-    props.chair(&base.then(place(0.1, 0.75, 0.2)));
-    props.chair(&base.then(place(-1.1, -0.2, 1.8)));
-    props.lamp(&base.then(place(1.15, 0.5, 0.0)));
-    props.plant(&base.then(place(0.85, -0.7, 0.7)));
+    props.chair(&base.then(pose_at(0.1, 0.75, 0.2)));
+    props.chair(&base.then(pose_at(-1.1, -0.2, 1.8)));
+    props.lamp(&base.then(pose_at(1.15, 0.5, 0.0)));
+    props.plant(&base.then(pose_at(0.85, -0.7, 0.7)));
 }
