@@ -4,11 +4,11 @@
     python3 benches/baselines.py OUT --bin BIN --scene DATA/dnerf_mutant [--minutes 60] [--only hexplane,...] [--jobs 1] [--threads N]
 
 Trains `dnerf+METHOD` (published iterations, sizes and rates; 800x800) and interrupts it after --minutes of training. What it has learned until then is evaluated once
-on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Images are on the background that the method is
-published on, black or white. Results are in OUT/rows.json, one row per method: iterations
+on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Images are on black where the method is published
+on it, else on white. Results are in OUT/rows.json, one row per method: iterations
 reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. With --jobs 2 --threads 1 two methods share the machine.
 
-Called again, it resumes what was cut off and leaves out what is done with the same scene, minutes, jobs, threads and program (its SHA-256); runs have folders of
+Called again, it resumes what was cut off and leaves out what is done with the same scene, minutes, jobs, threads, background and program (its SHA-256); runs have folders of
 their own for each of these, OUT/METHOD-HASH. Ctrl-C asks what runs to write its checkpoint and end (exit code 130). A training that fails, or cannot be evaluated,
 has no row, and makes the exit code 1.
 """

@@ -81,10 +81,10 @@ DESTROY = """async source => { const player = cc4dgs, { fetch, requestAnimationF
     GPUDevice.prototype.destroy = destroy;
     return { frames, devices, keys, fetching: !signal.aborted, loaded: await loading, refused, memory: gpu.__wbg_ptr !== 0,
         context: !!gl && !gl.gl.isContextLost(), worker: !!gl?.sorter.worker, elements: document.getElementById("player").childElementCount }; }"""
-# Destroys the page's player while a lost device is replaced. Returns how that ends, and what is left of the player.
 # A second player, inside of a page whose first one is the page's own.
 INSIDE = """import('./player.js').then(async m => { const box = document.body.appendChild(document.createElement('div'));
     box.style.cssText = 'position:fixed;left:0;top:0;width:160px;height:120px'; window.inner = await m.createPlayer(box); })"""
+# Destroys the page's player while a lost device is replaced. Returns how that ends, and what is left of the player.
 DESTROY_LOST = """() => new Promise(done => { const player = cc4dgs;
     player.start = () => {
         delete player.start;

@@ -59,7 +59,7 @@ export function addKeys(element, act, commands, signal) {
     const held = new Set();
     const listen = (target, name, run) => target.addEventListener(name, run, { signal });
     listen(element, "keydown", e => {
-        // A player inside of the page has acted on it.
+        // Another player, inside of this one's page, has acted on it.
         if (e.defaultPrevented || e.ctrlKey || e.metaKey || e.altKey || e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
         const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
         if (FLY[key]) { held.add(key); e.preventDefault(); return; }

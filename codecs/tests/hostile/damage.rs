@@ -4,7 +4,7 @@ use cc4dgs_format::Stream;
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A damage to one stream. Places are fractions of its length.
+/// A damage to one stream. Positions are fractions of its length.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Damage {
     Flip(f64, u8),

@@ -186,6 +186,7 @@ pub fn evaluate(
     let mut images = Vec::with_capacity(views.len());
     let mut times: Vec<FrameTime> = Vec::with_capacity(views.len());
     let (mut skimage, mut ms_ssim) = (0.0, Some(0.0));
+    // Datasets have images of one kind.
     let transparent = scene.frame(views[0])?.channels == 4;
     let frames = FrameSet { split, count: views.len(), of: in_split, background: transparent.then_some(background) };
     let metric = |m: Metric| m.over(frames.clone());

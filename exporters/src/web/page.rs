@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// Names the folder of the page; nothing else is looked at then.
 pub const PAGE_VARIABLE: &str = "CC4DGS_PAGE";
-/// Name of the folder in the other folders.
+/// Name of the folder where the variable does not state one.
 const PAGE_FOLDER: &str = "page";
 /// Files of the page that `apps/player/build-web` makes; `index.html` is written anew.
 pub const PAGE_FILES: [&str; 9] =

@@ -112,9 +112,9 @@ mod tests {
 
     #[test]
     fn splines_are_added_to_what_the_network_computes() {
-        let network = Some(Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(1), 3, 2])));
-        let functions = TemporalFunctions { bands: 1, cycles: 1.0, falloff: 1.0, splines: 0, network: network.clone(), knots: 6 };
-        let weights: Vec<f32> = (0..network.unwrap().parameter_count()).map(|k| (k as f32).sin()).collect();
+        let network = Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(1), 3, 2]));
+        let functions = TemporalFunctions { bands: 1, cycles: 1.0, falloff: 1.0, splines: 0, network: Some(network.clone()), knots: 6 };
+        let weights: Vec<f32> = (0..network.parameter_count()).map(|k| (k as f32).sin()).collect();
         let knots: Vec<f32> = (0..functions.knot_weights()).map(|k| (k as f32 + 0.5).cos()).collect();
         assert_eq!(knots.len(), 12);
         for time in [0.0, 0.37, 1.0] {

@@ -39,8 +39,10 @@ pub fn gallery(folder: &Path, scene: &str, rows: &[Row], views: usize) -> Result
     let usable: Vec<usize> = (0..first.images.len()).filter(|i| shown.iter().all(|(_, cell)| file_of(folder, cell, *i).is_some())).collect();
     // In the order of their frames, every so many images are often of one camera.
     let usable = by_group(&usable, |image| first.images[image].camera.as_str());
+    let mut chosen = spread_from_first(&usable, views);
+    chosen.sort_unstable();
     let mut body = String::new();
-    for view in spread_from_first(&usable, views) {
+    for view in chosen {
         body += &sheet(folder, scene, &shown, view)?;
     }
     body += &flicker(folder, &shown)?;

@@ -7,7 +7,7 @@ use std::sync::{Arc, OnceLock};
 
 /// Names a weights file; nothing else is looked at then.
 pub const LPIPS_VARIABLE: &str = "CC4DGS_LPIPS";
-/// Name of the weights file in the other folders.
+/// Name of the weights file where the variable does not state one.
 pub const LPIPS_FILE: &str = "lpips-alexnet.safetensors";
 
 /// The weights of this program, and where they are from.
