@@ -1,8 +1,7 @@
 //! A deformer that is linear in its functions of time: offsets = C(f_voxel) φ(t).
 //!
 //! C is a matrix of coefficients per Gaussian, computed from the same hashed voxel features as the CDF's (paper Section IV-B) and cached by playback like
-//! them; φ is one vector per frame, shared by all Gaussians: a constant, t, Fourier bands, optional splines and functions learned by a small network, to which
-//! splines may be added.
+//! them; φ is one vector per frame, shared by all Gaussians: a constant, t, Fourier bands, optional splines and functions learned by a small network.
 //! A frame costs a dot product per offset instead of a network per Gaussian. It also represents motion over many cycles, which FiLM in front of a trunk hardly
 //! learns.
 //! Trajectories as combinations of few shared functions are the idea of DynMF (Kratimenos et al. 2024) and Gaussian-Flow (Lin et al. 2024), which store the
@@ -42,7 +41,6 @@ falloff = 1.0            # amplitude of a band over the next lower one is 2^-fal
 sparsity = 1e-4          # weight of a group lasso on every function of every head (Fourier bands: times their frequency); 0 is off
 splines = 0              # cubic B-splines over the sequence, in addition to the bands; 0 or at least 4
 learned = 16             # functions of time learned by a small network; 0 is none
-# knots = 40             # cubic B-splines over the sequence of which sums are added to each learned function; at least 4
 heads = ["means", "log_scales", "quaternions"]
 rotation = "additive"    # added to quaternions (the paper) | "exponential": a rotation vector, exact for any angle
 unused = 0.01            # after training, functions that together make less than this share of a head's offsets are dropped; 0 keeps all
@@ -54,14 +52,11 @@ clip_norm = 1.0          # gradient-norm clip per group; 0 is off
 # means = [0, 1, 2]
 "#;
 
-/// The parameter of the splines that are added to learned functions `[knots, learned]`.
-const KNOTS: &str = "net.knots";
-
 /// Parameter groups by index.
 const GRID: usize = 0;
 const NET: usize = 1;
 
-/// The deformer. Parameters: decoders by level, the functions' network and the splines added to it (if any), the coefficients' trunk, one head each.
+/// The deformer. Parameters: decoders by level, the functions' network (if any), the coefficients' trunk, one head each.
 struct CdfBasis {
     section: toml::Table,
     context: DeformerContext,
@@ -92,9 +87,6 @@ impl CdfBasis {
         if let Some(shape) = &functions.network {
             add("net.functions".into(), weights::chain(seed.child("functions"), &weights::widths(shape)));
         }
-        if functions.knots > 0 {
-            add(KNOTS.into(), vec![0.0; functions.knot_weights()]);
-        }
         let chain: Vec<usize> = std::iter::once(voxels.width()).chain(coefficients.trunk.iter().copied()).collect();
         add("net.trunk".into(), weights::chain(seed.child("trunk"), &chain));
         for (head, &(values, own)) in settings.heads.iter().zip(&shape.groups) {
@@ -123,12 +115,7 @@ impl CdfBasis {
         let functions = &self.functions;
         let mut parts = vec![rows(&|t| functions.plain(t))];
         if let (Some(network), Some(weights)) = (&functions.network, weights) {
-            let mut learned = mlp_relu(rows(&|t| functions.network_input(t)), weights, network)?;
-            if let (Some(learned), Some(knots)) = (learned.first_mut(), self.parameters.iter().find(|p| p.name == KNOTS)) {
-                let weights = knots.value.clone().reshape([functions.knots, functions.knot_weights() / functions.knots]);
-                *learned = learned.clone() + rows(&|t| functions.knots_at(t)).matmul(weights);
-            }
-            parts.extend(learned);
+            parts.extend(mlp_relu(rows(&|t| functions.network_input(t)), weights, network)?);
         }
         Ok(Tensor::cat(parts, 1))
     }
@@ -151,7 +138,7 @@ impl Deformer for CdfBasis {
             return Ok(SpatialFeatures { values: empty, work: DeformerWork::default() });
         }
         let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
-        let weights = self.weights_after(usize::from(self.functions.network.is_some()) + usize::from(self.functions.knots > 0));
+        let weights = self.weights_after(usize::from(self.functions.network.is_some()));
         let flat = mlp_relu_flat(voxel, weights, &self.coefficients)?;
         Ok(SpatialFeatures { values: flat.reshape([m, self.shape.coefficients()]), work })
     }

@@ -98,7 +98,7 @@ fn players_compute_what_the_deformer_computes() {
     for (section, sh_degree, heads) in [
         (small.to_string(), 1, 3),
         (format!("{small}layers = 1\nlearned = 0\nsplines = 6\ncycles = 0.5\nfalloff = 0.0\nheads = ['sh', 'means']\nlr_start = 0.1"), 2, 2),
-        (format!("{small}learned = 4\nknots = 7\ntime_bands = 3\nheads = ['quaternions', 'log_scales']\n[kept]\nquaternions = [1, 5, 9]"), 0, 2),
+        (format!("{small}learned = 4\ntime_bands = 3\nheads = ['quaternions', 'log_scales']\n[kept]\nquaternions = [1, 5, 9]"), 0, 2),
     ] {
         let found = differences(&section, sh_degree);
         assert_eq!(found.len(), heads);

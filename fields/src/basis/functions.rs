@@ -1,5 +1,4 @@
-//! The functions of time that all Gaussians share: a constant, t, Fourier bands, cubic B-splines, and functions learned by a small network,
-//! to which splines may be added.
+//! The functions of time that all Gaussians share: a constant, t, Fourier bands, cubic B-splines, and functions learned by a small network.
 
 use crate::forward::network;
 use crate::networks::ReluShape;
@@ -23,18 +22,12 @@ pub struct TemporalFunctions {
     pub splines: usize,
     /// The network from time to the learned functions.
     pub network: Option<Arc<ReluShape>>,
-    /// Number of cubic B-splines of which each learned function has a sum added to what the network computes: 0 or at least 4.
-    pub knots: usize,
 }
 
 impl TemporalFunctions {
     /// Inputs of the network: t and the bands.
     pub fn encoding(bands: usize) -> usize {
         1 + 2 * bands
-    }
-    /// Weights of the splines that are added to learned functions `[knots, learned]`.
-    pub fn knot_weights(&self) -> usize {
-        self.knots * self.learned()
     }
     fn learned(&self) -> usize {
         self.network.as_ref().and_then(|n| n.output_widths().first().copied()).unwrap_or(0)
@@ -56,22 +49,15 @@ impl TemporalFunctions {
     pub fn network_input(&self, time_norm: f32) -> Vec<f32> {
         self.encoded(time_norm, NETWORK_FALLOFF)
     }
-    /// The splines that are added to learned functions, at `time_norm` `[knots]`.
-    pub fn knots_at(&self, time_norm: f32) -> Vec<f32> {
-        splines_at(time_norm, self.knots)
-    }
-    /// All functions at `times_norm`, `[times, functions]`. `weights` are those of the network, if there is one, `knots` those of the splines that are added to
-    /// what it computes.
-    pub fn at(&self, times_norm: &[f32], weights: &[f32], knots: &[f32]) -> Vec<Vec<f32>> {
-        let Some(shape) = &self.network else { return times_norm.iter().map(|&t| self.plain(t)).collect() };
-        let inputs: Vec<f32> = times_norm.iter().flat_map(|&t| self.network_input(t)).collect();
-        let mut learned = network(shape, weights, &inputs).concat();
-        for (&t, values) in times_norm.iter().zip(learned.chunks_exact_mut(self.learned())) {
-            for (spline, weights) in self.knots_at(t).iter().zip(knots.chunks_exact(values.len())) {
-                values.iter_mut().zip(weights).for_each(|(value, weight)| *value += spline * weight);
-            }
-        }
-        times_norm.iter().zip(learned.chunks_exact(self.learned())).map(|(&t, learned)| [self.plain(t).as_slice(), learned].concat()).collect()
+    /// All functions at `times_norm`, `[times, functions]`. `weights` are those of the network, if there is one.
+    pub fn at(&self, times_norm: &[f32], weights: &[f32]) -> Vec<Vec<f32>> {
+        let learned = self.network.as_ref().map(|shape| {
+            let inputs: Vec<f32> = times_norm.iter().flat_map(|&t| self.network_input(t)).collect();
+            network(shape, weights, &inputs).concat()
+        });
+        let learned = learned.unwrap_or_default();
+        let of = |k: usize| &learned[k * self.learned()..(k + 1) * self.learned()];
+        times_norm.iter().enumerate().map(|(k, &t)| [self.plain(t).as_slice(), of(k)].concat()).collect()
     }
     /// t and the bands; the amplitude of each band is 2^-falloff times that of the next lower one.
     fn encoded(&self, time_norm: f32, falloff: f32) -> Vec<f32> {
@@ -111,26 +97,9 @@ mod tests {
     }
 
     #[test]
-    fn splines_are_added_to_what_the_network_computes() {
-        let network = Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(1), 3, 2]));
-        let functions = TemporalFunctions { bands: 1, cycles: 1.0, falloff: 1.0, splines: 0, network: Some(network.clone()), knots: 6 };
-        let weights: Vec<f32> = (0..network.parameter_count()).map(|k| (k as f32).sin()).collect();
-        let knots: Vec<f32> = (0..functions.knot_weights()).map(|k| (k as f32 + 0.5).cos()).collect();
-        assert_eq!(knots.len(), 12);
-        for time in [0.0, 0.37, 1.0] {
-            let without = TemporalFunctions { knots: 0, ..functions.clone() }.at(&[time], &weights, &[]).remove(0);
-            let with = functions.at(&[time], &weights, &knots).remove(0);
-            for (k, (with, without)) in with.iter().zip(&without).enumerate() {
-                let added: f32 = splines_at(time, 6).iter().enumerate().map(|(s, value)| if k < 4 { 0.0 } else { value * knots[2 * s + k - 4] }).sum();
-                assert!((with - without - added).abs() < 1e-5, "{k} at {time}: {with}, {without} and {added}");
-            }
-        }
-    }
-
-    #[test]
     fn bands_fall_off_by_octaves() {
-        let functions = TemporalFunctions { bands: 3, cycles: 1.0, falloff: 0.5, splines: 4, network: None, knots: 0 };
-        let values = functions.at(&[0.2], &[], &[]).remove(0);
+        let functions = TemporalFunctions { bands: 3, cycles: 1.0, falloff: 0.5, splines: 4, network: None };
+        let values = functions.at(&[0.2], &[]).remove(0);
         assert_eq!(values.len(), functions.count());
         assert_eq!(functions.prices().len(), functions.count());
         let angle = std::f32::consts::TAU * 0.2;

@@ -51,11 +51,12 @@ pub(crate) fn motion(source: &MotionSource) -> Result<Option<ComputedMotion>> {
         return Ok(None);
     }
 
-    let weights = |name: &str, count: usize| if count > 0 { source.weights(name, count) } else { Ok(&[][..]) };
-    let of_functions = weights("net.functions", plan.functions.network.as_ref().map_or(0, |shape| shape.parameter_count()))?;
-    let knots = weights("net.knots", plan.functions.knot_weights())?;
+    let of_functions = match &plan.functions.network {
+        Some(shape) => source.weights("net.functions", shape.parameter_count())?,
+        None => &[],
+    };
     let times: Vec<f32> = (0..samples).map(|k| frame_time(k, samples)).collect();
-    let functions = plan.functions.at(&times, of_functions, knots);
+    let functions = plan.functions.at(&times, of_functions);
 
     let decoder = plan.voxels.sizes()?.decoder.parameter_count();
     let voxels = features(&plan.voxels, source.context, &source.gaussians.means, |level| source.weights(&format!("grid.level{level}"), decoder))?;
@@ -83,7 +84,7 @@ pub(crate) fn motion(source: &MotionSource) -> Result<Option<ComputedMotion>> {
 fn samples_for(functions: &TemporalFunctions) -> usize {
     let fastest = if functions.bands == 0 { 0.0 } else { f64::from(functions.cycles) * (functions.bands as f64 - 1.0).exp2() };
     let of_bands = (SAMPLES_PER_CYCLE * fastest).ceil() as usize;
-    of_bands.max(SAMPLES_PER_SPLINE * functions.splines.max(functions.knots)) + 1
+    of_bands.max(SAMPLES_PER_SPLINE * functions.splines) + 1
 }
 
 /// Whether features or multiplications for `m` Gaussians and `samples` of time are more than a player should spend.

@@ -52,8 +52,6 @@ pub struct BasisSettings {
     pub splines: usize,
     /// Learned functions.
     pub learned: usize,
-    /// Cubic B-splines added to learned functions.
-    pub knots: usize,
     /// What changes.
     pub heads: Vec<Head>,
     /// How rotations change.
@@ -75,7 +73,6 @@ impl Default for BasisSettings {
             sparsity: 1e-4,
             splines: 0,
             learned: 16,
-            knots: 0,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions],
             rotation: Rotation::Additive,
             unused: 0.01,
@@ -89,8 +86,8 @@ const KEPT: &str = "kept";
 
 impl BasisSettings {
     /// The keys of these settings in a `[deformer]` section, but for the one that training writes.
-    pub const KEYS: [&'static str; 12] =
-        ["width", "layers", "time_bands", "cycles", "falloff", "sparsity", "splines", "learned", "knots", "heads", "rotation", "unused"];
+    pub const KEYS: [&'static str; 11] =
+        ["width", "layers", "time_bands", "cycles", "falloff", "sparsity", "splines", "learned", "heads", "rotation", "unused"];
     /// Values per Gaussian of a head.
     pub fn width_of(&self, head: Head, sh_degree: usize) -> usize {
         if head == Head::Quaternions && self.rotation == Rotation::Exponential { 3 } else { head.width(sh_degree) }
@@ -145,16 +142,13 @@ impl BasisPlan {
         within("layers", settings.layers, 1, 8)?;
         within("time_bands", settings.time_bands, 0, 24)?;
         within("learned", settings.learned, 0, 256)?;
-        for (name, count) in [("splines", settings.splines), ("knots", settings.knots)] {
-            within(name, count, 0, 1024)?;
-            if (1..4).contains(&count) {
-                let problem = format!("{count} splines are too few; cubic splines need 4");
-                return Err(Error::parameter(format!("deformer.{name}"), problem, "Give 0 (none) or at least 4"));
-            }
-        }
-        if settings.knots > 0 && settings.learned == 0 {
-            let problem = format!("{} splines are to be added to learned functions, of which there are none", settings.knots);
-            return Err(Error::parameter("deformer.knots", problem, "Give 0, or deformer.learned of at least 1"));
+        within("splines", settings.splines, 0, 1024)?;
+        if (1..4).contains(&settings.splines) {
+            return Err(Error::parameter(
+                "deformer.splines",
+                format!("{} splines are too few; cubic splines need 4", settings.splines),
+                "Give 0 (none) or at least 4",
+            ));
         }
         within("spherical-harmonics degree", context.sh_degree, 0, 4)?;
         if !(0.1..=16.0).contains(&settings.cycles) {
@@ -171,15 +165,14 @@ impl BasisPlan {
         }
         let bands = if settings.time_bands == 0 { bands_for(context.frame_count).min(MOST_BANDS) } else { settings.time_bands };
         let network = (settings.learned > 0).then(|| Arc::new(ReluShape::chain(&[TemporalFunctions::encoding(bands), width, width, settings.learned])));
-        let BasisSettings { cycles, falloff, splines, knots, .. } = settings;
-        let functions = TemporalFunctions { bands, cycles, falloff, splines, network, knots };
+        let functions = TemporalFunctions { bands, cycles: settings.cycles, falloff: settings.falloff, splines: settings.splines, network };
         let kept = settings.functions_of_heads(functions.count())?;
         let groups: Vec<(usize, usize)> = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let outputs = groups.iter().map(|(values, own)| vec![width, values * own]).collect();
         let sizes = voxels.sizes()?;
         let coefficients = Arc::new(ReluShape { input: sizes.width(), trunk: vec![width; settings.layers], heads: outputs });
         let of_functions = functions.network.as_ref().map_or(0, |n| n.parameter_count());
-        bounded([sizes.parameter_count(), coefficients.parameter_count(), of_functions, functions.knot_weights()])?;
+        bounded([sizes.parameter_count(), coefficients.parameter_count(), of_functions])?;
         Ok(Self { settings, voxels, functions, kept, groups, coefficients })
     }
     /// Width of the coefficient network.
