@@ -67,7 +67,7 @@ pub fn protocols(results: &[CellResult]) -> String {
     let mut metrics: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
     for (name, score) in results.iter().flat_map(|r| &r.metrics) {
         let stated = score.protocol.iter().filter(|(key, _)| *key != "frames");
-        // Of the images, what is behind them: their number is beside every table.
+        // Of the images only what is behind them: how many there are differs between scenes.
         let behind = score.protocol.get("frames").and_then(|frames| frames.get("background")).map(|value| ("background", value));
         let entries = stated.map(|(key, value)| (key.as_str(), value)).chain(behind).filter(|(_, value)| !value.is_null()).map(|(key, value)| {
             let text = value.as_str().map_or_else(|| value.to_string(), str::to_string);
