@@ -26,6 +26,7 @@ mod tests {
         for (kind, settings) in [
             ("cdf", voxels),
             ("cdf-basis", voxels),
+            ("hash-basis", "log2_rows = 24\nlevels = 16\nbase = 256\nfeatures = 64"),
             ("hexplane", "resolution = 4096\nmultires = [64, 64, 64, 64, 64, 64, 64, 64]\nfeatures = 256"),
             ("grid4d", "log2_rows = 24\nspace_levels = 64\nfeatures = 16\nspace_base = 65536\nspace_final = 65536"),
             ("swift4d-hash", "log2_rows = 24\nlevels = 20\nfeatures = 16"),
@@ -49,6 +50,7 @@ mod tests {
         for (kind, settings) in [
             ("cdf", "lr_start lr_end clip_norm"),
             ("cdf-basis", "lr_start lr_end clip_norm sparsity"),
+            ("hash-basis", "lr_start lr_end clip_norm sparsity grid_rate"),
             ("hexplane", "lr_start lr_end grid_rate tv_space tv_time time_one"),
             ("grid4d", "lr_start lr_end lr_grid_start lr_grid_end smooth_weight smooth_delta"),
             ("swift4d-hash", "lr_start lr_end"),

@@ -5,13 +5,15 @@ pub mod basis;
 pub mod forward;
 pub mod hash;
 pub mod heads;
+pub mod lookup;
 pub mod networks;
 pub mod settings;
+pub mod tables;
 pub mod time;
 pub mod voxels;
 
 /// Keeps every plug-in of this crate in the program: linkers for wasm32 drop object files that nothing refers to.
 pub fn link() {
-    let motion: fn(&_) -> _ = basis::motion;
+    let motion: [fn(&cc4dgs_format::playback::MotionSource) -> _; 2] = [basis::computed, basis::stored];
     std::hint::black_box(motion);
 }

@@ -1,93 +1,15 @@
 //! Interpolated lookups in grids of stored features: dense, or hashed where a level has more vertices than rows (Müller et al. 2022).
 
 use crate::cpu::simd::vectorized;
-use crate::ops::lookup::{GridLevel, GridShape, Outside, PRIMES};
+use crate::ops::lookup::{GridLevel, GridShape};
+use cc4dgs_fields::lookup::{add_scaled, cell, corner, gather};
+use cc4dgs_fields::with_dims;
 use rayon::prelude::*;
 
 /// Points per task.
 const ROWS: usize = 128;
 /// Features a backward task adds up: several tasks share a level where it has many.
 const FEATURES: usize = 8;
-
-/// The cell of a point on a level of `D` axes: per axis, the contributions of its lower and upper vertex in weight, hash and index.
-struct Cell<const D: usize> {
-    weight: [[f32; 2]; D],
-    hash: [[u32; 2]; D],
-    index: [[u32; 2]; D],
-}
-
-/// The cell of `x` (in 0..1 per axis), `None` outside the grid.
-#[inline(always)]
-fn cell<const D: usize>(x: &[f32; D], level: &GridLevel, shape: &GridShape) -> Option<Cell<D>> {
-    let mut cell = Cell { weight: [[0.0; 2]; D], hash: [[0; 2]; D], index: [[0; 2]; D] };
-    let mut stride = 1u32;
-    for d in 0..D {
-        let raw = x[d];
-        // Comparisons with NaN are false: it is outside, or at the lower face.
-        if shape.outside == Outside::Zero && !(0.0..=1.0).contains(&raw) {
-            return None;
-        }
-        let clamped = if raw > 0.0 { raw.min(1.0) } else { 0.0 };
-        let position = clamped * level.scale[d] + shape.stagger;
-        // A dense level ends with its last vertex; a hashed one has a row for every index.
-        let low = if shape.clamps { position.floor().min((level.size[d] - 2) as f32) } else { position.floor() };
-        let part = position - low;
-        let part = if shape.smooth { part * part * (3.0 - 2.0 * part) } else { part };
-        let vertex = low as u32;
-        cell.weight[d] = [1.0 - part, part];
-        // Products and sums wrap; the index does so on hashed levels only, which do not use it.
-        cell.hash[d] = [vertex.wrapping_mul(PRIMES[d]), (vertex + 1).wrapping_mul(PRIMES[d])];
-        cell.index[d] = [vertex.wrapping_mul(stride), (vertex + 1).wrapping_mul(stride)];
-        stride = stride.wrapping_mul(level.size[d]);
-    }
-    Some(cell)
-}
-
-/// Row (within the level) and weight of a corner (bit d set: the upper one along axis d).
-#[inline(always)]
-fn corner<const D: usize>(cell: &Cell<D>, corner: usize, level: &GridLevel) -> (usize, f32) {
-    let (mut weight, mut hash, mut index) = (1.0f32, 0u32, 0u32);
-    for d in 0..D {
-        let upper = corner >> d & 1;
-        weight *= cell.weight[d][upper];
-        hash ^= cell.hash[d][upper];
-        index = index.wrapping_add(cell.index[d][upper]);
-    }
-    let (raw, rows) = (if level.hashed { hash } else { index }, level.rows as u32);
-    // A division per corner would cost more than the lookup.
-    let row = if raw < rows {
-        raw
-    } else if rows.is_power_of_two() {
-        raw & (rows - 1)
-    } else {
-        raw % rows
-    };
-    (row as usize, weight)
-}
-
-/// Runs `$body` with `$d` the number of axes as a constant.
-macro_rules! with_dims {
-    ($dims:expr, $d:ident => $body:expr) => {
-        match $dims {
-            1 => {
-                const $d: usize = 1;
-                $body
-            }
-            2 => {
-                const $d: usize = 2;
-                $body
-            }
-            3 => {
-                const $d: usize = 3;
-                $body
-            }
-            _ => {
-                const $d: usize = 4;
-                $body
-            }
-        }
-    };
-}
 
 /// Rows of the table and weights of all corners of `points` `[M, dims]` on one level, each `[M, 2^dims]`; weight 0 outside the grid. For
 /// comparisons: the operation stores neither.
@@ -114,27 +36,10 @@ pub fn forward(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f32> {
     out.par_chunks_mut(ROWS * width).zip(points.par_chunks(ROWS * dims)).for_each(|(out, points)| {
         vectorized(
             #[inline(always)]
-            || with_dims!(dims, D => gather::<D>(shape, table, points, width, out)),
+            || gather(shape, table, points, out),
         );
     });
     out
-}
-
-#[inline(always)]
-fn gather<const D: usize>(shape: &GridShape, table: &[f32], points: &[f32], width: usize, out: &mut [f32]) {
-    let f = shape.features;
-    // Level by level, so that a task's rows of one table stay near.
-    for (l, level) in shape.levels.iter().enumerate() {
-        let own = &table[level.first_row * f..(level.first_row + level.rows) * f];
-        for (row, x) in out.chunks_exact_mut(width).zip(points.as_chunks::<D>().0) {
-            let Some(cell) = cell(x, level, shape) else { continue };
-            let sum = &mut row[l * f..(l + 1) * f];
-            for c in 0..1 << D {
-                let (at, weight) = corner(&cell, c, level);
-                add_scaled(sum, &own[at * f..(at + 1) * f], weight);
-            }
-        }
-    }
 }
 
 /// The gradient of the table, given that of the features. A task owns some features of one level and visits the points in order, so that no two tasks write the same element.
@@ -204,12 +109,5 @@ fn scatter<const D: usize>(
             let (at, weight) = corner(&cell, c, level);
             add_scaled(&mut out[at * stride..at * stride + d.len()], d, weight);
         }
-    }
-}
-
-#[inline(always)]
-fn add_scaled(row: &mut [f32], values: &[f32], scale: f32) {
-    for (r, v) in row.iter_mut().zip(values) {
-        *r += scale * v;
     }
 }

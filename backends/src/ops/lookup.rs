@@ -11,86 +11,8 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::Tensor;
 use cc4dgs_core::{Error, Result};
+pub use cc4dgs_fields::lookup::{GridLevel, GridShape, MAX_DIMS, Outside, PRIMES};
 use std::sync::Arc;
-
-/// Most axes of a grid.
-pub const MAX_DIMS: usize = 4;
-/// Multipliers of the spatial hash (Müller et al. 2022).
-pub const PRIMES: [u32; MAX_DIMS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
-
-/// What points outside 0..1 get.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Outside {
-    /// Zeros, and no gradient.
-    Zero,
-    /// What the nearest face has.
-    Clamp,
-}
-
-/// One level.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GridLevel {
-    /// Vertices per axis.
-    pub size: [u32; MAX_DIMS],
-    /// Position = x * scale + stagger, per axis.
-    pub scale: [f32; MAX_DIMS],
-    /// Rows of the table before this level.
-    pub first_row: usize,
-    /// Rows of this level.
-    pub rows: usize,
-    /// Whether vertices share rows by their hash.
-    pub hashed: bool,
-}
-
-/// A whole grid.
-#[derive(Clone, Debug, PartialEq)]
-pub struct GridShape {
-    /// Axes, 1 to [`MAX_DIMS`].
-    pub dims: usize,
-    /// Features per level.
-    pub features: usize,
-    /// Levels, in the order of the table.
-    pub levels: Vec<GridLevel>,
-    /// Added to positions (tiny-cuda-nn: 0.5).
-    pub stagger: f32,
-    /// Whether interpolation weights go through smoothstep.
-    pub smooth: bool,
-    /// Whether the last cell ends with the last vertex, so that x = 1 lies at it (align_corners).
-    pub clamps: bool,
-    /// What points outside get.
-    pub outside: Outside,
-}
-
-impl GridShape {
-    /// Rows of the table.
-    pub fn rows(&self) -> usize {
-        self.levels.iter().map(|l| l.rows).sum()
-    }
-    /// Weights of the table.
-    pub fn parameter_count(&self) -> usize {
-        self.rows() * self.features
-    }
-    /// Features per point.
-    pub fn width(&self) -> usize {
-        self.levels.len() * self.features
-    }
-    /// Appends a level of `size` vertices per axis in at most `most_rows` rows; dense where they suffice.
-    pub fn push(&mut self, size: &[u32], scale: &[f32], most_rows: usize) {
-        let vertices = size.iter().fold(1u64, |n, &s| n.saturating_mul(u64::from(s)));
-        // Tables are padded to eight rows, as tiny-cuda-nn does.
-        let padded = vertices.saturating_add(7) / 8 * 8;
-        let rows = if self.clamps { vertices } else { padded }.min(most_rows as u64) as usize;
-        let fill = |values: &[u32]| std::array::from_fn(|d| values.get(d).copied().unwrap_or(1));
-        let level = GridLevel {
-            size: fill(size),
-            scale: std::array::from_fn(|d| scale.get(d).copied().unwrap_or(0.0)),
-            first_row: self.rows(),
-            rows,
-            hashed: vertices > rows as u64,
-        };
-        self.levels.push(level);
-    }
-}
 
 /// The derivative per device.
 pub trait LookupBackward: Backend {

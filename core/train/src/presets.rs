@@ -63,6 +63,7 @@ methods! {
     "free-time", "velocities and lives of Gaussians", "FreeTimeGS; FreeTimeGS++; SharpTimeGS";
     "native-4d", "4D-GS's Gaussians of space and time", "4D-GS (Yang et al. 2024)";
     "cdf-basis", "this project's deformer, linear in functions of time", "this project";
+    "hash-basis", "the same, with features of space stored in a hash grid", "this project";
     "none", "no deformation", "Kerbl et al. 2023 (3DGS)";
 }
 
@@ -75,7 +76,7 @@ mod tests {
     fn every_family_and_method_resolves() {
         let registry = Registry::collect().unwrap();
         let names = |method: bool| registry.presets().filter(move |p| (p.role == PresetRole::Method) == method).map(|p| p.info.name).collect::<Vec<_>>();
-        assert_eq!((names(false).len(), names(true).len()), (6, 10));
+        assert_eq!((names(false).len(), names(true).len()), (6, 11));
         for family in names(false) {
             for method in names(true).into_iter().map(|name| format!("+{name}")).chain([String::new()]) {
                 let name = format!("{family}{method}");

@@ -1,41 +1,21 @@
-//! A deformer that is linear in its functions of time: offsets = C(f_voxel) φ(t).
+//! Deformers that are linear in their functions of time: offsets = C(f) φ(t).
 //!
-//! C is a matrix of coefficients per Gaussian, computed from the same hashed voxel features as the CDF's (paper Section IV-B) and cached by playback like
-//! them; φ is one vector per frame, shared by all Gaussians: a constant, t, Fourier bands, optional splines and functions learned by a small network.
+//! C is a matrix of coefficients per Gaussian, computed by a small network from features f of its canonical centre and cached by playback; φ is one vector per
+//! frame, shared by all Gaussians: a constant, t, Fourier bands, optional splines and functions learned by a small network.
 //! A frame costs a dot product per offset instead of a network per Gaussian. It also represents motion over many cycles, which FiLM in front of a trunk hardly
 //! learns.
 //! Trajectories as combinations of few shared functions are the idea of DynMF (Kratimenos et al. 2024) and Gaussian-Flow (Lin et al. 2024), which store the
 //! coefficients per Gaussian.
 //!
+//! Two plug-ins differ in their features of space: those of `cdf-basis` ([`computed`]) are the CDF's, hashed and decoded without stored tables (paper Section
+//! IV-B); those of `hash-basis` ([`stored`]) are stored in a hash grid, which takes more bytes, less time, and follows finer motion.
+//!
 //! After training, functions that a head hardly uses and heads without effect are dropped: see `simplify`.
 
-mod simplify;
-mod sparsity;
-
-use crate::parts::centres::check_time;
-use crate::parts::heads::{self, Head};
-use crate::parts::settings::{Rates, take};
-use crate::parts::voxels::{Voxels, parameter};
-use crate::parts::weights;
-use burn::tensor::{Device, Int, Tensor, TensorData};
-use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine_all};
-use cc4dgs_backends::ops::field::{ReluShape, mlp_relu, mlp_relu_flat};
-use cc4dgs_core::{
-    Deformer, DeformerContext, DeformerPlugin, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Simplified, SpatialFeatures,
-    SpatialInput, inventory,
-};
-use cc4dgs_fields::basis::{BasisPlan, BasisSettings, NAME, Rotation, TemporalFunctions, VERSION};
-use std::sync::Arc;
-
-/// Settings with their defaults, as shown to users.
-const SCHEMA: &str = r#"capacity = "default"    # small | mid | default, as for `cdf`
-# levels, resolutions, hidden, features: as for `cdf`
-hashes = 128             # hash functions per vertex
-modulus = 1000000        # m of the hash functions
-vertex_reuse = true      # decode a vertex once, however many Gaussians share it
-# width = 128            # width of the coefficient network (small: 64; mid: 96)
-layers = 2               # hidden layers of the coefficient network
-time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
+/// The part of the schema that the plug-ins share.
+macro_rules! shared_schema {
+    () => {
+        r#"time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
 cycles = 1.0             # cycles of the lowest band over the sequence; with whole cycles, what the bands move ends where it began
 falloff = 1.0            # amplitude of a band over the next lower one is 2^-falloff: fast motion is learned later; 0 treats all alike
 sparsity = 1e-4          # weight of a group lasso on every function of every head (Fourier bands: times their frequency); 0 is off
@@ -50,19 +30,43 @@ warmup = 0.025           # linear warm-up, as a share of the stage
 clip_norm = 1.0          # gradient-norm clip per group; 0 is off
 # [deformer.kept]        # function indices per head; written by training
 # means = [0, 1, 2]
-"#;
+"#
+    };
+}
+
+pub mod computed;
+mod simplify;
+mod space;
+mod sparsity;
+pub mod stored;
+
+use crate::parts::centres::check_time;
+use crate::parts::heads::{self, Head};
+use crate::parts::settings::{Rates, not_negative, take};
+use crate::parts::voxels::parameter;
+use crate::parts::weights;
+use burn::tensor::{Device, Int, Tensor, TensorData};
+use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine_all};
+use cc4dgs_backends::ops::field::{ReluShape, mlp_relu, mlp_relu_flat};
+use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Offsets, Parameter, ParameterGroup, Part, Result, Simplified, SpatialFeatures, SpatialInput};
+use cc4dgs_fields::basis::{BasisPlan, BasisSettings, Rotation, Space, SpaceKind, TemporalFunctions};
+use space::SpaceFeatures;
+use std::sync::Arc;
 
 /// Parameter groups by index.
 const GRID: usize = 0;
 const NET: usize = 1;
 
-/// The deformer. Parameters: decoders by level, the functions' network (if any), the coefficients' trunk, one head each.
-struct CdfBasis {
+/// The deformer. Parameters: those of the features, the functions' network (if any), the coefficients' trunk, one head each.
+struct Basis {
+    kind: SpaceKind,
     section: toml::Table,
     context: DeformerContext,
     settings: BasisSettings,
     rates: Rates,
-    voxels: Voxels,
+    /// Factor on the learning rates of stored features; `None` where they are computed.
+    grid_rate: Option<f64>,
+    space: SpaceFeatures,
     functions: TemporalFunctions,
     /// Function indices by head.
     kept: Vec<Vec<usize>>,
@@ -71,33 +75,38 @@ struct CdfBasis {
     parameters: Vec<Parameter>,
 }
 
-impl CdfBasis {
-    fn new(section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Self> {
+impl Basis {
+    fn new(kind: SpaceKind, section: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Self> {
         let mut rest = section.clone();
         let rates: Rates = take(&mut rest, &Rates::KEYS)?;
         rates.check()?;
-        let plan = BasisPlan::new(&rest, context)?;
+        let plan = BasisPlan::new(kind, &rest, context)?;
         let width = plan.width();
-        let BasisPlan { settings, voxels: voxel_settings, functions, kept, groups, coefficients } = plan;
+        let grid_rate = match &plan.space {
+            Space::Computed(_) => None,
+            Space::Stored(tables) => Some(tables.grid_rate),
+        };
+        not_negative(&[("grid_rate", grid_rate.unwrap_or_default())])?;
+        let BasisPlan { settings, space, functions, kept, groups, coefficients } = plan;
         let shape = Arc::new(BasisShape { groups });
 
-        let (voxels, mut parameters) = Voxels::new(&voxel_settings, context, GRID, device)?;
+        let (space, mut parameters) = SpaceFeatures::new(&space, context, GRID, device)?;
         let seed = context.seed;
         let mut add = |name: String, values: Vec<f32>| parameters.push(parameter(name, Part::Net, NET, values, device));
         if let Some(shape) = &functions.network {
             add("net.functions".into(), weights::chain(seed.child("functions"), &weights::widths(shape)));
         }
-        let chain: Vec<usize> = std::iter::once(voxels.width()).chain(coefficients.trunk.iter().copied()).collect();
+        let chain: Vec<usize> = std::iter::once(coefficients.input).chain(coefficients.trunk.iter().copied()).collect();
         add("net.trunk".into(), weights::chain(seed.child("trunk"), &chain));
         for (head, &(values, own)) in settings.heads.iter().zip(&shape.groups) {
             add(format!("net.head.{}", head.name()), weights::head(seed.child(head.name()), width, values * own));
         }
         let (section, context) = (section.clone(), context.clone());
-        Ok(Self { section, context, rates, voxels, functions, kept, shape, coefficients, parameters, settings })
+        Ok(Self { kind, section, context, rates, grid_rate, space, functions, kept, shape, coefficients, parameters, settings })
     }
-    /// The weights of all parameters from index `index` after the decoders to the end, concatenated.
+    /// The weights of all parameters from index `index` after those of the features to the end, concatenated.
     fn weights_after(&self, index: usize) -> Tensor<1> {
-        Tensor::cat(self.parameters[self.voxels.levels() + index..].iter().map(|p| p.value.clone()).collect(), 0)
+        Tensor::cat(self.parameters[self.space.parameters() + index..].iter().map(|p| p.value.clone()).collect(), 0)
     }
     /// The unit of a head's outputs: half the diagonal of the box (world units) for centres, else 1.
     fn scale_of(&self, head: Head) -> f64 {
@@ -106,7 +115,7 @@ impl CdfBasis {
     }
     /// All functions at `times_norm` (0..1): φ(t) `[times, functions]`.
     fn functions_at(&self, times_norm: &[f32], like: &Device) -> Result<Tensor<2>> {
-        let weights = self.functions.network.as_ref().map(|_| self.parameters[self.voxels.levels()].value.clone());
+        let weights = self.functions.network.as_ref().map(|_| self.parameters[self.space.parameters()].value.clone());
         let rows = |of: &dyn Fn(f32) -> Vec<f32>| {
             let values: Vec<f32> = times_norm.iter().flat_map(|&t| of(t)).collect();
             let width = values.len() / times_norm.len().max(1);
@@ -129,7 +138,7 @@ impl CdfBasis {
     }
 }
 
-impl Deformer for CdfBasis {
+impl Deformer for Basis {
     fn spatial(&self, input: &SpatialInput) -> Result<SpatialFeatures> {
         let means_world = input.means_world.clone();
         let [m, _] = means_world.dims();
@@ -137,9 +146,9 @@ impl Deformer for CdfBasis {
             let empty = Tensor::zeros([0, self.shape.coefficients()], &means_world.inner().device());
             return Ok(SpatialFeatures { values: empty, work: DeformerWork::default() });
         }
-        let (voxel, work) = self.voxels.features(&self.parameters, means_world)?;
+        let (features, work) = self.space.features(&self.parameters, means_world)?;
         let weights = self.weights_after(usize::from(self.functions.network.is_some()));
-        let flat = mlp_relu_flat(voxel, weights, &self.coefficients)?;
+        let flat = mlp_relu_flat(features, weights, &self.coefficients)?;
         Ok(SpatialFeatures { values: flat.reshape([m, self.shape.coefficients()]), work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
@@ -176,31 +185,20 @@ impl Deformer for CdfBasis {
         self.parameters.iter_mut().collect()
     }
     fn groups(&self) -> Vec<ParameterGroup> {
-        vec![self.rates.group("cdf-basis grid"), self.rates.group("cdf-basis net")]
+        let name = |part: &str| format!("{} {part}", self.kind.name());
+        let grid = self.rates.group(&name("grid"));
+        let grid = match self.grid_rate {
+            // Few rows of a table have gradients in an iteration, and the norm of all says little about them.
+            Some(factor) => ParameterGroup { lr_start: factor * grid.lr_start, lr_end: factor * grid.lr_end, clip_norm: 0.0, ..grid },
+            None => grid,
+        };
+        vec![grid, self.rates.group(&name("net"))]
     }
     fn regularizer(&self, _input: &SpatialInput, _time_norm: f32, _progress: f32) -> Result<Option<Tensor<1>>> {
         Ok(if self.settings.sparsity > 0.0 { sparsity::group_lasso(self, self.settings.sparsity) } else { None })
     }
     fn simplified(&self, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
         simplify::simplified(self, features, times)
-    }
-}
-
-fn build(settings: &toml::Table, context: &DeformerContext, device: &Device) -> Result<Box<dyn Deformer>> {
-    Ok(Box::new(CdfBasis::new(settings, context, device)?))
-}
-
-inventory::submit! {
-    DeformerPlugin {
-        info: Plugin {
-            name: NAME,
-            version: VERSION,
-            summary: "computational deformation field, linear in shared functions of time: a dot product per frame",
-            paper: "CC-4DGS, Section IV-B (spatial half); DynMF, Gaussian-Flow (shared temporal functions)",
-            schema: SCHEMA,
-            capabilities: &["differentiable", "starts-as-identity", "vertex-reuse", "cached-spatial", "simplifies", "rotation=additive,exponential"],
-        },
-        build,
     }
 }
 

@@ -4,7 +4,7 @@
 //! times its own. Functions are dropped from the smallest part on, as long as the root-mean-square of all that is dropped stays below a share of that of the
 //! head's offsets.
 
-use super::{CdfBasis, NET};
+use super::{Basis, NET};
 use crate::parts::heads::Head;
 use crate::parts::voxels::parameter;
 use burn::tensor::Tensor;
@@ -26,7 +26,7 @@ struct Plan {
     kept: Vec<usize>,
 }
 
-pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
+pub(super) fn simplified(field: &Basis, features: Tensor<2>, times: &[f32]) -> Result<Option<Simplified>> {
     let [m, _] = features.dims();
     if field.settings.unused == 0.0 || m == 0 || times.is_empty() {
         return Ok(None);
@@ -59,7 +59,7 @@ pub(super) fn simplified(field: &CdfBasis, features: Tensor<2>, times: &[f32]) -
         return Ok(None);
     }
     let small = rebuilt(field, &plans)?;
-    let bytes = |f: &CdfBasis| f.parameters().iter().map(|p| 4 * p.shape.iter().product::<usize>()).sum::<usize>();
+    let bytes = |f: &Basis| f.parameters().iter().map(|p| 4 * p.shape.iter().product::<usize>()).sum::<usize>();
     let message = format!("{}; {} bytes of weights become {}", lines.join(", "), bytes(field), bytes(&small));
     Ok(Some(Simplified { settings: small.section.clone(), field: Box::new(small), message }))
 }
@@ -106,7 +106,7 @@ fn keep(effects: &[f64], count: usize, allowed: f64) -> Vec<usize> {
 }
 
 /// The deformer with the planned functions only: the same weights without the columns of the others.
-fn rebuilt(field: &CdfBasis, plans: &[Plan]) -> Result<CdfBasis> {
+fn rebuilt(field: &Basis, plans: &[Plan]) -> Result<Basis> {
     let left: Vec<(&Plan, &Vec<usize>)> = plans.iter().zip(&field.kept).filter(|(p, _)| !p.kept.is_empty()).collect();
     let mut section = field.section.clone();
     let names: Vec<toml::Value> = left.iter().map(|(p, _)| p.head.name().into()).collect();
@@ -117,9 +117,9 @@ fn rebuilt(field: &CdfBasis, plans: &[Plan]) -> Result<CdfBasis> {
     });
     section.insert("kept".into(), toml::Value::Table(lists.collect()));
     let device = field.parameters[0].value.device();
-    let mut small = CdfBasis::new(&section, &field.context, &device)?;
+    let mut small = Basis::new(field.kind, &section, &field.context, &device)?;
     for target in &mut small.parameters {
-        let missing = || Error::backend("deformer cdf-basis", format!("it has no weights {}", target.name), "Report this as a defect");
+        let missing = || Error::backend(format!("deformer {}", field.kind.name()), format!("it has no weights {}", target.name), "Report this as a defect");
         let source = field.parameters.iter().find(|p| p.name == target.name).ok_or_else(missing)?;
         let of_head = field.settings.heads.iter().position(|h| format!("net.head.{}", h.name()) == target.name);
         *target = match of_head {

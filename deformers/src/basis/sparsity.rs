@@ -4,7 +4,7 @@
 //! not need goes to zero for all Gaussians at once, and is dropped after training (see [`super::simplify`]). The penalty of a Fourier band is proportional to
 //! its frequency; with unpenalised high bands, the deformer fits each training time separately.
 
-use super::CdfBasis;
+use super::Basis;
 use burn::tensor::{Tensor, TensorData};
 
 /// Added to squared norms, so that a group of zeros has a derivative.
@@ -15,7 +15,7 @@ const LEAST_SCALE: f32 = 1e-6;
 
 /// `weight` times the sum over heads and functions of penalty times norm. Norms of centres are in half diagonals of the box, so that the result does not depend on
 /// the scene's unit of length.
-pub(super) fn group_lasso(field: &CdfBasis, weight: f32) -> Option<Tensor<1>> {
+pub(super) fn group_lasso(field: &Basis, weight: f32) -> Option<Tensor<1>> {
     let prices = field.functions.prices();
     let width = field.coefficients.trunk.last().copied()?;
     let first = field.parameters.len() - field.settings.heads.len();

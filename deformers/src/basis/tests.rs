@@ -4,15 +4,15 @@ use super::*;
 use burn::tensor::TensorData;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::{ComputedMotion, Head as LayerHead, MotionPlugin, MotionSource, frame_time};
-use cc4dgs_core::{Entries, HostGaussians, Seed, WeightArray};
+use cc4dgs_core::{DeformerPlugin, Entries, HostGaussians, Seed, WeightArray};
 
 const COUNT: usize = 37;
 const LEAST_SAMPLES: usize = 9;
 
 /// The evaluation without burn of the version that is trained.
-fn plugin() -> &'static MotionPlugin {
-    let plugin = Entries::<MotionPlugin>::collect().unwrap().get("cdf-basis").unwrap();
-    let trained = Entries::<DeformerPlugin>::collect().unwrap().get("cdf-basis").unwrap();
+fn plugin(kind: SpaceKind) -> &'static MotionPlugin {
+    let plugin = Entries::<MotionPlugin>::collect().unwrap().get(kind.name()).unwrap();
+    let trained = Entries::<DeformerPlugin>::collect().unwrap().get(kind.name()).unwrap();
     assert_eq!(plugin.info.version, trained.info.version);
     plugin
 }
@@ -22,11 +22,11 @@ fn draw(column: usize, index: usize) -> f32 {
 }
 
 /// The largest difference between offsets of the deformer and those of the layer, over the largest offset, head by head.
-fn differences(section: &str, sh_degree: usize) -> Vec<f32> {
+fn differences(kind: SpaceKind, section: &str, sh_degree: usize) -> Vec<f32> {
     let device = Device::flex();
     let context = DeformerContext { box_min: [-1.0, -0.5, 0.0], box_max: [1.0, 0.7, 2.0], frame_count: 20, sh_degree, seed: Seed::root(8) };
     let settings: toml::Table = section.parse().unwrap();
-    let mut field = CdfBasis::new(&settings, &context, &device).unwrap();
+    let mut field = Basis::new(kind, &settings, &context, &device).unwrap();
     for (column, parameter) in field.parameters.iter_mut().enumerate() {
         // Heads start at zero, where there is nothing to compare.
         let count = parameter.shape.iter().product::<usize>();
@@ -59,7 +59,7 @@ fn differences(section: &str, sh_degree: usize) -> Vec<f32> {
         least_samples: LEAST_SAMPLES,
         most_coefficients: usize::MAX,
     };
-    let plugin = plugin();
+    let plugin = plugin(kind);
     let ComputedMotion { samples, tracks } = (plugin.motion)(&source).unwrap().unwrap();
     assert!((plugin.motion)(&MotionSource { most_coefficients: 10, ..source }).unwrap().is_none());
 
@@ -95,12 +95,20 @@ fn differences(section: &str, sh_degree: usize) -> Vec<f32> {
 #[test]
 fn players_compute_what_the_deformer_computes() {
     let small = "capacity = 'small'\nresolutions = [3, 8]\nhashes = 24\nwidth = 16\n";
-    for (section, sh_degree, heads) in [
-        (small.to_string(), 1, 3),
-        (format!("{small}layers = 1\nlearned = 0\nsplines = 6\ncycles = 0.5\nfalloff = 0.0\nheads = ['sh', 'means']\nlr_start = 0.1"), 2, 2),
-        (format!("{small}learned = 4\ntime_bands = 3\nheads = ['quaternions', 'log_scales']\n[kept]\nquaternions = [1, 5, 9]"), 0, 2),
+    let tables = "levels = 3\nbase = 4\nlog2_rows = 7\nfeatures = 3\nwidth = 16\n";
+    for (kind, section, sh_degree, heads) in [
+        (SpaceKind::Stored, tables.to_string(), 1, 3),
+        (SpaceKind::Stored, format!("{tables}layers = 2\nlearned = 4\nheads = ['means', 'quaternions']\ngrid_rate = 3.0"), 0, 2),
+        (SpaceKind::Computed, small.to_string(), 1, 3),
+        (
+            SpaceKind::Computed,
+            format!("{small}layers = 1\nlearned = 0\nsplines = 6\ncycles = 0.5\nfalloff = 0.0\nheads = ['sh', 'means']\nlr_start = 0.1"),
+            2,
+            2,
+        ),
+        (SpaceKind::Computed, format!("{small}learned = 4\ntime_bands = 3\nheads = ['quaternions', 'log_scales']\n[kept]\nquaternions = [1, 5, 9]"), 0, 2),
     ] {
-        let found = differences(&section, sh_degree);
+        let found = differences(kind, &section, sh_degree);
         assert_eq!(found.len(), heads);
         assert!(found.iter().all(|d| *d < 2e-5), "{section}: {found:?}");
     }
@@ -114,7 +122,7 @@ fn what_is_not_linear_is_left_to_baking() {
         let settings: toml::Table = section.parse().unwrap();
         let (object, settings, context) = ("the model", &settings, &context);
         let source = MotionSource { object, settings, context, weights: &[], gaussians: &gaussians, least_samples: 2, most_coefficients: 1 << 20 };
-        (plugin().motion)(&source)
+        (plugin(SpaceKind::Computed).motion)(&source)
     };
     assert!(of("rotation = 'exponential'").unwrap().is_none() && of("heads = ['opacity']").unwrap().is_none());
     assert!(of("life = true").unwrap().is_none() && of("life = { gate = 0.5 }").unwrap().is_none(), "lives change the motion");

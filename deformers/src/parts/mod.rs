@@ -5,5 +5,6 @@ pub mod heads;
 pub mod lives;
 pub mod neighbours;
 pub mod settings;
+pub mod tables;
 pub mod voxels;
 pub mod weights;

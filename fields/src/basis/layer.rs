@@ -1,10 +1,9 @@
 //! The field as a playback layer.
 
-use super::{BasisPlan, NAME, Rotation, TemporalFunctions, VERSION};
+use super::{BasisPlan, Rotation, SpaceKind, TemporalFunctions, VERSION};
 use crate::forward::network;
 use crate::heads::Head;
 use crate::settings::RATE_KEYS;
-use crate::voxels::features;
 use cc4dgs_format::playback::Head as LayerHead;
 use cc4dgs_format::playback::{ComputedMotion, MAX_FUNCTIONS, MAX_SAMPLES, MotionPlugin, MotionSource, Track, frame_time};
 use cc4dgs_format::{HostGaussians, Plugin, Result, inventory};
@@ -13,8 +12,8 @@ use rayon::prelude::*;
 /// Memory at most, in floats: 256 MB.
 const MOST_FLOATS: u64 = 64 << 20;
 /// What a vertex takes beside its features, in floats: its position in the list and in the ordered map of vertices. And a Gaussian, for the corners of its cell.
-const FLOATS_OF_VERTEX: u64 = 12;
-const FLOATS_OF_GAUSSIAN: u64 = 16;
+pub(super) const FLOATS_OF_VERTEX: u64 = 12;
+pub(super) const FLOATS_OF_GAUSSIAN: u64 = 16;
 /// Multiplications at most: some ten seconds in a browser, and a second or two on a desktop.
 const MOST_MULTIPLICATIONS: u64 = 20_000_000_000;
 /// Gaussians whose coefficients are computed at a time.
@@ -36,11 +35,19 @@ fn layer_head(head: Head, rotation: Rotation) -> Option<LayerHead> {
     }
 }
 
-pub(crate) fn motion(source: &MotionSource) -> Result<Option<ComputedMotion>> {
+pub(crate) fn computed(source: &MotionSource) -> Result<Option<ComputedMotion>> {
+    motion(SpaceKind::Computed, source)
+}
+
+pub(crate) fn stored(source: &MotionSource) -> Result<Option<ComputedMotion>> {
+    motion(SpaceKind::Stored, source)
+}
+
+fn motion(kind: SpaceKind, source: &MotionSource) -> Result<Option<ComputedMotion>> {
     let mut section = source.settings.clone();
     RATE_KEYS.iter().for_each(|key| _ = section.remove(*key));
     // Settings that are unknown here may be those of a layer around the deformer. Baking builds both, and says what is wrong if anything is.
-    let Ok(plan) = BasisPlan::new(&section, source.context) else { return Ok(None) };
+    let Ok(plan) = BasisPlan::new(kind, &section, source.context) else { return Ok(None) };
     let heads: Option<Vec<LayerHead>> = plan.settings.heads.iter().map(|&head| layer_head(head, plan.settings.rotation)).collect();
     let (Some(heads), m) = (heads, source.gaussians.len()) else { return Ok(None) };
     let per_gaussian: usize = plan.groups.iter().map(|(values, own)| values * own).sum();
@@ -58,11 +65,10 @@ pub(crate) fn motion(source: &MotionSource) -> Result<Option<ComputedMotion>> {
     let times: Vec<f32> = (0..samples).map(|k| frame_time(k, samples)).collect();
     let functions = plan.functions.at(&times, of_functions);
 
-    let decoder = plan.voxels.sizes()?.decoder.parameter_count();
-    let voxels = features(&plan.voxels, source.context, &source.gaussians.means, |level| source.weights(&format!("grid.level{level}"), decoder))?;
+    let features = plan.space.features(source)?;
     let weights = coefficient_weights(&plan, source)?;
     let width = plan.coefficients.input;
-    let blocks: Vec<Vec<Vec<f32>>> = voxels.par_chunks(BLOCK * width).map(|voxels| network(&plan.coefficients, &weights, voxels)).collect();
+    let blocks: Vec<Vec<Vec<f32>>> = features.par_chunks(BLOCK * width).map(|features| network(&plan.coefficients, &weights, features)).collect();
 
     let track = |(index, &head): (usize, &LayerHead)| {
         let ((values, own), kept) = (plan.groups[index], &plan.kept[index]);
@@ -89,15 +95,10 @@ fn samples_for(functions: &TemporalFunctions) -> usize {
 
 /// Whether features or multiplications for `m` Gaussians and `samples` of time are more than a player should spend.
 fn too_much(plan: &BasisPlan, m: usize, samples: usize) -> Result<bool> {
-    let sizes = plan.voxels.sizes()?;
-    let vertices = |resolution: &u32| (u64::from(*resolution) + 1).pow(3).min(8 * m as u64);
-    let vertices: u64 = sizes.resolutions.iter().map(vertices).sum();
-    let of_gaussian = sizes.width() as u64 + FLOATS_OF_GAUSSIAN;
-    let floats = (m as u64).saturating_mul(of_gaussian).saturating_add(vertices.saturating_mul(sizes.decoder.output as u64 + FLOATS_OF_VERTEX));
-    let of_vertices = vertices.saturating_mul(sizes.decoder.parameter_count() as u64);
+    let (floats, of_space) = plan.space.work(m as u64)?;
     let of_gaussians = (m as u64).saturating_mul(plan.coefficients.parameter_count() as u64);
     let of_functions = plan.functions.network.as_ref().map_or(0, |shape| (samples as u64).saturating_mul(shape.parameter_count() as u64));
-    Ok(floats > MOST_FLOATS || of_vertices.saturating_add(of_gaussians).saturating_add(of_functions) > MOST_MULTIPLICATIONS)
+    Ok(floats > MOST_FLOATS || of_space.saturating_add(of_gaussians).saturating_add(of_functions) > MOST_MULTIPLICATIONS)
 }
 
 /// The weights of trunk and heads, one after the other.
@@ -129,14 +130,28 @@ fn factor(head: LayerHead, gaussians: &HostGaussians, gaussian: usize) -> f32 {
 inventory::submit! {
     MotionPlugin {
         info: Plugin {
-            name: NAME,
+            name: SpaceKind::Computed.name(),
             version: VERSION,
             summary: "the coefficients of cdf-basis, from its weights",
             paper: "this project",
             schema: "",
             capabilities: &[],
         },
-        motion,
+        motion: computed,
+    }
+}
+
+inventory::submit! {
+    MotionPlugin {
+        info: Plugin {
+            name: SpaceKind::Stored.name(),
+            version: VERSION,
+            summary: "the coefficients of hash-basis, from its weights",
+            paper: "this project",
+            schema: "",
+            capabilities: &[],
+        },
+        motion: stored,
     }
 }
 

@@ -1,23 +1,22 @@
-//! The field `cdf-basis`: offsets = C(f_voxel) φ(t). Its settings and sizes, and its evaluation as a playback layer.
+//! The fields `cdf-basis` and `hash-basis`: offsets = C(f) φ(t), where f are features of space. Their settings and sizes, and their evaluation as a playback layer.
 
 mod functions;
 mod layer;
+mod space;
 
 use crate::heads::{self, Head};
 use crate::networks::ReluShape;
-use crate::settings::{RATE_KEYS, bounded, refuse_unknown, take, within};
+use crate::settings::{RATE_KEYS, bounded, refuse_unknown, within};
 use crate::time::bands_for;
-use crate::voxels::VoxelSettings;
 use cc4dgs_format::{DeformerContext, Error, Result, config};
 pub use functions::TemporalFunctions;
-pub(crate) use layer::motion;
+pub(crate) use layer::{computed, stored};
 use serde::{Deserialize, Serialize};
+pub use space::{Space, SpaceKind};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// The field's name.
-pub const NAME: &str = "cdf-basis";
-/// The version of its stored form.
+/// The version of their stored form.
 pub const VERSION: &str = "2";
 /// Largest number of bands chosen automatically: up to 32 cycles per sequence.
 pub const MOST_BANDS: usize = 6;
@@ -36,10 +35,10 @@ pub enum Rotation {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BasisSettings {
-    /// Width of the coefficient network; that of the capacity where absent.
+    /// Width of the coefficient network; chosen by the features of space where absent.
     pub width: Option<usize>,
-    /// Its hidden layers.
-    pub layers: usize,
+    /// Its hidden layers; as its width.
+    pub layers: Option<usize>,
     /// Fourier bands; 0 chooses by the number of frames.
     pub time_bands: usize,
     /// Cycles of the lowest band.
@@ -66,7 +65,7 @@ impl Default for BasisSettings {
     fn default() -> Self {
         Self {
             width: None,
-            layers: 2,
+            layers: None,
             time_bands: 0,
             cycles: 1.0,
             falloff: 1.0,
@@ -114,8 +113,8 @@ impl BasisSettings {
 pub struct BasisPlan {
     /// Settings of everything after the voxel features.
     pub settings: BasisSettings,
-    /// Settings of the voxel features.
-    pub voxels: VoxelSettings,
+    /// Settings of the features of space.
+    pub space: Space,
     /// The functions of time.
     pub functions: TemporalFunctions,
     /// Function indices by head.
@@ -131,15 +130,15 @@ impl BasisPlan {
     ///
     /// # Errors
     /// [`Error::Parameter`] for unknown keys and values out of range.
-    pub fn new(section: &toml::Table, context: &DeformerContext) -> Result<Self> {
+    pub fn new(kind: SpaceKind, section: &toml::Table, context: &DeformerContext) -> Result<Self> {
         let mut rest = section.clone();
-        refuse_unknown(rest.keys().filter(|key| *key != KEPT), &[&VoxelSettings::KEYS, &BasisSettings::KEYS, &RATE_KEYS])?;
-        let voxels: VoxelSettings = take(&mut rest, &VoxelSettings::KEYS)?;
-        let settings: BasisSettings = config::parse_section("deformer cdf-basis", &rest)?;
+        refuse_unknown(rest.keys().filter(|key| *key != KEPT), &[kind.keys(), &BasisSettings::KEYS, &RATE_KEYS])?;
+        let space = kind.take(&mut rest)?;
+        let settings: BasisSettings = config::parse_section(&format!("deformer {}", kind.name()), &rest)?;
         heads::check(&settings.heads)?;
-        let width = settings.width.unwrap_or(voxels.capacity.width());
+        let (width, layers) = (settings.width.unwrap_or(space.network().0), settings.layers.unwrap_or(space.network().1));
         within("width", width, 1, 4096)?;
-        within("layers", settings.layers, 1, 8)?;
+        within("layers", layers, 1, 8)?;
         within("time_bands", settings.time_bands, 0, 24)?;
         within("learned", settings.learned, 0, 256)?;
         within("splines", settings.splines, 0, 1024)?;
@@ -169,11 +168,10 @@ impl BasisPlan {
         let kept = settings.functions_of_heads(functions.count())?;
         let groups: Vec<(usize, usize)> = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let outputs = groups.iter().map(|(values, own)| vec![width, values * own]).collect();
-        let sizes = voxels.sizes()?;
-        let coefficients = Arc::new(ReluShape { input: sizes.width(), trunk: vec![width; settings.layers], heads: outputs });
+        let coefficients = Arc::new(ReluShape { input: space.width()?, trunk: vec![width; layers], heads: outputs });
         let of_functions = functions.network.as_ref().map_or(0, |n| n.parameter_count());
-        bounded([sizes.parameter_count(), coefficients.parameter_count(), of_functions])?;
-        Ok(Self { settings, voxels, functions, kept, groups, coefficients })
+        bounded([space.parameter_count()?, coefficients.parameter_count(), of_functions])?;
+        Ok(Self { settings, space, functions, kept, groups, coefficients })
     }
     /// Width of the coefficient network.
     pub fn width(&self) -> usize {

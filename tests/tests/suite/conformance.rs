@@ -13,6 +13,7 @@ fn small(name: &str) -> toml::Table {
     let text = match name {
         "cdf" => "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = [20, 12]\nfeatures = 6\nwidth = 16",
         "cdf-basis" => "levels = 3\nresolutions = [3, 8, 40]\nhashes = 24\nhidden = [20, 12]\nfeatures = 6\nwidth = 16\nlearned = 5",
+        "hash-basis" => "levels = 3\nbase = 4\nlog2_rows = 7\nwidth = 16\nlearned = 5",
         "swift4d-hash" => "levels = 3\nlog2_rows = 9\nbase = 4\nwidth = 16",
         "grid4d" => "log2_rows = 9\nspace_levels = 3\nspace_final = 64\ntime_levels = 3\nwidth = 16",
         "hexplane" => "resolution = 6\ntime_resolution = 8\nfeatures = 4\nwidth = 16",

@@ -1,6 +1,7 @@
-//! `cdf` and `cdf-basis`: features of centres without stored tables (CC-4DGS, Section IV-B), and what becomes of them over time.
+//! `cdf` and `cdf-basis`: features of centres without stored tables (CC-4DGS, Section IV-B), and what becomes of them over time. `hash-basis`: the same as
+//! `cdf-basis` with features from a stored hash grid.
 
-use super::grids::{cell, interpolate};
+use super::grids::{HashGrid, cell, interpolate};
 use super::network::{chain, decoder, dot};
 use super::{Formula, Inputs, Rows, Weights, in_box};
 use cc4dgs_core::{DeformerContext, Result, config, toml};
@@ -9,10 +10,14 @@ use cc4dgs_deformers::parts::heads::Head;
 use cc4dgs_deformers::parts::voxels::VoxelSettings;
 use std::f64::consts::TAU;
 
-/// Bands, and hidden layers and width of networks, of `cdf-basis`.
+/// Bands, learned functions and heads of `cdf-basis` and `hash-basis`.
 const MOST_BANDS: usize = 6;
-const BASIS_WIDTH: usize = 128;
 const LEARNED: usize = 16;
+/// Widths of the hidden layers of the coefficient network of each; the last is that of the functions' network, too.
+const CDF_BASIS: &[usize] = &[128, 128];
+const HASH_BASIS: &[usize] = &[64];
+/// Levels, vertices per axis of the first, features per level and most rows of a level of `hash-basis`.
+const GRID: (u32, u32, usize, usize) = (6, 16, 4, 1 << 15);
 const BASIS_HEADS: [(&str, usize); 3] = [("means", 3), ("log_scales", 3), ("quaternions", 4)];
 
 struct Cdf {
@@ -23,10 +28,12 @@ struct Cdf {
     features: Rows,
 }
 
-struct CdfBasis {
+struct Basis {
     bands: usize,
     weights: Weights,
-    /// Voxel features per Gaussian.
+    /// Hidden layers of the coefficient network.
+    hidden: &'static [usize],
+    /// Features of space per Gaussian.
     features: Rows,
 }
 
@@ -42,7 +49,17 @@ pub fn build(inputs: Inputs) -> Result<Box<dyn Formula>> {
 pub fn build_basis(inputs: Inputs) -> Result<Box<dyn Formula>> {
     let Inputs { weights, context, points, .. } = inputs;
     let features = voxels(&VoxelSettings::default(), &context, &points, &weights)?;
-    Ok(Box::new(CdfBasis { bands: bands_for(context.frame_count).min(MOST_BANDS), weights, features }))
+    Ok(Box::new(Basis { bands: bands_for(context.frame_count).min(MOST_BANDS), weights, hidden: CDF_BASIS, features }))
+}
+
+/// `hash-basis`. Points outside the box are moved to its nearest face.
+pub fn build_hash_basis(inputs: Inputs) -> Result<Box<dyn Formula>> {
+    let Inputs { weights, context, points, .. } = inputs;
+    let (levels, base, features, most_rows) = GRID;
+    let grid = HashGrid::<3>::new((0..levels).map(|level| [f64::from((base << level) - 1); 3]), most_rows, features, 0.0, false);
+    let table = weights.of("grid.table")?;
+    let features = points.iter().map(|point| grid.features(table, in_box(point, &context).map(|x| x.clamp(0.0, 1.0)))).collect();
+    Ok(Box::new(Basis { bands: bands_for(context.frame_count).min(MOST_BANDS), weights, hidden: HASH_BASIS, features }))
 }
 
 /// Hash signatures of the eight corners, a decoder per level, trilinear interpolation. Points outside the box are moved to its nearest face.
@@ -91,15 +108,16 @@ impl Formula for Cdf {
     }
 }
 
-impl Formula for CdfBasis {
+impl Formula for Basis {
     /// Coefficients per Gaussian times functions that all share: 1, t, bands, and those of a network.
     fn offsets(&self, t: f64) -> Result<Rows> {
         let encoding = encode(t, self.bands, |band| (-(band as f64)).exp2());
-        let w = BASIS_WIDTH;
+        let w = self.hidden.last().copied().unwrap_or(0);
         let learned = chain(encoding.clone(), self.weights.of("net.functions")?, &[encoding.len(), w, w, LEARNED], false);
         let functions = [vec![1.0], encoding, learned].concat();
         let row = |features: &Vec<f64>| {
-            let hidden = chain(features.clone(), self.weights.of("net.trunk")?, &[features.len(), w, w], true);
+            let trunk: Vec<usize> = std::iter::once(features.len()).chain(self.hidden.iter().copied()).collect();
+            let hidden = chain(features.clone(), self.weights.of("net.trunk")?, &trunk, true);
             let mut out = Vec::new();
             for (name, width) in BASIS_HEADS {
                 let coefficients = chain(hidden.clone(), self.weights.of(&format!("net.head.{name}"))?, &[w, w, width * functions.len()], false);

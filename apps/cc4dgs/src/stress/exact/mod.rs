@@ -44,13 +44,14 @@ pub struct Inputs {
 type Build = fn(Inputs) -> Result<Box<dyn Formula>>;
 
 /// The deformers that have formulas, by name.
-const FORMULAS: [(&str, Build); 9] = [
+const FORMULAS: [(&str, Build); 10] = [
     ("cdf", cdf::build),
     ("cdf-basis", cdf::build_basis),
     ("deform-mlp", deform_mlp::build),
     ("embedding", embedding::build),
     ("free-time", free_time::build),
     ("grid4d", grid4d::build),
+    ("hash-basis", cdf::build_hash_basis),
     ("hexplane", hexplane::build),
     ("native-4d", native4d::build),
     ("swift4d-hash", swift4d::build),
