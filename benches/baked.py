@@ -11,7 +11,7 @@ and of the deformer's weights (fp16), as stored; and the PSNR between images of 
 import argparse, json, pathlib, subprocess, sys, tempfile
 
 LAYER_KEYS = ["moving", "samples", "samples_limited", "segments", "at_samples", "between_samples", "between_p99", "between_over", "between_measured"]
-METHODS = "cdf,cdf-basis,deform-mlp,embedding,free-time,grid4d,hexplane,native-4d,swift4d"
+METHODS = "cdf,cdf-basis,deform-mlp,embedding,free-time,grid4d,hash-basis,hexplane,native-4d,swift4d"
 
 
 def run(*command):

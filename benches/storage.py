@@ -21,7 +21,7 @@ def main():
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for method in ("cdf", "cdf-basis", "swift4d", "grid4d", "hexplane", "deform-mlp"):
+        for method in ("cdf", "cdf-basis", "hash-basis", "swift4d", "grid4d", "hexplane", "deform-mlp"):
             preset = options.family if method == "cdf" else f"{options.family}+{method}"
             run = pathlib.Path(folder) / method
             sets = ["train.iterations=3", "train.checks=false", "train.shares=[1.0,0.0,2.0]", "train.dynamic=all", "scene.width=0"]

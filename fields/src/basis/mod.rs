@@ -1,4 +1,4 @@
-//! The fields `cdf-basis` and `hash-basis`: offsets = C(f) φ(t), where f are features of space. Their settings and sizes, and their evaluation as a playback layer.
+//! The deformers `cdf-basis` and `hash-basis`: offsets = C(f) φ(t), where f are features of space. Their settings and sizes, and their evaluation as a playback layer.
 
 mod functions;
 mod layer;

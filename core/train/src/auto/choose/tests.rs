@@ -60,8 +60,10 @@ fn scenes_get_what_they_need_and_no_more() {
     assert_eq!((value(&odd, "train.dynamic"), value(&odd, "train.recover")), (Some("all".into()), Some(true.into())));
     let growth = |minutes: f64| value(&choose(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, true), "train.image_growth");
     assert_eq!((growth(5.0), growth(30.0)), (Some(0.5.into()), Some(0.0.into())));
-    let sparsity = |minutes: f64| value(&choose(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, true), "deformer.sparsity");
-    assert_eq!((sparsity(5.0), sparsity(90.0)), (Some(0.0.into()), None));
+    let stored = |minutes: f64, key: &str| value(&choose(&facts(Arrangement::OneCameraAnywhere), MACHINE, minutes, true), key);
+    assert_eq!((stored(5.0, "deformer.kind"), stored(5.0, "deformer.log2_rows")), (Some("hash-basis".into()), Some(13.into())));
+    assert_eq!((stored(90.0, "deformer.log2_rows"), stored(90.0, "deformer.cycles")), (Some(15.into()), Some(0.5.into())));
+    assert_eq!(value(&odd, "deformer.kind"), Some("cdf-basis".into()));
     let large = Facts { size: [800, 800], transparent: 0.8, ..facts(Arrangement::OneCameraAnywhere) };
     let rate = |minutes: f64| value(&choose(&large, MACHINE, minutes, true), "train.lr.means").and_then(|v| v.as_float()).unwrap();
     assert_eq!((rate(5.0), slower(60_000.0)), (3.2e-4, 0.5));
