@@ -61,7 +61,7 @@ impl GridShape {
     }
     /// Weights of the table.
     pub fn parameter_count(&self) -> usize {
-        self.rows() * self.features
+        self.rows().saturating_mul(self.features)
     }
     /// Features per point.
     pub fn width(&self) -> usize {

@@ -18,7 +18,7 @@ fn deformers_and_loss_terms_are_compared_with_float64() {
     let of = |part: &str| cases.iter().filter(|case| case["part"] == part && case["oracle"].is_string()).collect::<Vec<_>>();
     // All deformers but the one that moves nothing.
     let deformers: BTreeSet<&str> = parts(&|_| true).into_iter().filter(|part| part.starts_with("deformer ") && *part != "deformer none").collect();
-    assert_eq!(deformers.len(), 9, "{deformers:?}");
+    assert_eq!(deformers.len(), 10, "{deformers:?}");
     for part in deformers {
         let compared = of(part);
         assert!(compared.len() >= 30 && compared.iter().all(|case| case["oracle"] == "float64"), "{part}: {compared:?}");

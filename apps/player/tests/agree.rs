@@ -102,6 +102,7 @@ fn images_of_a_field_that_is_linear_in_its_functions_agree() {
 fn images_of_motion_that_is_computed_from_weights_agree() {
     // The images compared are larger than this focal length, and blur more.
     agrees(&["deformer.kind=cdf-basis", "render.focal=100.0"], false);
+    agrees(&["deformer.kind=hash-basis"], false);
 }
 
 #[test]

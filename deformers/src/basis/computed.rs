@@ -14,6 +14,7 @@ modulus = 1000000        # m of the hash functions
 vertex_reuse = true      # decode a vertex once, however many Gaussians share it
 # width = 128            # width of the coefficient network (small: 64; mid: 96)
 layers = 2               # hidden layers of the coefficient network
+clip_norm = 1.0          # gradient-norm clip per group; 0 is off
 "#,
     shared_schema!()
 );

@@ -27,7 +27,6 @@ unused = 0.01            # after training, functions that together make less tha
 lr_start = 1e-3          # Adam, log-linear to lr_end over the main stage
 lr_end = 1e-5
 warmup = 0.025           # linear warm-up, as a share of the stage
-clip_norm = 1.0          # gradient-norm clip per group; 0 is off
 # [deformer.kept]        # function indices per head; written by training
 # means = [0, 1, 2]
 "#

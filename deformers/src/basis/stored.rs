@@ -11,9 +11,10 @@ const SCHEMA: &str = concat!(
 base = 16                # vertices per axis of the first level; each level doubles them
 features = 4             # features per level
 log2_rows = 15           # rows of a level's table at most, as a binary logarithm; where a level has more vertices, they share rows by a hash
-grid_rate = 10.0         # factor on the learning rates of the tables
+grid_rate = 10.0         # learning rates of the tables, in multiples of lr_start and lr_end
 width = 64               # width of the coefficient network
 layers = 1               # hidden layers of the coefficient network
+clip_norm = 1.0          # gradient-norm clip of the networks; 0 is off; tables have none
 "#,
     shared_schema!()
 );

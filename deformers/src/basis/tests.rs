@@ -99,6 +99,7 @@ fn players_compute_what_the_deformer_computes() {
     for (kind, section, sh_degree, heads) in [
         (SpaceKind::Stored, tables.to_string(), 1, 3),
         (SpaceKind::Stored, format!("{tables}layers = 2\nlearned = 4\nheads = ['means', 'quaternions']\ngrid_rate = 3.0"), 0, 2),
+        (SpaceKind::Stored, format!("{tables}heads = ['quaternions', 'means']\n[kept]\nmeans = [0, 4]"), 0, 2),
         (SpaceKind::Computed, small.to_string(), 1, 3),
         (
             SpaceKind::Computed,
@@ -118,14 +119,21 @@ fn players_compute_what_the_deformer_computes() {
 fn what_is_not_linear_is_left_to_baking() {
     let context = DeformerContext { box_min: [0.0; 3], box_max: [1.0; 3], frame_count: 3, sh_degree: 0, seed: Seed::root(1) };
     let gaussians = HostGaussians::default();
-    let of = |section: &str| {
+    let by = |kind: SpaceKind, section: &str, weights: &[WeightArray]| {
         let settings: toml::Table = section.parse().unwrap();
         let (object, settings, context) = ("the model", &settings, &context);
-        let source = MotionSource { object, settings, context, weights: &[], gaussians: &gaussians, least_samples: 2, most_coefficients: 1 << 20 };
-        (plugin(SpaceKind::Computed).motion)(&source)
+        let source = MotionSource { object, settings, context, weights, gaussians: &gaussians, least_samples: 2, most_coefficients: 1 << 20 };
+        (plugin(kind).motion)(&source)
     };
+    let of = |section: &str| by(SpaceKind::Computed, section, &[]);
     assert!(of("rotation = 'exponential'").unwrap().is_none() && of("heads = ['opacity']").unwrap().is_none());
     assert!(of("life = true").unwrap().is_none() && of("life = { gate = 0.5 }").unwrap().is_none(), "lives change the motion");
     assert!(of("time_bands = 20").unwrap().is_none(), "too fast for samples");
     assert!(of("heads = ['means']").unwrap_err().to_string().contains("of the model"), "weights are missing");
+    assert!(by(SpaceKind::Stored, "learned = 0", &[]).unwrap_err().to_string().contains("grid.table"), "weights are missing");
+    let short = WeightArray { name: "grid.table".into(), shape: vec![8], values: vec![0.0; 8] };
+    assert!(by(SpaceKind::Stored, "learned = 0", &[short]).is_err(), "it has too few weights");
+    // The number of weights does not fit 32 bits.
+    let large = "learned = 0\nlevels = 4\nbase = 256\nlog2_rows = 24\nfeatures = 64";
+    assert!(by(SpaceKind::Stored, large, &[]).unwrap().is_none(), "baking says what is wrong");
 }

@@ -35,3 +35,14 @@ pub fn check_time(time_norm: f32) -> Result<()> {
     }
     Err(Error::parameter("deformer time", format!("{time_norm} is not a number"), "Use a time in 0..1"))
 }
+
+/// Refuses a box that is not finite.
+///
+/// # Errors
+/// [`Error::Parameter`].
+pub fn check_box(context: &DeformerContext) -> Result<()> {
+    if context.box_min.iter().chain(&context.box_max).all(|v| v.is_finite()) {
+        return Ok(());
+    }
+    Err(Error::parameter("deformer box", format!("{:?} to {:?}", context.box_min, context.box_max), "Give finite corners"))
+}

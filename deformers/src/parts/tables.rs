@@ -1,6 +1,6 @@
 //! Features of canonical centres from stored tables (Müller et al. 2022).
 
-use super::centres::in_box;
+use super::centres::{check_box, in_box};
 use super::voxels::parameter;
 use super::weights;
 use burn::tensor::{Device, Tensor};
@@ -23,8 +23,9 @@ impl Tables {
     /// A grid for the scene of `context` and its initial table, in optimizer group `group`.
     ///
     /// # Errors
-    /// As [`TableSettings::shape`].
+    /// [`cc4dgs_core::Error::Parameter`] for sizes out of range and a box that is not finite.
     pub fn new(settings: &TableSettings, context: &DeformerContext, group: usize, device: &Device) -> Result<(Self, Parameter)> {
+        check_box(context)?;
         let grid = settings.shape()?;
         let table = weights::uniform(context.seed.child("table"), grid.parameter_count(), TABLE);
         let table = parameter("grid.table".into(), Part::Grid, group, table, device);

@@ -3,10 +3,11 @@
 
 pub use cc4dgs_fields::voxels::{VoxelSettings, VoxelSizes};
 
+use super::centres::check_box;
 use super::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::field::{Decoder, GridBox, VoxelCorners};
-use cc4dgs_core::{DeformerContext, DeformerWork, Error, Parameter, Part, Result};
+use cc4dgs_core::{DeformerContext, DeformerWork, Parameter, Part, Result};
 use std::sync::Arc;
 
 /// The grid over a scene's box with the hash functions and layer shapes of its decoders. The weights are [`Parameter`]s of the deformer that owns the grid.
@@ -23,9 +24,7 @@ pub struct Voxels {
 impl Voxels {
     /// A grid for the scene of `context` and the initial weights of its decoders, one parameter per level in optimizer group `group`.
     pub fn new(settings: &VoxelSettings, context: &DeformerContext, group: usize, device: &Device) -> Result<(Self, Vec<Parameter>)> {
-        if context.box_min.iter().chain(&context.box_max).any(|v| !v.is_finite()) {
-            return Err(Error::parameter("deformer box", format!("{:?} to {:?}", context.box_min, context.box_max), "Give finite corners"));
-        }
+        check_box(context)?;
         let sizes = settings.sizes()?;
         let (mut decoders, mut parameters) = (Vec::new(), Vec::new());
         for level in 0..sizes.resolutions.len() {

@@ -15,7 +15,7 @@ use std::path::Path;
 
 const SCHEMA: &str = "\
 max_error = \"0.1px\"      # how far a point may be off where motion has to be baked; as for `cc4dgs bake`
-baked = false            # bake motion even where the page can compute it from the deformer's weights: a larger file that opens sooner
+baked = false            # bake motion even where the page can compute it from the deformer's weights: mostly a larger file, which opens sooner
 autoplay = true          # play as soon as the model is there
 page = \"\"                # folder of the page that apps/player/build-web made; by default the one that `cc4dgs doctor` names
 ";

@@ -11,7 +11,8 @@ use rayon::prelude::*;
 
 /// Memory at most, in floats: 256 MB.
 const MOST_FLOATS: u64 = 64 << 20;
-/// What a vertex takes beside its features, in floats: its position in the list and in the ordered map of vertices. And a Gaussian, for the corners of its cell.
+/// What a vertex takes beside its features, in floats: its position in the list and in the ordered map of vertices. And a Gaussian, for its centre in the box
+/// and the corners of its cell.
 pub(super) const FLOATS_OF_VERTEX: u64 = 12;
 pub(super) const FLOATS_OF_GAUSSIAN: u64 = 16;
 /// Multiplications at most: some ten seconds in a browser, and a second or two on a desktop.

@@ -1,4 +1,5 @@
-//! The deformers `cdf-basis` and `hash-basis`: offsets = C(f) φ(t), where f are features of space. Their settings and sizes, and their evaluation as a playback layer.
+//! The deformers `cdf-basis` and `hash-basis`: offsets = C(f) φ(t), where f are features of space. Their settings and sizes, and their evaluation as a
+//! playback layer.
 
 mod functions;
 mod layer;
@@ -31,7 +32,7 @@ pub enum Rotation {
     Exponential,
 }
 
-/// Settings of everything after the voxel features.
+/// Settings of everything after the features of space.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BasisSettings {
@@ -111,7 +112,7 @@ impl BasisSettings {
 /// Everything about the field that follows from settings and scene.
 #[derive(Clone, Debug)]
 pub struct BasisPlan {
-    /// Settings of everything after the voxel features.
+    /// Settings of everything after the features of space.
     pub settings: BasisSettings,
     /// Settings of the features of space.
     pub space: Space,
@@ -121,7 +122,7 @@ pub struct BasisPlan {
     pub kept: Vec<Vec<usize>>,
     /// By head, the values per Gaussian and its number of functions.
     pub groups: Vec<(usize, usize)>,
-    /// The network from voxel features to coefficients: an output per head, [values, functions].
+    /// The network from features of space to coefficients: an output per head, [values, functions].
     pub coefficients: Arc<ReluShape>,
 }
 

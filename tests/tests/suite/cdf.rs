@@ -267,11 +267,15 @@ fn completed_sections_state_every_default() {
     let registry = Registry::collect().unwrap();
     let section = |text: &str| cc4dgs_core::config::parse_table("test", text).unwrap();
     let device = cc4dgs_core::parse_device("flex").unwrap();
-    for kind in ["cdf", "cdf-basis"] {
-        let given = section(&format!("kind = '{kind}'\ncapacity = 'small'\nlife = true"));
+    let decoded = ["capacity", "hashes", "modulus", "vertex_reuse"];
+    let stored = ["levels", "base", "features", "log2_rows", "grid_rate", "width", "layers"];
+    for (kind, setting, keys) in
+        [("cdf", "capacity = 'small'", &decoded[..]), ("cdf-basis", "capacity = 'small'", &decoded[..]), ("hash-basis", "width = 32", &stored[..])]
+    {
+        let given = section(&format!("kind = '{kind}'\n{setting}\nlife = true"));
         let full = registry.complete_deformer(&given).unwrap();
-        for key in ["capacity", "hashes", "modulus", "vertex_reuse", "time_bands", "heads", "lr_start"] {
-            assert!(full.contains_key(key), "{kind}: no {key} in {full}");
+        for key in keys.iter().chain(&["time_bands", "heads", "lr_start"]) {
+            assert!(full.contains_key(*key), "{kind}: no {key} in {full}");
         }
         assert!(full["life"].as_table().unwrap().len() >= 10, "{full}");
         assert_eq!(registry.complete_deformer(&full).unwrap(), full);

@@ -26,6 +26,15 @@ fn planes() -> GridShape {
     shape
 }
 
+/// A hash grid of vertices that lie on the faces of the box, where points outside have what the nearest face has, as `hash-basis` has it.
+fn box_grid() -> GridShape {
+    let mut shape = GridShape { dims: 3, features: 4, levels: Vec::new(), stagger: 0.0, smooth: false, clamps: true, outside: Outside::Clamp };
+    for size in [5, 10, 20] {
+        shape.push(&[size; 3], &[size as f32 - 1.0; 3], 256);
+    }
+    shape
+}
+
 /// The same lookup in float64, for one point and one level at a time.
 fn oracle(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f64> {
     let mut out = Vec::new();
@@ -64,7 +73,7 @@ fn oracle(shape: &GridShape, table: &[f32], points: &[f32]) -> Vec<f64> {
 fn features_and_gradients_are_those_of_the_formulas() {
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(6);
     let smooth = GridShape { stagger: 0.0, smooth: true, ..hash_grid(3, 4, 128) };
-    for shape in [hash_grid(4, 3, 512), hash_grid(3, 2, 100_000), smooth, planes()] {
+    for shape in [hash_grid(4, 3, 512), hash_grid(3, 2, 100_000), smooth, planes(), box_grid()] {
         let m = 300;
         let mut points: Vec<f32> = (0..m * shape.dims).map(|_| random.random_range(-0.05..1.05)).collect();
         points[..shape.dims].fill(1.0);
@@ -110,7 +119,7 @@ fn features_and_gradients_are_those_of_the_formulas() {
 #[test]
 fn what_is_no_number_gets_a_defined_answer() {
     for (name, device) in devices() {
-        for shape in [hash_grid(4, 2, 512), planes()] {
+        for shape in [hash_grid(4, 2, 512), planes(), box_grid()] {
             let dims = shape.dims;
             let table = Tensor::<1>::ones([shape.parameter_count()], &device);
             let odd = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30].repeat(dims);

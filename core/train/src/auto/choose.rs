@@ -29,8 +29,12 @@ const PER_THREAD_MINUTE: f64 = 6500.0;
 /// The same where all of them move; and how many more there are per pixel with detail, where there is time for them: 0.7 dB on mutant at equal time.
 const ALL_MOVE_PER_THREAD_MINUTE: f64 = 1200.0;
 const ALL_MOVE_DETAIL: f64 = 2.0;
-/// Minutes of one thread below which the finest voxels are left out, whose vertices are most of a step, the coefficient network is half as wide, and images
-/// are small at first.
+/// Deformers that plans know.
+const FREE_TIME: &str = "free-time";
+const CDF_BASIS: &str = "cdf-basis";
+const HASH_BASIS: &str = "hash-basis";
+/// Minutes of one thread below which `cdf-basis` has no finest voxels, whose vertices are most of a step, and half the width, `hash-basis` has smaller tables,
+/// and images are small at first.
 const SHORT: f64 = 16.0;
 /// |ln| of the brightness ratio of neighbouring cameras from which exposures are taken to differ.
 const EXPOSURE: f32 = 0.09;
@@ -133,10 +137,11 @@ pub(super) fn image_size(native: [u32; 2], options: &SceneOptions, machine: Mach
     Some(choice([("scene.width", integer(width))], reason))
 }
 
-/// Every other setting but the number of iterations. `free` says whether Gaussians may have lives: not where another deformer is stated.
-pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, free: bool) -> Vec<Choice> {
+/// Every other setting but the number of iterations. `stated` is the deformer that the configuration states, if any.
+pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, stated: Option<&str>) -> Vec<Choice> {
+    let free = stated.is_none_or(|kind| kind == FREE_TIME);
     let every = free.then(|| key_frames(facts, machine, minutes)).flatten();
-    let mut choices = vec![field(facts, machine, minutes, every), stages(facts, machine, minutes, every), counts(facts, machine, minutes)];
+    let mut choices = vec![field(facts, machine, minutes, stated, every), stages(facts, machine, minutes, every), counts(facts, machine, minutes)];
     choices.extend(background(facts));
     choices.extend(near(facts));
     choices.push(blur());
@@ -172,39 +177,45 @@ fn key_frames(facts: &Facts, machine: Machine, minutes: f64) -> Option<usize> {
     (every <= MOST_KEY_INTERVAL && facts.frames >= 2 * every).then_some(every)
 }
 
-fn field(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize>) -> Choice {
+fn field(facts: &Facts, machine: Machine, minutes: f64, stated: Option<&str>, key_frames: Option<usize>) -> Choice {
     if stands_still(facts) {
         return choice([("deformer.kind", "none".into()), ("train.dynamic", "none".into())], "nothing moves");
     }
     if let Some(every) = key_frames {
         let reason = format!("{} cameras see each frame: what moves starts with points of key frames, each with a velocity and a life", facts.cameras);
-        return choice([("deformer.kind", "free-time".into()), ("train.key_frames", integer(every as f64))], reason);
+        return choice([("deformer.kind", FREE_TIME.into()), ("train.key_frames", integer(every as f64))], reason);
     }
+    // Where poses have nothing to do with each other, stored features are 1.4 dB better than decoded ones on mutant; where one camera moves through time they
+    // are 0.1 to 0.2 dB worse.
+    let stored = match stated {
+        Some(kind) => kind == HASH_BASIS,
+        None => facts.arrangement == Arrangement::OneCameraAnywhere,
+    };
+    // Higher bands would learn every training time of unrelated poses by itself and the times between not at all. Half a cycle lets the last frame differ from
+    // the first: 0.2 dB on mutant, 0.9 on its first frame, with the same highest frequency.
+    let (bands, cycles) = match facts.arrangement {
+        Arrangement::OneCameraAnywhere => (5, 0.5),
+        _ if facts.frames > 100 => (6, 1.0),
+        _ => (4, 1.0),
+    };
     let short = is_short(machine, minutes);
-    let reason = format!("{} frames; the most accurate deformer for its time", facts.frames);
-    if facts.arrangement == Arrangement::OneCameraAnywhere {
-        // On mutant, stored features have 1.4 dB more than decoded ones after as many iterations, in half of the time; on `turntable` and `handheld` nothing.
-        // Higher bands would learn every training time by itself and the times between not at all. Half a cycle lets the last frame differ from the first: 0.2 dB
-        // on mutant, 0.9 on its first frame, with the same highest frequency.
-        let rows = if short { 13 } else { 15 };
-        let settings = [
-            ("deformer.kind", "hash-basis".into()),
-            ("deformer.time_bands", Value::Integer(5)),
-            ("deformer.cycles", Value::Float(0.5)),
-            ("deformer.log2_rows", Value::Integer(rows)),
-        ];
-        return choice(settings, reason);
+    let kind = if stored { HASH_BASIS } else { CDF_BASIS };
+    let mut settings = vec![("deformer.kind", kind.into()), ("deformer.time_bands", Value::Integer(bands)), ("deformer.cycles", Value::Float(cycles))];
+    if stored {
+        settings.push(("deformer.log2_rows", Value::Integer(if short { 13 } else { 15 })));
+    } else if short && facts.arrangement == Arrangement::OneCameraAnywhere {
+        // The penalty that takes unneeded functions out also makes needed ones smaller. Short runs of mutant have 0.3 dB more without it, 1.1 and 4.1 on the
+        // first frame; longer ones nothing, and one of 90 minutes had 1.8 dB less, because rounds of density control cost more than was won back between them.
+        settings.push(("deformer.sparsity", Value::Float(0.0)));
     }
-    let bands = if facts.frames > 100 { 6 } else { 4 };
-    let mut settings = vec![("deformer.kind", "cdf-basis".into()), ("deformer.time_bands", Value::Integer(bands))];
-    if !machine.graphics || minutes < FULL_SIZE_MINUTES {
+    if !stored && (!machine.graphics || minutes < FULL_SIZE_MINUTES) {
         settings.push(("deformer.capacity", "small".into()));
         let resolutions: &[i64] = if short { &[8, 16, 32] } else { &[8, 16, 32, 64] };
         settings.push(("deformer.resolutions", Value::Array(resolutions.iter().map(|&r| Value::Integer(r)).collect())));
         settings.push(("deformer.hashes", Value::Integer(if short { 32 } else { 64 })));
         settings.push(("deformer.width", Value::Integer(if short { 64 } else { 128 })));
     }
-    choice(settings, reason)
+    choice(settings, format!("{} frames; the most accurate deformer for its time", facts.frames))
 }
 
 /// Whether there is little time for a machine without a graphics card.

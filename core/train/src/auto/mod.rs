@@ -153,8 +153,8 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
     let full_size = if graphics { Some(layers.at_full_size(registry, choose::dataset_like(&facts))?) } else { None };
     let layers = full_size.as_ref().unwrap_or(layers);
     let kind = asked.deformer.get("kind").and_then(|k| k.as_str());
-    let free = !layers.state("deformer.kind") || kind == Some("free-time");
-    for choice in choose::choose(&facts, machine, minutes, free) {
+    let stated = kind.filter(|_| layers.state("deformer.kind"));
+    for choice in choose::choose(&facts, machine, minutes, stated) {
         plan.add(for_density_of(layers, &asked, choice, registry)?)?;
     }
     let mut ends = None;

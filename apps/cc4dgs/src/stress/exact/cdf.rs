@@ -13,7 +13,7 @@ use std::f64::consts::TAU;
 /// Bands, learned functions and heads of `cdf-basis` and `hash-basis`.
 const MOST_BANDS: usize = 6;
 const LEARNED: usize = 16;
-/// Widths of the hidden layers of the coefficient network of each; the last is that of the functions' network, too.
+/// Widths of the hidden layers of the coefficient network of each. The functions' network has two layers of the last width.
 const CDF_BASIS: &[usize] = &[128, 128];
 const HASH_BASIS: &[usize] = &[64];
 /// Levels, vertices per axis of the first, features per level and most rows of a level of `hash-basis`.
