@@ -75,7 +75,7 @@ impl Default for BasisSettings {
             learned: 16,
             heads: vec![Head::Means, Head::LogScales, Head::Quaternions],
             rotation: Rotation::Additive,
-            unused: 0.01,
+            unused: 0.001,
             kept: BTreeMap::new(),
         }
     }
