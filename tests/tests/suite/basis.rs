@@ -180,7 +180,9 @@ fn what_a_scene_does_not_use_is_left_out() {
 /// What is dropped from a deformer with these coefficients, head after head, row by row, per output those of the functions 1, t, and two bands of two.
 fn dropped(heads: &str, rows: usize, coefficients: Vec<f32>, times: &[f32]) -> String {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
-    let text = format!("levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 0\ntime_bands = 2\nheads = {heads}");
+    let text = format!(
+        "levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 0\ntime_bands = 2\nunused = 0.01\nheads = {heads}"
+    );
     let plugin = Registry::collect().unwrap().deformer("cdf-basis").unwrap();
     let field = (plugin.build)(&config::parse_table("test", &text).unwrap(), &context, &Device::flex()).unwrap();
     let columns = coefficients.len() / rows;
