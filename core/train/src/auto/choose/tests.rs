@@ -73,7 +73,7 @@ fn scenes_get_what_they_need_and_no_more() {
     assert!(value(&other, "train.key_frames").is_none());
     let large = Facts { size: [800, 800], transparent: 0.8, ..facts(Arrangement::OneCameraAnywhere) };
     let rate = |minutes: f64| value(&choose(&large, MACHINE, minutes, None), "train.lr.means").and_then(|v| v.as_float()).unwrap();
-    assert_eq!((rate(5.0), slower(60_000.0)), (3.2e-4, 0.5));
+    assert_eq!((rate(3.0), slower(60_000.0)), (3.2e-4, 0.5));
     assert!(rate(90.0) < 1e-4);
     assert_eq!(super::rate(1.6e-5 * 0.4), Value::Float(6.4e-6));
     assert_eq!(value(&choose(&facts(Arrangement::OneMovingCamera), MACHINE, 5.0, None), "train.dynamic"), Some("score".into()));
