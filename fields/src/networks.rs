@@ -35,6 +35,12 @@ pub struct Layer {
     pub slot: Option<usize>,
 }
 
+/// The number of weights of layers of these `widths`, one after another, whose input has `input` values.
+pub fn weights_of_chain(mut input: usize, widths: &[usize]) -> usize {
+    let layer = |&output: &usize| (std::mem::replace(&mut input, output) + 1) * output;
+    widths.iter().map(layer).sum()
+}
+
 impl ReluShape {
     /// A chain of Linear + ReLU layers ending in a Linear layer, if `widths` is input, hidden…, output.
     pub fn chain(widths: &[usize]) -> Self {

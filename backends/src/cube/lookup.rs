@@ -1,7 +1,7 @@
 //! Interpolated lookups in grids of stored features; the arithmetic of `cpu::lookup`.
 
 use super::sort::sort_pairs;
-use super::tensor::{THREADS, constant, empty, floats, workgroups_for};
+use super::tensor::{THREADS, constant, empty, floats, spread, workgroups_for};
 use crate::ops::lookup::{GridShape, LookupBackward, LookupOps, MAX_DIMS, Outside, PRIMES};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
@@ -129,7 +129,12 @@ fn rows_of_slots(points: &[f32], levels: &[u32], rows: &mut [u32], slots: &mut [
     }
 }
 
-/// Gradient of the table: each row finds its slots among the sorted ones and visits them in order.
+/// Slices of the slots of a row: rows of coarse levels have thousands.
+const SLICES: usize = 16;
+/// Numbers of the table that a workgroup computes.
+const NUMBERS: usize = THREADS as usize / SLICES;
+
+/// Gradient of the table: each row finds its slots among the sorted ones and visits them in order, in slices that are added up in order.
 #[cube(launch)]
 fn gather(
     sorted: &[u32],
@@ -142,9 +147,13 @@ fn gather(
     level_count: u32,
     #[comptime] rules: Rules,
 ) {
-    if ABSOLUTE_POS < out.len() {
+    let mut sums = Shared::<[f32]>::new_slice(THREADS as usize);
+    let thread = UNIT_POS as usize;
+    let (slice, item) = (thread / NUMBERS, CUBE_POS * NUMBERS + thread % NUMBERS);
+    let mut sum = 0.0f32;
+    if item < out.len() {
         let (f, count) = (features as usize, level_count as usize);
-        let (row, feature) = ((ABSOLUTE_POS / f) as u32, ABSOLUTE_POS % f);
+        let (row, feature) = ((item / f) as u32, item % f);
         let mut low = 0usize.runtime();
         let mut high = sorted.len();
         while low < high {
@@ -156,7 +165,7 @@ fn gather(
             }
         }
         let corners = comptime!(1usize << rules.dims);
-        let mut sum = 0.0f32;
+        low += slice;
         let mut more = low < sorted.len();
         while more {
             if sorted[low] == row {
@@ -164,13 +173,22 @@ fn gather(
                 let cell = slot / corners;
                 let (_, weight) = corner(points, levels, cell / count, cell % count, (slot % corners) as u32, rules);
                 sum += weight * grad[cell * f + feature];
-                low += 1;
+                low += SLICES;
                 more = low < sorted.len();
             } else {
                 more = false;
             }
         }
-        out[ABSOLUTE_POS] = sum;
+    }
+    sums[thread] = sum;
+    sync_cube();
+    if slice == 0 && item < out.len() {
+        let mut total = 0.0f32;
+        #[unroll]
+        for k in 0..SLICES {
+            total += sums[k * NUMBERS + thread];
+        }
+        out[item] = total;
     }
 }
 
@@ -220,7 +238,7 @@ impl LookupBackward for CubeBackend {
         let out = floats(&grad, [shape.parameter_count()]);
         gather::launch(
             &client,
-            workgroups_for(shape.parameter_count()),
+            spread(shape.parameter_count().div_ceil(NUMBERS)),
             dim,
             sorted.into_buffer_arg(),
             slots.into_buffer_arg(),

@@ -15,7 +15,8 @@
 /// The part of the schema that the plug-ins share.
 macro_rules! shared_schema {
     () => {
-        r#"time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
+        r#"head_layers = 1          # hidden layers of each head behind them
+time_bands = 0           # Fourier bands; 0 chooses by the number of frames, at most 6
 cycles = 1.0             # cycles of the lowest band over the sequence; with whole cycles, what the bands move ends where it began
 falloff = 1.0            # amplitude of a band over the next lower one is 2^-falloff: fast motion is learned later; 0 treats all alike
 sparsity = 1e-4          # weight of a group lasso on every function of every head (Fourier bands: times their frequency); 0 is off
@@ -98,7 +99,7 @@ impl Basis {
         let chain: Vec<usize> = std::iter::once(coefficients.input).chain(coefficients.trunk.iter().copied()).collect();
         add("net.trunk".into(), weights::chain(seed.child("trunk"), &chain));
         for (head, &(values, own)) in settings.heads.iter().zip(&shape.groups) {
-            add(format!("net.head.{}", head.name()), weights::head(seed.child(head.name()), width, values * own));
+            add(format!("net.head.{}", head.name()), weights::head(seed.child(head.name()), width, settings.head_layers, values * own));
         }
         let (section, context) = (section.clone(), context.clone());
         Ok(Self { kind, section, context, rates, grid_rate, space, functions, kept, shape, coefficients, parameters, settings })

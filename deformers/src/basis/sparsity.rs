@@ -18,13 +18,14 @@ const LEAST_SCALE: f32 = 1e-6;
 pub(super) fn group_lasso(field: &Basis, weight: f32) -> Option<Tensor<1>> {
     let prices = field.functions.prices();
     let width = field.coefficients.trunk.last().copied()?;
+    let hidden = width * (width + 1) * field.settings.head_layers;
     let first = field.parameters.len() - field.settings.heads.len();
     let mut total: Option<Tensor<1>> = None;
     let heads = field.settings.heads.iter().zip(&field.shape.groups).zip(&field.kept);
     for (parameter, ((&head, &(outputs, own)), kept)) in field.parameters[first..].iter().zip(heads) {
         // The lower bound keeps the penalty finite for a box without extent.
         let weight = weight / (field.scale_of(head) as f32).max(LEAST_SCALE);
-        let last = parameter.value.clone().narrow(0, width * (width + 1), (width + 1) * outputs * own).reshape([(width + 1) * outputs, own]);
+        let last = parameter.value.clone().narrow(0, hidden, (width + 1) * outputs * own).reshape([(width + 1) * outputs, own]);
         let norms = (last.clone() * last).sum_dim(0).add_scalar(LEAST_SQUARED_NORM).sqrt().flatten(0, 1);
         let price: Vec<f32> = kept.iter().map(|&f| weight * prices[f]).collect();
         let term = (norms * Tensor::<1>::from_data(TensorData::new(price, [own]), &parameter.value.device())).sum();

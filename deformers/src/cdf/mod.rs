@@ -61,7 +61,7 @@ impl Cdf {
         let trunk: Vec<usize> = std::iter::once(width).chain(sizes.network.trunk.iter().copied()).collect();
         add("net.trunk".into(), weights::chain(seed.child("trunk"), &trunk));
         for head in &config.network.heads {
-            let values = weights::head(seed.child(head.name()), width, head.width(context.sh_degree));
+            let values = weights::head(seed.child(head.name()), width, 1, head.width(context.sh_degree));
             add(format!("net.head.{}", head.name()), values);
         }
         Ok(Self {

@@ -67,9 +67,10 @@ pub fn zeros(input: usize, output: usize) -> Vec<f32> {
     vec![0.0; (input + 1) * output]
 }
 
-/// A head: its last layer is zero, so that nothing moves at first. Features are of order 1, so random heads would displace everything.
-pub fn head(seed: Seed, width: usize, output: usize) -> Vec<f32> {
-    let mut out = rectified(seed, width, width);
+/// A head with some hidden layers: its last layer is zero, so that nothing moves at first. Features are of order 1, so random heads would displace everything.
+pub fn head(seed: Seed, width: usize, hidden: usize, output: usize) -> Vec<f32> {
+    let seed_of = |layer: usize| if layer == 0 { seed } else { seed.index(layer as u64) };
+    let mut out: Vec<f32> = (0..hidden).flat_map(|layer| rectified(seed_of(layer), width, width)).collect();
     out.extend(zeros(width, output));
     out
 }

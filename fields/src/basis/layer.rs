@@ -3,6 +3,7 @@
 use super::{BasisPlan, Rotation, SpaceKind, TemporalFunctions, VERSION};
 use crate::forward::network;
 use crate::heads::Head;
+use crate::networks::weights_of_chain;
 use crate::settings::RATE_KEYS;
 use cc4dgs_format::playback::Head as LayerHead;
 use cc4dgs_format::playback::{ComputedMotion, MAX_FUNCTIONS, MAX_SAMPLES, MotionPlugin, MotionSource, Track, frame_time};
@@ -104,12 +105,10 @@ fn too_much(plan: &BasisPlan, m: usize, samples: usize) -> Result<bool> {
 
 /// The weights of trunk and heads, one after the other.
 fn coefficient_weights(plan: &BasisPlan, source: &MotionSource) -> Result<Vec<f32>> {
-    let (shape, width) = (&plan.coefficients, plan.width());
-    let inputs = std::iter::once(shape.input).chain(shape.trunk.iter().copied());
-    let trunk: usize = inputs.zip(&shape.trunk).map(|(input, output)| (input + 1) * output).sum();
-    let mut weights = source.weights("net.trunk", trunk)?.to_vec();
-    for (head, (values, own)) in plan.settings.heads.iter().zip(&plan.groups) {
-        weights.extend(source.weights(&format!("net.head.{}", head.name()), (width + 1) * (width + values * own))?);
+    let shape = &plan.coefficients;
+    let mut weights = source.weights("net.trunk", weights_of_chain(shape.input, &shape.trunk))?.to_vec();
+    for (head, layers) in plan.settings.heads.iter().zip(&shape.heads) {
+        weights.extend(source.weights(&format!("net.head.{}", head.name()), weights_of_chain(plan.width(), layers))?);
     }
     Ok(weights)
 }

@@ -40,6 +40,8 @@ pub struct BasisSettings {
     pub width: Option<usize>,
     /// Its hidden layers; as its width.
     pub layers: Option<usize>,
+    /// Hidden layers of each head behind them.
+    pub head_layers: usize,
     /// Fourier bands; 0 chooses by the number of frames.
     pub time_bands: usize,
     /// Cycles of the lowest band.
@@ -67,6 +69,7 @@ impl Default for BasisSettings {
         Self {
             width: None,
             layers: None,
+            head_layers: 1,
             time_bands: 0,
             cycles: 1.0,
             falloff: 1.0,
@@ -86,8 +89,8 @@ const KEPT: &str = "kept";
 
 impl BasisSettings {
     /// The keys of these settings in a `[deformer]` section, but for the one that training writes.
-    pub const KEYS: [&'static str; 11] =
-        ["width", "layers", "time_bands", "cycles", "falloff", "sparsity", "splines", "learned", "heads", "rotation", "unused"];
+    pub const KEYS: [&'static str; 12] =
+        ["width", "layers", "head_layers", "time_bands", "cycles", "falloff", "sparsity", "splines", "learned", "heads", "rotation", "unused"];
     /// Values per Gaussian of a head.
     pub fn width_of(&self, head: Head, sh_degree: usize) -> usize {
         if head == Head::Quaternions && self.rotation == Rotation::Exponential { 3 } else { head.width(sh_degree) }
@@ -140,6 +143,7 @@ impl BasisPlan {
         let (width, layers) = (settings.width.unwrap_or(space.network().0), settings.layers.unwrap_or(space.network().1));
         within("width", width, 1, 4096)?;
         within("layers", layers, 1, 8)?;
+        within("head_layers", settings.head_layers, 0, 8)?;
         within("time_bands", settings.time_bands, 0, 24)?;
         within("learned", settings.learned, 0, 256)?;
         within("splines", settings.splines, 0, 1024)?;
@@ -168,7 +172,7 @@ impl BasisPlan {
         let functions = TemporalFunctions { bands, cycles: settings.cycles, falloff: settings.falloff, splines: settings.splines, network };
         let kept = settings.functions_of_heads(functions.count())?;
         let groups: Vec<(usize, usize)> = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
-        let outputs = groups.iter().map(|(values, own)| vec![width, values * own]).collect();
+        let outputs = groups.iter().map(|(values, own)| [vec![width; settings.head_layers], vec![values * own]].concat()).collect();
         let coefficients = Arc::new(ReluShape { input: space.width()?, trunk: vec![width; layers], heads: outputs });
         let of_functions = functions.network.as_ref().map_or(0, |n| n.parameter_count());
         bounded([space.parameter_count()?, coefficients.parameter_count(), of_functions])?;

@@ -40,8 +40,6 @@ struct Tree {
 
 const TRUNK: usize = 0;
 const HEAD: usize = 1;
-/// For gradients of outputs that are wider than a tile, which are loaded in pieces.
-const PIECE: usize = 2;
 /// Rows of a plan that is made only to look at its widths.
 const ANY_ROWS: usize = 16;
 
@@ -134,31 +132,55 @@ fn plan(tree: &Tree, rows: usize, wants_input: bool) -> Plan {
         }
     }
     let of_input = take(if wants_input { rows * tree.layers.first().map_or(0, |l| l.input) } else { 0 });
-    // Whether the trunk's tile holds a gradient yet, to which further heads add.
-    let mut begun = false;
-    for (i, layer) in tree.layers.iter().enumerate().rev() {
-        let (tile, width) = (tree.tile(i), layer.output);
-        let to = layer.parent.map_or(TRUNK, |p| tree.tile(p));
-        let leaves = layer.parent.is_none() && !wants_input;
-        let add = to == TRUNK && i >= tree.trunk && begun;
-        begun |= to == TRUNK && i >= tree.trunk;
-        let target = if layer.parent.is_none() && i < tree.trunk { Target::Out(of_input) } else { Target::Tile(to) };
-        if let (Some(at), false) = (tree.slots[i], layer.relu) {
-            let most = tree.widest_inside();
-            let source = if width > most && to == HEAD { PIECE } else { HEAD };
-            for start in (0..if leaves { 0 } else { width }).step_by(most) {
-                let columns = start..(start + most).min(width);
-                steps.push(Step::Load { tile: source, columns: columns.clone(), width, at });
-                steps.push(tree.backward(i, source, columns, target, add || start > 0));
+    let widest = tree.widest_inside();
+    // From the gradient of output `i`, in pieces that fit a tile, to that of its input.
+    let from_output = |steps: &mut Vec<Step>, i: usize, at: usize, source: usize, target: Target, add: bool| {
+        let width = tree.layers[i].output;
+        for start in (0..width).step_by(widest) {
+            let columns = start..(start + widest).min(width);
+            steps.push(Step::Load { tile: source, columns: columns.clone(), width, at });
+            steps.push(tree.backward(i, source, columns, target, add || start > 0));
+        }
+    };
+    // Heads first, down to the gradients of their first layers. These are saved, so that until then the trunk's tile is free for pieces of outputs.
+    for (i, layer) in tree.layers.iter().enumerate().skip(tree.trunk).rev() {
+        let first = layer.parent.is_none_or(|p| p < tree.trunk);
+        match tree.slots[i] {
+            Some(at) if !first => from_output(&mut steps, i, at, TRUNK, Target::Tile(HEAD), false),
+            Some(_) => {}
+            None => {
+                let width = layer.output;
+                steps.extend([Step::Mask { tile: HEAD, width, at: saved[i].output }, Step::Save { tile: HEAD, width, at: saved[i].gradient }]);
+                if !first {
+                    steps.push(tree.backward(i, HEAD, 0..width, Target::Tile(HEAD), false));
+                }
             }
+        }
+    }
+    // Then what the heads add to the gradient of what the trunk ends with.
+    let mut begun = false;
+    for (i, layer) in tree.layers.iter().enumerate().skip(tree.trunk).rev() {
+        if layer.parent.is_some_and(|p| p >= tree.trunk) || (layer.parent.is_none() && !wants_input) {
             continue;
         }
-        if let Some(at) = tree.slots[i] {
-            steps.push(Step::Load { tile, columns: 0..width, width, at });
+        match tree.slots[i] {
+            Some(at) => from_output(&mut steps, i, at, HEAD, Target::Tile(TRUNK), begun),
+            None => {
+                steps.push(Step::Reload { tile: HEAD, width: layer.output, at: saved[i].gradient });
+                steps.push(tree.backward(i, HEAD, 0..layer.output, Target::Tile(TRUNK), begun));
+            }
         }
-        steps.extend([Step::Mask { tile, width, at: saved[i].output }, Step::Save { tile, width, at: saved[i].gradient }]);
-        if !leaves {
-            steps.push(tree.backward(i, tile, 0..width, target, add));
+        begun = true;
+    }
+    for (i, layer) in tree.layers.iter().enumerate().take(tree.trunk).rev() {
+        let width = layer.output;
+        if let Some(at) = tree.slots[i] {
+            steps.push(Step::Load { tile: TRUNK, columns: 0..width, width, at });
+        }
+        steps.extend([Step::Mask { tile: TRUNK, width, at: saved[i].output }, Step::Save { tile: TRUNK, width, at: saved[i].gradient }]);
+        if layer.parent.is_some() || wants_input {
+            let target = if layer.parent.is_none() { Target::Out(of_input) } else { Target::Tile(TRUNK) };
+            steps.push(tree.backward(i, TRUNK, 0..width, target, false));
         }
     }
     if wants_input && tree.trunk == 0 {

@@ -11,6 +11,7 @@ pub const SAVE: u32 = 2;
 pub const MASK: u32 = 3;
 pub const NORM: u32 = 4;
 pub const NORM_BACK: u32 = 5;
+pub const RELOAD: u32 = 6;
 
 /// Words per step in a plan; a kind leaves the words it does not need at 0.
 pub const FIELDS: usize = 14;

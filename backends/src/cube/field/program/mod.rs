@@ -12,7 +12,7 @@ use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cc4dgs_fields::hash::LevelHash;
 use cubecl::prelude::*;
-use fields::{FIELDS, Fields, LOAD, MASK, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, SAVE};
+use fields::{FIELDS, Fields, LOAD, MASK, MULTIPLY, NONE, NORM, NORM_BACK, OUTSIDE, RELOAD, SAVE};
 use std::ops::Range;
 use steps::{BLOCK, PARTS};
 
@@ -41,6 +41,8 @@ pub enum Step {
     Multiply { source: usize, target: Target, input: usize, output: usize, weights: usize, bias: Option<usize>, relu: bool, add: bool },
     /// The tile is written to the output buffer: a saved activation.
     Save { tile: usize, width: usize, at: usize },
+    /// The tile becomes what was saved in the same way.
+    Reload { tile: usize, width: usize, at: usize },
     /// The ReLU mask: zero where the saved output of a ReLU is.
     Mask { tile: usize, width: usize, at: usize },
     /// LayerNorm and Mish; gain and shift follow each other among the weights. `save` says where normalised values and scales go, if they are needed.
@@ -64,9 +66,11 @@ impl Step {
             Self::Multiply { source, target: Target::Tile(t), input, output, .. } => (source.max(t), input.max(output)),
             Self::Multiply { source, input, .. } => (source, input),
             Self::Load { tile, ref columns, .. } => (tile, columns.len()),
-            Self::Save { tile, width, .. } | Self::Mask { tile, width, .. } | Self::Norm { tile, width, .. } | Self::NormBack { tile, width, .. } => {
-                (tile, width)
-            }
+            Self::Save { tile, width, .. }
+            | Self::Reload { tile, width, .. }
+            | Self::Mask { tile, width, .. }
+            | Self::Norm { tile, width, .. }
+            | Self::NormBack { tile, width, .. } => (tile, width),
         }
     }
     fn encode(&self) -> [u32; FIELDS] {
@@ -94,6 +98,7 @@ impl Step {
                 }
             }
             Self::Save { tile, width, at } => Fields { kind: SAVE, tile, width, at, ..Fields::default() },
+            Self::Reload { tile, width, at } => Fields { kind: RELOAD, tile, width, at, ..Fields::default() },
             Self::Mask { tile, width, at } => Fields { kind: MASK, tile, width, at, ..Fields::default() },
             Self::Norm { tile, width, gain, save } => {
                 let SavedNorm { normal, scale } = save.unwrap_or(SavedNorm { normal: NONE as usize, scale: 0 });

@@ -2,8 +2,8 @@
 
 use super::Layout;
 use super::fields::{
-    ACCUMULATE, AT, BEFORE, BIAS, COLUMN, FIELDS, FLAGS, KIND, LOAD, MASK, MULTIPLY, NONE, NORM, NORMAL, OUTPUT, OUTSIDE, RELU, SAVE, SCALE, STRIDE, TARGET,
-    TILE, WEIGHTS, WIDTH,
+    ACCUMULATE, AT, BEFORE, BIAS, COLUMN, FIELDS, FLAGS, KIND, LOAD, MASK, MULTIPLY, NONE, NORM, NORMAL, OUTPUT, OUTSIDE, RELOAD, RELU, SAVE, SCALE, STRIDE,
+    TARGET, TILE, WEIGHTS, WIDTH,
 };
 use crate::cube::field::activation::{mish, mish_derivative};
 use crate::cube::field::decoder::signature;
@@ -12,6 +12,8 @@ use cubecl::prelude::*;
 
 /// Rows and columns a thread computes.
 pub const BLOCK: usize = 8;
+/// Values that a thread reads from global memory before it needs the first of them.
+const AHEAD: usize = 8;
 
 /// Four floats that one instruction loads.
 type Four = Vector<f32, Const<4>>;
@@ -75,6 +77,8 @@ pub fn run_steps(
             multiply(&mut tiles, &mut rows, &mut factors, weights, plan, out, at, first, count, layout);
         } else if kind == LOAD {
             load(&mut tiles, given, plan, at, first, count, start, layout);
+        } else if kind == RELOAD {
+            reload(&mut tiles, plan, &*out, at, first, count, layout);
         } else if kind == SAVE {
             save(&mut tiles, plan, out, at, first, count, layout);
         } else if kind == MASK {
@@ -111,9 +115,9 @@ fn stage(
         let mut four = Four::new(0.0f32);
         #[unroll]
         for v in 0..4usize {
-            if from + v < input {
-                four.insert(v, tiles[source + r * stride + from + v]);
-            }
+            let inside = from + v < input;
+            let value = tiles[source + r * stride + select(inside, from + v, 0)];
+            four.insert(v, select(inside, value, 0.0f32));
         }
         rows[index] = four;
         index += comptime!(layout.threads());
@@ -122,11 +126,12 @@ fn stage(
     while index < comptime!(layout.chunk() / 4) * columns {
         let (column, from) = (first + index % columns, i + index / columns * 4);
         let mut four = Four::new(0.0f32);
+        // Without branches, a thread need not wait for one weight before it asks for the next.
         #[unroll]
         for v in 0..4usize {
-            if from + v < input && column < output {
-                four.insert(v, weights[matrix + (from + v) * output + column]);
-            }
+            let inside = from + v < input && column < output;
+            let value = weights[matrix + select(inside, (from + v) * output + column, 0)];
+            four.insert(v, select(inside, value, 0.0f32));
         }
         factors[index] = four;
         index += comptime!(layout.threads());
@@ -224,6 +229,13 @@ fn multiply(
     }
 }
 
+/// The index into a tile of value `index` of rows of `width`, and whether it is within the tile and its row among the last.
+#[cube]
+fn position(index: usize, width: usize, first: usize, count: usize, #[comptime] layout: Layout) -> (usize, bool) {
+    let (r, i) = (index / width, index % width);
+    (r * comptime!(layout.stride) + i, index < comptime!(layout.tile) * width && first + r < count)
+}
+
 #[cube]
 fn load(tiles: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first: usize, count: usize, start: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
@@ -231,17 +243,54 @@ fn load(tiles: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first
     let (width, from) = (plan[at + STRIDE] as usize, plan[at + AT] as usize);
     let mut index = UNIT_POS as usize;
     while index < tile * taken {
-        let (r, i) = (index / taken, index % taken);
-        let mut value = 0.0f32;
-        if first + r < count {
-            value = given[from + (start + first + r) * width + column + i];
+        let mut values = Array::<f32>::new(AHEAD);
+        #[unroll]
+        for k in 0..AHEAD {
+            let own = index + k * comptime!(layout.threads());
+            let (_, inside) = position(own, taken, first, count, layout);
+            let value = given[from + select(inside, (start + first + own / taken) * width + column + own % taken, 0)];
+            values[k] = select(inside, value, 0.0f32);
         }
-        tiles[target * (tile * stride) + r * stride + i] = value;
-        index += comptime!(layout.threads());
+        #[unroll]
+        for k in 0..AHEAD {
+            let own = index + k * comptime!(layout.threads());
+            if own < tile * taken {
+                let (to, _) = position(own, taken, first, count, layout);
+                tiles[target * (tile * stride) + to] = values[k];
+            }
+        }
+        index += comptime!(AHEAD * layout.threads());
     }
 }
 
-/// A thread saves here what it reads in [`mask`], so that no other thread's writes have to arrive.
+/// A thread reloads what it has saved, as in [`mask`].
+#[cube]
+fn reload(tiles: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
+    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
+    let (target, width, from) = (plan[at + TILE] as usize, plan[at + WIDTH] as usize, plan[at + AT] as usize);
+    let mut index = UNIT_POS as usize;
+    while index < tile * width {
+        let mut values = Array::<f32>::new(AHEAD);
+        #[unroll]
+        for k in 0..AHEAD {
+            let own = index + k * comptime!(layout.threads());
+            let (_, inside) = position(own, width, first, count, layout);
+            let value = out[from + select(inside, first * width + own, 0)];
+            values[k] = select(inside, value, 0.0f32);
+        }
+        #[unroll]
+        for k in 0..AHEAD {
+            let own = index + k * comptime!(layout.threads());
+            if own < tile * width {
+                let (to, _) = position(own, width, first, count, layout);
+                tiles[target * (tile * stride) + to] = values[k];
+            }
+        }
+        index += comptime!(AHEAD * layout.threads());
+    }
+}
+
+/// A thread saves here what it reads in [`mask`] and [`reload`], so that no other thread's writes have to arrive.
 #[cube]
 fn save(tiles: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
@@ -262,13 +311,22 @@ fn mask(tiles: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first: 
     let (target, width, from) = (plan[at + TILE] as usize, plan[at + WIDTH] as usize, plan[at + AT] as usize);
     let mut index = UNIT_POS as usize;
     while index < tile * width {
-        let (r, i) = (index / width, index % width);
-        if first + r < count {
-            if out[from + (first + r) * width + i] <= 0.0 {
-                tiles[target * (tile * stride) + r * stride + i] = 0.0f32;
+        let mut values = Array::<f32>::new(AHEAD);
+        #[unroll]
+        for k in 0..AHEAD {
+            let own = index + k * comptime!(layout.threads());
+            let (_, inside) = position(own, width, first, count, layout);
+            values[k] = out[from + select(inside, first * width + own, 0)];
+        }
+        #[unroll]
+        for k in 0..AHEAD {
+            let own = index + k * comptime!(layout.threads());
+            let (to, inside) = position(own, width, first, count, layout);
+            if inside && values[k] <= 0.0 {
+                tiles[target * (tile * stride) + to] = 0.0f32;
             }
         }
-        index += comptime!(layout.threads());
+        index += comptime!(AHEAD * layout.threads());
     }
 }
 
