@@ -5,7 +5,6 @@ use crate::cpu::simd::{Lanes, dispatch};
 use crate::ops::adam::AdamScalars;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Elements per task; rows are never split.
 const CHUNK: usize = 8 << 10;
@@ -13,14 +12,13 @@ const CHUNK: usize = 8 << 10;
 const WIDE_ROW: usize = 16;
 
 /// One step in place over rows of `width` elements. Rows whose entry in `rows` is 0 are unchanged, moments included; so are
-/// rows with a gradient that is not finite. Returns the number of the latter.
-pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width: usize, rows: Option<&[i64]>, scalars: &AdamScalars) -> u64 {
+/// rows with a gradient that is not finite.
+pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width: usize, rows: Option<&[i64]>, scalars: &AdamScalars) {
     if param.is_empty() || width == 0 {
-        return 0;
+        return;
     }
     let rows_per_chunk = (CHUNK / width).max(1);
     let chunk = rows_per_chunk * width;
-    let skipped = AtomicU64::new(0);
     let chunks = param.par_chunks_mut(chunk).zip(m.par_chunks_mut(chunk)).zip(v.par_chunks_mut(chunk)).zip(grad.par_chunks(chunk));
     chunks.enumerate().for_each(|(i, (((p, m), v), g))| {
         let visible = rows.map(|rows| &rows[i * rows_per_chunk..][..p.len() / width]);
@@ -35,14 +33,11 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
             None => moves.fill(1.0),
         }
         if !finite {
-            let mut bad = 0;
-            for (moves, g) in moves.iter_mut().zip(g.chunks_exact(width)).filter(|(moves, _)| **moves != 0.0) {
+            for (moves, g) in moves.iter_mut().zip(g.chunks_exact(width)) {
                 if g.iter().any(|v| !v.is_finite()) {
                     *moves = 0.0;
-                    bad += 1;
                 }
             }
-            skipped.fetch_add(bad, Ordering::Relaxed);
         }
         if width >= WIDE_ROW {
             let mut start = 0;
@@ -66,7 +61,6 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
             dispatch(Update { p, m, v, g, keep: Some(&keep), scalars });
         }
     });
-    skipped.into_inner()
 }
 
 /// Each of `values`, `W` times.

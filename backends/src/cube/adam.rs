@@ -1,6 +1,6 @@
 //! The fused Adam step on the device: one sweep. Wide rows have a sweep before it that decides which of them move.
 
-use super::tensor::{THREADS, constant, is_finite, owned, signed, workgroups_for, zeros};
+use super::tensor::{THREADS, constant, is_finite, owned, workgroups_for};
 use crate::ops::adam::{AdamOps, AdamScalars};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
@@ -12,9 +12,9 @@ use cubecl::prelude::*;
 /// Upper bound on the values of a row for which every value checks the whole row; wider rows are checked once, by a launch before.
 const NARROW: usize = 4;
 
-/// Whether the row is wanted and its gradient is finite; `skipped` counts rows that were wanted and are not finite, where `counts`.
+/// Whether the row is wanted and its gradient is finite.
 #[cube]
-fn moves_row(grad: &[f32], visible: &[i32], skipped: &mut [Atomic<i32>], row: usize, width: u32, counts: bool, #[comptime] masked: bool) -> bool {
+fn moves_row(grad: &[f32], visible: &[i32], row: usize, width: u32, #[comptime] masked: bool) -> bool {
     let mut wanted = true;
     if comptime!(masked) {
         wanted = visible[row] != 0;
@@ -23,18 +23,15 @@ fn moves_row(grad: &[f32], visible: &[i32], skipped: &mut [Atomic<i32>], row: us
     for k in 0..width as usize {
         finite = finite && is_finite(grad[row * width as usize + k]);
     }
-    if counts && wanted && !finite {
-        skipped[0].fetch_add(1i32);
-    }
     wanted && finite
 }
 
 /// moves`[row]` is 1 where the row moves.
 #[cube(launch)]
-fn rows_that_move(grad: &[f32], visible: &[i32], moves: &mut [u32], skipped: &mut [Atomic<i32>], width: u32, #[comptime] masked: bool) {
+fn rows_that_move(grad: &[f32], visible: &[i32], moves: &mut [u32], width: u32, #[comptime] masked: bool) {
     let row = ABSOLUTE_POS;
     if row < moves.len() {
-        let own = moves_row(grad, visible, skipped, row, width, true, masked);
+        let own = moves_row(grad, visible, row, width, masked);
         moves[row] = select(own, 1u32, 0u32);
     }
 }
@@ -48,7 +45,6 @@ fn move_rows(
     grad: &[f32],
     moves: &[u32],
     visible: &[i32],
-    skipped: &mut [Atomic<i32>],
     width: u32,
     beta1: f32,
     beta2: f32,
@@ -63,7 +59,7 @@ fn move_rows(
     let at = ABSOLUTE_POS;
     if at < param.len() {
         let row = at / width as usize;
-        let own = if comptime!(narrow) { moves_row(grad, visible, skipped, row, width, at == row * width as usize, masked) } else { moves[row] != 0 };
+        let own = if comptime!(narrow) { moves_row(grad, visible, row, width, masked) } else { moves[row] != 0 };
         if own {
             let g = grad[at];
             let first = beta1 * m[at] + one_minus_beta1 * g;
@@ -75,12 +71,11 @@ fn move_rows(
     }
 }
 
-fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visible: Option<CubeTensor>, s: &AdamScalars) -> [CubeTensor; 4] {
-    let skipped = signed(zeros(&grad, 1));
+fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visible: Option<CubeTensor>, s: &AdamScalars) -> [CubeTensor; 3] {
     let shape = param.meta.shape().clone();
     let (n, rows) = (shape.num_elements(), shape[0]);
     if n == 0 {
-        return [param, m, v, skipped];
+        return [param, m, v];
     }
     let width = (n / rows) as u32;
     let [param, m, v] = [param, m, v].map(owned);
@@ -94,8 +89,7 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
     let dim = CubeDim::new_1d(THREADS);
     if !narrow {
         let (g, seen) = (grad.clone().into_buffer_arg(), visible.clone().into_buffer_arg());
-        let (to, count) = (moves.clone().into_buffer_arg(), skipped.clone().into_buffer_arg());
-        rows_that_move::launch(&client, workgroups_for(rows), dim, g, seen, to, count, width, masked);
+        rows_that_move::launch(&client, workgroups_for(rows), dim, g, seen, moves.clone().into_buffer_arg(), width, masked);
     }
     move_rows::launch(
         &client,
@@ -107,7 +101,6 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
         grad.into_buffer_arg(),
         moves.into_buffer_arg(),
         visible.into_buffer_arg(),
-        skipped.clone().into_buffer_arg(),
         width,
         s.beta1,
         s.beta2,
@@ -119,7 +112,7 @@ fn step(param: CubeTensor, m: CubeTensor, v: CubeTensor, grad: CubeTensor, visib
         narrow,
         masked,
     );
-    [param, m, v, skipped]
+    [param, m, v]
 }
 
 impl AdamOps for CubeBackend {
@@ -129,7 +122,7 @@ impl AdamOps for CubeBackend {
         v: FloatTensor<Self>,
         grad: FloatTensor<Self>,
         scalars: AdamScalars,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, IntTensor<Self>) {
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>) {
         step(param, m, v, grad, None, &scalars).into()
     }
     fn adam_visible(
@@ -139,7 +132,7 @@ impl AdamOps for CubeBackend {
         grad: FloatTensor<Self>,
         visible: IntTensor<Self>,
         scalars: AdamScalars,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, IntTensor<Self>) {
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>) {
         step(param, m, v, grad, Some(visible), &scalars).into()
     }
 }

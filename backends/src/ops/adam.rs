@@ -59,13 +59,11 @@ pub struct AdamStep<const D: usize> {
     pub m: Tensor<D>,
     /// Second moment.
     pub v: Tensor<D>,
-    /// Rows that were skipped because their gradient was not finite `[1]`, on the device.
-    pub skipped_rows: Tensor<1, Int>,
 }
 
-type Moved<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>, IntTensor<B>);
+type Moved<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>);
 
-/// The operations per device: `(param, m, v, skipped rows [1])`.
+/// The operations per device: `(param, m, v)`.
 #[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"))]
 pub trait AdamOps: Backend {
     /// Moves `param` by one step; all four float tensors have one shape.
@@ -75,7 +73,7 @@ pub trait AdamOps: Backend {
         v: FloatTensor<Self>,
         grad: FloatTensor<Self>,
         scalars: AdamScalars,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, IntTensor<Self>);
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
     /// The same for the rows whose entry in `visible` is not 0.
     fn adam_visible(
         param: FloatTensor<Self>,
@@ -84,7 +82,7 @@ pub trait AdamOps: Backend {
         grad: FloatTensor<Self>,
         visible: IntTensor<Self>,
         scalars: AdamScalars,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, IntTensor<Self>);
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
 }
 
 fn step_on_cpu<B: CpuBackend>(
@@ -99,16 +97,16 @@ fn step_on_cpu<B: CpuBackend>(
     let width = shape.num_elements().checked_div(shape[0]).unwrap_or(0);
     let rows = visible.as_ref().map(|visible| B::ints(visible));
     let grad = B::floats(&grad);
-    let (mut moments, mut skipped) = ((None, None), 0);
+    let mut moments = (None, None);
     let param = B::update_floats(param, |p| {
         let mut second = None;
         let first = B::update_floats(m, |m| {
-            second = Some(B::update_floats(v, |v| skipped = kernel::adam(p, m, v, &grad, width, rows.as_deref(), &scalars)));
+            second = Some(B::update_floats(v, |v| kernel::adam(p, m, v, &grad, width, rows.as_deref(), &scalars)));
         });
         moments = (Some(first), second);
     });
     let empty = || B::from_floats(Vec::new(), [0]);
-    (param, moments.0.unwrap_or_else(empty), moments.1.unwrap_or_else(empty), B::from_ints(vec![skipped as i64], [1]))
+    (param, moments.0.unwrap_or_else(empty), moments.1.unwrap_or_else(empty))
 }
 
 impl<B: CpuBackend> AdamOps for B {
@@ -128,7 +126,7 @@ impl<B: CpuBackend> AdamOps for B {
 }
 
 /// One Adam step, p -= lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps), in place when the tensors have no other owner.
-/// Results carry no autodiff association; rows (dimension 0) with a gradient that is not finite are skipped and counted.
+/// Results carry no autodiff association; rows (dimension 0) with a gradient that is not finite are skipped.
 pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, grad: Tensor<D>, settings: &AdamSettings) -> Result<AdamStep<D>> {
     let shape = param.dims();
     for (name, other) in [("first moment", m.dims()), ("second moment", v.dims()), ("gradient", grad.dims())] {
@@ -164,9 +162,9 @@ pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, g
         epsilon: settings.epsilon as f32,
     };
     let [param, m, v, grad] = [param, m, v, grad].map(|t| t.inner().into_dispatch());
-    let (param, m, v, skipped) = match settings.visible.clone() {
+    let (param, m, v) = match settings.visible.clone() {
         Some(visible) => <Dispatch as AdamOps>::adam_visible(param, m, v, grad, visible.inner().into_dispatch(), scalars),
         None => <Dispatch as AdamOps>::adam(param, m, v, grad, scalars),
     };
-    Ok(AdamStep { param: Tensor::from_dispatch(param), m: Tensor::from_dispatch(m), v: Tensor::from_dispatch(v), skipped_rows: Tensor::from_dispatch(skipped) })
+    Ok(AdamStep { param: Tensor::from_dispatch(param), m: Tensor::from_dispatch(m), v: Tensor::from_dispatch(v) })
 }

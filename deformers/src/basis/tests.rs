@@ -100,6 +100,8 @@ fn players_compute_what_the_deformer_computes() {
         (SpaceKind::Stored, tables.to_string(), 1, 3),
         (SpaceKind::Stored, format!("{tables}layers = 2\nlearned = 4\nheads = ['means', 'quaternions']\ngrid_rate = 3.0"), 0, 2),
         (SpaceKind::Stored, format!("{tables}heads = ['quaternions', 'means']\n[kept]\nmeans = [0, 4]"), 0, 2),
+        (SpaceKind::Stored, format!("{tables}head_layers = 0"), 0, 3),
+        (SpaceKind::Computed, format!("{small}head_layers = 2\nlearned = 2"), 0, 3),
         (SpaceKind::Computed, small.to_string(), 1, 3),
         (
             SpaceKind::Computed,

@@ -79,6 +79,8 @@ fn networks_of_every_shape_are_those_of_their_layers() {
         shape(20, &[33, 24], &[&[24, 3], &[24, 16, 5], &[48]]),
         // Outputs wider than the shared memory, behind a hidden layer and directly behind the trunk.
         shape(12, &[16], &[&[16, 150], &[90]]),
+        // The same without a trunk, behind two hidden layers.
+        shape(12, &[], &[&[16, 16, 150], &[90]]),
         shape(130, &[130], &[&[130, 4]]),
         // Too wide for the shared memory of any device.
         shape(3, &[1100], &[&[2]]),

@@ -116,10 +116,16 @@ fn what_does_not_fit_is_an_error() {
 /// A deformer with functions that have almost no effect in one head and none in another.
 #[test]
 fn what_a_scene_does_not_use_is_left_out() {
+    [1, 0, 2].into_iter().for_each(unused_functions_are_left_out);
+}
+
+/// See [`what_a_scene_does_not_use_is_left_out`]; with so many hidden layers in heads.
+fn unused_functions_are_left_out(layers: usize) {
     let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
     let registry = Registry::collect().unwrap();
-    let text = "levels = 2\nresolutions = [3, 6]\nhashes = 16\nhidden = [12]\nfeatures = 5\nwidth = 16\nlearned = 3\ntime_bands = 2";
-    let section = config::parse_table("test", text).unwrap();
+    let text =
+        format!("levels = 2\nresolutions = [3, 6]\nhashes = 16\nhidden = [12]\nfeatures = 5\nwidth = 16\nlearned = 3\ntime_bands = 2\nhead_layers = {layers}");
+    let section = config::parse_table("test", &text).unwrap();
     let plugin = registry.deformer("cdf-basis").unwrap();
     let mut field = (plugin.build)(&section, &context, &Device::flex()).unwrap();
     // Functions: 1, t, two bands of two, three learned.
@@ -245,12 +251,12 @@ fn a_moment_alone_is_that_moment_among_others() {
 fn the_lasso_pulls_every_function_by_its_price() {
     let context = DeformerContext { box_min: [-1.0, -2.0, 0.0], box_max: [1.0, 2.0, 4.0], frame_count: 12, sh_degree: 1, seed: Seed::root(3) };
     let text = "levels = 1\nresolutions = [3]\nhashes = 8\nhidden = [8]\nfeatures = 4\nwidth = 6\nlearned = 2\ntime_bands = 3\nsparsity = 0.01\nfalloff = 0.0\nheads = [\"means\", \"quaternions\"]";
-    let section = config::parse_table("test", text).unwrap();
+    let section = |layers: usize| config::parse_table("test", &format!("{text}\nhead_layers = {layers}")).unwrap();
     let registry = Registry::collect().unwrap();
     let prices = [1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 4.0, 4.0, 1.0, 1.0];
-    for (name, device) in devices() {
+    for ((name, device), layers) in devices().into_iter().flat_map(|device| [1, 0, 2].map(|layers| (device.clone(), layers))) {
         let device = device.autodiff();
-        let mut field = (registry.deformer("cdf-basis").unwrap().build)(&section, &context, &device).unwrap();
+        let mut field = (registry.deformer("cdf-basis").unwrap().build)(&section(layers), &context, &device).unwrap();
         for (k, parameter) in field.parameters_mut().into_iter().enumerate() {
             let len = parameter.value.dims()[0];
             parameter.value = Tensor::from_data(TensorData::new(noise(70 + k as u64, len), [len]), &device).require_grad();
@@ -262,7 +268,7 @@ fn the_lasso_pulls_every_function_by_its_price() {
         for (head, outputs, unit) in [("net.head.means", 3, 3.0), ("net.head.quaternions", 4, 1.0)] {
             let parameter = field.parameters().into_iter().find(|p| p.name == head).unwrap();
             let (values, gradient) = (to_vec(parameter.value.clone(), "w").unwrap(), to_vec(parameter.value.grad(&gradients).unwrap(), "g").unwrap());
-            let first = 6 * 7;
+            let first = layers * 6 * 7;
             assert!(gradient[..first].iter().all(|g| *g == 0.0), "{name}: {head}: hidden layers are not pulled");
             for (f, price) in prices.iter().enumerate() {
                 let group = |values: &[f32]| -> Vec<f64> {

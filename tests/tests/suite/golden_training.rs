@@ -127,8 +127,6 @@ fn adam_leaves_invisible_and_broken_rows_alone() {
         let mut settings = AdamSettings::new(0.01, 3);
         settings.visible = Some(Tensor::<1, Int>::from_data(TensorData::new(visible.clone(), [rows]), &device));
         let out = adam_step(matrix(p0.clone()), matrix(m0.clone()), matrix(v0.clone()), matrix(g.clone()), &settings).expect("a step");
-        // 9000 is a multiple of 3, so this row was not selected and is not compared.
-        assert_eq!(out.skipped_rows.into_data().iter::<i64>().collect::<Vec<_>>(), [2], "{name}");
         let (p, m, v) = (values(out.param), values(out.m), values(out.v));
         for (row, &shown) in visible.iter().enumerate() {
             for i in row * width..(row + 1) * width {

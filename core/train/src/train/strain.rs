@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 /// Neighbours further apart than this multiple of the median distance say nothing of each other.
 const FAR: f32 = 4.0;
-/// Least squared distance over the canonical one: the root has no gradient at 0.
+/// Added to squared distances over the canonical ones: the root has no gradient at 0.
 const LEAST: f32 = 1e-8;
 
 /// Neighbours of one Gaussian at most; those nearest to each other count first. Three are looked for, and each may be found by others.
@@ -36,6 +36,8 @@ struct Lists {
     inverse: Tensor<3>,
     /// 2 where both are among the three nearest of the other, else 1, over the sum of the weights of all pairs `[M,most,1]`.
     weights: Tensor<3>,
+    /// Twice the weights over the distances `[M,most,1]`.
+    slopes: Tensor<3>,
 }
 
 /// Pairs of neighbours (i, j, their distance, 1 or 2), nearest first, with i < j; see [`Neighbours::of`].
@@ -91,12 +93,14 @@ impl Lists {
             }
         }
         let array = |values: Vec<f32>, width: usize| Tensor::<3>::from_data(TensorData::new(values, [points.len(), most, width]), device);
+        let (inverse, weights) = (array(inverse, 1), array(weights, 1));
         Some(Self {
             most,
             rows: Tensor::from_data(TensorData::new(rows, [count]), device),
             directions: array(directions, 3),
-            inverse: array(inverse, 1),
-            weights: array(weights, 1),
+            slopes: (weights.clone() * inverse.clone()).mul_scalar(2.0),
+            inverse,
+            weights,
         })
     }
 }
@@ -114,18 +118,25 @@ impl Neighbours {
     /// belong to things that part (Geman and McClure's function). `offsets` are those of the centres `[M,3]`.
     /// `None` without pairs.
     pub fn strain(&self, offsets: Tensor<2>) -> Option<Tensor<1>> {
-        let Lists { most, rows, directions, inverse, weights } = self.lists.as_ref()?;
-        let constant = |values: &Tensor<3>| Tensor::from_inner(values.clone());
-        let count = offsets.dims()[0];
-        // Each pair is in two lists. Neighbours are taken as constants: a Gaussian's own list then gives its whole gradient.
-        let others = offsets.clone().inner().select(0, rows.clone()).reshape([count, *most, 3]);
-        let difference = offsets.reshape([count, 1, 3]) - constant(&others);
-        let apart = constant(directions) + difference * constant(inverse);
-        let stretch = (apart.clone() * apart).sum_dim(2).clamp_min(LEAST).sqrt().sub_scalar(1.0);
-        let squares = stretch.clone() * stretch;
-        let twice = (squares.clone() / squares.add_scalar(1.0) * constant(weights)).sum();
-        let once = Tensor::from_inner(twice.clone().inner().mul_scalar(0.5));
-        Some(twice - once)
+        let Lists { most, rows, directions, inverse, weights, slopes } = self.lists.as_ref()?;
+        let own = offsets.clone().inner();
+        let count = own.dims()[0];
+        // Value and gradient are computed outside of the graph: with it there are half as many passes again over all pairs.
+        let others = own.clone().select(0, rows.clone()).reshape([count, *most, 3]);
+        let apart = (own.reshape([count, 1, 3]) - others) * inverse.clone() + directions.clone();
+        let length = (apart.clone() * apart.clone()).sum_dim(2).add_scalar(LEAST).sqrt();
+        let stretch = length.clone().sub_scalar(1.0);
+        let squares = stretch.clone() * stretch.clone();
+        let bound = squares.clone().add_scalar(1.0);
+        // Each pair is in two lists.
+        let value = (squares / bound.clone() * weights.clone()).sum().mul_scalar(0.5);
+        // In its own list a Gaussian has its whole gradient.
+        let slope = stretch / (bound.clone() * bound * length) * slopes.clone();
+        let gradient = (apart * slope).sum_dim(1).reshape([count, 3]);
+        // What has this gradient, and then this value.
+        let linear = (offsets * Tensor::from_inner(gradient)).sum();
+        let missing = value - linear.clone().inner();
+        Some(linear + Tensor::from_inner(missing))
     }
 }
 
@@ -156,7 +167,7 @@ mod tests {
         assert!((stretched - 0.01 / 1.01).abs() < 1e-4, "{stretched}");
         let apart = strain(&|[x, y, z]| [100.0 * x, 100.0 * y, 100.0 * z]);
         assert!((0.99..=1.0).contains(&apart), "{apart}");
-        // The gradient is that of the value, though neighbours are constants in it.
+        // The gradient is that of the value, though each is computed by itself.
         let wiggle: Vec<f32> = (0..90).map(|k| 0.2 * (0.7 * k as f32).sin()).collect();
         let at = |values: &[f32]| neighbours.strain(Tensor::from_data(TensorData::new(values.to_vec(), [30, 3]), &device)).unwrap();
         let offsets = Tensor::<2>::from_data(TensorData::new(wiggle.clone(), [30, 3]), &device).require_grad();

@@ -290,7 +290,7 @@ fn reload(tiles: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first
     }
 }
 
-/// A thread saves here what it reads in [`mask`] and [`reload`], so that no other thread's writes have to arrive.
+/// A thread saves here what it reads in [`mask`] and [`reload`], so that no other thread's writes have to arrive; what else they read is not used.
 #[cube]
 fn save(tiles: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
