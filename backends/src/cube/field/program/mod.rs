@@ -98,7 +98,7 @@ impl Step {
                 }
             }
             Self::Save { tile, width, at } => Fields { kind: SAVE, tile, width, at, ..Fields::default() },
-            Self::Reload { tile, width, at } => Fields { kind: RELOAD, tile, width, at, ..Fields::default() },
+            Self::Reload { tile, width, at } => Fields { kind: RELOAD, tile, width, at, stride: width, ..Fields::default() },
             Self::Mask { tile, width, at } => Fields { kind: MASK, tile, width, at, ..Fields::default() },
             Self::Norm { tile, width, gain, save } => {
                 let SavedNorm { normal, scale } = save.unwrap_or(SavedNorm { normal: NONE as usize, scale: 0 });

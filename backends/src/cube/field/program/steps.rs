@@ -76,9 +76,9 @@ pub fn run_steps(
         if kind == MULTIPLY {
             multiply(&mut tiles, &mut rows, &mut factors, weights, plan, out, at, first, count, layout);
         } else if kind == LOAD {
-            load(&mut tiles, given, plan, at, first, count, start, layout);
+            load(&mut tiles, given, plan, at, start + first, first, count, layout);
         } else if kind == RELOAD {
-            reload(&mut tiles, plan, &*out, at, first, count, layout);
+            load(&mut tiles, &*out, plan, at, first, first, count, layout);
         } else if kind == SAVE {
             save(&mut tiles, plan, out, at, first, count, layout);
         } else if kind == MASK {
@@ -236,8 +236,9 @@ fn position(index: usize, width: usize, first: usize, count: usize, #[comptime] 
     (r * comptime!(layout.stride) + i, index < comptime!(layout.tile) * width && first + r < count)
 }
 
+/// Columns of rows of `buffer` into a tile, the first of them `row`: what is given, or what was saved.
 #[cube]
-fn load(tiles: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first: usize, count: usize, start: usize, #[comptime] layout: Layout) {
+fn load(tiles: &mut Shared<[f32]>, buffer: &[f32], plan: &[u32], at: usize, row: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
     let (target, column, taken) = (plan[at + TILE] as usize, plan[at + COLUMN] as usize, plan[at + WIDTH] as usize);
     let (width, from) = (plan[at + STRIDE] as usize, plan[at + AT] as usize);
@@ -248,7 +249,7 @@ fn load(tiles: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first
         for k in 0..AHEAD {
             let own = index + k * comptime!(layout.threads());
             let (_, inside) = position(own, taken, first, count, layout);
-            let value = given[from + select(inside, (start + first + own / taken) * width + column + own % taken, 0)];
+            let value = buffer[from + select(inside, (row + own / taken) * width + column + own % taken, 0)];
             values[k] = select(inside, value, 0.0f32);
         }
         #[unroll]
@@ -263,34 +264,7 @@ fn load(tiles: &mut Shared<[f32]>, given: &[f32], plan: &[u32], at: usize, first
     }
 }
 
-/// A thread reloads what it has saved, as in [`mask`].
-#[cube]
-fn reload(tiles: &mut Shared<[f32]>, plan: &[u32], out: &[f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
-    let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
-    let (target, width, from) = (plan[at + TILE] as usize, plan[at + WIDTH] as usize, plan[at + AT] as usize);
-    let mut index = UNIT_POS as usize;
-    while index < tile * width {
-        let mut values = Array::<f32>::new(AHEAD);
-        #[unroll]
-        for k in 0..AHEAD {
-            let own = index + k * comptime!(layout.threads());
-            let (_, inside) = position(own, width, first, count, layout);
-            let value = out[from + select(inside, first * width + own, 0)];
-            values[k] = select(inside, value, 0.0f32);
-        }
-        #[unroll]
-        for k in 0..AHEAD {
-            let own = index + k * comptime!(layout.threads());
-            if own < tile * width {
-                let (to, _) = position(own, width, first, count, layout);
-                tiles[target * (tile * stride) + to] = values[k];
-            }
-        }
-        index += comptime!(AHEAD * layout.threads());
-    }
-}
-
-/// A thread saves here what it reads in [`mask`] and [`reload`], so that no other thread's writes have to arrive; what else they read is not used.
+/// A thread saves here what it reads in [`mask`] and, for a reload, in [`load`], so that no other thread's writes have to arrive; what else they read is not used.
 #[cube]
 fn save(tiles: &mut Shared<[f32]>, plan: &[u32], out: &mut [f32], at: usize, first: usize, count: usize, #[comptime] layout: Layout) {
     let (tile, stride) = (comptime!(layout.tile), comptime!(layout.stride));
