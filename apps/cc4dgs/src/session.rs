@@ -4,7 +4,7 @@ use crate::Model;
 use crate::runs::{Existing, check_folder};
 use crate::{plugins, scenes};
 use burn::tensor::Device;
-use cc4dgs_core::{Error, Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device};
+use cc4dgs_core::{Error, Event, EventSink, Limits, Registry, Result, Scene, SceneOptions, Silent, Split, parse_device, resolved_device};
 use cc4dgs_play::player::Player;
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
@@ -64,9 +64,10 @@ impl SessionBuilder {
     /// [`Error::Parameter`] for an unknown device and for two plug-ins of one name,
     /// [`Error::Unsupported`] for a device that does not answer.
     pub fn build(self) -> Result<Session> {
-        let device = parse_device(&self.device)?;
+        let device_name = resolved_device(&self.device).to_string();
+        let device = parse_device(&device_name)?;
         let (limits, events, stop) = (self.limits, self.events, AtomicBool::new(false));
-        Ok(Session { shared: Arc::new(Shared { registry: Registry::collect()?, limits, events, device, device_name: self.device, stop }) })
+        Ok(Session { shared: Arc::new(Shared { registry: Registry::collect()?, limits, events, device, device_name, stop }) })
     }
 }
 
@@ -106,8 +107,8 @@ impl Session {
     pub fn device(&self) -> &Device {
         &self.shared.device
     }
-    /// Asks a running [`Session::train`] to stop after its current iteration, with a checkpoint where it has a folder, and a running [`Model::save_tuned`] to
-    /// write nothing. What begins later is not stopped. May be called from any thread.
+    /// Asks a running [`Session::train`] to stop after its current iteration, with a checkpoint where it has a folder, and a running [`Session::plan`] or
+    /// [`Model::save_tuned`] to end with nothing. What begins later is not stopped. May be called from any thread.
     pub fn stop(&self) {
         self.shared.stop.store(true, Ordering::Relaxed);
     }
@@ -134,12 +135,12 @@ impl Session {
     /// and limits. `auto.minutes=5` states the time there is.
     ///
     /// # Errors
-    /// As [`Session::config`] and [`Session::read_scene`].
+    /// [`Error::Interrupted`] after [`Session::stop`]; as [`Session::config`] and [`Session::read_scene`].
     pub fn plan(&self, path: impl AsRef<Path>, overrides: &[&str]) -> Result<(RunConfig, Arc<Scene>)> {
         let device = format!("device={}", self.shared.device_name);
         let overrides: Vec<String> = overrides.iter().map(ToString::to_string).chain([device]).collect();
         let layers = Layers::collect(self.registry(), Some(auto::PRESET), None, &overrides)?;
-        let (config, scene) = auto::open(path.as_ref(), &layers, self.registry(), self.events())?;
+        let (config, scene) = auto::open(path.as_ref(), &layers, self.registry(), self.events(), self.stop_flag())?;
         Ok((self.adopted(config), scene))
     }
     /// Opens the dataset at `path`; `procedural` and `procedural:NAME` are built in. Images are decoded later, on demand.
@@ -168,7 +169,8 @@ impl Session {
         }
         self.run(config, scene.into(), out, false)
     }
-    /// Goes on with the run in `folder` from its checkpoint; the result is the same as without the interruption.
+    /// Goes on with the run in `folder` from its checkpoint; the result is the same as without the interruption. The session must compute on the device that the
+    /// run's `config.toml` names.
     ///
     /// # Errors
     /// As [`Session::train`], and for a folder without a run.

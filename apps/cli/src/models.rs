@@ -1,6 +1,6 @@
 //! The model a command works on.
 
-use cc4dgs_core::{EventSink, Limits, Registry, Result, auto_device, parse_device};
+use cc4dgs_core::{EventSink, Limits, Registry, Result, parse_device, resolved_device};
 use cc4dgs_play::model::Model;
 use std::path::Path;
 
@@ -16,9 +16,4 @@ pub fn load_model(path: &Path, device_name: &str, registry: &Registry, limits: &
     let device = parse_device(device_name)?;
     let model = Model::open(path, registry, &device, limits, events)?;
     Ok(Loaded { model, device, device_name: resolved_device(device_name).to_string() })
-}
-
-/// The device a name stands for: `auto` becomes the one it takes, others stay.
-pub fn resolved_device(name: &str) -> &str {
-    if name == "auto" { auto_device().0 } else { name }
 }

@@ -7,14 +7,18 @@ use burn::tensor::Device;
 /// The device names a configuration may use. `wgpu:N` is the N-th adapter of `cc4dgs doctor`, `wgpu` the first.
 pub const DEVICE_NAMES: [&str; 5] = ["auto", "flex", "ndarray", "wgpu", "cuda"];
 
+/// The device that `name` stands for: `auto` becomes the one that [`auto_device`] takes, other names stay.
+pub fn resolved_device(name: &str) -> &str {
+    if name == "auto" { auto_device().0 } else { name }
+}
+
 /// Turns a device name into a burn device. `auto` is wgpu on a graphics card and flex without one; see [`auto_device`].
 ///
 /// # Errors
 /// [`Error::Parameter`] for an unknown name, [`Error::Unsupported`] if the device is missing or not in this build.
 pub fn parse_device(name: &str) -> Result<Device> {
-    match name {
-        "auto" => parse_device(auto_device().0),
-        "flex" | "ndarray" => processor_device(name),
+    match resolved_device(name) {
+        name @ ("flex" | "ndarray") => processor_device(name),
         "wgpu" => wgpu_device(0),
         "cuda" => cuda_device(),
         other => match other.strip_prefix("wgpu:").map(str::parse) {

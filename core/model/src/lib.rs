@@ -47,7 +47,7 @@ pub use deformer::{
     SpatialInput, check_attributes,
 };
 pub use density::{DensityControl, DensityPlan, DensityPlugin, DensityReport, RowValues, Statistic, ViewStatistics};
-pub use device::{DEVICE_NAMES, parse_device};
+pub use device::{DEVICE_NAMES, parse_device, resolved_device};
 pub use gaussians::Gaussians;
 pub use life::{LIFE_ATTRIBUTES, LIFE_GATE_STEEPNESS, gate_value};
 pub use loss::{Fusion, LossInput, LossPlugin, LossTerm};

@@ -13,12 +13,13 @@ pub const SH_C0: f32 = 0.282_094_8;
 /// The dataset's points are enough where they are at least this share of the wanted ones; else others are looked for beside them.
 const ENOUGH: f64 = 0.1;
 
-/// Gaussians for `scene` as `config.init` wants them, at most `init.count`. An [`Event::Note`] says where they come from.
+/// Gaussians for `scene` as `config.init` wants them, at most `init.count` and `density.max_gaussians`. An [`Event::Note`] says where they come from.
 ///
 /// # Errors
 /// [`Error::Parameter`] and [`Error::Data`] where the scene has no points of that kind, and whatever decoding its images meets.
 pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn EventSink) -> Result<HostGaussians> {
-    let count = config.init.count.min(config.limits.max_gaussians as usize);
+    let most = config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(usize::MAX, |most| most.max(1) as usize);
+    let count = config.init.count.min(most).min(config.limits.max_gaussians as usize);
     let own = scene.points.as_ref().filter(|p| !p.positions.is_empty());
     let mut uncertain = 0..0;
     let few = own.is_some_and(|points| (points.positions.len() as f64) < ENOUGH * count as f64);

@@ -17,7 +17,7 @@ use std::sync::atomic::AtomicBool;
 fn planned(capture: &str, sets: &[&str], registry: &Registry) -> (RunConfig, Arc<Scene>) {
     let sets: Vec<String> = ["scene.width=64", "device=flex", "train.log_every=10"].iter().chain(sets).map(ToString::to_string).collect();
     let layers = Layers::collect(registry, Some(auto::PRESET), None, &sets).unwrap();
-    auto::open(Path::new(&format!("procedural:captures/{capture}")), &layers, registry, &Silent).unwrap()
+    auto::open(Path::new(&format!("procedural:captures/{capture}")), &layers, registry, &Silent, &AtomicBool::new(false)).unwrap()
 }
 
 fn trained(config: &RunConfig, scene: &Arc<Scene>, registry: &Registry) -> (Model, Vec<Event>) {

@@ -1,7 +1,7 @@
 //! The library as used by a program.
 
 use cc4dgs::{Error, Event, Orbit, Session, Split};
-use cc4dgs_core::{Seed, Similarity, ply};
+use cc4dgs_core::{Seed, Similarity, ply, resolved_device};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -58,6 +58,14 @@ fn a_session_trains_saves_opens_and_plays() {
     assert_eq!(again.background, Some([0.0; 3]));
     let report = session.evaluate(&opened, &again, Split::Test).unwrap();
     assert_eq!(report.psnr_db, session.evaluate(&model, &scene, Split::Test).unwrap().psnr_db);
+}
+
+#[test]
+fn a_session_names_the_device_it_took() {
+    let session = Session::new().unwrap();
+    let taken = session.config("demo", &[]).unwrap().device;
+    assert_eq!(taken, resolved_device("auto"));
+    assert_ne!(taken, "auto");
 }
 
 #[test]

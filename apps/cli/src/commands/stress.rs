@@ -2,9 +2,8 @@
 
 use super::Context;
 use crate::args::Stress;
-use crate::models::resolved_device;
 use cc4dgs::stress::{NO_ORACLE, StressJob, StressReport, stress};
-use cc4dgs_core::{Error, Event, EventSink, Result, parse_device};
+use cc4dgs_core::{Error, Event, EventSink, Result, parse_device, resolved_device};
 use serde_json::json;
 use std::collections::BTreeMap;
 

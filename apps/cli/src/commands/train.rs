@@ -5,7 +5,7 @@ use crate::args::Train;
 use crate::interrupt;
 use cc4dgs::plugins;
 use cc4dgs::runs::{EVENTS, Existing, check_folder};
-use cc4dgs_core::{Error, Result};
+use cc4dgs_core::{Error, Result, resolved_device};
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
 use cc4dgs_train::layers::Layers;
@@ -60,7 +60,7 @@ pub fn run(context: &Context, args: &Train, observer: Option<&dyn Observer>) -> 
 /// Preset, file and overrides, with the device and the limits of the command line on top.
 pub fn layers(context: &Context, preset: Option<&str>, file: Option<&Path>, sets: &[String], device: Option<&str>) -> Result<Layers> {
     let limits = context.limit_options.iter().map(|option| format!("limits.{option}"));
-    let device = device.map(|name| format!("device={name}"));
+    let device = device.map(|name| format!("device={}", resolved_device(name)));
     let sets: Vec<String> = sets.iter().cloned().chain(limits).chain(device).collect();
     Layers::collect(&context.registry, preset, file, &sets)
 }
@@ -86,7 +86,7 @@ pub fn train_into(context: &Context, layers: &Layers, scene_path: &Path, out: &P
     if !layers.want_plan() {
         plugins::check(&layers.config()?, &context.registry)?;
     }
-    let (config, scene) = auto::open(scene_path, layers, &context.registry, &context.listeners(None)?)?;
+    let (config, scene) = auto::open(scene_path, layers, &context.registry, &context.listeners(None)?, stop)?;
     plugins::check(&config, &context.registry)?;
     // Opened only now: a mistyped path must not wipe the log of an earlier run.
     let resume = existing == Existing::Resume;

@@ -1,11 +1,12 @@
 //! How long an iteration takes, found by training for a few.
 
+use super::proceed;
 use crate::config::{Dynamic, RunConfig};
 use crate::train::{TrainJob, growth, share_per_view, train};
 use cc4dgs_core::{Event, Recorder, Registry, Result, Scene, Split};
 use rayon::prelude::*;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Iterations of each stage that are timed, and how many one measurement takes.
@@ -32,14 +33,19 @@ pub(super) struct Timing {
 
 /// Trains for a few iterations as `config` would, from the same first Gaussians, once without and once with motion, and forgets the result. Images are decoded
 /// before, for at most `patience`: most iterations of a run find theirs in the cache.
-pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Registry, patience: Duration) -> Result<Timing> {
+pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Registry, patience: Duration, stop: &AtomicBool) -> Result<Timing> {
     let began = Instant::now();
-    scene.split(Split::Train).into_par_iter().filter(|_| began.elapsed() < patience).try_for_each(|view| scene.frame(view).map(drop))?;
+    scene
+        .split(Split::Train)
+        .into_par_iter()
+        .filter(|_| began.elapsed() < patience && !stop.load(Ordering::Relaxed))
+        .try_for_each(|view| scene.frame(view).map(drop))?;
     let mut trial = config.clone();
     let most = config.density.get("max_gaussians").and_then(|v| v.as_integer()).map_or(config.init.count, |v| v.max(1) as usize);
+    trial.init.count = trial.init.count.min(most);
     trial.density = toml::Table::from_iter([("kind".into(), "none".into())]);
     trial.train.iterations = 2 * ITERATIONS;
-    trial.train.batch = 1;
+    (trial.train.batch, trial.train.coarse_batch) = (1, 0);
     trial.train.shares = [1.0, 0.0, 1.0];
     trial.train.dynamic = Dynamic::All;
     (trial.train.lambda_r, trial.train.recover) = (0.0, false);
@@ -53,9 +59,10 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
     trial.auto = Default::default();
     let began = Instant::now();
     let recorder = Recorder::default();
-    let stop = AtomicBool::new(false);
-    let (model, _) =
-        train(&TrainJob { config: &trial, scene: scene.clone(), out: None, resume: false, registry, events: &recorder, stop: &stop, observer: None })?;
+    let job = TrainJob { config: &trial, scene: scene.clone(), out: None, resume: false, registry, events: &recorder, stop, observer: None };
+    let trained = train(&job);
+    proceed(stop)?;
+    let (model, _) = trained?;
     let all_ms = 1000.0 * began.elapsed().as_secs_f64();
     let events = recorder.events();
     let iterations_ms: f64 =

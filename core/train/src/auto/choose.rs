@@ -139,11 +139,21 @@ pub(super) fn image_size(native: [u32; 2], options: &SceneOptions, machine: Mach
     Some(choice([("scene.width", integer(width))], reason))
 }
 
-/// Every other setting but the number of iterations. `stated` is the deformer that the configuration states, if any.
-pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, stated: Option<&str>) -> Vec<Choice> {
-    let free = stated.is_none_or(|kind| kind == FREE_TIME);
-    let every = free.then(|| key_frames(facts, machine, minutes)).flatten();
-    let mut choices = vec![field(facts, machine, minutes, stated, every), stages(facts, machine, minutes, every), counts(facts, machine, minutes)];
+/// What the configuration states and the plan follows.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Stated<'a> {
+    /// The deformer.
+    pub deformer: Option<&'a str>,
+    /// The upper bound of Gaussians.
+    pub gaussians: Option<f64>,
+}
+
+/// Every other setting but the number of iterations.
+pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, stated: Stated) -> Vec<Choice> {
+    let most = stated.gaussians.unwrap_or_else(|| most_gaussians(facts, machine, minutes));
+    let free = stated.deformer.is_none_or(|kind| kind == FREE_TIME);
+    let every = free.then(|| key_frames(facts, machine, minutes, most)).flatten();
+    let mut choices = vec![field(facts, machine, minutes, stated.deformer, every), stages(facts, machine, minutes, most, every), counts(facts, most)];
     choices.extend(background(facts));
     choices.extend(near(facts));
     choices.push(blur());
@@ -165,8 +175,8 @@ fn stands_alone(facts: &Facts) -> bool {
     facts.plain.is_some() || facts.transparent > OBJECT
 }
 
-/// How many frames lie between key frames, where several cameras see each, things pass and there is time to match enough of them.
-fn key_frames(facts: &Facts, machine: Machine, minutes: f64) -> Option<usize> {
+/// How many frames lie between key frames, where several cameras see each, things pass, and there is time to match enough of them for `most` Gaussians.
+fn key_frames(facts: &Facts, machine: Machine, minutes: f64, most: f64) -> Option<usize> {
     // Where no camera stands still, nothing says what moves.
     if stands_still(facts) || facts.moving.is_none() || !facts.arrangement.has_several_cameras() || facts.occupied.is_some_and(|share| share > ON_THE_SPOT) {
         return None;
@@ -174,7 +184,7 @@ fn key_frames(facts: &Facts, machine: Machine, minutes: f64) -> Option<usize> {
     let image = facts.pixels().min(MOST_MATCHED_PIXELS) * facts.cameras as f64;
     // Images are matched by the processor on every machine.
     let affordable = MATCHING_SHARE * 60.0 * minutes * machine.threads.max(1) as f64 / (SECONDS_PER_MATCHED_PIXEL * image.max(1.0));
-    let points = (1.0 - AT_START) * most_gaussians(facts, machine, minutes) / LEAST_KEY_POINTS;
+    let points = (1.0 - AT_START) * most / LEAST_KEY_POINTS;
     let every = (facts.frames as f64 / affordable.min(points).max(1.0)).ceil().max(LEAST_KEY_INTERVAL) as usize;
     (every <= MOST_KEY_INTERVAL && facts.frames >= 2 * every).then_some(every)
 }
@@ -230,9 +240,9 @@ fn slower(gaussians: f64) -> f64 {
     (FULL_RATE_GAUSSIANS / gaussians).sqrt().min(1.0)
 }
 
-fn stages(facts: &Facts, machine: Machine, minutes: f64, key_frames: Option<usize>) -> Choice {
+fn stages(facts: &Facts, machine: Machine, minutes: f64, most: f64, key_frames: Option<usize>) -> Choice {
     let shares = |shares: [f64; 3]| Value::Array(shares.map(Value::Float).to_vec());
-    let slower = if all_move(facts) { slower(most_gaussians(facts, machine, minutes)) } else { 1.0 };
+    let slower = if all_move(facts) { slower(most) } else { 1.0 };
     let (mut settings, reason) = match facts.arrangement {
         _ if stands_still(facts) => (vec![("train.shares", shares([1.0, 0.0, 4.0])), ("train.coarse_frames", "all".into())], "a static scene".to_string()),
         Arrangement::OneMovingCamera if !stands_alone(facts) => (
@@ -308,8 +318,7 @@ fn most_gaussians(facts: &Facts, machine: Machine, minutes: f64) -> f64 {
     (wanted.min(affordable).max(LEAST_GAUSSIANS) / 500.0).ceil() * 500.0
 }
 
-fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
-    let most = most_gaussians(facts, machine, minutes);
+fn counts(facts: &Facts, most: f64) -> Choice {
     let reason = format!("{:.0} % of the pixels show detail", 100.0 * facts.detail);
     // What is split while it learns to move has to learn it again: all at once are 0.1 to 0.4 dB better on mutant.
     let at_start = if all_move(facts) { most } else { AT_START * most };
@@ -317,10 +326,12 @@ fn counts(facts: &Facts, machine: Machine, minutes: f64) -> Choice {
 }
 
 fn background(facts: &Facts) -> Option<Choice> {
-    let (colour, reason) = match facts.plain {
-        Some(colour) => (colour, "the images have a plain background of this colour"),
-        None if stands_alone(facts) => ([1.0; 3], "the images are transparent"),
-        None => (facts.mean?, "where nothing is known of the surroundings, held-out views get the mean colour of the images"),
+    let (colour, reason) = match (facts.plain, facts.mean) {
+        (Some(colour), _) => (colour, "the images have a plain background of this colour"),
+        // The dataset states it.
+        (None, None) => return None,
+        (None, Some(_)) if stands_alone(facts) => ([1.0; 3], "the images are transparent"),
+        (None, Some(mean)) => (mean, "where nothing is known of the surroundings, held-out views get the mean colour of the images"),
     };
     Some(choice([("render.background", Value::Array(colour.map(|c| float(f64::from(c))).to_vec()))], reason))
 }

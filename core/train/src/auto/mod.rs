@@ -18,10 +18,11 @@ use crate::data;
 use crate::layers::Layers;
 use crate::train_config::LEAST_ITERATIONS;
 use calibrate::{Timing, calibrate};
-use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, auto_device, config};
+use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, auto_device, config, resolved_device};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Name of the preset.
@@ -109,9 +110,9 @@ impl Plan {
 /// Opens the scene at `path` and settles the configuration of `layers`. Where they ask for the preset `auto` and hold no plan yet, the plan is made here.
 ///
 /// # Errors
-/// What configuration, reader and images report.
-pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn EventSink) -> Result<(RunConfig, Arc<Scene>)> {
-    open_shared(path, layers, registry, events, 1)
+/// [`Error::Interrupted`] where `stop` is set while a plan is made, and what configuration, reader and images report.
+pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn EventSink, stop: &AtomicBool) -> Result<(RunConfig, Arc<Scene>)> {
+    open_shared(path, layers, registry, events, stop, 1)
 }
 
 /// As [`open`], where `processes` processes, this one included, share the memory of the machine. Each of several keeps images decoded in a third of an equal
@@ -119,17 +120,27 @@ pub fn open(path: &Path, layers: &Layers, registry: &Registry, events: &dyn Even
 ///
 /// # Errors
 /// As [`open`].
-pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &dyn EventSink, processes: usize) -> Result<(RunConfig, Arc<Scene>)> {
+pub fn open_shared(
+    path: &Path,
+    layers: &Layers,
+    registry: &Registry,
+    events: &dyn EventSink,
+    stop: &AtomicBool,
+    processes: usize,
+) -> Result<(RunConfig, Arc<Scene>)> {
     let asked = layers.config()?;
     let read = |config: &RunConfig| Ok::<_, Error>(Arc::new(data::open(path, &scene_options(config, processes), registry, &config.limits)?));
     if !layers.want_plan() {
         return Ok((asked.clone(), read(&asked)?));
     }
     let began = Instant::now();
-    let step = |done| events.emit(&Event::Progress { task: "look at the scene".into(), done, total: 3 });
-    step(0);
+    let step = |done| {
+        events.emit(&Event::Progress { task: "look at the scene".into(), done, total: 3 });
+        proceed(stop)
+    };
+    step(0)?;
     let mut plan = Plan::default();
-    let device = if layers.state("device") { asked.device.clone() } else { auto_device().0.to_string() };
+    let device = resolved_device(if layers.state("device") { &asked.device } else { "auto" }).to_string();
     plan.add(Choice { settings: vec![("device", device.clone().into())], reason: auto_device().1 })?;
     let graphics = !matches!(device.as_str(), "flex" | "ndarray");
     let machine = Machine { threads: rayon::current_num_threads(), graphics, memory: memory::memory(processes) };
@@ -139,12 +150,12 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
         plan.add(choice)?;
         scene = read(&layers.over(&plan.table).config()?)?;
     }
-    step(1);
+    step(1)?;
     let facts = Facts::of(&scene)?;
     if let Some(message) = facts.overlap.as_ref().and_then(Overlap::warning) {
         events.emit(&Event::Warning { object: scene.name.clone(), message });
     }
-    step(2);
+    step(2)?;
     let cache = memory::cache(scene.views.len(), facts.pixels(), asked.scene.cache_mb, machine.memory);
     if let Some(choice) = cache.filter(|_| !layers.state("scene.cache_mb")) {
         plan.add(choice)?;
@@ -153,14 +164,15 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
     let full_size = if graphics { Some(layers.at_full_size(registry, choose::dataset_like(&facts))?) } else { None };
     let layers = full_size.as_ref().unwrap_or(layers);
     let kind = asked.deformer.get("kind").and_then(|k| k.as_str());
-    let stated = kind.filter(|_| layers.state("deformer.kind"));
+    let most = asked.density.get("max_gaussians").and_then(|most| most.as_integer()).map(|most| most.max(1) as f64);
+    let stated = choose::Stated { deformer: kind.filter(|_| layers.state("deformer.kind")), gaussians: most.filter(|_| layers.state("density.max_gaussians")) };
     for choice in choose::choose(&facts, machine, minutes, stated) {
         plan.add(for_density_of(layers, &asked, choice, registry)?)?;
     }
     let mut ends = None;
     if !layers.state("train.iterations") {
         let patience = Duration::from_secs_f64(DECODING_SHARE * 60.0 * minutes);
-        let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &scene, registry, patience)?;
+        let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &scene, registry, patience, stop)?;
         let config = layers.over(&plan.table).config()?;
         let spent = began.elapsed().as_secs_f64() / 60.0;
         let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
@@ -172,7 +184,7 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
         let reason = "the iterations are stated, so none were timed: one view each";
         plan.add(Choice { settings: vec![("train.batch", 1.into())], reason: reason.into() })?;
     }
-    step(3);
+    step(3)?;
     let config = layers.over(&plan.table).config()?;
     if config.train.shares[1] > 0.0 {
         let score = config.train.iterations as f64 * config.train.shares[1] / config.train.shares.iter().sum::<f64>();
@@ -182,6 +194,8 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
     }
     let mut config = layers.over(&plan.table).config()?;
     config.auto.ends = ends;
+    // A stated `auto` becomes the device that it stands for here.
+    config.device = device;
     let [width, height] = facts.size;
     let seen = format!("{}: {} training images of {width}x{height} pixels, {} frames", facts.arrangement.describe(), facts.views, facts.frames);
     let noun = if matches!(facts.arrangement, Arrangement::OneMovingCamera | Arrangement::OneCameraAnywhere) { "positions" } else { "cameras" };
@@ -195,6 +209,11 @@ pub fn open_shared(path: &Path, layers: &Layers, registry: &Registry, events: &d
             .push(format!("{} iterations are few: more minutes or smaller images (--minutes, scene.width) give a better model", config.train.iterations));
     }
     Ok((config, scene))
+}
+
+/// An [`Error::Interrupted`] once `stop` is set.
+fn proceed(stop: &AtomicBool) -> Result<()> {
+    if stop.load(Ordering::Relaxed) { Err(Error::Interrupted("in planning; nothing was written".into())) } else { Ok(()) }
 }
 
 /// `choice` for the density control that `layers` state: its upper bound of Gaussians is the plan's too, where it has one.

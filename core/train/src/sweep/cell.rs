@@ -1,11 +1,11 @@
 //! Runs a cell: the trained model is stored by a codec, read back, and scored.
 
-use super::facts::{PeakMemory, device_facts, locate};
+use super::facts::{PeakMemory, device_facts};
 use super::folder::SweepFolder;
 use super::hash::name_of;
 use super::plan::{Plan, PlannedCell, PlannedTraining};
 use super::result::{Axes, Blocks, CellResult, Cost, FrameMs, ImageResult, KIND, ResultProvenance, SCHEMA, Score, Storage, StreamBytes};
-use super::training::{FinishedTraining, Worker, config_of};
+use super::training::{FinishedTraining, Worker, config_of, planned_dataset};
 use crate::auto::scene_options;
 use crate::code;
 use crate::config::RunConfig;
@@ -46,7 +46,7 @@ impl<'a> Trained<'a> {
         let device = parse_device(&config.device)?;
         let model = Model::open(&folder.training(&training.id), worker.registry, &device, &limits, worker.events)?;
         let trained = data::Trained { normalisation: model.normalisation, frames: config.scene.frames };
-        let scene = data::open_in(&locate(&training.data.path)?, &scene_options(&config, worker.processes), &trained, worker.registry, &limits)?;
+        let scene = data::open_in(&planned_dataset(training)?, &scene_options(&config, worker.processes), &trained, worker.registry, &limits)?;
         let scene = Arc::new(data::hold_out(&scene, config.train.validation)?);
         Ok(Self { training, finished, config, limits, device, model, scene })
     }

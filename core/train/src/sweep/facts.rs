@@ -2,7 +2,7 @@
 
 use super::hash::ContentHash;
 use super::result::{DataFingerprint, DeviceFacts, TrainingDevice};
-use cc4dgs_core::{Error, Registry, Result, adapters, auto_device};
+use cc4dgs_core::{Error, Registry, Result, adapters, resolved_device};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
@@ -135,7 +135,7 @@ fn content(path: &Path) -> Result<u64> {
 
 /// What the device `name` is on this machine.
 pub fn device_facts(name: &str) -> DeviceFacts {
-    let name = if name == "auto" { auto_device().0 } else { name };
+    let name = resolved_device(name);
     let index = name.strip_prefix("wgpu").map(|rest| rest.strip_prefix(':').and_then(|index| index.parse().ok()).unwrap_or(0));
     let (adapter, driver) = match index.and_then(|index: usize| adapters().get(index)) {
         Some(adapter) => (Some(format!("{} ({})", adapter.name, adapter.api)), Some(adapter.driver.clone())),

@@ -16,7 +16,7 @@ use cc4dgs_core::{Error, Event, EventSink, Limits, Registry, Result, config, tom
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 /// What a finished training leaves beside its checkpoint.
@@ -77,6 +77,19 @@ impl EventSink for Both<'_> {
     }
 }
 
+/// Where the dataset of `training` lies.
+///
+/// # Errors
+/// [`Error::Data`] where it changed since the plan was made.
+pub(super) fn planned_dataset(training: &PlannedTraining) -> Result<PathBuf> {
+    let path = locate(&training.data.path)?;
+    if listing(&path)? != training.listing {
+        let problem = "names or sizes of its files are not those of the plan";
+        return Err(Error::data(format!("scene {}", training.data.path), problem, "Restore the dataset, or make the plan again"));
+    }
+    Ok(path)
+}
+
 /// Trains, goes on with what an interrupted process left, or reads what a finished one left. The caller holds the lock.
 pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &PlannedTraining) -> Result<FinishedTraining> {
     let run = folder.training(&training.id);
@@ -84,11 +97,7 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     if record.is_file() {
         return read_finished(&record);
     }
-    let path = locate(&training.data.path)?;
-    if listing(&path)? != training.listing {
-        let problem = "names or sizes of its files are not those of the plan";
-        return Err(Error::data(format!("scene {}", training.data.path), problem, "Restore the dataset, or make the plan again"));
-    }
+    let path = planned_dataset(training)?;
     let memory = PeakMemory::begin();
     std::fs::create_dir_all(&run).map_err(|e| Error::io(&run, e))?;
     // Once the configuration is written, it decides: a plan of the preset `auto` is made once.
@@ -99,7 +108,7 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     let events = Both(&log, worker.events);
     let limits: Vec<String> = worker.limits.iter().map(|limit| format!("limits.{limit}")).collect();
     let layers = if begun { Layers::collect(worker.registry, None, Some(&own), &[])? } else { training.layers(worker.registry)? };
-    let (mut config, scene) = auto::open_shared(&path, &layers.with(&limits)?, worker.registry, &events, worker.processes)?;
+    let (mut config, scene) = auto::open_shared(&path, &layers.with(&limits)?, worker.registry, &events, worker.stop, worker.processes)?;
     // Results do not depend on the machine: what is written, and how many points a run begins with, has the limits of the grid.
     config.machine_limits = Some(std::mem::replace(&mut config.limits, layers.config()?.limits));
     if !begun && !layers.state("train.checkpoint_every") {

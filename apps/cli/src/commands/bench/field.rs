@@ -3,10 +3,9 @@
 use super::{Spread, timed};
 use crate::args::BenchField;
 use crate::commands::Context;
-use crate::models::resolved_device;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, SpatialInput, config, parse_device};
+use cc4dgs_core::{Deformer, DeformerContext, DeformerWork, Error, Result, Seed, SpatialInput, config, parse_device, resolved_device};
 use cc4dgs_deformers::cdf::{Cdf, CdfConfig, Formulas};
 use rand::Rng;
 use serde::Serialize;

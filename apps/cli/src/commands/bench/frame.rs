@@ -4,7 +4,6 @@ use super::{Playback, Spread, WARM_UP, scene_cases, time_playback};
 use crate::args::BenchFrame;
 use crate::commands::{Context, create_parent};
 use crate::interrupt;
-use crate::models::resolved_device;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings, presented};
 use cc4dgs_backends::bench::{SceneCase, Workload, growth, shrunk, synthetic_scene};
@@ -12,7 +11,9 @@ use cc4dgs_core::archive::{MAGIC, Provenance, write_atomically};
 use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::format::conformance::uniform;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Result, Seed, Similarity, SpatialInput, config, parse_device};
+use cc4dgs_core::{
+    Camera, Deformer, DeformerContext, Error, Event, EventSink, HostGaussians, Result, Seed, Similarity, SpatialInput, config, parse_device, resolved_device,
+};
 use cc4dgs_play::Moving;
 use cc4dgs_play::RenderConfig;
 use cc4dgs_play::model::{Model, ModelDeformer, ModelSize};

@@ -3,12 +3,11 @@
 use super::{Spread, timed};
 use crate::args::BenchLookup;
 use crate::commands::Context;
-use crate::models::resolved_device;
 use burn::tensor::{Int, Tensor, TensorData};
 use cc4dgs_backends::cpu::lookup::corners;
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, lookup as look_up};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Result, Seed, parse_device};
+use cc4dgs_core::{Result, Seed, parse_device, resolved_device};
 use rand::Rng;
 use serde::Serialize;
 use std::sync::Arc;

@@ -3,12 +3,11 @@
 use super::{Spread, timed};
 use crate::args::{BenchLoss, BenchSort};
 use crate::commands::Context;
-use crate::models::resolved_device;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::ops::photometric::photometric_loss;
 use cc4dgs_backends::ops::sort::sort_order;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Result, Seed, parse_device};
+use cc4dgs_core::{Result, Seed, parse_device, resolved_device};
 use rand::Rng;
 use serde::Serialize;
 

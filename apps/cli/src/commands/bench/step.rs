@@ -3,9 +3,8 @@
 use super::scene_cases;
 use crate::args::BenchStep;
 use crate::commands::Context;
-use crate::models::resolved_device;
 use cc4dgs_backends::bench::{OPERATIONS_PER_PAIR, STANDARD_CASES, StepTiming, Workload, synthetic_scene, time_step};
-use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device};
+use cc4dgs_core::{Event, EventSink, Result, Seed, parse_device, resolved_device};
 use serde::Serialize;
 
 #[derive(Serialize)]
