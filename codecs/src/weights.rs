@@ -105,7 +105,7 @@ impl WeightCodec for Precision {
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<Vec<WeightArray>> {
         let mut reader = StreamSet::new(self.name(), streams).reader(WEIGHTS)?;
         context.limits.check_bytes("deformer weights", reader.remaining() as u64)?;
-        let mut arrays = read_shapes(&mut reader)?;
+        let mut arrays = read_shapes(&mut reader, &context.limits)?;
         for array in &mut arrays {
             let fits = |n: &usize| self.bytes(*n).is_some_and(|bytes| bytes <= reader.remaining());
             let Some(length) = value_count(&array.shape).filter(fits) else {

@@ -2,7 +2,7 @@
 
 use crate::memory;
 use cc4dgs_format::archive::{Archive, MAGIC, Presentation, StreamKind};
-use cc4dgs_format::gaussians::sh_rest_len;
+use cc4dgs_format::gaussians::{sh_rest_len, unit_quaternion};
 use cc4dgs_format::playback::{Head, PlaybackLayer};
 use cc4dgs_format::{BLUR, BLUR_RANGE, Error, HostGaussians, Limits, Result, Rules, Silent, StoredModel, ply, spz};
 
@@ -163,14 +163,13 @@ impl Scene {
             tracks: Vec::new(),
         };
         for &i in &order {
-            let q = &gaussians.quaternions[4 * i..4 * i + 4];
-            let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
             // Without a direction there is no rotation: the Gaussian is culled.
-            let unit = |v: f32| if norm > 1e-15 { v / norm } else { 0.0 };
+            let q = [0, 1, 2, 3].map(|k| gaussians.quaternions[4 * i + k]);
+            let [w, x, y, z] = unit_quaternion(&q).unwrap_or([0.0; 4]);
             let opacity = 1.0 / (1.0 + (-gaussians.opacity_logits[i]).exp());
             let (m, s, d) = (&gaussians.means[3 * i..3 * i + 3], &gaussians.log_scales[3 * i..3 * i + 3], &gaussians.sh_dc[3 * i..3 * i + 3]);
             out.gaussians.extend([m[0], m[1], m[2], opacity, s[0], s[1], s[2], 0.0]);
-            out.gaussians.extend([unit(q[0]), unit(q[1]), unit(q[2]), unit(q[3]), d[0], d[1], d[2], 0.0]);
+            out.gaussians.extend([w, x, y, z, d[0], d[1], d[2], 0.0]);
         }
         if let Some(layer) = layer {
             out.reach = reach(&gaussians.means, out.reach, &layer);

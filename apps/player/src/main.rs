@@ -44,7 +44,7 @@ fn run() -> Result<()> {
 }
 
 fn open(path: &Path) -> Result<Opened> {
-    let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-    let content = Content::read(&path.display().to_string(), bytes, &Limits::default())?;
+    let limits = Limits::default();
+    let content = Content::read(&path.display().to_string(), limits.read_file(path)?, &limits)?;
     Ok(Opened { content, exact: Err("This program has no deformers. `cc4dgs view` has.".to_string()) })
 }

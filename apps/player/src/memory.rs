@@ -22,8 +22,8 @@ fn of_gaussians(count: u64, sh_degree: usize) -> u64 {
     count.saturating_mul(2 * floats + scene)
 }
 
-/// Bytes for an archive beside the file itself. Motion that is computed from weights is not counted: its evaluation has a limit of its
-/// own, and the weights have `limits.max_bytes`.
+/// Bytes for an archive beside the file itself. Motion that is computed from weights is not counted: its evaluation, weights included, has a limit of its
+/// own.
 fn of_archive(archive: &Archive) -> u64 {
     let (manifest, streams) = (archive.manifest(), archive.stream_sizes());
     let decoded = |kind: StreamKind| streams.iter().filter(|s| s.kind == kind).fold(0, |sum: u64, s| sum.saturating_add(s.decoded_bytes));

@@ -23,7 +23,7 @@ pub fn checksum(bytes: Vec<u8>) -> Result<u64> {
         add_all(&read_stage(object, &archive, stage, &limits, &Silent)?);
     }
     if let Some(deformer) = &archive.manifest().deformer {
-        read_weights(object, &archive, &deformer.weights, &limits, &Silent)?.iter().for_each(|array| add(&array.values));
+        read_weights(object, &archive, &deformer.weights, None, &limits, &Silent)?.iter().for_each(|array| add(&array.values));
     }
     Ok(hash.digest())
 }

@@ -119,13 +119,9 @@ impl WeightCodec for Weights {
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<Vec<WeightArray>> {
         let set = StreamSet::new("compact", streams);
         let (mut shapes, mut values): (ByteReader, ByteReader) = (set.reader(SHAPES)?, set.reader(VALUES)?);
-        let mut arrays = read_shapes(&mut shapes)?;
+        let mut arrays = read_shapes(&mut shapes, &context.limits)?;
         let forms = arrays.iter().map(|_| Form::read(&mut shapes)).collect::<Result<Vec<Form>>>()?;
-        // Equal values may take no bits at all, so bytes do not tell how many there can be.
-        let total = arrays.iter().try_fold(0usize, |sum, array| sum.checked_add(value_count(&array.shape)?));
-        let Some(total) = total else { return Err(shapes.error("the arrays do not fit into memory")) };
         shapes.finish()?;
-        context.limits.check_bytes("deformer weights", 4u64.saturating_mul(total as u64))?;
         let (object, length) = ("compact stream 'values'", values.u32()? as usize);
         let tables = Tables::read(object, contexts(arrays.len()), values.take(length)?)?;
         let mut coder = Decoder::new(object, &tables, values.rest())?;

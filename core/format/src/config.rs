@@ -17,26 +17,29 @@ fn read<T: DeserializeOwned>(section: toml::Table) -> std::result::Result<T, Str
     T::deserialize(toml::Value::Table(section)).map_err(|e| e.message().to_string())
 }
 
-/// Values of a section in which the key at fault is looked for: every key costs a copy. Sections that people write are smaller; stored ones may be hostile.
-const MOST_VALUES: usize = 4096;
+/// The largest size of a section in which the key at fault is looked for: every key costs a copy. Sections that people write are smaller; stored ones may be hostile.
+const MOST_SIZE: usize = 4096;
+/// Bytes of text that count as a value.
+const TEXT_OF_VALUE: usize = 16;
 
-/// The number of values of `table`, those of inner tables and lists included.
-fn values(table: &toml::Table) -> usize {
+/// The number of values of `table`, those of inner tables and lists included, and what its keys and texts count for.
+fn size(table: &toml::Table) -> usize {
     fn of(value: &toml::Value) -> usize {
         match value {
-            toml::Value::Table(table) => 1 + values(table),
+            toml::Value::Table(table) => 1 + size(table),
             toml::Value::Array(list) => 1 + list.iter().map(of).sum::<usize>(),
+            toml::Value::String(text) => 1 + text.len() / TEXT_OF_VALUE,
             _ => 1,
         }
     }
-    table.values().map(of).sum()
+    table.iter().map(|(key, value)| key.len() / TEXT_OF_VALUE + of(value)).sum()
 }
 
 /// The error of a section that fails with `message`. `fails` says why another section fails.
 fn at_fault(object: &str, section: &toml::Table, message: &str, fails: &dyn Fn(toml::Table) -> Option<String>) -> Error {
     // The key without which the section does not fail in this way.
     let mut path: Vec<&str> = Vec::new();
-    let mut inner = (values(section) <= MOST_VALUES).then_some(section);
+    let mut inner = (size(section) <= MOST_SIZE).then_some(section);
     while let Some(table) = inner {
         let key = table.keys().find(|key| {
             let mut without = section.clone();

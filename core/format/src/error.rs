@@ -139,6 +139,16 @@ impl Error {
             other => other,
         }
     }
+    /// The error where it was met in the file `object`, which errors of its streams do not name.
+    pub fn within(self, file: &str) -> Self {
+        let named = |object: String| if object.contains(file) { object } else { format!("{file}: {object}") };
+        match self {
+            Self::Data { object, problem, remedy } => Self::Data { object: named(object), problem, remedy },
+            Self::Limit { object, value, limit, remedy } => Self::Limit { object: named(object), value, limit, remedy },
+            Self::Unsupported { object, problem, remedy } => Self::Unsupported { object: named(object), problem, remedy },
+            other => other,
+        }
+    }
     /// A [`Error::Io`] about `path`.
     pub fn io(path: impl AsRef<Path>, source: std::io::Error) -> Self {
         Self::Io { path: path.as_ref().to_path_buf(), source }

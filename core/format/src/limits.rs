@@ -2,6 +2,7 @@
 
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 
 /// Upper bounds for readers of untrusted bytes. A reader checks a stated size against them before it allocates memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -30,6 +31,15 @@ impl Limits {
     /// [`Error::Limit`].
     pub fn check_bytes(&self, object: &str, bytes: u64) -> Result<()> {
         Self::check(object, bytes, self.max_bytes, "Raise limits.max_bytes if the file is trusted")
+    }
+    /// The bytes of the file at `path`, which may have [`Limits::max_bytes`]: of a larger one nothing is read.
+    ///
+    /// # Errors
+    /// [`Error::Limit`], [`Error::Io`].
+    pub fn read_file(&self, path: &Path) -> Result<Vec<u8>> {
+        let failed = |e| Error::io(path, e);
+        self.check_bytes(&path.display().to_string(), std::fs::metadata(path).map_err(failed)?.len())?;
+        std::fs::read(path).map_err(failed)
     }
     /// Refuses an `object` of more than [`Limits::max_gaussians`].
     ///

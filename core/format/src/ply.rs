@@ -27,11 +27,7 @@ pub fn read(path: impl AsRef<Path>, limits: &Limits) -> Result<HostGaussians> {
 /// Like [`read`], with what the header says of rendering, and remarks about ignored properties and missing dynamic scores.
 pub fn read_file(path: impl AsRef<Path>, limits: &Limits) -> Result<GaussianFile> {
     let path = path.as_ref();
-    let object = path.display().to_string();
-    let size = std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
-    limits.check_bytes(&object, size)?;
-    let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-    from_bytes(&object, &bytes, limits)
+    from_bytes(&path.display().to_string(), &limits.read_file(path)?, limits)
 }
 
 /// Like [`read_file`], for a file in memory; `object` names it in errors.

@@ -82,15 +82,39 @@ pub fn weight_seed(root: u64) -> Seed {
     Seed::root(root).child("weight-codec")
 }
 
-/// The weights of the deformer of `archive`, decoded by the weight codec `entry`, which must be linked; `object` names the archive in errors.
+/// What names and shapes of weights may take beside their values, in bytes.
+const NAMES_OF_WEIGHTS: u64 = 1 << 20;
+
+/// The weights of the deformer of `archive`, decoded by the weight codec `entry`, which must be linked; `object` names the archive in errors. Where it is known how many
+/// the deformer has by its settings, no memory is allocated for more.
 ///
 /// # Errors
 /// As [`read_gaussians`].
-pub fn read_weights(object: &str, archive: &Archive, entry: &CodecEntry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
+pub fn read_weights(
+    object: &str,
+    archive: &Archive,
+    entry: &CodecEntry,
+    count: Option<u64>,
+    limits: &Limits,
+    events: &dyn EventSink,
+) -> Result<Vec<WeightArray>> {
+    let most = count.map_or(u64::MAX, |count| count.saturating_mul(4).saturating_add(NAMES_OF_WEIGHTS));
+    let own = Limits { max_bytes: limits.max_bytes.min(most), ..*limits };
+    let stored = archive.stream_sizes().iter().filter(|s| s.kind == StreamKind::Field).fold(0u64, |sum, s| sum.saturating_add(s.decoded_bytes));
+    let checked = own.check_bytes("deformer weights", stored).and_then(|()| decode_weights(object, archive, entry, &own, events));
+    checked.map_err(|error| match error {
+        Error::Limit { value, .. } if value <= limits.max_bytes => {
+            contradiction(object, format!("the weights of its deformer have {value} bytes, and by its settings at most {most}"))
+        }
+        other => other,
+    })
+}
+
+fn decode_weights(object: &str, archive: &Archive, entry: &CodecEntry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<WeightArray>> {
     let codec = (linked::<WeightCodecPlugin>(object, entry)?.build)(&entry.settings).map_err(|e| e.of_file(object))?;
     let own = |s: Stream| Some(Stream { name: s.name.strip_prefix(FIELD_STREAMS)?.to_string(), bytes: s.bytes });
     let streams: Vec<Stream> = archive.read_kind(StreamKind::Field)?.into_iter().filter_map(own).collect();
-    codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events))
+    codec.decode(&streams, &CodecContext::new(weight_seed(archive.manifest().provenance.seed), *limits, events)).map_err(|e| e.within(object))
 }
 
 /// The linked plug-in that `object` names, of the version that it names.
@@ -100,11 +124,27 @@ fn linked<P: PluginEntry>(object: &str, entry: &CodecEntry) -> Result<&'static P
     linked.get(&entry.name)
 }
 
-/// The codec of `archive`, which must be linked, and the context of decoding with it.
+/// The codec of `archive`, which must be linked, and the context of decoding with it: no memory is allocated for more Gaussians than the manifest says.
 fn codec_of<'a>(object: &str, archive: &Archive, limits: &Limits, events: &'a dyn EventSink) -> Result<(Box<dyn AttributeCodec>, CodecContext<'a>)> {
     let (manifest, entry) = (archive.manifest(), &archive.manifest().codec);
     let codec = (linked::<CodecPlugin>(object, entry)?.build)(&entry.profile, &entry.settings).map_err(|e| e.of_file(object))?;
-    Ok((codec, CodecContext::new(Seed::root(manifest.provenance.seed).child("codec"), *limits, events)))
+    let own = Limits { max_gaussians: limits.max_gaussians.min(manifest.gaussian_count), ..*limits };
+    Ok((codec, CodecContext::new(Seed::root(manifest.provenance.seed).child("codec"), own, events)))
+}
+
+/// An error of decoding `archive`. Where the streams have more Gaussians than the manifest says, they contradict each other.
+fn of_decoding(error: Error, object: &str, archive: &Archive, limits: &Limits) -> Error {
+    let said = archive.manifest().gaussian_count;
+    match error {
+        Error::Limit { value, limit, .. } if limit == said && value > said && said < limits.max_gaussians => {
+            contradiction(object, format!("the manifest says {said} Gaussians, the streams hold {value}"))
+        }
+        other => other.within(object),
+    }
+}
+
+fn contradiction(object: &str, problem: String) -> Error {
+    Error::data(object, problem, "The archive is damaged; fetch it again")
 }
 
 /// The canonical Gaussians of `archive`, decoded by its codec, which must be linked; `object` names the archive in errors.
@@ -114,7 +154,7 @@ fn codec_of<'a>(object: &str, archive: &Archive, limits: &Limits, events: &'a dy
 /// [`Error::Limit`].
 pub fn read_gaussians(object: &str, archive: &Archive, limits: &Limits, events: &dyn EventSink) -> Result<HostGaussians> {
     let (codec, context) = codec_of(object, archive, limits, events)?;
-    let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context)?;
+    let gaussians = codec.decode(&archive.read_kind(StreamKind::Canonical)?, &context).map_err(|e| of_decoding(e, object, archive, limits))?;
     checked(object, archive, limits, gaussians, true)
 }
 
@@ -137,7 +177,8 @@ pub fn read_stage(object: &str, archive: &Archive, stage: StreamStage, limits: &
     }
     let (codec, context) = codec_of(object, archive, limits, events)?;
     let streams = archive.read_those(|info| info.kind == StreamKind::Canonical && codec.stage(&info.name) <= stage)?;
-    checked(object, archive, limits, codec.decode_stage(&streams, &context)?, stage >= StreamStage::BASE)
+    let gaussians = codec.decode_stage(&streams, &context).map_err(|e| of_decoding(e, object, archive, limits))?;
+    checked(object, archive, limits, gaussians, stage >= StreamStage::BASE)
 }
 
 /// `gaussians`, where they are what the manifest says, or the first of them.
@@ -149,7 +190,7 @@ fn checked(object: &str, archive: &Archive, limits: &Limits, gaussians: HostGaus
             "the manifest says {} Gaussians of degree {}, the streams hold {found} of degree {}",
             manifest.gaussian_count, manifest.sh_degree, gaussians.sh_degree
         );
-        return Err(Error::data(object, problem, "The archive is damaged; fetch it again"));
+        return Err(contradiction(object, problem));
     }
     Ok(gaussians)
 }

@@ -179,7 +179,7 @@ fn bad_files() -> Vec<(&'static str, Vec<u8>, &'static str)> {
                 let at = directory_at(h);
                 h[at..at + 4].copy_from_slice(&u32::MAX.to_le_bytes());
             }),
-            "expected",
+            "over the limit of 16384",
         ),
         ("stream_unknown_encoding.cc4d", with_entry(2, &[9]), "encoding 9"),
         ("stream_unknown_shuffle.cc4d", with_entry(1, &[3]), "shuffle 3"),

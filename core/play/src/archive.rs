@@ -65,7 +65,8 @@ impl Model {
                 let mut section = entry.settings.clone();
                 section.insert("kind".into(), entry.name.clone().into());
                 let mut field = registry.build_deformer(&section, &entry.context, device).map_err(|e| e.of_file(object))?;
-                let weights = read_weights(object, archive, &entry.weights, limits, events)?;
+                let count = field.parameters().iter().map(|p| p.shape.iter().product::<usize>() as u64).sum();
+                let weights = read_weights(object, archive, &entry.weights, Some(count), limits, events)?;
                 load_weights(object, field.as_mut(), weights, device)?;
                 Some(ModelDeformer { field, section, context: entry.context.clone() })
             }

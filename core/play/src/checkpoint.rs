@@ -102,9 +102,7 @@ impl CheckpointFile {
     /// # Errors
     /// [`Error::Unsupported`] for other formats, [`Error::Data`] for files that are damaged or no checkpoints, [`Error::Limit`] for files over `limits`.
     pub fn read(path: &Path, limits: &Limits) -> Result<Self> {
-        let object = path.display().to_string();
-        limits.check_bytes(&object, std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len())?;
-        Self::from_bytes(object, std::fs::read(path).map_err(|e| Error::io(path, e))?)
+        Self::from_bytes(path.display().to_string(), limits.read_file(path)?)
     }
     /// [`CheckpointFile::read`] of a file in memory; `object` names it in errors.
     pub fn from_bytes(object: String, bytes: Vec<u8>) -> Result<Self> {

@@ -104,10 +104,8 @@ impl Model {
                 Ok(Self::from_static(found, file_bytes(&file)?))
             }
             SourceKind::Spz => {
-                let (object, bytes) = (file.display().to_string(), file_bytes(&file)?);
-                limits.check_bytes(&object, bytes)?;
-                let content = std::fs::read(&file).map_err(|e| Error::io(&file, e))?;
-                Ok(Self::from_static(spz::from_spz(&object, &content, limits)?, bytes))
+                let content = limits.read_file(&file)?;
+                Ok(Self::from_static(spz::from_spz(&file.display().to_string(), &content, limits)?, content.len() as u64))
             }
         }
     }

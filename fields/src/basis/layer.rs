@@ -7,7 +7,7 @@ use crate::networks::weights_of_chain;
 use crate::settings::RATE_KEYS;
 use cc4dgs_format::playback::Head as LayerHead;
 use cc4dgs_format::playback::{ComputedMotion, MAX_FUNCTIONS, MAX_SAMPLES, MotionPlugin, MotionSource, Track, frame_time};
-use cc4dgs_format::{HostGaussians, Plugin, Result, inventory};
+use cc4dgs_format::{DeformerContext, HostGaussians, Plugin, Result, inventory, toml};
 use rayon::prelude::*;
 
 /// Memory at most, in floats: 256 MB.
@@ -45,11 +45,20 @@ pub(crate) fn stored(source: &MotionSource) -> Result<Option<ComputedMotion>> {
     motion(SpaceKind::Stored, source)
 }
 
-fn motion(kind: SpaceKind, source: &MotionSource) -> Result<Option<ComputedMotion>> {
-    let mut section = source.settings.clone();
+/// The plan of a deformer. Settings that are unknown here may be those of a layer around it. Baking builds both, and says what is wrong if anything is.
+fn plan_of(kind: SpaceKind, settings: &toml::Table, context: &DeformerContext) -> Option<BasisPlan> {
+    let mut section = settings.clone();
     RATE_KEYS.iter().for_each(|key| _ = section.remove(*key));
-    // Settings that are unknown here may be those of a layer around the deformer. Baking builds both, and says what is wrong if anything is.
-    let Ok(plan) = BasisPlan::new(kind, &section, source.context) else { return Ok(None) };
+    BasisPlan::new(kind, &section, context).ok()
+}
+
+fn weights(kind: SpaceKind, settings: &toml::Table, context: &DeformerContext) -> Option<u64> {
+    let count = plan_of(kind, settings, context)?.parameter_count().ok()? as u64;
+    (count <= MOST_FLOATS).then_some(count)
+}
+
+fn motion(kind: SpaceKind, source: &MotionSource) -> Result<Option<ComputedMotion>> {
+    let Some(plan) = plan_of(kind, source.settings, source.context) else { return Ok(None) };
     let heads: Option<Vec<LayerHead>> = plan.settings.heads.iter().map(|&head| layer_head(head, plan.settings.rotation)).collect();
     let (Some(heads), m) = (heads, source.gaussians.len()) else { return Ok(None) };
     let per_gaussian: usize = plan.groups.iter().map(|(values, own)| values * own).sum();
@@ -137,6 +146,7 @@ inventory::submit! {
             schema: "",
             capabilities: &[],
         },
+        weights: |settings, context| weights(SpaceKind::Computed, settings, context),
         motion: computed,
     }
 }
@@ -151,6 +161,7 @@ inventory::submit! {
             schema: "",
             capabilities: &[],
         },
+        weights: |settings, context| weights(SpaceKind::Stored, settings, context),
         motion: stored,
     }
 }

@@ -174,9 +174,21 @@ impl BasisPlan {
         let groups: Vec<(usize, usize)> = settings.heads.iter().zip(&kept).map(|(h, own)| (settings.width_of(*h, context.sh_degree), own.len())).collect();
         let outputs = groups.iter().map(|(values, own)| [vec![width; settings.head_layers], vec![values * own]].concat()).collect();
         let coefficients = Arc::new(ReluShape { input: space.width()?, trunk: vec![width; layers], heads: outputs });
-        let of_functions = functions.network.as_ref().map_or(0, |n| n.parameter_count());
-        bounded([space.parameter_count()?, coefficients.parameter_count(), of_functions])?;
-        Ok(Self { settings, space, functions, kept, groups, coefficients })
+        let plan = Self { settings, space, functions, kept, groups, coefficients };
+        bounded(plan.parameter_counts()?)?;
+        Ok(plan)
+    }
+    /// Weights of the features of space, of the coefficients, and of the functions of time.
+    fn parameter_counts(&self) -> Result<[usize; 3]> {
+        let of_functions = self.functions.network.as_ref().map_or(0, |network| network.parameter_count());
+        Ok([self.space.parameter_count()?, self.coefficients.parameter_count(), of_functions])
+    }
+    /// Weights of the whole field.
+    ///
+    /// # Errors
+    /// As [`BasisPlan::new`].
+    pub fn parameter_count(&self) -> Result<usize> {
+        Ok(self.parameter_counts()?.into_iter().fold(0, usize::saturating_add))
     }
     /// Width of the coefficient network.
     pub fn width(&self) -> usize {

@@ -24,7 +24,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub struct ExportRequest {
     /// The instant (0..1) that formats without motion hold; `None` is the canonical model. Formats with motion refuse one.
     pub time_norm: Option<f32>,
-    /// Frames of formats that hold several; as many as the model was trained with where absent. Frame k of n is at time k / n.
+    /// Frames of formats that hold several; as many as the model was trained with where absent. Frame k of n is at time k / (n - 1).
     pub frames: Option<usize>,
     /// Frames per second of videos.
     pub frames_per_second: f64,

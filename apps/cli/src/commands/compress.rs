@@ -126,7 +126,7 @@ pub fn compress(context: &Context, model: &Model, options: &ArchiveOptions, out:
     read_gaussians(&object, &archive, &context.limits, events)?;
     let decode_seconds = began.elapsed().as_secs_f64();
     if let Some(deformer) = &archive.manifest().deformer {
-        read_weights(&object, &archive, &deformer.weights, &context.limits, events)?;
+        read_weights(&object, &archive, &deformer.weights, None, &context.limits, events)?;
     }
     write_atomically(out, &file)?;
     events.emit(&Event::Saved { path: object, bytes });

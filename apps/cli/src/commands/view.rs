@@ -69,7 +69,7 @@ fn content(path: &Path, options: &Options, registry: &Registry, events: &dyn Eve
 }
 
 fn read(file: &Path, limits: &Limits) -> Result<Content> {
-    Content::read(&file.display().to_string(), std::fs::read(file).map_err(|e| Error::io(file, e))?, limits)
+    Content::read(&file.display().to_string(), limits.read_file(file)?, limits)
 }
 
 /// Opens the window until it is closed.

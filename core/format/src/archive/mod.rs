@@ -40,6 +40,8 @@ const PREFIX_BYTES: usize = 24;
 
 /// Most bytes of a header, decoded: hundreds of times those of a manifest and a directory.
 const LARGEST_HEADER: u32 = 16 << 20;
+/// Most streams of an archive.
+const MOST_STREAMS: u32 = 1 << 14;
 
 /// Purpose of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,7 +1,7 @@
 //! Reading of an archive: manifest and directory once, then any stream separately.
 
 use super::packing::{Encoding, unpack};
-use super::{ByteReader, FORMAT_VERSION, LARGEST_HEADER, MAGIC, Manifest, PREFIX_BYTES, StreamKind};
+use super::{ByteReader, FORMAT_VERSION, LARGEST_HEADER, MAGIC, MOST_STREAMS, Manifest, PREFIX_BYTES, StreamKind};
 use crate::{Error, Limits, Result, Stream, unknown_name};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
@@ -203,6 +203,9 @@ impl Archive {
 /// The directory; stored lengths must fill the file from `start` to `total` exactly.
 fn read_directory(reader: &mut ByteReader, start: u64, total: u64) -> Result<Vec<Entry>> {
     let count = reader.u32()?;
+    if count > MOST_STREAMS {
+        return Err(reader.error(format!("{count} streams, over the limit of {MOST_STREAMS}")));
+    }
     // Grown entry by entry, because the stated count is untrusted.
     let mut entries = Vec::new();
     let (mut offset, mut names) = (start, BTreeSet::new());

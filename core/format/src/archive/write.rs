@@ -2,7 +2,7 @@
 
 use super::packing::pack;
 use super::zstandard::compress;
-use super::{FORMAT_VERSION, LARGEST_HEADER, MAGIC, Manifest, StreamKind};
+use super::{FORMAT_VERSION, LARGEST_HEADER, MAGIC, MOST_STREAMS, Manifest, StreamKind};
 use crate::{Error, Result, Stream};
 use rayon::prelude::*;
 use std::path::Path;
@@ -39,6 +39,9 @@ impl ArchiveWriter {
         }
         if let Some(name) = names.iter().find(|n| n.is_empty() || n.len() > 255 || n.chars().any(char::is_control)) {
             return Err(refuse(name, "the name is empty, over 255 bytes or not printable"));
+        }
+        if names.len() > MOST_STREAMS as usize {
+            return Err(Error::limit("streams of an archive", names.len() as u64, u64::from(MOST_STREAMS), "Store several columns in one stream"));
         }
         let packed = self.streams.par_iter().map(|(_, s)| pack(&s.bytes)).collect::<Result<Vec<_>>>()?;
         let manifest = self.manifest.to_json()?;

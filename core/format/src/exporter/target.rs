@@ -42,8 +42,10 @@ pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn Ex
         std::fs::rename(path, &old).map_err(|e| Error::io(path, e))?;
     }
     if let Err(e) = std::fs::rename(&part, path) {
-        if replaced {
-            std::fs::rename(&old, path).ok();
+        if replaced && std::fs::rename(&old, path).is_err() {
+            let kept = beside.keep().join(".replaced");
+            let problem = format!("it could not be replaced: {e}; the old folder is {}", kept.display());
+            return Err(Error::data(path.display().to_string(), problem, "Move the old folder back, and free the name before the next export"));
         }
         return Err(Error::io(path, e));
     }

@@ -50,6 +50,8 @@ impl MotionSource<'_> {
 pub struct MotionPlugin {
     /// Name, version and other facts.
     pub info: Plugin,
+    /// How many weights a deformer with these settings, without `kind`, has; `None` where [`MotionPlugin::motion`] gives none for them, or there are too many.
+    pub weights: fn(&toml::Table, &DeformerContext) -> Option<u64>,
     /// The motion; `None` where it is not linear with these settings, some of them belong to something else, such as a layer around the deformer, or a player
     /// would need too many coefficients, samples, memory or multiplications. Such models are baked.
     pub motion: fn(&MotionSource) -> Result<Option<ComputedMotion>>,
@@ -89,7 +91,7 @@ impl PlaybackLayer {
         if streams.is_empty() {
             return Self::computed(object, archive, gaussians, moving, limits);
         }
-        Self::decode(&streams, gaussians.len(), gaussians.sh_degree, limits).map(Some)
+        Self::decode(&streams, gaussians.len(), gaussians.sh_degree, limits).map(Some).map_err(|e| e.within(object))
     }
     /// The motion of an archive without a layer, from its deformer's weights; `None` where nothing moves, or no [`MotionPlugin`] for this deformer is linked.
     ///
@@ -106,7 +108,9 @@ impl PlaybackLayer {
             let problem = format!("its deformer is of degree {}, its Gaussians of degree {}", deformer.context.sh_degree, gaussians.sh_degree);
             return Err(Error::data(object, problem, "The archive is damaged; fetch it again"));
         }
-        let weights = read_weights(object, archive, &deformer.weights, limits, &Silent)?;
+        // What settings say is known before any weight is decoded.
+        let Some(count) = (plugin.weights)(&deformer.settings, &deformer.context) else { return Ok(None) };
+        let weights = read_weights(object, archive, &deformer.weights, Some(count), limits, &Silent)?;
         let least_samples = manifest.frame_count.saturating_sub(1).saturating_mul(SAMPLES_PER_FRAME).saturating_add(1).clamp(LEAST_SAMPLES, MAX_SAMPLES);
         let moved = gaussians.select(&rows);
         let source = MotionSource {

@@ -4,6 +4,7 @@ use super::extra::{self, Attributes, extra_streams};
 use crate::archive::ByteReader;
 use crate::gaussians::sh_rest_len;
 use crate::{Error, HostGaussians, Limits, Result, Stream, StreamStage};
+use std::collections::BTreeMap;
 
 /// The stream that describes the others.
 pub const META: &str = "meta";
@@ -23,25 +24,25 @@ pub fn stage_of_column(name: &str) -> StreamStage {
 /// The streams of a decoder, by name.
 pub struct StreamSet<'a> {
     codec: &'static str,
-    streams: &'a [Stream],
+    streams: BTreeMap<&'a str, &'a [u8]>,
 }
 
 impl<'a> StreamSet<'a> {
     /// The streams of a decoder; `codec` is the name in errors.
     pub fn new(codec: &'static str, streams: &'a [Stream]) -> Self {
-        Self { codec, streams }
+        Self { codec, streams: streams.iter().map(|stream| (stream.name.as_str(), stream.bytes.as_slice())).collect() }
     }
     /// Whether there is a stream `name`.
     pub fn has(&self, name: &str) -> bool {
-        self.streams.iter().any(|s| s.name == name)
+        self.streams.contains_key(name)
     }
     /// A reader over the stream `name`.
     ///
     /// # Errors
     /// [`Error::Data`] if there is no such stream.
     pub fn reader(&self, name: &str) -> Result<ByteReader<'a>> {
-        match self.streams.iter().find(|s| s.name == name) {
-            Some(stream) => Ok(ByteReader::new(format!("{} stream '{name}'", self.codec), &stream.bytes)),
+        match self.streams.get(name) {
+            Some(bytes) => Ok(ByteReader::new(format!("{} stream '{name}'", self.codec), bytes)),
             None => Err(Error::data(format!("{} stream '{name}'", self.codec), "it is missing", "The file is damaged or another codec wrote it")),
         }
     }
