@@ -4,6 +4,7 @@
 
 use crate::knn::nearest;
 use burn::tensor::{Device, Int, Tensor, TensorData};
+use cc4dgs_core::ordered_sum;
 use std::sync::Arc;
 
 /// Neighbours further apart than this multiple of the median distance say nothing of each other.
@@ -129,12 +130,12 @@ impl Neighbours {
         let squares = stretch.clone() * stretch.clone();
         let bound = squares.clone().add_scalar(1.0);
         // Each pair is in two lists.
-        let value = (squares / bound.clone() * weights.clone()).sum().mul_scalar(0.5);
+        let value = ordered_sum(squares / bound.clone() * weights.clone()).mul_scalar(0.5);
         // In its own list a Gaussian has its whole gradient.
         let slope = stretch / (bound.clone() * bound * length) * slopes.clone();
         let gradient = (apart * slope).sum_dim(1).reshape([count, 3]);
         // What has this gradient, and then this value.
-        let linear = (offsets * Tensor::from_inner(gradient)).sum();
+        let linear = ordered_sum(offsets * Tensor::from_inner(gradient));
         let missing = value - linear.clone().inner();
         Some(linear + Tensor::from_inner(missing))
     }
