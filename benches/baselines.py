@@ -4,11 +4,11 @@
     python3 benches/baselines.py OUT --bin BIN --scene DATA/dnerf_mutant [--minutes 60] [--only hexplane,...] [--jobs 1] [--threads N]
 
 Trains `dnerf+METHOD` (published iterations, sizes and rates; 800x800) and interrupts it after --minutes of training. What it has learned until then is evaluated once
-on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Images are on black where the method is published
-on it, else on white. Results are in OUT/rows.json, one row per method: iterations
+on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Presets have
+the background that a method is published on. Results are in OUT/rows.json, one row per method: iterations
 reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. With --jobs 2 --threads 1 two methods share the machine.
 
-Called again, it resumes what was cut off and leaves out what is done with the same scene, minutes, jobs, threads, background and program (its SHA-256); runs have folders of
+Called again, it resumes what was cut off and leaves out what is done with the same scene, minutes, jobs, threads and program (its SHA-256); runs have folders of
 their own for each of these, OUT/METHOD-HASH. Ctrl-C asks what runs to write its checkpoint and end (exit code 130). A training that fails, or cannot be evaluated,
 has no row, and makes the exit code 1.
 """
@@ -26,9 +26,6 @@ from concurrent.futures import ThreadPoolExecutor
 from trainings import TRAINED, Rows, begin, ended, interrupt, sha256
 
 METHODS = ["hexplane", "native-4d", "swift4d", "embedding", "grid4d", "deform-mlp"]
-# What is behind the transparent images in the published runs of a method, where it is not the white of the preset.
-BLACK = "render.background=[0.0,0.0,0.0]"
-BACKGROUNDS = dict.fromkeys(["native-4d", "grid4d", "deform-mlp"], BLACK)
 
 
 def events(out):
@@ -70,7 +67,6 @@ def row(options, stated):
         arguments += ["--resume"]
     else:
         arguments += ["--overwrite", "--preset", f"dnerf+{method}", "--set", "scene.width=800", "--set", "train.checkpoint_every=500"]
-        arguments += ["--set", BACKGROUNDS[method]] if method in BACKGROUNDS else []
     if options.threads:
         arguments += ["--threads", str(options.threads)]
     left = 60 * options.minutes - trained(out) if resumed else 60 * options.minutes
@@ -93,10 +89,11 @@ def row(options, stated):
             curve.append([round(seconds), event["stage"], event["iteration"], round(event["psnr_db"], 2)])
     found = json.loads(report.read_text()) if scored else {}
     config = out / "config.toml"
-    published = tomllib.loads(config.read_text())["train"]["iterations"] if config.exists() else None
+    settings = tomllib.loads(config.read_text()) if config.exists() else {}
+    published = settings.get("train", {}).get("iterations")
     keys = ["psnr_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "psnr_worst_block_db"]
     return {**stated, "exit": code, "resumed": resumed, "seconds": round(trained(out), 1), "iterations": done, "published_iterations": published,
-            **{key: found.get(key) for key in keys}, "training_views": curve}
+            "background": settings.get("render", {}).get("background"), **{key: found.get(key) for key in keys}, "training_views": curve}
 
 
 def main():
@@ -115,7 +112,7 @@ def main():
     def one(method):
         """Whether the method has a score."""
         stated = {"method": method, "path": str(options.scene), "minutes": options.minutes, "threads": options.threads, "jobs": options.jobs}
-        stated |= {"background": "black" if method in BACKGROUNDS else "white", "binary_sha256": sha256(options.bin)}
+        stated |= {"binary_sha256": sha256(options.bin)}
         if rows.find(stated):
             return True
         began = time.time()

@@ -12,7 +12,8 @@ pub enum PresetRole {
         /// Whether its sizes are for two cores, so that a method's `cpu` table applies too.
         small: bool,
     },
-    /// Changes to a family by a method. The layer has a table `all` for all families, one per dataset that differs, and one for `cpu` sizes.
+    /// Changes to a family by a method. The layer has a table `all` for all families, one per dataset that differs, and one for `cpu` sizes. Tables of the same names
+    /// in `published` say how the method is published, beside its sizes: families that plan for themselves leave them out.
     Method,
 }
 
@@ -68,20 +69,21 @@ impl Registry {
                 return Err(unknown_name("preset method", method, self.preset_names(|role| role == PresetRole::Method)));
             };
             let layers = plugin.layer()?;
-            for layer in ["all", dataset, "cpu"] {
-                if layer == "cpu" && !small {
-                    continue;
+            let table = |layers: &toml::Table, name: &str| match layers.get(name) {
+                Some(toml::Value::Table(table)) => Ok(table.clone()),
+                Some(_) => {
+                    let problem = format!("{name} is not a table");
+                    Err(Error::parameter(format!("preset method {method}"), problem, "Write the settings under a table header"))
                 }
-                match layers.get(layer) {
-                    Some(toml::Value::Table(over)) => config::merge(&mut settings, over),
-                    Some(_) => {
-                        return Err(Error::parameter(
-                            format!("preset method {method}"),
-                            format!("{layer} is not a table"),
-                            "Write the settings under a table header",
-                        ));
-                    }
-                    None => {}
+                None => Ok(toml::Table::new()),
+            };
+            for name in ["all", dataset].into_iter().chain(small.then_some("cpu")) {
+                config::merge(&mut settings, &table(&layers, name)?);
+            }
+            if !small && full_size.is_none() {
+                let published = table(&layers, "published")?;
+                for name in ["all", dataset] {
+                    config::merge(&mut settings, &table(&published, name)?);
                 }
             }
         }

@@ -3,7 +3,7 @@
 use crate::config::GaussianRates;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::CORE_ATTRIBUTES;
-use cc4dgs_core::{AttributeSpec, Error, Gaussians, HostGaussians, Result, Seed};
+use cc4dgs_core::{AttributeSpec, Error, Gaussians, HostGaussians, Result, Schedule, Seed, Stage};
 
 /// All Gaussians under optimisation; plain tensors, never tracked.
 #[derive(Clone, Debug)]
@@ -119,10 +119,13 @@ impl Leaves {
     }
 }
 
-/// The learning rate of a core attribute at `progress` in 0..1 of its stage; positions move with the camera `extent`.
-pub fn gaussian_rate(rates: &GaussianRates, name: &str, progress: f64, extent: f64) -> f64 {
+/// The learning rate of a core attribute at `schedule`; positions move with the extent of the cameras.
+pub fn gaussian_rate(rates: &GaussianRates, name: &str, schedule: &Schedule) -> f64 {
     match name {
-        "means" => log_linear(rates.means, rates.means_end, progress) * extent,
+        "means" => {
+            let way = if schedule.stage == Stage::Coarse { rates.coarse_decay } else { 1.0 };
+            log_linear(rates.means, rates.means_end, way * schedule.progress()) * f64::from(schedule.extent)
+        }
         "log_scales" => rates.log_scales,
         "quaternions" => rates.quaternions,
         "opacity_logits" => rates.opacity,

@@ -156,6 +156,8 @@ pub struct GaussianRates {
     pub means: f64,
     /// Positions at the last iteration of a stage, times the camera extent.
     pub means_end: f64,
+    /// Share of the way from the first rate of positions to the last one that the coarse stage goes: 1 is all of it, 0.25 that of the published 5,000 of 20,000 iterations.
+    pub coarse_decay: f64,
     /// Log-scales.
     pub log_scales: f64,
     /// Quaternions.
@@ -179,6 +181,7 @@ impl Default for GaussianRates {
             cooldown: 0.0,
             means: 1.6e-4,
             means_end: 1.6e-6,
+            coarse_decay: 1.0,
             log_scales: 5e-3,
             quaternions: 1e-3,
             opacity: 0.05,
@@ -187,6 +190,24 @@ impl Default for GaussianRates {
             score: 0.05,
             extra: 2.5e-3,
         }
+    }
+}
+
+impl GaussianRates {
+    /// The rates with their keys.
+    fn rates(&self) -> [(&'static str, f64); 9] {
+        let Self { means, means_end, log_scales, quaternions, opacity, sh_dc, sh_rest, score, extra, coarse_decay: _, batch_power: _, cooldown: _ } = *self;
+        [
+            ("means", means),
+            ("means_end", means_end),
+            ("log_scales", log_scales),
+            ("quaternions", quaternions),
+            ("opacity", opacity),
+            ("sh_dc", sh_dc),
+            ("sh_rest", sh_rest),
+            ("score", score),
+            ("extra", extra),
+        ]
     }
 }
 
@@ -231,6 +252,14 @@ impl TrainConfig {
         if !(0.0..=1.0).contains(&t.time_ramp) {
             return bad("time_ramp", format!("{} is not in 0..1", t.time_ramp), "It is a share of the main stage");
         }
+        if let Some((key, rate)) = t.lr.rates().into_iter().find(|(_, rate)| !(*rate >= 0.0 && rate.is_finite())) {
+            return bad(&format!("lr.{key}"), rate.to_string(), "Give a learning rate of 0 or more");
+        }
+        for (key, value) in [("mask_threshold", t.mask_threshold), ("flicker_threshold", t.flicker_threshold), ("zeta", t.zeta)] {
+            if !(value >= 0.0 && value.is_finite()) {
+                return bad(key, value.to_string(), "Give a finite number of 0 or more");
+            }
+        }
         if !(0.0..=1.0).contains(&t.lr.batch_power) {
             return bad(
                 "lr.batch_power",
@@ -240,6 +269,9 @@ impl TrainConfig {
         }
         if !(0.0..=1.0).contains(&t.lr.cooldown) {
             return bad("lr.cooldown", format!("{} is not in 0..1", t.lr.cooldown), "It is a share of the main stage; 0.1 is usual");
+        }
+        if !(0.0..=1.0).contains(&t.lr.coarse_decay) {
+            return bad("lr.coarse_decay", format!("{} is not in 0..1", t.lr.coarse_decay), "It is a share of the way from lr.means to lr.means_end");
         }
         if !(0.0..=1.0).contains(&t.image_growth) {
             return bad("image_growth", format!("{} is not in 0..1", t.image_growth), "It is a share of the coarse and main stage");

@@ -191,8 +191,7 @@ impl Context<'_> {
             state.deformer.iter().flat_map(|d| d.field.attributes()).map(|a| (a.name, if a.times_extent { a.lr * extent } else { a.lr })).collect();
         let scale = train.rate_scale(schedule);
         let rates = state.rates.clone();
-        let rate =
-            |name: &str| rates.of_gaussians(name) * scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, progress, extent));
+        let rate = |name: &str| rates.of_gaussians(name) * scale * of_plugin.get(name).copied().unwrap_or_else(|| gaussian_rate(&train.lr, name, schedule));
         match state.rounded.take() {
             Some(mut rounded) => {
                 rounded.step_gaussians(state, of_gaussians, visible.as_ref())?;

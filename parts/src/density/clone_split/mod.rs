@@ -23,6 +23,7 @@ max_scale_share = 0.0    # larger Gaussians are removed, as a share of the exten
 min_weight = 0.02        # a weight pruning removes Gaussians whose largest blending weight is below this
 weight_every = 3000      # reference iterations between two weight prunings; 0 is off
 reset_every = 3000       # reference iterations between two opacity resets of the coarse stage; 0 is off
+reset_in_main = false    # reset opacities in the main stage, too, until the last round
 max_gaussians = 400000   # at this count or more, no Gaussians are added
 ";
 
@@ -51,6 +52,7 @@ struct Settings {
     min_weight: f32,
     weight_every: usize,
     reset_every: usize,
+    reset_in_main: bool,
     max_gaussians: usize,
 }
 
@@ -68,6 +70,7 @@ impl Default for Settings {
             min_weight: 0.02,
             weight_every: 3000,
             reset_every: 3000,
+            reset_in_main: false,
             max_gaussians: 400_000,
         }
     }
@@ -85,11 +88,11 @@ impl Settings {
     fn due(&self, schedule: &Schedule) -> Due {
         let (iteration, end) = (schedule.iteration, self.end(schedule));
         let reset_interval = schedule.at(self.reset_every).max(1);
-        let coarse = schedule.stage == Stage::Coarse;
+        let resets = schedule.stage == Stage::Coarse || (self.reset_in_main && iteration < end);
         Due {
             grow: iteration > schedule.at(self.from) && iteration < end && iteration.is_multiple_of(schedule.interval(self.every, MIN_INTERVAL)),
             prune_weight: self.weight_every > 0 && iteration < end && iteration.is_multiple_of(self.weight_interval(schedule)),
-            reset: coarse && self.reset_every > 0 && iteration.is_multiple_of(reset_interval) && schedule.left() >= MIN_RECOVERY,
+            reset: resets && self.reset_every > 0 && iteration.is_multiple_of(reset_interval) && schedule.left() >= MIN_RECOVERY,
             held: 0,
         }
     }
