@@ -47,12 +47,16 @@ pub(crate) fn over_time(scene: &Scene, views: &[usize], threshold: f32, sigma: f
     let camera = scene.camera(views[0]);
     let (w, h) = (camera.width as usize, camera.height as usize);
     let (mut sum, mut squares) = (vec![0.0f64; 3 * w * h], vec![0.0f64; 3 * w * h]);
-    for &view in views {
-        let planes = scene.frame(view)?.to_planes(background);
-        sum.par_iter_mut().zip(squares.par_iter_mut()).zip(planes.par_iter()).for_each(|((s, q), &v)| {
-            *s += f64::from(v);
-            *q += f64::from(v) * f64::from(v);
-        });
+    // Images are decoded in parallel, and added in their order.
+    for views in views.chunks(rayon::current_num_threads()) {
+        let images = views.par_iter().map(|&view| scene.frame(view)).collect::<Result<Vec<_>>>()?;
+        for image in images {
+            let planes = image.to_planes(background);
+            sum.par_iter_mut().zip(squares.par_iter_mut()).zip(planes.par_iter()).for_each(|((s, q), &v)| {
+                *s += f64::from(v);
+                *q += f64::from(v) * f64::from(v);
+            });
+        }
     }
     let n = views.len() as f64;
     let deviation: Vec<f32> = (0..w * h)

@@ -47,7 +47,7 @@ pub struct ReaderPlugin {
     pub info: Plugin,
     /// Description of what [`ReaderPlugin::probe`] looks for: `transforms.json (nerfstudio)`.
     pub looks_for: &'static str,
-    /// Readers are probed in ascending order, equal ones by name. More specific formats get lower numbers; built-in readers use multiples of 100 up to 700.
+    /// Readers are probed in ascending order, equal ones by name. More specific formats get lower numbers; built-in readers use multiples of 100 up to 600.
     pub order: u32,
     /// Whether a path looks like this format. It reads directory entries and at most the beginning of a file, and never fails.
     pub probe: fn(&Path) -> bool,

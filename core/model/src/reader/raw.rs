@@ -144,6 +144,9 @@ pub struct RawScene {
 /// How the warning of [`RawScene::rank_times`] about times that are all equal begins.
 pub const SAME_TIME: &str = "all images state the same time";
 
+/// Difference up to which times are one instant, as a share of the whole time.
+const SAME_INSTANT: f64 = 1e-6;
+
 impl RawScene {
     /// Sets frame and time of each view from the dataset's times, one per view: the frame is the rank among the distinct times; if times exceed 1,
     /// all are divided by the largest. `object` names the file in errors.
@@ -163,10 +166,12 @@ impl RawScene {
         let largest = times.iter().flatten().fold(1.0f64, |a, &t| a.max(t));
         let mut distinct: Vec<f64> = times.iter().map(|t| t.unwrap_or(0.0)).collect();
         distinct.sort_by(f64::total_cmp);
-        distinct.dedup();
+        // Times that differ by rounding are one.
+        let near = SAME_INSTANT * (distinct.last().copied().unwrap_or(0.0) - distinct.first().copied().unwrap_or(0.0));
+        distinct.dedup_by(|later, kept| *later - *kept <= near);
         for (view, time) in self.views.iter_mut().zip(times) {
             let t = time.unwrap_or(0.0);
-            view.frame = distinct.partition_point(|&d| d < t);
+            view.frame = distinct.partition_point(|&d| d <= t).saturating_sub(1);
             view.time = Some(t / largest);
         }
         Ok(())

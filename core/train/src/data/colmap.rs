@@ -1,7 +1,7 @@
 //! COLMAP models, text or binary, with their sparse points. Every eighth image is held out. Scenes are static, unless each image has a video of its name.
 
 use super::assemble::fit_to_image;
-use super::nerfstudio::HOLD_OUT_EVERY;
+use super::nerfstudio::{HOLD_OUT_EVERY, LEAST_HELD_OUT, NOTHING_HELD_OUT};
 use super::video::{self, Footage};
 use super::{colmap_binary, colmap_text};
 use cc4dgs_core::reader::files::{file_name, list, read_bytes, read_text};
@@ -160,7 +160,10 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let folders = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()];
     let has_images = |f: &&PathBuf| images.iter().any(|image| f.join(&image.name).is_file());
     let image_folder = folders.iter().find(has_images).or_else(|| folders.iter().find(|f| f.is_dir())).unwrap_or(&folders[0]);
-    let hold_out = images.len() > 1;
+    let hold_out = images.len() >= LEAST_HELD_OUT;
+    if !hold_out {
+        scene.warnings.push(NOTHING_HELD_OUT.into());
+    }
     let mut videos = videos(path, &images, options, limits, &mut scene.warnings)?.into_iter();
     for (index, image) in images.iter().enumerate() {
         let bad = |problem: String| Error::data(format!("{object}: image {}", image.name), problem, "Export the model again");

@@ -1,6 +1,7 @@
 //! N3DV ("dynerf") and LLFF scenes: `poses_bounds.npy` with one row per camera, and per camera a video, a folder of frames, or one image.
 
 use super::camera_box::frustum_box;
+use super::nerfstudio::{LEAST_HELD_OUT, NOTHING_HELD_OUT};
 use super::npy::read_npy;
 use super::{colmap, video};
 use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_bytes};
@@ -65,12 +66,15 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     if footage.iter().any(|f| f.images.len() != frames) {
         scene.warnings.push(format!("cameras have different numbers of frames; the first {frames} of each are used"));
     }
+    if array.shape[0] < LEAST_HELD_OUT {
+        scene.warnings.push(NOTHING_HELD_OUT.into());
+    }
     let mut depths = Vec::new();
     for (index, (footage, row)) in footage.into_iter().zip(array.values.chunks_exact(17)).enumerate() {
         scene.cameras.push(camera(row, &footage).map_err(|e| bad(format!("row {index}: {e}"), "Fetch the file again"))?);
         depths.push((row[15], row[16]));
         // The first camera in sorted order is held out (the protocol of Neural 3D Video).
-        let split = if index == 0 { Split::Test } else { Split::Train };
+        let split = if index == 0 && array.shape[0] >= LEAST_HELD_OUT { Split::Test } else { Split::Train };
         for (frame, image) in footage.images.into_iter().take(frames).enumerate() {
             scene.views.extend(image.map(|image| RawView { camera: index, frame, time: None, split, image }));
         }

@@ -17,6 +17,10 @@ use std::path::{Path, PathBuf};
 
 /// Where the file names no split, every eighth image is held out, as is usual for static scenes.
 pub(crate) const HOLD_OUT_EVERY: usize = 8;
+/// From so many cameras or images on some are held out: one alone cannot be trained on.
+pub(crate) const LEAST_HELD_OUT: usize = 3;
+/// What is said of fewer.
+pub(crate) const NOTHING_HELD_OUT: &str = "fewer than three images or cameras: none is held out (scene.test_cameras names some)";
 
 /// What a file says of a lens: of all images, or of one.
 #[derive(Clone, Default, Deserialize)]
@@ -167,7 +171,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
                     continue;
                 }
             }
-        } else if seen % HOLD_OUT_EVERY == 0 && transforms.frames.len() > 1 {
+        } else if seen % HOLD_OUT_EVERY == 0 && transforms.frames.len() >= LEAST_HELD_OUT {
             Split::Test
         } else {
             Split::Train
@@ -205,7 +209,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     if has_times {
         warn_of_missing_times(&times, &mut scene.warnings);
         scene.rank_times(&times, &object)?;
-        if merge_fixed_cameras(&mut scene, &times) && !named_split && scene.cameras.len() > 1 {
+        if merge_fixed_cameras(&mut scene, &times) && !named_split && scene.cameras.len() >= LEAST_HELD_OUT {
             // Another instant of a camera that is trained on says nothing of new views.
             scene.views.iter_mut().for_each(|view| view.split = if view.camera.is_multiple_of(HOLD_OUT_EVERY) { Split::Test } else { Split::Train });
         }

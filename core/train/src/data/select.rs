@@ -28,9 +28,10 @@ pub(super) fn select(raw: &mut RawScene, options: &SceneOptions, trained: Option
         hold_out(raw, held_out)?;
     }
     raw.views.sort_by_key(|v| (v.frame, v.camera));
+    // Before views are left out, so that the times of the others do not depend on how many.
+    let (first, last) = trained_on.unwrap_or_else(|| ends(&raw.views));
     cap_training_views(raw, options.max_views);
     drop_unused_cameras(raw);
-    let (first, last) = trained_on.unwrap_or_else(|| ends(&raw.views));
     let length = if last > first { last - first } else { 1.0 };
     let time_of = |view: &RawView| (time(view) - first) / length;
     // Times that are not finite are refused with the rest of the scene.
@@ -145,8 +146,8 @@ fn cap_training_views(raw: &mut RawScene, cap: usize) {
     order.sort_by_key(|&v| (raw.views[v].camera, raw.views[v].frame));
     let mut keep = vec![true; raw.views.len()];
     for (k, view) in order.into_iter().enumerate() {
-        // Those at which the running share of `cap` passes a whole number: evenly spread.
-        keep[view] = ((k + 1) * cap) / train != (k * cap) / train;
+        // The first, and those at which the running share of `cap` passes a whole number: evenly spread.
+        keep[view] = k == 0 || (k * cap) / train != ((k - 1) * cap) / train;
     }
     let mut keep = keep.into_iter();
     raw.views.retain(|_| keep.next().unwrap_or(true));

@@ -4,7 +4,7 @@ use super::super::camera_box::camera_box;
 use super::super::focus::Focus;
 use super::super::resample::resize;
 use super::choose::{Arrangement, Choice, focus_depth};
-use cc4dgs_core::{Camera, Image8, Result, Scene};
+use cc4dgs_core::{Camera, Error, Image8, Result, Scene};
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use rayon::prelude::*;
 
@@ -193,11 +193,15 @@ fn load_view(scene: &Scene, view: usize) -> Result<WorkView> {
     }
     let opaque = fine.as_ref().filter(|f| f.channels == 4).map(|f| f.data.chunks_exact(4).map(|p| p[3] > 127).collect());
     let mask = match (&scene.foreground_masks, &fine) {
-        // A view without a mask is no obstacle.
-        (Some(source), Some(f)) => source.load(view).ok().map(|m| {
-            let m = resize(&m, f.width, f.height);
-            m.data.chunks_exact(m.channels as usize).map(|p| p[0] > 127).collect()
-        }),
+        (Some(source), Some(f)) => match source.load(view) {
+            Ok(m) => {
+                let m = resize(&m, f.width, f.height);
+                Some(m.data.chunks_exact(m.channels as usize).map(|p| p[0] > 127).collect())
+            }
+            // A view without a mask is no obstacle.
+            Err(Error::Unsupported { .. }) => None,
+            Err(e) => return Err(e),
+        },
         _ => None,
     };
     let (rotation, translation) = camera.rotation_translation();

@@ -125,7 +125,7 @@ impl VideoFrames {
         let bug = || Error::parameter(format!("video {}", video.display()), format!("frame {frame} was not asked for"), "Reopen the scene");
         let clip = self.clips.get(video).ok_or_else(bug)?;
         let rank = clip.wanted.rank(frame).ok_or_else(bug)?;
-        let what = format!("{}|{:?}", clip.wanted.condition(), clip.size);
+        let what = format!("rgb24|{}|{:?}", clip.wanted.condition(), clip.size);
         let folder = cache_folder(&self.options)?.join(cache_name(video, &what)?);
         // A poisoned lock only means that another extraction failed; this one may do better.
         let _guard = clip.busy.lock().unwrap_or_else(|e| e.into_inner());
@@ -151,7 +151,7 @@ impl VideoFrames {
         // The display matrix is applied here, because versions of ffmpeg differ in what they do with it.
         let turn = turn_of(video, &self.options)?.filter;
         let turn = if turn.is_empty() { String::new() } else { format!("{turn},") };
-        let filter = format!("select='{}',{turn}{CONSECUTIVE},scale={}:{}:flags=lanczos", clip.wanted.condition(), clip.size[0], clip.size[1]);
+        let filter = format!("select='{}',{turn}{CONSECUTIVE},scale={}:{}:flags=lanczos,format=rgb24", clip.wanted.condition(), clip.size[0], clip.size[1]);
         // In a pattern, a percent sign of the folder's name is written twice.
         let outputs = work.path().to_str().map_or_else(|| work.path().to_path_buf(), |folder| PathBuf::from(folder.replace('%', "%%")));
         let (video_input, count, pattern) = (input(video), clip.wanted.count().to_string(), outputs.join("%06d.png"));
