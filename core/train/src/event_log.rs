@@ -4,7 +4,7 @@ use cc4dgs_core::{Error, Event, EventSink, Result, Stage};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
-use std::io::Write;
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::Path;
 use std::sync::Mutex;
 use std::time::Instant;
@@ -45,9 +45,16 @@ impl JsonLines {
         if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
             std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, e))?;
         }
-        let file = OpenOptions::new().create(true).append(true).open(path).map_err(failed)?;
+        let mut file = OpenOptions::new().create(true).read(true).append(true).open(path).map_err(failed)?;
         let holds_a_run = file.metadata().map_err(failed)?.len() > 0;
-        Ok(Self { log: Mutex::new(Log { file, waiting: holds_a_run.then(String::new) }), append, began: Instant::now() })
+        let mut waiting = String::new();
+        if holds_a_run && append {
+            let mut last = [0];
+            file.seek(SeekFrom::End(-1)).and_then(|_| file.read_exact(&mut last)).map_err(failed)?;
+            // A line that was cut must not take the next one with it.
+            waiting.extend((last != *b"\n").then_some('\n'));
+        }
+        Ok(Self { log: Mutex::new(Log { file, waiting: holds_a_run.then_some(waiting) }), append, began: Instant::now() })
     }
 }
 
@@ -119,19 +126,22 @@ pub fn read_history(path: &Path) -> Result<History> {
     let mut points: BTreeMap<usize, HistoryPoint> = BTreeMap::new();
     // Iterations before each stage, and seconds of the processes before this one.
     let mut before: BTreeMap<String, usize> = BTreeMap::new();
-    let (mut iterations, mut earlier, mut last, mut starts) = (0, 0.0, 0.0, 0usize);
+    let (mut iterations, mut earlier, mut last, mut has_started) = (0, 0.0, 0.0, false);
     let mut stage: Option<String> = None;
     for line in String::from_utf8_lossy(&text).lines() {
         let Some((seconds, event)) = read_line(line) else { continue };
-        if seconds < last {
-            (earlier, last, stage) = (earlier + last, 0.0, None);
+        // Another process, whose clock begins anew. It may be late with its first line.
+        let starts = matches!(&event, Event::RunStarted { command, .. } if command == "train");
+        if seconds < last || (starts && has_started) {
+            (earlier, last, stage, has_started) = (earlier + last, 0.0, None, false);
         }
+        has_started |= starts;
+        history.resumed += usize::from(starts);
         if let Some(stage) = &stage {
             *history.stage_seconds.entry(stage.clone()).or_default() += seconds - last;
         }
         last = seconds;
         match event {
-            Event::RunStarted { command, .. } if command == "train" => starts += 1,
             Event::StageStarted { stage: name, iterations: length, .. } => {
                 if !before.contains_key(&name) {
                     before.insert(name.clone(), iterations);
@@ -148,7 +158,7 @@ pub fn read_history(path: &Path) -> Result<History> {
         }
     }
     history.seconds = earlier + last;
-    history.resumed = starts.saturating_sub(1);
+    history.resumed = history.resumed.saturating_sub(1);
     history.points = points.into_values().collect();
     Ok(history)
 }
@@ -184,6 +194,23 @@ mod tests {
         assert_eq!((history.resumed, history.points[1].seconds), (1, 9.2));
         assert!((history.seconds - 10.7).abs() < 1e-9 && (history.stage_seconds["main"] - 3.5).abs() < 1e-9, "{history:?}");
         assert_eq!(history.stage_seconds["coarse"], 2.0);
+
+        // The process that goes on is later with its first line than the other was with its last.
+        let text = [(0.5, run()), (1.0, start("coarse", 10)), (2.0, step("coarse", 10, 20.0)), (6.0, run()), (7.0, start("coarse", 10)), (8.0, end("coarse"))];
+        std::fs::write(&path, text.map(|(s, e)| line(s, e)).concat()).unwrap();
+        let history = read_history(&path).unwrap();
+        assert_eq!((history.seconds, history.resumed, history.stage_seconds["coarse"]), (10.0, 1, 2.0));
+    }
+
+    #[test]
+    fn a_line_that_was_cut_does_not_take_the_next_one_with_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(EVENTS);
+        std::fs::write(&path, "{\"seconds\":8.5,\"eve").unwrap();
+        let begins = Event::RunStarted { command: "eval".into(), device: "flex".into(), seed: 0 };
+        JsonLines::open(&path, true).unwrap().emit(&begins);
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert_eq!(text.lines().filter_map(read_line).map(|(_, event)| event).collect::<Vec<_>>(), [begins]);
     }
 
     #[test]

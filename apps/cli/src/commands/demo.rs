@@ -1,13 +1,12 @@
 //! `cc4dgs demo`: the whole chain on the built-in scene.
 
-use super::eval::{FullReport, Images, measure};
+use super::eval::{FullReport, Images, Subject, measure};
 use super::train::{Trained, layers, train_into};
 use super::{Context, compress, create_parent, eval, train};
 use crate::args::Demo;
 use crate::models::load_model;
 use crate::output::to_json;
 use cc4dgs::runs::{EVENTS, Existing};
-use cc4dgs::scenes::open_as_trained;
 use cc4dgs_core::archive::write_atomically;
 use cc4dgs_core::exporter::refuse_existing;
 use cc4dgs_core::{Error, Result, Split};
@@ -62,12 +61,12 @@ pub fn run(context: &Context, args: &Demo) -> Result<()> {
     let options = ArchiveOptions { codec: CODEC, settings: &toml::Table::new(), field_weights: FIELD_WEIGHTS, scene: None, tuner: None };
     let packed = compress::compress(context, &loaded.model, &options, &archive, &events)?;
 
-    let scene = open_as_trained(scene_path, &loaded.model, &[], &context.registry, &context.limits)?;
-    let plain = Images::default();
-    let before = measure(context, &args.out, &loaded, &scene, Scored::all(Split::Test), &plain, &events)?;
+    let subject = Subject::open(context, &args.out, &loaded, scene_path, &[])?;
+    let before = measure(context, &subject, Scored::all(Split::Test), &Images::default(), &events)?;
     let images = Images { sheet: Some(sheet), sheet_rows: 6, renders: None };
     let unpacked = load_model(&archive, &config.device, &context.registry, &context.limits, &events)?;
-    let after = measure(context, &archive, &unpacked, &scene, Scored::all(Split::Test), &images, &events)?;
+    let subject = Subject::open(context, &archive, &unpacked, scene_path, &[])?;
+    let after = measure(context, &subject, Scored::all(Split::Test), &images, &events)?;
 
     let report = DemoReport {
         scene: scene_name,

@@ -4,11 +4,11 @@ use super::{Context, lies_in};
 use crate::args::Eval;
 use crate::interrupt;
 use crate::models::{Loaded, load_model};
-use cc4dgs::scenes::open_as_trained;
+use cc4dgs::scenes::{open_as_trained, options_as_trained};
 use cc4dgs_core::exporter::refuse_other_content;
 use cc4dgs_core::sample::spread_views;
 use cc4dgs_core::{Error, Event, EventSink, Limits, Result, Scene, Split};
-use cc4dgs_train::data::procedural::{self, ProceduralScene};
+use cc4dgs_train::data::procedural::{ProceduralScene, whole_scene};
 use cc4dgs_train::eval::{EvalReport, Scored, evaluate};
 use cc4dgs_train::images::{Comparison, SheetOptions, comparison_sheet, write_png};
 use cc4dgs_train::trajectory::{MotionScore, motion_scores};
@@ -71,10 +71,10 @@ pub fn run(context: &Context, args: &Eval) -> Result<()> {
     };
     let events = context.listeners(None)?;
     let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
-    let scene = open_as_trained(&args.views.scene, &loaded.model, &args.views.sets, &context.registry, &context.limits)?;
+    let subject = Subject::open(context, &args.views.model, &loaded, &args.views.scene, &args.views.sets)?;
     earlier.iter().try_for_each(|render| std::fs::remove_file(render).map_err(|e| Error::io(render, e)))?;
-    let report =
-        measure(context, &args.views.model, &loaded, &scene, Scored { split, max_views: args.max_views, perceptual: args.perceptual }, &images, &events)?;
+    let scored = Scored { split, max_views: args.max_views, perceptual: args.perceptual };
+    let report = measure(context, &subject, scored, &images, &events)?;
     context.output.result(&report, || text(&report))?;
     report.sheet_error.map_or(Ok(()), Err)
 }
@@ -129,18 +129,33 @@ fn earlier_renders(folder: &Path, scene: &Path, overwrite: bool) -> Result<Vec<P
     Ok(entries)
 }
 
+/// A model and the scene it is scored on.
+pub struct Subject<'a> {
+    path: &'a Path,
+    loaded: &'a Loaded,
+    scene: Scene,
+    /// What moves how, where the scene is built in and the model was trained on all of its frames.
+    truth: Option<ProceduralScene>,
+}
+
+impl<'a> Subject<'a> {
+    /// The model `loaded` from `path`, and the dataset at `scene` as it was trained on, with `sets` laid over.
+    pub fn open(context: &Context, path: &'a Path, loaded: &'a Loaded, scene: &Path, sets: &[String]) -> Result<Self> {
+        let stored = &loaded.model.provenance.config;
+        let options = options_as_trained(stored, sets)?;
+        let truth = match options_as_trained(stored, &[])?.frames == options.frames {
+            true => whole_scene(scene, &options, &context.limits)?,
+            false => None,
+        };
+        Ok(Self { path, loaded, scene: open_as_trained(scene, &loaded.model, sets, &context.registry, &context.limits)?, truth })
+    }
+}
+
 /// Measures and draws.
-pub fn measure(
-    context: &Context,
-    model_path: &Path,
-    loaded: &Loaded,
-    scene: &Scene,
-    scored: Scored,
-    images: &Images,
-    events: &dyn EventSink,
-) -> Result<FullReport> {
+pub fn measure(context: &Context, subject: &Subject, scored: Scored, images: &Images, events: &dyn EventSink) -> Result<FullReport> {
     let began = Instant::now();
     let stop = interrupt::stop_flag()?;
+    let (loaded, scene) = (subject.loaded, &subject.scene);
     let model = &loaded.model;
     events.emit(&Event::RunStarted { command: "eval".into(), device: loaded.device_name.clone(), seed: model.provenance.seed });
     for message in &scene.warnings {
@@ -177,20 +192,13 @@ pub fn measure(
     ] {
         events.emit(&Event::Work { stage: "eval".into(), counter: counter.into(), done, skipped });
     }
-    let motion = match procedural::name_of(Path::new(&scene.name)) {
-        Some(name) => {
-            let mut truth = ProceduralScene::named(name)?;
-            if let Some(camera) = scene.cameras.first() {
-                (truth.width, truth.height) = (camera.width, camera.height);
-            }
-            truth.frames = scene.frame_count;
-            motion_scores(model, &truth, &context.registry, &loaded.device, events)?
-        }
+    let motion = match &subject.truth {
+        Some(truth) => motion_scores(model, truth, &context.registry, &loaded.device, events)?,
         None => Vec::new(),
     };
     let provenance = &model.provenance;
     Ok(FullReport {
-        model: model_path.to_path_buf(),
+        model: subject.path.to_path_buf(),
         device: loaded.device_name.clone(),
         seconds: began.elapsed().as_secs_f64(),
         sheet,

@@ -10,6 +10,7 @@ use cc4dgs_play::presentation;
 use cc4dgs_player::Content;
 use cc4dgs_player::window::{Live, Shown, show};
 use cc4dgs_train::train::{Observer, Snapshot, Standing};
+use std::io::Write;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -87,6 +88,13 @@ pub fn run(args: &Train, with_context: impl FnOnce(&mut (dyn FnMut(&Context) -> 
             stop.store(true, Ordering::Relaxed);
         }
         let trained = training.join().unwrap_or_else(|_| Err(Error::backend("training", "it panicked", "Report this with what it printed")));
-        shown.and(trained)
+        match (shown, trained) {
+            // The training went on without its window, and is what counts.
+            (Err(lost @ Error::Backend { .. }), trained) => {
+                writeln!(std::io::stderr(), "warning: {lost}").ok();
+                trained
+            }
+            (shown, trained) => shown.and(trained),
+        }
     })
 }

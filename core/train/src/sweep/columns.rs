@@ -4,7 +4,7 @@ use super::result::ImageResult;
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A column per field of [`ImageResult`]. A column that no image has is left out.
 #[derive(Serialize, Deserialize)]
@@ -27,8 +27,8 @@ pub fn serialize<S: Serializer>(images: &[ImageResult], serializer: S) -> Result
         let values: Vec<Option<T>> = images.iter().map(of).collect();
         values.iter().any(Option::is_some).then_some(values)
     }
-    let names = images.iter().flat_map(|image| image.scores.keys());
-    let scores = names.map(|name| (name.clone(), images.iter().map(|image| image.scores.get(name).copied()).collect())).collect();
+    let names: BTreeSet<&String> = images.iter().flat_map(|image| image.scores.keys()).collect();
+    let scores = names.into_iter().map(|name| (name.clone(), images.iter().map(|image| image.scores.get(name).copied()).collect())).collect();
     Columns {
         camera: images.iter().map(|image| image.camera.clone()).collect(),
         frame: images.iter().map(|image| image.frame).collect(),

@@ -108,6 +108,24 @@ pub struct TrainReport {
     pub verdict: Option<Verdict>,
 }
 
+/// Where a run starts.
+enum Start {
+    /// At a checkpoint.
+    Resumed(Box<TrainState>),
+    /// At the beginning, with these plug-ins.
+    New(Parts),
+}
+
+impl Start {
+    /// Whether masks of what moves will be read: by the score stage, and by key frames when the main stage begins.
+    fn needs_masks(&self) -> bool {
+        match self {
+            Self::Resumed(state) => state.stage < Stage::Main || state.iteration == 0,
+            Self::New(_) => true,
+        }
+    }
+}
+
 /// What stays fixed during a run.
 pub(crate) struct Context<'a> {
     pub job: &'a TrainJob<'a>,
@@ -156,7 +174,6 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     for message in &job.scene.warnings {
         job.events.emit(&Event::Warning { object: job.scene.name.clone(), message: message.clone() });
     }
-    let doubts = if config.train.checks { examine(&job.scene, config.background()?, job.events)? } else { Vec::new() };
     let moving = decide_moving(&config.train, &job.scene)?;
     let training_camera = training_cameras(&job.scene);
     let parts = Parts {
@@ -168,8 +185,15 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         density: job.registry.build_density(&config.density)?,
         optimizer: job.registry.build_optimizer(&config.optimizer)?,
     };
+    let checkpoint = job.out.as_ref().map(|out| out.join(CHECKPOINT));
+    // A continuation that is refused is refused at once.
+    let start = match &checkpoint {
+        Some(path) if job.resume => Start::Resumed(Box::new(folder::resumed(job, path, &device, parts)?)),
+        _ => Start::New(parts),
+    };
+    let doubts = if config.train.checks { examine(&job.scene, config.background()?, job.events)? } else { Vec::new() };
     let masks = match moving {
-        Moving::Scored { .. } => {
+        Moving::Scored { .. } if start.needs_masks() => {
             let train = &config.train;
             dynamic_masks(&job.scene, Split::Train, train.mask_threshold, train.mask_sigma, config.background()?, job.events)?
         }
@@ -178,10 +202,9 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let rasterizer = job.registry.build_rasterizer(&config.rasterizer)?;
     let losses = LossTerms::build(job.registry, &config.loss)?;
     let score_loss = LossTerms::build(job.registry, std::slice::from_ref(&config.score_loss))?;
-    let checkpoint = job.out.as_ref().map(|out| out.join(CHECKPOINT));
-    let mut state = match &checkpoint {
-        Some(path) if job.resume => folder::resumed(job, path, &device, parts)?,
-        _ => {
+    let mut state = match start {
+        Start::Resumed(state) => *state,
+        Start::New(parts) => {
             let host = initialise(&job.scene, config, seed.child("init"), job.events)?;
             // What is refused until here leaves the run that was to be overwritten.
             if !job.resume {

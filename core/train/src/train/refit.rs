@@ -49,14 +49,18 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
         let message = format!("{before} Gaussians, {psnr_before_db:.3} dB; {alone:.3} dB after re-fit with nothing removed");
         job.events.emit(&Event::Note { object: "prune".into(), message });
     }
-    let (mut share, mut psnr_after_db) = (FIRST_SHARE, psnr_before_db);
+    let (mut share, mut psnr_after_db, mut last_order) = (FIRST_SHARE, psnr_before_db, None);
     for round in 0..ROUNDS {
         let n = model.gaussians.len();
         let removed = (share * n as f64) as usize;
         if share < LEAST_SHARE || removed == 0 || removed == n {
             break;
         }
-        let order = by_contribution(&contributions(model, scene, job.registry, job.device, job.events)?);
+        // After a round that was undone the model, and with it the order, is the same.
+        let order = match last_order.take() {
+            Some(order) => order,
+            None => by_contribution(&contributions(model, scene, job.registry, job.device, job.events)?),
+        };
         let rest = at_rows(&model.gaussians, &order[..n - removed]);
         let tuner = job.tuner(model, scene).with_targets(targets.clone());
         let found = refit(&tuner, &rest, iterations, seed.index(round as u64))?;
@@ -74,7 +78,7 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
             model.size = model.float32_size();
             psnr_after_db = psnr;
         } else {
-            share *= 0.5;
+            (share, last_order) = (0.5 * share, Some(order));
         }
     }
     let views = super::tune::judges(scene).len();

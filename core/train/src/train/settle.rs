@@ -6,7 +6,7 @@ use super::{Context, TrainState};
 use crate::sample::spread_views;
 use burn::tensor::{Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, Event, Result, Schedule, Split, Stage};
+use cc4dgs_core::{Camera, DensityPlan, Event, Result, Schedule, Split, Stage};
 use cc4dgs_play::Moving;
 
 /// When it is looked at: shares of the main stage.
@@ -63,6 +63,13 @@ impl Context<'_> {
         let count = scores.len();
         state.set.set("dynamic_scores", Tensor::from_data(TensorData::new(scores, [count, 1]), &self.device))?;
         state.invalidate_rows();
+        // What moves stays in one piece: gathering and scattering it is slow on graphics cards.
+        let mut plan = DensityPlan::unchanged(count);
+        self.guard_plan(&mut plan, state, schedule)?;
+        if !plan.keeps_all(count) {
+            self.carry_out(&plan, state, schedule)?;
+            state.density.executed(&plan, &self.device)?;
+        }
         Ok(())
     }
 }

@@ -6,7 +6,7 @@ use crate::interrupt;
 use cc4dgs_core::{Error, Event, EventSink, Result};
 use cc4dgs_train::sweep::{Failure, INTERRUPTED, Plan, SweepFolder};
 use serde::Serialize;
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::ffi::OsString;
 use std::fs::OpenOptions;
 use std::path::Path;
@@ -51,6 +51,8 @@ struct Pool<'a> {
     /// Seconds of the trainings that finished here.
     seconds: Vec<f64>,
     failed: Vec<(usize, Failure)>,
+    /// Cells that are finished.
+    done: BTreeSet<usize>,
     not_before: Instant,
 }
 
@@ -65,8 +67,8 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
     let jobs = jobs.unwrap_or_else(|| cores.checked_div(threads).map_or(1, |jobs| jobs.max(1)));
     let queue: VecDeque<usize> = folder.open_trainings(plan).into();
     let processes = jobs.min(queue.len());
-    let (running, seconds, failed, not_before) = (Vec::new(), Vec::new(), Vec::new(), began);
-    let mut pool = Pool { context, plan, folder, threads, processes, events: &events, queue, running, seconds, failed, not_before };
+    let (running, seconds, failed, done, not_before) = (Vec::new(), Vec::new(), Vec::new(), BTreeSet::new(), began);
+    let mut pool = Pool { context, plan, folder, threads, processes, events: &events, queue, running, seconds, failed, done, not_before };
     pool.progress();
     if let Err(error) = pool.work(jobs, stop) {
         // Nobody else would end them: they are in groups of their own.
@@ -101,10 +103,14 @@ impl Pool<'_> {
             std::thread::sleep(TICK);
         }
     }
-    fn finished(&self) -> usize {
-        self.plan.cells.iter().filter(|cell| self.folder.finished(cell).is_some()).count()
+    /// How many cells are finished. A result is read once.
+    fn finished(&mut self) -> usize {
+        let finished = self.plan.cells.iter().enumerate().filter(|(index, cell)| !self.done.contains(index) && self.folder.finished(cell).is_some());
+        let new: Vec<usize> = finished.map(|(index, _)| index).collect();
+        self.done.extend(new);
+        self.done.len()
     }
-    fn progress(&self) {
+    fn progress(&mut self) {
         let (done, total) = (self.finished() as u64, self.plan.cells.len() as u64);
         self.events.emit(&Event::Progress { task: "sweep".into(), done, total });
     }
@@ -153,7 +159,8 @@ impl Pool<'_> {
                 let seconds = job.began.elapsed().as_secs_f64();
                 self.seconds.push(seconds);
                 let hopeless = if status.success() { "" } else { ", hopeless" };
-                self.note(job.index, format!("done in {}{hopeless}; {}", duration(seconds), self.left(jobs)));
+                let left = self.left(jobs);
+                self.note(job.index, format!("done in {}{hopeless}; {left}", duration(seconds)));
             }
             Some(code) if code == i32::from(BUSY) => {
                 self.queue.push_back(job.index);
@@ -186,7 +193,7 @@ impl Pool<'_> {
         }
     }
     /// Trainings done and the time that the others will take.
-    fn left(&self, jobs: usize) -> String {
+    fn left(&mut self, jobs: usize) -> String {
         let waiting = self.queue.len() + self.running.len();
         let text = format!("{} of {} cells, {waiting} trainings left", self.finished(), self.plan.cells.len());
         if waiting == 0 || self.seconds.is_empty() {

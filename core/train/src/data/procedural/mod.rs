@@ -15,7 +15,7 @@ mod trace;
 
 pub use figure::{Arms, Figure, Part, Path, Side};
 pub use objects::{ALWAYS, Material, Motion, Object, Pose};
-pub use reader::name_of;
+pub use reader::{name_of, whole_scene};
 pub use rig::{Rig, Viewpoint};
 pub use sensor::{Noise, Sensor, Sensors};
 pub use shapes::Shape;

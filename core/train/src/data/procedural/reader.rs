@@ -46,6 +46,19 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             format!("Write procedural:NAME, one of {}", NAMES.join(", ")),
         ));
     };
+    Ok(with_options(name, options, limits)?.into_raw(format!("procedural:{name}")))
+}
+
+/// The built-in scene that `path` names, as `options` want it. `None` where `path` names no built-in scene, and where `options` choose some of its frames.
+///
+/// # Errors
+/// As for reading it.
+pub fn whole_scene(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<Option<ProceduralScene>> {
+    let whole = options.frames.is_none_or(|[first, _, step]| (first, step) == (0, 1));
+    name_of(path).filter(|_| whole).map(|name| with_options(name, options, limits)).transpose()
+}
+
+fn with_options(name: &str, options: &SceneOptions, limits: &Limits) -> Result<ProceduralScene> {
     let mut scene = ProceduralScene::named(name)?;
     (scene.width, scene.height) = options.target_size((scene.width, scene.height));
     limits.check_pixels(&format!("procedural scene {name}"), u64::from(scene.width), u64::from(scene.height))?;
@@ -57,7 +70,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         limits.check_bytes(&format!("procedural scene {name}: frames"), (count as u64).saturating_mul(1 << 16))?;
         scene.frames = count;
     }
-    Ok(scene.into_raw(format!("procedural:{name}")))
+    Ok(scene)
 }
 
 /// Images traced when they are asked for.
