@@ -105,6 +105,7 @@ kernels() {
         awk 'NF == 3 { print $1, $2 * ($3 == "s" ? 1000 : $3 == "ms" ? 1 : $3 == "ns" ? 0.000001 : 0.001) }' | sort -k1,1 -k2,2g |
         awk 'function flush() { if (n) printf "%s  {\"kernel\": \"%s\", \"launches\": %d, \"min_ms\": %g, \"median_ms\": %g, \"sum_ms\": %g}", (any++ ? ",\n" : ""), name, n, v[1], v[int((n + 1) / 2)], sum }
              BEGIN { print "[" } { if ($1 != name) { flush(); name = $1; n = 0; sum = 0 } v[++n] = $2; sum += $2 } END { flush(); print "\n]" }' >"$out/$name.json"
+    grep -q '"kernel"' "$out/$name.json" || { echo "   FAILED: no line of the log was understood"; rm -f "$out/$name.json"; failed=1; }
     rm -rf "$folder"
 }
 

@@ -11,6 +11,7 @@ says camera and frame of every render. Needs numpy and Pillow.
 import argparse
 import json
 import pathlib
+import sys
 
 import numpy
 from PIL import Image
@@ -33,17 +34,22 @@ def main():
     parser.add_argument("--images", type=pathlib.Path, required=True, help="a folder per camera")
     parser.add_argument("--json", type=pathlib.Path)
     options = parser.parse_args()
-    views = json.loads(options.evaluation.read_text())["images"]
+    report = json.loads(options.evaluation.read_text())
+    views = report["images"]
+    # Frames are counted among those that were chosen.
+    first, _, stride = report["provenance"]["config"].get("scene", {}).get("frames") or (0, 0, 1)
     rows = []
     for index, view in enumerate(views):
         camera, frame = view["camera"], view["frame"]
         render = Image.open(options.renders / f"{index:05}.png")
-        truth = sorted((options.images / camera).iterdir())[frame]
+        truth = sorted(path for path in (options.images / camera).iterdir() if not path.name.startswith("."))[first + frame * stride]
         shown = object_pixels(Image.open(truth).resize(render.size, Image.Resampling.BOX))
         drawn = object_pixels(render)
         if shown.sum() < LEAST * render.size[0] * render.size[1] / (640 * 360):
             continue
         rows.append({"camera": camera, "frame": frame, "pixels": int(shown.sum()), "overlap": round(float((shown & drawn).sum() / (shown | drawn).sum()), 4)})
+    if not rows:
+        sys.exit("no image shows the object")
     overlaps = [row["overlap"] for row in rows]
     lost = [row for row in rows if row["overlap"] < THERE]
     print(f"{len(rows)} of {len(views)} images show it; overlap: median {numpy.median(overlaps):.2f}, least {min(overlaps):.2f}; lost (below {THERE}) in {len(lost)}")

@@ -42,12 +42,8 @@ def train(options, stated):
     if report.exists():
         found = json.loads(report.read_text())
         verdict = found.get("verdict") or {}
-        row |= {"gaussians": found.get("gaussians"), "moving_gaussians": found.get("dynamic_gaussians")}
+        row |= {"gaussians": found.get("gaussians"), "moving_gaussians": found.get("dynamic_gaussians"), "iterations": found.get("iterations")}
         row |= {key: verdict.get(f"{key}_psnr_db") for key in ["train", "validation", "moving"] if verdict.get(f"{key}_psnr_db") is not None}
-    config = out / "config.toml"
-    if config.exists():
-        line = next((line for line in config.read_text().splitlines() if line.startswith("iterations = ")), "")
-        row["iterations"] = int(line.split("=")[1]) if line else None
     return row
 
 

@@ -18,6 +18,11 @@ pub fn devices() -> Vec<(&'static str, Device)> {
     devices
 }
 
+/// The larger of two numbers. One that is no number stays, where `f32::max` leaves it out, so that no assertion about the largest of many holds.
+pub fn larger<T: PartialOrd + Copy>(a: T, b: T) -> T {
+    if a.partial_cmp(&a).is_none() || a >= b { a } else { b }
+}
+
 /// Fills the device's free memory with NaNs, so that tests detect kernels that read uninitialised memory.
 pub fn poison(device: &Device) {
     let mut held = Vec::new();

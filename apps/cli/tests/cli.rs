@@ -301,33 +301,37 @@ fn archives_of_plug_ins_that_are_not_linked_say_what_to_link() {
 #[test]
 fn an_interrupted_run_resumes_to_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
-    let (whole, parts) = (folder.path().join("whole"), folder.path().join("parts"));
+    let whole = folder.path().join("whole");
     let iterations = "train.iterations=400";
     succeed(&train_args(text(&whole), iterations));
+    let whole = std::fs::read(whole.join("checkpoint")).unwrap();
 
-    let log = parts.join("events.jsonl");
-    let mut child = cc4dgs().args(train_args(text(&parts), iterations)).stderr(Stdio::piped()).spawn().unwrap();
-    let began = Instant::now();
-    while !std::fs::read_to_string(&log).is_ok_and(|l| l.contains("\"iteration\"")) && child.try_wait().unwrap().is_none() {
-        assert!(began.elapsed() < Duration::from_secs(120), "no iteration within two minutes");
-        std::thread::sleep(Duration::from_millis(5));
+    for signal in ["-INT", "-TERM"] {
+        let parts = folder.path().join(signal);
+        let log = parts.join("events.jsonl");
+        let mut child = cc4dgs().args(train_args(text(&parts), iterations)).stderr(Stdio::piped()).spawn().unwrap();
+        let began = Instant::now();
+        while !std::fs::read_to_string(&log).is_ok_and(|l| l.contains("\"iteration\"")) && child.try_wait().unwrap().is_none() {
+            assert!(began.elapsed() < Duration::from_secs(120), "no iteration within two minutes");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let sent = Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap();
+        assert!(sent.success(), "the training ended before it was interrupted");
+        let output = child.wait_with_output().unwrap();
+        assert_eq!(output.status.code(), Some(130), "{signal}: {}", String::from_utf8_lossy(&output.stderr));
+        assert_ne!(std::fs::read(parts.join("checkpoint")).unwrap(), whole);
+
+        // A continuation with other settings is refused and leaves those of the run.
+        let config = std::fs::read_to_string(parts.join("config.toml")).unwrap();
+        let other = ["train", "--scene", "procedural:tiny", "--resume", "--set", "train.iterations=500", "--out", text(&parts), "-q"];
+        assert!(fail(&other, 2).contains("train.iterations was 400 and is 500"));
+        assert_eq!(std::fs::read_to_string(parts.join("config.toml")).unwrap(), config);
+
+        let lines = std::fs::read_to_string(&log).unwrap().lines().count();
+        succeed(&["train", "--scene", "procedural:tiny", "--resume", "--out", text(&parts), "-q"]);
+        assert!(std::fs::read_to_string(&log).unwrap().lines().count() > lines, "the log goes on where it ended");
+        assert!(std::fs::read(parts.join("checkpoint")).unwrap() == whole, "{signal}: interruption changed the result");
     }
-    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    let output = child.wait_with_output().unwrap();
-    assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8_lossy(&output.stderr));
-    assert_ne!(std::fs::read(parts.join("checkpoint")).unwrap(), std::fs::read(whole.join("checkpoint")).unwrap());
-
-    // A continuation with other settings is refused and leaves those of the run.
-    let config = std::fs::read_to_string(parts.join("config.toml")).unwrap();
-    let other = ["train", "--scene", "procedural:tiny", "--resume", "--set", "train.iterations=500", "--out", text(&parts), "-q"];
-    assert!(fail(&other, 2).contains("train.iterations was 400 and is 500"));
-    assert_eq!(std::fs::read_to_string(parts.join("config.toml")).unwrap(), config);
-
-    let lines = std::fs::read_to_string(&log).unwrap().lines().count();
-    succeed(&["train", "--scene", "procedural:tiny", "--resume", "--out", text(&parts), "-q"]);
-    assert!(std::fs::read_to_string(&log).unwrap().lines().count() > lines, "the log goes on where it ended");
-    let same = std::fs::read(parts.join("checkpoint")).unwrap() == std::fs::read(whole.join("checkpoint")).unwrap();
-    assert!(same, "interruption changed the result");
 }
 
 #[cfg(not(feature = "view"))]

@@ -8,7 +8,7 @@ use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_backends::{cap_bindings, cap_shared_memory};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Camera, Gaussians, HostGaussians, Rasterizer, RenderSettings, Rules, Seed, Splats};
-use cc4dgs_tests::{devices, poison};
+use cc4dgs_tests::{devices, larger, poison};
 
 struct Case {
     name: &'static str,
@@ -159,7 +159,7 @@ fn near_ties_of_depth_are_drawn_in_one_order() {
     let truth = draw(&ReferenceRasterizer::default(), &Device::flex());
     for (name, device) in devices() {
         let found = draw(&TileRasterizer, &device);
-        let worst = found.iter().zip(&truth).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max);
+        let worst = found.iter().zip(&truth).map(|(a, b)| (a - b).abs()).fold(0.0f32, larger);
         assert!(worst < 0.5 / 255.0, "{name}: a value differs by {} levels", worst * 255.0);
     }
 }
@@ -202,7 +202,7 @@ fn small_adapters_change_nothing_or_are_an_error() {
         for (k, (whole, small)) in whole.1.iter().zip(&gradients).enumerate() {
             let scale = whole.iter().fold(0.0f32, |m, v| m.max(v.abs()));
             // The sums over the pixels of a tile have another order.
-            let worst = whole.iter().zip(small).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let worst = whole.iter().zip(small).map(|(a, b)| (a - b).abs()).fold(0.0, larger);
             // The rotation gradient of round Gaussians is zero up to rounding.
             assert!(worst < 1e-5 * scale + 1e-7, "{name}: gradient {k} differs by {worst:e} of {scale:e} with less shared memory");
         }

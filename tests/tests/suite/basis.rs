@@ -5,7 +5,7 @@ use cc4dgs_backends::ops::basis::{BasisShape, by_columns, combine, combine_all};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Deformer, DeformerContext, Gaussians, HostGaussians, Offsets, Registry, Seed, SpatialInput, config};
 use cc4dgs_deformers as _;
-use cc4dgs_tests::{devices, poison};
+use cc4dgs_tests::{devices, larger, poison};
 use std::sync::Arc;
 
 fn noise(seed: u64, len: usize) -> Vec<f32> {
@@ -51,7 +51,7 @@ fn values_and_gradients_are_those_of_the_sums() {
                 let gradients = (out.clone() * u).sum().backward();
                 let close = |what: &str, found: Vec<f32>, wanted: &[f64]| {
                     let size = wanted.iter().fold(1.0f64, |a, v| a.max(v.abs()));
-                    let worst = found.iter().zip(wanted).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max);
+                    let worst = found.iter().zip(wanted).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, larger);
                     assert!(found.len() == wanted.len() && worst <= 2e-5 * size, "{name}, {shape:?}, {rows} rows, {what}: {worst} of {size}");
                 };
                 close("values by columns", to_vec(packed.inner(), "values").unwrap(), &values);
@@ -91,11 +91,11 @@ fn gradients_of_several_moments_are_the_sums_of_each() {
         let list = |t: Tensor<2>| to_vec(t, "gradient").unwrap();
         let (a, b) = (loss(&together).backward(), loss(&apart).backward());
         let (found, wanted) = (list(tracked[0].grad(&a).unwrap()), list(tracked[1].grad(&b).unwrap()));
-        let worst = found.iter().zip(&wanted).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+        let worst = found.iter().zip(&wanted).map(|(x, y)| (x - y).abs()).fold(0.0, larger);
         assert!(found.len() == rows * columns && worst < 1e-5 && wanted.iter().any(|v| v.abs() > 0.1), "{name}: {worst}");
         for (k, moment) in moments.iter().enumerate() {
             let (x, y) = (moment.grad(&a).map(|t| to_vec(t, "f").unwrap()), moment.grad(&b).map(|t| to_vec(t, "f").unwrap()));
-            let worst = x.iter().flatten().zip(y.iter().flatten()).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+            let worst = x.iter().flatten().zip(y.iter().flatten()).map(|(x, y)| (x - y).abs()).fold(0.0, larger);
             assert!(x.is_some() == (k != 1) && y.is_some() == (k != 1) && worst < 1e-3, "{name}, moment {k}: {worst}");
         }
     }
@@ -172,7 +172,7 @@ fn unused_functions_are_left_out(layers: usize) {
         assert_eq!(after, rebuilt);
         assert!(after.1.is_none() && before.1.unwrap().iter().all(|v| *v == 0.0));
         for (a, b) in [(before.0, after.0), (before.2, after.2)] {
-            let worst = a.unwrap().iter().zip(b.unwrap()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let worst = a.unwrap().iter().zip(b.unwrap()).map(|(a, b)| (a - b).abs()).fold(0.0, larger);
             assert!(worst < 1e-4, "at {time}: {worst}");
         }
     }

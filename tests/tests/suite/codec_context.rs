@@ -14,6 +14,7 @@ use cc4dgs_play::codec_services::{ModelServices, SceneViews};
 use cc4dgs_play::model::{ModelDeformer, ModelSize};
 use cc4dgs_play::player::Player;
 use cc4dgs_play::{ArchiveOptions, Model};
+use cc4dgs_tests::larger;
 use cc4dgs_train::data;
 use std::path::Path;
 
@@ -184,7 +185,7 @@ fn services_move_and_draw_as_playback_does() {
     let (camera, _) = views.view(0);
     let drawn = services.render(&model.gaussians, camera, 0.8).unwrap();
     let played = Player::new(&model, &registry, &device).unwrap().render(camera, 0.8).unwrap().0.planes.into_data().to_vec::<f32>().unwrap();
-    let worst = drawn.planes.iter().zip(&played).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    let worst = drawn.planes.iter().zip(&played).map(|(a, b)| (a - b).abs()).fold(0.0, larger);
     assert!(drawn.planes.len() == played.len() && worst < 1e-4, "off by {worst}");
 
     let moved = services.deform(&model.gaussians, 0.8).unwrap();
@@ -231,6 +232,6 @@ fn a_colour_below_zero_matters_as_much_as_any_other() {
     let dark = HostGaussians { sh_dc: vec![-9.0; 3 * COUNT], ..model.gaussians.clone() };
     let (bright, dark) = (of(&model.gaussians), of(&dark));
     assert!(bright.iter().filter(|v| **v > 0.0).count() > COUNT);
-    let worst = bright.iter().zip(&dark).map(|(a, b)| (a - b).abs() / (a.max(*b) + 1e-6)).fold(0.0, f32::max);
+    let worst = bright.iter().zip(&dark).map(|(a, b)| (a - b).abs() / (a.max(*b) + 1e-6)).fold(0.0, larger);
     assert!(worst < 1e-3, "derivatives differ by {worst} of their size");
 }

@@ -112,6 +112,18 @@ fn same_seed_gives_the_same_bytes_and_resuming_does_too() {
 }
 
 #[test]
+fn a_training_has_the_same_bytes_on_any_number_of_threads() {
+    let (config, folder, never) = (tiny(&["train.iterations=60"]), tempfile::tempdir().unwrap(), AtomicBool::new(false));
+    let of = |threads: usize| {
+        let out = folder.path().join(threads.to_string());
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| run(&config, &out, false, &Silent, &never)).unwrap();
+        std::fs::read(out.join(CHECKPOINT)).unwrap()
+    };
+    assert!(of(1) == of(3), "the number of threads shows");
+}
+
+#[test]
 fn a_run_that_has_time_left_is_longer_and_its_settings_repeat_it() {
     let mut config = tiny(&["train.iterations=60"]);
     let planned = config.train.iterations;

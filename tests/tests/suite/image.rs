@@ -4,7 +4,7 @@ use burn::tensor::{Tensor, TensorData};
 use cc4dgs_backends::ops::image::{image_planes, read_image};
 use cc4dgs_core::Image8;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_tests::devices;
+use cc4dgs_tests::{devices, larger};
 use std::sync::Arc;
 
 #[test]
@@ -15,7 +15,7 @@ fn planes_are_those_of_the_host() {
         let truth = image.to_planes([0.2, 0.7, 1.0]);
         for (name, device) in devices() {
             let found = to_vec(image_planes(&image, [0.2, 0.7, 1.0], &device), "planes").unwrap();
-            let worst = truth.iter().zip(&found).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let worst = truth.iter().zip(&found).map(|(a, b)| (a - b).abs()).fold(0.0, larger);
             assert!(found.len() == truth.len() && worst <= 1.5e-7, "{name}: {width}x{height}x{channels} differs by {worst}");
         }
     }

@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::lookup::{GridShape, Outside, PRIMES, lookup};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_tests::{devices, poison};
+use cc4dgs_tests::{devices, larger, poison};
 use rand::{Rng, SeedableRng};
 use std::sync::Arc;
 
@@ -93,7 +93,7 @@ fn features_and_gradients_are_those_of_the_formulas() {
                 (to_vec(out.inner(), "features").unwrap(), to_vec(weights.grad(&gradients).unwrap(), "gradient").unwrap())
             };
             let (found, gradient) = run(&device.clone().autodiff());
-            let worst = found.iter().zip(&truth).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max);
+            let worst = found.iter().zip(&truth).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, larger);
             assert!(worst < 1e-4, "{name}, {} axes: features differ by {worst:.2e}", shape.dims);
             // The lookup is linear in its table, so <gradient, table> = <upstream, features>.
             let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
@@ -101,7 +101,7 @@ fn features_and_gradients_are_those_of_the_formulas() {
             match &of_first {
                 None => of_first = Some(gradient),
                 Some(first) => {
-                    let worst = first.iter().zip(&gradient).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                    let worst = first.iter().zip(&gradient).map(|(a, b)| (a - b).abs()).fold(0.0, larger);
                     assert!(worst < 1e-4, "{name}, {} axes: gradients differ by {worst:.2e}", shape.dims);
                 }
             }

@@ -14,6 +14,7 @@ enum Mistake {
     None,
     DoubledGradient,
     DetachedGradient,
+    PartialGradient,
     DetachedRegularizer,
     NameTwice,
     WrongShape,
@@ -40,6 +41,10 @@ impl Deformer for Velocities {
         let values = match self.0 {
             Mistake::DoubledGradient => velocity.clone().mul_scalar(2.0) - velocity.detach(),
             Mistake::DetachedGradient => velocity.detach(),
+            Mistake::PartialGradient => {
+                let [n, width] = velocity.dims();
+                Tensor::cat(vec![velocity.clone().narrow(0, 0, n / 2).detach(), velocity.narrow(0, n / 2, n - n / 2)], 0).reshape([n, width])
+            }
             _ => velocity,
         };
         Ok(SpatialFeatures { values, work: DeformerWork::default() })
@@ -102,8 +107,9 @@ fn a_deformer_that_lives_in_its_attributes_conforms() {
 
 #[test]
 fn mistakes_are_found() {
-    let cases: [(Build, &str); 9] = [
+    let cases: [(Build, &str); 10] = [
         (with!(DoubledGradient), "attribute velocity: the value rises"),
+        (with!(PartialGradient), "attribute velocity: the value changes with entries that have no gradient"),
         (with!(DetachedGradient), "no gradient reaches attribute velocity"),
         (with!(DetachedRegularizer), "regularizer: at progress 0: no gradient reaches attribute velocity, but"),
         (with!(NameTwice), "the name is used twice"),

@@ -7,6 +7,7 @@ use cc4dgs_backends::ops::rasterize::{GradientRequest, RasterSettings};
 use cc4dgs_backends::rasterizers::reference::{self, ReferenceInput, ReferenceRasterizer};
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::{BLUR, Camera, Error, Gaussians, HostGaussians, ParameterSpace, Rasterizer, Registry, RenderSettings, Rules, Seed, SplatColors, Splats};
+use cc4dgs_tests::larger;
 
 const EVERYTHING: GradientRequest = GradientRequest {
     means: true,
@@ -106,7 +107,7 @@ fn tile_agrees_with_the_reference() {
         let mut upstream = noise(seed.child("upstream"), 5 * pixels);
         let mut flipped = 0;
         for i in 0..pixels {
-            let worst = (0..4).map(|c| (f64::from(tile.planes[c * pixels + i]) - exact.planes[c * pixels + i]).abs()).fold(0.0, f64::max);
+            let worst = (0..4).map(|c| (f64::from(tile.planes[c * pixels + i]) - exact.planes[c * pixels + i]).abs()).fold(0.0, larger);
             if worst > 1e-5 {
                 assert!(worst < 2.0 / 255.0, "{rules:?}: pixel {i} differs by {worst}");
                 flipped += 1;

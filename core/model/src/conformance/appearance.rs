@@ -1,6 +1,6 @@
 //! The conformance suite of appearance models.
 
-use super::{guarded, settings_are_read, uniform};
+use super::{guarded, settings_are_read, uniform, within};
 use crate::gaussians::to_vec;
 use crate::{Appearance, AppearanceContext, AppearancePlugin, Result, Seed};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -87,7 +87,7 @@ impl Suite<'_> {
         let apply = |model: &dyn Appearance, camera| to_vec(model.apply(self.planes(rendered.clone(), self.device), camera)?, "planes");
         let fresh = self.fresh(self.device)?;
         for camera in 0..CAMERAS {
-            if apply(fresh.as_ref(), Some(camera))?.iter().zip(&rendered).any(|(a, b)| (a - b).abs() > 1e-6) {
+            if apply(fresh.as_ref(), Some(camera))?.iter().zip(&rendered).any(|(a, b)| !within(f64::from(a - b), 1e-6)) {
                 return Ok(Some(format!("a new model changes the image of camera {camera}")));
             }
         }
@@ -137,7 +137,7 @@ impl Suite<'_> {
             let count = start.len();
             built.parameters_mut()[index].value = Tensor::from_data(TensorData::new(start, [count]), &device);
             let found = slope(ends, step);
-            if norm == 0.0 || !norm.is_finite() || (found / norm - 1.0).abs() > SLOPE_TOLERANCE {
+            if norm == 0.0 || !within(found / norm - 1.0, SLOPE_TOLERANCE) {
                 return Ok(Some(format!("{name}: the loss rises by {found:.5} per unit along its gradient of norm {norm:.5}")));
             }
         }
@@ -150,7 +150,7 @@ impl Suite<'_> {
             *end = number(measure(built.as_ref(), self.planes(moved, &device))?)?;
         }
         let found = slope(ends, step);
-        Ok(((found / norm - 1.0).abs() > SLOPE_TOLERANCE)
+        Ok((norm == 0.0 || !within(found / norm - 1.0, SLOPE_TOLERANCE))
             .then(|| format!("planes: the loss rises by {found:.5} per unit along its gradient of norm {norm:.5}")))
     }
 }

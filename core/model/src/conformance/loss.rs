@@ -1,6 +1,6 @@
 //! The conformance suite of loss terms.
 
-use super::{guarded, settings_are_read, uniform};
+use super::{guarded, settings_are_read, uniform, within};
 use crate::gaussians::to_vec;
 use crate::{Gaussians, HostGaussians, LossInput, LossPlugin, LossTerm, Registry, Result, Schedule, Seed};
 use burn::tensor::{Device, Int, Tensor, TensorData};
@@ -11,6 +11,9 @@ const SIZE: [usize; 2] = [17, 23];
 const COUNT: usize = 6;
 /// Largest relative difference between a finite difference along the gradient and the gradient's norm.
 const SLOPE_TOLERANCE: f64 = 0.05;
+/// By how much values change that have no gradient, and the largest relative change of the loss then.
+const MOVE: f32 = 0.01;
+const UNMOVED: f64 = 1e-5;
 /// Largest relative difference between a fused term and the sum of its parts.
 const FUSED_TOLERANCE: f64 = 1e-4;
 
@@ -96,6 +99,7 @@ impl Suite<'_> {
             g.quaternions = g.quaternions.require_grad();
             g.opacity_logits = g.opacity_logits.require_grad();
             g.sh_dc = g.sh_dc.require_grad();
+            g.sh_rest = g.sh_rest.require_grad();
         }
         let radii = Tensor::<1, Int>::ones([inputs.gaussians.len()], self.device);
         let schedule = Schedule::main(100);
@@ -122,22 +126,29 @@ impl Suite<'_> {
         let gradients = value.backward();
         let flat = |t: Option<Tensor<2>>| t.map(|t| to_vec(t, "gradient")).transpose();
         type Slot = fn(&mut Inputs) -> &mut Vec<f32>;
-        let found: [(&str, Option<Vec<f32>>, Slot); 6] = [
+        let found: [(&str, Option<Vec<f32>>, Slot); 7] = [
             ("planes", planes.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.planes),
             ("means", flat(g.means.grad(&gradients))?, |i| &mut i.gaussians.means),
             ("log_scales", flat(g.log_scales.grad(&gradients))?, |i| &mut i.gaussians.log_scales),
             ("quaternions", flat(g.quaternions.grad(&gradients))?, |i| &mut i.gaussians.quaternions),
             ("opacity_logits", g.opacity_logits.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.gaussians.opacity_logits),
             ("sh_dc", flat(g.sh_dc.grad(&gradients))?, |i| &mut i.gaussians.sh_dc),
+            ("sh_rest", g.sh_rest.grad(&gradients).map(|t| to_vec(t, "gradient")).transpose()?, |i| &mut i.gaussians.sh_rest),
         ];
         let mut reached = 0;
         for (name, gradient, slot) in found {
-            let Some(gradient) = gradient else { continue };
+            let gradient = gradient.unwrap_or_default();
             let norm = gradient.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
             if !norm.is_finite() {
                 return Ok(Some(format!("the gradient of {name} has norm {norm}")));
             }
             if norm == 0.0 {
+                let mut moved = inputs.clone();
+                slot(&mut moved).iter_mut().enumerate().for_each(|(k, v)| *v += MOVE * uniform(Seed::root(57), k));
+                let (before, after) = (self.number(term.as_ref(), &inputs)?, self.number(term.as_ref(), &moved)?);
+                if !within(before - after, UNMOVED * before.abs()) {
+                    return Ok(Some(format!("no gradient reaches {name}, but a change of it takes the loss from {before:.6e} to {after:.6e}")));
+                }
                 continue;
             }
             reached += 1;
@@ -177,6 +188,6 @@ impl Suite<'_> {
         for (kind, weight) in fusion.kinds.iter().zip(&weights) {
             sum += weight * self.number((self.registry.loss(kind)?.build)(&toml::Table::new())?.as_ref(), &inputs)?;
         }
-        Ok(((fused - sum).abs() > FUSED_TOLERANCE * sum.abs()).then(|| format!("with weights {weights:?} it is {fused}, the sum of its terms is {sum}")))
+        Ok((!within(fused - sum, FUSED_TOLERANCE * sum.abs())).then(|| format!("with weights {weights:?} it is {fused}, the sum of its terms is {sum}")))
     }
 }

@@ -61,6 +61,11 @@ fn settings_are_read(kind: &str, info: &Plugin, settings: &toml::Table, build: i
     Ok(build(&stated).err().map(|e| format!("it refuses the settings that its schema states: {e}")))
 }
 
+/// Whether `value` is at most `most` away from 0; a value that is no number is not.
+fn within(value: f64, most: f64) -> bool {
+    value.abs() <= most
+}
+
 /// A tensor `[rows, width]` of uniform random numbers in -1..1.
 fn matrix(seed: Seed, rows: usize, width: usize, device: &Device) -> Tensor<2> {
     let values: Vec<f32> = (0..rows * width).map(|k| uniform(seed, k)).collect();

@@ -1,6 +1,6 @@
 //! Gradients of weights and attributes against finite differences.
 
-use super::super::uniform;
+use super::super::{uniform, within};
 use super::{CENTRES, SHAKE, Suite, no_heads};
 use crate::gaussians::to_vec;
 use crate::{Deformer, Result, Seed, SpatialInput};
@@ -128,6 +128,18 @@ fn compare(
     }
     if norm == 0.0 {
         return Ok(None);
+    }
+    // The slope along a gradient that lacks some entries is its norm, too. So those without a gradient must not change the value.
+    let of_entry = |(k, g): (usize, &f32)| if *g == 0.0 { uniform(Seed::root(17), k).signum() } else { 0.0 };
+    let without: Vec<f32> = gradient.iter().enumerate().map(of_entry).collect();
+    if without.iter().any(|direction| *direction != 0.0) {
+        let mut at = |step: f64| measure(start.iter().zip(&without).map(|(s, d)| s + (step * f64::from(*d)) as f32).collect());
+        let (slope, noise) = ((at(STEP)? - at(-STEP)?) / (2.0 * STEP), NOISE * size.abs() / STEP);
+        if !within(slope, SLOPE_TOLERANCE * norm + noise) {
+            return Ok(Some(format!(
+                "{name}: the value changes with entries that have no gradient, by {slope:.3e} per unit, where the gradient has norm {norm:.3e}"
+            )));
+        }
     }
     // The change must be above the rounding error of the value itself.
     let step = (1e-3 * size.abs() / norm).clamp(STEP, 20.0 * STEP);
