@@ -23,24 +23,9 @@ import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 
-from trainings import TRAINED, Rows, begin, ended, interrupt, sha256
+from trainings import TRAINED, Rows, begin, ended, events, interrupt, sha256, trained
 
 METHODS = ["hexplane", "native-4d", "swift4d", "embedding", "grid4d", "deform-mlp"]
-
-
-def events(out):
-    log = out / "events.jsonl"
-    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
-
-
-def trained(out):
-    """Seconds of training, all parts of an interrupted run together."""
-    total, last = 0.0, 0.0
-    for event in events(out):
-        if event["event"] == "run-started":
-            total, last = total + last, 0.0
-        last = event.get("seconds", last)
-    return total + last
 
 
 def stop(child, seconds):

@@ -19,7 +19,7 @@ import sys
 import time
 import tomllib
 
-from trainings import TRAINED, Rows, let_end, sha256
+from trainings import TRAINED, Rows, let_end, sha256, trained
 
 # Name, scene, minutes, settings, and the PSNR in dB it is meant to reach.
 RUNS = [
@@ -79,11 +79,11 @@ def train(options, stated, settings):
     if options.threads:
         arguments += ["--threads", str(options.threads)]
     out.with_suffix(".train.json").unlink(missing_ok=True)
-    began = time.time()
+    before, began = trained(out) if resumed else 0.0, time.time()
     with open(log, "a") as file:
         code, peak = measured([options.bin, *arguments], file)
     row = {**stated, "exit": code, "resumed": resumed}
-    row |= {"seconds": round(time.time() - began, 1), "peak_memory_mb": peak, "bench_step": step, "curve": curve(out / "events.jsonl")}
+    row |= {"seconds": round(before + time.time() - began, 1), "peak_memory_mb": peak, "bench_step": step, "curve": curve(out / "events.jsonl")}
     report = out.with_suffix(".eval.json")
     report.unlink(missing_ok=True)
     evaluation = [options.bin, "eval", str(out), "--scene", path, "--split", "test", f"--json={report}", "--sheet", str(out.with_suffix(".png")), "--quiet"]

@@ -11,7 +11,7 @@ stores it. The same program on the same kind of machine gives the same bytes. Th
     benches/codecs.py --cc4dgs target/release/cc4dgs --out benches/results/DATE-codecs OUT/mutant-12k=mutant-12k:DATA/dnerf_mutant ...
 """
 import argparse, hashlib, json, pathlib, subprocess, sys, tempfile, time
-from trainings import begin, ended, replace, sha256
+from trainings import begin, ended, replace, sha256, trained
 
 SCENES = {"mutant-12k": "dnerf_mutant", "mutant-40k": "dnerf_mutant", "basketball": "panoptic_basketball", "built-in": None}
 CONFIGURATIONS = pathlib.Path(__file__).resolve().parent / "models"
@@ -52,8 +52,9 @@ def model(program, data, out, name):
     finished = (folder / "finished.json").exists()
     if not finished:
         again = (folder / "checkpoint").exists()
+        before = trained(folder) if again else 0.0
         run(program, *common, *(["--resume"] if again else ["--config", configuration, "--overwrite"]))
-        replace(folder / "finished.json", {"seconds": round(time.time() - began, 1), "resumed": again})
+        replace(folder / "finished.json", {"seconds": round(before + time.time() - began, 1), "resumed": again})
     scores = json.loads(run(program, "eval", folder, "--scene", scene, "--sheet-rows", 0, "--json", "-", "--quiet"))
     with tempfile.TemporaryDirectory() as temporary:
         archive = pathlib.Path(temporary) / "raw.cc4d"

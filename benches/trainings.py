@@ -45,6 +45,27 @@ class Rows:
             replace(self.file, self.rows)
 
 
+def events(out):
+    """The events of the run in the folder `out`; a line that was cut is none."""
+    log, found = out / "events.jsonl", []
+    for line in log.read_text().splitlines() if log.exists() else []:
+        try:
+            found.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return found
+
+
+def trained(out):
+    """Seconds of training, all parts of an interrupted run together."""
+    total, last = 0.0, 0.0
+    for event in events(out):
+        if event["event"] == "run-started":
+            total, last = total + last, 0.0
+        last = event.get("seconds", last)
+    return total + last
+
+
 def begin(arguments, **streams):
     """The process, unless Ctrl-C was pressed."""
     if INTERRUPTED.is_set():

@@ -32,7 +32,7 @@ impl<B: CpuBackend> ImageOps for B {
 
 /// Planes `[3,H,W]` in 0..1 of `image` on `device`, alpha composited over `background` (RGB in 0..1); the same numbers as [`Image8::to_planes`].
 pub fn image_planes(image: &Arc<Image8>, background: [f32; 3], device: &Device) -> Tensor<3> {
-    let like = Tensor::<1>::zeros([1], &device.clone().without_autodiff());
+    let like = Tensor::<1>::empty([1], &device.clone().without_autodiff());
     Tensor::from_dispatch(<Dispatch as ImageOps>::planes(like.into_dispatch(), image.clone(), background))
 }
 

@@ -156,6 +156,12 @@ mod tests {
         assert_eq!((integer(&layers, "time_resolution"), integer(&full, "time_resolution")), (Some(30), Some(75)));
         assert_eq!((integer(&layers, "features"), integer(&full, "features")), (Some(7), Some(7)));
         assert!(full.want_plan());
+        let (published, demo) = (registry.preset("dnerf+grid4d").unwrap(), registry.preset("demo+grid4d").unwrap());
+        let iterations = |table: &toml::Table| table["train"].get("iterations").and_then(toml::Value::as_integer);
+        assert_eq!(iterations(&published), Some(50_000));
+        assert!(iterations(&demo) < Some(50_000) && !demo.contains_key("published"));
+        let planned = Layers::collect(&registry, Some("auto+grid4d"), None, &[]).unwrap().at_full_size(&registry, "dnerf").unwrap();
+        assert!(!planned.state("train.iterations") && !planned.state("render.background"), "plans decide, not how a method is published");
         let alone = Layers::collect(&registry, Some("auto"), None, &[]).unwrap();
         assert_eq!(alone.at_full_size(&registry, "n3dv").unwrap(), alone);
     }

@@ -60,6 +60,8 @@ fn differences(kind: SpaceKind, section: &str, sh_degree: usize) -> Vec<f32> {
         most_coefficients: usize::MAX,
     };
     let plugin = plugin(kind);
+    let count = weights.iter().map(|array| array.values.len() as u64).sum();
+    assert_eq!((plugin.weights)(&settings, &context), Some(count), "no archive may hold more");
     let ComputedMotion { samples, tracks } = (plugin.motion)(&source).unwrap().unwrap();
     assert!((plugin.motion)(&MotionSource { most_coefficients: 10, ..source }).unwrap().is_none());
 

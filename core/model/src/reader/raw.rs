@@ -220,3 +220,22 @@ impl RawScene {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_that_differ_by_rounding_are_one_instant() {
+        let view = || RawView { camera: 0, frame: 0, time: None, split: Split::Train, image: ImageSource::File { path: "x.png".into(), mask: None } };
+        let frames = |times: &[f64]| {
+            let mut scene = RawScene { views: times.iter().map(|_| view()).collect(), ..Default::default() };
+            scene.rank_times(&times.iter().map(|t| Some(*t)).collect::<Vec<_>>(), "t").unwrap();
+            scene.views.iter().map(|v| v.frame).collect::<Vec<_>>()
+        };
+        assert_eq!(frames(&[0.1 + 0.2, 0.3, 0.0, 1.0, 0.3 - 1e-12]), [1, 1, 0, 2, 1]);
+        assert_eq!(frames(&[1.7e9 + 0.04, 1.7e9, 1.7e9 + 0.08]), [1, 0, 2], "seconds since 1970");
+        assert_eq!(frames(&[0.5, 0.5]), [0, 0]);
+        assert_eq!(frames(&[0.0, 1.0 / 149.0, 2.0 / 149.0]), [0, 1, 2]);
+    }
+}

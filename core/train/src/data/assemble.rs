@@ -18,6 +18,9 @@ use std::sync::Arc;
 /// Positions over this many units of the normalised frame are useless.
 const FARTHEST: f64 = 1e9;
 
+/// Size per axis of stored frames of a video whose lens has to be undone, over their final one.
+const LENS_SHARE: f64 = 1.5;
+
 /// The scene a reader parsed, with frames and cameras chosen, lenses undone and images brought to the size the options ask for.
 ///
 /// The scene is in the normalised frame of its cameras and on a clock of its own, or in those of a model.
@@ -45,7 +48,8 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
             Some(ImageSource::File { path, .. }) => fit_to_image(camera, image_size(path, limits)?, &mut raw.warnings)?,
             _ => camera.size,
         };
-        let (plan, pinhole) = plan_camera(camera, native, (!raw.resized).then_some(options), limits)?;
+        let is_video = matches!(image, Some(ImageSource::Video { .. }));
+        let (plan, pinhole) = plan_camera(camera, native, is_video, (!raw.resized).then_some(options), limits)?;
         plans.push(plan);
         cameras.push(frame.apply_camera(&pinhole));
     }
@@ -116,22 +120,36 @@ pub(super) fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: 
 }
 
 /// What happens to the images of a camera, and the pinhole camera they have then. Without options the images keep their size.
-fn plan_camera(camera: &RawCamera, native: [u32; 2], options: Option<&SceneOptions>, limits: &Limits) -> Result<(Plan, Camera)> {
+fn plan_camera(camera: &RawCamera, native: [u32; 2], is_video: bool, options: Option<&SceneOptions>, limits: &Limits) -> Result<(Plan, Camera)> {
     let object = format!("camera {}", camera.name);
-    let mut pinhole = Camera { width: native[0], height: native[1], ..camera.pinhole() };
-    pinhole.validate()?;
-    let undistort = if camera.distortion.is_identity() {
-        None
-    } else {
-        let plan = Undistort::plan(&object, &camera.distortion, native, camera.focal, camera.principal)?;
-        [pinhole.width, pinhole.height] = plan.size;
-        [pinhole.cx, pinhole.cy] = plan.principal_point();
-        Some(plan)
-    };
+    let (undistort, pinhole) = without_lens(&object, camera, native)?;
     let size = (pinhole.width, pinhole.height);
     let output = options.map_or(size, |o| o.target_size(size));
     limits.check_pixels(&object, u64::from(output.0), u64::from(output.1))?;
-    Ok((Plan { native, undistort, output }, pinhole.resized(output.0, output.1)))
+    let plan = Plan { native, undistort, output };
+    let share = LENS_SHARE * f64::max(f64::from(output.0) / f64::from(size.0), f64::from(output.1) / f64::from(size.1));
+    if !is_video || plan.undistort.is_none() || share >= 1.0 {
+        return Ok((plan, pinhole.resized(output.0, output.1)));
+    }
+    // Every frame is stored before its lens is undone, so it should not be larger than needed.
+    let small = native.map(|n| (f64::from(n) * share).ceil() as u32);
+    let scaled = |values: [f64; 2]| [0, 1].map(|axis| values[axis] * f64::from(small[axis]) / f64::from(native[axis]));
+    let camera = RawCamera { size: small, focal: scaled(camera.focal), principal: scaled(camera.principal), ..camera.clone() };
+    let (undistort, pinhole) = without_lens(&object, &camera, small)?;
+    Ok((Plan { native: small, undistort, output }, pinhole.resized(output.0, output.1)))
+}
+
+/// How the lens of a camera whose images have `native` pixels is undone, if it has one, and the pinhole camera that is left.
+fn without_lens(object: &str, camera: &RawCamera, native: [u32; 2]) -> Result<(Option<Undistort>, Camera)> {
+    let mut pinhole = Camera { width: native[0], height: native[1], ..camera.pinhole() };
+    pinhole.validate()?;
+    if camera.distortion.is_identity() {
+        return Ok((None, pinhole));
+    }
+    let plan = Undistort::plan(object, &camera.distortion, native, camera.focal, camera.principal)?;
+    [pinhole.width, pinhole.height] = plan.size;
+    [pinhole.cx, pinhole.cy] = plan.principal_point();
+    Ok((Some(plan), pinhole))
 }
 
 /// Each distinct warning once, with how often it came.

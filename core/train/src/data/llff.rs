@@ -63,8 +63,9 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         return Err(bad(problem, "Remove the row together with the camera"));
     }
     let frames = footage.iter().map(|f| f.images.len()).min().unwrap_or(0);
-    if footage.iter().any(|f| f.images.len() != frames) {
-        scene.warnings.push(format!("cameras have different numbers of frames; the first {frames} of each are used"));
+    let longest = footage.iter().map(|f| f.images.len()).max().unwrap_or(0);
+    if let Some(shortest) = footage.iter().find(|f| f.images.len() == frames && frames < longest) {
+        scene.warnings.push(format!("cameras have {frames} ({}) to {longest} frames; the first {frames} of each are used", shortest.name));
     }
     if array.shape[0] < LEAST_HELD_OUT {
         scene.warnings.push(NOTHING_HELD_OUT.into());

@@ -46,6 +46,7 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     }
     // "Trains" and "Train" are both in use.
     let range = FIRST_FRAMES.iter().find(|(name, _)| scene_name.starts_with(name)).map(|&(_, first)| first..first + FRAMES);
+    let found = images.len();
     if let Some(range) = &range {
         images.retain(|(frame, _), _| range.contains(frame));
     }
@@ -63,6 +64,10 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
     };
     let (w, h) = image_size(first, limits)?;
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
+    if let Some(range) = range.filter(|_| images.len() < found) {
+        let (more, last) = (found - images.len(), range.end - 1);
+        scene.warnings.push(format!("{more} images are outside of frames {} to {last}, on which {scene_name} is evaluated, and were skipped", range.start));
+    }
     for (index, row) in rows.iter().enumerate() {
         let bad = |problem: String| Error::data(format!("{}: camera {index}", file.display()), problem, "Fetch the file again");
         scene.cameras.push(RawCamera {

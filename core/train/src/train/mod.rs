@@ -55,7 +55,7 @@ use crate::gaussian_set::GaussianSet;
 use crate::init::initialise;
 use crate::masks::{DynamicMask, dynamic_masks};
 use crate::schedule::StageLengths;
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{AppearanceContext, Event, EventSink, Rasterizer, Registry, Result, Scene, Seed, Split, Stage, parse_device};
 use cc4dgs_play::checkpoint::CHECKPOINT;
 use cc4dgs_play::{Model, Moving};
@@ -134,6 +134,8 @@ pub(crate) struct Context<'a> {
     pub lengths: StageLengths,
     pub pyramid: Pyramid,
     pub device: Device,
+    /// The colour behind everything `[3]`.
+    pub background: Tensor<1>,
     pub rasterizer: Box<dyn Rasterizer>,
     pub losses: LossTerms,
     pub score_loss: LossTerms,
@@ -221,6 +223,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         rasterizer,
         losses,
         score_loss,
+        background: Tensor::from_floats(config.background()?, &device),
         device,
         seed,
         masks,

@@ -7,7 +7,7 @@ use super::smoothness::{flicker, smoothness};
 use super::watchdog::{Trouble, is_finite};
 use super::{Context, TrainState, parameters};
 use crate::gaussian_set::{Leaves, gaussian_rate};
-use burn::tensor::{Gradients, Int, Tensor, TensorData};
+use burn::tensor::{Gradients, Int, Tensor};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
     Camera, Error, Event, LossInput, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics,
@@ -66,9 +66,8 @@ impl Context<'_> {
 
         let statistics = state.density.statistics(schedule);
         let background_rgb = self.job.config.background()?;
-        let background = Tensor::<1>::from_data(TensorData::new(background_rgb.to_vec(), [3]), &self.device);
         let max_weights = statistics.contains(&Statistic::MaxWeight);
-        let settings = RenderSettings { max_weights, ..self.job.config.render.settings(Some(Tensor::from_inner(background))) };
+        let settings = RenderSettings { max_weights, ..self.job.config.render.settings(Some(Tensor::from_inner(self.background.clone()))) };
         let mut total: Option<Tensor<1>> = None;
         let mut rendered = Vec::with_capacity(batch.len());
         let mut seen: Option<Tensor<1, Int>> = None;
@@ -126,7 +125,7 @@ impl Context<'_> {
             if read {
                 log.psnr(psnr_db(planes.inner().narrow(0, 0, 3), target.inner())?);
             }
-            let loss = loss.div_scalar(batch.len() as f32);
+            let loss = if batch.len() == 1 { loss } else { loss.div_scalar(batch.len() as f32) };
             total = Some(match total {
                 Some(sum) => sum + loss,
                 None => loss,

@@ -146,6 +146,7 @@ impl<'a> Tuner<'a> {
             rasterizer: registry.build_rasterizer(&config.rasterizer)?,
             losses: LossTerms::build(registry, &config.loss)?,
             score_loss: LossTerms::build(registry, std::slice::from_ref(&config.score_loss))?,
+            background: Tensor::from_floats(config.background()?, device),
             device: (*device).clone(),
             seed,
             masks: Vec::new(),

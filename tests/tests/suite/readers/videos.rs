@@ -15,6 +15,7 @@ const BITS: u32 = 10;
 fn ffmpeg() -> bool {
     let here =
         ["ffmpeg", "ffprobe"].iter().all(|c| Command::new(c).arg("-version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success()));
+    assert!(here || std::env::var_os("CC4DGS_REQUIRE_FFMPEG").is_none(), "the ffmpeg and ffprobe commands are absent");
     if !here {
         eprintln!("skipped: the ffmpeg and ffprobe commands are absent");
     }
@@ -280,6 +281,18 @@ fn transforms_and_colmap_may_name_videos() {
     let scene = opened(&dir, &options);
     check(&scene);
     assert_eq!((scene.camera(0).width, scene.camera(0).cx, scene.cameras[0].name.as_str()), (64, 32.0, "videos/c0.mp4"));
+    // Frames of a camera with a lens are stored a little larger than they are wanted, not at the size of the video.
+    let lens = serde_json::json!({"fl_x": 2.0 * cameras[0].fx, "cx": 64.0, "cy": 48.0, "w": 128, "h": 96, "k1": -0.05, "frames": frames});
+    std::fs::write(dir.path().join("transforms.json"), lens.to_string()).unwrap();
+    let small = SceneOptions { width: 16, video_cache: Some(dir.path().join("small")), ..options.clone() };
+    let (whole, small) = (opened(&dir, &options), opened(&dir, &small));
+    let image = small.frame(0).unwrap();
+    assert_eq!((small.camera(0).width, image.width, image.height), (16, 16, small.camera(0).height));
+    let angle = |camera: &cc4dgs_core::Camera| f64::from(camera.width) / camera.fx;
+    assert!((angle(whole.camera(0)) / angle(small.camera(0)) - 1.0).abs() < 0.05, "{} {}", angle(whole.camera(0)), angle(small.camera(0)));
+    let folders = std::fs::read_dir(dir.path().join("small")).unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.is_dir());
+    let stored = folders.map(|folder| image::image_dimensions(folder.join("000001.png")).unwrap().0).max().unwrap();
+    assert!((16..32).contains(&stored), "{stored} of 64 pixels");
     let refused = |extra: serde_json::Value| {
         write(&[&frames[..], &[extra]].concat());
         open(dir.path(), &options, &Limits::default()).err().unwrap().to_string()
@@ -295,6 +308,25 @@ fn transforms_and_colmap_may_name_videos() {
         std::fs::write(dir.path().join(format!("sparse/0/{file}.bin")), bytes).unwrap();
     }
     check(&opened(&dir, &options));
+}
+
+#[test]
+fn frames_that_a_cut_made_undecodable_do_not_count() {
+    if !ffmpeg() {
+        return;
+    }
+    let (dir, options) = rig(3, SIZE);
+    let source = dir.path().join("source.mp4");
+    let open_groups = ["-c:v", "libx264", "-x264-params", "open-gop=1:keyint=12:min-keyint=12:bframes=3:b-adapt=0:scenecut=0:log=none"];
+    for c in 0..3 {
+        record(&source, c, &(0..60).collect::<Vec<_>>(), "30", &open_groups);
+        // Begins at the key frame of instant 24, with three frames before it that need the ones that are cut off.
+        encode(&["-ss", "0.8", "-i", source.to_str().unwrap(), "-c", "copy", "-avoid_negative_ts", "make_zero", "-f", "matroska"], &video(&dir, c));
+    }
+    let scene = opened(&dir, &options);
+    let found: Vec<Vec<Option<usize>>> = instants(&scene).into_values().collect();
+    let first = found[0][0].unwrap();
+    assert!(found.len() > 30 && found.iter().enumerate().all(|(k, cameras)| cameras.iter().all(|c| *c == Some(first + k))), "{found:?}");
 }
 
 #[test]

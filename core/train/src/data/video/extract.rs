@@ -183,7 +183,7 @@ fn decoded_count(folder: &Path) -> Option<usize> {
     std::fs::read_to_string(folder.join(COUNT)).ok()?.parse().ok()
 }
 
-/// ffmpeg scales as it extracts, unless a lens has to be undone at the native size first.
+/// ffmpeg scales as it extracts: to the final size, or to the one at which a lens is undone.
 fn plan_size(plan: &Plan) -> [u32; 2] {
     if plan.undistort.is_some() { plan.native } else { [plan.output.0, plan.output.1] }
 }

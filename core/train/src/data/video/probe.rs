@@ -3,8 +3,11 @@
 use super::{STREAM, input, run};
 use cc4dgs_core::{Error, Limits, Result, SceneOptions};
 use serde::Deserialize;
+use std::collections::BTreeMap;
 use std::ffi::OsStr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::SystemTime;
 
 /// The most that is read of the list of packets: days of video.
 const MOST_PRINTED: u64 = 1 << 28;
@@ -13,7 +16,11 @@ const TAN_ONE_DEGREE: f64 = 0.017_455;
 /// The rate of a video that states none. It cancels out where all videos of a scene state none.
 const DEFAULT_RATE: f64 = 25.0;
 
+/// Difference of times in seconds that is rounding.
+const SAME_TIME: f64 = 1e-4;
+
 /// What `ffprobe` says about a video.
+#[derive(Clone)]
 pub(crate) struct VideoFacts {
     /// Width and height in pixels, as displayed.
     pub size: [u32; 2],
@@ -38,6 +45,13 @@ struct Printed {
     packets: Vec<Packet>,
     #[serde(default)]
     streams: Vec<Stream>,
+    #[serde(default)]
+    frames: Vec<Frame>,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    pts_time: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -70,7 +84,24 @@ struct SideData {
 /// Errors: [`Error::Data`] for a file without video, with no frame, or turned by other than multiples of 90 degrees, [`Error::Limit`] for large frames,
 /// [`Error::Unsupported`] without `ffprobe`.
 pub(crate) fn probe(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFacts> {
-    let printed = ask(video, options, "packet=pts_time,flags:stream=width,height,r_frame_rate,avg_frame_rate:stream_side_data=displaymatrix,rotation")?;
+    // Listing packets reads the whole file, and a plan opens its scene several times.
+    static KNOWN: Mutex<BTreeMap<(PathBuf, u64, SystemTime, String), VideoFacts>> = Mutex::new(BTreeMap::new());
+    let known = || KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+    let file = std::fs::metadata(video).and_then(|facts| Ok((video.to_path_buf(), facts.len(), facts.modified()?, options.ffmpeg.clone()))).ok();
+    if let Some(facts) = file.as_ref().and_then(|file| known().get(file).cloned()) {
+        limits.check_pixels(&format!("video {}", video.display()), u64::from(facts.size[0]), u64::from(facts.size[1]))?;
+        return Ok(facts);
+    }
+    let facts = list(video, options, limits)?;
+    if let Some(file) = file {
+        known().insert(file, facts.clone());
+    }
+    Ok(facts)
+}
+
+fn list(video: &Path, options: &SceneOptions, limits: &Limits) -> Result<VideoFacts> {
+    let entries = "packet=pts_time,flags:stream=width,height,r_frame_rate,avg_frame_rate:stream_side_data=displaymatrix,rotation";
+    let printed = ask(video, options, &["-show_entries", entries])?;
     let bad = |problem: String, remedy: &str| Error::data(format!("video {}", video.display()), problem, remedy);
     let Some(stream) = printed.streams.first() else { return Err(bad("it holds no video".into(), "Check the file")) };
     if !(1..=1 << 16).contains(&stream.width) || !(1..=1 << 16).contains(&stream.height) {
@@ -79,7 +110,8 @@ pub(crate) fn probe(video: &Path, options: &SceneOptions, limits: &Limits) -> Re
     limits.check_pixels(&format!("video {}", video.display()), stream.width, stream.height)?;
     let turn = stream.turn().map_err(|angle| bad(format!("it is displayed turned by {angle:.1} degrees"), "Turn it by a multiple of 90 degrees"))?;
     let size = [stream.width as u32, stream.height as u32];
-    let (times, keys) = frame_times(&printed.packets, stream);
+    let first = if has_leading(&printed.packets) { first_decoded(video, options)? } else { None };
+    let (times, keys) = frame_times(&printed.packets, stream, first);
     if times.is_empty() {
         return Err(bad("it has no frame".into(), "Check the video"));
     }
@@ -88,19 +120,26 @@ pub(crate) fn probe(video: &Path, options: &SceneOptions, limits: &Limits) -> Re
 
 /// How the frames of a video are turned, without listing its packets.
 pub(super) fn turn_of(video: &Path, options: &SceneOptions) -> Result<Turn> {
-    let printed = ask(video, options, "stream=width:stream_side_data=displaymatrix,rotation")?;
+    let printed = ask(video, options, &["-show_entries", "stream=width:stream_side_data=displaymatrix,rotation"])?;
     let turn = printed.streams.first().map_or(Ok(Turn::UPRIGHT), Stream::turn);
     turn.map_err(|angle| {
         Error::data(format!("video {}", video.display()), format!("it is displayed turned by {angle:.1} degrees"), "Turn it by a multiple of 90 degrees")
     })
 }
 
-fn ask(video: &Path, options: &SceneOptions, entries: &str) -> Result<Printed> {
+/// When the first frame is shown that can be decoded.
+fn first_decoded(video: &Path, options: &SceneOptions) -> Result<Option<f64>> {
+    let printed = ask(video, options, &["-read_intervals", "%+#1", "-show_entries", "frame=pts_time"])?;
+    Ok(printed.frames.first().and_then(|frame| seconds(&frame.pts_time)))
+}
+
+/// Runs `ffprobe` on `video`; `what` says what it shows.
+fn ask(video: &Path, options: &SceneOptions, what: &[&str]) -> Result<Printed> {
     let beside = |name: &str| options.ffmpeg.strip_suffix(name).map(|folder| format!("{folder}{}", name.replace("ffmpeg", "ffprobe")));
     let ffprobe = beside("ffmpeg").or_else(|| beside("ffmpeg.exe")).unwrap_or_else(|| "ffprobe".into());
-    let arguments = ["-v", "error", "-protocol_whitelist", "file", "-select_streams", STREAM, "-show_entries", entries, "-of", "json=compact=1"];
+    let arguments = ["-v", "error", "-protocol_whitelist", "file", "-select_streams", STREAM, "-of", "json=compact=1"];
     let video_input = input(video);
-    let mut arguments = arguments.map(OsStr::new).to_vec();
+    let mut arguments: Vec<&OsStr> = arguments.iter().chain(what).map(OsStr::new).collect();
     arguments.push(&video_input);
     let printed = run(&ffprobe, &arguments, video, MOST_PRINTED)?;
     serde_json::from_slice(&printed).map_err(|e| {
@@ -176,11 +215,27 @@ fn display_matrix(text: &str) -> Option<[f64; 4]> {
     }
 }
 
-/// Times and key frames in the order of presentation. Packets that are only decoded, not shown, are left out.
-fn frame_times(packets: &[Packet], stream: &Stream) -> (Vec<f64>, Vec<bool>) {
-    let shown: Vec<&Packet> = packets.iter().filter(|p| !p.flags.contains('D')).collect();
-    let time = |p: &&Packet| p.pts_time.as_deref().and_then(|t| t.parse::<f64>().ok()).filter(|t| t.is_finite());
-    let stated: Option<Vec<f64>> = shown.iter().map(time).collect();
+/// A time that is stated.
+fn seconds(text: &Option<String>) -> Option<f64> {
+    text.as_deref().and_then(|text| text.parse::<f64>().ok()).filter(|time| time.is_finite())
+}
+
+/// Packets that are shown, not only decoded.
+fn shown(packets: &[Packet]) -> impl Iterator<Item = &Packet> {
+    packets.iter().filter(|packet| !packet.flags.contains('D'))
+}
+
+/// Whether packets come before the first key frame, or have no time beside others that have one: in a video that was cut without decoding it, those cannot be decoded.
+fn has_leading(packets: &[Packet]) -> bool {
+    let Some(key) = shown(packets).find(|packet| packet.flags.contains('K')).and_then(|packet| seconds(&packet.pts_time)) else { return false };
+    shown(packets).any(|packet| seconds(&packet.pts_time).is_none_or(|time| time < key))
+}
+
+/// Times and key frames in the order of presentation, from the time `first` on where one is given. Packets that are only decoded, not shown, are left out.
+fn frame_times(packets: &[Packet], stream: &Stream, first: Option<f64>) -> (Vec<f64>, Vec<bool>) {
+    let is_late = |packet: &&Packet| first.is_none_or(|first| seconds(&packet.pts_time).is_some_and(|time| time >= first - SAME_TIME));
+    let shown: Vec<&Packet> = shown(packets).filter(is_late).collect();
+    let stated: Option<Vec<f64>> = shown.iter().map(|packet| seconds(&packet.pts_time)).collect();
     // Without times of all frames, their order is that of the packets, at a constant rate.
     let times = stated.unwrap_or_else(|| (0..shown.len()).map(|i| i as f64 / stream.rate()).collect());
     let mut frames: Vec<(f64, bool)> = times.into_iter().zip(shown.iter().map(|p| p.flags.contains('K'))).collect();
@@ -217,8 +272,9 @@ mod tests {
 
     #[test]
     fn times_are_sorted_and_hidden_packets_left_out() {
-        let read =
-            |packets: &str, stream: &str| frame_times(&serde_json::from_str::<Vec<Packet>>(packets).unwrap(), &serde_json::from_str::<Stream>(stream).unwrap());
+        let read = |packets: &str, stream: &str| {
+            frame_times(&serde_json::from_str::<Vec<Packet>>(packets).unwrap(), &serde_json::from_str::<Stream>(stream).unwrap(), None)
+        };
         let packets = r#"[{"pts_time":"0.0","flags":"KD"},{"pts_time":"0.1","flags":"K_"},{"pts_time":"0.3","flags":"__"},{"pts_time":"0.2"}]"#;
         assert_eq!(read(packets, "{}"), (vec![0.1, 0.2, 0.3], vec![true, false, false]));
         // A time is missing, or no number: a constant rate.
@@ -227,5 +283,9 @@ mod tests {
             assert_eq!(times, vec![0.0, 0.1]);
         }
         assert_eq!(read("[{},{}]", r#"{"avg_frame_rate":"1/0"}"#).0, vec![0.0, 1.0 / DEFAULT_RATE]);
+        // Cut without decoding: what comes before the first key frame needs frames that are gone.
+        let cut: Vec<Packet> = serde_json::from_str(r#"[{"pts_time":"0.2","flags":"K_"},{"pts_time":"0.1"},{},{"pts_time":"0.3"}]"#).unwrap();
+        assert!(has_leading(&cut) && !has_leading(&cut[..1]));
+        assert_eq!(frame_times(&cut, &serde_json::from_str("{}").unwrap(), Some(0.2)), (vec![0.2, 0.3], vec![true, false]));
     }
 }

@@ -49,7 +49,7 @@ pub struct Guard {
     /// Views in which each Gaussian was drawn since then, up to the last plan `[N]`.
     drawn: Vec<f32>,
     /// Views since the last plan, on the device `[N]`.
-    drawn_since: Option<Tensor<1>>,
+    drawn_since: Option<Tensor<1, Int>>,
     /// The last removal that was measured, until the next one or a reset.
     removal: Option<Removal>,
     /// Number of removed Gaussians that growth may not replace yet; 0 without a removal.
@@ -109,7 +109,7 @@ impl Guard {
     /// A training view drew the Gaussians with these radii, 0 where it did not `[N]`. Nothing is read from the device.
     pub(super) fn saw(&mut self, radii: &Tensor<1, Int>) {
         if radii.dims()[0] == self.born.len() {
-            let drawn = radii.clone().greater_elem(0).float();
+            let drawn = radii.clone().clamp(0, 1);
             self.drawn_since = Some(match self.drawn_since.take() {
                 Some(sum) => sum + drawn,
                 None => drawn,
@@ -123,7 +123,7 @@ impl Guard {
     /// Views in which each Gaussian was drawn `[N]`.
     fn drawn_until_now(&self) -> Result<Vec<f32>> {
         let Some(since) = &self.drawn_since else { return Ok(self.drawn.clone()) };
-        Ok(self.drawn.iter().zip(to_vec(since.clone(), "views of Gaussians")?).map(|(before, since)| before + since).collect())
+        Ok(self.drawn.iter().zip(to_vec(since.clone().float(), "views of Gaussians")?).map(|(before, since)| before + since).collect())
     }
     /// Reads the count of views from the device.
     fn read_views(&mut self) -> Result<()> {
