@@ -18,8 +18,12 @@ const ENOUGH: f64 = 0.1;
 /// # Errors
 /// [`Error::Parameter`] and [`Error::Data`] where the scene has no points of that kind, and whatever decoding its images meets.
 pub fn initialise(scene: &Scene, config: &RunConfig, seed: Seed, events: &dyn EventSink) -> Result<HostGaussians> {
-    let most = config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(usize::MAX, |most| most.max(1) as usize);
+    let most = config.density.get("max_gaussians").and_then(toml::Value::as_integer).filter(|most| *most > 0).map_or(usize::MAX, |most| most as usize);
     let count = config.init.count.min(most).min(config.limits.max_gaussians as usize);
+    if most < config.init.count {
+        let message = format!("init.count is {}, over density.max_gaussians: the run begins with {most} Gaussians at most", config.init.count);
+        events.emit(&Event::Note { object: "initial Gaussians".into(), message });
+    }
     let own = scene.points.as_ref().filter(|p| !p.positions.is_empty());
     let mut uncertain = 0..0;
     let few = own.is_some_and(|points| (points.positions.len() as f64) < ENOUGH * count as f64);

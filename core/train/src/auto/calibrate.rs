@@ -41,7 +41,7 @@ pub(super) fn calibrate(config: &RunConfig, scene: &Arc<Scene>, registry: &Regis
         .filter(|_| began.elapsed() < patience && !stop.load(Ordering::Relaxed))
         .try_for_each(|view| scene.frame(view).map(drop))?;
     let mut trial = config.clone();
-    let most = config.density.get("max_gaussians").and_then(|v| v.as_integer()).map_or(config.init.count, |v| v.max(1) as usize);
+    let most = config.density.get("max_gaussians").and_then(|v| v.as_integer()).filter(|v| *v > 0).map_or(config.init.count, |v| v as usize);
     trial.init.count = trial.init.count.min(most);
     trial.density = toml::Table::from_iter([("kind".into(), "none".into())]);
     trial.train.iterations = 2 * ITERATIONS;

@@ -146,11 +146,13 @@ pub(super) struct Stated<'a> {
     pub deformer: Option<&'a str>,
     /// The upper bound of Gaussians.
     pub gaussians: Option<f64>,
+    /// The first Gaussians; a bound that is not stated is no lower.
+    pub first: Option<f64>,
 }
 
 /// Every other setting but the number of iterations.
 pub(super) fn choose(facts: &Facts, machine: Machine, minutes: f64, stated: Stated) -> Vec<Choice> {
-    let most = stated.gaussians.unwrap_or_else(|| most_gaussians(facts, machine, minutes));
+    let most = stated.gaussians.unwrap_or_else(|| most_gaussians(facts, machine, minutes).max(stated.first.unwrap_or(0.0)));
     let free = stated.deformer.is_none_or(|kind| kind == FREE_TIME);
     let every = free.then(|| key_frames(facts, machine, minutes, most)).flatten();
     let mut choices = vec![field(facts, machine, minutes, stated.deformer, every), stages(facts, machine, minutes, most, every), counts(facts, most)];

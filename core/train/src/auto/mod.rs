@@ -164,8 +164,12 @@ pub fn open_shared(
     let full_size = if graphics { Some(layers.at_full_size(registry, choose::dataset_like(&facts))?) } else { None };
     let layers = full_size.as_ref().unwrap_or(layers);
     let kind = asked.deformer.get("kind").and_then(|k| k.as_str());
-    let most = asked.density.get("max_gaussians").and_then(|most| most.as_integer()).map(|most| most.max(1) as f64);
-    let stated = choose::Stated { deformer: kind.filter(|_| layers.state("deformer.kind")), gaussians: most.filter(|_| layers.state("density.max_gaussians")) };
+    let most = asked.density.get("max_gaussians").and_then(|most| most.as_integer()).filter(|most| *most > 0).map(|most| most as f64);
+    let stated = choose::Stated {
+        deformer: kind.filter(|_| layers.state("deformer.kind")),
+        gaussians: most.filter(|_| layers.state("density.max_gaussians")),
+        first: layers.state("init.count").then_some(asked.init.count as f64),
+    };
     for choice in choose::choose(&facts, machine, minutes, stated) {
         plan.add(for_density_of(layers, &asked, choice, registry)?)?;
     }

@@ -161,7 +161,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     let has_images = |f: &&PathBuf| images.iter().any(|image| f.join(&image.name).is_file());
     let image_folder = folders.iter().find(has_images).or_else(|| folders.iter().find(|f| f.is_dir())).unwrap_or(&folders[0]);
     let hold_out = images.len() >= LEAST_HELD_OUT;
-    if !hold_out {
+    if !hold_out && options.test_cameras.is_none() {
         scene.warnings.push(NOTHING_HELD_OUT.into());
     }
     let mut videos = videos(path, &images, options, limits, &mut scene.warnings)?.into_iter();

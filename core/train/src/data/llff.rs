@@ -67,7 +67,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     if let Some(shortest) = footage.iter().find(|f| f.images.len() == frames && frames < longest) {
         scene.warnings.push(format!("cameras have {frames} ({}) to {longest} frames; the first {frames} of each are used", shortest.name));
     }
-    if array.shape[0] < LEAST_HELD_OUT {
+    if array.shape[0] < LEAST_HELD_OUT && options.test_cameras.is_none() {
         scene.warnings.push(NOTHING_HELD_OUT.into());
     }
     let mut depths = Vec::new();

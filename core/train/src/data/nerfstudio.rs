@@ -199,6 +199,9 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
             if missing.len() > 3 { ", …" } else { "" }
         ));
     }
+    if !named_split && transforms.frames.len() < LEAST_HELD_OUT && options.test_cameras.is_none() {
+        scene.warnings.push(NOTHING_HELD_OUT.into());
+    }
     if unlisted > 0 {
         scene.warnings.push(format!("{unlisted} images are in none of train_filenames, test_filenames and val_filenames, and were skipped"));
     }

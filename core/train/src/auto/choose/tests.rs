@@ -25,7 +25,7 @@ fn facts(arrangement: Arrangement) -> Facts {
 }
 
 fn chosen(facts: &Facts, machine: Machine, minutes: f64, deformer: Option<&str>) -> Vec<Choice> {
-    choose(facts, machine, minutes, Stated { deformer, gaussians: None })
+    choose(facts, machine, minutes, Stated { deformer, ..Default::default() })
 }
 
 fn value(choices: &[Choice], key: &str) -> Option<Value> {
@@ -96,8 +96,10 @@ fn images_shrink_to_the_time() {
 #[test]
 fn a_stated_number_of_gaussians_is_planned_with() {
     let scene = facts(Arrangement::OneCameraAnywhere);
-    let with = |gaussians: f64| choose(&scene, MACHINE, 5.0, Stated { deformer: None, gaussians: Some(gaussians) });
+    let with = |gaussians: f64| choose(&scene, MACHINE, 5.0, Stated { gaussians: Some(gaussians), ..Default::default() });
     assert_eq!(value(&with(60_000.0), "init.count"), Some(60_000.into()));
+    let begun = choose(&scene, MACHINE, 5.0, Stated { first: Some(90_000.0), ..Default::default() });
+    assert_eq!(value(&begun, "density.max_gaussians"), Some(90_000.into()), "no lower than what a run begins with");
     let rate = |gaussians: f64| value(&with(gaussians), "train.lr.means").and_then(|v| v.as_float()).unwrap();
     assert_eq!((rate(1000.0), rate(60_000.0)), (3.2e-4, 1.6e-4));
 }
