@@ -45,7 +45,7 @@ pub fn export(exporter: &dyn Exporter, target: ExportTarget, source: &mut dyn Ex
         if replaced && std::fs::rename(&old, path).is_err() {
             let kept = beside.keep().join(".replaced");
             let problem = format!("it could not be replaced: {e}; the old folder is {}", kept.display());
-            return Err(Error::data(path.display().to_string(), problem, "Move the old folder back, and free the name before the next export"));
+            return Err(Error::data(path.display().to_string(), problem, "Move the old folder back, or export to another name"));
         }
         return Err(Error::io(path, e));
     }
