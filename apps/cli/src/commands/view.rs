@@ -4,7 +4,7 @@ use super::{Context, exact};
 use crate::args::View;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings};
 use cc4dgs_core::archive::Archive;
-use cc4dgs_core::{Error, EventSink, Limits, Registry, Result, Silent, StoredModel, parse_device};
+use cc4dgs_core::{EventSink, Limits, Registry, Result, Silent, StoredModel, parse_device};
 use cc4dgs_play::bake::MaxError;
 use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_player::Content;
