@@ -217,7 +217,7 @@ pub struct Report {
     /// Views per scene to show images of.
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..=100))]
     pub views: u16,
-    /// Only results with this scene, method, setting, codec, seed, device or split; may be given several times.
+    /// Only results with this scene, method, setting, codec, seed, device, adapter, processor, threads or split; may be given several times.
     #[arg(long = "where", value_name = "KEY=VALUE")]
     pub only: Vec<String>,
     /// Columns of the summary tables by their names in the CSV file, such as psnr_db,size_mb,frame_ms; all by default.

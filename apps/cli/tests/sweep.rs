@@ -64,7 +64,13 @@ fn a_grid_becomes_tables() {
     succeed(&["sweep", "run", text(&single), "--index", "1"]);
     let said = fail(&["sweep", "collect", text(&single), "-q"], 3);
     assert!(said.contains("2 of 4 cells are missing") && said.contains("tiny cdf base seed 0 half") && said.contains("not begun"), "{said}");
+    let report = succeed(&["report", text(&single), "--images", "none"]);
+    assert!(report["gap"].as_str().unwrap().starts_with("2 of 4 cells of the sweep are missing: tiny cdf base seed 0 raw;"), "{report}");
+    let page = std::fs::read_to_string(report["html"].as_str().unwrap()).unwrap();
+    assert!(page.contains("2 of 4 cells of the sweep are missing"), "said on the page");
     let plan: Value = serde_json::from_slice(&std::fs::read(single.join("plan.json")).unwrap()).unwrap();
+    let said = fail(&["sweep", "run", text(&single), "--plan", "0123456789abcdef", "--index", "0", "-q"], 2);
+    assert!(said.contains("may be other trainings"), "{said}");
     let cell = |index: usize| plan["cells"][index]["id"].as_str().unwrap();
     // One cell trains; the other one of the training finds it trained.
     succeed(&["sweep", "run", text(&single), "--cell", cell(0)]);
@@ -119,6 +125,38 @@ fn a_grid_becomes_tables() {
     std::fs::write(&name, other).unwrap();
     let said = fail(&["sweep", "collect", text(&pool), "-q"], 3);
     assert!(said.contains("two devices") && said.contains("flex") && said.contains("ndarray"), "{said}");
+}
+
+#[test]
+fn a_codec_that_fails_keeps_no_other_from_being_tried() {
+    let folder = tempfile::tempdir().unwrap();
+    let (grid, sweep) = (folder.path().join("grid.toml"), folder.path().join("sweep"));
+    let text_of_grid = "name = 'strict'
+iterations = 30
+images = 0
+max_views = 1
+[[scene]]
+name = 'tiny'
+path = 'procedural:tiny'
+family = 'demo'
+[[method]]
+name = 'still'
+preset = '+none'
+[[codec]]
+name = 'impossible'
+codec = 'compact:max-size=0.0001MB'
+[[codec]]
+name = 'raw'
+codec = 'raw'
+";
+    std::fs::write(&grid, text_of_grid).unwrap();
+    succeed(&["sweep", "plan", text(&grid), "--out", text(&sweep)]);
+    let said = fail(&["sweep", "run", text(&sweep), "--index", "0", "-q"], 2);
+    assert!(said.contains("codec compact"), "{said}");
+    let found = results(&sweep);
+    assert!(found.len() == 1 && found[0].1["axes"]["codec"] == "raw", "{found:?}");
+    let said = fail(&["sweep", "collect", text(&sweep), "-q"], 3);
+    assert!(said.contains("1 of 2 cells are missing") && said.contains("impossible") && said.contains("codec compact"), "{said}");
 }
 
 #[test]

@@ -57,6 +57,9 @@ pub struct SweepRun {
     /// Run the I-th training, from 0, with all of its cells.
     #[arg(long, value_name = "I")]
     pub index: Option<usize>,
+    /// Refuse to run if the folder has another plan by now, so that an index cannot mean another training; `sweep emit` writes it into job files.
+    #[arg(long, value_name = "ID", requires = "index")]
+    pub plan: Option<String>,
     /// Leave a training that another process works on (exit code 75) instead of waiting.
     #[arg(long, hide = true)]
     pub no_wait: bool,
@@ -73,7 +76,7 @@ pub struct SweepCollect {
     /// Make tables of what is there, also where cells are missing.
     #[arg(long)]
     pub partial: bool,
-    /// Tables of these results only: scene, method, setting, codec, seed, device or split; may be given several times.
+    /// Tables of these results only: scene, method, setting, codec, seed, device, adapter, processor, threads or split; may be given several times.
     #[arg(long = "where", value_name = "KEY=VALUE")]
     pub conditions: Vec<String>,
 }

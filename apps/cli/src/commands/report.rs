@@ -26,6 +26,7 @@ pub fn run(context: &Context, args: &Report) -> Result<()> {
     let files = write_report(&args.results, &out, &options)?;
     context.output.result(&files, || {
         let tables = [&files.csv, &files.markdown, &files.latex].map(|file| file.display().to_string()).join(", ");
-        format!("{} ({:.2} MB) from {} results; tables: {tables}", files.html.display(), megabytes(files.html_bytes as u64), files.cells)
+        let gap = files.gap.as_ref().map_or_else(String::new, |gap| format!("\n{gap}"));
+        format!("{} ({:.2} MB) from {} results; tables: {tables}{gap}", files.html.display(), megabytes(files.html_bytes as u64), files.cells)
     })
 }

@@ -74,6 +74,8 @@ pub struct Report {
     pub figures: Vec<(String, String)>,
     /// Results that it is made of.
     pub cells: usize,
+    /// Which cells of the sweep are missing, if any.
+    pub gap: Option<String>,
 }
 
 /// The files of a report.
@@ -91,18 +93,21 @@ pub struct ReportFiles {
     pub figures: Vec<PathBuf>,
     /// Results that it is made of.
     pub cells: usize,
+    /// Which cells of the sweep are missing, if any.
+    pub gap: Option<String>,
     /// Size of the page in bytes.
     pub html_bytes: usize,
 }
 
-/// The results of the cells of the plan in `folder`, in the order of [`read_results`].
-fn planned_results(folder: &Path) -> Result<Vec<CellResult>> {
-    let mut results = collect(&SweepFolder::new(folder), &Plan::read(folder)?)?.results;
+/// The results of the cells of the plan in `folder`, in the order of [`read_results`], and what is missing.
+fn planned_results(folder: &Path) -> Result<(Vec<CellResult>, Option<String>)> {
+    let collection = collect(&SweepFolder::new(folder), &Plan::read(folder)?)?;
+    let (gap, mut results) = (collection.gap(), collection.results);
     if results.is_empty() {
         return Err(Error::data(folder.display().to_string(), "no result is of a cell of its plan", "Run the sweep first: cc4dgs sweep run DIR"));
     }
     results.sort_by(|a, b| a.axes.cmp(&b.axes).then_with(|| a.id.cmp(&b.id)));
-    Ok(results)
+    Ok((results, gap))
 }
 
 /// Makes the report of the results in `path` (see [`read_results`]); of a sweep's folder, those of the cells of its plan. The folder of images is `path` itself,
@@ -113,7 +118,8 @@ fn planned_results(folder: &Path) -> Result<Vec<CellResult>> {
 pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     // Earlier plans leave results in the folder of a sweep, too.
     let is_sweep = path.join(PLAN).is_file() && path.join(RESULTS).is_dir();
-    let results = select(if is_sweep { planned_results(path)? } else { read_results(path)? }, &options.only)?;
+    let (results, gap) = if is_sweep { planned_results(path)? } else { (read_results(path)?, None) };
+    let results = select(results, &options.only)?;
     check_comparable(&results)?;
     let scenes = rows(&results)?;
     let beside = path.is_file() || path.file_name().is_some_and(|name| name == RESULTS);
@@ -133,6 +139,11 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     let mut body = page::contents(&links) + &page::facts(&results);
     let mut markdown = format!("# {}\n\n{MARKDOWN_NOTE} ↑ high is better, ↓ low is better. MB are 10⁶ bytes.\n\n", text::markdown(&title));
     let mut latex = format!("{LATEX_NOTE} MB are 10^6 bytes.\n");
+    if let Some(gap) = &gap {
+        body += &format!("<p class=\"warning\">{}</p>\n", text::html(gap));
+        markdown += &format!("{}\n\n", text::markdown(gap));
+        latex += &format!("% {gap}\n");
+    }
     for (i, (scene, rows)) in scenes.iter().enumerate() {
         let table = tables::summary(scene, rows, &columns, &trained);
         markdown += &table.markdown();
@@ -157,7 +168,7 @@ pub fn report(path: &Path, options: &ReportOptions) -> Result<Report> {
     body += "</div>\n";
     let mut figures: Vec<(String, String)> = scenes.iter().flat_map(|(scene, rows)| charts::files(scene, rows, &key, &trained)).collect();
     number_equals(&mut figures);
-    Ok(Report { html: page::page(&title, &body), csv: tables::csv(&scenes), markdown, latex, figures, cells: results.len() })
+    Ok(Report { html: page::page(&title, &body), csv: tables::csv(&scenes), markdown, latex, figures, cells: results.len(), gap })
 }
 
 /// Numbers the second and later of equal names: they lack the punctuation and the case of their scenes.
@@ -233,6 +244,7 @@ pub fn write_report(path: &Path, out: &Path, options: &ReportOptions) -> Result<
         latex: write("tex", &report.latex)?,
         html: write("html", &report.html)?,
         cells: report.cells,
+        gap: report.gap,
         html_bytes: report.html.len(),
     })
 }

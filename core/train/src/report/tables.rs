@@ -2,7 +2,7 @@
 
 use super::rows::{Better, QUANTITIES, Quantity, Row, TRAINING};
 use super::text;
-use crate::sweep::{TrainingDevices, csv_field, trained_on};
+use crate::sweep::{TrainingDevices, csv_field, mixture_notes, trained_on};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -82,6 +82,7 @@ pub(super) fn summary(scene: &str, rows: &[Row], quantities: &[&Quantity], train
             line.push(Cell { text, best: is_best });
         }
     }
+    notes.extend(mixture_notes(rows.iter().map(|row| (row.training(), row.cells.as_slice()))));
     let hopeless: Vec<String> = rows
         .iter()
         .filter(|row| row.hopeless())

@@ -99,6 +99,13 @@ pub fn collect(folder: &SweepFolder, plan: &Plan) -> Result<Collection> {
 }
 
 impl Collection {
+    /// What tables of an incomplete sweep say about it; `None` of a complete one.
+    pub fn gap(&self) -> Option<String> {
+        let named: Vec<&str> = self.missing.iter().take(NAMED).map(|m| m.axes.as_str()).collect();
+        let more = self.missing.len().saturating_sub(NAMED);
+        let rest = if more > 0 { format!("; and {more} more") } else { String::new() };
+        (!self.missing.is_empty()).then(|| format!("{} of {} cells of the sweep are missing: {}{rest}.", self.missing.len(), self.planned, named.join("; ")))
+    }
     /// Refuses a sweep that is not complete.
     ///
     /// # Errors
@@ -116,25 +123,28 @@ impl Collection {
     }
 }
 
-/// Writes `results` (one file, a line each) and their tables into the sweep's folder.
+/// Writes `results` (one file, a line each) and their tables into the sweep's folder; `gap` is what the Markdown says is missing ([`Collection::gap`]).
 ///
 /// # Errors
 /// As [`markdown`], and [`Error::Io`].
-pub fn write_tables(folder: &SweepFolder, results: &[CellResult]) -> Result<Tables> {
-    let (table, comma_separated) = (markdown(results)?, csv(results)?);
-    let lines = write_lines(results)?;
+pub fn write_tables(folder: &SweepFolder, results: &[CellResult], gap: Option<&str>) -> Result<Tables> {
     let at = |name: &str| folder.root().join(name);
     let tables = Tables { results: at("results.jsonl"), markdown: at("table.md"), csv: at("table.csv") };
-    write_atomically(&tables.results, lines.as_bytes())?;
+    // Results are written even where they do not belong into one table.
+    write_atomically(&tables.results, write_lines(results)?.as_bytes())?;
+    let (mut table, comma_separated) = (markdown(results)?, csv(results)?);
+    if let Some(gap) = gap {
+        table = table.replacen("\n\n", &format!("\n\n{gap}\n\n"), 1);
+    }
     write_atomically(&tables.markdown, table.as_bytes())?;
     write_atomically(&tables.csv, comma_separated.as_bytes())?;
     Ok(tables)
 }
 
 /// The keys that [`select`] knows.
-const KEYS: [&str; 7] = ["scene", "method", "setting", "codec", "seed", "device", "split"];
+const KEYS: [&str; 10] = ["scene", "method", "setting", "codec", "seed", "device", "adapter", "processor", "threads", "split"];
 
-/// The results that `conditions` ask for, each `KEY=VALUE` with one of the keys scene, method, setting, codec, seed, device and split. Several values of one key
+/// The results that `conditions` ask for, each `KEY=VALUE` with one of the keys scene, method, setting, codec, seed, device, adapter, processor, threads and split. Several values of one key
 /// are alternatives; all keys must hold.
 ///
 /// # Errors
@@ -154,6 +164,9 @@ pub fn select(results: Vec<CellResult>, conditions: &[String]) -> Result<Vec<Cel
         "codec" => r.axes.codec.clone(),
         "seed" => r.axes.seed.to_string(),
         "device" => r.provenance.device.name.clone(),
+        "adapter" => r.provenance.device.adapter.clone().unwrap_or_default(),
+        "processor" => r.provenance.device.processor.clone(),
+        "threads" => r.provenance.device.threads.to_string(),
         _ => format!("{:?}", r.split).to_lowercase(),
     };
     let mut kept = results;
@@ -197,15 +210,20 @@ mod tests {
         assert_eq!((partial.finished, partial.planned, partial.foreign.as_slice()), (1, 2, &["other.json".to_string()][..]));
         let message = partial.check_complete(&folder).unwrap_err().to_string();
         assert!([all[1].id.as_str(), "tiny own base seed 0 half", "damaged", "not begun"].iter().all(|part| message.contains(part)), "{message}");
+        let gap = partial.gap().unwrap();
+        assert_eq!(gap, "1 of 2 cells of the sweep are missing: tiny own base seed 0 half.");
+        let tables = write_tables(&folder, &partial.results, Some(&gap)).unwrap();
+        assert!(std::fs::read_to_string(tables.markdown).unwrap().contains(&format!("\n\n{gap}\n\n")));
         all[1].write(&folder.result(&all[1].id)).unwrap();
         let complete = collect(&folder, &plan).unwrap();
         complete.check_complete(&folder).unwrap();
+        assert_eq!(complete.gap(), None);
         // Names are those of the plan, also in the files.
         let renamed = |r: &CellResult| (r.id.clone(), r.training.clone(), r.metrics.clone());
         assert_eq!(complete.results.iter().map(renamed).collect::<Vec<_>>(), all.iter().map(renamed).collect::<Vec<_>>());
         assert!(complete.results.iter().all(|r| (r.axes.method.as_str(), r.axes.setting.as_str()) == ("own", "base") && r.sweep == plan.name));
         assert_eq!(collect(&folder, &plan).unwrap(), complete);
-        let tables = write_tables(&folder, &complete.results).unwrap();
+        let tables = write_tables(&folder, &complete.results, None).unwrap();
         assert_eq!(super::super::read_results(&tables.results).unwrap().len(), 2);
         assert!(std::fs::read_to_string(tables.markdown).unwrap().contains("| half |"));
     }
@@ -216,7 +234,8 @@ mod tests {
         let of = |conditions: &[&str]| select(results(), &conditions.iter().map(ToString::to_string).collect::<Vec<_>>());
         assert_eq!(of(&[]).unwrap().len(), 2);
         assert_eq!(of(&["seed=7", "device=flex"]).unwrap()[0].id, "b");
-        assert_eq!(of(&["seed=7", "seed=0", "split=test"]).unwrap().len(), 2);
+        assert_eq!(of(&["seed=7", "seed=0", "split=test", "processor=Example processor"]).unwrap().len(), 2);
+        assert!(of(&["threads=97"]).unwrap_err().to_string().contains("threads=97"));
         assert!(of(&["seed=8"]).unwrap_err().to_string().contains("0, 7"));
         assert!(of(&["sead=8"]).unwrap_err().to_string().contains("one of the keys"));
         assert!(of(&["seed"]).unwrap_err().to_string().contains("KEY=VALUE"));

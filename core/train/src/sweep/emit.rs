@@ -1,4 +1,4 @@
-//! The trainings of a plan as jobs of schedulers. Each index runs `cc4dgs sweep run DIR --index I`: the training and the cells it lacks.
+//! The trainings of a plan as jobs of schedulers. Each index runs `cc4dgs sweep run DIR --plan ID --index I`: the training and the cells it lacks.
 
 use super::plan::Plan;
 use cc4dgs_core::{Error, Result};
@@ -122,7 +122,7 @@ fn slurm(plan: &Plan, o: &EmitOptions) -> String {
 #SBATCH --output={output}
 set -u
 cd {cd} || exit 2
-{program} --quiet --threads {threads} sweep run {folder} --index "$SLURM_ARRAY_TASK_ID" &
+{program} --quiet --threads {threads} sweep run {folder} --plan {plan} --index "$SLURM_ARRAY_TASK_ID" &
 work=$!
 trap 'kill -TERM "$work" 2>/dev/null' TERM INT
 # A signal ends the first wait; the second one waits for the checkpoint.
@@ -146,6 +146,7 @@ exit "$code"
         cd = quoted(&o.working_folder),
         program = quoted(&o.program),
         folder = quoted(&o.folder),
+        plan = plan.id(),
     )
 }
 
@@ -189,7 +190,7 @@ spec:
         image: {image}
         workingDir: {cd}
         command: [{program}]
-        args: ["--quiet", "--threads", "{threads}", "sweep", "run", {folder}, "--index", "$(JOB_COMPLETION_INDEX)"]
+        args: ["--quiet", "--threads", "{threads}", "sweep", "run", {folder}, "--plan", "{plan}", "--index", "$(JOB_COMPLETION_INDEX)"]
         env:
         - name: JOB_COMPLETION_INDEX
           valueFrom:
@@ -221,6 +222,7 @@ spec:
         memory = u64::from(o.memory_gb) * 1000,
         stop_after = stop_after(o.minutes),
         claim = yaml(&o.claim),
+        plan = plan.id(),
     )
 }
 
@@ -229,7 +231,8 @@ fn skypilot(plan: &Plan, o: &EmitOptions) -> String {
     let last = plan.trainings.len() - 1;
     // SkyPilot has no time limit. `timeout` asks the program to stop and ends with the program's own code.
     let limit = format!("timeout --preserve-status --kill-after={NOTICE_SECONDS} {}", stop_after(o.minutes));
-    let command = format!("{limit} {} --quiet --threads {} sweep run {} --index \"$INDEX\"", quoted(&o.program), o.threads, quoted(&o.folder));
+    let command =
+        format!("{limit} {} --quiet --threads {} sweep run {} --plan {} --index \"$INDEX\"", quoted(&o.program), o.threads, quoted(&o.folder), plan.id());
     format!(
         r#"# {trainings} trainings, {cells} cells. Launch one managed job per index:
 #   for index in $(seq 0 {last}); do sky jobs launch --yes --detach-run --name "{name}-$index" --env INDEX="$index" FILE; done

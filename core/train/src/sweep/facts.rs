@@ -69,19 +69,28 @@ fn list(root: &Path) -> Result<Vec<DataFile>> {
     Ok(files)
 }
 
+/// The folder of everything that readers take from the dataset at `path`: of a file the one it lies in, since images are named relative to it; of a COLMAP model that
+/// of its project, where its images are.
+fn root_of(path: &Path) -> PathBuf {
+    if path.is_file() {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        return folder.unwrap_or(Path::new(".")).to_path_buf();
+    }
+    let is_model = ["cameras.bin", "cameras.txt"].iter().any(|name| path.join(name).is_file());
+    if is_model { path.join("../..") } else { path.to_path_buf() }
+}
+
 /// Names and sizes of a dataset's files as one name: what is compared before a training begins, because it costs little.
 ///
 /// # Errors
 /// [`Error::Io`].
 pub fn listing(path: &Path) -> Result<String> {
     let mut hash = ContentHash::default();
-    if path.is_dir() {
-        for file in list(path)? {
+    if path.exists() {
+        for file in list(&root_of(path))? {
             hash.part(file.name.as_bytes());
             hash.part(&file.bytes.to_le_bytes());
         }
-    } else if let Ok(facts) = std::fs::metadata(path) {
-        hash.part(&facts.len().to_le_bytes());
     }
     Ok(hash.name())
 }
@@ -106,12 +115,7 @@ pub fn fingerprint(text: &str, registry: &Registry) -> Result<DataFingerprint> {
         hash.part(text.as_bytes());
         return Ok(DataFingerprint { path: text.into(), hash: hash.name(), files: 0, bytes: 0 });
     }
-    let files = if path.is_dir() {
-        list(&path)?
-    } else {
-        let bytes = std::fs::metadata(&path).map_err(|e| Error::io(&path, e))?.len();
-        vec![DataFile { name: String::new(), bytes, path: path.clone() }]
-    };
+    let files = list(&root_of(&path))?;
     let contents: Vec<u64> = files.par_iter().map(|file| content(&file.path)).collect::<Result<_>>()?;
     for (file, content) in files.iter().zip(&contents) {
         hash.part(file.name.as_bytes());
@@ -222,6 +226,23 @@ mod tests {
         std::fs::rename(at("train/a.png"), at("train/b.png")).unwrap();
         assert_ne!(of().hash, first.hash, "another name");
         assert_ne!(listing(folder.path()).unwrap(), first_listing);
+    }
+
+    #[test]
+    fn images_beside_a_file_or_a_model_count() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir_all(at("sparse/0")).unwrap();
+        std::fs::create_dir(at("images")).unwrap();
+        std::fs::write(at("sparse/0/cameras.bin"), "model").unwrap();
+        std::fs::write(at("transforms.json"), "{}").unwrap();
+        std::fs::write(at("images/a.png"), "image").unwrap();
+        let of = || [at("transforms.json"), at("sparse/0")].map(|path| listing(&path).unwrap());
+        let first = of();
+        std::fs::write(at("images/a.png"), "another image").unwrap();
+        let second = of();
+        assert!(first[0] != second[0] && first[1] != second[1], "{first:?} {second:?}");
+        assert_eq!(list(&root_of(&at("transforms.json"))).unwrap().len(), 3);
     }
 
     #[cfg(target_os = "linux")]

@@ -13,6 +13,7 @@ mod grid;
 mod hash;
 mod lines;
 mod lock;
+mod mixture;
 mod overruled;
 mod plan;
 mod read;
@@ -28,6 +29,7 @@ pub use facts::{PeakMemory, device_facts, fingerprint};
 pub use folder::{Failure, SweepFolder};
 pub use grid::{Axis, CodecAxis, Grid, MethodAxis, MethodKeys, SceneAxis, SceneKeys, ScoredViews, SettingAxis, SettingKeys};
 pub use lock::TrainingLock;
+pub(crate) use mixture::notes as mixture_notes;
 pub use plan::{PLAN, Plan, PlannedCell, PlannedTraining};
 pub use read::{RESULTS, check_comparable, read_results};
 pub use result::{

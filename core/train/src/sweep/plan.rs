@@ -2,7 +2,7 @@
 
 use super::facts::{fingerprint, listing, locate};
 use super::grid::{Grid, MethodAxis, SceneAxis, ScoredViews, SettingAxis};
-use super::hash::name_of;
+use super::hash::{ContentHash, name_of};
 use super::result::{CodecChoice, DataFingerprint};
 use crate::code;
 use crate::config::RunConfig;
@@ -143,6 +143,23 @@ impl Plan {
             }
         }
         Ok(plan)
+    }
+    /// A name of the trainings in their order: an index means the same training as long as it is the same.
+    pub fn id(&self) -> String {
+        let mut hash = ContentHash::default();
+        self.trainings.iter().for_each(|training| hash.part(training.id.as_bytes()));
+        hash.name()
+    }
+    /// Refuses an index of another plan than the one called `id`.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`].
+    pub fn check_id(&self, id: &str) -> Result<()> {
+        if self.id() == id {
+            return Ok(());
+        }
+        let problem = format!("the folder now has the plan {}, whose indices may be other trainings", self.id());
+        Err(Error::parameter(format!("--plan {id}"), problem, "Make the job file again (cc4dgs sweep emit), or run the sweep again"))
     }
     /// Wall minutes that all trainings together are to take, each by its size; `None` where the grid is not sized in minutes.
     pub fn minutes(&self) -> Option<f64> {

@@ -62,15 +62,19 @@ pub fn run_training(worker: &Worker, folder: &SweepFolder, plan: &Plan, index: u
     }
     let run = || {
         let trained = Trained::open(worker, folder, training, finish_training(worker, folder, training)?)?;
-        let mut results = Vec::with_capacity(wanted.len());
+        let (mut results, mut failed) = (Vec::with_capacity(wanted.len()), None);
         for cell in &wanted {
-            let result = match folder.finished(cell) {
-                Some(result) => result,
-                None => trained.run(worker, folder, plan, cell)?,
-            };
-            results.push(result);
+            match folder.finished(cell).map_or_else(|| trained.run(worker, folder, plan, cell), Ok) {
+                Ok(result) => results.push(result),
+                Err(interrupted @ Error::Interrupted(_)) => return Err(interrupted),
+                // Codecs do not depend on each other: the error of one keeps none of the others from being tried.
+                Err(error) => {
+                    worker.events.emit(&Event::Warning { object: format!("cell {} (codec {})", cell.id, cell.codec), message: error.to_string() });
+                    failed = failed.or(Some(error));
+                }
+            }
         }
-        Ok(results)
+        failed.map_or(Ok(results), Err)
     };
     let outcome = run();
     match &outcome {

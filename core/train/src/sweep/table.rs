@@ -1,5 +1,6 @@
 //! Tables of results: mean and spread over seeds, as Markdown and CSV.
 
+use super::mixture;
 use super::read::check_comparable;
 use super::result::{CellResult, Outcome};
 use super::trained::{TrainingDevices, trained_on};
@@ -118,7 +119,7 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
         headings.extend(metrics.iter().map(|m| m.1));
         headings.extend(["MB", "Gaussians", "training s", "encode s", "decode s", "frame ms", ""]);
         let _ = writeln!(text, "| {} |\n|{}", headings.join(" | "), " --- |".repeat(headings.len()));
-        for row in of_scene {
+        for row in &of_scene {
             let shown = |spread: Option<Spread>, decimals| spread.map_or_else(|| "-".to_string(), |s| s.text(decimals));
             let mut cells: Vec<String> = row.axes[1..].iter().map(ToString::to_string).collect();
             cells.push(row.results.len().to_string());
@@ -132,6 +133,9 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
             let hopeless = row.results.iter().filter(|r| r.outcome == Outcome::Hopeless).count();
             cells.push(if hopeless > 0 { format!("{hopeless} hopeless") } else { String::new() });
             let _ = writeln!(text, "| {} |", cells.join(" | "));
+        }
+        for note in mixture::notes(of_scene.iter().map(|row| (format!("{} {}", row.axes[1], row.axes[2]), row.results.as_slice()))) {
+            let _ = writeln!(text, "\n{note}");
         }
     }
     Ok(text)

@@ -83,6 +83,9 @@ fn grid(args: &SweepPlan) -> Result<Grid> {
 
 pub fn run(context: &Context, args: &SweepRun, threads: usize) -> Result<()> {
     let plan = Plan::read(&args.dir)?;
+    if let Some(id) = &args.plan {
+        plan.check_id(id)?;
+    }
     let folder = SweepFolder::new(&args.dir);
     let index = match (&args.cell, args.index) {
         (Some(id), _) => Some(index_of(&plan, id)?),
@@ -143,7 +146,7 @@ pub fn collect(context: &Context, args: &SweepCollect) -> Result<()> {
         return Err(Error::data(format!("sweep {}", args.dir.display()), "there is no result", "Run it first: cc4dgs sweep run DIR"));
     }
     let results = select(std::mem::take(&mut collection.results), &args.conditions)?;
-    let tables = write_tables(&folder, &results)?;
+    let tables = write_tables(&folder, &results, collection.gap().as_deref())?;
     let report = CollectReport { collection: &collection, in_table: results.len(), tables: &tables };
     context.output.result(&report, || {
         let mut text = std::fs::read_to_string(&tables.markdown).unwrap_or_default();

@@ -128,7 +128,7 @@ impl Pool<'_> {
             _ => std::env::current_exe().map_err(|e| Error::io("the program", e))?,
         };
         let mut command = Command::new(&program);
-        command.args(arguments(self.folder.root(), index, self.threads, self.processes, self.context.limit_options));
+        command.args(arguments(self.folder.root(), &self.plan.id(), index, self.threads, self.processes, self.context.limit_options));
         command.stdin(Stdio::null()).stdout(log.try_clone().map_err(io)?).stderr(log);
         // A group of its own: Ctrl-C reaches this process alone, which then asks each child once.
         #[cfg(unix)]
@@ -240,13 +240,13 @@ fn of_exit_code(code: u8, object: String, problem: String) -> Error {
     }
 }
 
-/// The arguments of the process that runs the training at `index` of the sweep in `root`, beside others of the pool.
-fn arguments(root: &Path, index: usize, threads: usize, processes: usize, limits: &[String]) -> Vec<OsString> {
+/// The arguments of the process that runs the training at `index` of the plan `plan` of the sweep in `root`, beside others of the pool.
+fn arguments(root: &Path, plan: &str, index: usize, threads: usize, processes: usize, limits: &[String]) -> Vec<OsString> {
     let mut all = Vec::from(["--quiet", "--threads", &threads.to_string()].map(OsString::from));
     all.extend(limits.iter().flat_map(|limit| ["--limit", limit]).map(OsString::from));
     all.extend(["sweep", "run"].map(OsString::from));
     all.push(root.into());
-    all.extend(["--index", &index.to_string(), "--no-wait", "--processes", &processes.to_string()].map(OsString::from));
+    all.extend(["--plan", plan, "--index", &index.to_string(), "--no-wait", "--processes", &processes.to_string()].map(OsString::from));
     all
 }
 
@@ -288,12 +288,12 @@ mod tests {
 
     #[test]
     fn processes_are_told_their_share() {
-        let given = arguments(Path::new("my sweep"), 7, 2, 3, &["max_gaussians=5".into()]);
+        let given = arguments(Path::new("my sweep"), "0f", 7, 2, 3, &["max_gaussians=5".into()]);
         let cli = Cli::try_parse_from([OsString::from("cc4dgs")].into_iter().chain(given)).unwrap();
         assert_eq!((cli.threads, cli.quiet, cli.limits.as_slice()), (2, true, &["max_gaussians=5".to_string()][..]));
         let crate::args::Command::Sweep(sweep) = &cli.command else { panic!("{:?}", cli.command) };
         let SweepWhat::Run(run) = &sweep.what else { panic!("{:?}", sweep.what) };
-        assert_eq!((run.dir.as_path(), run.index, run.no_wait, run.processes), (Path::new("my sweep"), Some(7), true, 3));
+        assert_eq!((run.dir.as_path(), run.plan.as_deref(), run.index, run.no_wait, run.processes), (Path::new("my sweep"), Some("0f"), Some(7), true, 3));
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Job files against a part of their schedulers' schemas, and scripts in the hands of a shell.
 
+use super::super::plan::PlannedTraining;
 use super::super::plan::tests::example as plan;
 use super::*;
 use serde_json::Value;
@@ -168,9 +169,16 @@ fn indices_reach_the_program() {
     let value = parse(&text);
     let container = &value["spec"]["template"]["spec"]["containers"][0];
     let arguments: Vec<&str> = container["args"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
-    assert_eq!(arguments, ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--index", "$(JOB_COMPLETION_INDEX)"]);
+    let id = plan().id();
+    assert_eq!(arguments, ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--plan", &id, "--index", "$(JOB_COMPLETION_INDEX)"]);
     let slurm = emit(Scheduler::Slurm, &plan(), &options()).unwrap();
-    assert!(slurm.contains("#SBATCH --array=0-0%3\n") && slurm.contains("--index \"$SLURM_ARRAY_TASK_ID\""), "{slurm}");
+    assert!(slurm.contains("#SBATCH --array=0-0%3\n") && slurm.contains(&format!("--plan {id} --index \"$SLURM_ARRAY_TASK_ID\"")), "{slurm}");
+    let sky = emit(Scheduler::SkyPilot, &plan(), &options()).unwrap();
+    assert!(sky.contains(&format!("--plan {id} --index \"$INDEX\"")), "{sky}");
+    let mut grown = plan();
+    grown.trainings.push(PlannedTraining { id: "another".into(), ..grown.trainings[0].clone() });
+    assert!(plan().check_id(&id).is_ok());
+    assert!(grown.check_id(&id).unwrap_err().to_string().contains("sweep emit"));
 }
 
 /// The script as bash reads it, with a program that answers with its arguments and an exit code.
@@ -196,7 +204,10 @@ fn the_slurm_script_is_bash_and_requeues_what_was_interrupted() {
             Command::new("bash").arg(at("array.sh")).env("PATH", &path).env("SLURM_ARRAY_JOB_ID", "7").env("SLURM_ARRAY_TASK_ID", "3").status().unwrap();
         assert_eq!(status.code(), Some(code));
         let arguments = std::fs::read_to_string(at("arguments")).unwrap();
-        assert_eq!(arguments.lines().collect::<Vec<_>>(), ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--index", "3"]);
+        assert_eq!(
+            arguments.lines().collect::<Vec<_>>(),
+            ["--quiet", "--threads", "2", "sweep", "run", "/sweeps/it's a $(test)", "--plan", &plan().id(), "--index", "3"]
+        );
         assert_eq!(std::fs::read_to_string(at("requeued")).unwrap_or_default(), requeued);
     }
 }
