@@ -16,7 +16,7 @@ use cc4dgs_backends::ops::field::{ReluShape, mlp_relu};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
     AttributeSpec, Deformer, DeformerContext, DeformerPlugin, DeformerWork, Error, Offsets, Parameter, ParameterGroup, Part, Plugin, Result, Seed,
-    SpatialFeatures, SpatialInput, config, inventory,
+    SpatialFeatures, SpatialInput, config, inventory, ordered_sum,
 };
 use serde::Deserialize;
 use std::sync::Arc;
@@ -227,7 +227,7 @@ impl Deformer for Embedding {
         let near: Vec<f32> = pairs.iter().map(|pair| (-s.smooth_falloff * f64::from(pair.squared)).exp() as f32).collect();
         let near = Tensor::<2>::from_data(TensorData::new(near, [count, 1]), &device);
         let squares = (difference.clone() * difference).sum_dim(1) * near;
-        Ok(Some(squares.add_scalar(LEAST_SQUARE).sqrt().mean().mul_scalar(s.smooth_weight)))
+        Ok(Some(ordered_sum(squares.add_scalar(LEAST_SQUARE).sqrt()).mul_scalar(s.smooth_weight / count as f64)))
     }
     fn set_progress(&mut self, progress: f32) {
         self.progress = progress;

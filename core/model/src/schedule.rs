@@ -68,12 +68,25 @@ pub struct Schedule {
     pub image_scale: f32,
     /// 1.1 times the largest distance of a training camera from their mean, world units.
     pub extent: f32,
+    /// Whether the model is trained already: what a deformer brings in gradually is all there, while rates are those of [`Schedule::progress`].
+    pub trained: bool,
 }
+
+/// Iterations of a trained model are so small a share of this that rates stay what they are, and far enough apart that no two draw the same random numbers.
+const HALF: usize = 1_000_000;
 
 impl Schedule {
     /// The first iteration of a main stage of `length` iterations, for tests and tools.
     pub fn main(length: usize) -> Self {
-        Self { stage: Stage::Main, iteration: 1, length, settled: None, total: length, pass: 1, sh_degree: 3, image_scale: 1.0, extent: 1.0 }
+        Self { stage: Stage::Main, iteration: 1, length, settled: None, total: length, pass: 1, sh_degree: 3, image_scale: 1.0, extent: 1.0, trained: false }
+    }
+    /// Iteration `iteration`, from 0 to a million, of training a trained model further, as for fine-tuning: rates stand in the middle of a main stage.
+    pub fn further(iteration: usize) -> Self {
+        Self { iteration: HALF + iteration, trained: true, ..Self::main(2 * HALF) }
+    }
+    /// The progress that the deformer is told, above 0 and at most 1.
+    pub fn deformer_progress(&self) -> f64 {
+        if self.trained { 1.0 } else { self.progress() }
     }
     /// Share of the stage done after this iteration, above 0 and at most 1. It grows steadily where the length of the stage changes, too.
     pub fn progress(&self) -> f64 {
@@ -109,6 +122,14 @@ impl Schedule {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn training_further_leaves_rates_alone_and_repeats_no_draw() {
+        let seen: std::collections::BTreeSet<u32> = (0..5000).map(|i| (Schedule::further(i).progress() as f32).to_bits()).collect();
+        assert_eq!(seen.len(), 5000);
+        assert!((Schedule::further(5000).progress() - 0.5).abs() < 0.003);
+        assert_eq!((Schedule::further(7).deformer_progress(), Schedule::main(4).deformer_progress()), (1.0, 0.25));
+    }
 
     #[test]
     fn reference_counts_scale_with_the_stage() {

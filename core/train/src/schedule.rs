@@ -122,6 +122,7 @@ impl StageLengths {
             sh_degree: self.sh_degree,
             image_scale: 1.0,
             extent: self.extent,
+            trained: false,
         };
         schedule.image_scale = self.image_scale(Schedule { iteration: iteration.saturating_sub(1), ..schedule });
         if stage == Stage::Coarse {

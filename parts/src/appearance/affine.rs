@@ -5,7 +5,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_backends::ops::colors::{NUMBERS, affine_colors};
-use cc4dgs_core::{Appearance, AppearanceContext, AppearancePlugin, Error, Parameter, ParameterGroup, Part, Plugin, Result, config, inventory};
+use cc4dgs_core::{Appearance, AppearanceContext, AppearancePlugin, Error, Parameter, ParameterGroup, Part, Plugin, Result, config, inventory, ordered_sum};
 use serde::Deserialize;
 
 const SCHEMA: &str = "\
@@ -67,7 +67,7 @@ impl Appearance for Affine {
             return Ok(None);
         }
         let own = self.parameters[0].value.clone();
-        Ok(Some((own.clone() * own).sum().mul_scalar(self.settings.identity / self.cameras.max(1) as f64)))
+        Ok(Some(ordered_sum(own.clone() * own).mul_scalar(self.settings.identity / self.cameras.max(1) as f64)))
     }
 }
 

@@ -39,7 +39,7 @@ pub(crate) fn share_per_view(model: &Model, scene: &Arc<Scene>, views: usize, re
     let seed = Seed::root(run.seed).child("cost");
     tuner.with_state(&tuner.start(&model.gaussians)?, seed, |context, state| {
         let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);
-        let schedule = Schedule { extent: scene.extent(), sh_degree: model.gaussians.sh_degree, ..Schedule::main(2) };
+        let schedule = Schedule { extent: scene.extent(), sh_degree: model.gaussians.sh_degree, ..Schedule::further(0) };
         let mut shortest = |views: usize| {
             let mut sampler = Sampler::new(scene.split(Split::Train), seed.child("views"), views);
             let mut least = f64::INFINITY;

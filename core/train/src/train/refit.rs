@@ -114,7 +114,7 @@ fn refit(tuner: &Tuner<'_>, gaussians: &HostGaussians, iterations: usize, seed: 
         let mut sampler = Sampler::new(scene.split(Split::Train), seed.child("views"), BATCH);
         // Nothing is logged.
         let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);
-        let schedule = Schedule { extent: scene.extent(), sh_degree: gaussians.sh_degree, ..Schedule::main(2) };
+        let extent = scene.extent();
         let names: Vec<String> = state.set.iter().map(|(name, _)| format!("gaussians/{name}")).collect();
         for iteration in 1..=iterations {
             if stop.load(Ordering::Relaxed) {
@@ -124,6 +124,7 @@ fn refit(tuner: &Tuner<'_>, gaussians: &HostGaussians, iterations: usize, seed: 
             let of_gaussians = names.iter().map(|name| (name.clone(), GAUSSIAN_RATE * share));
             state.rates = RateFactors(of_gaussians.chain([("deformer".into(), DEFORMER_RATE * share)]).collect());
             let check = iteration.is_multiple_of(CHECK_EVERY);
+            let schedule = Schedule { extent, sh_degree: gaussians.sh_degree, ..Schedule::further(iteration) };
             if let Some(trouble) = context.photometric_step(&schedule, state, &sampler.batch(iteration - 1), check, &mut log)? {
                 return Err(Error::backend("re-fitting", format!("{} is not finite", trouble.what), "Prune with --refit 0"));
             }

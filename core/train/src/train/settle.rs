@@ -11,10 +11,10 @@ use cc4dgs_play::Moving;
 
 /// When it is looked at: shares of the main stage.
 const SHARES: [f64; 2] = [1.0 / 3.0, 2.0 / 3.0];
-/// Times over the sequence, and training cameras, at which motion is looked at.
-const TIMES: usize = 13;
+/// The most times over the sequence, and training cameras, at which motion is looked at: of more frames than that, every few.
+const TIMES: usize = 64;
 const CAMERAS: usize = 24;
-/// Changes of other attributes up to this do not count: logarithms of scales, components of quaternions, logits, colour coefficients.
+/// Changes of other attributes up to this do not count: logarithms of scales, shares of them, components of quaternions, logits, colour coefficients.
 const LEAST_CHANGE: f32 = 0.03;
 /// Least depth of a Gaussian in front of a camera, in units of the normalised frame.
 const LEAST_DEPTH: f64 = 0.05;
@@ -31,8 +31,12 @@ impl Context<'_> {
         let Some(deformer) = state.deformer.as_ref().filter(|d| !d.field.is_static() && rows.count() > 0) else { return Ok(()) };
         let features = deformer.field.spatial(&state.spatial_input(deformer, &rows)?)?.values;
         let (mut shift, mut change) = (vec![0.0f32; rows.count()], vec![0.0f32; rows.count()]);
-        for k in 0..TIMES {
-            let mut offsets = deformer.field.deform(features.clone(), k as f32 / (TIMES - 1) as f32)?;
+        let times = self.job.scene.frame_count.clamp(2, TIMES);
+        let scales = rows.select(state.set.get("log_scales")?.clone()).exp();
+        for k in 0..times {
+            let mut offsets = deformer.field.deform(features.clone(), k as f32 / (times - 1) as f32)?;
+            // In units of the world; what counts is the share of the Gaussian's own size.
+            offsets.scales = offsets.scales.map(|changes| changes / scales.clone());
             if let Some(means) = offsets.means.take() {
                 raise(&mut shift, &to_vec((means.clone() * means).sum_dim(1).sqrt(), "offsets")?);
             }

@@ -40,6 +40,9 @@ impl Context<'_> {
         let (n, progress) = (state.set.len(), schedule.progress());
         let rows = state.moving_rows(&self.device)?;
         let moves = state.deformer.as_ref().is_some_and(|d| !d.field.is_static()) && rows.count() > 0;
+        if let Some(deformer) = &mut state.deformer {
+            deformer.field.set_progress(schedule.deformer_progress() as f32);
+        }
         self.decide_smoothness(state, schedule, moves)?;
 
         let mut neighbours = if moves && train.strain > 0.0 { Some(state.current_neighbours(&self.device)?) } else { None };
@@ -57,7 +60,6 @@ impl Context<'_> {
                     rounded.exchange_weights(deformer.field.parameters_mut());
                 }
                 parameters::track(deformer.field.parameters_mut());
-                deformer.field.set_progress(progress as f32);
                 Some(spatial_pass(deformer, &leaves, &rows, log, n)?)
             }
             _ => None,
@@ -105,7 +107,7 @@ impl Context<'_> {
             };
             let mut splats = Splats::from_gaussians(&drawn, schedule.sh_degree);
             if train.dropout > 0.0 {
-                let seed = self.seed.child("dropout").index(schedule.iteration as u64).index(view as u64);
+                let seed = self.seed.child("dropout").child(schedule.stage.name()).index(schedule.iteration as u64).index(view as u64);
                 splats.opacities = dropout::dropped(splats.opacities, train.dropout * progress, seed);
             }
             let probe = |wanted| statistics.contains(&wanted).then(|| Tensor::<2>::zeros([n, 2], &autodiff).require_grad());

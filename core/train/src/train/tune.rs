@@ -194,10 +194,6 @@ impl<'a> Tuner<'a> {
         gaussians.validate(object, limits)?;
         Ok(gaussians)
     }
-    /// Where all iterations stand: in the middle of a main stage.
-    fn schedule(&self, sh_degree: usize) -> Schedule {
-        Schedule { extent: self.job.scene.extent(), sh_degree, ..Schedule::main(2) }
-    }
     /// Mean absolute error of `gaussians`, as they are, on a few training views.
     fn mean_error(&self, context: &Context, state: &mut TrainState, gaussians: &HostGaussians) -> Result<f64> {
         let scene = self.targets()?;
@@ -276,6 +272,7 @@ impl TuneModel for Tuner<'_> {
             // Where all steps are as large as they should be, an octave more of them costs as much as it saves; a step's error adds in proportion to its square.
             let per_bit = tuning.size_weight * 2.0 * std::f64::consts::LN_2 * lost.max(0.0) / tuning.bits_per_octave;
             let mut sampler = Sampler::new(self.job.scene.split(Split::Train), tuning.seed.child("views"), BATCH);
+            let extent = self.job.scene.extent();
             // Nothing is logged.
             let mut log = Log::new(Stage::Main, usize::MAX, usize::MAX);
             for iteration in 1..=tuning.iterations {
@@ -291,7 +288,7 @@ impl TuneModel for Tuner<'_> {
                 fixed.rate = RATE * (RATE_ITERATIONS / tuning.iterations as f64).sqrt() * share;
                 state.rounded = Some(self.round(state, tuning, &weight_settings, &fixed)?);
                 state.rates = RateFactors(BTreeMap::from([("deformer".into(), DEFORMER_RATE * share)]));
-                let schedule = self.schedule(from.gaussians.sh_degree);
+                let schedule = Schedule { extent, sh_degree: from.gaussians.sh_degree, ..Schedule::further(tuning.of.0 + iteration) };
                 let check = iteration.is_multiple_of(CHECK_EVERY);
                 if let Some(trouble) = context.photometric_step(&schedule, state, &sampler.batch(iteration - 1), check, &mut log)? {
                     return Err(Error::backend("fine-tuning", format!("{} is not finite", trouble.what), "Compress with finetune=0"));

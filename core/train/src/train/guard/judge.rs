@@ -22,7 +22,7 @@ pub(super) const OPACITIES: &str = "opacity_logits";
 impl Context<'_> {
     /// Weakens what `plan` removes, remembers what it resets, and puts what moves first. Call before the plan is carried out.
     pub(crate) fn guard_plan(&self, plan: &mut DensityPlan, state: &mut TrainState, schedule: &Schedule) -> Result<()> {
-        let count = state.set.len();
+        let (count, own) = (state.set.len(), plan.len());
         state.guard.read_views()?;
         let removed = plan.removed(count);
         if !removed.is_empty() || state.guard.held > 0 {
@@ -33,8 +33,12 @@ impl Context<'_> {
                 state.guard.held += count.saturating_sub(plan.len());
             }
         }
-        if plan.restarted().iter().any(|name| name == OPACITIES) && !self.begin_reset(state, schedule)? {
-            *plan = without_reset(plan);
+        if plan.restarted().iter().any(|name| name == OPACITIES) {
+            if self.begin_reset(state, schedule)? {
+                lower_restored(plan, own, &to_vec(state.set.get(OPACITIES)?.clone(), OPACITIES)?);
+            } else {
+                *plan = without_reset(plan);
+            }
         }
         moving_first(plan, state)?;
         state.guard.follow(plan, schedule.iteration);
@@ -187,9 +191,38 @@ fn without_reset(plan: &DensityPlan) -> DensityPlan {
     other
 }
 
+/// Resets the rows that were restored, from `first` on, as the control resets its own: to at most the largest logit that it sets. `logits` are those of old rows.
+fn lower_restored(plan: &mut DensityPlan, first: usize, logits: &[f32]) {
+    let set = plan.values().iter().filter(|set| set.attribute == OPACITIES).flat_map(|set| &set.values);
+    let highest = set.copied().fold(f32::NEG_INFINITY, f32::max);
+    if highest.is_finite() {
+        for row in first..plan.len() {
+            let logit = logits[plan.parents()[row]];
+            plan.set(row, OPACITIES, &[logit.min(highest)]);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_reset_reaches_rows_that_were_restored() {
+        let logits = [3.0, 2.0, -9.0, 1.0];
+        let mut plan = DensityPlan::new();
+        let own = plan.keep(0);
+        plan.set(own, OPACITIES, &[-4.5]);
+        plan.restart(OPACITIES);
+        plan.restore(&[2, 3]);
+        lower_restored(&mut plan, 1, &logits);
+        assert_eq!((plan.values()[0].rows.as_slice(), plan.values()[0].values.as_slice()), (&[0, 1, 2][..], &[-4.5, -9.0, -4.5][..]));
+        // A control that sets no opacity has none to follow.
+        let mut other = DensityPlan::unchanged(1);
+        other.restore(&[1]);
+        lower_restored(&mut other, 1, &logits);
+        assert!(other.values().is_empty());
+    }
 
     #[test]
     fn a_reset_is_left_out_of_a_plan_and_nothing_else() {
