@@ -135,8 +135,10 @@ impl<'a> Motion<'a> {
                     let position = |g: &HostGaussians| -> [f32; 3] { std::array::from_fn(|k| g.means[3 * i + k]) };
                     let step = (samples / POSITIONS).max(1);
                     let positions: Vec<[f32; 3]> = moved.iter().step_by(step).map(position).collect();
-                    let scale = host.log_scales[3 * i..3 * i + 3].iter().copied().fold(f32::NEG_INFINITY, f32::max).exp();
-                    tolerances.of(&positions, scale)
+                    // Errors of scales and rotations show most where the deformer makes the Gaussian largest, and those of rotations where it makes the quaternion shortest.
+                    let largest = |most: f32, g: &HostGaussians| g.log_scales[3 * i..3 * i + 3].iter().copied().fold(most, f32::max);
+                    let norms = Norms::of(&moved, i);
+                    tolerances.of(&positions, moved.iter().fold(f32::NEG_INFINITY, largest).exp(), norms.least / norms.mean)
                 })
                 .collect();
             for head in &mut out.heads {
@@ -159,6 +161,29 @@ impl<'a> Motion<'a> {
     }
 }
 
+fn quaternion(g: &HostGaussians, i: usize) -> [f32; 4] {
+    std::array::from_fn(|k| g.quaternions[4 * i + k])
+}
+
+/// The norm of the quaternion of the Gaussian `i`, above 0.
+fn norm_of(g: &HostGaussians, i: usize) -> f32 {
+    quaternion(g, i).iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE)
+}
+
+/// Norms of the quaternion of a Gaussian over time.
+struct Norms {
+    /// The mean of the first and the last, which are the same however many samples are between.
+    mean: f32,
+    least: f32,
+}
+
+impl Norms {
+    fn of(moved: &[HostGaussians], i: usize) -> Self {
+        let mean = moved.first().zip(moved.last()).map_or(1.0, |(first, last)| 0.5 * (norm_of(first, i) + norm_of(last, i)));
+        Self { mean, least: moved.iter().map(|g| norm_of(g, i)).fold(mean, f32::min) }
+    }
+}
+
 /// The offsets of one head of the Gaussian `i` of `host` at all samples `moved`.
 pub(super) fn offsets_of(head: Head, host: &HostGaussians, moved: &[HostGaussians], i: usize) -> Vec<f32> {
     let differences = |width: usize, of: fn(&HostGaussians) -> &Vec<f32>| -> Vec<f32> {
@@ -170,12 +195,10 @@ pub(super) fn offsets_of(head: Head, host: &HostGaussians, moved: &[HostGaussian
         Head::Means => differences(3, |g| &g.means),
         Head::LogScales => differences(3, |g| &g.log_scales),
         Head::Rotations => {
-            let of = |g: &HostGaussians| -> [f32; 4] { std::array::from_fn(|k| g.quaternions[4 * i + k]) };
-            let norm = |q: [f32; 4]| q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
-            let start = of(host).map(|v| v / norm(of(host)));
-            // Quaternions of any length are the same rotation; one factor for all times keeps what is linear linear, and the ends have the same however many are between.
-            let mean = moved.first().zip(moved.last()).map_or(1.0, |(first, last)| 0.5 * (norm(of(first)) + norm(of(last))));
-            moved.iter().flat_map(|g| std::array::from_fn::<f32, 4, _>(|k| of(g)[k] / mean - start[k])).collect()
+            let start = quaternion(host, i).map(|v| v / norm_of(host, i));
+            // Quaternions of any length are the same rotation; one factor for all times keeps what is linear linear.
+            let mean = Norms::of(moved, i).mean;
+            moved.iter().flat_map(|g| std::array::from_fn::<f32, 4, _>(|k| quaternion(g, i)[k] / mean - start[k])).collect()
         }
         Head::Opacities => moved.iter().map(|g| sigmoid(g.opacity_logits[i]) - sigmoid(host.opacity_logits[i])).collect(),
         Head::Colors => {

@@ -40,15 +40,16 @@ impl Tolerances {
             }
         }
     }
-    /// The tolerances of the heads in the order of [`Head::ALL`], for a Gaussian that is at `positions` over time and whose largest scale is `scale`.
-    pub(super) fn of(&self, positions: &[[f32; 3]], scale: f32) -> [f32; 5] {
+    /// The tolerances of the heads in the order of [`Head::ALL`], for a Gaussian that is at `positions` over time, whose largest scale over time is `scale`, and
+    /// whose quaternions, as they are stored, are at least `shortest` long, which is at most 1.
+    pub(super) fn of(&self, positions: &[[f32; 3]], scale: f32, shortest: f32) -> [f32; 5] {
         let length = self.length(positions);
         let reach = (EDGE * scale).max(f32::MIN_POSITIVE);
         Head::ALL.map(|head| match head {
             Head::Means => SHARES[0] * length,
             Head::LogScales => (SHARES[1] * length / reach).clamp(LOG_SCALE[0], LOG_SCALE[1]),
             // An angle is twice the error of a unit quaternion.
-            Head::Rotations => (SHARES[2] * length / (2.0 * reach)).clamp(ROTATION[0], ROTATION[1]),
+            Head::Rotations => (shortest * SHARES[2] * length / (2.0 * reach)).clamp(ROTATION[0], ROTATION[1]),
             Head::Opacities => OPACITY,
             Head::Colors => COLOR,
         })
@@ -79,11 +80,13 @@ mod tests {
         let both = [camera([4.0, 0.0, 0.0]), camera([0.0, 2.0, 0.0])];
         let focal = both[0].fx;
         let tolerances = Tolerances::new(MaxError::Pixels(0.1), &both);
-        let at = |point: [f32; 3]| f64::from(tolerances.of(&[point], 0.1)[0]) / 0.5 / 0.1 * focal;
+        let at = |point: [f32; 3]| f64::from(tolerances.of(&[point], 0.1, 1.0)[0]) / 0.5 / 0.1 * focal;
         assert!((at([0.0; 3]) - 2.0).abs() < 1e-4);
         // Behind the second camera: only the first sees it, from afar.
         assert!(at([0.0, 2.1, 0.0]) > 3.0);
         // Larger Gaussians need finer rotations.
-        assert!(tolerances.of(&[[0.0; 3]], 1.0)[2] < tolerances.of(&[[0.0; 3]], 0.1)[2]);
+        assert!(tolerances.of(&[[0.0; 3]], 1.0, 1.0)[2] < tolerances.of(&[[0.0; 3]], 0.1, 1.0)[2]);
+        // So do shorter quaternions.
+        assert!((tolerances.of(&[[0.0; 3]], 0.1, 0.5)[2] / tolerances.of(&[[0.0; 3]], 0.1, 1.0)[2] - 0.5).abs() < 1e-6);
     }
 }
