@@ -2,6 +2,7 @@
 
 use crate::data::procedural::{Body, ProceduralScene, Viewpoint};
 use burn::tensor::Device;
+use cc4dgs_core::metrics::PSNR_CEILING_DB;
 use cc4dgs_core::{Event, EventSink, HostGaussians, Registry, Result, Split};
 use cc4dgs_play::{Model, Player};
 use glam::DVec3;
@@ -31,8 +32,8 @@ pub struct MotionScore {
     /// true displacement's root-mean-square: 0 follows exactly, 1 is as good as not moving. None without Gaussians or true displacements.
     pub trajectory_error: Option<f64>,
     /// PSNR over the pixels that the body covers, all held-out images, 8-bit: those it ever covers for a camera that takes all frames, those of the
-    /// image's own frame for a moving camera.
-    pub psnr_db: f64,
+    /// image's own frame for a moving camera. None where there are none.
+    pub psnr_db: Option<f64>,
 }
 
 /// Scores every body of `scene` at the times of its frames, in the coordinates of `scene`.
@@ -89,9 +90,15 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
         cycles: body.cycles,
         gaussians: followed.rows.len(),
         trajectory_error: trajectory_error(d),
-        psnr_db: 10.0 * (255.0f64.powi(2) * count.max(1) as f64 / error.max(1e-9)).log10(),
+        psnr_db: psnr_of_sums(error, count),
     });
     Ok(scores.collect())
+}
+
+/// PSNR in dB of `count` values of 8 bits whose squared errors add up to `error`; `None` of no values.
+fn psnr_of_sums(error: f64, count: u64) -> Option<f64> {
+    let mean = error / (255.0f64.powi(2) * count as f64);
+    (count > 0).then(|| if mean > 0.0 { (-10.0 * mean.log10()).min(PSNR_CEILING_DB) } else { PSNR_CEILING_DB })
 }
 
 /// The trajectory error from sums of squares over Gaussians and frames: of differences, of true displacements, and of the coordinates at the start.

@@ -39,10 +39,19 @@ pub struct FullReport {
     pub provenance: Provenance,
 }
 
-/// Where the model came from.
+/// A program.
+#[derive(Serialize)]
+pub struct Program {
+    pub version: &'static str,
+    /// Empty if unknown.
+    pub commit: &'static str,
+}
+
+/// Where the model came from, and what scored it.
 #[derive(Serialize)]
 pub struct Provenance {
-    pub version: &'static str,
+    pub evaluated_by: Program,
+    /// Commit of the program that trained.
     pub commit: String,
     pub seed: u64,
     pub trained_on: String,
@@ -196,7 +205,7 @@ pub fn measure(context: &Context, subject: &Subject, scored: Scored, images: &Im
         Some(truth) => motion_scores(model, truth, &context.registry, &loaded.device, events)?,
         None => Vec::new(),
     };
-    let provenance = &model.provenance;
+    let (provenance, (version, commit)) = (&model.provenance, cc4dgs_train::code::version());
     Ok(FullReport {
         model: subject.path.to_path_buf(),
         device: loaded.device_name.clone(),
@@ -206,7 +215,7 @@ pub fn measure(context: &Context, subject: &Subject, scored: Scored, images: &Im
         eval: report,
         motion,
         provenance: Provenance {
-            version: env!("CARGO_PKG_VERSION"),
+            evaluated_by: Program { version, commit },
             commit: provenance.commit.clone(),
             seed: provenance.seed,
             trained_on: provenance.device.clone(),
@@ -247,7 +256,8 @@ pub fn text(report: &FullReport) -> String {
     lines.extend(report.motion.iter().map(|m| {
         let error = m.trajectory_error.map_or_else(|| "-".to_string(), |e| format!("{e:.3}"));
         let cycles = m.cycles.map_or_else(|| "-".to_string(), |c| c.to_string());
-        format!("  {:<24} {cycles:>6} {:>8.2} {error:>17} {:>10}", m.name, m.psnr_db, m.gaussians)
+        let psnr = m.psnr_db.map_or_else(|| "-".to_string(), |p| format!("{p:.2}"));
+        format!("  {:<24} {cycles:>6} {psnr:>8} {error:>17} {:>10}", m.name, m.gaussians)
     }));
     if let Some(path) = &report.sheet {
         lines.push(format!("  contact sheet {}", path.display()));
