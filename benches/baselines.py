@@ -23,7 +23,7 @@ import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 
-from trainings import TRAINED, Rows, begin, ended, events, interrupt, sha256, trained
+from trainings import TRAINED, Rows, begin, ended, events, interrupt, points, sha256, trained
 
 METHODS = ["hexplane", "native-4d", "swift4d", "embedding", "grid4d", "deform-mlp"]
 
@@ -68,8 +68,8 @@ def row(options, stated):
     stages = {e["stage"]: e["iterations"] for e in events(out) if e["event"] == "stage-started"}
     done = sum(count for stage, count in stages.items() if stage != steps[-1]["stage"]) + steps[-1]["iteration"] if steps else 0
     curve, seconds = [], 0.0
-    for event in events(out):
-        if event["event"] == "iteration" and event["seconds"] >= seconds + 60:
+    for event in points(out, "iteration"):
+        if event["seconds"] >= seconds + 60:
             seconds = event["seconds"]
             curve.append([round(seconds), event["stage"], event["iteration"], round(event["psnr_db"], 2)])
     found = json.loads(report.read_text()) if scored else {}

@@ -28,7 +28,7 @@ def measured(program, *arguments):
         out.seek(0), err.seek(0)
         if child.returncode:
             sys.exit(f"{' '.join(map(str, arguments))}: {err.read().decode().strip()}")
-        return out.read().decode(), usage.ru_maxrss / 1024
+        return out.read().decode(), usage.ru_maxrss * 1024 / 1e6
 
 
 def between(program, model, other):

@@ -6,7 +6,7 @@
 # FILE is a built cc4dgs (default: target/release/cc4dgs), which may have been carried here from another machine. --scale shrinks images and Gaussians for
 # devices that are slow. --data, a folder with dnerf_mutant and panoptic_basketball, and --train, minutes such as 0.5, go together: `auto` plans for the minutes and
 # trains each at the published size (mutant 800x800, basketball 640x360 with all frames). A training that takes more than 1.5 times as long is stopped.
-# Other steps are stopped after --step seconds (120), and keep what they measured until then. The exit code is 1 if a step fails, and 130 after Ctrl-C. What a call is
+# Other steps are stopped after --step seconds (120). The exit code is 1 if a step fails or is stopped before it wrote anything, and 130 after Ctrl-C. What a call is
 # to measure is removed from DIR before it begins.
 # --player names the example `frames` of the player (cargo build --release -p cc4dgs-player --example frames); with it the player's renderer is timed too.
 set -uo pipefail
@@ -73,6 +73,8 @@ step() {
         exit 130
     elif [ $status = 124 ]; then
         echo "   stopped after $((SECONDS - began)) s"
+        # Profiled steps leave a log.
+        [ -n "${profiled:-}" ] || [ -s "$out/$name.json" ] || { echo "   FAILED: it wrote nothing; give more --step seconds"; failed=1; }
     elif [ $status != 0 ]; then
         echo "   FAILED with exit code $status:"
         tail -3 "$out/$name.log"
@@ -84,7 +86,7 @@ step() {
 # kernels NAME COMMAND…: the same with every kernel timed by itself (CubeCL's profile, read from the working folder, waits after each); the JSON is launches and
 # milliseconds per kernel, NAME-stopped.json where the time was over. Whole times are not comparable with those of other steps.
 kernels() {
-    local name=$1 folder status
+    local name=$1 folder status profiled=1
     shift
     folder=$(mktemp -d)
     printf '[profiling]\nlogger = { level = "full", file = "%s/log" }\n' "$folder" >"$folder/cubecl.toml"
@@ -95,7 +97,9 @@ kernels() {
     rm -f "$out/$name.json"
     case $status in
         0) [ -f "$folder/log" ] || { echo "   FAILED: no kernel was timed"; failed=1; } ;;
-        124) name+=-stopped ;;
+        124)
+            [ -f "$folder/log" ] || { echo "   FAILED: no kernel was timed"; failed=1; }
+            name+=-stopped ;;
         *) rm -f "$folder/log" ;;
     esac
     [ -f "$folder/log" ] || { rm -rf "$folder"; return; }

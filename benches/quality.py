@@ -19,7 +19,7 @@ import sys
 import time
 import tomllib
 
-from trainings import TRAINED, Rows, let_end, sha256, trained
+from trainings import TRAINED, Rows, let_end, points, sha256, trained
 
 # Name, scene, minutes, settings, and the PSNR in dB it is meant to reach.
 RUNS = [
@@ -83,7 +83,7 @@ def train(options, stated, settings):
     with open(log, "a") as file:
         code, peak = measured([options.bin, *arguments], file)
     row = {**stated, "exit": code, "resumed": resumed}
-    row |= {"seconds": round(before + time.time() - began, 1), "peak_memory_mb": peak, "bench_step": step, "curve": curve(out / "events.jsonl")}
+    row |= {"seconds": round(before + time.time() - began, 1), "peak_memory_mb": peak, "bench_step": step, "curve": curve(out)}
     report = out.with_suffix(".eval.json")
     report.unlink(missing_ok=True)
     evaluation = [options.bin, "eval", str(out), "--scene", path, "--split", "test", f"--json={report}", "--sheet", str(out.with_suffix(".png")), "--quiet"]
@@ -97,15 +97,9 @@ def train(options, stated, settings):
     return row
 
 
-def curve(log):
+def curve(out):
     """Seconds and PSNR of validation views, of a run with views kept out of training."""
-    points = []
-    if log.exists():
-        for line in log.read_text().splitlines():
-            event = json.loads(line)
-            if event.get("event") == "validated":
-                points.append([round(event["seconds"], 1), round(event["psnr_db"], 3)])
-    return points
+    return [[round(event["seconds"], 1), round(event["psnr_db"], 3)] for event in points(out, "validated")]
 
 
 def main():

@@ -56,14 +56,31 @@ def events(out):
     return found
 
 
-def trained(out):
-    """Seconds of training, all parts of an interrupted run together."""
-    total, last = 0.0, 0.0
+def timed(out):
+    """The events of the run in the folder `out`, with the seconds of all parts of an interrupted run together."""
+    total, last, found = 0.0, 0.0, []
     for event in events(out):
         if event["event"] == "run-started":
             total, last = total + last, 0.0
         last = event.get("seconds", last)
-    return total + last
+        found.append({**event, "seconds": total + last})
+    return found
+
+
+def points(out, kind):
+    """The events of one kind, in order, one per iteration: what a resumed run did again counts as the last part did it."""
+    found = {}
+    for event in timed(out):
+        if event["event"] == kind:
+            key = (event.get("stage"), event.get("iteration"))
+            found.pop(key, None)
+            found[key] = event
+    return list(found.values())
+
+
+def trained(out):
+    """Seconds of training, all parts of an interrupted run together."""
+    return max((event["seconds"] for event in timed(out)), default=0.0)
 
 
 def begin(arguments, **streams):
