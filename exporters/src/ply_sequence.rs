@@ -48,7 +48,7 @@ inventory::submit! {
             summary: "a folder with one PLY per frame",
             paper: "3D Gaussian Splatting for Real-Time Radiance Field Rendering (Kerbl et al. 2023)",
             schema: SCHEMA,
-            capabilities: &["motion"],
+            capabilities: &["motion", "frames"],
         },
         target: ExportTarget::Folder(&["*.ply"]),
         build,

@@ -168,7 +168,11 @@ impl Stored {
 /// # Errors
 /// As [`presentation::of_gaussians`].
 pub fn presented(model: &PlayModel, cameras: &[Camera], up: Option<[f64; 3]>) -> Result<Presentation> {
-    if cameras.is_empty() { presentation::of_gaussians(&model.gaussians, up.unwrap_or([0.0, 0.0, 1.0])) } else { Ok(presentation::of_cameras(cameras, up)) }
+    if cameras.is_empty() {
+        presentation::of_gaussians(&model.gaussians, up.unwrap_or([0.0, 0.0, 1.0]))
+    } else {
+        Ok(presentation::of_recorded(model, cameras, up))
+    }
 }
 
 /// The model at half time, from its home camera, as a PNG.

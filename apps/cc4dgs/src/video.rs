@@ -46,7 +46,9 @@ pub fn encode(frames: &Path, count: usize, fps: u32, out: &Path) -> Result<()> {
 
 /// Encoding that players agree on: 4:2:0 colour, which needs even sides, by the matrix of BT.709 whatever the size, and the index in front. Nothing of the day or
 /// the program is written.
-const CODEC: [&str; 16] = [
+const CODEC: [&str; 18] = [
+    "-c:v",
+    "libx264",
     "-vf",
     "pad=ceil(iw/2)*2:ceil(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv,format=yuv420p",
     "-colorspace",

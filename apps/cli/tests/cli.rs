@@ -87,6 +87,8 @@ fn mistakes_end_with_their_own_exit_code() {
         ("decompress x --no-dynamic --out y.spz", "name a file that ends in .ply"),
         ("export ply x --frames 3 --out y.ply", "ply-sequence"),
         ("export sog x --fps 3 --out y.sog", "sog holds one instant"),
+        ("export splatv x --frames 3 --out y.splatv", "splatv holds the whole time"),
+        ("export ply-sequence x --fps 3 --out y", "how fast it is played"),
         ("render x --fps 3 --out y", "--mp4"),
         ("compress x --codec kwantize --out y.cc4d", "quantize"),
         ("compress x --codec raw --set bitz=3 --out y.cc4d", "bitz"),

@@ -10,6 +10,8 @@ use cc4dgs_format::{BLUR, BLUR_RANGE, Error, HostGaussians, Limits, Result, Rule
 const LEAST_NEAR: f32 = 1e-6;
 /// Greatest.
 const MOST_NEAR: f32 = 1e6;
+/// The near plane of models without units, as a share of half their diagonal.
+const NEAR_OF_RADIUS: f32 = 0.01;
 /// Floats of a Gaussian in [`Scene::gaussians`].
 pub(crate) const GAUSSIAN_FLOATS: usize = 16;
 
@@ -94,7 +96,13 @@ impl Content {
             let remedy = "Give a .cc4d archive, a PLY file of 3D Gaussian splatting or an SPZ file";
             return Err(Error::data(object, "it begins like no model", remedy));
         };
-        let scene = Scene { antialiased: file.antialiased, ..Scene::new(&file.gaussians, None)? };
+        let mut scene = Scene { antialiased: file.antialiased, ..Scene::new(&file.gaussians, None)? };
+        // The file does not say its units: cameras around a small model are near it too.
+        let [lower, upper] = scene.bounds;
+        let radius = 0.5 * lower.iter().zip(upper).map(|(low, high)| (high - low).powi(2)).sum::<f32>().sqrt();
+        if radius > 0.0 && radius.is_finite() {
+            scene.near = scene.near.min(NEAR_OF_RADIUS * radius).max(LEAST_NEAR);
+        }
         Ok(Self { scene, presentation: Presentation::default(), frame_count: 1, lacks_motion: false, bytes: size })
     }
     /// The model of an archive.

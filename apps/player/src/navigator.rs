@@ -33,7 +33,8 @@ impl Navigator {
     /// Starts at the home camera of `shown`; without one, beside the box from `lower` to `upper`.
     pub fn new(shown: &Presentation, lower: [f32; 3], upper: [f32; 3]) -> Self {
         let of = |v: [f32; 3]| DVec3::from(v.map(f64::from));
-        let (middle, radius) = (0.5 * (of(lower) + of(upper)), 0.5 * (of(upper) - of(lower)).length().max(1e-3));
+        let (middle, radius) = (0.5 * (of(lower) + of(upper)), 0.5 * (of(upper) - of(lower)).length());
+        let radius = if radius > 1e-9 { radius } else { 1e-3 };
         let up = shown.up.map_or(DVec3::Z, of).try_normalize().unwrap_or(DVec3::Z);
         let side = up.any_orthonormal_vector();
         let target = shown.target.map_or(middle, of);

@@ -29,7 +29,7 @@ export function addGestures(canvas, act, signal) {
         } else if (e.buttons & 6 || e.shiftKey) {
             act.pan(-dx / height, -dy / height);
         } else if (act.mode() === "fly") {
-            act.look(-2 * dx / height, -2 * dy / height);
+            act.look(-2 * dx / height, 2 * dy / height);
         } else {
             act.orbit(-4 * dx / height, 4 * dy / height);
         }

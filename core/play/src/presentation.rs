@@ -1,8 +1,9 @@
 //! How players show a model: its home camera, the cameras of its recording, the axis that points up.
 
-use crate::Orbit;
+use crate::orbit::middle_and_radius;
+use crate::{Model, Orbit};
 use cc4dgs_core::archive::{MAX_CAMERAS, Presentation};
-use cc4dgs_core::{Camera, HostGaussians, Result};
+use cc4dgs_core::{Camera, HostGaussians, Result, Similarity};
 use glam::{DMat3, DVec3};
 
 /// Size of home cameras in pixels; players resize them to their window.
@@ -24,8 +25,14 @@ fn storable(camera: &Camera) -> Camera {
     out
 }
 
-/// The presentation of a model that was recorded by `cameras`, all in the coordinates of the model, whose origin they look at. The first is the home camera; the others
-/// are thinned out to the number that archives hold.
+/// The presentation of `model`, which was recorded by `cameras`, all in its coordinates. The first is the home camera; the others are thinned out to the number that
+/// archives hold. Trained models have what their cameras look at in the origin; of others it is their middle.
+pub fn of_recorded(model: &Model, cameras: &[Camera], up: Option<[f64; 3]>) -> Presentation {
+    let target = if model.normalisation == Similarity::IDENTITY { middle_and_radius(&model.gaussians).0 } else { [0.0; 3] };
+    Presentation { target: Some(target.map(|v| rounded(v) as f32)), ..of_cameras(cameras, up) }
+}
+
+/// The presentation of a model in training, which `cameras` record and whose origin they look at.
 pub fn of_cameras(cameras: &[Camera], up: Option<[f64; 3]>) -> Presentation {
     let up = up.map_or_else(|| upward(cameras), DVec3::from);
     let step = cameras.len().div_ceil(MAX_CAMERAS).max(1);

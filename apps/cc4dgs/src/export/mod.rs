@@ -12,7 +12,7 @@ use cc4dgs_core::archive::{Presentation, StreamKind};
 use cc4dgs_core::exporter::export;
 use cc4dgs_core::playback::MaxError;
 use cc4dgs_core::playback::frame_time;
-use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Limits, Registry, Result};
+use cc4dgs_core::{Camera, Error, Event, EventSink, ExportFacts, ExportSource, ExporterPlugin, HostGaussians, Image8, Limits, Registry, Result, Similarity};
 use cc4dgs_play::model::Model as PlayModel;
 use cc4dgs_play::player::Player;
 use serde::Serialize;
@@ -156,6 +156,25 @@ fn check_up(up: [f64; 3]) -> Result<()> {
     Err(Error::parameter("up", format!("{up:?} has the length {length}, and an axis has 1"), remedy))
 }
 
+/// Steps of float32 over the size of a Gaussian from which centres are visibly off.
+const COARSE: f64 = 0.1;
+
+/// What float32 does to the centres of `gaussians` in the dataset's coordinates, where this can be seen: an origin far away, as in maps, leaves few digits for them.
+fn coarse(gaussians: &HostGaussians, to_dataset: &Similarity) -> Option<String> {
+    let centres = gaussians.means.chunks_exact(3).map(|mean| to_dataset.apply(std::array::from_fn(|k| f64::from(mean[k]))));
+    let farthest = centres.flatten().fold(0.0, |most: f64, v| most.max(v.abs())) as f32;
+    let mut scales = gaussians.log_scales.clone();
+    scales.sort_unstable_by(f32::total_cmp);
+    let size = to_dataset.scale * f64::from(*scales.get(scales.len() / 2)?).exp();
+    let step = f64::from(farthest.next_up()) - f64::from(farthest);
+    let remedy = "shift the dataset's origin near the scene, or keep the archive, whose coordinates are its own";
+    (step > COARSE * size).then(|| {
+        format!(
+            "centres are up to {farthest:.3e} from the dataset's origin, where float32 has steps of {step:.1e}, and Gaussians have a middle size of {size:.1e}: {remedy}"
+        )
+    })
+}
+
 /// A model as exporters see it.
 struct ModelSource<'a> {
     job: &'a ExportJob<'a>,
@@ -167,7 +186,12 @@ impl<'a> ModelSource<'a> {
     fn new(job: &'a ExportJob<'a>) -> Result<Self> {
         let (model, request) = (job.model, &job.request);
         let player = Player::new(model, job.registry, job.device)?.on(request.background);
-        let frames = request.frames.unwrap_or(model.frame_count).max(1);
+        // What stands still is the same in every frame.
+        let all = if player.moving() == 0 { 1 } else { model.frame_count };
+        let frames = request.frames.unwrap_or(all).max(1);
+        if let Some(message) = coarse(&model.gaussians, &model.normalisation.inverse()) {
+            job.events.emit(&Event::Warning { object: format!("export of {}", job.out.display()), message });
+        }
         let orbit = Orbit { frames: 1, up: request.up, ..Orbit::default() };
         // A camera is a convenience; models that no orbit can look at have none.
         let home = request.shots.first().map(|(camera, _)| camera.clone()).or_else(|| orbit.around(&model.gaussians).ok()?.pop());
@@ -265,6 +289,15 @@ impl Model {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn origins_too_far_for_float32_are_told() {
+        let gaussians = HostGaussians { means: vec![0.5, -0.25, 0.125], log_scales: vec![-3.0; 3], ..Default::default() };
+        let at = |origin: f64| coarse(&gaussians, &Similarity { scale: 1.0, translation: [0.0, origin, 0.0] });
+        assert_eq!(at(100.0), None);
+        assert!(at(5e6).unwrap().contains("steps of 5.0e-1"), "{:?}", at(5e6));
+        assert_eq!(coarse(&HostGaussians::default(), &Similarity::IDENTITY), None);
+    }
 
     #[test]
     fn only_axes_of_length_one_point_up() {

@@ -75,20 +75,23 @@ pub fn finish(context: &Context, job: &ExportJob) -> Result<()> {
     })
 }
 
-/// Refuses a number of frames and their rate for a format of one instant, and a number of frames for a player: they have no use for them.
+/// Refuses a number of frames and their rate for formats that have no use for them.
 fn check_clock(registry: &Registry, plugin: &ExporterPlugin, shots: &Shots) -> Result<()> {
-    let is_still = |plugin: &ExporterPlugin| plugin.info.capabilities.contains(&"still");
-    if shots.frames.is_some() && plugin.info.capabilities.contains(&"player") {
-        return Err(Error::parameter("--frames", format!("{} plays the whole time of a model", plugin.info.name), "Leave it out"));
-    }
-    match shots.frames.map(|_| "--frames").or(shots.fps.map(|_| "--fps")) {
-        Some(option) if is_still(plugin) => {
-            let others: Vec<&str> = registry.exporters().filter(|p| !is_still(p)).map(|p| p.info.name).collect();
-            let remedy = format!("Leave it out, or choose a format of more: {}", others.join(", "));
-            Err(Error::parameter(option, format!("{} holds one instant", plugin.info.name), remedy))
+    let can = |plugin: &ExporterPlugin, capability: &&str| plugin.info.capabilities.contains(capability);
+    let name = plugin.info.name;
+    for (option, given, useful) in [("--frames", shots.frames.is_some(), ["frames", "images"]), ("--fps", shots.fps.is_some(), ["player", "images"])] {
+        if !given || useful.iter().any(|capability| can(plugin, capability)) {
+            continue;
         }
-        _ => Ok(()),
+        let others: Vec<&str> = registry.exporters().filter(|p| useful.iter().any(|capability| can(p, capability))).map(|p| p.info.name).collect();
+        let problem = match (option, plugin.info.capabilities) {
+            (_, capabilities) if capabilities.contains(&"still") => format!("{name} holds one instant"),
+            ("--fps", _) => format!("{name} says nothing of how fast it is played"),
+            _ => format!("{name} holds the whole time of a model"),
+        };
+        return Err(Error::parameter(option, problem, format!("Leave it out, or choose one of the formats that use it: {}", others.join(", "))));
     }
+    Ok(())
 }
 
 /// Other programs go by the ending of a file.

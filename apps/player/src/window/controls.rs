@@ -199,7 +199,7 @@ impl Window {
         if response.dragged() {
             match (pans, self.flying) {
                 (true, _) => self.navigator.pan(-dx, -dy),
-                (false, true) => self.navigator.look(-2.0 * dx, -2.0 * dy),
+                (false, true) => self.navigator.look(-2.0 * dx, 2.0 * dy),
                 (false, false) => self.navigator.orbit(-4.0 * dx, 4.0 * dy),
             }
         }
