@@ -4,6 +4,7 @@ use super::attributes::{Coded, Coding};
 use super::colors::{Choices, Degree};
 use super::geometry::{CODE_LIMIT, GRID_BITS, Geometry, Rotation, companded};
 use super::importance::{Importance, median};
+use super::joint::Directions;
 use super::write::APART;
 use cc4dgs_format::HostGaussians;
 use rayon::prelude::*;
@@ -173,8 +174,8 @@ impl Plan {
         let attributes = importance.attributes.iter().filter_map(|of| Coding::plan(gaussians, of, &geometry, quality)).collect();
         Self { degrees: (0..=gaussians.sh_degree).map(degree).collect(), attributes, geometry, rounds: factors.map(|f| f > 0.0), choices: *choices }
     }
-    /// The integers of canonical Gaussians, as many as those that were planned for.
-    pub fn quantise<'a>(&'a self, gaussians: &HostGaussians, free: &[bool], classes: &'a Classes) -> Integers<'a> {
+    /// The integers of canonical Gaussians, as many as those that were planned for. With `directions`, colours are rounded together.
+    pub fn quantise<'a>(&'a self, gaussians: &HostGaussians, free: &[bool], classes: &'a Classes, directions: Option<&Directions>) -> Integers<'a> {
         let (geometry, shapes, n) = (&self.geometry, &classes.shapes, gaussians.len());
         let mut exact = vec![Vec::new(); 4];
         let mut scales = vec![[0i32; 3]; n];
@@ -209,14 +210,19 @@ impl Plan {
                 None => exact[3].push(i),
             }
         }
+        let rounds: Vec<bool> = (0..self.degrees.len()).map(|degree| self.rounds[if degree == 0 { 4 } else { 5 }]).collect();
+        let choices_of = |degree: usize| Choices { rate_weight: if degree == 0 { 0.0 } else { self.choices.rate_weight }, ..self.choices };
+        let choices: Vec<Choices> = (0..self.degrees.len()).map(choices_of).collect();
+        let each = |(degree, plan): (usize, &Degree)| plan.quantise(&coefficients(gaussians, degree), &classes.colors, &choices[degree]);
+        let found = match directions {
+            Some(directions) => directions.quantise(&self.degrees, gaussians, &classes.colors, &rounds, &choices),
+            None => self.degrees.iter().enumerate().map(each).collect(),
+        };
         let mut colors = Vec::new();
-        for (degree, plan) in self.degrees.iter().enumerate() {
-            let rounds = self.rounds[if degree == 0 { 4 } else { 5 }];
-            let choices = Choices { rate_weight: if degree == 0 { 0.0 } else { self.choices.rate_weight }, ..self.choices };
+        for ((plan, rows), rounds) in self.degrees.iter().zip(found).zip(rounds) {
             let mut missing = Vec::new();
             let mut codes = vec![0; n * plan.dims];
-            let rows = plan.quantise(&coefficients(gaussians, degree), &classes.colors, &choices).into_iter().zip(codes.chunks_exact_mut(plan.dims));
-            for (i, (row, out)) in rows.enumerate() {
+            for (i, (row, out)) in rows.into_iter().zip(codes.chunks_exact_mut(plan.dims)).enumerate() {
                 match row.filter(|_| rounds) {
                     Some(row) => out.copy_from_slice(&row),
                     None => missing.push(i),
@@ -294,7 +300,7 @@ mod tests {
         let weights = vec![1.0; means.len() / 3];
         let gaussians = HostGaussians { log_scales: vec![0.0; means.len()], means, ..Default::default() };
         let (shapes, steps) = (weights.clone(), Steps::default());
-        let importance = Importance { weights, shapes, samples: 1.0, pixels_per_unit: 100.0, steps, attributes: Vec::new() };
+        let importance = Importance { weights, shapes, samples: 1.0, pixels_per_unit: 100.0, steps, attributes: Vec::new(), directions: None };
         let mut geometry = Geometry {
             scale_origin: 0.0,
             scale_step: std::f32::consts::LN_2,

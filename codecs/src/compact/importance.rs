@@ -3,6 +3,7 @@
 //! Where errors of all parameters add the same to the squared error of images, a file of a given size has the smallest error. A parameter's step is
 //! therefore inversely proportional to its *weight*: the root of the sum, over pixels and channels of an image, of the squared derivatives.
 
+use super::joint::Directions;
 use super::sensitivity::Sensitivity;
 use cc4dgs_format::{BLUR, CodecContext, HostGaussians, Result};
 use std::ops::RangeInclusive;
@@ -42,6 +43,8 @@ pub struct Importance {
     pub steps: Steps,
     /// Attributes of plug-ins that were measured; others are stored as the plug-in allows.
     pub attributes: Vec<Sensitivity>,
+    /// From where Gaussians with harmonics are seen.
+    pub directions: Option<Directions>,
 }
 
 /// Steps relative to the step of a degree-0 colour coefficient.
@@ -84,22 +87,30 @@ pub fn estimate(gaussians: &HostGaussians, context: &CodecContext) -> Importance
         SH0 * SEEN * alpha * (std::f64::consts::PI * area).min(samples).sqrt()
     };
     let weights: Vec<f64> = (0..gaussians.len()).map(weight).collect();
-    Importance { shapes: weights.clone(), weights, samples, pixels_per_unit: median(&scale), steps: Steps::default(), attributes: Vec::new() }
+    Importance { shapes: weights.clone(), weights, samples, pixels_per_unit: median(&scale), steps: Steps::default(), attributes: Vec::new(), directions: None }
 }
 
-/// Weights from derivatives of renders; `None` where the context cannot tell them. `apart` says whether shapes have weights of their own.
-pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool) -> Result<Option<Importance>> {
+/// Weights from derivatives of renders; `None` where the context cannot tell them. `apart` says whether shapes have weights of their own, `joint` whether directions
+/// are wanted.
+pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool, joint: bool) -> Result<Option<Importance>> {
     let (Some(views), Some(renderer)) = (context.views, context.renderer) else { return Ok(None) };
     let chosen = views.len().min(budget(WORK, gaussians.len(), VIEWS));
     if chosen == 0 || gaussians.is_empty() {
         return Ok(None);
     }
     let mut total: Option<HostGaussians> = None;
+    let mut directions = (joint && gaussians.sh_degree > 0).then(|| Directions::new(gaussians.len(), gaussians.sh_degree));
     for k in 0..chosen {
         let (camera, time_norm) = views.view(k * views.len() / chosen);
         let Some(found) = renderer.squared_derivatives(gaussians, camera, time_norm, context.seed.child("importance").index(k as u64))? else {
             return Ok(None);
         };
+        if let Some(directions) = &mut directions {
+            let weights: Vec<f64> =
+                found.sh_dc.chunks_exact(3).map(|v| v.iter().map(|&v| f64::from(v)).sum::<f64>() / (3.0 * SH0 * SH0 * chosen as f64)).collect();
+            let moved = context.deformer.map(|deformer| deformer.deform(gaussians, time_norm)).transpose()?;
+            directions.add(camera, &moved.as_ref().unwrap_or(gaussians).means, &weights);
+        }
         match &mut total {
             None => total = Some(found),
             Some(total) => {
@@ -164,7 +175,15 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool) -
     };
     let (scale, samples) = pixel_scales(gaussians, context);
     let root = |squares: Vec<f64>| squares.into_iter().map(|w| (w / chosen as f64).sqrt()).collect();
-    Ok(Some(Importance { weights: root(colours), shapes: root(shapes), samples, pixels_per_unit: median(&scale), steps, attributes: Vec::new() }))
+    Ok(Some(Importance {
+        weights: root(colours),
+        shapes: root(shapes),
+        samples,
+        pixels_per_unit: median(&scale),
+        steps,
+        attributes: Vec::new(),
+        directions: directions.map(Directions::factored),
+    }))
 }
 
 /// Pixels per world unit at each Gaussian (root of the mean square over cameras that see it), and the samples of an image.

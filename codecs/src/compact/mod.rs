@@ -14,6 +14,7 @@ mod encode;
 mod entropy;
 mod geometry;
 mod importance;
+mod joint;
 mod layers;
 mod predict;
 mod read;
@@ -33,6 +34,7 @@ use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Err
 use colors::Choices;
 use encode::{Classes, Factors, Plan};
 use importance::Importance;
+use joint::Directions;
 use settings::Settings;
 use write::Motion;
 
@@ -64,6 +66,8 @@ struct Job<'a> {
     gaussians: &'a HostGaussians,
     free: Vec<bool>,
     importance: &'a Importance,
+    /// From where Gaussians are seen, where colours are rounded together.
+    directions: Option<&'a Directions>,
     classes: Classes,
     /// The layer of each Gaussian, and how many each layer has.
     layers: (Vec<u8>, Vec<usize>),
@@ -114,7 +118,7 @@ impl Job<'_> {
     }
     /// The streams of canonical Gaussians as `plan` rounds them, and the order of their rows.
     fn attempt_planned(&self, gaussians: &HostGaussians, plan: Plan, quality: f64) -> Result<(Attempt, Vec<usize>)> {
-        let of = plan.quantise(gaussians, &self.free, &self.classes);
+        let of = plan.quantise(gaussians, &self.free, &self.classes, self.directions);
         let mut order: Vec<usize> = (0..gaussians.len()).collect();
         order.sort_by_key(|&i| (self.layers.0[i], of.keys[i], i));
         let streams = write::write(gaussians, &of, &self.motion, &order, &self.layers.1)?;
@@ -170,7 +174,11 @@ impl AttributeCodec for Compact {
     fn encode(&self, gaussians: &HostGaussians, context: &CodecContext) -> Result<Vec<Stream>> {
         crate::require_encoders()?;
         gaussians.validate("Gaussians to encode", &context.limits)?;
-        let measured = if self.settings.measured { importance::measure(gaussians, context, self.settings.adaptive && self.settings.shapes)? } else { None };
+        let measured = if self.settings.measured {
+            importance::measure(gaussians, context, self.settings.adaptive && self.settings.shapes, self.settings.joint)?
+        } else {
+            None
+        };
         let mut importance = measured.unwrap_or_else(|| importance::estimate(gaussians, context));
         let (motion, free) = self.motion(gaussians, context)?;
         let canonical = encode::canonical(gaussians, &free);
@@ -180,7 +188,9 @@ impl AttributeCodec for Compact {
         }
         let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
         let layers = layers::assign(&importance.weights, layers::number(self.settings.layers, gaussians.len()));
-        let mut job = Job { gaussians: &canonical, free, importance: &importance, classes, layers, motion, choices, factors: [1.0; 6], limits: context };
+        let directions = importance.directions.as_ref();
+        let mut job =
+            Job { gaussians: &canonical, free, importance: &importance, directions, classes, layers, motion, choices, factors: [1.0; 6], limits: context };
         Ok(search::search(&mut job, &self.settings, context)?.streams)
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {

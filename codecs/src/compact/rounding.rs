@@ -20,10 +20,10 @@ pub struct Rounder<'a> {
 
 impl Rounding for Rounder<'_> {
     fn round(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
-        Ok(restored(&self.plan.quantise(gaussians, self.free, self.classes), gaussians))
+        Ok(restored(&self.plan.quantise(gaussians, self.free, self.classes, None), gaussians))
     }
     fn steps(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
-        let codes = self.plan.quantise(gaussians, self.free, self.classes);
+        let codes = self.plan.quantise(gaussians, self.free, self.classes, None);
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
         let mut out = zeros_like(gaussians);
         for (i, &shape) in shapes.iter().enumerate() {
@@ -44,7 +44,7 @@ impl Rounding for Rounder<'_> {
         Ok(out)
     }
     fn bit_slopes(&self, gaussians: &HostGaussians) -> Result<HostGaussians> {
-        let codes = self.plan.quantise(gaussians, self.free, self.classes);
+        let codes = self.plan.quantise(gaussians, self.free, self.classes, None);
         let (geometry, shapes) = (&self.plan.geometry, &self.classes.shapes);
         let mut out = zeros_like(gaussians);
         for (i, &shape) in shapes.iter().enumerate() {
@@ -216,7 +216,8 @@ mod tests {
             let motion = Motion { free: u8::from(free[0]), moving: None, levels: [0.0; 2] };
             let layers = layers::assign(&importance.weights, 2);
             let choices = Choices { transform: true, rate_weight: 0.0 };
-            let job = Job { gaussians: &g, free, importance: &importance, classes, layers, motion, choices, factors: [1.0; 6], limits: &limits };
+            let job =
+                Job { gaussians: &g, free, importance: &importance, directions: None, classes, layers, motion, choices, factors: [1.0; 6], limits: &limits };
             let plan = Plan::new(&g, &importance, &job.classes, 0.02, &[1.0; 6], &job.choices);
             let (attempt, order) = job.attempt_planned(&g, plan, 0.02).unwrap();
             let rounder = Rounder { plan: &attempt.plan, free: &job.free, classes: &job.classes };

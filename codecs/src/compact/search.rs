@@ -139,6 +139,17 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         }
         _ => return job.attempt(start),
     };
+    let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
+    let caution = tuner.filter(|_| !settings.finetune_wanted).map(|t| t.caution()).transpose()?.flatten();
+    if let Some(why) = &caution {
+        let message = format!("the model is not fine-tuned: {why}. --set finetune={} does it all the same", settings.finetune);
+        context.events.emit(&Event::Warning { object: object.into(), message });
+    }
+    let tuner = tuner.filter(|_| caution.is_none());
+    if tuner.is_some() {
+        // Training learns which coefficients matter, and starts from steps of coefficients by themselves.
+        job.directions = None;
+    }
     let corrected = services.filter(|_| settings.allocate);
     let mut found = seek(job, start, &allowance, if corrected.is_some() { ROUGH } else { GOOD })?;
     if let Some((views, renderer)) = corrected {
@@ -157,13 +168,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         Allowance::Bytes { limit, .. } => Goal::Bytes(*limit),
         Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
-    let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
-    let caution = tuner.filter(|_| !settings.finetune_wanted).map(|t| t.caution()).transpose()?.flatten();
-    if let Some(why) = &caution {
-        let message = format!("the model is not fine-tuned: {why}. --set finetune={} does it all the same", settings.finetune);
-        context.events.emit(&Event::Warning { object: object.into(), message });
-    }
-    if let Some(tuner) = tuner.filter(|_| caution.is_none()) {
+    if let Some(tuner) = tuner {
         match tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)? {
             Tuned::Better(attempt) => return Ok(*attempt),
             // It was measured on more views, and with the deformer's weights as they are stored.

@@ -16,6 +16,7 @@ adaptive = true          # steps of their own for Gaussians that are seen more o
 shapes = true            # with --scene: steps of shapes by the weights of shapes; false: by those of colours
 allocate = true          # with --scene: correct the steps of the columns by what a change of each costs and saves
 transform = true         # transform the colour coefficients of each degree
+joint = true             # with --scene and without fine-tuning: round the colour coefficients of a Gaussian together, for the directions that views see
 canonical = true         # sort the axes of Gaussians whose shape does not change
 layers = 0               # sets of Gaussians by falling weight, which a player draws one by one while they arrive, up to 6; 0: 3 from 131,072 Gaussians on, else 1
 ";
@@ -46,6 +47,8 @@ pub struct Settings {
     pub allocate: bool,
     /// Transform colour coefficients.
     pub transform: bool,
+    /// Round coefficients of colours together.
+    pub joint: bool,
     /// Sort axes.
     pub canonical: bool,
     /// Sets of Gaussians by falling weight; 0 chooses by their number.
@@ -72,6 +75,7 @@ impl Default for Settings {
             shapes: true,
             allocate: true,
             transform: true,
+            joint: true,
             canonical: true,
             layers: 0,
             drop_wanted: false,
