@@ -81,7 +81,7 @@ def main():
     parser.add_argument("--ablation", action="store_true", help="compact with each of its ideas switched off")
     parser.add_argument("models", nargs="+", metavar="MODEL=NAME[:SCENE]")
     args = parser.parse_args()
-    switches = ["adaptive=false", "measured=false", "transform=false", "shapes=false", "allocate=false", "canonical=false", "rate_weight=1.0"] if args.ablation else []
+    switches = ["adaptive=false", "measured=false", "transform=false", "shapes=false", "allocate=false", "joint=false", "canonical=false", "rate_weight=1.0"] if args.ablation else []
     results, lines = [], []
     for spec in args.models:
         model, name = spec.split("=", 1)
