@@ -356,7 +356,7 @@ mod tests {
         let read = || open(dir.path(), &SceneOptions::default(), &Limits::default()).unwrap();
         std::fs::write(&file, &sound).unwrap();
         let scene = read();
-        assert_eq!(scene.warnings, Vec::<String>::new());
+        assert_eq!(scene.warnings, [NOTHING_HELD_OUT]);
         assert_eq!(scene.points, Some(RawPoints { positions: vec![[7.0, 8.0, 5.0], [1.0, 2.0, 3.0]], colors: vec![[1.0, 0.0, 0.2], [0.0, 1.0, 0.0]] }));
         assert_eq!(scene.cameras[0].pinhole().center_world(), [7.0, 8.0, 9.0]);
         // Without its points the scene is still there.
