@@ -49,9 +49,10 @@ fn find() -> Result<InstalledLpips, String> {
             let network = Lpips::from_bytes(bytes).map_err(|e| format!("LPIPS is not measured: the weights built in: {e}"))?;
             Ok(InstalledLpips { network: Arc::new(network), source: "built in".into() })
         }
+        // Results state this, and no paths of a machine.
         None => Err(format!(
-            "LPIPS is not measured: its weights are neither built in nor at {}. Make the file with benches/lpips_weights.py, or name one in {LPIPS_VARIABLE}",
-            paths.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(" or ")
+            "LPIPS is not measured: its weights are neither built in nor where `cc4dgs doctor` looks for them. Make the file with benches/lpips_weights.py, or name one in \
+             {LPIPS_VARIABLE}"
         )),
     }
 }
