@@ -180,6 +180,8 @@ struct ModelSource<'a> {
     job: &'a ExportJob<'a>,
     player: Player<'a>,
     facts: ExportFacts,
+    /// Whether it was looked at what float32 does to centres.
+    checked: bool,
 }
 
 impl<'a> ModelSource<'a> {
@@ -189,9 +191,6 @@ impl<'a> ModelSource<'a> {
         // What stands still is the same in every frame.
         let all = if player.moving() == 0 { 1 } else { model.frame_count };
         let frames = request.frames.unwrap_or(all).max(1);
-        if let Some(message) = coarse(&model.gaussians, &model.normalisation.inverse()) {
-            job.events.emit(&Event::Warning { object: format!("export of {}", job.out.display()), message });
-        }
         let orbit = Orbit { frames: 1, up: request.up, ..Orbit::default() };
         // A camera is a convenience; models that no orbit can look at have none.
         let home = request.shots.first().map(|(camera, _)| camera.clone()).or_else(|| orbit.around(&model.gaussians).ok()?.pop());
@@ -209,7 +208,7 @@ impl<'a> ModelSource<'a> {
             home: home.map(|camera| model.normalisation.inverse().apply_camera(&camera)),
             images: request.shots.len(),
         };
-        Ok(Self { job, player, facts })
+        Ok(Self { job, player, facts, checked: false })
     }
     /// Ends the export where the user wants to stop; `when` says how far it is.
     fn check_stop(&self, when: &str) -> Result<()> {
@@ -222,6 +221,13 @@ impl ExportSource for ModelSource<'_> {
         &self.facts
     }
     fn gaussians(&mut self, time_norm: Option<f32>) -> Result<HostGaussians> {
+        // Images and pages keep the coordinates of the model.
+        let model = self.job.model;
+        if !std::mem::replace(&mut self.checked, true)
+            && let Some(message) = coarse(&model.gaussians, &model.normalisation.inverse())
+        {
+            self.job.events.emit(&Event::Warning { object: format!("export of {}", self.job.out.display()), message });
+        }
         let mut gaussians = match time_norm {
             None => self.job.model.gaussians.clone(),
             Some(time) => self.player.gaussians_at(time)?.to_host()?,
