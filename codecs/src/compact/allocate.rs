@@ -1,9 +1,9 @@
 //! Steps of the columns relative to each other, from what a change of each costs and saves: at the best ratio all columns give the same bytes for the same
 //! error of images. Derivatives give the steps to start with; this corrects for what they leave out, such as large steps and prediction.
 
-use super::Job;
 use super::encode::Factors;
 use super::importance::budget;
+use super::{Job, bytes_of};
 use cc4dgs_format::{RenderModel, Result, TrainingViews};
 use std::ops::RangeInclusive;
 
@@ -17,18 +17,19 @@ const LARGEST: f64 = 8.0;
 
 /// The factors of the columns at about the step factor `quality`.
 pub fn allocate(job: &Job, quality: f64, views: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<Factors> {
-    let chosen = views.len().min(budget(WORK, job.gaussians.len(), VIEWS));
+    let gaussians = job.planner.gaussians;
+    let chosen = views.len().min(budget(WORK, gaussians.len(), VIEWS));
     let view = |k: usize| views.view(k * views.len() / chosen);
-    let originals = (0..chosen).map(|k| Ok(renderer.render(job.gaussians, view(k).0, view(k).1)?.planes)).collect::<Result<Vec<Vec<f32>>>>()?;
+    let originals = (0..chosen).map(|k| Ok(renderer.render(gaussians, view(k).0, view(k).1)?.planes)).collect::<Result<Vec<Vec<f32>>>>()?;
     let measure = |factors: &Factors| -> Result<(f64, f64)> {
-        let attempt = job.attempt_with(job.gaussians, quality, factors)?;
+        let attempt = job.attempt_with(&job.planner, quality, factors)?;
         let mut error = 0.0;
         for (k, original) in originals.iter().enumerate() {
-            let drawn = renderer.render(&attempt.decoded, view(k).0, view(k).1)?;
+            let drawn = renderer.render(&attempt.rounded, view(k).0, view(k).1)?;
             let colours = 3 * drawn.width as usize * drawn.height as usize;
             error += original.iter().zip(&drawn.planes).take(colours).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
         }
-        Ok((error, attempt.bytes as f64))
+        Ok((error, bytes_of(&job.streams(gaussians, &attempt.plan)?) as f64))
     };
     let mut factors: Factors = [1.0; 6];
     let (error, bytes) = measure(&factors)?;

@@ -2,8 +2,10 @@
 
 use super::entropy::{Coder, LANES, Lanes, behind, symbol_of};
 use super::transform::{Basis, analysis, basis, identity, scaled};
+use crate::jacobi;
 use cc4dgs_format::Result;
 use cc4dgs_format::archive::ByteReader;
+use rayon::prelude::*;
 
 /// Contexts of the size of a row: four per octave of the size expected.
 const SIZES: usize = 32;
@@ -46,31 +48,38 @@ pub struct Choices {
     pub rate_weight: f64,
 }
 
-impl Degree {
-    /// Plans the storage of `rows` `[N,dims]` in steps of `step` for class 0; `weights` `[N]` say how visible each is.
-    pub fn plan(rows: &[f32], dims: usize, classes: &[u8], weights: &[f64], step: f32, choices: &Choices) -> Self {
-        let n = classes.len().max(1) as f64;
+/// What all plans of the same coefficients share, whatever their step.
+pub struct Transform {
+    dims: usize,
+    mean: Vec<f32>,
+    basis: Basis,
+    /// Root-mean-square coordinates.
+    spread: Vec<f64>,
+}
+
+impl Transform {
+    /// Of `rows` `[N,dims]`; `weights` `[N]` say how visible each is.
+    pub fn of(rows: &[f32], dims: usize, weights: &[f64], choices: &Choices) -> Self {
+        let n = (rows.len() / dims).max(1) as f64;
         let mean: Vec<f32> = (0..dims).map(|c| (rows.iter().skip(c).step_by(dims).map(|&v| f64::from(v)).sum::<f64>() / n) as f32).collect();
         let centred: Vec<f64> = rows.iter().enumerate().map(|(k, &v)| f64::from(v) - f64::from(mean[k % dims])).collect();
-        let mut out = Self { dims, mean, basis: identity(dims), step, spread: vec![ONE_STEP as u8; dims] };
-        if choices.transform {
-            let found = basis(&centred, dims, weights);
-            if analysis(&found, dims).is_some() {
-                out.basis = found;
-            }
-        }
-        let Some(analysis) = analysis(&out.basis, dims) else { return out };
-        let mut energy = vec![0.0; dims];
-        for row in centred.chunks_exact(dims) {
-            for (c, energy) in energy.iter_mut().enumerate() {
-                *energy += project(&analysis[c * dims..(c + 1) * dims], row).powi(2);
-            }
-        }
-        for (spread, energy) in out.spread.iter_mut().zip(energy) {
-            let relative = (energy / n).sqrt() / f64::from(step);
-            *spread = if relative > 0.0 { (2.0 * libm::log2(relative) + 128.0).round().clamp(0.0, 255.0) as u8 } else { 0 };
-        }
-        out
+        let found = choices.transform.then(|| basis(&centred, dims, weights)).and_then(|basis| Some((analysis(&basis, dims)?, basis)));
+        let (vectors, basis) = found.unwrap_or_else(|| (jacobi::identity(dims), identity(dims)));
+        let energy = |vector: &[f64]| centred.chunks_exact(dims).map(|row| project(vector, row).powi(2)).sum::<f64>();
+        let spread = vectors.par_chunks_exact(dims).map(|vector| (energy(vector) / n).sqrt()).collect();
+        Self { dims, mean, basis, spread }
+    }
+}
+
+impl Degree {
+    /// Plans the storage of the coefficients of `transform` in steps of `step` for class 0.
+    pub fn plan(transform: &Transform, step: f32) -> Self {
+        let octaves = |spread: &f64| {
+            let relative = spread / f64::from(step);
+            if relative > 0.0 { (2.0 * libm::log2(relative) + 128.0).round().clamp(0.0, 255.0) as u8 } else { 0 }
+        };
+        let Transform { dims, mean, basis, spread } = transform;
+        Self { dims: *dims, mean: mean.clone(), basis: basis.clone(), step, spread: spread.iter().map(octaves).collect() }
     }
     /// Codes `[N,dims]` of `rows`; `None` for a row that is out of range.
     pub fn quantise(&self, rows: &[f32], classes: &[u8], choices: &Choices) -> Vec<Option<Vec<i32>>> {
@@ -85,7 +94,7 @@ impl Degree {
             };
             (0..self.dims).map(code).collect()
         };
-        rows.chunks_exact(self.dims).zip(classes).map(quantise).collect()
+        rows.par_chunks_exact(self.dims).zip(classes).map(quantise).collect()
     }
     /// The derivative of the estimated bits of all coordinates by each of the values `rows` `[N,dims]`; `guesses` `[N,dims]` are predictions in steps.
     pub fn bit_slopes(&self, rows: &[f32], classes: &[u8], guesses: Option<&[f64]>) -> Vec<f32> {
@@ -125,6 +134,9 @@ impl Degree {
     /// A magnitude in steps, rounded down where that costs less than the bits it saves: coordinates are thought to have a Laplace distribution.
     fn rounded(&self, steps: f64, c: usize, class: u8, rate_weight: f64) -> f64 {
         let down = libm::floor(steps);
+        if rate_weight == 0.0 {
+            return if steps - down < 0.5 { down } else { down + 1.0 };
+        }
         let mean = (MEAN * libm::exp2(0.5 * f64::from(i32::from(self.spread[c]) - ONE_STEP) - f64::from(class))).max(0.05);
         // From one code to the next the logarithm of the probability falls by 1 / mean; the first one has a sign.
         let bits = std::f64::consts::LOG2_E / mean + f64::from(u8::from(down == 0.0));

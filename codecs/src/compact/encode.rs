@@ -1,7 +1,7 @@
 //! From Gaussians to integers: classes, canonical rotations, steps, order, and rows that are stored exactly.
 
 use super::attributes::{Coded, Coding};
-use super::colors::{Choices, Degree};
+use super::colors::{Choices, Degree, Transform};
 use super::geometry::{CODE_LIMIT, GRID_BITS, Geometry, Rotation, companded};
 use super::importance::{Importance, median};
 use super::joint::Directions;
@@ -13,7 +13,7 @@ use rayon::prelude::*;
 pub const CLASSES: u8 = 12;
 /// What Gaussians of larger weights than that of class 0 add to the squared error of images, as a share of what all others do.
 const EXCESS: f64 = 2e-3;
-/// Largest step of a centre, in middle scales.
+/// Largest step of a centre, in middle scales, if no [`Bounds`] are set.
 const LARGEST_STEP: f64 = 1.0;
 /// Largest steps of log-scales and companded opacities.
 const LARGEST_SCALE_STEP: f64 = 0.7;
@@ -35,6 +35,8 @@ pub struct Plan {
     attributes: Vec<(Coding, Vec<bool>)>,
     /// Whether means, log-scales, quaternions, opacity logits, degree 0 and higher degrees are rounded; else they are stored exactly.
     rounds: [bool; 6],
+    /// Whether colours may be rounded together.
+    joint: bool,
     choices: Choices,
 }
 
@@ -143,17 +145,69 @@ fn octaves(weights: &[f64], top: Option<f64>, adaptive: bool) -> (Vec<u8>, f64) 
 /// Factors of the steps of the columns means, log-scales, quaternions, opacity logits, degree 0 and higher degrees.
 pub type Factors = [f64; 6];
 
-impl Plan {
-    /// Plans the storage of canonical Gaussians with the step `quality` / weight for colours. A column whose factor is 0 is stored exactly.
-    pub fn new(gaussians: &HostGaussians, importance: &Importance, classes: &Classes, quality: f64, factors: &Factors, choices: &Choices) -> Self {
-        let (base, steps) = (quality / classes.top, importance.steps);
-        let positive = |v: f64| (v as f32).clamp(1e-18, 1e18);
+/// What keeps the declared loss, where steps alone do not.
+#[derive(Clone, Copy)]
+pub struct Bounds {
+    /// Factors of the largest step of each column; of all steps of those that have none. A column whose factor is 0 is stored exactly.
+    pub largest: Factors,
+    /// Whether colours may be rounded together.
+    pub joint: bool,
+}
+
+impl Bounds {
+    pub const NONE: Self = Self { largest: [1.0; 6], joint: true };
+}
+
+/// Plans for canonical Gaussians, and what all of them share.
+pub struct Planner<'a> {
+    pub gaussians: &'a HostGaussians,
+    pub importance: &'a Importance,
+    pub classes: &'a Classes,
+    choices: Choices,
+    /// Mean log-scale.
+    scale_origin: f32,
+    /// Median of the middle log-scales.
+    middle: f64,
+    /// Sorted coordinates of the centres.
+    axes: [Vec<f64>; 3],
+    /// Of each degree.
+    transforms: Vec<Transform>,
+}
+
+impl<'a> Planner<'a> {
+    pub fn new(gaussians: &'a HostGaussians, importance: &'a Importance, classes: &'a Classes, choices: Choices) -> Self {
         let finite: Vec<f64> = gaussians.log_scales.iter().filter(|v| v.abs() < LOG_SCALE_LIMIT).map(|&v| f64::from(v)).collect();
-        let mut geometry = Geometry {
+        let middle: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
+        let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
+        let transform = |degree: usize| Transform::of(&coefficients(gaussians, degree), 3 * (2 * degree + 1), &squared, &choices);
+        Self {
+            gaussians,
+            importance,
+            classes,
+            choices,
             scale_origin: (finite.iter().sum::<f64>() / finite.len().max(1) as f64) as f32,
-            scale_step: positive((base * steps.log_scales * factors[1]).min(LARGEST_SCALE_STEP)),
-            rotation_step: positive(base * steps.quaternions * factors[2]),
-            opacity_step: positive((base * steps.opacity_logits * factors[3]).min(LARGEST_OPACITY_STEP)),
+            middle: median(&middle),
+            axes: sorted_axes(&gaussians.means),
+            transforms: (0..=gaussians.sh_degree).map(transform).collect(),
+        }
+    }
+    /// Plans for other Gaussians of the same importance.
+    pub fn of<'b>(&self, gaussians: &'b HostGaussians) -> Planner<'b>
+    where
+        'a: 'b,
+    {
+        Planner::new(gaussians, self.importance, self.classes, self.choices)
+    }
+    /// Plans the storage with the step `quality` / weight for colours.
+    pub fn plan(&self, quality: f64, factors: &Factors, bounds: &Bounds) -> Plan {
+        let (base, steps, largest) = (quality / self.classes.top, self.importance.steps, bounds.largest);
+        let (largest_scale, largest_opacity) = (LARGEST_SCALE_STEP * largest[1], LARGEST_OPACITY_STEP * largest[3]);
+        let positive = |v: f64| (v as f32).clamp(1e-18, 1e18);
+        let mut geometry = Geometry {
+            scale_origin: self.scale_origin,
+            scale_step: positive((base * steps.log_scales * factors[1]).min(largest_scale)),
+            rotation_step: positive(base * steps.quaternions * factors[2] * largest[2]),
+            opacity_step: positive((base * steps.opacity_logits * factors[3]).min(largest_opacity)),
             corner: [0.0; 3],
             cell: 1.0,
             size_floor: 0,
@@ -162,61 +216,59 @@ impl Plan {
             opacity_limit: 0,
         };
         let limit = |step: f32, largest: f64| libm::log2(largest / f64::from(step)).clamp(0.0, 15.0) as u8;
-        geometry.scale_limit = limit(geometry.scale_step, LARGEST_SCALE_STEP);
-        geometry.opacity_limit = limit(geometry.opacity_step, LARGEST_OPACITY_STEP);
-        grid(&mut geometry, gaussians, importance, base * steps.means * factors[0]);
-        let squared: Vec<f64> = importance.weights.iter().map(|w| w * w).collect();
-        let degree = |degree: usize| {
-            let dims = 3 * (2 * degree + 1);
-            let (relative, factor) = if degree == 0 { (1.0, factors[4]) } else { (steps.sh_rest[degree - 1], factors[5]) };
-            Degree::plan(&coefficients(gaussians, degree), dims, &classes.colors, &squared, positive(base * relative * factor), choices)
+        geometry.scale_limit = limit(geometry.scale_step, largest_scale);
+        geometry.opacity_limit = limit(geometry.opacity_step, largest_opacity);
+        let means = (base * steps.means * factors[0], LARGEST_STEP * largest[0]);
+        grid(&mut geometry, &self.axes, self.middle, self.importance.pixels_per_unit, means);
+        let degree = |(degree, transform): (usize, &Transform)| {
+            let (relative, factor) = if degree == 0 { (1.0, factors[4] * largest[4]) } else { (steps.sh_rest[degree - 1], factors[5] * largest[5]) };
+            Degree::plan(transform, positive(base * relative * factor))
         };
-        let attributes = importance.attributes.iter().filter_map(|of| Coding::plan(gaussians, of, &geometry, quality)).collect();
-        Self { degrees: (0..=gaussians.sh_degree).map(degree).collect(), attributes, geometry, rounds: factors.map(|f| f > 0.0), choices: *choices }
+        Plan {
+            degrees: self.transforms.iter().enumerate().map(degree).collect(),
+            attributes: self.importance.attributes.iter().filter_map(|of| Coding::plan(self.gaussians, of, &geometry, quality)).collect(),
+            geometry,
+            rounds: largest.map(|factor| factor > 0.0),
+            joint: bounds.joint,
+            choices: self.choices,
+        }
     }
-    /// The integers of canonical Gaussians, as many as those that were planned for. With `directions`, colours are rounded together.
+}
+
+impl Plan {
+    /// The integers of canonical Gaussians, as many as those that were planned for. With `directions`, colours are rounded together if they may be.
     pub fn quantise<'a>(&'a self, gaussians: &HostGaussians, free: &[bool], classes: &'a Classes, directions: Option<&Directions>) -> Integers<'a> {
         let (geometry, shapes, n) = (&self.geometry, &classes.shapes, gaussians.len());
-        let mut exact = vec![Vec::new(); 4];
-        let mut scales = vec![[0i32; 3]; n];
-        for (i, (codes, values)) in scales.iter_mut().zip(gaussians.log_scales.chunks_exact(3)).enumerate() {
-            let step = geometry.scale_step_of(shapes[i]);
+        let (scales, exact_scales) = each(n, |i| {
+            let (values, step) = (&gaussians.log_scales[3 * i..3 * i + 3], geometry.scale_step_of(shapes[i]));
             let found: [Option<i32>; 3] = std::array::from_fn(|k| code((f64::from(values[k]) - f64::from(geometry.scale_origin)) / step));
             match found {
-                [Some(a), Some(b), Some(c)] if self.rounds[1] && values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => *codes = [a, b, c],
-                _ => exact[1].push(i),
+                [Some(a), Some(b), Some(c)] if self.rounds[1] && values.iter().all(|v| v.abs() < LOG_SCALE_LIMIT) => Some([a, b, c]),
+                _ => None,
             }
-        }
-        let mut keys = vec![0u64; n];
-        for (i, (key, mean)) in keys.iter_mut().zip(gaussians.means.chunks_exact(3)).enumerate() {
-            match geometry.key(mean, geometry.position_shift(scales[i], shapes[i])).filter(|_| self.rounds[0]) {
-                Some(found) => *key = found,
-                None => exact[0].push(i),
-            }
-        }
-        let mut rotations = vec![Rotation::default(); n];
-        for (i, (codes, q)) in rotations.iter_mut().zip(gaussians.quaternions.chunks_exact(4)).enumerate() {
+        });
+        let (keys, exact_means) = each(n, |i| {
+            let mean = &gaussians.means[3 * i..3 * i + 3];
+            geometry.key(mean, geometry.position_shift(scales[i], shapes[i])).filter(|_| self.rounds[0])
+        });
+        let (rotations, exact_rotations) = each(n, |i| {
+            let q = &gaussians.quaternions[4 * i..4 * i + 4];
             let norm = q.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>().sqrt();
             let step = geometry.rotation(geometry.rotation_shift(scales[i], shapes[i]));
-            match Some(norm).filter(|norm| self.rounds[2] && NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i])) {
-                Some(found) => *codes = found,
-                None => exact[2].push(i),
-            }
-        }
-        let mut opacities = vec![0i32; n];
-        for (i, (out, &logit)) in opacities.iter_mut().zip(&gaussians.opacity_logits).enumerate() {
-            match code(companded(logit) / geometry.opacity_step_of(shapes[i])).filter(|_| self.rounds[3] && logit.abs() < LOGIT_LIMIT) {
-                Some(found) => *out = found,
-                None => exact[3].push(i),
-            }
-        }
+            Some(norm).filter(|norm| self.rounds[2] && NORMS.contains(norm)).and_then(|norm| Rotation::of(q, norm, step, free[i]))
+        });
+        let (opacities, exact_opacities) = each(n, |i| {
+            let logit = gaussians.opacity_logits[i];
+            code(companded(logit) / geometry.opacity_step_of(shapes[i])).filter(|_| self.rounds[3] && logit.abs() < LOGIT_LIMIT)
+        });
+        let mut exact = vec![exact_means, exact_scales, exact_rotations, exact_opacities];
         let rounds: Vec<bool> = (0..self.degrees.len()).map(|degree| self.rounds[if degree == 0 { 4 } else { 5 }]).collect();
         let choices_of = |degree: usize| Choices { rate_weight: if degree == 0 { 0.0 } else { self.choices.rate_weight }, ..self.choices };
         let choices: Vec<Choices> = (0..self.degrees.len()).map(choices_of).collect();
-        let each = |(degree, plan): (usize, &Degree)| plan.quantise(&coefficients(gaussians, degree), &classes.colors, &choices[degree]);
-        let found = match directions {
+        let alone = |(degree, plan): (usize, &Degree)| plan.quantise(&coefficients(gaussians, degree), &classes.colors, &choices[degree]);
+        let found = match directions.filter(|_| self.joint) {
             Some(directions) => directions.quantise(&self.degrees, gaussians, &classes.colors, &rounds, &choices),
-            None => self.degrees.iter().enumerate().map(each).collect(),
+            None => self.degrees.iter().enumerate().map(alone).collect(),
         };
         let mut colors = Vec::new();
         for ((plan, rows), rounds) in self.degrees.iter().zip(found).zip(rounds) {
@@ -236,6 +288,13 @@ impl Plan {
     }
 }
 
+/// The codes of `n` rows, and the rows that have none.
+fn each<T: Default + Send>(n: usize, code: impl Fn(usize) -> Option<T> + Send + Sync) -> (Vec<T>, Vec<usize>) {
+    let found: Vec<Option<T>> = (0..n).into_par_iter().map(code).collect();
+    let missing = found.iter().enumerate().filter(|(_, code)| code.is_none()).map(|(i, _)| i).collect();
+    (found.into_iter().map(Option::unwrap_or_default).collect(), missing)
+}
+
 fn code(steps: f64) -> Option<i32> {
     let code = steps.round();
     (code.abs() < CODE_LIMIT as f64).then_some(code as i32)
@@ -248,20 +307,27 @@ pub fn coefficients(gaussians: &HostGaussians, degree: usize) -> Vec<f32> {
     }
     let width = 3 * cc4dgs_format::gaussians::sh_rest_len(gaussians.sh_degree);
     let (from, to) = (3 * (degree * degree - 1), 3 * ((degree + 1) * (degree + 1) - 1));
-    gaussians.sh_rest.chunks_exact(width).flat_map(|row| &row[from..to]).copied().collect()
+    let mut out = Vec::with_capacity(gaussians.len() * (to - from));
+    gaussians.sh_rest.chunks_exact(width).for_each(|row| out.extend_from_slice(&row[from..to]));
+    out
 }
 
-/// Chooses the grid of the centres: `relative` is the step of class 0 over the middle scale. A grid of so many cells may be too small for them; then some are
-/// left out, or cells are larger than wanted, and steps of larger Gaussians and coarser classes are doubled less often.
-fn grid(geometry: &mut Geometry, gaussians: &HostGaussians, importance: &Importance, relative: f64) {
-    let relative = relative.clamp(1e-9, 0.5);
-    let middle: Vec<f64> = gaussians.log_scales.chunks_exact(3).map(|s| f64::from(s[0].min(s[1]).max(s[0].max(s[1]).min(s[2])))).collect();
+/// The coordinates of centres `[N,3]`, sorted along each axis.
+fn sorted_axes(means: &[f32]) -> [Vec<f64>; 3] {
+    let mut axes: [Vec<f64>; 3] = std::array::from_fn(|k| means.iter().skip(k).step_by(3).map(|&v| f64::from(v)).collect());
+    axes.iter_mut().for_each(|axis| axis.par_sort_unstable_by(f64::total_cmp));
+    axes
+}
+
+/// Chooses the grid of the centres, whose sorted coordinates are `axes`: `relative` is the step of class 0 over the middle scale, `largest` that of the coarsest
+/// class; the logarithm of the middle scale has the median `middle`. A grid of so many cells may be too small for them; then some are left out, or cells are larger than wanted, and steps of larger Gaussians and
+/// coarser classes are doubled less often.
+fn grid(geometry: &mut Geometry, axes: &[Vec<f64>; 3], middle: f64, pixels_per_unit: f64, (relative, largest): (f64, f64)) {
+    let relative = relative.min(0.5).min(largest).max(1e-9);
     // Below half a pixel all Gaussians look alike.
-    let pixel = if importance.pixels_per_unit > 0.0 { libm::log(0.5 / importance.pixels_per_unit) } else { -60.0 };
-    let floor = pixel.max(median(&middle) - 6.0).clamp(-60.0, 60.0);
+    let pixel = if pixels_per_unit > 0.0 { libm::log(0.5 / pixels_per_unit) } else { -60.0 };
+    let floor = pixel.max(middle - 6.0).clamp(-60.0, 60.0);
     let (cell, cells) = ((relative * libm::exp(floor)).max(1e-30), f64::from(1u32 << GRID_BITS));
-    let mut axes: [Vec<f64>; 3] = std::array::from_fn(|k| gaussians.means.iter().skip(k).step_by(3).map(|&v| f64::from(v)).collect());
-    axes.iter_mut().for_each(|axis| axis.sort_unstable_by(f64::total_cmp));
     let mut best = f64::INFINITY;
     for (cut, cost) in OUTSIDE {
         let spans = axes.each_ref().map(|axis| span(axis, cut));
@@ -275,7 +341,7 @@ fn grid(geometry: &mut Geometry, gaussians: &HostGaussians, importance: &Importa
         geometry.corner = spans.map(|[low, high]| if cut > 0.0 { 0.5 * (low + high) - 0.5 * cells * geometry.cell } else { low });
         let octaves = libm::log2(growth);
         geometry.size_floor = ((floor / std::f64::consts::LN_2 + octaves) * 65536.0) as i64;
-        geometry.class_limit = (libm::log2(LARGEST_STEP / relative) - octaves).clamp(0.0, 15.0) as u8;
+        geometry.class_limit = (libm::log2(largest / relative) - octaves).clamp(0.0, 15.0) as u8;
     }
 }
 
@@ -291,16 +357,11 @@ fn span(sorted: &[f64], cut: f64) -> [f64; 2] {
 
 #[cfg(test)]
 mod tests {
-    use super::super::importance::Steps;
     use super::*;
 
     /// The grid of Gaussians on the x axis, all with a standard deviation of 1, where a pixel is a hundredth.
     fn grid_of(x: impl Iterator<Item = f32>) -> Geometry {
         let means: Vec<f32> = x.flat_map(|x| [x, 0.0, 0.0]).collect();
-        let weights = vec![1.0; means.len() / 3];
-        let gaussians = HostGaussians { log_scales: vec![0.0; means.len()], means, ..Default::default() };
-        let (shapes, steps) = (weights.clone(), Steps::default());
-        let importance = Importance { weights, shapes, samples: 1.0, pixels_per_unit: 100.0, steps, attributes: Vec::new(), directions: None };
         let mut geometry = Geometry {
             scale_origin: 0.0,
             scale_step: std::f32::consts::LN_2,
@@ -313,7 +374,7 @@ mod tests {
             scale_limit: 0,
             opacity_limit: 0,
         };
-        grid(&mut geometry, &gaussians, &importance, 0.1);
+        grid(&mut geometry, &sorted_axes(&means), 0.0, 100.0, (0.1, LARGEST_STEP));
         geometry
     }
 

@@ -196,6 +196,7 @@ fn factor(triangle: &mut [f32], functions: usize) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use super::super::colors::Transform;
     use super::*;
 
     /// Directions of one Gaussian at the origin, which cameras see from one side.
@@ -248,7 +249,7 @@ mod tests {
             .map(|d| {
                 let rows = coefficients(&gaussians, d);
                 let both: Vec<f32> = rows.iter().copied().chain(rows.iter().map(|v| -v)).collect();
-                Degree::plan(&both, rows.len(), &[0, 0], &[1.0, 1.0], [0.02, 0.3, 0.3][d], &choices[0])
+                Degree::plan(&Transform::of(&both, rows.len(), &[1.0, 1.0], &choices[0]), [0.02, 0.3, 0.3][d])
             })
             .collect();
         let error = |codes: &[Codes]| {

@@ -32,9 +32,9 @@ pub(crate) use weights::build as build_weights;
 use cc4dgs_format::storage::column_loss;
 use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Error, HostGaussians, Plugin, Result, Stream, StreamStage, inventory};
 use colors::Choices;
-use encode::{Classes, Factors, Plan};
-use importance::Importance;
+use encode::{Bounds, Factors, Integers, Plan, Planner};
 use joint::Directions;
+use rayon::prelude::*;
 use settings::Settings;
 use write::Motion;
 
@@ -52,8 +52,12 @@ const LOSSES: [(&str, f64); 7] = [
     // One of two levels, each the mean of its scores.
     ("dynamic_scores", 1.0),
 ];
-/// Halvings of a column's step until its loss is allowed; then the whole column is stored exactly.
-const HALVINGS: usize = 12;
+/// Reductions of a column's largest step until its loss is allowed; then the whole column is stored exactly.
+const REDUCTIONS: usize = 12;
+/// The share of the declared loss that a smaller step aims at, and by how much steps become smaller at a time: errors grow in proportion to steps where these
+/// are small.
+const LOSS_AIM: f64 = 0.9;
+const SMALLER: std::ops::RangeInclusive<f64> = 0.02..=0.7;
 /// Times at which the deformer is asked what it changes.
 const TIMES: [f32; 3] = [0.0, 0.37, 1.0];
 
@@ -63,68 +67,87 @@ struct Compact {
 
 /// What does not change from one attempt to the next.
 struct Job<'a> {
-    gaussians: &'a HostGaussians,
+    /// Of the Gaussians to encode.
+    planner: Planner<'a>,
     free: Vec<bool>,
-    importance: &'a Importance,
     /// From where Gaussians are seen, where colours are rounded together.
     directions: Option<&'a Directions>,
-    classes: Classes,
     /// The layer of each Gaussian, and how many each layer has.
     layers: (Vec<u8>, Vec<usize>),
     motion: Motion,
-    choices: Choices,
     /// Of the columns, to start with.
     factors: Factors,
-    limits: &'a CodecContext<'a>,
 }
 
-/// Streams of a quality.
+/// Gaussians rounded in the steps of a quality.
 struct Attempt {
     quality: f64,
-    bytes: usize,
-    streams: Vec<Stream>,
-    /// What they decode to.
-    decoded: HostGaussians,
     /// How the values were rounded.
     plan: Plan,
+    /// What they will be decoded to, in the order in which they are stored, on which images depend where depths are the same; but for dynamic scores, and for
+    /// attributes of plug-ins that are stored as these allow.
+    rounded: HostGaussians,
 }
 
 impl Job<'_> {
+    /// Rounds the Gaussians to encode.
     fn attempt(&self, quality: f64) -> Result<Attempt> {
-        self.attempt_with(self.gaussians, quality, &self.factors)
+        self.attempt_with(&self.planner, quality, &self.factors)
     }
-    /// The streams of canonical Gaussians, in steps that keep the declared loss.
-    fn attempt_with(&self, gaussians: &HostGaussians, quality: f64, factors: &Factors) -> Result<Attempt> {
-        let mut factors = *factors;
-        for halvings in 0.. {
-            let plan = Plan::new(gaussians, self.importance, &self.classes, quality, &factors, &self.choices);
-            let (attempt, order) = self.attempt_planned(gaussians, plan, quality)?;
-            let expected = gaussians.select(&order);
-            let mut kept = true;
-            for (((name, width, before), (_, _, after)), factor) in expected.columns().into_iter().zip(attempt.decoded.columns()).zip(&mut factors) {
+    /// Rounds the Gaussians of `planner` in steps that keep the declared loss.
+    fn attempt_with(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<Attempt> {
+        let mut bounds = Bounds::NONE;
+        // Colours may be rounded apart, and each column be stored exactly in the end.
+        for reductions in 0..REDUCTIONS + 2 + factors.len() {
+            let plan = planner.plan(quality, factors, &bounds);
+            let of = self.quantise(planner.gaussians, &plan);
+            let rounded = rounding::restored(&of, planner.gaussians);
+            let (together, mut kept) = (bounds.joint && self.directions.is_some(), true);
+            for (((name, width, before), (_, _, after)), factor) in planner.gaussians.columns().into_iter().zip(rounded.columns()).zip(&mut bounds.largest) {
                 let allowed = LOSSES.iter().find(|l| l.0 == name).map_or(0.0, |l| l.1);
                 let lost = column_loss(name, before, after, width);
                 // A small part of it is left for what rounding adds.
                 if lost.is_nan() || lost > 0.999 * allowed {
-                    *factor *= if halvings < HALVINGS { 0.5 } else { 0.0 };
                     kept = false;
+                    if together && name.starts_with("sh_") {
+                        bounds.joint = false;
+                        continue;
+                    }
+                    let smaller = Some(LOSS_AIM * allowed / lost).filter(|s| !s.is_nan()).unwrap_or(0.5).clamp(*SMALLER.start(), *SMALLER.end());
+                    *factor *= if reductions < REDUCTIONS { smaller } else { 0.0 };
                 }
             }
-            if kept || halvings > HALVINGS {
-                return Ok(attempt);
+            if kept {
+                let rounded = rounded.select(&self.order(&of));
+                return Ok(Attempt { quality, plan, rounded });
             }
         }
         Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
     }
-    /// The streams of canonical Gaussians as `plan` rounds them, and the order of their rows.
-    fn attempt_planned(&self, gaussians: &HostGaussians, plan: Plan, quality: f64) -> Result<(Attempt, Vec<usize>)> {
-        let of = plan.quantise(gaussians, &self.free, &self.classes, self.directions);
-        let mut order: Vec<usize> = (0..gaussians.len()).collect();
-        order.sort_by_key(|&i| (self.layers.0[i], of.keys[i], i));
-        let streams = write::write(gaussians, &of, &self.motion, &order, &self.layers.1)?;
-        let decoded = read::read(&streams, &CodecContext::new(self.limits.seed, self.limits.limits, self.limits.events), true)?;
-        Ok((Attempt { quality, bytes: streams.iter().map(|s| s.bytes.len()).sum(), streams, decoded, plan }, order))
+    fn quantise<'a>(&'a self, gaussians: &HostGaussians, plan: &'a Plan) -> Integers<'a> {
+        plan.quantise(gaussians, &self.free, self.planner.classes, self.directions)
     }
+    /// The streams of canonical Gaussians as `plan` rounds them.
+    fn streams(&self, gaussians: &HostGaussians, plan: &Plan) -> Result<Vec<Stream>> {
+        let of = self.quantise(gaussians, plan);
+        write::write(gaussians, &of, &self.motion, &self.order(&of), &self.layers.1)
+    }
+    /// What these streams will be decoded to, as in [`Attempt::rounded`].
+    fn rounded(&self, gaussians: &HostGaussians, plan: &Plan) -> HostGaussians {
+        let of = self.quantise(gaussians, plan);
+        rounding::restored(&of, gaussians).select(&self.order(&of))
+    }
+    /// The order in which rows are stored.
+    fn order(&self, of: &Integers) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..of.keys.len()).collect();
+        order.par_sort_by_key(|&i| (self.layers.0[i], of.keys[i], i));
+        order
+    }
+}
+
+/// The bytes of all streams.
+fn bytes_of(streams: &[Stream]) -> usize {
+    streams.iter().map(|stream| stream.bytes.len()).sum()
 }
 
 impl Compact {
@@ -188,10 +211,12 @@ impl AttributeCodec for Compact {
         }
         let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
         let layers = layers::assign(&importance.weights, layers::number(self.settings.layers, gaussians.len()));
-        let directions = importance.directions.as_ref();
-        let mut job =
-            Job { gaussians: &canonical, free, importance: &importance, directions, classes, layers, motion, choices, factors: [1.0; 6], limits: context };
-        Ok(search::search(&mut job, &self.settings, context)?.streams)
+        let planner = Planner::new(&canonical, &importance, &classes, choices);
+        let mut job = Job { planner, free, directions: importance.directions.as_ref(), layers, motion, factors: [1.0; 6] };
+        let streams = search::search(&mut job, &self.settings, context)?;
+        // What cannot be read again is no file.
+        self.decode(&streams, context)?;
+        Ok(streams)
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
         read::read(streams, context, true)
@@ -239,6 +264,48 @@ mod tests {
     fn the_stored_version_is_that_of_the_plug_in() {
         let plugin = cc4dgs_format::Entries::<CodecPlugin>::collect().and_then(|all| all.get("compact")).map(|p| p.info.version);
         assert_eq!(plugin.ok(), Some(VERSION.to_string().as_str()));
+    }
+
+    #[test]
+    fn the_declared_loss_is_kept_by_the_steps_of_what_is_hardly_seen() {
+        let n = 400;
+        let draw = |k: usize, column: u64| (cc4dgs_format::Seed::root(column).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+        let mut g = HostGaussians { sh_degree: 2, opacity_logits: vec![0.0; n], ..Default::default() };
+        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
+            *values = (0..n * width).map(|k| draw(k, column as u64)).collect();
+        }
+        // Large beside the distances between them, so that steps of a size lose much.
+        g.log_scales.fill(0.5);
+        let context = CodecContext::new(cc4dgs_format::Seed::root(1), Default::default(), &cc4dgs_format::Silent);
+        let mut importance = importance::estimate(&g, &context);
+        importance.weights.iter_mut().chain(&mut importance.shapes).enumerate().filter(|(k, _)| k % 8 > 0).for_each(|(_, w)| *w *= 1e-4);
+        let classes = encode::classify(&importance.weights, &importance.shapes, true);
+        let mut directions = Directions::new(n, 2);
+        for k in 0..20 {
+            let eye = [4.0, (k as f64 * 0.7).sin(), (k as f64 * 1.3).cos()];
+            directions.add(&cc4dgs_format::Camera::look_at("t", (8, 8), 1.0, eye, [0.0; 3], [0.0, 0.0, 1.0]), &g.means, &vec![1.0; n]);
+        }
+        let directions = directions.factored();
+        let planner = Planner::new(&g, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
+        let (layers, motion) = (layers::assign(&importance.weights, 1), Motion { free: 0, moving: None, levels: [0.0; 2] });
+        let job = Job { planner, free: vec![false; n], directions: Some(&directions), layers, motion, factors: [1.0; 6] };
+        let wanted = job.planner.plan(0.05, &job.factors, &Bounds::NONE);
+        let too_much = |plan: &Plan| {
+            let (sorted, rounded) = (g.select(&job.order(&job.quantise(&g, plan))), job.rounded(&g, plan));
+            let losses = sorted.columns().into_iter().zip(rounded.columns()).zip(LOSSES).map(|(((name, width, a), (_, _, b)), loss)| {
+                assert_eq!(name, loss.0);
+                column_loss(name, a, b, width) > loss.1
+            });
+            losses.collect::<Vec<bool>>()
+        };
+        let lost = too_much(&wanted);
+        assert!(lost[0] && (lost[4] || lost[5]), "the test has nothing to show: {lost:?}");
+        let kept = job.attempt(0.05).unwrap().plan;
+        assert_eq!(too_much(&kept), [false; 7]);
+        // Steps of class 0 are as wanted: the others pay.
+        assert_eq!((kept.geometry.cell, kept.geometry.scale_step), (wanted.geometry.cell, wanted.geometry.scale_step));
+        assert!(kept.geometry.class_limit < wanted.geometry.class_limit);
+        assert!((0..3).all(|d| kept.degrees[d].step_of(0) == wanted.degrees[d].step_of(0)));
     }
 
     #[test]

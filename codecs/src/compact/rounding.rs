@@ -7,6 +7,7 @@ use super::predict::{Known, Linear};
 use super::write::{known_classes, known_scales};
 use cc4dgs_format::gaussians::sh_rest_len;
 use cc4dgs_format::{HostGaussians, Result, Rounding};
+use rayon::prelude::*;
 
 /// Largest step of a unit quaternion's component that [`Rounding::steps`] tells: with larger ones all rotations are rounded alike.
 const LARGEST_TURN: f64 = 0.25;
@@ -122,20 +123,19 @@ pub fn restored(codes: &Integers, gaussians: &HostGaussians) -> HostGaussians {
     let (plan, classes) = (codes.plan, codes.classes);
     let (geometry, shapes) = (&plan.geometry, &classes.shapes);
     let mut out = gaussians.clone();
-    for (i, &shape) in shapes.iter().enumerate() {
-        let scales = codes.scales[i];
-        for (k, &code) in scales.iter().enumerate() {
-            out.log_scales[3 * i + k] = geometry.scale(code, shape);
-        }
-        out.means[3 * i..3 * i + 3].copy_from_slice(&geometry.centre(codes.keys[i], geometry.position_shift(scales, shape)));
-        let step = geometry.rotation(geometry.rotation_shift(scales, shape));
-        out.quaternions[4 * i..4 * i + 4].copy_from_slice(&codes.rotations[i].quaternion(step));
-        out.opacity_logits[i] = geometry.opacity(codes.opacities[i], shape);
-    }
+    let centres = out.means.par_chunks_exact_mut(3).zip(out.log_scales.par_chunks_exact_mut(3));
+    let rows = centres.zip(out.quaternions.par_chunks_exact_mut(4)).zip(out.opacity_logits.par_iter_mut()).enumerate();
+    rows.for_each(|(i, (((mean, log_scales), quaternion), opacity))| {
+        let (scales, shape) = (codes.scales[i], shapes[i]);
+        log_scales.iter_mut().zip(scales).for_each(|(out, code)| *out = geometry.scale(code, shape));
+        mean.copy_from_slice(&geometry.centre(codes.keys[i], geometry.position_shift(scales, shape)));
+        quaternion.copy_from_slice(&codes.rotations[i].quaternion(geometry.rotation(geometry.rotation_shift(scales, shape))));
+        *opacity = geometry.opacity(codes.opacities[i], shape);
+    });
     for (degree, (plan, codes)) in plan.degrees.iter().zip(&codes.colors).enumerate() {
         let basis = plan.scaled_basis();
         let mut rows = vec![0.0; codes.len()];
-        let each = rows.chunks_exact_mut(plan.dims).zip(codes.chunks_exact(plan.dims)).zip(&classes.colors);
+        let each = rows.par_chunks_exact_mut(plan.dims).zip(codes.par_chunks_exact(plan.dims)).zip(&classes.colors);
         each.for_each(|((row, codes), &class)| plan.restore(&basis, codes, class, row));
         set_coefficients(&mut out, degree, &rows);
     }
@@ -184,9 +184,9 @@ fn keep_exact(codes: &Integers, from: &HostGaussians, to: &mut HostGaussians) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::encode::{canonical, classify};
+    use super::super::encode::{Bounds, Planner, canonical, classify};
     use super::super::sensitivity::{Growth, Sensitivity};
-    use super::super::{Choices, Job, Motion, importance, layers};
+    use super::super::{Choices, Job, Motion, importance, layers, read};
     use super::*;
     use cc4dgs_format::{CodecContext, ExtraAttribute, Limits, Seed, Silent};
 
@@ -216,17 +216,18 @@ mod tests {
             let motion = Motion { free: u8::from(free[0]), moving: None, levels: [0.0; 2] };
             let layers = layers::assign(&importance.weights, 2);
             let choices = Choices { transform: true, rate_weight: 0.0 };
-            let job =
-                Job { gaussians: &g, free, importance: &importance, directions: None, classes, layers, motion, choices, factors: [1.0; 6], limits: &limits };
-            let plan = Plan::new(&g, &importance, &job.classes, 0.02, &[1.0; 6], &job.choices);
-            let (attempt, order) = job.attempt_planned(&g, plan, 0.02).unwrap();
-            let rounder = Rounder { plan: &attempt.plan, free: &job.free, classes: &job.classes };
+            let planner = Planner::new(&g, &importance, &classes, choices);
+            let job = Job { planner, free, directions: None, layers, motion, factors: [1.0; 6] };
+            let plan = job.planner.plan(0.02, &[1.0; 6], &Bounds::NONE);
+            let order = job.order(&job.quantise(&g, &plan));
+            let decoded = read::read(&job.streams(&g, &plan).unwrap(), &limits, true).unwrap();
+            let rounder = Rounder { plan: &plan, free: &job.free, classes: &classes };
             let rounded = rounder.round(&g).unwrap();
             let (found, steps) = (rounded.select(&order), rounder.steps(&g).unwrap());
-            for ((name, _, a), (_, _, b)) in found.columns().into_iter().zip(attempt.decoded.columns()).filter(|c| c.0.0 != "dynamic_scores") {
+            for ((name, _, a), (_, _, b)) in found.columns().into_iter().zip(decoded.columns()).filter(|c| c.0.0 != "dynamic_scores") {
                 assert!(a == b, "{name} differ");
             }
-            assert_eq!(found.extra, attempt.decoded.extra);
+            assert_eq!(found.extra, decoded.extra);
             assert!(rounded.extra["a"] != g.extra["a"] && steps.extra["a"].values.iter().all(|s| *s > 0.0));
             // Free quaternions have the norm 1 in canonical form, which can be rounded.
             assert_eq!((steps.quaternions[0] == 0.0, steps.log_scales[7]), (!job.free[0], 0.0), "rows that are stored exactly");
@@ -243,7 +244,10 @@ mod tests {
     fn slopes_are_derivatives_of_bits() {
         let g = scene(40);
         let (rows, classes) = (coefficients(&g, 2), vec![1u8; 40]);
-        let plan = super::super::colors::Degree::plan(&rows, 15, &classes, &[1.0; 40], 0.2, &Choices { transform: true, rate_weight: 0.0 });
+        let plan = super::super::colors::Degree::plan(
+            &super::super::colors::Transform::of(&rows, 15, &[1.0; 40], &Choices { transform: true, rate_weight: 0.0 }),
+            0.2,
+        );
         let guesses: Vec<f64> = (0..rows.len()).map(|k| (k as f64 * 0.7).sin()).collect();
         let slopes = plan.bit_slopes(&rows, &classes, Some(&guesses));
         for k in [0, 7, 100, 599] {

@@ -2,9 +2,9 @@
 
 use super::importance::{Importance, budget};
 use super::settings::Settings;
-use super::tune::{self, Goal, Tuned};
-use super::{Attempt, Job, allocate};
-use cc4dgs_format::{CodecContext, Error, Event, RenderModel, Result, TrainingViews, WeightArray, psnr_on_views};
+use super::tune::{self, Goal, Tuned, Untuned};
+use super::{Attempt, Job, allocate, bytes_of};
+use cc4dgs_format::{CodecContext, Error, Event, RenderModel, Result, Stream, TrainingViews, WeightArray, psnr_on_views};
 use std::ops::RangeInclusive;
 
 /// Views on which the loss is measured, by [`budget`].
@@ -40,18 +40,18 @@ enum Allowance<'a> {
 }
 
 impl Allowance<'_> {
-    /// What an attempt uses, as a share of what is allowed.
-    fn share(&self, attempt: &Attempt) -> Result<f64> {
+    /// What an attempt uses, as a share of what is allowed. Only where bytes are allowed is it coded.
+    fn share(&self, job: &Job, attempt: &Attempt) -> Result<f64> {
         match self {
-            Self::Bytes { limit, context } => Ok(file_bytes(context, attempt, None)? / limit),
-            Self::Drop { before, limit, views, renderer, chosen } => Ok((before - psnr_on_views(&attempt.decoded, *views, *renderer, *chosen)?) / limit),
+            Self::Bytes { limit, context } => Ok(file_bytes(context, &job.streams(job.planner.gaussians, &attempt.plan)?, None)? / limit),
+            Self::Drop { before, limit, views, renderer, chosen } => Ok((before - psnr_on_views(&attempt.rounded, *views, *renderer, *chosen)?) / limit),
         }
     }
     /// Octaves from the step factor of an attempt to the one that is expected to use [`AIM`].
     fn octaves(&self, attempt: &Attempt, share: f64) -> f64 {
         match self {
             // An octave of all steps is a bit of every value that is not zero.
-            Self::Bytes { limit, .. } => (share - AIM) * limit / (PARAMETERS / 8.0 * attempt.decoded.len().max(1) as f64),
+            Self::Bytes { limit, .. } => (share - AIM) * limit / (PARAMETERS / 8.0 * attempt.rounded.len().max(1) as f64),
             // Squared errors of images, small beside what a model leaves, add to the loss in proportion.
             Self::Drop { .. } => 0.5 * libm::log2(AIM / share.max(LEAST)),
         }
@@ -83,7 +83,7 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
     let mut least = None;
     for _ in 0..ATTEMPTS {
         let attempt = job.attempt(start * libm::exp2(direction * at))?;
-        let share = allowance.share(&attempt)?;
+        let share = allowance.share(job, &attempt)?;
         let step = direction * allowance.octaves(&attempt, share);
         let tried = Tried { attempt, share };
         if tried.allowed() {
@@ -114,30 +114,30 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
 }
 
 /// The streams that the settings ask for.
-pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Result<Attempt> {
-    let start = estimate(settings.psnr_db, job.importance);
+pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Result<Vec<Stream>> {
+    let (gaussians, start) = (job.planner.gaussians, estimate(settings.psnr_db, job.planner.importance));
     let object = "codec compact";
-    if settings.finetune_wanted && settings.finetune > 0 && context.tuner.is_none() && !job.gaussians.is_empty() {
+    if settings.finetune_wanted && settings.finetune > 0 && context.tuner.is_none() && !gaussians.is_empty() {
         let problem = "fine-tuning needs the training views, and there are none";
         return Err(Error::parameter("codec compact.finetune", problem, "Give the dataset with --scene, or leave it out"));
     }
-    let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !job.gaussians.is_empty());
+    let services = context.views.filter(|v| !v.is_empty()).zip(context.renderer).filter(|_| !gaussians.is_empty());
     let allowance = match services {
         _ if settings.max_size_mb > 0.0 => Allowance::Bytes { limit: bytes_of_file(settings, context)?, context },
-        None if settings.drop_wanted && !job.gaussians.is_empty() => {
+        None if settings.drop_wanted && !gaussians.is_empty() => {
             let problem = "a loss of PSNR is measured on training views, and there are none";
             return Err(Error::parameter(object, problem, "Give the dataset with --scene, or choose compact:psnr=50dB or compact:max-size=5MB"));
         }
         Some((views, renderer)) if settings.max_drop_db > 0.0 => {
-            let chosen = views.len().min(budget(WORK, job.gaussians.len(), VIEWS));
-            let before = psnr_on_views(job.gaussians, views, renderer, chosen)?;
+            let chosen = views.len().min(budget(WORK, gaussians.len(), VIEWS));
+            let before = psnr_on_views(gaussians, views, renderer, chosen)?;
             Allowance::Drop { before, limit: settings.max_drop_db, views, renderer, chosen }
         }
-        _ if settings.finetune_wanted && settings.finetune > 0 && !job.gaussians.is_empty() => {
+        _ if settings.finetune_wanted && settings.finetune > 0 && !gaussians.is_empty() => {
             let problem = "fine-tuning belongs to the search for a loss or a size, and neither is bounded";
             return Err(Error::parameter("codec compact.finetune", problem, "Choose compact:max-drop=0.05dB or compact:max-size=5MB, or leave it out"));
         }
-        _ => return job.attempt(start),
+        _ => return job.streams(gaussians, &job.attempt(start)?.plan),
     };
     let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
     let caution = tuner.filter(|_| !settings.finetune_wanted).map(|t| t.caution()).transpose()?.flatten();
@@ -152,16 +152,19 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     }
     let corrected = services.filter(|_| settings.allocate);
     let mut found = seek(job, start, &allowance, if corrected.is_some() { ROUGH } else { GOOD })?;
+    let mut streams = job.streams(gaussians, &found.attempt.plan)?;
     if let Some((views, renderer)) = corrected {
         let plain = job.factors;
         job.factors = allocate::allocate(job, found.attempt.quality, views, renderer)?;
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
         let second = seek(job, found.attempt.quality, &allowance, GOOD)?;
-        let first = std::mem::replace(&mut found, second);
+        let coded = job.streams(gaussians, &second.attempt.plan)?;
         // The corrections may be worth nothing in small models.
-        let worse = matches!(allowance, Allowance::Drop { .. }) && found.attempt.bytes >= first.attempt.bytes;
-        if first.allowed() && (worse || !found.allowed()) {
-            (found, job.factors) = (first, plain);
+        let worse = matches!(allowance, Allowance::Drop { .. }) && bytes_of(&coded) >= bytes_of(&streams);
+        if found.allowed() && (worse || !second.allowed()) {
+            job.factors = plain;
+        } else {
+            (found, streams) = (second, coded);
         }
     }
     let goal = match &allowance {
@@ -169,20 +172,21 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
     if let Some(tuner) = tuner {
-        match tune::tune(job, &found.attempt, found.allowed(), &goal, settings, tuner, context)? {
-            Tuned::Better(attempt) => return Ok(*attempt),
+        let untuned = Untuned { attempt: &found.attempt, bytes: bytes_of(&streams), allowed: found.allowed() };
+        match tune::tune(job, &untuned, &goal, settings, tuner, context)? {
+            Tuned::Better(streams) => return Ok(streams),
             // It was measured on more views, and with the deformer's weights as they are stored.
             Tuned::Nothing { lost } if let Allowance::Drop { limit, .. } = &allowance => found.share = found.share.max(lost / limit),
             Tuned::Nothing { .. } => {}
         }
     }
-    report(&found, &allowance, start, settings, context)?;
-    Ok(found.attempt)
+    report(&found, bytes_of(&streams), &allowance, start, settings, context)?;
+    Ok(streams)
 }
 
-/// The bytes of the file with the streams of `attempt`, and with other weights of the deformer where they are given; of the streams alone where nothing else is known.
-pub fn file_bytes(context: &CodecContext, attempt: &Attempt, weights: Option<(&[WeightArray], f64)>) -> Result<f64> {
-    Ok(context.file_bytes.map_or(Ok(attempt.bytes as u64), |of| of(&attempt.streams, weights))? as f64)
+/// The bytes of the file with `streams`, and with other weights of the deformer where they are given; of the streams alone where nothing else is known.
+pub fn file_bytes(context: &CodecContext, streams: &[Stream], weights: Option<(&[WeightArray], f64)>) -> Result<f64> {
+    Ok(context.file_bytes.map_or(Ok(bytes_of(streams) as u64), |of| of(streams, weights))? as f64)
 }
 
 /// The allowed bytes of the file, if there is room for Gaussians.
@@ -196,13 +200,13 @@ fn bytes_of_file(settings: &Settings, context: &CodecContext) -> Result<f64> {
     Err(Error::parameter("codec compact.max_size_mb", problem, "Allow more, or store the weights in fewer bits, such as --field-weights compact:bits=6"))
 }
 
-/// Says what was chosen; a loss or size over what the user allowed is an error.
-fn report(found: &Tried, allowance: &Allowance, start: f64, settings: &Settings, context: &CodecContext) -> Result<()> {
+/// Says what was chosen, whose Gaussians take so many `bytes`; a loss or size over what the user allowed is an error.
+fn report(found: &Tried, bytes: usize, allowance: &Allowance, start: f64, settings: &Settings, context: &CodecContext) -> Result<()> {
     let object = "codec compact";
-    let (megabytes, steps) = (found.attempt.bytes as f64 / 1e6, found.attempt.quality / start);
+    let (megabytes, steps) = (bytes as f64 / 1e6, found.attempt.quality / start);
     match allowance {
         Allowance::Bytes { limit, .. } if !found.allowed() => {
-            let problem = format!("the smallest file it reached has {:.0} bytes, {} of them of Gaussians", found.share * limit, found.attempt.bytes);
+            let problem = format!("the smallest file it reached has {:.0} bytes, {bytes} of them of Gaussians", found.share * limit);
             return Err(Error::parameter(object, problem, "Allow more, or remove Gaussians with `cc4dgs prune`"));
         }
         Allowance::Bytes { limit, .. } => {

@@ -1,6 +1,7 @@
 //! A Karhunen-Loève transform with an 8-bit basis.
 
 use crate::jacobi;
+use rayon::prelude::*;
 
 /// Steps of a basis vector's component.
 const UNIT: f64 = 127.0;
@@ -10,15 +11,15 @@ pub type Basis = Vec<i8>;
 
 /// The basis of the weighted second moments of `rows` `[N,dims]`.
 pub fn basis(rows: &[f64], dims: usize, weights: &[f64]) -> Basis {
-    let mut moments = vec![0.0; dims * dims];
-    for (row, weight) in rows.chunks_exact(dims).zip(weights) {
-        for i in 0..dims {
+    let upper = |i: usize| {
+        let mut sums = vec![0.0; dims];
+        for (row, weight) in rows.chunks_exact(dims).zip(weights) {
             let scaled = weight * row[i];
-            for j in i..dims {
-                moments[i * dims + j] += scaled * row[j];
-            }
+            sums[i..].iter_mut().zip(&row[i..]).for_each(|(sum, value)| *sum += scaled * value);
         }
-    }
+        sums
+    };
+    let mut moments: Vec<f64> = (0..dims).into_par_iter().flat_map_iter(upper).collect();
     for i in 0..dims {
         for j in 0..i {
             moments[i * dims + j] = moments[j * dims + i];

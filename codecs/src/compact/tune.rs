@@ -3,12 +3,12 @@
 //! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The best
 //! file that keeps what is allowed is taken; if there is none, the one that needed no training.
 
-use super::encode::canonical;
+use super::encode::{Plan, canonical};
 use super::rounding::Rounder;
 use super::search::{file_bytes, note};
 use super::settings::Settings;
-use super::{Attempt, Job};
-use cc4dgs_format::{CodecContext, Result, TuneModel, TunedModel, Tuning};
+use super::{Attempt, Job, bytes_of};
+use cc4dgs_format::{CodecContext, Result, Stream, TuneModel, TunedModel, Tuning};
 
 /// Rounds of training.
 const ROUNDS: usize = 5;
@@ -37,14 +37,23 @@ pub enum Goal {
 /// What training came to.
 pub enum Tuned {
     /// Streams that are better than those without training.
-    Better(Box<Attempt>),
+    Better(Vec<Stream>),
     /// Nothing better: those without training lose `lost` dB of PSNR.
     Nothing { lost: f64 },
 }
 
+/// What needed no training.
+pub struct Untuned<'a> {
+    pub attempt: &'a Attempt,
+    /// Bytes of its streams.
+    pub bytes: usize,
+    /// Whether it uses no more than what is allowed.
+    pub allowed: bool,
+}
+
 /// What a round came to.
 struct Outcome {
-    attempt: Attempt,
+    streams: Vec<Stream>,
     model: TunedModel,
     weight_steps: f64,
     /// Bytes with the deformer's weights, and of the whole file where it is known.
@@ -82,37 +91,39 @@ impl Goal {
     }
 }
 
-/// The best streams that `goal` allows, after training; `found` are those that do without, which may be `allowed`.
-pub fn tune(job: &Job, found: &Attempt, allowed: bool, goal: &Goal, settings: &Settings, tuner: &dyn TuneModel, context: &CodecContext) -> Result<Tuned> {
+/// The best streams that `goal` allows, after training; `found` is what there is without.
+pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner: &dyn TuneModel, context: &CodecContext) -> Result<Tuned> {
     let megabytes = |bytes: usize| bytes as f64 / 1e6;
-    let mut model = tuner.start(job.gaussians)?;
+    let mut model = tuner.start(job.planner.gaussians)?;
     let before = tuner.psnr(&model.gaussians, &model.weights, None)?;
-    let untuned = before - tuner.psnr(&found.decoded, &model.weights, Some(1.0))?;
+    let untuned = before - tuner.psnr(&found.attempt.rounded, &model.weights, Some(1.0))?;
     let first_bytes = found.bytes + tuner.weight_bytes(&model.weights, 1.0)?;
     note(context, format!("without fine-tuning {:.4} MB with the deformer's weights, PSNR {untuned:.3} dB lower", megabytes(first_bytes)));
     // Weights are rounded too, and the loss was measured on fewer views before.
     let allowed = match goal {
-        Goal::Drop(limit) => allowed && untuned <= *limit,
-        Goal::Bytes(_) => allowed,
+        Goal::Drop(limit) => found.allowed && untuned <= *limit,
+        Goal::Bytes(_) => found.allowed,
     };
     let mut best: Option<Outcome> = None;
     let mut octaves = goal.first();
     let shares = rounds(settings.finetune);
     for (round, &iterations) in shares.iter().enumerate() {
-        let quality = found.quality * libm::exp2(octaves);
+        let quality = found.attempt.quality * libm::exp2(octaves);
         let weight_steps = if matches!(goal, Goal::Drop(_)) { libm::exp2(octaves) } else { 1.0 };
-        let planned = job.attempt_with(&model.gaussians, quality, &job.factors)?;
-        let doubled = job.attempt_with(&model.gaussians, 2.0 * quality, &job.factors)?;
-        let bits_per_octave = 8.0 * planned.bytes.saturating_sub(doubled.bytes).max(1) as f64;
-        let rounding = &Rounder { plan: &planned.plan, free: &job.free, classes: &job.classes };
+        let planner = job.planner.of(&model.gaussians);
+        let plan_of = |quality: f64| Ok(job.attempt_with(&planner, quality, &job.factors)?.plan);
+        let bytes = |plan: &Plan| Ok(bytes_of(&job.streams(&model.gaussians, plan)?));
+        let plan: Plan = plan_of(quality)?;
+        let bits_per_octave = 8.0 * bytes(&plan)?.saturating_sub(bytes(&plan_of(2.0 * quality)?)?).max(1) as f64;
+        let rounding = &Rounder { plan: &plan, free: &job.free, classes: job.planner.classes };
         let of = (shares[..round].iter().sum(), settings.finetune);
         let seed = context.seed.child("fine-tuning").index(round as u64);
         model = tuner.tune(&model, &Tuning { rounding, weight_steps, iterations, of, seed, size_weight: settings.size_weight, bits_per_octave })?;
         model.gaussians = canonical(&model.gaussians, &job.free);
-        let (attempt, _) = job.attempt_planned(&model.gaussians, planned.plan, quality)?;
-        let drop = before - tuner.psnr(&attempt.decoded, &model.weights, Some(weight_steps))?;
-        let bytes = attempt.bytes + tuner.weight_bytes(&model.weights, weight_steps)?;
-        let (number, steps, gaussians) = (round + 1, libm::exp2(octaves), megabytes(attempt.bytes));
+        let streams = job.streams(&model.gaussians, &plan)?;
+        let drop = before - tuner.psnr(&job.rounded(&model.gaussians, &plan), &model.weights, Some(weight_steps))?;
+        let bytes = bytes_of(&streams) + tuner.weight_bytes(&model.weights, weight_steps)?;
+        let (number, steps, gaussians) = (round + 1, libm::exp2(octaves), megabytes(bytes_of(&streams)));
         note(
             context,
             format!(
@@ -120,8 +131,8 @@ pub fn tune(job: &Job, found: &Attempt, allowed: bool, goal: &Goal, settings: &S
                 megabytes(bytes)
             ),
         );
-        let file = file_bytes(context, &attempt, Some((&model.weights, weight_steps)))?;
-        let outcome = Outcome { attempt, model: model.clone(), weight_steps, bytes, file, drop };
+        let file = file_bytes(context, &streams, Some((&model.weights, weight_steps)))?;
+        let outcome = Outcome { streams, model: model.clone(), weight_steps, bytes, file, drop };
         let aim = if round + 2 == shares.len() { LAST_AIM } else { AIM };
         octaves += goal.octaves(&outcome, aim, octaves, bits_per_octave);
         let (bytes, drop) = best.as_ref().map_or(if allowed { (first_bytes, untuned) } else { (usize::MAX, f64::INFINITY) }, |b| (b.bytes, b.drop));
@@ -135,7 +146,7 @@ pub fn tune(job: &Job, found: &Attempt, allowed: bool, goal: &Goal, settings: &S
     };
     note(context, format!("fine-tuned: {:.4} MB with the deformer's weights, PSNR {:.3} dB lower", megabytes(best.bytes), best.drop));
     tuner.adopt(best.model.weights, best.weight_steps);
-    Ok(Tuned::Better(Box::new(best.attempt)))
+    Ok(Tuned::Better(best.streams))
 }
 
 /// Iterations of each round, which add up to `iterations`.
