@@ -9,6 +9,8 @@ mod sweep;
 pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLoss, BenchPlay, BenchSkip, BenchSort, BenchStep, BenchWhat};
 pub use files::{Decompress, Export, Render, Shots};
 pub use play::{Bake, View};
+#[cfg(feature = "view")]
+pub use play::{VIEW_DEVICE, VIEW_MAX_ERROR};
 pub use prune::Prune;
 pub use sweep::{SchedulerArg, Sweep, SweepCollect, SweepEmit, SweepPlan, SweepRun, SweepWhat};
 

@@ -40,7 +40,7 @@ fn run() -> Result<()> {
     let path = path.ok_or_else(|| usage("no file is named".into()))?;
     let title = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let opened = Box::new(open(&path)?);
-    show(&title, Shown::Model(opened, Source { path, open: Arc::new(open), start, command: "cc4dgs-view" }))
+    show(&title, Shown::Model(opened, Source { path, open: Arc::new(open), start, command: "cc4dgs-view".into() }))
 }
 
 fn open(path: &Path) -> Result<Opened> {

@@ -1,8 +1,8 @@
 //! Steps of the columns relative to each other, from what a change of each costs and saves: at the best ratio all columns give the same bytes for the same
 //! error of images. Derivatives give the steps to start with; this corrects for what they leave out, such as large steps and prediction.
 
-use super::encode::Factors;
 use super::importance::budget;
+use super::plan::Factors;
 use super::{Job, bytes_of};
 use cc4dgs_format::{RenderModel, Result, TrainingViews};
 use std::ops::RangeInclusive;

@@ -1,8 +1,9 @@
 //! Gaussians as they will be decoded, and what their values cost, without coding them. Fine-tuning asks for both in every iteration.
 
 use super::colors::slope;
-use super::encode::{Classes, Integers, Plan, coefficients};
+use super::encode::{Classes, Integers, coefficients};
 use super::geometry::companded;
+use super::plan::Plan;
 use super::predict::{Known, Linear};
 use super::write::{known_classes, known_scales};
 use cc4dgs_format::gaussians::sh_rest_len;
@@ -184,7 +185,8 @@ fn keep_exact(codes: &Integers, from: &HostGaussians, to: &mut HostGaussians) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::encode::{Bounds, Planner, canonical, classify};
+    use super::super::encode::{canonical, classify};
+    use super::super::plan::{Bounds, Planner};
     use super::super::sensitivity::{Growth, Sensitivity};
     use super::super::{Choices, Job, Motion, importance, layers, read};
     use super::*;

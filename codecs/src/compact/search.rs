@@ -22,6 +22,8 @@ const AIM: f64 = 0.985;
 /// Octaves of the step factor by which attempts differ, at most, and the share of a known interval that they stay away from its ends.
 const FARTHEST: f64 = 2.0;
 const MARGIN: f64 = 0.08;
+/// A loss in dB that is left after fine-tuning, for which the steps of the columns are corrected.
+const TUNED: f64 = 0.1;
 /// Least share from which a loss is extrapolated: smaller ones are noise.
 const LEAST: f64 = 0.05;
 
@@ -155,7 +157,8 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     let mut streams = job.streams(gaussians, &found.attempt.plan)?;
     if let Some((views, renderer)) = corrected {
         let plain = job.factors;
-        job.factors = allocate::allocate(job, found.attempt.quality, views, renderer)?;
+        let quality = found.attempt.quality * if tuner.is_some() { fine(job, &found.attempt, views, renderer)? } else { 1.0 };
+        job.factors = allocate::allocate(job, quality, views, renderer)?;
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
         let second = seek(job, found.attempt.quality, &allowance, GOOD)?;
         let coded = job.streams(gaussians, &second.attempt.plan)?;
@@ -172,7 +175,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         Allowance::Drop { limit, .. } => Goal::Drop(*limit),
     };
     if let Some(tuner) = tuner {
-        let untuned = Untuned { attempt: &found.attempt, bytes: bytes_of(&streams), allowed: found.allowed() };
+        let untuned = Untuned { attempt: &found.attempt, streams: &streams, allowed: found.allowed() };
         match tune::tune(job, &untuned, &goal, settings, tuner, context)? {
             Tuned::Better(streams) => return Ok(streams),
             // It was measured on more views, and with the deformer's weights as they are stored.
@@ -182,6 +185,13 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     }
     report(&found, bytes_of(&streams), &allowance, start, settings, context)?;
     Ok(streams)
+}
+
+/// A factor of the steps of `attempt` with which about [`TUNED`] is lost. Where a size is allowed, more is lost before training than after it.
+fn fine(job: &Job, attempt: &Attempt, views: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<f64> {
+    let chosen = views.len().min(budget(WORK, attempt.rounded.len(), VIEWS));
+    let lost = psnr_on_views(job.planner.gaussians, views, renderer, chosen)? - psnr_on_views(&attempt.rounded, views, renderer, chosen)?;
+    Ok(if lost > TUNED { (TUNED / lost).sqrt() } else { 1.0 })
 }
 
 /// The bytes of the file with `streams`, and with other weights of the deformer where they are given; of the streams alone where nothing else is known.

@@ -3,7 +3,9 @@
 //! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The best
 //! file that keeps what is allowed is taken; if there is none, the one that needed no training.
 
-use super::encode::{Plan, canonical};
+use super::encode::canonical;
+use super::forecast::Forecast;
+use super::plan::{Plan, Planner};
 use super::rounding::Rounder;
 use super::search::{file_bytes, note};
 use super::settings::Settings;
@@ -12,25 +14,26 @@ use cc4dgs_format::{CodecContext, Result, Stream, TuneModel, TunedModel, Tuning}
 
 /// Rounds of training.
 const ROUNDS: usize = 5;
-/// Share of the loss by rounding that training leaves. With steps k times those that need no training, rounding costs k² times what is allowed.
-const REMAINS: f64 = 0.3;
-/// What further training gains in dB in the first round, whatever is rounded; models that were trained for a few minutes gain more.
-const GAIN: f64 = 0.15;
 /// The most octaves by which the steps of the first round are larger than those that need no training, where a loss is allowed.
 const FIRST: f64 = 2.0;
 /// Octaves by which the steps of two rounds differ, at most.
 const FARTHEST: f64 = 1.0;
-/// The share of what is allowed that rounds aim at, and the last one, less what a round differs from what is expected, in dB.
+/// The share of what is allowed that rounds aim at, and what is left for the difference of a round from what is expected, in dB: of all but the last, of the last if
+/// there is a file that keeps what is allowed, and if there is none.
 const AIM: f64 = 0.95;
-const LAST_AIM: f64 = 0.8;
+const SPREADS: [f64; 3] = [0.01, 0.02, 0.03];
 const SIZE_AIM: f64 = 0.99;
-const SPREAD: f64 = 0.03;
+/// Octaves by which steps of the deformer's weights grow to measure what they cost, by which they may be larger or smaller than those chosen without training
+/// beside those of the Gaussians, and the least loss in dB that counts.
+const PROBED: f64 = 2.0;
+const WEIGHTS_FARTHEST: f64 = 3.0;
+const SMALLEST: f64 = 1e-5;
 
 /// What is allowed.
 pub enum Goal {
     /// A loss of PSNR in dB; the fewest bytes are best.
     Drop(f64),
-    /// Bytes of the file; the highest PSNR is best. Weights of the deformer keep their steps.
+    /// Bytes of the file; the highest PSNR is best.
     Bytes(f64),
 }
 
@@ -45,8 +48,7 @@ pub enum Tuned {
 /// What needed no training.
 pub struct Untuned<'a> {
     pub attempt: &'a Attempt,
-    /// Bytes of its streams.
-    pub bytes: usize,
+    pub streams: &'a [Stream],
     /// Whether it uses no more than what is allowed.
     pub allowed: bool,
 }
@@ -70,25 +72,6 @@ impl Goal {
             Self::Bytes(limit) => outcome.file <= *limit && outcome.drop < drop,
         }
     }
-    /// Octaves by which the steps of the first round are larger than those that need no training.
-    fn first(&self) -> f64 {
-        match self {
-            Self::Drop(limit) => (0.5 * libm::log2((AIM + GAIN / limit.max(1e-9)) / REMAINS)).min(FIRST),
-            Self::Bytes(_) => 0.0,
-        }
-    }
-    /// By how many octaves the next steps should be larger; `aim` is a share.
-    fn octaves(&self, outcome: &Outcome, aim: f64, octaves: f64, bits_per_octave: f64) -> f64 {
-        let more = match self {
-            Self::Drop(limit) => {
-                // Rounding costs in proportion to squared steps; training gains what it gains.
-                let cost = REMAINS * limit * libm::exp2(2.0 * octaves);
-                0.5 * libm::log2(((cost + aim * limit - SPREAD - outcome.drop) / cost).max(1e-3))
-            }
-            Self::Bytes(limit) => 8.0 * (outcome.file - SIZE_AIM * limit) / bits_per_octave,
-        };
-        more.clamp(-FARTHEST, FARTHEST)
-    }
 }
 
 /// The best streams that `goal` allows, after training; `found` is what there is without.
@@ -97,7 +80,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     let mut model = tuner.start(job.planner.gaussians)?;
     let before = tuner.psnr(&model.gaussians, &model.weights, None)?;
     let untuned = before - tuner.psnr(&found.attempt.rounded, &model.weights, Some(1.0))?;
-    let first_bytes = found.bytes + tuner.weight_bytes(&model.weights, 1.0)?;
+    let first_bytes = bytes_of(found.streams) + tuner.weight_bytes(&model.weights, 1.0)?;
     note(context, format!("without fine-tuning {:.4} MB with the deformer's weights, PSNR {untuned:.3} dB lower", megabytes(first_bytes)));
     // Weights are rounded too, and the loss was measured on fewer views before.
     let allowed = match goal {
@@ -105,16 +88,41 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         Goal::Bytes(_) => found.allowed,
     };
     let mut best: Option<Outcome> = None;
-    let mut octaves = goal.first();
     let shares = rounds(settings.finetune);
+    let count = shares.len();
+    let per_round = settings.finetune as f64 / count.max(1) as f64;
+    // Where the loss is bounded, steps are planned for the last round but one, whose file is safe, and then for the last.
+    let mut forecast = Forecast::new(if let Goal::Drop(limit) = goal { *limit } else { 0.0 }, per_round);
+    let planned = |forecast: &Forecast, limit: f64, done: usize, kept: bool| {
+        let (last, spread) = match (done + 1 < count, kept) {
+            (true, _) => (count - 1, SPREADS[0]),
+            (false, kept) => (count, SPREADS[if kept { 1 } else { 2 }]),
+        };
+        forecast.octaves(last, AIM * limit - spread)
+    };
+    let (_, per_octave) = planned_with(job, &job.planner, found.attempt.quality)?;
+    let of_weights = {
+        // A byte more of the weights is to be worth as much as one more of the Gaussians. Losses grow with squared steps.
+        let probed = before - tuner.psnr(&model.gaussians, &model.weights, Some(libm::exp2(PROBED)))?;
+        let lost = (probed * libm::exp2(-2.0 * PROBED)).max(SMALLEST);
+        let saved = tuner.weight_bytes(&model.weights, 1.0)?.saturating_sub(tuner.weight_bytes(&model.weights, 2.0)?) as f64;
+        let octaves = 0.5 * libm::log2((untuned - lost).max(SMALLEST) * saved / (lost * per_octave));
+        if octaves.is_finite() { octaves.clamp(-WEIGHTS_FARTHEST, WEIGHTS_FARTHEST) } else { 0.0 }
+    };
+    let mut octaves = match goal {
+        Goal::Drop(limit) => planned(&forecast, *limit, 0, false).clamp(0.0, FIRST),
+        Goal::Bytes(limit) => {
+            let weights = tuner.weight_bytes(&model.weights, libm::exp2(of_weights))? as f64 - tuner.weight_bytes(&model.weights, 1.0)? as f64;
+            ((file_bytes(context, found.streams, None)? + weights - SIZE_AIM * limit) / per_octave).clamp(-FIRST, FIRST)
+        }
+    };
+    note(context, format!("steps of the deformer's weights {:.2} times larger than those of the Gaussians", libm::exp2(of_weights)));
     for (round, &iterations) in shares.iter().enumerate() {
         let quality = found.attempt.quality * libm::exp2(octaves);
-        let weight_steps = if matches!(goal, Goal::Drop(_)) { libm::exp2(octaves) } else { 1.0 };
+        let weight_steps = libm::exp2(octaves + of_weights);
         let planner = job.planner.of(&model.gaussians);
-        let plan_of = |quality: f64| Ok(job.attempt_with(&planner, quality, &job.factors)?.plan);
-        let bytes = |plan: &Plan| Ok(bytes_of(&job.streams(&model.gaussians, plan)?));
-        let plan: Plan = plan_of(quality)?;
-        let bits_per_octave = 8.0 * bytes(&plan)?.saturating_sub(bytes(&plan_of(2.0 * quality)?)?).max(1) as f64;
+        let (plan, per_octave) = planned_with(job, &planner, quality)?;
+        let bits_per_octave = 8.0 * per_octave;
         let rounding = &Rounder { plan: &plan, free: &job.free, classes: job.planner.classes };
         let of = (shares[..round].iter().sum(), settings.finetune);
         let seed = context.seed.child("fine-tuning").index(round as u64);
@@ -132,13 +140,19 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
             ),
         );
         let file = file_bytes(context, &streams, Some((&model.weights, weight_steps)))?;
-        let outcome = Outcome { streams, model: model.clone(), weight_steps, bytes, file, drop };
-        let aim = if round + 2 == shares.len() { LAST_AIM } else { AIM };
-        octaves += goal.octaves(&outcome, aim, octaves, bits_per_octave);
+        let (outcome, lost) = (Outcome { streams, model: model.clone(), weight_steps, bytes, file, drop }, drop);
         let (bytes, drop) = best.as_ref().map_or(if allowed { (first_bytes, untuned) } else { (usize::MAX, f64::INFINITY) }, |b| (b.bytes, b.drop));
         if goal.is_better(&outcome, bytes, drop) {
             best = Some(outcome);
         }
+        let next = match goal {
+            Goal::Drop(limit) => {
+                forecast.add(round + 1, octaves, lost);
+                planned(&forecast, *limit, round + 1, best.is_some())
+            }
+            Goal::Bytes(limit) => octaves + (file - SIZE_AIM * limit) / per_octave,
+        };
+        octaves = next.clamp(octaves - FARTHEST, octaves + FARTHEST);
     }
     let Some(best) = best else {
         note(context, "fine-tuning found nothing better".into());
@@ -147,6 +161,17 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     note(context, format!("fine-tuned: {:.4} MB with the deformer's weights, PSNR {:.3} dB lower", megabytes(best.bytes), best.drop));
     tuner.adopt(best.model.weights, best.weight_steps);
     Ok(Tuned::Better(best.streams))
+}
+
+/// The plan of a quality, and the bytes that steps twice as large save.
+fn planned_with(job: &Job, planner: &Planner, quality: f64) -> Result<(Plan, f64)> {
+    let bytes = |quality: f64| {
+        let plan = job.attempt_with(planner, quality, &job.factors)?.plan;
+        Ok((bytes_of(&job.streams(planner.gaussians, &plan)?), plan))
+    };
+    let (own, plan) = bytes(quality)?;
+    let (coarser, _) = bytes(2.0 * quality)?;
+    Ok((plan, own.saturating_sub(coarser).max(1) as f64))
 }
 
 /// Iterations of each round, which add up to `iterations`.

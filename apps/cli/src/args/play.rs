@@ -49,6 +49,12 @@ pub struct Bake {
     pub device: String,
 }
 
+/// What `view` takes without `--device` and `--max-error`.
+#[cfg(feature = "view")]
+pub const VIEW_DEVICE: &str = "flex";
+#[cfg(feature = "view")]
+pub const VIEW_MAX_ERROR: &str = "0.1px";
+
 #[cfg(feature = "view")]
 #[derive(Debug, Args)]
 pub struct View {
@@ -56,7 +62,7 @@ pub struct View {
     #[arg(value_name = "MODEL")]
     pub model: PathBuf,
     /// How far a point of a Gaussian may be off where motion has to be baked first; as for `bake`.
-    #[arg(long, value_name = "E", default_value = "0.1px")]
+    #[arg(long, value_name = "E", default_value = VIEW_MAX_ERROR)]
     pub max_error: String,
     /// Stand still at this normalised time, 0 to 1, instead of playing from the first frame.
     #[arg(long, value_name = "T")]
@@ -65,7 +71,7 @@ pub struct View {
     #[arg(long, value_name = "P", allow_hyphen_values = true)]
     pub pose: Option<String>,
     /// Device that motion is baked on, and that exact images are drawn on.
-    #[arg(long, value_name = "NAME", default_value = "flex")]
+    #[arg(long, value_name = "NAME", default_value = VIEW_DEVICE)]
     pub device: String,
 }
 

@@ -37,7 +37,7 @@ impl Window {
     /// The command that opens this file at this time and pose, where there is a file.
     pub(super) fn command(&self) -> Option<String> {
         let start = Start { time: Some(self.clock.time), pose: Some(self.navigator.pose()) };
-        self.source.as_ref().map(|source| start.command(source.command, &source.path))
+        self.source.as_ref().map(|source| start.command(&source.command, &source.path))
     }
     /// Writes the command that opens this file at this time and pose to standard output, and shows it. Clipboards need a library per window system, which is not here.
     pub(super) fn print_command(&mut self) {

@@ -50,8 +50,8 @@ pub struct Source {
     pub open: Open,
     /// Where the window begins.
     pub start: Start,
-    /// The command that opens a window, such as `cc4dgs view`.
-    pub command: &'static str,
+    /// The command that opens a window, with the options that say how, such as `cc4dgs view --device wgpu`.
+    pub command: String,
 }
 
 /// Opens the model in a file.
