@@ -307,6 +307,17 @@ mod tests {
         assert_eq!(scene.reach, [[0.0, 1.0, 2.0], [11.0, 12.0, 13.0]]);
     }
 
+    #[test]
+    fn small_files_are_drawn_from_nearer() {
+        let near = |size: f32| {
+            let gaussians = HostGaussians { means: vec![0.0, 0.0, 0.0, size, 0.0, 0.0, 0.0, size, 0.0], ..three(0) };
+            Content::read("t", ply::to_bytes(&gaussians, false).unwrap(), &Limits::default()).unwrap().scene.near
+        };
+        let usual = Rules::default().near();
+        assert_eq!(near(100.0), usual);
+        assert!((1e-6..0.01 * usual).contains(&near(1e-3)), "{}", near(1e-3));
+    }
+
     /// Three Gaussians whose harmonics count from 0.
     fn three(sh_degree: usize) -> HostGaussians {
         HostGaussians {

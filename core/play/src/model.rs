@@ -110,7 +110,7 @@ impl Model {
         }
     }
     /// A static model of `gaussians` that take `bytes` in their file. The file does not say its units: cameras around a small model are near it too.
-    fn from_static(file: GaussianFile, bytes: u64) -> Self {
+    pub(crate) fn from_static(file: GaussianFile, bytes: u64) -> Self {
         let GaussianFile { gaussians, antialiased, .. } = file;
         let near = (middle_and_radius(&gaussians).1 * NEAR_OF_RADIUS) as f32;
         let usual = RenderConfig::default();

@@ -84,6 +84,7 @@ fn upward(cameras: &[Camera]) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::GaussianFile;
     use cc4dgs_core::archive::Manifest;
 
     #[test]
@@ -98,6 +99,29 @@ mod tests {
         let manifest = Manifest { frame_count: 1, presentation: of_cameras(&rig, None), ..Default::default() };
         manifest.to_json().unwrap();
         assert!(one.up.unwrap()[1] < -0.5);
+    }
+
+    #[test]
+    fn files_that_were_not_normalised_are_looked_at_in_their_middle() {
+        let gaussians = HostGaussians { means: [2.0, 3.0, 4.0].repeat(3), opacity_logits: vec![3.0; 3], ..Default::default() };
+        let mut model = Model::from_static(GaussianFile { gaussians, ..Default::default() }, 0);
+        let cameras = [Camera::look_at("t", (8, 8), 1.0, [9.0, 3.0, 4.0], [2.0, 3.0, 4.0], [0.0, 0.0, 1.0])];
+        let shown = of_recorded(&model, &cameras, None);
+        assert_eq!((shown.target, shown.home.as_ref()), (Some([2.0, 3.0, 4.0]), Some(&storable(&cameras[0]))));
+        model.normalisation = Similarity { scale: 0.5, ..Similarity::IDENTITY };
+        assert_eq!(of_recorded(&model, &cameras, None).target, Some([0.0; 3]));
+    }
+
+    #[test]
+    fn models_of_files_are_drawn_from_nearer_where_they_are_small() {
+        let near = |size: f32| {
+            let gaussians =
+                HostGaussians { means: (0..30).map(|k| size * (k as f32 * 0.7).sin()).collect(), opacity_logits: vec![3.0; 10], ..Default::default() };
+            Model::from_static(GaussianFile { gaussians, ..Default::default() }, 0).render.near
+        };
+        assert_eq!(near(100.0), None);
+        let small = near(1e-3).unwrap();
+        assert!((1e-6..1e-4).contains(&small), "{small}");
     }
 
     #[test]
