@@ -39,6 +39,7 @@ use joint::Directions;
 use plan::{Bounds, Factors, Plan, Planner};
 use rayon::prelude::*;
 use settings::Settings;
+use std::cell::Cell;
 use write::Motion;
 
 /// Version of the stored form.
@@ -60,7 +61,7 @@ const REDUCTIONS: usize = 12;
 /// The share of the declared loss that a smaller step aims at, and by how much steps become smaller at a time: errors grow in proportion to steps where these
 /// are small.
 const LOSS_AIM: f64 = 0.9;
-const SMALLER: std::ops::RangeInclusive<f64> = 0.02..=0.7;
+const SMALLER: std::ops::RangeInclusive<f64> = 0.02..=0.5;
 /// Times at which the deformer is asked what it changes.
 const TIMES: [f32; 3] = [0.0, 0.37, 1.0];
 
@@ -80,6 +81,8 @@ struct Job<'a> {
     motion: Motion,
     /// Of the columns, to start with.
     factors: Factors,
+    /// Whether colours are rounded together: not any more once that has exceeded the declared loss, so that attempts can be compared.
+    joint: Cell<bool>,
 }
 
 /// Gaussians rounded in the steps of a quality.
@@ -87,8 +90,8 @@ struct Attempt {
     quality: f64,
     /// How the values were rounded.
     plan: Plan,
-    /// What they will be decoded to, in the order in which they are stored, on which images depend where depths are the same; but for dynamic scores, and for
-    /// attributes of plug-ins that are stored as these allow.
+    /// What they will be decoded to, in the order in which they are stored, which decides images where depths are equal. Dynamic scores, and attributes that are
+    /// stored as their plug-ins allow, are the originals.
     rounded: HostGaussians,
 }
 
@@ -99,7 +102,7 @@ impl Job<'_> {
     }
     /// Rounds the Gaussians of `planner` in steps that keep the declared loss.
     fn attempt_with(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<Attempt> {
-        let mut bounds = Bounds::NONE;
+        let mut bounds = Bounds { joint: self.joint.get(), ..Bounds::NONE };
         // Colours may be rounded apart, and each column be stored exactly in the end.
         for reductions in 0..REDUCTIONS + 2 + factors.len() {
             let plan = planner.plan(quality, factors, &bounds);
@@ -114,10 +117,11 @@ impl Job<'_> {
                     kept = false;
                     if together && name.starts_with("sh_") {
                         bounds.joint = false;
+                        self.joint.set(false);
                         continue;
                     }
-                    let smaller = Some(LOSS_AIM * allowed / lost).filter(|s| !s.is_nan()).unwrap_or(0.5).clamp(*SMALLER.start(), *SMALLER.end());
-                    *factor *= if reductions < REDUCTIONS { smaller } else { 0.0 };
+                    let smaller = (LOSS_AIM * allowed / lost).clamp(*SMALLER.start(), *SMALLER.end());
+                    *factor *= if reductions < REDUCTIONS && lost.is_finite() { smaller } else { 0.0 };
                 }
             }
             if kept {
@@ -142,8 +146,8 @@ impl Job<'_> {
     }
     /// The order in which rows are stored.
     fn order(&self, of: &Integers) -> Vec<usize> {
-        let mut order: Vec<usize> = (0..of.keys.len()).collect();
-        order.par_sort_by_key(|&i| (self.layers.0[i], of.keys[i], i));
+        let (mut order, layers): (Vec<usize>, _) = ((0..of.keys.len()).collect(), &self.layers.0);
+        order.par_sort_by_key(|&i| (layers[i], of.keys[i], i));
         order
     }
 }
@@ -215,10 +219,10 @@ impl AttributeCodec for Compact {
         let choices = Choices { transform: self.settings.transform, rate_weight: self.settings.rate_weight };
         let layers = layers::assign(&importance.weights, layers::number(self.settings.layers, gaussians.len()));
         let planner = Planner::new(&canonical, &importance, &classes, choices);
-        let mut job = Job { planner, free, directions: importance.directions.as_ref(), layers, motion, factors: [1.0; 6] };
+        let mut job = Job { planner, free, directions: importance.directions.as_ref(), layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
         let streams = search::search(&mut job, &self.settings, context)?;
         // What cannot be read again is no file.
-        self.decode(&streams, context)?;
+        self.decode(&streams, &CodecContext::new(context.seed, context.limits, context.events))?;
         Ok(streams)
     }
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<HostGaussians> {
@@ -291,7 +295,7 @@ mod tests {
         let directions = directions.factored();
         let planner = Planner::new(&g, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
         let (layers, motion) = (layers::assign(&importance.weights, 1), Motion { free: 0, moving: None, levels: [0.0; 2] });
-        let job = Job { planner, free: vec![false; n], directions: Some(&directions), layers, motion, factors: [1.0; 6] };
+        let job = Job { planner, free: vec![false; n], directions: Some(&directions), layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
         let wanted = job.planner.plan(0.05, &job.factors, &Bounds::NONE);
         let too_much = |plan: &Plan| {
             let (sorted, rounded) = (g.select(&job.order(&job.quantise(&g, plan))), job.rounded(&g, plan));

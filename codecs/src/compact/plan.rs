@@ -33,7 +33,7 @@ pub struct Plan {
 /// Factors of the steps of the columns means, log-scales, quaternions, opacity logits, degree 0 and higher degrees.
 pub type Factors = [f64; 6];
 
-/// What keeps the declared loss, where steps alone do not.
+/// What is changed so that the declared loss is kept.
 #[derive(Clone, Copy)]
 pub struct Bounds {
     /// Factors of the largest step of each column; of all steps of those that have none. A column whose factor is 0 is stored exactly.

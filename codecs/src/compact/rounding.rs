@@ -191,6 +191,7 @@ mod tests {
     use super::super::{Choices, Job, Motion, importance, layers, read};
     use super::*;
     use cc4dgs_format::{CodecContext, ExtraAttribute, Limits, Seed, Silent};
+    use std::cell::Cell;
 
     fn scene(n: usize) -> HostGaussians {
         let draw = |i: usize, k: usize| (Seed::root(5).index(i as u64).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
@@ -219,7 +220,7 @@ mod tests {
             let layers = layers::assign(&importance.weights, 2);
             let choices = Choices { transform: true, rate_weight: 0.0 };
             let planner = Planner::new(&g, &importance, &classes, choices);
-            let job = Job { planner, free, directions: None, layers, motion, factors: [1.0; 6] };
+            let job = Job { planner, free, directions: None, layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
             let plan = job.planner.plan(0.02, &[1.0; 6], &Bounds::NONE);
             let order = job.order(&job.quantise(&g, &plan));
             let decoded = read::read(&job.streams(&g, &plan).unwrap(), &limits, true).unwrap();

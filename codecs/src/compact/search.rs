@@ -42,7 +42,7 @@ enum Allowance<'a> {
 }
 
 impl Allowance<'_> {
-    /// What an attempt uses, as a share of what is allowed. Only where bytes are allowed is it coded.
+    /// What an attempt uses, as a share of what is allowed. It is coded only where bytes are allowed.
     fn share(&self, job: &Job, attempt: &Attempt) -> Result<f64> {
         match self {
             Self::Bytes { limit, context } => Ok(file_bytes(context, &job.streams(job.planner.gaussians, &attempt.plan)?, None)? / limit),
@@ -157,7 +157,9 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     let mut streams = job.streams(gaussians, &found.attempt.plan)?;
     if let Some((views, renderer)) = corrected {
         let plain = job.factors;
-        let quality = found.attempt.quality * if tuner.is_some() { fine(job, &found.attempt, views, renderer)? } else { 1.0 };
+        // Where a size is allowed, more is lost before fine-tuning than after it.
+        let fewer = tuner.is_some() && matches!(allowance, Allowance::Bytes { .. });
+        let quality = found.attempt.quality * if fewer { fine(job, &found.attempt, views, renderer)? } else { 1.0 };
         job.factors = allocate::allocate(job, quality, views, renderer)?;
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
         let second = seek(job, found.attempt.quality, &allowance, GOOD)?;
@@ -187,7 +189,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
     Ok(streams)
 }
 
-/// A factor of the steps of `attempt` with which about [`TUNED`] is lost. Where a size is allowed, more is lost before training than after it.
+/// A factor of the steps of `attempt` with which about [`TUNED`] is lost; 1 if less is lost already.
 fn fine(job: &Job, attempt: &Attempt, views: &dyn TrainingViews, renderer: &dyn RenderModel) -> Result<f64> {
     let chosen = views.len().min(budget(WORK, attempt.rounded.len(), VIEWS));
     let lost = psnr_on_views(job.planner.gaussians, views, renderer, chosen)? - psnr_on_views(&attempt.rounded, views, renderer, chosen)?;

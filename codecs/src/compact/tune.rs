@@ -1,16 +1,16 @@
-//! Fine-tuning: rounds of training with rounded values, each in the steps that the one before suggests.
+//! Fine-tuning: rounds of training with rounded values, each in the steps that those before suggest.
 //!
 //! Training makes up for what rounding costs, so larger steps keep the same PSNR. Each round chooses steps, trains with them and measures what is lost. The best
 //! file that keeps what is allowed is taken; if there is none, the one that needed no training.
 
 use super::encode::canonical;
 use super::forecast::Forecast;
-use super::plan::{Plan, Planner};
+use super::plan::Planner;
 use super::rounding::Rounder;
 use super::search::{file_bytes, note};
 use super::settings::Settings;
 use super::{Attempt, Job, bytes_of};
-use cc4dgs_format::{CodecContext, Result, Stream, TuneModel, TunedModel, Tuning};
+use cc4dgs_format::{CodecContext, Result, Stream, TuneModel, TunedModel, Tuning, WeightArray};
 
 /// Rounds of training.
 const ROUNDS: usize = 5;
@@ -19,15 +19,15 @@ const FIRST: f64 = 2.0;
 /// Octaves by which the steps of two rounds differ, at most.
 const FARTHEST: f64 = 1.0;
 /// The share of what is allowed that rounds aim at, and what is left for the difference of a round from what is expected, in dB: of all but the last, of the last if
-/// there is a file that keeps what is allowed, and if there is none.
+/// fine-tuning has a file that keeps what is allowed, and if it has none.
 const AIM: f64 = 0.95;
 const SPREADS: [f64; 3] = [0.01, 0.02, 0.03];
 const SIZE_AIM: f64 = 0.99;
-/// Octaves by which steps of the deformer's weights grow to measure what they cost, by which they may be larger or smaller than those chosen without training
-/// beside those of the Gaussians, and the least loss in dB that counts.
+/// Octaves by which steps of the deformer's weights grow to measure what they cost, and the least loss in dB that counts then: smaller ones are noise.
 const PROBED: f64 = 2.0;
-const WEIGHTS_FARTHEST: f64 = 3.0;
-const SMALLEST: f64 = 1e-5;
+const LEAST_PROBED: f64 = 0.01;
+/// The most of [`weight_octaves`], up and down.
+const WEIGHTS_FARTHEST: f64 = 2.0;
 
 /// What is allowed.
 pub enum Goal {
@@ -91,8 +91,9 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     let shares = rounds(settings.finetune);
     let count = shares.len();
     let per_round = settings.finetune as f64 / count.max(1) as f64;
-    // Where the loss is bounded, steps are planned for the last round but one, whose file is safe, and then for the last.
-    let mut forecast = Forecast::new(if let Goal::Drop(limit) = goal { *limit } else { 0.0 }, per_round);
+    // Rounding costs at least what is allowed, where steps of single columns or of the weights cost more.
+    let mut forecast = Forecast::new(untuned.max(if let Goal::Drop(limit) = goal { *limit } else { 0.0 }), per_round);
+    // Steps are planned for the last round but one, whose file is safe, and then for the last.
     let planned = |forecast: &Forecast, limit: f64, done: usize, kept: bool| {
         let (last, spread) = match (done + 1 < count, kept) {
             (true, _) => (count - 1, SPREADS[0]),
@@ -100,28 +101,22 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         };
         forecast.octaves(last, AIM * limit - spread)
     };
-    let (_, per_octave) = planned_with(job, &job.planner, found.attempt.quality)?;
-    let of_weights = {
-        // A byte more of the weights is to be worth as much as one more of the Gaussians. Losses grow with squared steps.
-        let probed = before - tuner.psnr(&model.gaussians, &model.weights, Some(libm::exp2(PROBED)))?;
-        let lost = (probed * libm::exp2(-2.0 * PROBED)).max(SMALLEST);
-        let saved = tuner.weight_bytes(&model.weights, 1.0)?.saturating_sub(tuner.weight_bytes(&model.weights, 2.0)?) as f64;
-        let octaves = 0.5 * libm::log2((untuned - lost).max(SMALLEST) * saved / (lost * per_octave));
-        if octaves.is_finite() { octaves.clamp(-WEIGHTS_FARTHEST, WEIGHTS_FARTHEST) } else { 0.0 }
-    };
+    let per_octave = saved_by_doubling(job, &job.planner, found.attempt.quality, bytes_of(found.streams))?;
+    let of_weights = weight_octaves(tuner, &model, (before, untuned), per_octave)?;
     let mut octaves = match goal {
         Goal::Drop(limit) => planned(&forecast, *limit, 0, false).clamp(0.0, FIRST),
         Goal::Bytes(limit) => {
-            let weights = tuner.weight_bytes(&model.weights, libm::exp2(of_weights))? as f64 - tuner.weight_bytes(&model.weights, 1.0)? as f64;
-            ((file_bytes(context, found.streams, None)? + weights - SIZE_AIM * limit) / per_octave).clamp(-FIRST, FIRST)
+            let (weights, saved) = weights_and_saved(tuner, &model.weights, libm::exp2(of_weights))?;
+            let file = file_bytes(context, found.streams, None)? - tuner.weight_bytes(&model.weights, 1.0)? as f64 + weights;
+            ((file - SIZE_AIM * limit) / (per_octave + saved)).clamp(-FIRST, FIRST)
         }
     };
-    note(context, format!("steps of the deformer's weights {:.2} times larger than those of the Gaussians", libm::exp2(of_weights)));
     for (round, &iterations) in shares.iter().enumerate() {
         let quality = found.attempt.quality * libm::exp2(octaves);
         let weight_steps = libm::exp2(octaves + of_weights);
         let planner = job.planner.of(&model.gaussians);
-        let (plan, per_octave) = planned_with(job, &planner, quality)?;
+        let plan = job.attempt_with(&planner, quality, &job.factors)?.plan;
+        let per_octave = saved_by_doubling(job, &planner, quality, bytes_of(&job.streams(&model.gaussians, &plan)?))?;
         let bits_per_octave = 8.0 * per_octave;
         let rounding = &Rounder { plan: &plan, free: &job.free, classes: job.planner.classes };
         let of = (shares[..round].iter().sum(), settings.finetune);
@@ -135,7 +130,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         note(
             context,
             format!(
-                "fine-tuning {number}: steps {steps:.2} times larger, {gaussians:.4} MB of Gaussians, {:.4} MB in all, PSNR {drop:.3} dB lower",
+                "fine-tuning {number}: steps {steps:.2} times larger, of weights {weight_steps:.2}, {gaussians:.4} MB of Gaussians, {:.4} MB in all, PSNR {drop:.3} dB lower",
                 megabytes(bytes)
             ),
         );
@@ -150,7 +145,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
                 forecast.add(round + 1, octaves, lost);
                 planned(&forecast, *limit, round + 1, best.is_some())
             }
-            Goal::Bytes(limit) => octaves + (file - SIZE_AIM * limit) / per_octave,
+            Goal::Bytes(limit) => octaves + (file - SIZE_AIM * limit) / (per_octave + weights_and_saved(tuner, &model.weights, weight_steps)?.1),
         };
         octaves = next.clamp(octaves - FARTHEST, octaves + FARTHEST);
     }
@@ -163,15 +158,31 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     Ok(Tuned::Better(best.streams))
 }
 
-/// The plan of a quality, and the bytes that steps twice as large save.
-fn planned_with(job: &Job, planner: &Planner, quality: f64) -> Result<(Plan, f64)> {
-    let bytes = |quality: f64| {
-        let plan = job.attempt_with(planner, quality, &job.factors)?.plan;
-        Ok((bytes_of(&job.streams(planner.gaussians, &plan)?), plan))
-    };
-    let (own, plan) = bytes(quality)?;
-    let (coarser, _) = bytes(2.0 * quality)?;
-    Ok((plan, own.saturating_sub(coarser).max(1) as f64))
+/// The bytes that steps twice as large save where those of `quality` give `bytes`.
+fn saved_by_doubling(job: &Job, planner: &Planner, quality: f64, bytes: usize) -> Result<f64> {
+    let coarser = job.attempt_with(planner, 2.0 * quality, &job.factors)?.plan;
+    Ok(bytes.saturating_sub(bytes_of(&job.streams(planner.gaussians, &coarser)?)).max(1) as f64)
+}
+
+/// Bytes of weights in such steps, and those that steps twice as large save.
+fn weights_and_saved(tuner: &dyn TuneModel, weights: &[WeightArray], steps: f64) -> Result<(f64, f64)> {
+    let bytes = tuner.weight_bytes(weights, steps)? as f64;
+    Ok((bytes, (bytes - tuner.weight_bytes(weights, 2.0 * steps)? as f64).max(0.0)))
+}
+
+/// Octaves by which steps of the weights should be larger than those chosen without training, beside those of the Gaussians, so that a byte more of either is worth
+/// the same: a loss that grows with squared steps costs its share of the bytes. `psnr` is that of the model and what is lost where all is rounded; doubled steps of
+/// the Gaussians save `per_octave` bytes.
+fn weight_octaves(tuner: &dyn TuneModel, model: &TunedModel, (psnr, untuned): (f64, f64), per_octave: f64) -> Result<f64> {
+    let saved = weights_and_saved(tuner, &model.weights, 1.0)?.1;
+    if saved == 0.0 {
+        return Ok(0.0);
+    }
+    let probed = psnr - tuner.psnr(&model.gaussians, &model.weights, Some(libm::exp2(PROBED)))?;
+    let lost = probed.max(LEAST_PROBED) * libm::exp2(-2.0 * PROBED);
+    let of_gaussians = (untuned - lost).max(0.1 * untuned).max(lost);
+    let octaves = 0.5 * libm::log2(of_gaussians * saved / (lost * per_octave));
+    Ok(if octaves.is_finite() { octaves.clamp(-WEIGHTS_FARTHEST, WEIGHTS_FARTHEST) } else { 0.0 })
 }
 
 /// Iterations of each round, which add up to `iterations`.
@@ -182,7 +193,89 @@ fn rounds(iterations: usize) -> Vec<usize> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::encode::classify;
+    use super::super::{Choices, Motion, importance, layers};
     use super::*;
+    use cc4dgs_format::{HostGaussians, Seed, Silent};
+    use std::cell::{Cell, RefCell};
+    use std::collections::BTreeMap;
+
+    /// A trainer whose PSNR falls with the mean squared error of the colours of degree 0 and rises with each iteration; its weight counts these.
+    struct Trainer {
+        colors: Vec<f32>,
+        cost: f64,
+        gain: f64,
+        /// What was measured after so many iterations, and after how many those were that were adopted.
+        measured: RefCell<BTreeMap<u32, f64>>,
+        adopted: Cell<u32>,
+    }
+
+    impl TuneModel for Trainer {
+        fn caution(&self) -> Result<Option<String>> {
+            Ok(None)
+        }
+        fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
+            Ok(TunedModel { gaussians: gaussians.clone(), weights: vec![WeightArray { name: "iterations".into(), shape: vec![1], values: vec![0.0] }] })
+        }
+        fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel> {
+            let mut out = from.clone();
+            out.weights[0].values[0] += tuning.iterations as f32;
+            Ok(out)
+        }
+        fn psnr(&self, gaussians: &HostGaussians, weights: &[WeightArray], _: Option<f64>) -> Result<f64> {
+            // Scores are the indices of the rows, whose order may change.
+            let rows = gaussians.dynamic_scores.iter().zip(gaussians.sh_dc.chunks_exact(3));
+            let squares = rows.flat_map(|(&row, found)| found.iter().zip(&self.colors[3 * row as usize..])).map(|(a, b)| f64::from(a - b).powi(2));
+            // Training makes up for most of what rounding costs.
+            let cost = self.cost * if weights[0].values[0] > 0.0 { 0.3 } else { 1.0 };
+            let psnr = 40.0 - cost * squares.sum::<f64>() / self.colors.len() as f64 + self.gain * f64::from(weights[0].values[0]);
+            self.measured.borrow_mut().insert(weights[0].values[0] as u32, psnr);
+            Ok(psnr)
+        }
+        fn weight_bytes(&self, _: &[WeightArray], _: f64) -> Result<usize> {
+            Ok(0)
+        }
+        fn weight_settings(&self, _: f64) -> Result<toml::Table> {
+            Ok(toml::Table::new())
+        }
+        fn adopt(&self, weights: Vec<WeightArray>, _: f64) {
+            self.adopted.set(weights[0].values[0] as u32);
+        }
+        fn adopted(&self) -> Result<Option<(Vec<WeightArray>, toml::Table)>> {
+            Ok(None)
+        }
+    }
+
+    #[test]
+    fn what_is_allowed_is_used_whatever_training_gains() {
+        let n = 500;
+        let draw = |k: usize, column: u64| (Seed::root(column).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+        let mut g = HostGaussians { opacity_logits: vec![0.0; n], ..Default::default() };
+        for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
+            *values = (0..n * width).map(|k| draw(k, column as u64)).collect();
+        }
+        g.dynamic_scores = (0..n).map(|row| row as f32).collect();
+        let context = CodecContext::new(Seed::root(1), Default::default(), &Silent);
+        let importance = importance::estimate(&g, &context);
+        let classes = classify(&importance.weights, &importance.shapes, false);
+        let planner = Planner::new(&g, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
+        let layers = layers::assign(&importance.weights, 1);
+        let motion = Motion { free: 0, moving: None, levels: [0.0; 2] };
+        let job = Job { planner, free: vec![false; n], directions: None, layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
+        let attempt = job.attempt(0.01).unwrap();
+        let streams = job.streams(&g, &attempt.plan).unwrap();
+        for (limit, gain) in [(0.05, 0.0), (0.05, 3e-4), (0.05, 1.5e-3), (0.3, 5e-4), (0.05, -1e-5)] {
+            let mut trainer = Trainer { colors: g.sh_dc.clone(), cost: 1.0, gain, measured: Default::default(), adopted: Cell::new(0) };
+            // What needs no training loses almost what is allowed.
+            trainer.cost = 0.99 * limit / (40.0 - trainer.psnr(&attempt.rounded, &trainer.start(&g).unwrap().weights, None).unwrap());
+            let found = Untuned { attempt: &attempt, streams: &streams, allowed: true };
+            let tuned = tune(&job, &found, &Goal::Drop(limit), &Settings::default(), &trainer, &context).unwrap();
+            let Tuned::Better(better) = tuned else { panic!("nothing better for {limit} dB and a gain of {gain}") };
+            assert!(bytes_of(&better) < bytes_of(&streams));
+            let lost = 40.0 - trainer.measured.borrow()[&trainer.adopted.get()];
+            assert!((0.2 * limit..=limit).contains(&lost), "{limit} dB, a gain of {gain}: {:?}", trainer.measured);
+        }
+    }
 
     #[test]
     fn rounds_add_up() {
