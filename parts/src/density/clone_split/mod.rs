@@ -16,6 +16,7 @@ from = 500               # first round, in reference iterations of the stage (co
 until = 10000            # last round, in reference iterations of the main stage; the coarse stage ends at 5,000
 every = 100              # reference iterations between two rounds
 gradient = 2e-4          # mean screen gradient, in normalised device units, from which a Gaussian is cloned or split
+absolute = false         # sums of absolute values over pixels as gradients (AbsGS), where those of opposite signs do not cancel; for larger values of `gradient`
 corrected = false        # a clone and its original together draw what the original drew, instead of both having its opacity
 dense_share = 0.01       # largest size that is cloned instead of split, as a share of the extent of the cameras
 min_opacity = 0.005      # fainter Gaussians are removed
@@ -45,6 +46,7 @@ struct Settings {
     until: usize,
     every: usize,
     gradient: f32,
+    absolute: bool,
     corrected: bool,
     dense_share: f32,
     min_opacity: f32,
@@ -63,6 +65,7 @@ impl Default for Settings {
             until: 10_000,
             every: 100,
             gradient: 2e-4,
+            absolute: false,
             corrected: false,
             dense_share: 0.01,
             min_opacity: 0.005,
@@ -115,7 +118,7 @@ impl DensityControl for CloneSplit {
         let end = self.settings.end(schedule);
         let mut wanted = Vec::new();
         if schedule.iteration < end {
-            wanted.push(Statistic::ScreenGradient);
+            wanted.push(if self.settings.absolute { Statistic::AbsoluteScreenGradient } else { Statistic::ScreenGradient });
         }
         // Blending weights are collected until the last weight pruning.
         let interval = self.settings.weight_interval(schedule);
@@ -197,10 +200,50 @@ inventory::submit! {
             name: "clone-split",
             version: "1",
             summary: "clone and split by screen gradient, prune by opacity, size and blending weight",
-            paper: "Kerbl et al. 2023 (3DGS); Swift4D (Wu et al. 2025)",
+            paper: "Kerbl et al. 2023 (3DGS); Swift4D (Wu et al. 2025); absolute gradients of AbsGS (Ye et al. 2024)",
             schema: SCHEMA,
             capabilities: &[],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::{Int, TensorData};
+    use cc4dgs_core::HostGaussians;
+
+    #[test]
+    fn absolute_gradients_grow_what_opposite_signs_hide() {
+        let device = Device::flex();
+        let host = HostGaussians {
+            means: vec![0.0; 6],
+            log_scales: vec![-9.0; 6],
+            quaternions: [1.0, 0.0, 0.0, 0.0].repeat(2),
+            opacity_logits: vec![0.0; 2],
+            sh_dc: vec![0.0; 6],
+            dynamic_scores: vec![0.0; 2],
+            ..Default::default()
+        };
+        let schedule = Schedule { iteration: 1000, extent: 1.0, ..Schedule::main(20_000) };
+        let cloned = |absolute: bool| {
+            let mut control = build(&toml::Table::from_iter([("absolute".to_string(), absolute.into())])).unwrap();
+            control.begin_stage(2, &device);
+            let gradient = |wanted: Statistic, value: f32| {
+                control.statistics(&schedule).contains(&wanted).then(|| Tensor::<2>::from_floats([[value, 0.0], [0.0, 0.0]], &device))
+            };
+            let view = ViewStatistics {
+                radii: Tensor::<1, Int>::from_data(TensorData::new(vec![3i64, 3], [2]), &device),
+                screen_gradient: gradient(Statistic::ScreenGradient, 0.0),
+                absolute_screen_gradient: gradient(Statistic::AbsoluteScreenGradient, 1.0),
+                max_weights: None,
+                size: (8, 8),
+                views: 1,
+            };
+            control.observe(&view).unwrap();
+            control.plan(&Gaussians::from_host(&host, &device), &schedule, Seed::root(1)).unwrap().map_or(0, |plan| plan.report.cloned)
+        };
+        assert_eq!((cloned(false), cloned(true)), (0, 1));
     }
 }
