@@ -11,7 +11,10 @@ const GAIN: f64 = 0.04;
 const SPREADS: [f64; 3] = [0.4, 0.15, 0.03];
 /// The least that a is, as a share of what is expected before the first round: losses that have other reasons may suggest that rounding gains.
 const LEAST: f64 = 0.1;
-const NOISE: f64 = 0.02;
+const NOISE: f64 = 0.03;
+/// Octaves that are looked through, and how many to an octave.
+const OCTAVES: std::ops::RangeInclusive<i32> = -4..=5;
+const PER_OCTAVE: i32 = 64;
 
 /// The expectation of a, b and g.
 pub struct Forecast {
@@ -37,17 +40,27 @@ impl Forecast {
     }
     /// Takes note of what was lost after `round` rounds, the last with steps so many octaves larger than those without training.
     pub fn add(&mut self, round: usize, octaves: f64, loss: f64) {
-        let row = [libm::exp2(2.0 * octaves), -1.0, -(round as f64)];
+        let row = self.row(round, octaves);
         for (i, own) in row.into_iter().enumerate() {
             self.scaled[i] += own * loss / (NOISE * NOISE);
             self.precision[i].iter_mut().zip(row).for_each(|(sum, other)| *sum += own * other / (NOISE * NOISE));
         }
     }
-    /// The octaves with which `allowed` dB are lost after `round` rounds; minus infinity where none are expected to do.
-    pub fn octaves(&self, round: usize, allowed: f64) -> f64 {
+    /// The most octaves with which at most `allowed` dB are lost after `round` rounds, even if it is `caution` standard deviations more than expected; minus infinity
+    /// where none do.
+    pub fn octaves(&self, round: usize, allowed: f64, caution: f64) -> f64 {
         let [cost, at_once, gain] = solve(self.precision, self.scaled);
-        let squared = (allowed + at_once + gain * round as f64) / cost.max(self.least);
-        if squared > 0.0 { 0.5 * libm::log2(squared) } else { f64::NEG_INFINITY }
+        let loss = |octaves: f64| {
+            let row = self.row(round, octaves);
+            let variance: f64 = row.iter().zip(solve(self.precision, row)).map(|(a, b)| a * b).sum();
+            row[0] * cost.max(self.least) - at_once - gain * round as f64 + caution * (variance + NOISE * NOISE).sqrt()
+        };
+        let tried = (OCTAVES.start() * PER_OCTAVE..=OCTAVES.end() * PER_OCTAVE).rev().map(|k| f64::from(k) / f64::from(PER_OCTAVE));
+        tried.into_iter().find(|octaves| loss(*octaves) <= allowed).unwrap_or(f64::NEG_INFINITY)
+    }
+    /// What a, b and g are multiplied with.
+    fn row(&self, round: usize, octaves: f64) -> [f64; 3] {
+        [libm::exp2(2.0 * octaves), -1.0, -(round as f64)]
     }
 }
 
@@ -82,18 +95,19 @@ mod tests {
             (0.25, 0.301, [(2.27, 0.576), (1.14, 0.113), (1.60, 0.175), (1.73, 0.186)], 1.7..2.2),
         ] {
             let mut forecast = Forecast::new(untuned, 100.0);
-            let before = libm::exp2(forecast.octaves(4, limit));
+            let before = libm::exp2(forecast.octaves(4, limit, 0.0));
             assert!((1.5..4.0).contains(&before), "{before}");
             for (round, (steps, loss)) in rounds.into_iter().enumerate() {
                 forecast.add(round + 1, libm::log2(steps), loss);
             }
-            let steps = libm::exp2(forecast.octaves(5, limit));
+            let steps = libm::exp2(forecast.octaves(5, limit, 0.0));
             assert!(range.contains(&steps), "{steps}");
         }
         let mut hopeless = Forecast::new(0.01, 100.0);
+        assert!(hopeless.octaves(4, 0.01, 1.0) < hopeless.octaves(4, 0.01, 0.0), "caution costs bytes");
         hopeless.add(1, 0.0, 5.0);
         hopeless.add(2, 0.0, 5.0);
-        assert_eq!(hopeless.octaves(2, 0.01), f64::NEG_INFINITY);
+        assert_eq!(hopeless.octaves(2, 0.01, 0.0), f64::NEG_INFINITY);
     }
 
     #[test]
@@ -103,7 +117,7 @@ mod tests {
             let (mut forecast, mut octaves) = (Forecast::new(0.06, 100.0), 1.86f64);
             for (round, loss) in losses.into_iter().enumerate() {
                 forecast.add(round + 1, octaves, loss);
-                let next = forecast.octaves(4, 0.05).clamp(octaves - 1.0, octaves + 1.0);
+                let next = forecast.octaves(4, 0.05, 0.5).clamp(octaves - 1.0, octaves + 1.0);
                 assert!((next >= octaves) == grows, "round {}: {octaves} to {next}", round + 1);
                 octaves = next;
             }

@@ -18,10 +18,9 @@ const ROUNDS: usize = 5;
 const FIRST: f64 = 2.0;
 /// Octaves by which the steps of two rounds differ, at most.
 const FARTHEST: f64 = 1.0;
-/// The share of what is allowed that rounds aim at, and what is left for the difference of a round from what is expected, in dB: of all but the last, of the last if
-/// fine-tuning has a file that keeps what is allowed, and if it has none.
-const AIM: f64 = 0.95;
-const SPREADS: [f64; 3] = [0.01, 0.02, 0.03];
+/// Standard deviations by which a round may lose more than expected: of all but the last, of the last if fine-tuning has a file that keeps what is allowed, and if it
+/// has none.
+const CAUTION: [f64; 3] = [0.5, 0.5, 1.0];
 const SIZE_AIM: f64 = 0.99;
 /// Octaves by which steps of the deformer's weights grow to measure what they cost, and the least loss in dB that counts then: smaller ones are noise.
 const PROBED: f64 = 2.0;
@@ -95,11 +94,11 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     let mut forecast = Forecast::new(untuned.max(if let Goal::Drop(limit) = goal { *limit } else { 0.0 }), per_round);
     // Steps are planned for the last round but one, whose file is safe, and then for the last.
     let planned = |forecast: &Forecast, limit: f64, done: usize, kept: bool| {
-        let (last, spread) = match (done + 1 < count, kept) {
-            (true, _) => (count - 1, SPREADS[0]),
-            (false, kept) => (count, SPREADS[if kept { 1 } else { 2 }]),
+        let (last, caution) = match (done + 1 < count, kept) {
+            (true, _) => (count - 1, CAUTION[0]),
+            (false, kept) => (count, CAUTION[if kept { 1 } else { 2 }]),
         };
-        forecast.octaves(last, AIM * limit - spread)
+        forecast.octaves(last, limit, caution)
     };
     let per_octave = saved_by_doubling(job, &job.planner, found.attempt.quality, bytes_of(found.streams))?;
     let of_weights = weight_octaves(tuner, &model, (before, untuned), per_octave)?;

@@ -38,6 +38,8 @@ const RATE_ITERATIONS: f64 = 200.0;
 const DEFORMER_RATE: f64 = 0.1;
 /// Share of the iterations over which the learning rate rises.
 const WARMUP: f64 = 0.1;
+/// Share of the rates that is gone in the last of several trainings.
+const FALL: f64 = 0.5;
 /// Iterations for which derivatives of the size are kept: they change slowly.
 const SIZE_EVERY: usize = 8;
 /// Iterations between two looks for values that are not finite, and between two events.
@@ -284,7 +286,8 @@ impl TuneModel for Tuner<'_> {
                     let in_steps = |(name, slopes): (String, Tensor<2>)| Some((name.clone(), slopes * fixed.steps.get(&name)?.clone().mul_scalar(per_bit)));
                     fixed.size = slopes.into_iter().filter_map(in_steps).collect();
                 }
-                let share = rate_at((iteration as f64 - 0.5) / tuning.iterations as f64);
+                let share =
+                    rate_at((iteration as f64 - 0.5) / tuning.iterations as f64) * (1.0 - FALL * (tuning.of.0 + iteration) as f64 / tuning.of.1.max(1) as f64);
                 fixed.rate = RATE * (RATE_ITERATIONS / tuning.iterations as f64).sqrt() * share;
                 state.rounded = Some(self.round(state, tuning, &weight_settings, &fixed)?);
                 state.rates = RateFactors(BTreeMap::from([("deformer".into(), DEFORMER_RATE * share)]));
