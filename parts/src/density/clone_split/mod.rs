@@ -228,7 +228,7 @@ mod tests {
         };
         let schedule = Schedule { iteration: 1000, extent: 1.0, ..Schedule::main(20_000) };
         let cloned = |absolute: bool| {
-            let mut control = build(&toml::Table::from_iter([("absolute".to_string(), absolute.into())])).unwrap();
+            let mut control = build(&toml::Table::from_iter([("absolute".to_string(), absolute.into()), ("every".to_string(), 1.into())])).unwrap();
             control.begin_stage(2, &device);
             let gradient = |wanted: Statistic, value: f32| {
                 control.statistics(&schedule).contains(&wanted).then(|| Tensor::<2>::from_floats([[value, 0.0], [0.0, 0.0]], &device))
