@@ -50,6 +50,21 @@ pub struct Geometry {
 }
 
 impl Geometry {
+    /// With these steps of class 0, in log-scales from `scale_origin` on. Grid and limits are still to be chosen.
+    pub fn new(scale_origin: f32, scale_step: f32, rotation_step: f32, opacity_step: f32) -> Self {
+        Self {
+            scale_origin,
+            scale_step,
+            rotation_step,
+            opacity_step,
+            corner: [0.0; 3],
+            cell: 1.0,
+            size_floor: 0,
+            class_limit: 0,
+            scale_limit: 0,
+            opacity_limit: 0,
+        }
+    }
     /// Octaves per step of a log-scale of class 0, times 2^16.
     fn octave(&self) -> i64 {
         (f64::from(self.scale_step) / std::f64::consts::LN_2 * 65536.0) as i64

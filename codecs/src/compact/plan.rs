@@ -91,18 +91,10 @@ impl<'a> Planner<'a> {
         let (base, steps, largest) = (quality / self.classes.top, self.importance.steps, bounds.largest);
         let (largest_scale, largest_opacity) = (LARGEST_SCALE_STEP * largest[1], LARGEST_OPACITY_STEP * largest[3]);
         let positive = |v: f64| (v as f32).clamp(1e-18, 1e18);
-        let mut geometry = Geometry {
-            scale_origin: self.scale_origin,
-            scale_step: positive((base * steps.log_scales * factors[1]).min(largest_scale)),
-            rotation_step: positive(base * steps.quaternions * factors[2] * largest[2]),
-            opacity_step: positive((base * steps.opacity_logits * factors[3]).min(largest_opacity)),
-            corner: [0.0; 3],
-            cell: 1.0,
-            size_floor: 0,
-            class_limit: 0,
-            scale_limit: 0,
-            opacity_limit: 0,
-        };
+        let scale_step = positive((base * steps.log_scales * factors[1]).min(largest_scale));
+        let rotation_step = positive(base * steps.quaternions * factors[2] * largest[2]);
+        let opacity_step = positive((base * steps.opacity_logits * factors[3]).min(largest_opacity));
+        let mut geometry = Geometry::new(self.scale_origin, scale_step, rotation_step, opacity_step);
         let limit = |step: f32, largest: f64| libm::log2(largest / f64::from(step)).clamp(0.0, 15.0) as u8;
         geometry.scale_limit = limit(geometry.scale_step, largest_scale);
         geometry.opacity_limit = limit(geometry.opacity_step, largest_opacity);
@@ -173,18 +165,7 @@ mod tests {
     /// The grid of Gaussians on the x axis, all with a standard deviation of 1, where a pixel is a hundredth.
     fn grid_of(x: impl Iterator<Item = f32>) -> Geometry {
         let means: Vec<f32> = x.flat_map(|x| [x, 0.0, 0.0]).collect();
-        let mut geometry = Geometry {
-            scale_origin: 0.0,
-            scale_step: std::f32::consts::LN_2,
-            rotation_step: 1.0,
-            opacity_step: 1.0,
-            corner: [0.0; 3],
-            cell: 1.0,
-            size_floor: 0,
-            class_limit: 0,
-            scale_limit: 0,
-            opacity_limit: 0,
-        };
+        let mut geometry = Geometry::new(0.0, std::f32::consts::LN_2, 1.0, 1.0);
         grid(&mut geometry, &sorted_axes(&means), 0.0, 100.0, (0.1, LARGEST_STEP));
         geometry
     }

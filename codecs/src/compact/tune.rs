@@ -21,6 +21,7 @@ const FARTHEST: f64 = 1.0;
 /// Standard deviations by which a round may lose more than expected: of all but the last, of the last if fine-tuning has a file that keeps what is allowed, and if it
 /// has none.
 const CAUTION: [f64; 3] = [0.5, 0.5, 1.0];
+/// The share of an allowed size that rounds aim at.
 const SIZE_AIM: f64 = 0.99;
 /// Octaves by which steps of the deformer's weights grow to measure what they cost, and the least loss in dB that counts then: smaller ones are noise.
 const PROBED: f64 = 2.0;
@@ -90,7 +91,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     let shares = rounds(settings.finetune);
     let count = shares.len();
     let per_round = settings.finetune as f64 / count.max(1) as f64;
-    // Rounding costs at least what is allowed, where steps of single columns or of the weights cost more.
+    // Rounded weights may make the loss larger than what is allowed.
     let mut forecast = Forecast::new(untuned.max(if let Goal::Drop(limit) = goal { *limit } else { 0.0 }), per_round);
     // Steps are planned for the last round but one, whose file is safe, and then for the last.
     let planned = |forecast: &Forecast, limit: f64, done: usize, kept: bool| {
@@ -169,9 +170,9 @@ fn weights_and_saved(tuner: &dyn TuneModel, weights: &[WeightArray], steps: f64)
     Ok((bytes, (bytes - tuner.weight_bytes(weights, 2.0 * steps)? as f64).max(0.0)))
 }
 
-/// Octaves by which steps of the weights should be larger than those chosen without training, beside those of the Gaussians, so that a byte more of either is worth
-/// the same: a loss that grows with squared steps costs its share of the bytes. `psnr` is that of the model and what is lost where all is rounded; doubled steps of
-/// the Gaussians save `per_octave` bytes.
+/// By how many octaves the steps of the weights should grow more than those of the Gaussians, so that a byte more of either is worth the same. Losses grow with squared
+/// steps, so the losses of the two are then in proportion to the bytes that doubled steps of each save. Given are the PSNR of the model, what it loses where all is
+/// rounded, and the bytes that doubled steps of the Gaussians save.
 fn weight_octaves(tuner: &dyn TuneModel, model: &TunedModel, (psnr, untuned): (f64, f64), per_octave: f64) -> Result<f64> {
     let saved = weights_and_saved(tuner, &model.weights, 1.0)?.1;
     if saved == 0.0 {

@@ -38,7 +38,7 @@ const RATE_ITERATIONS: f64 = 200.0;
 const DEFORMER_RATE: f64 = 0.1;
 /// Share of the iterations over which the learning rate rises.
 const WARMUP: f64 = 0.1;
-/// Share of the rates that is gone in the last of several trainings.
+/// Share by which learning rates have fallen at the end of the last of several trainings.
 const FALL: f64 = 0.5;
 /// Iterations for which derivatives of the size are kept: they change slowly.
 const SIZE_EVERY: usize = 8;

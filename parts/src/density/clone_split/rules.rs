@@ -106,9 +106,10 @@ fn standard_normal(rng: &mut impl Rng) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::build;
     use super::*;
-    use burn::tensor::{Device, Tensor};
-    use cc4dgs_core::ExtraAttribute;
+    use burn::tensor::{Device, Int, Tensor, TensorData};
+    use cc4dgs_core::{ExtraAttribute, Gaussians, Schedule, Statistic, ViewStatistics};
 
     fn host_of(n: usize) -> HostGaussians {
         HostGaussians {
@@ -136,7 +137,7 @@ mod tests {
         let plan = round(&Settings::default(), &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
         assert_eq!((plan.report.cloned, plan.report.split, plan.report.removed), (1, 1, 1));
         assert_eq!(to_vec(statistics.after(&plan, false, &device).unwrap().max_weight, "weights").unwrap(), [0.0, 0.0, 1.0, 1.0, 1.0]);
-        let gaussians = cc4dgs_core::Gaussians::from_host(&host, &device);
+        let gaussians = Gaussians::from_host(&host, &device);
         plan.check("clone-split", &gaussians).unwrap();
         let after = plan.apply(&gaussians).unwrap().to_host().unwrap();
         assert_eq!(after.extra["label"].values, vec![0.0, 3.0, 0.0, 1.0, 1.0]);
@@ -155,7 +156,7 @@ mod tests {
         let due = Due { grow: true, ..Default::default() };
         let passed = |corrected: bool| {
             let plan = round(&Settings { corrected, ..Settings::default() }, &statistics, &host, due, 1.0, Seed::root(1)).unwrap().unwrap();
-            let after = plan.apply(&cc4dgs_core::Gaussians::from_host(&host, &device)).unwrap().to_host().unwrap();
+            let after = plan.apply(&Gaussians::from_host(&host, &device)).unwrap().to_host().unwrap();
             assert_eq!(after.len(), 2);
             after.opacity_logits.iter().map(|v| 1.0 - 1.0 / (1.0 + (-v).exp())).product::<f32>()
         };
@@ -186,5 +187,31 @@ mod tests {
         let due = Due { prune_weight: true, ..Default::default() };
         let plan = round(&Settings::default(), &statistics, &host_of(3), due, 1.0, Seed::root(1)).unwrap().unwrap();
         assert_eq!((plan.report.removed, plan.parents()), (2, &[0][..]));
+    }
+
+    #[test]
+    fn absolute_gradients_grow_what_opposite_signs_hide() {
+        let device = Device::flex();
+        let mut host = host_of(2);
+        host.log_scales.fill(0.001f32.ln());
+        let schedule = Schedule { iteration: 1000, extent: 1.0, ..Schedule::main(20_000) };
+        let cloned = |absolute: bool| {
+            let mut control = build(&toml::Table::from_iter([("absolute".to_string(), absolute.into()), ("every".to_string(), 1.into())])).unwrap();
+            control.begin_stage(2, &device);
+            let gradient = |wanted: Statistic, value: f32| {
+                control.statistics(&schedule).contains(&wanted).then(|| Tensor::<2>::from_floats([[value, 0.0], [0.0, 0.0]], &device))
+            };
+            let view = ViewStatistics {
+                radii: Tensor::<1, Int>::from_data(TensorData::new(vec![3i64, 3], [2]), &device),
+                screen_gradient: gradient(Statistic::ScreenGradient, 0.0),
+                absolute_screen_gradient: gradient(Statistic::AbsoluteScreenGradient, 1.0),
+                max_weights: None,
+                size: (8, 8),
+                views: 1,
+            };
+            control.observe(&view).unwrap();
+            control.plan(&Gaussians::from_host(&host, &device), &schedule, Seed::root(1)).unwrap().map_or(0, |plan| plan.report.cloned)
+        };
+        assert_eq!((cloned(false), cloned(true)), (0, 1));
     }
 }
