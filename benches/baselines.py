@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
 """Every baseline at its published size and rates for the same wall time: how far it comes, and the curve.
 
-    python3 benches/baselines.py OUT --bin BIN --scene DATA/dnerf_mutant [--minutes 60] [--only hexplane,...] [--jobs 1] [--threads N]
+    python3 benches/baselines.py OUT --bin BIN --scene DATA/dnerf_mutant [--minutes 60] [--only hexplane,...] [--jobs 1] [--threads N] [--processor]
 
 Trains `dnerf+METHOD` (published iterations, sizes and rates; 800x800) and interrupts it after --minutes of training. What it has learned until then is evaluated once
 on the test views; its learning rates have not fallen yet, so this is no figure of a finished training. Presets have
 the background that a method is published on. Results are in OUT/rows.json, one row per method: iterations
 reached of those published, seconds, PSNR, SSIM, and PSNR of the training views over time. With --jobs 2 --threads 1 two methods share the machine.
+--processor counts minutes of processor time, all threads of a training together, instead of those on the clock: nothing is lost while a training is stopped (SIGSTOP)
+or waits for others. Seconds of the curve are those on the clock.
 
 Called again, it resumes what was cut off and leaves out what is done with the same scene, minutes, jobs, threads and program (its SHA-256); runs have folders of
 their own for each of these, OUT/METHOD-HASH. Ctrl-C asks what runs to write its checkpoint and end (exit code 130). A training that fails, or cannot be evaluated,
@@ -15,6 +17,7 @@ has no row, and makes the exit code 1.
 import argparse
 import hashlib
 import json
+import os
 import pathlib
 import signal
 import subprocess
@@ -28,9 +31,30 @@ from trainings import TRAINED, Rows, begin, ended, events, interrupt, points, sh
 METHODS = ["hexplane", "native-4d", "swift4d", "embedding", "grid4d", "deform-mlp"]
 
 
-def stop(child, seconds):
+def used(child):
+    """Processor seconds that all threads of a running process took; none once it has ended."""
+    try:
+        fields = pathlib.Path(f"/proc/{child.pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def run(child, seconds, note):
+    """Lets a process run for so long, by the clock, or by its processor time where `note` is told that every second. Returns its exit code if it ended."""
+    if note is None:
+        return ended(child, seconds)
+    code, spent = None, 0.0
+    while code is None and spent < seconds:
+        code = ended(child, 1.0)
+        spent = max(spent, used(child))
+        note(spent)
+    return code
+
+
+def stop(child, seconds, note):
     """Lets a training run for so long, then asks it to write its checkpoint and end. Returns its exit code, and whether there is what it was to learn by then."""
-    code = ended(child, seconds)
+    code = run(child, seconds, note)
     if code is not None:
         return code, code in TRAINED
     child.send_signal(signal.SIGINT)
@@ -54,11 +78,18 @@ def row(options, stated):
         arguments += ["--overwrite", "--preset", f"dnerf+{method}", "--set", "scene.width=800", "--set", "train.checkpoint_every=500"]
     if options.threads:
         arguments += ["--threads", str(options.threads)]
-    left = 60 * options.minutes - trained(out) if resumed else 60 * options.minutes
+    clock = options.out / f"{name}.processor"
+    before = 0.0
+    if resumed:
+        before = float(clock.read_text()) if options.processor else trained(out)
+    elif options.processor:
+        clock.write_text("0.0\n")
+    left = 60 * options.minutes - before
+    note = (lambda seconds: clock.write_text(f"{before + seconds:.1f}\n")) if options.processor else None
     code, learned = None, True
     if left > 30:
         with open(options.out / f"{name}.log", "a") as log:
-            code, learned = stop(begin([options.bin, *arguments], stdout=log, stderr=subprocess.STDOUT), left)
+            code, learned = stop(begin([options.bin, *arguments], stdout=log, stderr=subprocess.STDOUT), left, note)
     report = options.out / f"{name}.json"
     report.unlink(missing_ok=True)
     evaluation = [options.bin, "eval", str(out), "--scene", str(options.scene), "--split", "test", f"--json={report}", "--sheet", str(options.out / f"{name}.png"), "--quiet"]
@@ -77,7 +108,8 @@ def row(options, stated):
     settings = tomllib.loads(config.read_text()) if config.exists() else {}
     published = settings.get("train", {}).get("iterations")
     keys = ["psnr_db", "ssim", "gaussians", "dynamic_gaussians", "size_mb", "psnr_worst_block_db"]
-    return {**stated, "exit": code, "resumed": resumed, "seconds": round(trained(out), 1), "iterations": done, "published_iterations": published,
+    return {**stated, "exit": code, "resumed": resumed, "seconds": round(trained(out), 1),
+            "processor_seconds": float(clock.read_text()) if options.processor else None, "iterations": done, "published_iterations": published,
             "background": settings.get("render", {}).get("background"), **{key: found.get(key) for key in keys}, "training_views": curve}
 
 
@@ -90,6 +122,7 @@ def main():
     parser.add_argument("--only", default=",".join(METHODS))
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--processor", action="store_true", help="minutes of processor time")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rows = Rows(options.out / "rows.json")
@@ -97,6 +130,8 @@ def main():
     def one(method):
         """Whether the method has a score."""
         stated = {"method": method, "path": str(options.scene), "minutes": options.minutes, "threads": options.threads, "jobs": options.jobs}
+        if options.processor:
+            stated["clock"] = "processor"
         stated |= {"binary_sha256": sha256(options.bin)}
         if rows.find(stated):
             return True
