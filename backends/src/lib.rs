@@ -61,6 +61,7 @@ mod cube {
     mod cross_entropy;
     pub(crate) mod field;
     mod image;
+    mod kept_images;
     mod life;
     mod lookup;
     mod photometric;

@@ -1,15 +1,23 @@
 //! 8-bit images to planes and back.
 
+use super::kept_images::KeptImages;
 use super::tensor::{THREADS, constant, empty, floats, signed, workgroups_for};
 use crate::ops::image::ImageOps;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
-use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
+use burn_cubecl::{CubeBackend, CubeDevice};
 use cc4dgs_core::Image8;
 use cubecl::prelude::*;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+use std::thread::ThreadId;
+
+/// Upper bound on the bytes of images that stay on devices.
+const MOST_KEPT: usize = 512 << 20;
+
+/// Images by thread (a thread has its own stream of launches) and device.
+static KEPT: LazyLock<Mutex<KeptImages<(ThreadId, CubeDevice), CubeTensor>>> = LazyLock::new(|| Mutex::new(KeptImages::new(MOST_KEPT)));
 
 /// Byte `at` of words that hold four each, lowest first, as 0..1.
 #[cube]
@@ -60,14 +68,18 @@ impl ImageOps for CubeBackend {
     fn planes(like: FloatTensor<Self>, image: Arc<Image8>, background: [f32; 3]) -> FloatTensor<Self> {
         let (width, height) = (image.width as usize, image.height as usize);
         let planes = floats(&like, [3, height, width]);
-        let count = image.data.len().div_ceil(4);
-        let mut padded = Vec::new();
-        if !image.data.len().is_multiple_of(4) {
-            padded = image.data.clone();
-            padded.resize(4 * count, 0);
-        }
-        let words = like.client.create_from_slice(if padded.is_empty() { &image.data } else { &padded });
-        let words = CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), [count].into(), words, DType::U32);
+        let send = || {
+            let count = image.data.len().div_ceil(4);
+            let mut padded = Vec::new();
+            if !image.data.len().is_multiple_of(4) {
+                padded = image.data.clone();
+                padded.resize(4 * count, 0);
+            }
+            let words = like.client.create_from_slice(if padded.is_empty() { &image.data } else { &padded });
+            CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), [count].into(), words, DType::U32)
+        };
+        let place = (std::thread::current().id(), like.device.clone());
+        let words = KEPT.lock().unwrap_or_else(PoisonError::into_inner).of(place, &image, send);
         let client = like.client.clone();
         let (w, b) = (words.into_buffer_arg(), constant(&like, &background, DType::F32).into_buffer_arg());
         let pixels = width * height;

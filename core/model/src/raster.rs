@@ -92,8 +92,9 @@ pub struct RenderSettings {
     pub background: Option<Tensor<1>>,
     /// Collect the largest blending weight of every Gaussian (weight pruning).
     pub max_weights: bool,
-    /// Capacity in (Gaussian, tile) pairs, for playback on devices that would otherwise read the count of every frame back. Pairs beyond it are not drawn,
-    /// those of the farthest Gaussians first; [`RenderStats::pair_count`] has the true count. Not for gradients. `None` allocates memory for all pairs.
+    /// Capacity in (Gaussian, tile) pairs, for devices that would otherwise wait until the count of every image was read back. Pairs beyond it are not drawn, those
+    /// of the farthest Gaussians first, and gradients are of no use then; [`RenderStats::pair_count`] has the true count. Neither image nor gradients depend on
+    /// a capacity that suffices. `None`, or more than the device's limit, draws all pairs.
     pub pair_capacity: Option<usize>,
 }
 

@@ -4,6 +4,8 @@ use rayon::prelude::*;
 
 /// The most points of a leaf.
 const LEAF: usize = 8;
+/// Nodes with at least twice as many points are split by two threads.
+const PARALLEL: usize = 1024;
 /// Capacity of a query's stack: it grows by at most one node per level, and 2³² points have 30 levels.
 const STACK: usize = 32;
 
@@ -85,28 +87,9 @@ impl KdTree {
         let count = points.len();
         let mut tree = Self { points, nodes: Vec::new() };
         if count > 0 {
-            tree.add_node(0, count);
+            add_nodes(&mut tree.points, 0, &mut tree.nodes);
         }
         tree
-    }
-    /// Adds the node of the points `start..end`, and those below it.
-    fn add_node(&mut self, start: usize, end: usize) {
-        let own = &mut self.points[start..end];
-        let low: [f32; 3] = std::array::from_fn(|k| own.iter().map(|p| p.position[k]).fold(f32::INFINITY, f32::min));
-        let high: [f32; 3] = std::array::from_fn(|k| own.iter().map(|p| p.position[k]).fold(f32::NEG_INFINITY, f32::max));
-        let least = own.iter().map(|p| p.index).fold(u32::MAX, u32::min);
-        let node = self.nodes.len();
-        self.nodes.push(Node { low, high, least, start, end, second: None });
-        if own.len() <= LEAF {
-            return;
-        }
-        let side = |k: usize| high[k] - low[k];
-        let axis = (1..3).fold(0, |longest, k| if side(k) > side(longest) { k } else { longest });
-        let half = own.len() / 2;
-        own.select_nth_unstable_by(half, |a, b| a.position[axis].total_cmp(&b.position[axis]).then(a.index.cmp(&b.index)));
-        self.add_node(start, start + half);
-        self.nodes[node].second = Some(self.nodes.len());
-        self.add_node(start + half, end);
     }
     /// The `K` points nearest to `point`, nearest first, ties by index. The point with the index `except` is left out.
     pub fn nearest<const K: usize>(&self, point: &[f32; 3], except: Option<u32>) -> [Neighbour; K] {
@@ -139,6 +122,34 @@ impl KdTree {
         }
         (best, compared)
     }
+}
+
+/// Adds the node of `own`, the points from `start` on, and those below it, in pre-order; sorts the points. Indices of nodes count in `nodes`.
+fn add_nodes(own: &mut [Point], start: usize, nodes: &mut Vec<Node>) {
+    let low: [f32; 3] = std::array::from_fn(|k| own.iter().map(|p| p.position[k]).fold(f32::INFINITY, f32::min));
+    let high: [f32; 3] = std::array::from_fn(|k| own.iter().map(|p| p.position[k]).fold(f32::NEG_INFINITY, f32::max));
+    let least = own.iter().map(|p| p.index).fold(u32::MAX, u32::min);
+    let node = nodes.len();
+    nodes.push(Node { low, high, least, start, end: start + own.len(), second: None });
+    if own.len() <= LEAF {
+        return;
+    }
+    let side = |k: usize| high[k] - low[k];
+    let axis = (1..3).fold(0, |longest, k| if side(k) > side(longest) { k } else { longest });
+    let half = own.len() / 2;
+    own.select_nth_unstable_by(half, |a, b| a.position[axis].total_cmp(&b.position[axis]).then(a.index.cmp(&b.index)));
+    let (first, second) = own.split_at_mut(half);
+    if half < PARALLEL {
+        add_nodes(first, start, nodes);
+        nodes[node].second = Some(nodes.len());
+        add_nodes(second, start + half, nodes);
+        return;
+    }
+    let mut others = Vec::new();
+    rayon::join(|| add_nodes(first, start, nodes), || add_nodes(second, start + half, &mut others));
+    let shift = nodes.len();
+    nodes[node].second = Some(shift);
+    nodes.extend(others.into_iter().map(|node| Node { second: node.second.map(|second| shift + second), ..node }));
 }
 
 fn is_finite(point: &[f32; 3]) -> bool {
@@ -207,6 +218,9 @@ mod tests {
         }
         let few = nearest::<6>(&[[0.0; 3], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])[0];
         assert_eq!(few.map(|n| n.squared)[..3], [1.0, 9.0, f32::INFINITY]);
+        // So many that threads share the tree.
+        let many = distributions(3 * PARALLEL).pop().unwrap().1;
+        assert_eq!(nearest::<3>(&many), brute_force::<3>(&many));
         assert!(nearest::<3>(&[]).is_empty());
         assert_eq!(mean_squared_distance_3nn(&[[1.0; 3]]), vec![1.0]);
         assert_eq!(mean_squared_distance_3nn(&[[1.0; 3]; 5]), vec![0.0; 5]);

@@ -110,7 +110,9 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
         );
         total = exclusive_sums(&counts, n);
     }
-    let pairs = match settings.pair_capacity {
+    let limit = MAX_TILE_PAIRS.min(binding_bytes(&client) / (4 * blend::record_floats(settings.absolute_centers) as u64));
+    let capacity = settings.pair_capacity.filter(|&capacity| capacity as u64 <= limit);
+    let pairs = match capacity {
         Some(capacity) => capacity,
         None if n == 0 => 0,
         None => match read_word(&total) {
@@ -118,7 +120,6 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
             Err(error) => return refuse(&means, Refusal::Unread(error.to_string())),
         },
     };
-    let limit = MAX_TILE_PAIRS.min(binding_bytes(&client) / (4 * blend::record_floats(settings.absolute_centers) as u64));
     if pairs as u64 > limit {
         return refuse(&means, Refusal::Pairs { found: pairs as u64, limit });
     }
@@ -140,7 +141,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
             start_of_gaussian.clone().into_buffer_arg(),
             tiles_x as u32,
         );
-        if settings.pair_capacity.is_some() {
+        if capacity.is_some() {
             // What no Gaussian filled goes behind the last tile.
             let (tile, own) = (tile_of_pair.clone().into_buffer_arg(), pair.clone().into_buffer_arg());
             lists::fill_unused::launch(&client, workgroups_for(pairs), DIM(), tile, own, total.clone().into_buffer_arg(), tiles as u32);
@@ -175,7 +176,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
     let max_weights = if settings.max_weights && n > 0 { weights } else { floats(&means, [0]) };
     let saved = Lists { cam, splats, keys, gaussian_of_pair, start_of_gaussian, sorted, tile_starts, state, pairs };
     // Visible Gaussians and pixels are not counted here: that would need another read-back.
-    let work = RenderWork { visible: 0, tile_pairs: if settings.pair_capacity.is_none() { pairs as u64 } else { 0 }, pixel_pairs: 0 };
+    let work = RenderWork { visible: 0, tile_pairs: if capacity.is_none() { pairs as u64 } else { 0 }, pixel_pairs: 0 };
     // Counts stay below 2^31, so their bits are those of signed numbers too.
     let pair_count = CubeTensor::new_contiguous(total.client.clone(), total.device.clone(), [1].into(), total.handle.clone(), DType::I32);
     Rasterized { planes, radii, max_weights, work, pair_count, refused: None, saved: Saved::new(saved) }

@@ -1,6 +1,7 @@
 //! Tile lists: which Gaussians meet a tile, in depth order.
 
-use super::project::{KEY_COLUMNS, KEY_DEPTH, KEY_ROWS, KEY_TILES, KEYS};
+use super::cells::cells_of;
+use super::project::{KEY_CELLS, KEY_COLUMNS, KEY_DEPTH, KEY_ROWS, KEY_TILES, KEYS};
 use cubecl::prelude::*;
 
 /// Words behind the starts of the tiles: the bits of the background's colour, so that blending needs no array of its own for it.
@@ -42,15 +43,20 @@ pub fn emit_pairs(
         let mut index = starts[ABSOLUTE_POS];
         start_of_gaussian[gaussian as usize] = index;
         if keys[at + KEY_TILES] > 0 {
-            let (columns, rows) = (keys[at + KEY_COLUMNS], keys[at + KEY_ROWS]);
+            let (columns, rows, met) = (keys[at + KEY_COLUMNS], keys[at + KEY_ROWS], keys[at + KEY_CELLS]);
+            let cells = cells_of(columns, rows);
+            let (first_row, first_column, high, wide, across) = (cells.row, cells.column, cells.high, cells.wide, cells.across);
             for row in (rows & 0xffffu32)..(rows >> 16) {
                 for column in (columns & 0xffffu32)..(columns >> 16) {
-                    if (index as usize) < tile_of_pair.len() {
-                        tile_of_pair[index as usize] = row * tiles_x + column;
-                        pair[index as usize] = index;
-                        gaussian_of_pair[index as usize] = gaussian;
+                    let cell = (row - first_row) / high * across + (column - first_column) / wide;
+                    if (met >> cell) & 1u32 == 1u32 {
+                        if (index as usize) < tile_of_pair.len() {
+                            tile_of_pair[index as usize] = row * tiles_x + column;
+                            pair[index as usize] = index;
+                            gaussian_of_pair[index as usize] = gaussian;
+                        }
+                        index += 1;
                     }
-                    index += 1;
                 }
             }
         }

@@ -1,5 +1,6 @@
 //! From Gaussians to the visible ones on the screen: activation, projection, culling, colour.
 
+use super::cells::{cells_met, cells_of};
 use super::geometry::{CENTER, NEAR, Projected, SIZE, project, sorting_depth};
 use super::harmonics::basis;
 use super::vector::{V3, V4, add, dot, load3, scale, store3, v3};
@@ -9,7 +10,7 @@ use crate::ops::rasterize::{AT_A, AT_B, AT_C, AT_COLOR, AT_DEPTH, AT_OPACITY, AT
 use cubecl::prelude::*;
 
 /// Columns of what sorting needs of a Gaussian, and of which of its colours are clamped.
-pub const KEYS: usize = 5;
+pub const KEYS: usize = 6;
 /// Column of the depth key.
 pub const KEY_DEPTH: usize = 0;
 /// Column of the number of tiles.
@@ -21,6 +22,8 @@ pub const KEY_ROWS: usize = 3;
 /// Column of the channels that were negative and are clamped at zero: 1 for red, 2 for green, 4 for blue. Colours cannot say it themselves: 0 may be exact, and
 /// compilers may ignore the sign of a zero.
 pub const KEY_CLAMPED: usize = 4;
+/// Column of the cells that the footprint meets ([`cells_met`]).
+pub const KEY_CELLS: usize = 5;
 /// Sigma by which footprints are enlarged, so that rounding never cuts off a pixel that blending would count.
 const CUTOFF_MARGIN: f32 = 0.005;
 /// Colours of this size and above count as infinite: their sums could overflow.
@@ -105,7 +108,7 @@ fn all_finite(mean: V3, s: V3, q: V4, opacity: f32, p: Projected) -> bool {
         && is_finite(p.center_y)
 }
 
-/// Screen records `[N,10]` with the radius (0 if culled) in place of the colour, which [`color_gaussians`] adds; sorting keys `[N,5]`.
+/// Screen records `[N,10]` with the radius (0 if culled) in place of the colour, which [`color_gaussians`] adds; sorting keys `[N,6]`.
 #[cube(launch)]
 pub fn project_gaussians(
     means: &[f32],
@@ -177,7 +180,15 @@ pub fn project_gaussians(
         let key = KEYS * i;
         // Depths are positive, so their bits order like the numbers.
         keys[key + KEY_DEPTH] = select(drawn, u32::reinterpret(depth), 0xffff_ffffu32);
-        keys[key + KEY_TILES] = select(drawn, length_of(columns) * length_of(rows), 0u32);
+        let mut tiles = 0u32;
+        let mut met = 0u32;
+        if drawn && length_of(columns) > 0 && length_of(rows) > 0 {
+            let found = cells_met(cells_of(columns, rows), p, reach * 0.5);
+            met = found.cells;
+            tiles = found.tiles;
+        }
+        keys[key + KEY_TILES] = tiles;
+        keys[key + KEY_CELLS] = met;
         keys[key + KEY_COLUMNS] = columns;
         keys[key + KEY_ROWS] = rows;
         keys[key + KEY_CLAMPED] = 0u32;

@@ -1,6 +1,7 @@
 //! The three-stage trainer (paper Section V): coarse, dynamic score, main. It is composed of parts that are found by name: deformer, rasterizer, density control, loss terms,
 //! appearance model and optimizer.
 
+mod capacity;
 mod cost;
 mod density;
 mod dropout;

@@ -1,5 +1,6 @@
 //! Everything a run needs to continue to the same bytes.
 
+use super::capacity::PairCapacities;
 use super::guard::Guard;
 use super::record::Record;
 use super::rounded::Rounded;
@@ -45,6 +46,8 @@ pub struct TrainState {
     pub record: Record,
     /// What is drawn in place of the values, in fine-tuning.
     pub(crate) rounded: Option<Rounded>,
+    /// Learned again by a run that is resumed.
+    pub(crate) capacities: PairCapacities,
     rows: Option<MovingRows>,
     pub(crate) neighbours: Option<Neighbours>,
 }
@@ -86,6 +89,7 @@ impl TrainState {
             rates: RateFactors::default(),
             record: Record::default(),
             rounded: None,
+            capacities: PairCapacities::default(),
             rows: None,
             neighbours: None,
         }

@@ -1,5 +1,6 @@
 //! One photometric step: deform, render, loss, backward, optimizer. Shared by the coarse and the main stage.
 
+use super::capacity::Drawn;
 use super::dropout;
 use super::log::Log;
 use super::probe::psnr_db;
@@ -71,9 +72,11 @@ impl Context<'_> {
         let max_weights = statistics.contains(&Statistic::MaxWeight);
         let settings = RenderSettings { max_weights, ..self.job.config.render.settings(Some(Tensor::from_inner(self.background.clone()))) };
         let mut total: Option<Tensor<1>> = None;
-        let mut rendered = Vec::with_capacity(batch.len());
+        let (mut rendered, mut pairs) = (Vec::with_capacity(batch.len()), Vec::with_capacity(batch.len()));
         let mut seen: Option<Tensor<1, Int>> = None;
         let read = log.due(schedule.iteration);
+        // Iterations that wait for the device anyway need no capacity; in fine-tuning weights would be rounded twice.
+        let waits = read || check || state.rounded.is_some();
         let mut offsets = Vec::new();
         if let (Some(spatial), Some(deformer)) = (&spatial, &state.deformer) {
             let times: Vec<f32> = batch.iter().map(|&view| self.noisy_time(scene.views[view].time_norm, schedule, view)).collect();
@@ -114,7 +117,10 @@ impl Context<'_> {
             let (screen_probe, absolute_screen_probe) = (probe(Statistic::ScreenGradient), probe(Statistic::AbsoluteScreenGradient));
             splats.screen_probe = screen_probe.clone();
             splats.absolute_screen_probe = absolute_screen_probe.clone();
-            let output = self.rasterizer.render(&splats, camera, &settings)?;
+            let key = (scene.views[view].camera, camera.width, camera.height);
+            let capacity = if waits { None } else { state.capacities.of(key) };
+            let output = self.rasterizer.render(&splats, camera, &RenderSettings { pair_capacity: capacity, ..settings.clone() })?;
+            pairs.push(Drawn::new(key, capacity, &output));
             let planes = state.appearance.apply(output.planes, self.training_camera.get(&scene.views[view].camera).copied())?;
             let target = Tensor::<3>::from_inner(self.rasterizer.upload(&scene.frame(view)?, background_rgb, &self.device));
             let radii = output.stats.radii;
@@ -166,6 +172,10 @@ impl Context<'_> {
         }
 
         let gradients = loss.backward();
+        if !state.capacities.sufficed(&pairs)? {
+            // Nothing has changed yet.
+            return self.photometric_step(schedule, state, batch, check, log);
+        }
         for Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera } in rendered {
             let gradient_of = |probe: Option<Tensor<2>>| probe.and_then(|probe| probe.grad(&gradients));
             let (screen_gradient, absolute_screen_gradient) = (gradient_of(screen_probe), gradient_of(absolute_screen_probe));

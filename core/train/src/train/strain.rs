@@ -5,6 +5,7 @@
 use crate::knn::nearest;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use cc4dgs_core::ordered_sum;
+use rayon::prelude::*;
 use std::sync::Arc;
 
 /// Neighbours further apart than this multiple of the median distance say nothing of each other.
@@ -44,17 +45,17 @@ struct Lists {
 /// Pairs of neighbours (i, j, their distance, 1 or 2), nearest first, with i < j; see [`Neighbours::of`].
 fn pairs(points: &[[f32; 3]]) -> Vec<(usize, usize, f32, f32)> {
     let mut pairs: Vec<(usize, usize, f32, f32)> = nearest::<3>(points)
-        .iter()
+        .par_iter()
         .enumerate()
-        .flat_map(|(i, found)| found.iter().map(move |n| (i, n.index as usize, n.squared.sqrt())))
+        .flat_map_iter(|(i, found)| found.iter().map(move |n| (i, n.index as usize, n.squared.sqrt())))
         .filter(|(_, _, distance)| distance.is_finite() && *distance > 0.0)
         .map(|(i, j, distance)| (i.min(j), i.max(j), distance, 1.0))
         .collect();
     let mut distances: Vec<f32> = pairs.iter().map(|pair| pair.2).collect();
-    distances.sort_unstable_by(f32::total_cmp);
-    let most = distances.get(distances.len() / 2).map_or(0.0, |median| FAR * median);
+    let half = distances.len() / 2;
+    let most = if distances.is_empty() { 0.0 } else { FAR * *distances.select_nth_unstable_by(half, f32::total_cmp).1 };
     pairs.retain(|pair| pair.2 <= most);
-    pairs.sort_unstable_by(|a, b| a.2.total_cmp(&b.2).then((a.0, a.1).cmp(&(b.0, b.1))));
+    pairs.par_sort_unstable_by(|a, b| a.2.total_cmp(&b.2).then((a.0, a.1).cmp(&(b.0, b.1))));
     // Found from both sides.
     pairs.dedup_by(|later, kept| {
         let same = (later.0, later.1) == (kept.0, kept.1);
@@ -71,28 +72,31 @@ impl Lists {
         if points.len() < 2 || points.iter().flatten().any(|v| !v.is_finite()) {
             return None;
         }
-        let mut lists: Vec<Vec<(usize, f32, f32)>> = vec![Vec::new(); points.len()];
+        // Of length 1 where there is no neighbour, as if neither had moved.
+        let mut lists: Vec<[(usize, f32, f32); MOST]> = (0..points.len()).map(|i| [(i, f32::INFINITY, 0.0); MOST]).collect();
+        let mut lengths = vec![0; points.len()];
         let mut total = 0.0f32;
         for (i, j, distance, weight) in pairs(&points) {
-            if lists[i].len() < MOST && lists[j].len() < MOST {
-                lists[i].push((j, distance, weight));
-                lists[j].push((i, distance, weight));
+            if lengths[i] < MOST && lengths[j] < MOST {
+                lists[i][lengths[i]] = (j, distance, weight);
+                lists[j][lengths[j]] = (i, distance, weight);
+                (lengths[i], lengths[j]) = (lengths[i] + 1, lengths[j] + 1);
                 total += weight;
             }
         }
-        let most = lists.iter().map(Vec::len).max().filter(|&most| most > 0)?;
+        let most = lengths.into_iter().max().filter(|&most| most > 0)?;
         let count = most * points.len();
-        let (mut rows, mut directions, mut inverse, mut weights) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        for (i, list) in lists.iter().enumerate() {
-            for slot in 0..most {
-                // Of length 1 where there is no neighbour, as if neither had moved.
-                let (j, distance, weight) = list.get(slot).copied().unwrap_or((i, f32::INFINITY, 0.0));
-                rows.push(j as i64);
-                directions.extend((0..3).map(|k| if weight > 0.0 { (points[i][k] - points[j][k]) / distance } else { f32::from(u8::from(k == 0)) }));
-                inverse.push(1.0 / distance);
-                weights.push(weight / total);
-            }
-        }
+        // In parallel: (Gaussian, neighbour, distance, weight) of every slot, in order.
+        let slots = || lists.par_iter().enumerate().flat_map_iter(|(i, list)| list[..most].iter().map(move |&(j, distance, weight)| (i, j, distance, weight)));
+        let rows: Vec<i64> = slots().map(|(_, j, _, _)| j as i64).collect();
+        let direction = |(i, j, distance, weight): (usize, usize, f32, f32)| (0..3usize).map(move |k| (k, i, j, distance, weight));
+        let component = |(k, i, j, distance, weight): (usize, usize, usize, f32, f32)| match weight > 0.0 {
+            true => (points[i][k] - points[j][k]) / distance,
+            false => f32::from(u8::from(k == 0)),
+        };
+        let directions: Vec<f32> = slots().flat_map_iter(direction).map(component).collect();
+        let inverse: Vec<f32> = slots().map(|(_, _, distance, _)| 1.0 / distance).collect();
+        let weights: Vec<f32> = slots().map(|(_, _, _, weight)| weight / total).collect();
         let array = |values: Vec<f32>, width: usize| Tensor::<3>::from_data(TensorData::new(values, [points.len(), most, width]), device);
         let (inverse, weights) = (array(inverse, 1), array(weights, 1));
         Some(Self {
