@@ -26,17 +26,15 @@ impl<K: Eq + Hash, T: Clone> KeptImages<K, T> {
         Self { most_bytes, bytes: 0, entries: HashMap::new() }
     }
 
-    /// What `make` made of `image` for `place`. It is made again where there was no space for it; those that nobody has any more give theirs away first.
+    /// What `make` made of `image` for `place`. It is made again where there was no space for it. What was made of images that nobody has any more goes first.
     pub fn of(&mut self, place: K, image: &Arc<Image8>, make: impl FnOnce() -> T) -> T {
         let key = (place, Arc::as_ptr(image) as usize);
         if let Some(entry) = self.entries.get(&key) {
             return entry.made.clone();
         }
+        self.entries.retain(|_, entry| entry.image.strong_count() > 0);
+        self.bytes = self.entries.values().map(|entry| entry.bytes).sum();
         let (made, bytes) = (make(), image.data.len());
-        if self.bytes + bytes > self.most_bytes {
-            self.entries.retain(|_, entry| entry.image.strong_count() > 0);
-            self.bytes = self.entries.values().map(|entry| entry.bytes).sum();
-        }
         if self.bytes + bytes <= self.most_bytes {
             self.bytes += bytes;
             self.entries.insert(key, Entry { image: Arc::downgrade(image), bytes, made: made.clone() });

@@ -59,7 +59,7 @@ pub struct Met {
     pub tiles: u32,
 }
 
-/// The cells with a pixel centre within `cutoff` (sigma) of the footprint of `p`, or nearly.
+/// The cells in which sigma is at most `cutoff` somewhere between their outermost pixel centres, and a few more where it is slightly larger.
 #[cube]
 pub fn cells_met(cells: Cells, p: Projected, cutoff: f32) -> Met {
     let (xx, xy, yy) = (p.conic.x * 0.5, p.conic.y, p.conic.z * 0.5);

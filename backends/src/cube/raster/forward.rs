@@ -111,7 +111,7 @@ pub fn forward(splats: SplatTensors<CubeBackend>, settings: &RasterSettings) -> 
         total = exclusive_sums(&counts, n);
     }
     let limit = MAX_TILE_PAIRS.min(binding_bytes(&client) / (4 * blend::record_floats(settings.absolute_centers) as u64));
-    let capacity = settings.pair_capacity.filter(|&capacity| capacity as u64 <= limit);
+    let capacity = settings.pair_capacity.filter(|&capacity| n > 0 && capacity as u64 <= limit);
     let pairs = match capacity {
         Some(capacity) => capacity,
         None if n == 0 => 0,

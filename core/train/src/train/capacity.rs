@@ -2,8 +2,8 @@
 //!
 //! How many pairs a view has is known on the device alone. Reading the number back in the middle of every view leaves a graphics card idle while the launches
 //! behind it are prepared, so a view is drawn with room for as many pairs as its camera had before and some more. The numbers of all views are read once the
-//! backward pass is under way; where there were more pairs than room, the iteration is repeated. So what is learned never depends on capacities, which
-//! checkpoints do not keep.
+//! backward pass is under way; where there were more pairs than room, the iteration is repeated, and its views are counted first. So what is learned never depends on
+//! capacities, which checkpoints do not keep.
 
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, RenderOutput, Result};
@@ -11,6 +11,8 @@ use std::collections::BTreeMap;
 
 /// Capacity over the pairs that a camera had when it was last drawn.
 const SPARE: f64 = 1.25;
+/// Capacities that are larger than needed fall by this share of themselves per iteration: a camera's times need different ones.
+const FALL: usize = 16;
 
 /// The camera of a view, and the width and height of its image in pixels.
 pub(crate) type Key = (usize, u32, u32);
@@ -56,11 +58,13 @@ impl PairCapacities {
             _ => {
                 let failed =
                     |e| Error::backend("number of (Gaussian, tile) pairs", format!("reading it back failed: {e:?}"), "Try another device (--device flex)");
-                Tensor::cat(counts, 0).try_into_data().map_err(failed)?.iter::<i64>().map(|count| count.max(0) as usize).collect()
+                Tensor::cat(counts, 0).try_into_data().map_err(failed)?.iter::<i64>().map(|count| count as u32 as usize).collect()
             }
         };
         let mut counts = counts.into_iter();
         let mut sufficed = true;
+        // Several views may be of one camera.
+        let mut most: BTreeMap<Key, usize> = BTreeMap::new();
         for view in views {
             let pairs = match &view.asked {
                 Some((capacity, _)) => {
@@ -73,7 +77,12 @@ impl PairCapacities {
                     None => continue,
                 },
             };
-            self.of.insert(view.key, rounded_up((pairs as f64 * SPARE) as usize + 1024));
+            let of_camera = most.entry(view.key).or_default();
+            *of_camera = pairs.max(*of_camera);
+        }
+        for (key, pairs) in most {
+            let before = self.of.get(&key).map_or(0, |before| before - before / FALL);
+            self.of.insert(key, rounded_up(((pairs as f64 * SPARE) as usize + 1024).max(before)));
         }
         Ok(sufficed)
     }
@@ -108,6 +117,12 @@ mod tests {
         assert!(!capacities.sufficed(&[asked(one, room, 90_000), asked(other, 50_000, 50_001)]).unwrap(), "one too many in the second view");
         assert!(capacities.of(other).unwrap() > 50_001, "the repeated iteration has room");
         assert!(capacities.of(one).unwrap() < room, "less is needed now");
+
+        let two_times = || [asked(one, room, 400_000), asked(one, room, 100_000)];
+        assert!(!capacities.sufficed(&two_times()).unwrap());
+        assert!(capacities.of(one).unwrap() > 400_000, "the most of two views of a camera");
+        // A device has 32 bits, of which burn makes a signed number.
+        assert!(!capacities.sufficed(&[asked(one, room, -5)]).unwrap());
     }
 
     #[test]

@@ -11,7 +11,8 @@ use crate::gaussian_set::{Leaves, gaussian_rate};
 use burn::tensor::{Gradients, Int, Tensor};
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{
-    Camera, Error, Event, LossInput, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings, ViewStatistics,
+    Camera, DeformerWork, Error, Event, LossInput, ParameterGroup, RenderSettings, Result, Schedule, SpatialInput, Splats, Stage, Statistic, StepSettings,
+    ViewStatistics,
 };
 use cc4dgs_play::MovingRows;
 use cc4dgs_play::model::ModelDeformer;
@@ -21,6 +22,15 @@ use std::collections::BTreeMap;
 struct Spatial {
     input: SpatialInput,
     features: Tensor<2>,
+    work: DeformerWork,
+}
+
+/// What became of an iteration.
+enum Outcome {
+    Stepped,
+    Trouble(Trouble),
+    /// More pairs than a capacity: nothing was learned.
+    TooManyPairs,
 }
 
 /// A rendered view whose statistics wait for the backward pass.
@@ -36,6 +46,17 @@ impl Context<'_> {
     /// One iteration on the views of `batch`. Losses and offsets are looked at where they are logged and where `check` asks for it, gradients where `check` does;
     /// what is not finite is returned, and the parameters are then as they were or unfit for use.
     pub(crate) fn photometric_step(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], check: bool, log: &mut Log) -> Result<Option<Trouble>> {
+        // Iterations that wait for the device anyway need no capacity; in fine-tuning weights would be rounded twice.
+        let count = check || log.due(schedule.iteration) || state.rounded.is_some();
+        let outcome = match self.attempt(schedule, state, batch, check, count, log)? {
+            Outcome::TooManyPairs => self.attempt(schedule, state, batch, check, true, log)?,
+            outcome => outcome,
+        };
+        Ok(if let Outcome::Trouble(trouble) = outcome { Some(trouble) } else { None })
+    }
+
+    /// The same. Where pairs are not counted before they are drawn, there may be too many of them; parameters and statistics are then as they were.
+    fn attempt(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], check: bool, count: bool, log: &mut Log) -> Result<Outcome> {
         let train = &self.job.config.train;
         let scene = self.pyramid.at(schedule.image_scale);
         let (n, progress) = (state.set.len(), schedule.progress());
@@ -61,7 +82,7 @@ impl Context<'_> {
                     rounded.exchange_weights(deformer.field.parameters_mut());
                 }
                 parameters::track(deformer.field.parameters_mut());
-                Some(spatial_pass(deformer, &leaves, &rows, log, n)?)
+                Some(spatial_pass(deformer, &leaves, &rows)?)
             }
             _ => None,
         };
@@ -75,8 +96,6 @@ impl Context<'_> {
         let (mut rendered, mut pairs) = (Vec::with_capacity(batch.len()), Vec::with_capacity(batch.len()));
         let mut seen: Option<Tensor<1, Int>> = None;
         let read = log.due(schedule.iteration);
-        // Iterations that wait for the device anyway need no capacity; in fine-tuning weights would be rounded twice.
-        let waits = read || check || state.rounded.is_some();
         let mut offsets = Vec::new();
         if let (Some(spatial), Some(deformer)) = (&spatial, &state.deformer) {
             let times: Vec<f32> = batch.iter().map(|&view| self.noisy_time(scene.views[view].time_norm, schedule, view)).collect();
@@ -95,7 +114,7 @@ impl Context<'_> {
                     if (read || check)
                         && let Some(head) = offsets.broken_head(deformer.name())?
                     {
-                        return Ok(Some(Trouble::of("deformer", format!("the offsets of deformer {}, head {head}", deformer.name()))));
+                        return Ok(Outcome::Trouble(Trouble::of("deformer", format!("the offsets of deformer {}, head {head}", deformer.name()))));
                     }
                     // At the time of the first view: at all of them, strain would take longer than the deformer's functions of time.
                     if let (Some(neighbours), Some(means)) = (neighbours.take(), &offsets.means)
@@ -118,7 +137,7 @@ impl Context<'_> {
             splats.screen_probe = screen_probe.clone();
             splats.absolute_screen_probe = absolute_screen_probe.clone();
             let key = (scene.views[view].camera, camera.width, camera.height);
-            let capacity = if waits { None } else { state.capacities.of(key) };
+            let capacity = if count { None } else { state.capacities.of(key) };
             let output = self.rasterizer.render(&splats, camera, &RenderSettings { pair_capacity: capacity, ..settings.clone() })?;
             pairs.push(Drawn::new(key, capacity, &output));
             let planes = state.appearance.apply(output.planes, self.training_camera.get(&scene.views[view].camera).copied())?;
@@ -128,7 +147,7 @@ impl Context<'_> {
             let loss = self.losses.value(&input)?;
             if (read || check) && !is_finite(&loss, "loss")? {
                 let part = if is_finite(&planes, "image")? { self.losses.broken(&input)?.map(|term| format!("the loss term {term}")) } else { None };
-                return Ok(Some(Trouble::new(part.unwrap_or_else(|| format!("the image of camera {}", camera.name)))));
+                return Ok(Outcome::Trouble(Trouble::new(part.unwrap_or_else(|| format!("the image of camera {}", camera.name)))));
             }
             if read {
                 log.psnr(psnr_db(planes.inner().narrow(0, 0, 3), target.inner())?);
@@ -144,7 +163,7 @@ impl Context<'_> {
             });
             rendered.push(Rendered { screen_probe, absolute_screen_probe, radii, max_weights: output.stats.max_weights, camera });
         }
-        let Some(mut loss) = total else { return Ok(None) };
+        let Some(mut loss) = total else { return Ok(Outcome::Stepped) };
         if let (Some(deformer), Some(&view), Some(spatial)) = (&state.deformer, batch.first(), &spatial) {
             let time_norm = scene.views[view].time_norm;
             if state.smooth {
@@ -164,7 +183,7 @@ impl Context<'_> {
             let value = to_vec(loss.clone(), "loss")?.first().copied().unwrap_or(f32::NAN);
             if !value.is_finite() {
                 // The terms of the images are finite, so it is one of the others.
-                return Ok(Some(Trouble::new("the regularizer of deformer or appearance model, or smoothness")));
+                return Ok(Outcome::Trouble(Trouble::new("the regularizer of deformer or appearance model, or smoothness")));
             }
             if read {
                 log.loss(value);
@@ -173,8 +192,11 @@ impl Context<'_> {
 
         let gradients = loss.backward();
         if !state.capacities.sufficed(&pairs)? {
-            // Nothing has changed yet.
-            return self.photometric_step(schedule, state, batch, check, log);
+            return Ok(Outcome::TooManyPairs);
+        }
+        if let Some(Spatial { work, .. }) = &spatial {
+            let moving = rows.count() as u64;
+            log.count_deformer(work.vertices_decoded, work.vertices_queried - work.vertices_decoded, moving, n as u64 - moving);
         }
         for Rendered { screen_probe, absolute_screen_probe, radii, max_weights, camera } in rendered {
             let gradient_of = |probe: Option<Tensor<2>>| probe.and_then(|probe| probe.grad(&gradients));
@@ -185,7 +207,7 @@ impl Context<'_> {
         }
         let of_gaussians = leaves.gradients(&gradients);
         if check && let Some(trouble) = broken_gradient(state, &of_gaussians, &gradients)? {
-            return Ok(Some(trouble));
+            return Ok(Outcome::Trouble(trouble));
         }
         let deformed = spatial.is_some();
         // Whoever else holds the values would keep the optimizer from working in place.
@@ -223,7 +245,7 @@ impl Context<'_> {
         let of_group = |group: &ParameterGroup| rates.of_appearance() * of_group(group);
         parameters::update("appearance/", appearance.parameters_mut(), Vec::new(), &groups, &gradients, optimizer.as_mut(), of_group)?;
         log.step(self.job.events, schedule.iteration, state.set.len());
-        Ok(None)
+        Ok(Outcome::Stepped)
     }
 
     /// One optimizer step of the Gaussians' attributes that have a gradient.
@@ -283,14 +305,12 @@ impl Context<'_> {
 }
 
 /// Features of the moving Gaussians. Their centres are constants, which makes caching in playback exact; attributes of the deformer are tracked.
-fn spatial_pass(deformer: &ModelDeformer, leaves: &Leaves, rows: &MovingRows, log: &mut Log, total: usize) -> Result<Spatial> {
+fn spatial_pass(deformer: &ModelDeformer, leaves: &Leaves, rows: &MovingRows) -> Result<Spatial> {
     let means_world = Tensor::<2>::from_inner(rows.select(leaves.get("means")?.clone().inner()));
     let attributes = deformer.field.attributes().iter().map(|a| Ok(rows.select(leaves.get(&a.name)?.clone()))).collect::<Result<_>>()?;
     let input = SpatialInput { means_world, attributes };
     let spatial = deformer.field.spatial(&input)?;
-    let (work, moving) = (spatial.work, rows.count() as u64);
-    log.count_deformer(work.vertices_decoded, work.vertices_queried - work.vertices_decoded, moving, total as u64 - moving);
-    Ok(Spatial { input, features: spatial.values })
+    Ok(Spatial { input, features: spatial.values, work: spatial.work })
 }
 
 /// The first gradient that is not finite.

@@ -72,7 +72,6 @@ impl Lists {
         if points.len() < 2 || points.iter().flatten().any(|v| !v.is_finite()) {
             return None;
         }
-        // Of length 1 where there is no neighbour, as if neither had moved.
         let mut lists: Vec<[(usize, f32, f32); MOST]> = (0..points.len()).map(|i| [(i, f32::INFINITY, 0.0); MOST]).collect();
         let mut lengths = vec![0; points.len()];
         let mut total = 0.0f32;
@@ -92,6 +91,7 @@ impl Lists {
         let direction = |(i, j, distance, weight): (usize, usize, f32, f32)| (0..3usize).map(move |k| (k, i, j, distance, weight));
         let component = |(k, i, j, distance, weight): (usize, usize, usize, f32, f32)| match weight > 0.0 {
             true => (points[i][k] - points[j][k]) / distance,
+            // Of length 1 where there is no neighbour, as if neither had moved.
             false => f32::from(u8::from(k == 0)),
         };
         let directions: Vec<f32> = slots().flat_map_iter(direction).map(component).collect();
