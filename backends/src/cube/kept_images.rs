@@ -13,7 +13,7 @@ struct Entry<T> {
     made: T,
 }
 
-/// Images by where they are used and by their address in memory, as long as somebody else has them.
+/// What was made of images, by the place it is used in (`K`: a thread and a device) and the image's address. An entry lasts as long as somebody else has the image.
 pub struct KeptImages<K, T> {
     most_bytes: usize,
     bytes: usize,

@@ -1,4 +1,4 @@
-//! Which tiles of a footprint's box its ellipse meets: half of the pairs of slanted, narrow Gaussians would draw nothing.
+//! Which tiles of a footprint's box its ellipse meets: pairs with the others would draw nothing.
 //!
 //! The box is divided into up to 32 cells, eight along its longer side and four along the other, of whole tiles; a bit says whether the ellipse meets a cell.
 //! Up to eight by four tiles, each is a cell of its own. The bits are stored, so that whoever counts pairs and whoever lists them agree whatever their compilers round.

@@ -55,7 +55,8 @@ impl Context<'_> {
         Ok(if let Outcome::Trouble(trouble) = outcome { Some(trouble) } else { None })
     }
 
-    /// The same. Where pairs are not counted before they are drawn, there may be too many of them; parameters and statistics are then as they were.
+    /// One attempt at [`Context::photometric_step`]. With `count`, pairs are counted before a view is drawn. Without, there may be more than the capacity; parameters
+    /// and statistics are then as they were.
     fn attempt(&self, schedule: &Schedule, state: &mut TrainState, batch: &[usize], check: bool, count: bool, log: &mut Log) -> Result<Outcome> {
         let train = &self.job.config.train;
         let scene = self.pyramid.at(schedule.image_scale);
