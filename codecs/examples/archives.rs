@@ -100,7 +100,9 @@ impl Case<'_> {
             return Err(Error::backend(format!("archive {}", self.name), problem, "Choose Gaussians and settings for which the codec writes it"));
         }
         let weights = [WeightArray { name: "table".into(), shape: vec![64, 48], values: (0..64 * 48).map(|i| draw(i, 8)).collect() }];
-        let context = CodecContext::new(weight_seed(ROOT), Limits::default(), &Silent);
+        // Codecs that have steps of their own for rows are given what these follow from.
+        let importance = [(0..64 * 48).map(|i| 2f32.powi(i / 16 % 20)).collect::<Vec<f32>>()];
+        let context = CodecContext { weight_importance: Some(&importance), ..CodecContext::new(weight_seed(ROOT), Limits::default(), &Silent) };
         let weights = (weight_plugin.build)(&toml::Table::new())?.encode(&weights, &context)?;
         let weights = weights.into_iter().map(|s| Stream { name: format!("{FIELD_STREAMS}{}", s.name), ..s });
         let bytes = ArchiveWriter::new(manifest).add_all(StreamKind::Canonical, streams).add_all(StreamKind::Field, weights).to_bytes()?;

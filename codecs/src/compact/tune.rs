@@ -80,7 +80,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
     let mut model = tuner.start(job.planner.gaussians)?;
     let before = tuner.psnr(&model.gaussians, &model.weights, None)?;
     let untuned = before - tuner.psnr(&found.attempt.rounded, &model.weights, Some(1.0))?;
-    let first_bytes = bytes_of(found.streams) + tuner.weight_bytes(&model.weights, 1.0)?;
+    let first_bytes = bytes_of(found.streams) + weight_bytes(tuner, &model.weights, 1.0)?;
     note(context, format!("without fine-tuning {:.4} MB with the deformer's weights, PSNR {untuned:.3} dB lower", megabytes(first_bytes)));
     // Weights are rounded too, and the loss was measured on fewer views before.
     let allowed = match goal {
@@ -107,7 +107,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         Goal::Drop(limit) => planned(&forecast, *limit, 0, false).clamp(0.0, FIRST),
         Goal::Bytes(limit) => {
             let (weights, saved) = weights_and_saved(tuner, &model.weights, libm::exp2(of_weights))?;
-            let file = file_bytes(context, found.streams, None)? - tuner.weight_bytes(&model.weights, 1.0)? as f64 + weights;
+            let file = file_bytes(context, found.streams, None)? - weight_bytes(tuner, &model.weights, 1.0)? as f64 + weights;
             ((file - SIZE_AIM * limit) / (per_octave + saved)).clamp(-FIRST, FIRST)
         }
     };
@@ -125,7 +125,7 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         model.gaussians = canonical(&model.gaussians, &job.free);
         let streams = job.streams(&model.gaussians, &plan)?;
         let drop = before - tuner.psnr(&job.rounded(&model.gaussians, &plan), &model.weights, Some(weight_steps))?;
-        let bytes = bytes_of(&streams) + tuner.weight_bytes(&model.weights, weight_steps)?;
+        let bytes = bytes_of(&streams) + weight_bytes(tuner, &model.weights, weight_steps)?;
         let (number, steps, gaussians) = (round + 1, libm::exp2(octaves), megabytes(bytes_of(&streams)));
         note(
             context,
@@ -164,10 +164,15 @@ fn saved_by_doubling(job: &Job, planner: &Planner, quality: f64, bytes: usize) -
     Ok(bytes.saturating_sub(bytes_of(&job.streams(planner.gaussians, &coarser)?)).max(1) as f64)
 }
 
-/// Bytes of weights in such steps, and those that steps twice as large save.
+/// Bytes of weights in such steps.
+fn weight_bytes(tuner: &dyn TuneModel, weights: &[WeightArray], steps: f64) -> Result<usize> {
+    Ok(bytes_of(&tuner.encoded_weights(weights, steps)?.0))
+}
+
+/// The same, and those that steps twice as large save.
 fn weights_and_saved(tuner: &dyn TuneModel, weights: &[WeightArray], steps: f64) -> Result<(f64, f64)> {
-    let bytes = tuner.weight_bytes(weights, steps)? as f64;
-    Ok((bytes, (bytes - tuner.weight_bytes(weights, 2.0 * steps)? as f64).max(0.0)))
+    let bytes = weight_bytes(tuner, weights, steps)? as f64;
+    Ok((bytes, (bytes - weight_bytes(tuner, weights, 2.0 * steps)? as f64).max(0.0)))
 }
 
 /// By how many octaves the steps of the weights should grow more than those of the Gaussians, so that a byte more of either is worth the same. Losses grow with squared
@@ -196,7 +201,7 @@ mod tests {
     use super::super::encode::classify;
     use super::super::{Choices, Motion, importance, layers};
     use super::*;
-    use cc4dgs_format::{HostGaussians, Seed, Silent};
+    use cc4dgs_format::{EncodedWeights, HostGaussians, Seed, Silent};
     use std::cell::{Cell, RefCell};
     use std::collections::BTreeMap;
 
@@ -232,16 +237,13 @@ mod tests {
             self.measured.borrow_mut().insert(weights[0].values[0] as u32, psnr);
             Ok(psnr)
         }
-        fn weight_bytes(&self, _: &[WeightArray], _: f64) -> Result<usize> {
-            Ok(0)
-        }
-        fn weight_settings(&self, _: f64) -> Result<toml::Table> {
-            Ok(toml::Table::new())
+        fn encoded_weights(&self, _: &[WeightArray], _: f64) -> Result<EncodedWeights> {
+            Ok(EncodedWeights::default())
         }
         fn adopt(&self, weights: Vec<WeightArray>, _: f64) {
             self.adopted.set(weights[0].values[0] as u32);
         }
-        fn adopted(&self) -> Result<Option<(Vec<WeightArray>, toml::Table)>> {
+        fn adopted(&self) -> Result<Option<EncodedWeights>> {
             Ok(None)
         }
     }

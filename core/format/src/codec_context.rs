@@ -17,6 +17,8 @@ pub struct CodecContext<'a> {
     pub renderer: Option<&'a dyn RenderModel>,
     /// The deformer of the model; `None` for static models.
     pub deformer: Option<&'a dyn EvaluateDeformer>,
+    /// For a weight codec: how much images depend on each weight of each array in turn, the mean over views of the sum over pixels of the squared derivative.
+    pub weight_importance: Option<&'a [Vec<f32>]>,
     /// Trains the model further with rounded values.
     pub tuner: Option<&'a dyn TuneModel>,
     /// A Gaussian may move if and only if its dynamic score is above this: minus infinity if all may, infinity if none does. `None` if that is not known.
@@ -26,13 +28,24 @@ pub struct CodecContext<'a> {
 }
 
 /// The bytes of the whole file that has these streams of Gaussians: header and weights of the deformer included. The weights are those of the model as they are
-/// stored, or others, in steps so many times larger ([`TuneModel::weight_settings`]).
+/// stored, or others, in steps so many times larger ([`TuneModel::encoded_weights`]).
 pub type FileBytes<'a> = dyn Fn(&[Stream], Option<(&[WeightArray], f64)>) -> Result<u64> + 'a;
 
 impl<'a> CodecContext<'a> {
     /// A context without scene, renderer and deformer, as for decoding.
     pub fn new(seed: Seed, limits: Limits, events: &'a dyn EventSink) -> Self {
-        Self { seed, limits, events, views: None, renderer: None, deformer: None, tuner: None, dynamic_threshold: None, file_bytes: None }
+        Self {
+            seed,
+            limits,
+            events,
+            views: None,
+            renderer: None,
+            deformer: None,
+            weight_importance: None,
+            tuner: None,
+            dynamic_threshold: None,
+            file_bytes: None,
+        }
     }
 }
 

@@ -47,6 +47,6 @@ pub use rules::{BLUR, BLUR_RANGE, Rules, blur_at};
 pub use seed::Seed;
 pub use similarity::Similarity;
 pub use stored_model::{FIELD_STREAMS, MOVING, StoredModel, canonical_stages, read_gaussians, read_stage, read_weights, weight_seed};
-pub use tuning::{Rounding, TuneModel, TunedModel, Tuning};
-pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin};
+pub use tuning::{EncodedWeights, Rounding, TuneModel, TunedModel, Tuning};
+pub use weight_codec::{WeightArray, WeightCodec, WeightCodecPlugin, WeightSteps};
 pub use {inventory, serde, toml};

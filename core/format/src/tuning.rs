@@ -3,7 +3,7 @@
 //! The codec knows how values are rounded ([`Rounding`]), the trainer has renderer, images and optimizer ([`TuneModel`]). Images are drawn with rounded
 //! values, and what their derivatives say is applied to the values before rounding (the straight-through estimator, Bengio et al. 2013).
 
-use crate::{HostGaussians, Result, Seed, WeightArray};
+use crate::{HostGaussians, Result, Seed, Stream, WeightArray};
 
 /// How a codec that has chosen its steps rounds Gaussians.
 pub trait Rounding {
@@ -32,6 +32,9 @@ pub struct TunedModel {
     /// The weights of the deformer; none without one.
     pub weights: Vec<WeightArray>,
 }
+
+/// Streams of a deformer's weights, and the settings of the weight codec that encoded them.
+pub type EncodedWeights = (Vec<Stream>, toml::Table);
 
 /// One training.
 pub struct Tuning<'a> {
@@ -75,21 +78,16 @@ pub trait TuneModel {
     /// # Errors
     /// What scene and parts report.
     fn psnr(&self, gaussians: &HostGaussians, weights: &[WeightArray], weight_steps: Option<f64>) -> Result<f64>;
-    /// Bytes that `weights` take in such steps.
+    /// `weights` in such steps, as they are stored; nothing where there are none.
     ///
     /// # Errors
     /// What the weight codec reports.
-    fn weight_bytes(&self, weights: &[WeightArray], weight_steps: f64) -> Result<usize>;
-    /// Settings of the weight codec for steps that are `weight_steps` times those chosen without training.
-    ///
-    /// # Errors
-    /// What the weight codec reports.
-    fn weight_settings(&self, weight_steps: f64) -> Result<toml::Table>;
+    fn encoded_weights(&self, weights: &[WeightArray], weight_steps: f64) -> Result<EncodedWeights>;
     /// States that the codec's streams hold Gaussians that were trained with `weights`, which are to be stored in such steps.
     fn adopt(&self, weights: Vec<WeightArray>, weight_steps: f64);
-    /// The weights that were adopted and the settings of their codec; `None` if none were.
+    /// The weights that were adopted, as they are stored; `None` if none were.
     ///
     /// # Errors
     /// What the weight codec reports.
-    fn adopted(&self) -> Result<Option<(Vec<WeightArray>, toml::Table)>>;
+    fn adopted(&self) -> Result<Option<EncodedWeights>>;
 }

@@ -14,6 +14,15 @@ pub struct WeightArray {
     pub values: Vec<f32>,
 }
 
+/// What a training needs to know of how weights are stored.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct WeightSteps {
+    /// The distance of neighbouring values that can be stored, for every value of every array; 0 where there is only one.
+    pub steps: Vec<Vec<f32>>,
+    /// The derivative of the estimated size in bits by every value, in steps.
+    pub bit_slopes: Vec<Vec<f32>>,
+}
+
 /// Weights of a deformer to bytes and back. Every weight codec can store the weights of every deformer.
 ///
 /// [`crate::storage::write_shapes`] and [`crate::storage::read_shapes`] write, read and check names and shapes.
@@ -22,6 +31,14 @@ pub trait WeightCodec: Send + Sync {
     fn encode(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Vec<Stream>>;
     /// Decodes what [`WeightCodec::encode`] wrote: the same names and shapes in the same order, finite values. Bytes are untrusted: an error, never a panic.
     fn decode(&self, streams: &[Stream], context: &CodecContext) -> Result<Vec<WeightArray>>;
+    /// How far apart values that can be stored are, for a training that goes on while they are rounded; `None` where the codec does not say.
+    ///
+    /// # Errors
+    /// As [`WeightCodec::encode`].
+    fn steps(&self, weights: &[WeightArray], context: &CodecContext) -> Result<Option<WeightSteps>> {
+        let _ = (weights, context);
+        Ok(None)
+    }
     /// The largest absolute error of a value over the largest absolute value of its array; `0` is bit-exact. The conformance suite checks it.
     fn loss(&self) -> f64;
 }

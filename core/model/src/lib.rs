@@ -35,12 +35,12 @@ pub use appearance::{Appearance, AppearanceContext, AppearancePlugin};
 pub use burn;
 pub use cc4dgs_format as format;
 pub use cc4dgs_format::{
-    AttributeCodec, BLUR, BLUR_RANGE, Camera, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Entries, Error, EvaluateDeformer, Event, EventSink,
-    ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, ExtraAttribute, FIELD_STREAMS, Fanout, FileBytes, GaussianFile, HostGaussians,
-    Image8, Limits, MOVING, Moving, NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rounding, Rules, Seed, Silent, Similarity,
-    StoredModel, Stream, StreamStage, TrainingViews, TuneModel, TunedModel, Tuning, WeightArray, WeightCodec, WeightCodecPlugin, archive, blur_at, by_likeness,
-    canonical_stages, config, exporter, inventory, playback, plugin_kind, ply, psnr_of, psnr_on_views, read_gaussians, read_stage, read_weights, serde,
-    split_kind, spz, storage, toml, unknown_name, weight_seed,
+    AttributeCodec, BLUR, BLUR_RANGE, Camera, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, EncodedWeights, Entries, Error, EvaluateDeformer,
+    Event, EventSink, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, ExtraAttribute, FIELD_STREAMS, Fanout, FileBytes,
+    GaussianFile, HostGaussians, Image8, Limits, MOVING, Moving, NeededRows, Plugin, PluginEntry, Recorder, RenderModel, RenderedPlanes, Result, Rounding,
+    Rules, Seed, Silent, Similarity, StoredModel, Stream, StreamStage, TrainingViews, TuneModel, TunedModel, Tuning, WeightArray, WeightCodec,
+    WeightCodecPlugin, WeightSteps, archive, blur_at, by_likeness, canonical_stages, config, exporter, inventory, playback, plugin_kind, ply, psnr_of,
+    psnr_on_views, read_gaussians, read_stage, read_weights, serde, split_kind, spz, storage, toml, unknown_name, weight_seed,
 };
 pub use deformer::{
     AttributeSpec, BuildLayer, Deformer, DeformerLayerPlugin, DeformerPlugin, DeformerWork, Parameter, ParameterGroup, Part, Simplified, SpatialFeatures,

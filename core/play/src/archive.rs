@@ -1,7 +1,7 @@
 //! A model as a `.cc4d` archive.
 
 use crate::codec_services::{ModelServices, SceneViews};
-use crate::field_weights::{EncodedWeights, StoredField};
+use crate::field_weights::StoredField;
 use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
 use crate::{Moving, RenderConfig};
@@ -11,8 +11,8 @@ use cc4dgs_core::format::check_linked;
 use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::playback::PlaybackLayer;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, Deformer, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream, StreamStage,
-    TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
+    AttributeCodec, CodecContext, Deformer, EncodedWeights, Error, EventSink, HostGaussians, Limits, MOVING, NeededRows, Registry, Result, Scene, Seed, Stream,
+    StreamStage, TrainingViews, TuneModel, WeightArray, read_gaussians, read_weights, split_kind, weight_seed,
 };
 use serde::Serialize;
 use serde_json::Value;
@@ -179,19 +179,18 @@ impl Model {
             first.add_all(StreamKind::Canonical, harmonics)
         };
         let (seed, device) = (weight_seed(self.provenance.seed), scene.map(|(_, device)| device));
-        let encode_tuned = |tuned: &[WeightArray], settings: toml::Table| -> Result<Option<EncodedWeights>> {
-            let Some(stored) = &weights else { return Ok(None) };
-            Ok(Some((registry.build_weight_codec(&stored.chosen.name, &settings)?.encode(tuned, &context(seed))?, settings)))
-        };
         let untuned = OnceCell::new();
         let encode_weights = || -> Result<Option<EncodedWeights>> {
             let Some((stored, f)) = weights.as_ref().zip(field) else { return Ok(None) };
-            stored.chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context(seed), registry).map(Some)
+            let measured = device.zip(views.as_ref());
+            let importance = measured.map(|(device, views)| stored.chosen.importance(self, views, registry, device)).transpose()?.flatten();
+            let context = CodecContext { weight_importance: importance.as_deref(), ..context(seed) };
+            stored.chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context, registry).map(Some)
         };
         // A codec whose size is bounded asks for this.
         let file_bytes = |streams: &[Stream], tuned: Option<(&[WeightArray], f64)>| -> Result<u64> {
             let found = match tuned.zip(tuner) {
-                Some(((weights, steps), tuner)) => encode_tuned(weights, tuner.weight_settings(steps)?)?,
+                Some(((tuned, steps), tuner)) => weights.as_ref().map(|_| tuner.encoded_weights(tuned, steps)).transpose()?,
                 None => {
                     if untuned.get().is_none() {
                         let _ = untuned.set(encode_weights()?);
@@ -204,7 +203,7 @@ impl Model {
         let gaussians = self.for_codec(codec.as_ref());
         let streams = codec.encode(&gaussians, &CodecContext { file_bytes: Some(&file_bytes), ..context(codec_seed(self.provenance.seed)) })?;
         let found = match tuner.filter(|_| weights.is_some()).map(TuneModel::adopted).transpose()?.flatten() {
-            Some((tuned, settings)) => encode_tuned(&tuned, settings)?,
+            Some(tuned) => Some(tuned),
             None => untuned.into_inner().map_or_else(encode_weights, Ok)?,
         };
         Ok(assembled(streams, &found))

@@ -66,6 +66,11 @@ impl<'a> ModelServices<'a> {
         self.deformer = Some(deformer);
         self
     }
+    /// The image `[3,H,W]` of the model's own Gaussians, which a tracked deformer moves.
+    pub(crate) fn image(&self, gaussians: &HostGaussians, camera: &Camera, time_norm: f32) -> Result<Tensor<3>> {
+        let moved = self.moved(gaussians, time_norm)?;
+        Ok(self.rasterizer.render(&Splats::from_gaussians(&moved, moved.sh_degree), camera, &self.settings)?.image())
+    }
     fn moved(&self, host: &HostGaussians, time_norm: f32) -> Result<Gaussians> {
         let canonical = Gaussians::from_host(host, &self.device);
         let rows = self.model.moving.rows(&host.dynamic_scores);
@@ -144,7 +149,7 @@ impl RenderModel for ModelServices<'_> {
 }
 
 /// `count` numbers of 1 and -1.
-fn rand_signs(seed: Seed, count: usize) -> Vec<f32> {
+pub(crate) fn rand_signs(seed: Seed, count: usize) -> Vec<f32> {
     let word = |k: usize| seed.index(k as u64).value();
     (0..count.div_ceil(64)).flat_map(|k| (0..64).map(move |bit| if word(k) >> bit & 1 == 1 { 1.0 } else { -1.0 })).take(count).collect()
 }

@@ -3,11 +3,12 @@
 use crate::archive::{load_weights, weights_of};
 use crate::codec_services::{ModelServices, SceneViews};
 use crate::model::{Model, ModelDeformer};
+use crate::weight_importance::weight_importance;
 use burn::tensor::Device;
 use cc4dgs_core::archive::{CodecEntry, DeformerEntry};
 use cc4dgs_core::{
-    CodecContext, DeformerContext, Error, Event, EventSink, FIELD_STREAMS, Limits, Plugin, Registry, Result, Scene, Stream, WeightArray, config, psnr_on_views,
-    split_kind, weight_seed,
+    CodecContext, DeformerContext, EncodedWeights, Error, Event, EventSink, FIELD_STREAMS, Limits, Plugin, Registry, Result, Scene, Stream, TrainingViews,
+    WeightArray, config, psnr_on_views, split_kind, weight_seed,
 };
 use std::ops::RangeInclusive;
 
@@ -56,6 +57,16 @@ impl FieldWeights {
         out.max_drop_db = Some(number.ok_or_else(|| Error::parameter(object, format!("'{limit}' is no number of dB"), "Write compact:max-drop=0.01dB"))?);
         Ok(out)
     }
+    /// How much images depend on each weight of `model`, where the codec makes use of it; measured on training views.
+    ///
+    /// # Errors
+    /// What the deformer and the device report.
+    pub fn importance(&self, model: &Model, views: &dyn TrainingViews, registry: &Registry, device: &Device) -> Result<Option<Vec<Vec<f32>>>> {
+        if views.is_empty() || !registry.weight_codec(&self.name)?.info.capabilities.contains(&"importance") {
+            return Ok(None);
+        }
+        weight_importance(model, views, weight_seed(model.provenance.seed).child("importance"), registry, device).map(Some)
+    }
     /// The weights of `field` as streams, and the settings that were chosen.
     pub(crate) fn encode(
         &self,
@@ -99,9 +110,6 @@ impl FieldWeights {
     }
 }
 
-/// Streams, and the settings that they were encoded with.
-pub(crate) type EncodedWeights = (Vec<Stream>, toml::Table);
-
 /// How an archive describes the weights of its deformer.
 pub(crate) struct StoredField<'a> {
     /// The weight codec.
@@ -133,14 +141,14 @@ impl<'a> StoredField<'a> {
 }
 
 impl FieldWeights {
-    /// The settings of the weight codec for `model`, searched on the training views of `scene` where the loss was stated.
+    /// The settings of the weight codec for `model`, searched on the training views of `scene` where the loss was stated. `importance` is [`FieldWeights::importance`].
     ///
     /// # Errors
     /// As [`Model::save_archive`].
     pub fn settings_for(
         &self,
         model: &Model,
-        scene: &Scene,
+        (scene, importance): (&Scene, Option<&[Vec<f32>]>),
         registry: &Registry,
         device: &Device,
         limits: &Limits,
@@ -148,7 +156,7 @@ impl FieldWeights {
     ) -> Result<toml::Table> {
         let Some(of) = model.field.as_ref().filter(|_| self.max_drop_db.is_some()) else { return Ok(self.settings.clone()) };
         let (views, seed) = (SceneViews::new(scene), weight_seed(model.provenance.seed));
-        let context = CodecContext { views: Some(&views), ..CodecContext::new(seed, *limits, events) };
+        let context = CodecContext { views: Some(&views), weight_importance: importance, ..CodecContext::new(seed, *limits, events) };
         Ok(self.encode(model, &weights_of(of.field.as_ref())?, Some(device), &context, registry)?.1)
     }
     /// `settings` with steps `factor` times as large, in quarters of a bit; unchanged where bits were not searched.

@@ -18,6 +18,7 @@ pub mod presentation;
 pub mod prune;
 mod render;
 pub mod source;
+mod weight_importance;
 
 pub use archive::{ArchiveOptions, attribute_width, load_weights, weights_of};
 pub use cc4dgs_core::Moving;

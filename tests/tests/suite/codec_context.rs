@@ -4,13 +4,14 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_core::SceneOptions;
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, DeformerContext, Event, ExtraAttribute, HostGaussians, Limits, Plugin, Recorder, Registry, Result,
-    Seed, Silent, Stream, inventory,
+    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Deformer, DeformerContext, Event, ExtraAttribute, HostGaussians, Limits, Plugin, Recorder,
+    Registry, Result, Seed, Silent, Stream, inventory,
 };
 use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
 use cc4dgs_play::Moving;
 use cc4dgs_play::RenderConfig;
 use cc4dgs_play::codec_services::{ModelServices, SceneViews};
+use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::{ModelDeformer, ModelSize};
 use cc4dgs_play::player::Player;
 use cc4dgs_play::{ArchiveOptions, Model};
@@ -48,6 +49,8 @@ inventory::submit! {
 }
 
 const COUNT: usize = 90;
+/// A small change of weights.
+const CHANGE: f64 = 2e-4;
 
 /// Every third Gaussian moves, with attributes of its own.
 fn model(registry: &Registry) -> Model {
@@ -112,11 +115,7 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     let section: toml::Table = "kind = \"cdf-basis\"\ncapacity = \"small\"\nresolutions = [8]\nhashes = 16\ntime_bands = 2".parse().unwrap();
     let context = model.field.as_ref().unwrap().context.clone();
     let mut field = registry.build_deformer(&section, &context, &device).unwrap();
-    for parameter in field.parameters_mut() {
-        let [n] = parameter.value.dims();
-        let noise: Vec<f32> = (0..n).map(|k| ((k as f32 + 1.0) * 0.618).sin() * 0.1).collect();
-        parameter.value = parameter.value.clone() + Tensor::<1>::from_floats(noise.as_slice(), &device);
-    }
+    add_noise(field.as_mut(), 0.07, 1, &device);
     (model.field, model.moving) = (Some(ModelDeformer { field, section, context }), Moving::Everything);
     model.gaussians.extra.clear();
     let folder = tempfile::tempdir().unwrap();
@@ -153,6 +152,75 @@ fn weights_take_the_fewest_bits_that_keep_the_psnr() {
     assert!(size(&bounded, "fp16").unwrap() <= most);
     let refused = size(&bounded, "fp32").unwrap_err().to_string();
     assert!(refused.contains("weights of the deformer"), "{refused}");
+}
+
+/// Noise for the weights of a deformer, of the standard deviation 1: array by array.
+fn noise(counts: &[usize], seed: u64) -> Vec<Vec<f32>> {
+    let value = |word: u64| 3f32.sqrt() * ((word >> 40) as f32 / (1u64 << 23) as f32 - 1.0);
+    let array = |(index, &count): (usize, &usize)| (0..count).map(|k| value(Seed::root(seed).index(index as u64).index(k as u64).value())).collect();
+    counts.iter().enumerate().map(array).collect()
+}
+
+/// Gives the weights of `field` so much noise, so that all of them count.
+fn add_noise(field: &mut dyn Deformer, scale: f32, seed: u64, device: &Device) {
+    let counts: Vec<usize> = field.parameters().iter().map(|p| p.value.dims()[0]).collect();
+    for (parameter, noise) in field.parameters_mut().into_iter().zip(noise(&counts, seed)) {
+        parameter.value = parameter.value.clone() + Tensor::<1>::from_floats(noise.as_slice(), device).mul_scalar(scale);
+    }
+}
+
+#[test]
+fn importance_tells_how_much_images_change_with_weights() {
+    let registry = Registry::collect().unwrap();
+    let (device, scene) = (Device::flex(), scene());
+    let views = SceneViews::new(&scene);
+    let context = model(&registry).field.unwrap().context;
+    for (kind, section) in [
+        ("cdf-basis", "capacity = \"small\"\nresolutions = [8]\nhashes = 16"),
+        ("cdf", "capacity = \"small\""),
+        ("hash-basis", ""),
+        ("deform-mlp", "width = 32"),
+        ("hexplane", ""),
+    ] {
+        let mut section: toml::Table = section.parse().unwrap();
+        section.insert("kind".into(), kind.into());
+        let built = |scales: &[f32]| {
+            let mut field = registry.build_deformer(&section, &context, &device).unwrap();
+            scales.iter().zip(1..).for_each(|(scale, seed)| add_noise(field.as_mut(), *scale, seed, &device));
+            let mut out = Model {
+                field: Some(ModelDeformer { field, section: section.clone(), context: context.clone() }),
+                moving: Moving::Everything,
+                ..model(&registry)
+            };
+            out.gaussians.extra.clear();
+            out
+        };
+        let of = built(&[0.05]);
+        let compact = FieldWeights::parse("compact", &registry).unwrap();
+        assert!(FieldWeights::parse("fp16", &registry).unwrap().importance(&of, &views, &registry, &device).unwrap().is_none());
+        let importance = compact.importance(&of, &views, &registry, &device).unwrap().unwrap();
+        let counts: Vec<usize> = of.field.as_ref().unwrap().field.parameters().iter().map(|p| p.value.dims()[0]).collect();
+        assert_eq!(importance.iter().map(Vec::len).collect::<Vec<_>>(), counts, "{kind}");
+        assert!(importance.iter().flatten().all(|v| v.is_finite() && *v >= 0.0), "{kind}");
+        // A small change of all weights that has nothing to do with images.
+        let changes = noise(&counts, 2);
+        let squares = changes
+            .iter()
+            .flatten()
+            .zip(importance.iter().flatten())
+            .map(|(change, importance)| (CHANGE * f64::from(*change)).powi(2) * f64::from(*importance));
+        let expected: f64 = squares.sum();
+        let (mut found, after) = (0.0, built(&[0.05, CHANGE as f32]));
+        let (before, after) = (ModelServices::new(&of, &registry, &device).unwrap(), ModelServices::new(&after, &registry, &device).unwrap());
+        for k in 0..views.len() {
+            let (camera, time_norm) = views.view(k);
+            let [a, b] = [&before, &after].map(|services| services.render(&of.gaussians, camera, time_norm).unwrap().planes);
+            let colours = 3 * camera.width as usize * camera.height as usize;
+            found += a.iter().zip(&b).take(colours).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / views.len() as f64;
+        }
+        println!("{kind}: expected {expected:e}, found {found:e}");
+        assert!(expected > 0.0 && (0.2..5.0).contains(&(found / expected)), "{kind}: images change by {found:e}, {expected:e} was expected");
+    }
 }
 
 #[test]

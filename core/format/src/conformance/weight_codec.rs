@@ -1,7 +1,7 @@
 //! The conformance suite of weight codecs.
 
 use super::uniform;
-use crate::{CodecContext, Limits, Result, Seed, Silent, Stream, WeightArray, WeightCodec, WeightCodecPlugin};
+use crate::{CodecContext, Limits, Result, Seed, Silent, Stream, WeightArray, WeightCodec, WeightCodecPlugin, WeightSteps};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Damaged versions tried per stream.
@@ -12,6 +12,7 @@ const DAMAGES: usize = 48;
 /// - Unknown settings are refused.
 /// - Names, shapes and their order are kept; the error of every value is at most the declared one.
 /// - Equal weights give equal bytes.
+/// - Where it states its steps, no value is further from what comes back than half of one; so it is with [`CodecContext::weight_importance`], too.
 /// - Duplicate names, shapes that do not match the values and values that are not finite are refused.
 /// - Damaged streams give an error or valid weights, never a panic.
 pub fn weight_codec(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Vec<String> {
@@ -30,6 +31,9 @@ pub fn weight_codec(plugin: &WeightCodecPlugin, settings: &toml::Table) -> Vec<S
     note("settings", refuses_unknown_settings(plugin, settings));
     note("weights", comes_back(codec, &weights()));
     note("no weights", comes_back(codec, &[]));
+    note("steps", keeps_steps(codec, &context()));
+    let importance = importance();
+    note("steps by importance", keeps_steps(codec, &CodecContext { weight_importance: Some(&importance), ..context() }));
     note("repeats", repeats(codec));
     note("invalid weights", refuses_unsound(codec));
     note("damaged streams", survives_damage(codec));
@@ -82,6 +86,39 @@ fn comes_back(codec: &dyn WeightCodec, given: &[WeightArray]) -> Result<Option<S
         let kept = if allowed == 0.0 && largest > 0.0 { exact } else { worst <= allowed };
         if !kept || after.values.iter().any(|v| !v.is_finite()) {
             return Ok(Some(format!("'{}' has a relative error of {worst:.2e}, declared is {allowed:.2e}", before.name)));
+        }
+    }
+    Ok(None)
+}
+
+/// Values from none to large, some the same for many weights.
+fn importance() -> Vec<Vec<f32>> {
+    let of = |array: &WeightArray| {
+        let seed = Seed::root(5).child(&array.name);
+        (0..array.values.len()).map(|k| if k % 96 < 32 { 0.0 } else { libm::exp(20.0 * f64::from(uniform(seed, k / 16))) as f32 }).collect()
+    };
+    weights().iter().map(of).collect()
+}
+
+fn keeps_steps(codec: &dyn WeightCodec, context: &CodecContext) -> Result<Option<String>> {
+    let given = weights();
+    let found = codec.decode(&codec.encode(&given, context)?, context)?;
+    let lengths = |arrays: &[Vec<f32>]| arrays.iter().map(Vec::len).collect::<Vec<_>>();
+    let expected: Vec<usize> = given.iter().map(|array| array.values.len()).collect();
+    if found.iter().map(|array| array.values.len()).ne(expected.iter().copied()) {
+        return Ok(Some("arrays changed their sizes".into()));
+    }
+    let Some(WeightSteps { steps, bit_slopes }) = codec.steps(&given, context)? else { return Ok(None) };
+    if lengths(&steps) != expected || lengths(&bit_slopes) != expected {
+        return Ok(Some("there are not as many steps as values".into()));
+    }
+    for ((before, after), (steps, slopes)) in given.iter().zip(&found).zip(steps.iter().zip(&bit_slopes)) {
+        for ((a, b), (step, slope)) in before.values.iter().zip(&after.values).zip(steps.iter().zip(slopes)) {
+            let (error, most) = ((f64::from(*a) - f64::from(*b)).abs(), 0.5 * f64::from(*step) + 1e-6 * f64::from(a.abs()));
+            // NaN fails this comparison.
+            if !(error <= most && slope.is_finite()) {
+                return Ok(Some(format!("'{}' has an error of {error:.2e} and steps of {step:.2e}, its size a slope of {slope}", before.name)));
+            }
         }
     }
     Ok(None)

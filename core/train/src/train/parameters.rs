@@ -1,5 +1,6 @@
 //! Weights of plug-ins under optimisation: group schedules, gradient clipping, one optimizer step.
 
+use super::rounded::{ExactWeights, WeightScales};
 use crate::gaussian_set::log_linear;
 use burn::tensor::{Gradients, Tensor};
 use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings, ordered_sum};
@@ -18,11 +19,11 @@ pub(crate) fn track(parameters: Vec<&mut Parameter>) {
 }
 
 /// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `rate` gives the learning
-/// rate of a group. Where there are `exact` values, the tracked ones were rounded from them, and they are stepped instead.
+/// rate of a group. Where there are `exact` values, the tracked ones were rounded from them, and they are stepped instead, in their own steps where they have some.
 pub(crate) fn update(
     prefix: &str,
     mut parameters: Vec<&mut Parameter>,
-    exact: Vec<Tensor<1>>,
+    exact: ExactWeights,
     groups: &[ParameterGroup],
     gradients: &Gradients,
     optimizer: &mut dyn Optimizer,
@@ -39,8 +40,9 @@ pub(crate) fn update(
             gradient_of[i] = gradient_of[i].take().map(|t| t * scale.clone());
         }
     }
-    let mut exact = exact.into_iter();
-    for (parameter, gradient) in parameters.iter_mut().zip(gradient_of) {
+    let ExactWeights { values, scales } = exact;
+    let mut exact = values.into_iter();
+    for (index, (parameter, gradient)) in parameters.iter_mut().zip(gradient_of).enumerate() {
         let device = parameter.value.device();
         // Moved out, so that the optimizer holds the only reference and works in place.
         let tracked = std::mem::replace(&mut parameter.value, Tensor::empty([0], &device));
@@ -50,9 +52,15 @@ pub(crate) fn update(
             continue;
         };
         let group = &groups[parameter.group];
-        let settings = StepSettings { epsilon: group.epsilon, ..StepSettings::new(rate(group)) };
         let count = value.dims()[0];
         let name = format!("{prefix}{}", parameter.name);
+        if let Some((WeightScales { steps, size }, rate)) = &scales {
+            let gradient = (gradient * steps[index].clone() + size[index].clone()).reshape([count, 1]);
+            let moved = optimizer.step(&name, gradient.zeros_like(), gradient, &StepSettings::new(*rate))?;
+            parameter.value = value + moved.reshape([count]) * steps[index].clone();
+            continue;
+        }
+        let settings = StepSettings { epsilon: group.epsilon, ..StepSettings::new(rate(group)) };
         parameter.value = optimizer.step(&name, value.reshape([count, 1]), gradient.reshape([count, 1]), &settings)?.reshape([count]);
     }
     Ok(())

@@ -14,19 +14,43 @@ pub(crate) struct Rounded {
     pub steps: BTreeMap<String, Tensor<2>>,
     /// What is added to the derivatives by values in steps, by attribute `[N,width]`: those of the size.
     pub size: BTreeMap<String, Tensor<2>>,
-    /// Learning rate of the Gaussians, in steps.
+    /// Learning rate in steps.
     pub rate: f64,
     /// Weights of the deformer as they will be decoded, in the order of its parameters; the deformer's own lie in `exact_weights` between
     /// [`Rounded::exchange_weights`] and the step.
     pub weights: Vec<Tensor<1>>,
+    /// The weights' steps, where they have some.
+    pub weight_scales: Option<WeightScales>,
     /// The weights that were exchanged.
     pub exact_weights: Vec<Tensor<1>>,
+}
+
+/// Weights in steps.
+#[derive(Clone)]
+pub(crate) struct WeightScales {
+    /// The distance of neighbouring values, array by array.
+    pub steps: Vec<Tensor<1>>,
+    /// What is added to the derivatives by values in steps: those of the size.
+    pub size: Vec<Tensor<1>>,
+}
+
+/// What the optimizer steps in place of tracked weights.
+#[derive(Default)]
+pub(crate) struct ExactWeights {
+    /// The values before rounding; empty where nothing is rounded.
+    pub values: Vec<Tensor<1>>,
+    /// Their steps and the learning rate in these, where they have some.
+    pub scales: Option<(WeightScales, f64)>,
 }
 
 impl Rounded {
     /// Gives a deformer the rounded weights and keeps its own.
     pub fn exchange_weights(&mut self, parameters: Vec<&mut Parameter>) {
         self.exact_weights = parameters.into_iter().zip(&self.weights).map(|(p, rounded)| std::mem::replace(&mut p.value, rounded.clone())).collect();
+    }
+    /// The exchanged weights, with their steps.
+    pub fn exact(&mut self) -> ExactWeights {
+        ExactWeights { values: std::mem::take(&mut self.exact_weights), scales: self.weight_scales.take().map(|scales| (scales, self.rate)) }
     }
     /// One optimizer step of the attributes that have steps. Values are measured in their steps, so that one learning rate does for all: the codec chose steps
     /// that change images alike.

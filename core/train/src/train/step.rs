@@ -4,6 +4,7 @@ use super::capacity::Drawn;
 use super::dropout;
 use super::log::Log;
 use super::probe::psnr_db;
+use super::rounded::{ExactWeights, Rounded};
 use super::smoothness::{flicker, smoothness};
 use super::watchdog::{Trouble, is_finite};
 use super::{Context, TrainState, parameters};
@@ -237,14 +238,14 @@ impl Context<'_> {
         let TrainState { deformer, appearance, optimizer, .. } = state;
         if let Some(deformer) = deformer.as_mut().filter(|_| deformed) {
             let groups = deformer.field.groups();
-            let exact = state.rounded.as_mut().map(|rounded| std::mem::take(&mut rounded.exact_weights)).unwrap_or_default();
+            let exact = state.rounded.as_mut().map(Rounded::exact).unwrap_or_default();
             parameters::update("deformer/", deformer.field.parameters_mut(), exact, &groups, &gradients, optimizer.as_mut(), |group| {
                 rates.of_deformer() * of_group(group)
             })?;
         }
         let groups = appearance.groups();
         let of_group = |group: &ParameterGroup| rates.of_appearance() * of_group(group);
-        parameters::update("appearance/", appearance.parameters_mut(), Vec::new(), &groups, &gradients, optimizer.as_mut(), of_group)?;
+        parameters::update("appearance/", appearance.parameters_mut(), ExactWeights::default(), &groups, &gradients, optimizer.as_mut(), of_group)?;
         log.step(self.job.events, schedule.iteration, state.set.len());
         Ok(Outcome::Stepped)
     }

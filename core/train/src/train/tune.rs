@@ -4,7 +4,7 @@ use super::log::Log;
 use super::losses::LossTerms;
 use super::probe::mean;
 use super::pyramid::Pyramid;
-use super::rounded::Rounded;
+use super::rounded::{Rounded, WeightScales};
 use super::sampler::Sampler;
 use super::targets::{had_colours_per_camera, targets};
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
@@ -14,9 +14,10 @@ use crate::sample::spread_views;
 use crate::schedule::StageLengths;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::{
-    AppearanceContext, CodecContext, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, Stream, TuneModel,
-    TunedModel, Tuning, WeightArray, WeightCodec, config, psnr_of,
+    AppearanceContext, CodecContext, EncodedWeights, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage,
+    TuneModel, TunedModel, Tuning, WeightArray, WeightCodec, WeightSteps, config, psnr_of, weight_seed,
 };
+use cc4dgs_play::codec_services::SceneViews;
 use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, load_weights, weights_of};
@@ -30,11 +31,11 @@ const JUDGES: usize = 48;
 const PROBES: usize = 8;
 /// Views per iteration. With one, training loses more than rounding.
 const BATCH: usize = 4;
-/// Largest learning rate of Gaussians, in quantisation steps, of a training of so many iterations: larger ones make values noisy, which costs bytes. Shorter
-/// trainings have larger ones, so that a random walk goes as far.
+/// Largest learning rate in quantisation steps, of Gaussians and of weights whose codec states its steps, of a training of so many iterations: larger ones make
+/// values noisy, which costs bytes. Shorter trainings have larger ones, so that a random walk goes as far.
 const RATE: f64 = 0.01;
 const RATE_ITERATIONS: f64 = 200.0;
-/// Largest learning rate of the deformer's weights as a share of that in the middle of a main stage; ten times as much costs 0.4 dB.
+/// Largest learning rate of weights without steps as a share of that in the middle of a main stage; ten times as much costs 0.4 dB.
 const DEFORMER_RATE: f64 = 0.1;
 /// Share of the iterations over which the learning rate rises.
 const WARMUP: f64 = 0.1;
@@ -80,6 +81,8 @@ pub struct Tuner<'a> {
 struct Choices {
     config: RunConfig,
     field_weights: FieldWeights,
+    /// How much images depend on each weight, where the weight codec makes use of it.
+    importance: Option<Vec<Vec<f32>>>,
     /// Settings of the weight codec without training.
     weight_settings: toml::Table,
 }
@@ -117,11 +120,13 @@ impl<'a> Tuner<'a> {
         (config.train.time_noise, config.train.dropout, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0);
         config.validate()?;
         let field_weights = FieldWeights::parse(field_weights, registry)?;
-        let weight_settings = match self.moving_field() {
-            Some(_) => field_weights.settings_for(model, scene, registry, device, limits, *events)?,
-            None => field_weights.settings.clone(),
-        };
-        Ok(self.choices.get_or_init(|| Choices { config, field_weights, weight_settings }))
+        let moves = self.moving_field().is_some();
+        let (mut importance, mut weight_settings) = (None, field_weights.settings.clone());
+        if moves {
+            importance = field_weights.importance(model, &SceneViews::new(scene), registry, device)?;
+            weight_settings = field_weights.settings_for(model, (scene, importance.as_deref()), registry, device, limits, *events)?;
+        }
+        Ok(self.choices.get_or_init(|| Choices { config, field_weights, importance, weight_settings }))
     }
     /// The deformer, unless nothing moves: then it is not stored.
     fn moving_field(&self) -> Option<&ModelDeformer> {
@@ -165,22 +170,34 @@ impl<'a> Tuner<'a> {
         state.stage = Stage::Main;
         work(&context, &mut state)
     }
-    /// The streams of `weights`.
-    fn encoded_weights(&self, weights: &[WeightArray], settings: &toml::Table) -> Result<(Box<dyn WeightCodec>, Vec<Stream>)> {
-        let codec = self.job.registry.build_weight_codec(&self.choices()?.field_weights.name, settings)?;
-        let streams = codec.encode(weights, &self.codec_context())?;
-        Ok((codec, streams))
+    /// The weight codec in steps that are `weight_steps` times those chosen without training, and its settings.
+    fn weight_codec(&self, weight_steps: f64) -> Result<(Box<dyn WeightCodec>, toml::Table)> {
+        let Choices { field_weights, weight_settings, .. } = self.choices()?;
+        let settings = field_weights.coarser(weight_settings, weight_steps, self.job.registry)?;
+        Ok((self.job.registry.build_weight_codec(&field_weights.name, &settings)?, settings))
     }
-    fn codec_context(&self) -> CodecContext<'_> {
-        CodecContext::new(Seed::root(self.job.model.provenance.seed).child("weight-codec"), *self.job.limits, self.job.events)
+    fn codec_context(&self) -> Result<CodecContext<'_>> {
+        let context = CodecContext::new(weight_seed(self.job.model.provenance.seed), *self.job.limits, self.job.events);
+        Ok(CodecContext { weight_importance: self.choices()?.importance.as_deref(), ..context })
     }
-    /// `weights` as they will be decoded.
-    fn rounded_weights(&self, weights: &[WeightArray], settings: &toml::Table) -> Result<Vec<WeightArray>> {
+    /// `weights` as `codec` decodes them.
+    fn rounded_weights(&self, weights: &[WeightArray], codec: &dyn WeightCodec) -> Result<Vec<WeightArray>> {
         if weights.is_empty() {
             return Ok(Vec::new());
         }
-        let (codec, streams) = self.encoded_weights(weights, settings)?;
-        codec.decode(&streams, &self.codec_context())
+        let context = self.codec_context()?;
+        codec.decode(&codec.encode(weights, &context)?, &context)
+    }
+    /// Steps of the deformer's weights, where their codec states them, and what bits cost, each `per_bit`.
+    fn weight_scales(&self, state: &TrainState, codec: &dyn WeightCodec, per_bit: f64) -> Result<Option<WeightScales>> {
+        let Some(deformer) = &state.deformer else { return Ok(None) };
+        let Some(WeightSteps { steps, bit_slopes }) = codec.steps(&weights_of(deformer.field.as_ref())?, &self.codec_context()?)? else { return Ok(None) };
+        let upload = |values: Vec<f32>| {
+            let count = values.len();
+            Tensor::<1>::from_data(TensorData::new(values, [count]), self.job.device)
+        };
+        let size = bit_slopes.into_iter().map(|slopes| upload(slopes).mul_scalar(per_bit)).collect();
+        Ok(Some(WeightScales { steps: steps.into_iter().map(upload).collect(), size }))
     }
     /// `like` with the values of `state`, which must be sound; `object` names them in errors.
     pub(super) fn columns_of(like: &HostGaussians, state: &TrainState, limits: &Limits, object: &str) -> Result<HostGaussians> {
@@ -211,13 +228,11 @@ impl<'a> Tuner<'a> {
         Ok(sum / views.len().max(1) as f64)
     }
     /// What the next step draws, given the state's values.
-    fn round(&self, state: &TrainState, tuning: &Tuning, weight_settings: &toml::Table, fixed: &Fixed) -> Result<Rounded> {
+    fn round(&self, state: &TrainState, tuning: &Tuning, codec: &dyn WeightCodec, fixed: &Fixed) -> Result<Rounded> {
         let device = self.job.device;
         let host = state.set.host_gaussians()?;
-        let weights = match &state.deformer {
-            Some(deformer) => self.rounded_weights(&weights_of(deformer.field.as_ref())?, weight_settings)?,
-            None => Vec::new(),
-        };
+        let exact = state.deformer.as_ref().map(|d| weights_of(d.field.as_ref())).transpose()?.unwrap_or_default();
+        let weights = self.rounded_weights(&exact, codec)?;
         let upload = |w: WeightArray| {
             let count = w.values.len();
             Tensor::<1>::from_data(TensorData::new(w.values, [count]), device)
@@ -228,6 +243,7 @@ impl<'a> Tuner<'a> {
             size: fixed.size.clone(),
             rate: fixed.rate,
             weights: weights.into_iter().map(upload).collect(),
+            weight_scales: fixed.weights.clone(),
             exact_weights: Vec::new(),
         })
     }
@@ -243,6 +259,7 @@ pub(super) fn judges(scene: &Scene) -> Vec<usize> {
 struct Fixed {
     steps: BTreeMap<String, Tensor<2>>,
     size: BTreeMap<String, Tensor<2>>,
+    weights: Option<WeightScales>,
     rate: f64,
 }
 
@@ -267,9 +284,9 @@ impl TuneModel for Tuner<'_> {
     }
     fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel> {
         let device = self.job.device;
-        let weight_settings = self.weight_settings(tuning.weight_steps)?;
+        let (codec, _) = self.weight_codec(tuning.weight_steps)?;
         self.with_state(from, tuning.seed, |context, state| {
-            let mut fixed = Fixed { steps: columns(&tuning.rounding.steps(&from.gaussians)?, device), size: BTreeMap::new(), rate: 0.0 };
+            let mut fixed = Fixed { steps: columns(&tuning.rounding.steps(&from.gaussians)?, device), size: BTreeMap::new(), weights: None, rate: 0.0 };
             let lost = self.mean_error(context, state, &tuning.rounding.round(&from.gaussians)?)? - self.mean_error(context, state, &from.gaussians)?;
             // Where all steps are as large as they should be, an octave more of them costs as much as it saves; a step's error adds in proportion to its square.
             let per_bit = tuning.size_weight * 2.0 * std::f64::consts::LN_2 * lost.max(0.0) / tuning.bits_per_octave;
@@ -286,10 +303,13 @@ impl TuneModel for Tuner<'_> {
                     let in_steps = |(name, slopes): (String, Tensor<2>)| Some((name.clone(), slopes * fixed.steps.get(&name)?.clone().mul_scalar(per_bit)));
                     fixed.size = slopes.into_iter().filter_map(in_steps).collect();
                 }
+                if (iteration - 1).is_multiple_of(SIZE_EVERY) {
+                    fixed.weights = self.weight_scales(state, codec.as_ref(), per_bit)?;
+                }
                 let share =
                     rate_at((iteration as f64 - 0.5) / tuning.iterations as f64) * (1.0 - FALL * (tuning.of.0 + iteration) as f64 / tuning.of.1.max(1) as f64);
                 fixed.rate = RATE * (RATE_ITERATIONS / tuning.iterations as f64).sqrt() * share;
-                state.rounded = Some(self.round(state, tuning, &weight_settings, &fixed)?);
+                state.rounded = Some(self.round(state, tuning, codec.as_ref(), &fixed)?);
                 state.rates = RateFactors(BTreeMap::from([("deformer".into(), DEFORMER_RATE * share)]));
                 let schedule = Schedule { extent, sh_degree: from.gaussians.sh_degree, ..Schedule::further(tuning.of.0 + iteration) };
                 let check = iteration.is_multiple_of(CHECK_EVERY);
@@ -307,7 +327,7 @@ impl TuneModel for Tuner<'_> {
     }
     fn psnr(&self, gaussians: &HostGaussians, weights: &[WeightArray], weight_steps: Option<f64>) -> Result<f64> {
         let weights = match weight_steps {
-            Some(factor) => self.rounded_weights(weights, &self.weight_settings(factor)?)?,
+            Some(factor) => self.rounded_weights(weights, self.weight_codec(factor)?.0.as_ref())?,
             None => weights.to_vec(),
         };
         // Images of cameras with colours of their own would hide what is lost.
@@ -327,21 +347,17 @@ impl TuneModel for Tuner<'_> {
         })?;
         Ok(sum / views.len().max(1) as f64)
     }
-    fn weight_bytes(&self, weights: &[WeightArray], weight_steps: f64) -> Result<usize> {
+    fn encoded_weights(&self, weights: &[WeightArray], weight_steps: f64) -> Result<EncodedWeights> {
         if weights.is_empty() {
-            return Ok(0);
+            return Ok(EncodedWeights::default());
         }
-        let (_, streams) = self.encoded_weights(weights, &self.weight_settings(weight_steps)?)?;
-        Ok(streams.iter().map(|s| s.bytes.len()).sum())
-    }
-    fn weight_settings(&self, weight_steps: f64) -> Result<toml::Table> {
-        let Choices { field_weights, weight_settings, .. } = self.choices()?;
-        field_weights.coarser(weight_settings, weight_steps, self.job.registry)
+        let (codec, settings) = self.weight_codec(weight_steps)?;
+        Ok((codec.encode(weights, &self.codec_context()?)?, settings))
     }
     fn adopt(&self, weights: Vec<WeightArray>, weight_steps: f64) {
         *self.adopted.borrow_mut() = Some((weights, weight_steps));
     }
-    fn adopted(&self) -> Result<Option<(Vec<WeightArray>, toml::Table)>> {
-        self.adopted.borrow().as_ref().map(|(weights, factor)| Ok((weights.clone(), self.weight_settings(*factor)?))).transpose()
+    fn adopted(&self) -> Result<Option<EncodedWeights>> {
+        self.adopted.borrow().as_ref().map(|(weights, steps)| self.encoded_weights(weights, *steps)).transpose()
     }
 }
