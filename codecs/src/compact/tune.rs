@@ -169,7 +169,7 @@ fn weight_bytes(tuner: &dyn TuneModel, weights: &[WeightArray], steps: f64) -> R
     Ok(bytes_of(&tuner.encoded_weights(weights, steps)?.0))
 }
 
-/// The same, and those that steps twice as large save.
+/// Bytes of weights in such steps, and those that steps twice as large save.
 fn weights_and_saved(tuner: &dyn TuneModel, weights: &[WeightArray], steps: f64) -> Result<(f64, f64)> {
     let bytes = weight_bytes(tuner, weights, steps)? as f64;
     Ok((bytes, (bytes - weight_bytes(tuner, weights, 2.0 * steps)? as f64).max(0.0)))

@@ -1,6 +1,6 @@
 //! The weight codec `compact`: integers of few bits with a step per array, entropy coded.
 //!
-//! Where it is known how much images depend on each weight, rows have steps of their own: that of their array times a power of two. A file of a given size has the
+//! Where it is known how much images depend on each weight, rows of 16 weights have steps of their own: that of their array times a power of two. A file of a given size has the
 //! smallest error where errors of all weights cost the same, that is, where steps are inversely proportional to the root of a weight's importance.
 
 use super::entropy::{Coder, Decoder, Encoder, LANES, Lanes, Tables, symbol_of, symmetric};
@@ -24,7 +24,7 @@ const SIZES: usize = 16;
 const SHIFTS: std::ops::RangeInclusive<i32> = -4..=11;
 /// Of an array whose rows have shifts, added to its quarters of bits.
 const SHIFTED: u8 = 0x80;
-/// The least mean magnitude of a row in steps that counts in estimates of its size.
+/// Rows whose mean magnitude is less than so many steps are estimated as if it were this: the size of zeros among zeros has no derivative.
 const LEAST_MAGNITUDE: f64 = 0.05;
 /// Codes are shifted until they are below this; what is shifted out is stored as it is.
 const SYMBOL_LIMIT: f64 = 192.0;
@@ -41,7 +41,7 @@ struct Weights {
 #[derive(Clone, Copy)]
 struct Form {
     quarter_bits: u8,
-    /// Largest magnitude of a value.
+    /// Largest magnitude of a value, of those of a row over two to the power of its shift where that is positive.
     largest: f32,
     /// Whether rows have shifts.
     shifted: bool,
@@ -82,6 +82,9 @@ fn contexts(forms: &[Form]) -> usize {
 fn shifts_of(importance: &[f32]) -> Vec<i32> {
     let mean = |values: &[f32]| values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len().max(1) as f64;
     let all = mean(importance);
+    if !all.is_finite() {
+        return Vec::new();
+    }
     let shift = |row: &[f32]| {
         let octaves = -0.5 * libm::log2(mean(row) / all);
         if octaves.is_nan() { 0 } else { libm::round(octaves).clamp(f64::from(*SHIFTS.start()), f64::from(*SHIFTS.end())) as i32 }
@@ -137,7 +140,9 @@ impl Weights {
     fn form(&self, index: usize, array: &WeightArray, context: &CodecContext) -> (Form, Vec<i32>) {
         let importance = context.weight_importance.and_then(|all| all.get(index)).filter(|found| found.len() == array.values.len());
         let shifts = importance.map(|found| shifts_of(found)).unwrap_or_default();
-        let largest = array.values.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+        // Values of rows with larger steps have as many codes fewer, and must not enlarge the steps of others.
+        let scale = |row: usize| libm::exp2f(-shifts.get(row).copied().unwrap_or(0).max(0) as f32);
+        let largest = array.values.chunks(ROW).enumerate().flat_map(|(row, values)| values.iter().map(move |v| scale(row) * v.abs())).fold(0.0f32, f32::max);
         (Form { quarter_bits: self.quarter_bits(index), largest, shifted: shifts.iter().any(|shift| *shift != 0) }, shifts)
     }
     /// Bits of the array `index`, in quarters.
@@ -232,7 +237,7 @@ inventory::submit! {
             paper: "uniform symmetric quantisation; asymmetric numeral systems (constriction)",
             schema: "\
 bits = 12.0              # of the largest weight of an array, 3 to 16 in quarters, before entropy coding; one less doubles the error of weights
-array_bits = []          # of each array in turn, in place of bits; max-drop chooses them
+array_bits = []          # of each array in turn, in place of bits; max-drop chooses them. With --scene, weights on which images depend less have larger steps
 ",
             capabilities: &["lossy", "bits=3..16", "importance"],
         },
@@ -272,7 +277,7 @@ mod tests {
         let worst = |kind: usize| (0..count).filter(|k| k / ROW % 4 == kind).map(|k| (found[0].values[k] - weights[0].values[k]).abs()).fold(0.0f32, f32::max);
         assert!(worst(0) < 0.001 && worst(2) > 4.0 * worst(0) && worst(3) > 4.0 * worst(2) && worst(1) > 0.9, "{:?}", [0, 1, 2, 3].map(worst));
         // Importance that says nothing changes nothing.
-        for odd in [vec![1.0; count], vec![0.0; count], vec![f32::NAN; count], vec![1.0; 3]] {
+        for odd in [vec![1.0; count], vec![0.0; count], vec![f32::NAN; count], vec![f32::INFINITY; count], vec![1.0; 3]] {
             let importance = [odd];
             let context = CodecContext { weight_importance: Some(&importance), ..CodecContext::new(Seed::root(1), Limits::default(), &Silent) };
             assert!(codec.encode(&weights, &context).unwrap() == codec.encode(&weights, &plain).unwrap());

@@ -39,7 +39,7 @@ pub trait WeightCodec: Send + Sync {
         let _ = (weights, context);
         Ok(None)
     }
-    /// The largest absolute error of a value over the largest absolute value of its array; `0` is bit-exact. The conformance suite checks it.
+    /// The largest absolute error of a value over the largest absolute value of its array, where the context has no importance; `0` is bit-exact. The conformance suite checks it.
     fn loss(&self) -> f64;
 }
 

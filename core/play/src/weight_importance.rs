@@ -8,20 +8,23 @@ use cc4dgs_core::gaussians::to_vec;
 use cc4dgs_core::{Registry, Result, Seed, TrainingViews};
 use std::ops::RangeInclusive;
 
-/// Images whose derivatives are averaged: so many Gaussians are drawn in all.
+/// Images whose derivatives are averaged: as many as draw so many Gaussians, within the range.
 const IMAGES: RangeInclusive<usize> = 24..=128;
 const WORK: usize = 1_500_000;
 
 /// The mean over training views, for each weight of each array of the deformer, of the sum over pixels and channels of the squared derivative of the image by it.
 ///
-/// Each image estimates it by the square of the derivative of a sum with random signs (Hutchinson 1989). What no image showed may still be seen in others, so every
-/// weight has at least the share 1 / images² of the mean of its array.
+/// Each image estimates it by the square of the derivative of a sum with random signs (Hutchinson 1989). Other images may depend on weights on which
+/// none of these does, so every weight has at least the share 1 / images² of the mean of its array.
 ///
 /// # Errors
 /// What the deformer and the device report.
 pub(crate) fn weight_importance(model: &Model, views: &dyn TrainingViews, seed: Seed, registry: &Registry, device: &Device) -> Result<Vec<Vec<f32>>> {
     let Some(of) = &model.field else { return Ok(Vec::new()) };
     let weights = weights_of(of.field.as_ref())?;
+    if weights.is_empty() {
+        return Ok(Vec::new());
+    }
     let mut sums: Vec<Vec<f64>> = weights.iter().map(|array| vec![0.0; array.values.len()]).collect();
     let images = if views.is_empty() { 0 } else { (WORK / model.gaussians.len().max(1)).clamp(*IMAGES.start(), *IMAGES.end()) };
     let mut deformer = registry.build_deformer(&of.section, &of.context, device)?;
@@ -51,7 +54,7 @@ pub(crate) fn weight_importance(model: &Model, views: &dyn TrainingViews, seed: 
     let mean = |sums: Vec<f64>| {
         let (count, images) = (sums.len().max(1) as f64, images.max(1) as f64);
         let least = sums.iter().sum::<f64>() / (count * images * images);
-        sums.into_iter().map(|sum| ((sum + least) / images) as f32).collect()
+        sums.into_iter().map(|sum| ((sum + least) / images).min(f64::from(f32::MAX)) as f32).collect()
     };
     Ok(sums.into_iter().map(mean).collect())
 }

@@ -121,6 +121,9 @@ fn models_of_every_kind_are_tuned_or_left_alone() {
     let mut fixed = bench.open(&bench.archive(&moving, 0, None).unwrap());
     (fixed.field, fixed.moving, fixed.provenance) = (None, Moving::Nothing, Default::default());
     cases.push(("static, without a configuration".into(), fixed));
+    // It moves, and has no weights.
+    let of_attributes = tiny(&["train.iterations=40", "train.dynamic=all", "deformer.kind=free-time"]);
+    cases.push(("free-time".into(), bench.train(&of_attributes)));
     for (name, model) in cases {
         let count = model.gaussians.len();
         let bytes = bench.tuned(&model, 7).unwrap_or_else(|e| panic!("{name}: {e}"));

@@ -1,6 +1,6 @@
 //! Weights of plug-ins under optimisation: group schedules, gradient clipping, one optimizer step.
 
-use super::rounded::{ExactWeights, WeightScales};
+use super::rounded::{ExactWeights, WeightScale};
 use crate::gaussian_set::log_linear;
 use burn::tensor::{Gradients, Tensor};
 use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings, ordered_sum};
@@ -19,7 +19,8 @@ pub(crate) fn track(parameters: Vec<&mut Parameter>) {
 }
 
 /// Takes the gradients of tracked weights, clips them per group and steps. Weights are known to the optimizer as `prefix` and their name; `rate` gives the learning
-/// rate of a group. Where there are `exact` values, the tracked ones were rounded from them, and they are stepped instead, in their own steps where they have some.
+/// rate of a group. Where there are `exact` values, the tracked ones were rounded from them, and they are stepped instead. Arrays that have
+/// steps are stepped in these, at the rate of [`ExactWeights`], with the size's derivatives added after clipping.
 pub(crate) fn update(
     prefix: &str,
     mut parameters: Vec<&mut Parameter>,
@@ -40,9 +41,10 @@ pub(crate) fn update(
             gradient_of[i] = gradient_of[i].take().map(|t| t * scale.clone());
         }
     }
-    let ExactWeights { values, scales } = exact;
-    let mut exact = values.into_iter();
-    for (index, (parameter, gradient)) in parameters.iter_mut().zip(gradient_of).enumerate() {
+    let ExactWeights { values, scales, rate: rate_in_steps } = exact;
+    let (mut exact, mut scales) = (values.into_iter(), scales.into_iter().flatten());
+    for (parameter, gradient) in parameters.iter_mut().zip(gradient_of) {
+        let scale = scales.next().flatten();
         let device = parameter.value.device();
         // Moved out, so that the optimizer holds the only reference and works in place.
         let tracked = std::mem::replace(&mut parameter.value, Tensor::empty([0], &device));
@@ -54,10 +56,10 @@ pub(crate) fn update(
         let group = &groups[parameter.group];
         let count = value.dims()[0];
         let name = format!("{prefix}{}", parameter.name);
-        if let Some((WeightScales { steps, size }, rate)) = &scales {
-            let gradient = (gradient * steps[index].clone() + size[index].clone()).reshape([count, 1]);
-            let moved = optimizer.step(&name, gradient.zeros_like(), gradient, &StepSettings::new(*rate))?;
-            parameter.value = value + moved.reshape([count]) * steps[index].clone();
+        if let Some(WeightScale { steps, size }) = scale {
+            let gradient = (gradient * steps.clone() + size).reshape([count, 1]);
+            let moved = optimizer.step(&name, gradient.zeros_like(), gradient, &StepSettings::new(rate_in_steps))?;
+            parameter.value = value + moved.reshape([count]) * steps;
             continue;
         }
         let settings = StepSettings { epsilon: group.epsilon, ..StepSettings::new(rate(group)) };

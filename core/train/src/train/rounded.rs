@@ -19,19 +19,19 @@ pub(crate) struct Rounded {
     /// Weights of the deformer as they will be decoded, in the order of its parameters; the deformer's own lie in `exact_weights` between
     /// [`Rounded::exchange_weights`] and the step.
     pub weights: Vec<Tensor<1>>,
-    /// The weights' steps, where they have some.
-    pub weight_scales: Option<WeightScales>,
+    /// The weights' steps, where they have some; `None` in place of an array that has none.
+    pub weight_scales: Option<Vec<Option<WeightScale>>>,
     /// The weights that were exchanged.
     pub exact_weights: Vec<Tensor<1>>,
 }
 
-/// Weights in steps.
+/// An array of weights in steps.
 #[derive(Clone)]
-pub(crate) struct WeightScales {
-    /// The distance of neighbouring values, array by array.
-    pub steps: Vec<Tensor<1>>,
+pub(crate) struct WeightScale {
+    /// The distances of neighbouring values.
+    pub steps: Tensor<1>,
     /// What is added to the derivatives by values in steps: those of the size.
-    pub size: Vec<Tensor<1>>,
+    pub size: Tensor<1>,
 }
 
 /// What the optimizer steps in place of tracked weights.
@@ -39,8 +39,10 @@ pub(crate) struct WeightScales {
 pub(crate) struct ExactWeights {
     /// The values before rounding; empty where nothing is rounded.
     pub values: Vec<Tensor<1>>,
-    /// Their steps and the learning rate in these, where they have some.
-    pub scales: Option<(WeightScales, f64)>,
+    /// Their steps, array by array, where they have some.
+    pub scales: Option<Vec<Option<WeightScale>>>,
+    /// Learning rate in steps.
+    pub rate: f64,
 }
 
 impl Rounded {
@@ -50,7 +52,7 @@ impl Rounded {
     }
     /// The exchanged weights, with their steps.
     pub fn exact(&mut self) -> ExactWeights {
-        ExactWeights { values: std::mem::take(&mut self.exact_weights), scales: self.weight_scales.take().map(|scales| (scales, self.rate)) }
+        ExactWeights { values: std::mem::take(&mut self.exact_weights), scales: self.weight_scales.take(), rate: self.rate }
     }
     /// One optimizer step of the attributes that have steps. Values are measured in their steps, so that one learning rate does for all: the codec chose steps
     /// that change images alike.

@@ -4,7 +4,7 @@ use super::log::Log;
 use super::losses::LossTerms;
 use super::probe::mean;
 use super::pyramid::Pyramid;
-use super::rounded::{Rounded, WeightScales};
+use super::rounded::{Rounded, WeightScale};
 use super::sampler::Sampler;
 use super::targets::{had_colours_per_camera, targets};
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
@@ -52,7 +52,7 @@ pub struct TuneJob<'a> {
     pub model: &'a Model,
     /// The scene that it was trained on.
     pub scene: Arc<Scene>,
-    /// How the deformer's weights are stored: see [`FieldWeights::parse`].
+    /// How the deformer's weights are stored: see [`FieldWeights::parse`]. The archive must name the same.
     pub field_weights: &'a str,
     /// Where plug-ins are found.
     pub registry: &'a Registry,
@@ -188,16 +188,30 @@ impl<'a> Tuner<'a> {
         let context = self.codec_context()?;
         codec.decode(&codec.encode(weights, &context)?, &context)
     }
-    /// Steps of the deformer's weights, where their codec states them, and what bits cost, each `per_bit`.
-    fn weight_scales(&self, state: &TrainState, codec: &dyn WeightCodec, per_bit: f64) -> Result<Option<WeightScales>> {
+    /// Steps of the deformer's weights, where their codec states them and they were searched, and derivatives of the size per step, each bit counted as `per_bit`.
+    fn weight_scales(&self, state: &TrainState, codec: &dyn WeightCodec, per_bit: f64) -> Result<Option<Vec<Option<WeightScale>>>> {
         let Some(deformer) = &state.deformer else { return Ok(None) };
-        let Some(WeightSteps { steps, bit_slopes }) = codec.steps(&weights_of(deformer.field.as_ref())?, &self.codec_context()?)? else { return Ok(None) };
+        if self.choices()?.field_weights.max_drop_db.is_none() {
+            // Steps that nothing chose may be so small that no weight gets from one to the next.
+            return Ok(None);
+        }
+        let weights = weights_of(deformer.field.as_ref())?;
+        let Some(WeightSteps { steps, bit_slopes }) = codec.steps(&weights, &self.codec_context()?)? else { return Ok(None) };
+        let lengths = |arrays: &[Vec<f32>]| arrays.iter().map(Vec::len).collect::<Vec<_>>();
+        let expected: Vec<usize> = weights.iter().map(|array| array.values.len()).collect();
+        if lengths(&steps) != expected || lengths(&bit_slopes) != expected {
+            let object = format!("weight codec {}", self.choices()?.field_weights.name);
+            return Err(Error::parameter(object, "it states other numbers of steps than there are weights", "Return one step and one slope per weight"));
+        }
         let upload = |values: Vec<f32>| {
             let count = values.len();
             Tensor::<1>::from_data(TensorData::new(values, [count]), self.job.device)
         };
-        let size = bit_slopes.into_iter().map(|slopes| upload(slopes).mul_scalar(per_bit)).collect();
-        Ok(Some(WeightScales { steps: steps.into_iter().map(upload).collect(), size }))
+        let scale = |(steps, slopes): (Vec<f32>, Vec<f32>)| {
+            let moves = steps.iter().any(|step| *step > 0.0);
+            moves.then(|| WeightScale { steps: upload(steps), size: upload(slopes).mul_scalar(per_bit) })
+        };
+        Ok(Some(steps.into_iter().zip(bit_slopes).map(scale).collect()))
     }
     /// `like` with the values of `state`, which must be sound; `object` names them in errors.
     pub(super) fn columns_of(like: &HostGaussians, state: &TrainState, limits: &Limits, object: &str) -> Result<HostGaussians> {
@@ -259,7 +273,7 @@ pub(super) fn judges(scene: &Scene) -> Vec<usize> {
 struct Fixed {
     steps: BTreeMap<String, Tensor<2>>,
     size: BTreeMap<String, Tensor<2>>,
-    weights: Option<WeightScales>,
+    weights: Option<Vec<Option<WeightScale>>>,
     rate: f64,
 }
 
@@ -348,7 +362,7 @@ impl TuneModel for Tuner<'_> {
         Ok(sum / views.len().max(1) as f64)
     }
     fn encoded_weights(&self, weights: &[WeightArray], weight_steps: f64) -> Result<EncodedWeights> {
-        if weights.is_empty() {
+        if self.moving_field().is_none() {
             return Ok(EncodedWeights::default());
         }
         let (codec, settings) = self.weight_codec(weight_steps)?;
