@@ -78,7 +78,7 @@ pub trait TuneModel {
     /// # Errors
     /// What scene and parts report.
     fn psnr(&self, gaussians: &HostGaussians, weights: &[WeightArray], weight_steps: Option<f64>) -> Result<f64>;
-    /// `weights` in such steps, as they are stored; nothing where there are none.
+    /// `weights` in such steps, as they are stored; nothing where no deformer is stored.
     ///
     /// # Errors
     /// What the weight codec reports.
