@@ -21,6 +21,13 @@ const RANKS: usize = 2048;
 /// Numbers per pixel of one tile, row-major.
 pub type TilePlane = [f32; TILE_PIXELS];
 
+/// Keeps planes from being multiples of 4096 bytes apart: a load at such a distance from a store waits for it, because processors compare the low 12 bits of
+/// addresses first.
+#[derive(Default)]
+pub struct Gap {
+    _bytes: [[f32; TILE]; 8],
+}
+
 /// Pixel centres of the columns of a tile at `origin_x`.
 #[inline(always)]
 pub fn column_centers(origin_x: usize) -> [f32; TILE] {
@@ -97,14 +104,16 @@ pub fn max_weights(n: usize, workspace: &Workspace) -> Vec<f32> {
     out
 }
 
-/// Running numbers of one tile.
+/// Running numbers of one tile. Rows lie within cache lines.
+#[repr(C, align(64))]
 struct TileState<'a> {
+    /// Red, green, blue, depth so far.
+    sums: [TilePlane; 4],
+    apart: Gap,
     /// Transmittance so far; NaN where the pixel has stopped or is outside the image.
     running: TilePlane,
     /// Transmittance of stopped pixels.
     stopped: TilePlane,
-    /// Red, green, blue, depth so far.
-    sums: [TilePlane; 4],
     /// List position where a pixel stopped.
     stop_at: &'a mut [u32],
     /// Bits of rows with a running pixel.
@@ -121,9 +130,10 @@ impl<'a> TileState<'a> {
         let (width, height) = (TILE.min(settings.width - origin[0]), TILE.min(settings.height - origin[1]));
         let partial = width < TILE || height < TILE;
         let mut state = Self {
+            sums: [[0.0; TILE_PIXELS]; 4],
+            apart: Gap::default(),
             running: [1.0; TILE_PIXELS],
             stopped: [1.0; TILE_PIXELS],
-            sums: [[0.0; TILE_PIXELS]; 4],
             stop_at,
             alive: (1 << height) - 1,
             stops: false,
@@ -226,8 +236,7 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
                 prefetch(ranked, ahead.rank as usize);
             }
             let splat = &ranked[entry.rank as usize];
-            let rows = entry.row_mask() & if ends_early { state.alive } else { u32::MAX };
-            state.evaluations += u64::from(rows.count_ones()) * TILE as u64;
+            let alive = if ends_early { state.alive } else { u32::MAX };
             let [half_a, b, half_c] = splat.conic;
             let a = like(half_a);
             let opacity = like(splat.opacity);
@@ -236,7 +245,8 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
             for block in 0..TILE / S::F32_LANES {
                 let first = block * S::F32_LANES;
                 let dx = Lanes::load(simd, &columns[first..]) - splat.center[0];
-                let mut left = rows;
+                let mut left = entry.row_mask::<S>(first) & alive;
+                state.evaluations += u64::from(left.count_ones()) * S::F32_LANES as u64;
                 while left != 0 {
                     let row = left.trailing_zeros() as usize;
                     left &= left - 1;
@@ -253,7 +263,8 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
                         let sum = &mut state.sums[plane][at..];
                         weight.fma(shown[plane], Lanes::load(simd, sum)).store(sum);
                     }
-                    drawn.select(after, before).store(&mut state.running[at..]);
+                    // As `drawn.select(after, before)`, which becomes a masked store: a slow instruction without AVX-512.
+                    drawn.keep(alpha).nfma(before, before).store(&mut state.running[at..]);
                     if WEIGHTS {
                         largest = largest.max(weight);
                     }

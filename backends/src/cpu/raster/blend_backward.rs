@@ -4,7 +4,7 @@
 //! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = d loss / d
 //! sigma times powers of dx and dy; dx is constant per column, so its powers are applied once after the rows.
 
-use super::blend::{AHEAD, SIGMA_MAX, TilePlane, column_centers};
+use super::blend::{AHEAD, Gap, SIGMA_MAX, TilePlane, column_centers};
 use super::camera::{ALPHA_MIN, RuleConstants};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
@@ -57,10 +57,12 @@ pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, works
     });
 }
 
-/// Upstream gradients and running numbers of one tile.
+/// Upstream gradients and running numbers of one tile. Rows lie within cache lines.
+#[repr(C, align(64))]
 struct TileGradient {
     /// Upstream of red, green, blue, depth.
     upstream: [TilePlane; 4],
+    apart: Gap,
     /// Transmittance behind the Gaussian at hand.
     running: TilePlane,
     /// The loss's part behind the Gaussian at hand.
@@ -73,7 +75,7 @@ struct TileGradient {
 impl TileGradient {
     fn new(origin: [usize; 2], settings: &RasterSettings, background: [f32; 3], upstream: &[f32], transmittance: &[f32]) -> Self {
         let zero = [0.0; TILE_PIXELS];
-        let mut state = Self { upstream: [zero; 4], running: [1.0; TILE_PIXELS], behind: zero, live_rows: 0, depth_matters: false };
+        let mut state = Self { upstream: [zero; 4], apart: Gap::default(), running: [1.0; TILE_PIXELS], behind: zero, live_rows: 0, depth_matters: false };
         state.running.copy_from_slice(transmittance);
         vectorized(
             #[inline(always)]
@@ -144,7 +146,6 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
                 prefetch(ranked, list[i - AHEAD].rank as usize);
             }
             let splat = &ranked[entry.rank as usize];
-            let rows = entry.row_mask() & state.live_rows;
             let [half_a, b, half_c] = splat.conic;
             let a = like(half_a);
             let opacity = like(splat.opacity);
@@ -154,18 +155,21 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
             );
             let depth = like(splat.depth);
             let position = like(f32::from_bits(i as u32 + 1));
-            let mut record = [0.0f32; RECORD];
-            let mut absolute = [0.0f32; 2];
+            // Sums over pixels of v times x, x^2, y, x y, y^2 and 1, of weight times upstream colour and depth, and of absolute gradients.
+            let mut sums = [zero; 12];
             for block in 0..TILE / S::F32_LANES {
                 let first = block * S::F32_LANES;
+                let mut left = entry.row_mask::<S>(first) & state.live_rows;
+                if left == 0 {
+                    continue;
+                }
                 let dx = Lanes::load(simd, &columns[first..]) - splat.center[0];
-                // Sums over rows of v, v dy, v dy^2, weight times upstream colour and depth.
+                // Sums over rows of v, v dy and v dy^2.
                 let mut v_sum = zero;
                 let mut v_dy = zero;
                 let mut v_dy2 = zero;
                 let mut shown = [zero; 4];
                 let (mut absolute_x, mut absolute_y) = (zero, zero);
-                let mut left = rows;
                 while left != 0 {
                     let row = left.trailing_zeros() as usize;
                     left &= left - 1;
@@ -217,33 +221,32 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
                     }
                 }
                 let v_dx = v_sum * dx;
-                let (v, x, xx) = (v_sum.sum(), v_dx.sum(), (v_dx * dx).sum());
-                let (y, xy, yy) = (v_dy.sum(), (v_dy * dx).sum(), v_dy2.sum());
-                // v was -d loss / d sigma: the signs turn here. dx is pixel minus centre. The order is that of the columns of a record.
-                let part = [
-                    2.0 * half_a * x + b * y,
-                    b * x + 2.0 * half_c * y,
-                    -0.5 * xx,
-                    -xy,
-                    -0.5 * yy,
-                    v / splat.opacity,
-                    shown[0].sum(),
-                    shown[1].sum(),
-                    shown[2].sum(),
-                    if DEPTH { shown[3].sum() } else { 0.0 },
-                ];
-                for (sum, value) in record.iter_mut().zip(part) {
+                let [red, green, blue, deep] = shown;
+                let of_block = [v_dx, v_dx * dx, v_dy, v_dy * dx, v_dy2, v_sum, red, green, blue, deep, absolute_x, absolute_y];
+                for (sum, value) in sums.iter_mut().zip(of_block).take(if ABSOLUTE { 12 } else { 10 }) {
                     *sum += value;
                 }
-                if ABSOLUTE {
-                    absolute[0] += absolute_x.sum();
-                    absolute[1] += absolute_y.sum();
-                }
             }
+            let [x, xx, y, xy, yy, v] = each(
+                #[inline(always)]
+                |k| sums[k].sum(),
+            );
+            // v was -d loss / d sigma: the signs turn here. dx is pixel minus centre. The order is that of the columns of a record.
+            records[i] = [
+                2.0 * half_a * x + b * y,
+                b * x + 2.0 * half_c * y,
+                -0.5 * xx,
+                -xy,
+                -0.5 * yy,
+                v / splat.opacity,
+                sums[6].sum(),
+                sums[7].sum(),
+                sums[8].sum(),
+                if DEPTH { sums[9].sum() } else { 0.0 },
+            ];
             if ABSOLUTE {
-                absolute_sums[i] = absolute;
+                absolute_sums[i] = [sums[10].sum(), sums[11].sum()];
             }
-            records[i] = record;
         }
     }
 }

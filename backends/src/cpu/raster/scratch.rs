@@ -1,8 +1,9 @@
 //! The working memory of one render. It lives until the backward pass has used it, then returns to a pool, because faulting in fresh pages
 //! costs more than the kernels that fill them.
 
-use super::{RECORD, ScreenSplat};
+use super::{RECORD, ScreenSplat, TILE};
 use crate::cpu::simd::prefetch;
+use pulp::Simd;
 use std::sync::Mutex;
 
 /// Workspaces in the pool.
@@ -32,7 +33,7 @@ pub struct Pair {
     pub tile: u32,
     /// Position of the Gaussian in depth order.
     pub rank: u32,
-    /// First row of the tile it reaches, and last row times 256.
+    /// As [`Entry::rows`].
     pub rows: u32,
 }
 
@@ -41,15 +42,26 @@ pub struct Pair {
 pub struct Entry {
     /// Position of the Gaussian in depth order.
     pub rank: u32,
-    /// First row of the tile it reaches, and last row times 256.
+    /// The rows that it reaches in each of the [`strips`] of the tile, from the left, [`STRIP_BITS`] each: the first row, and the last row times 16.
     pub rows: u32,
 }
 
+/// Bits of [`Entry::rows`] per strip.
+pub const STRIP_BITS: u32 = 8;
+/// The bits of a strip that no pixel of is reached: its first row lies below its last.
+pub const EMPTY_STRIP: u32 = 15;
+
+/// The number of strips that a tile is cut into, side by side: one per vector of a row, at most four.
+pub const fn strips<S: Simd>() -> usize {
+    if S::F32_LANES < TILE / 4 { 4 } else { TILE / S::F32_LANES }
+}
+
 impl Entry {
-    /// One bit per row of the tile.
+    /// One bit per row of the tile that is reached in the strip of its column `column`.
     #[inline(always)]
-    pub fn row_mask(self) -> u32 {
-        let (first, last) = (self.rows & 255, self.rows >> 8);
+    pub fn row_mask<S: Simd>(self, column: usize) -> u32 {
+        let bits = self.rows >> (STRIP_BITS * (column * strips::<S>() / TILE) as u32);
+        let (first, last) = (bits & 15, bits >> 4 & 15);
         ((2u32 << last) - 1) & !((1u32 << first) - 1)
     }
 }

@@ -4,7 +4,7 @@
 use super::camera::RuleConstants;
 use super::parallel::{SharedMut, run_tasks};
 use super::project::CHUNK;
-use super::scratch::{Buffers, Entry, Footprint, Pair, Workspace, set_len};
+use super::scratch::{Buffers, EMPTY_STRIP, Entry, Footprint, Pair, STRIP_BITS, Workspace, set_len, strips};
 use super::{RasterSettings, ScreenSplat, TILE};
 use crate::cpu::simd::{dispatch, prefetch};
 use pulp::{Simd, WithSimd};
@@ -79,7 +79,7 @@ struct Bin<'a> {
 
 impl WithSimd for Bin<'_> {
     type Output = ();
-    // No vectors here: the instruction set is for rounding and fused steps.
+    // No vectors here: the instruction set is for rounding, fused steps and the width of strips.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { settings, rules, radii, slots, footprints, order, first, pairs, histogram, ranked, starts, rank_of_slot } = self;
@@ -98,7 +98,7 @@ impl WithSimd for Bin<'_> {
             unsafe { rank_of_slot.slice(slot, 1)[0] = rank };
             starts[k] = pairs.len() as u32;
             let limits = if rules.square_tiles { Some(square(splat.center, radii[splat.index as usize], settings)) } else { None };
-            cut_into_tiles(
+            cut_into_tiles::<S>(
                 &splat,
                 &footprints[slot],
                 settings,
@@ -172,10 +172,38 @@ fn half_column(splat: &ScreenSplat, foot: &Footprint, dx: f32) -> f32 {
     foot.aspect * ((splat.half_width - dx) * (splat.half_width + dx)).max(0.0).sqrt()
 }
 
-/// Calls `found(tile, rows)` for every tile with a pixel centre inside the footprint; `rows` packs the first and the last row of the tile.
+/// First and last row of the image with pixel centres inside the footprint in the columns `from` to `to`; none where the first is over the last.
 #[inline(always)]
-fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettings, limits: Option<[[usize; 2]; 2]>, mut found: impl FnMut(usize, u32)) {
+fn rows_between(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettings, from: usize, to: usize) -> [usize; 2] {
+    const NONE: [usize; 2] = [1, 0];
     let [x, y] = splat.center;
+    // The strip between the outermost pixel centres, relative to the centre of the Gaussian.
+    let left = (from as f32 + 0.5 - x).max(-splat.half_width);
+    let right = (to as f32 + 0.5 - x).min(splat.half_width);
+    if left > right {
+        return NONE;
+    }
+    let dx_bottom = foot.x_of_bottom.max(left).min(right);
+    let dx_top = (-foot.x_of_bottom).max(left).min(right);
+    let bottom = (foot.slope * dx_bottom + half_column(splat, foot, dx_bottom)).min(foot.half_height);
+    let top = (foot.slope * dx_top - half_column(splat, foot, dx_top)).max(-foot.half_height);
+    let last = (y + bottom - 0.5).floor();
+    if last < 0.0 || last.is_nan() {
+        return NONE;
+    }
+    [(y + top - 0.5).ceil().max(0.0) as usize, (last as usize).min(settings.height - 1)]
+}
+
+/// Calls `found(tile, rows)` for every tile with a pixel centre inside the footprint; `rows` are those of [`Entry`].
+#[inline(always)]
+fn cut_into_tiles<S: Simd>(
+    splat: &ScreenSplat,
+    foot: &Footprint,
+    settings: &RasterSettings,
+    limits: Option<[[usize; 2]; 2]>,
+    mut found: impl FnMut(usize, u32),
+) {
+    let x = splat.center[0];
     let tiles_x = settings.width.div_ceil(TILE);
     let first_column = (x - splat.half_width - 0.5).ceil().max(0.0) as usize;
     let last_column = ((x + splat.half_width - 0.5).floor().max(0.0) as usize).min(settings.width - 1);
@@ -186,20 +214,18 @@ fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettin
     if let Some([columns, _]) = limits {
         (first_tile, end_tile) = (first_tile.max(columns[0]), end_tile.min(columns[1]));
     }
+    let strips = strips::<S>();
+    let width = TILE / strips;
     for tile_x in first_tile..end_tile {
-        // The strip between the outermost pixel centres of the tile column, relative to the centre of the Gaussian.
-        let left = ((tile_x * TILE) as f32 + 0.5 - x).max(-splat.half_width);
-        let right = ((tile_x * TILE + TILE - 1) as f32 + 0.5 - x).min(splat.half_width);
-        let dx_bottom = foot.x_of_bottom.max(left).min(right);
-        let dx_top = (-foot.x_of_bottom).max(left).min(right);
-        let bottom = (foot.slope * dx_bottom + half_column(splat, foot, dx_bottom)).min(foot.half_height);
-        let top = (foot.slope * dx_top - half_column(splat, foot, dx_top)).max(-foot.half_height);
-        let first_row = (y + top - 0.5).ceil().max(0.0) as usize;
-        let last_row = (y + bottom - 0.5).floor();
-        if last_row < 0.0 || last_row.is_nan() {
-            continue;
+        let mut reached = [[1, 0]; 4];
+        let (mut first_row, mut last_row) = (usize::MAX, 0);
+        for (strip, rows) in reached.iter_mut().enumerate().take(strips) {
+            let from = tile_x * TILE + strip * width;
+            *rows = rows_between(splat, foot, settings, from, from + width - 1);
+            if rows[0] <= rows[1] {
+                (first_row, last_row) = (first_row.min(rows[0]), last_row.max(rows[1]));
+            }
         }
-        let last_row = (last_row as usize).min(settings.height - 1);
         if first_row > last_row {
             continue;
         }
@@ -208,9 +234,14 @@ fn cut_into_tiles(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettin
             (first, end) = (first.max(rows[0]), end.min(rows[1]));
         }
         for tile_y in first..end {
-            let from = first_row.max(tile_y * TILE) - tile_y * TILE;
-            let to = last_row.min(tile_y * TILE + TILE - 1) - tile_y * TILE;
-            found(tile_y * tiles_x + tile_x, (from | to << 8) as u32);
+            let top = tile_y * TILE;
+            let mut packed = 0;
+            for (strip, rows) in reached.iter().enumerate().take(strips) {
+                let (from, to) = (rows[0].max(top), rows[1].min(top + TILE - 1));
+                let bits = if from > to { EMPTY_STRIP } else { (from - top | (to - top) << 4) as u32 };
+                packed |= bits << (STRIP_BITS * strip as u32);
+            }
+            found(tile_y * tiles_x + tile_x, packed);
         }
     }
 }
