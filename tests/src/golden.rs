@@ -3,11 +3,11 @@
 
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// The folder of fixtures: `CC4DGS_GOLDEN`, or the committed folder.
 pub fn folder() -> PathBuf {
-    let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/golden");
+    let committed = PathBuf::from("fixtures/golden");
     std::env::var_os("CC4DGS_GOLDEN").map_or(committed, PathBuf::from)
 }
 

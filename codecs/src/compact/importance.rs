@@ -5,7 +5,7 @@
 
 use super::joint::Directions;
 use super::sensitivity::Sensitivity;
-use cc4dgs_format::{BLUR, CodecContext, HostGaussians, Result};
+use cc4dgs_format::{BLUR, CodecContext, Event, HostGaussians, Result};
 use std::ops::RangeInclusive;
 
 /// Value of the spherical-harmonics basis function of degree 0.
@@ -119,6 +119,7 @@ pub fn measure(gaussians: &HostGaussians, context: &CodecContext, apart: bool, j
                 }
             }
         }
+        context.events.emit(&Event::Progress { task: "importance of Gaussians".into(), done: k as u64 + 1, total: chosen as u64 });
     }
     let Some(total) = total else { return Ok(None) };
     let row = |values: &[f32], width: usize, i: usize| values[i * width..(i + 1) * width].iter().map(|&v| f64::from(v)).sum::<f64>();

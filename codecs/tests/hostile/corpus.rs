@@ -6,7 +6,7 @@ use cc4dgs_format::Stream;
 use proptest::sample::Index;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Streams larger than this have no corpus, so that the repository stays small.
 const MOST_BYTES: usize = 12_000;
@@ -46,7 +46,7 @@ pub fn class(message: &str, streams: &[Stream]) -> String {
 }
 
 fn path(name: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/corpus").join(format!("{name}.jsonl"))
+    Path::new("tests/corpus").join(format!("{name}.jsonl"))
 }
 
 fn hex(bytes: &[u8]) -> String {

@@ -182,10 +182,15 @@ impl Model {
         let untuned = OnceCell::new();
         let encode_weights = || -> Result<Option<EncodedWeights>> {
             let Some((stored, f)) = weights.as_ref().zip(field) else { return Ok(None) };
+            let of_field = weights_of(f.field.as_ref())?;
+            // What a tuner has measured and searched is not measured again.
+            if let Some(tuner) = tuner.filter(|_| views.as_ref().is_some_and(|v| !v.is_empty())) {
+                return tuner.encoded_weights(&of_field, 1.0).map(Some);
+            }
             let measured = device.zip(views.as_ref());
-            let importance = measured.map(|(device, views)| stored.chosen.importance(self, views, registry, device)).transpose()?.flatten();
+            let importance = measured.map(|(device, views)| stored.chosen.importance(self, views, registry, device, events)).transpose()?.flatten();
             let context = CodecContext { weight_importance: importance.as_deref(), ..context(seed) };
-            stored.chosen.encode(self, &weights_of(f.field.as_ref())?, device, &context, registry).map(Some)
+            stored.chosen.encode(self, &of_field, device, &context, registry).map(Some)
         };
         // A codec whose size is bounded asks for this.
         let file_bytes = |streams: &[Stream], tuned: Option<(&[WeightArray], f64)>| -> Result<u64> {

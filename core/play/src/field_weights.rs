@@ -61,11 +61,18 @@ impl FieldWeights {
     ///
     /// # Errors
     /// What the deformer and the device report.
-    pub fn importance(&self, model: &Model, views: &dyn TrainingViews, registry: &Registry, device: &Device) -> Result<Option<Vec<Vec<f32>>>> {
+    pub fn importance(
+        &self,
+        model: &Model,
+        views: &dyn TrainingViews,
+        registry: &Registry,
+        device: &Device,
+        events: &dyn EventSink,
+    ) -> Result<Option<Vec<Vec<f32>>>> {
         if views.is_empty() || !registry.weight_codec(&self.name)?.info.capabilities.contains(&"importance") {
             return Ok(None);
         }
-        weight_importance(model, views, weight_seed(model.provenance.seed).child("importance"), registry, device).map(Some)
+        weight_importance(model, views, weight_seed(model.provenance.seed).child("importance"), registry, device, events).map(Some)
     }
     /// The weights of `field` as streams, and the settings that were chosen.
     pub(crate) fn encode(

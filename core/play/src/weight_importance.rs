@@ -5,7 +5,7 @@ use crate::codec_services::{ModelServices, rand_signs};
 use crate::model::Model;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Registry, Result, Seed, TrainingViews};
+use cc4dgs_core::{Event, EventSink, Registry, Result, Seed, TrainingViews};
 use std::ops::RangeInclusive;
 
 /// Images whose derivatives are averaged: as many as draw so many Gaussians, within the range.
@@ -19,7 +19,14 @@ const WORK: usize = 1_500_000;
 ///
 /// # Errors
 /// What the deformer and the device report.
-pub(crate) fn weight_importance(model: &Model, views: &dyn TrainingViews, seed: Seed, registry: &Registry, device: &Device) -> Result<Vec<Vec<f32>>> {
+pub(crate) fn weight_importance(
+    model: &Model,
+    views: &dyn TrainingViews,
+    seed: Seed,
+    registry: &Registry,
+    device: &Device,
+    events: &dyn EventSink,
+) -> Result<Vec<Vec<f32>>> {
     let Some(of) = &model.field else { return Ok(Vec::new()) };
     let weights = weights_of(of.field.as_ref())?;
     if weights.is_empty() {
@@ -37,19 +44,19 @@ pub(crate) fn weight_importance(model: &Model, views: &dyn TrainingViews, seed: 
     for k in 0..images {
         let (camera, time_norm) = views.view(k * views.len() / images);
         let planes = services.image(&model.gaussians, camera, time_norm)?;
-        if !planes.is_tracked() {
-            // Nothing moves.
-            continue;
+        // Images where nothing moves do not depend on weights.
+        if planes.is_tracked() {
+            let shape = planes.dims();
+            let signs = Tensor::<3>::from_data(TensorData::new(rand_signs(seed.index(k as u64), shape.iter().product()), shape), &tracked);
+            let gradients = (planes * signs).sum().backward();
+            for (sums, parameter) in sums.iter_mut().zip(deformer.parameters()) {
+                // An array that no pixel depends on has no gradient.
+                let Some(gradient) = parameter.value.grad(&gradients) else { continue };
+                let found = to_vec(gradient, "derivatives by weights of the deformer")?;
+                sums.iter_mut().zip(found).filter(|(_, v)| v.is_finite()).for_each(|(sum, v)| *sum += f64::from(v).powi(2));
+            }
         }
-        let shape = planes.dims();
-        let signs = Tensor::<3>::from_data(TensorData::new(rand_signs(seed.index(k as u64), shape.iter().product()), shape), &tracked);
-        let gradients = (planes * signs).sum().backward();
-        for (sums, parameter) in sums.iter_mut().zip(deformer.parameters()) {
-            // An array that no pixel depends on has no gradient.
-            let Some(gradient) = parameter.value.grad(&gradients) else { continue };
-            let found = to_vec(gradient, "derivatives by weights of the deformer")?;
-            sums.iter_mut().zip(found).filter(|(_, v)| v.is_finite()).for_each(|(sum, v)| *sum += f64::from(v).powi(2));
-        }
+        events.emit(&Event::Progress { task: "importance of weights".into(), done: k as u64 + 1, total: images as u64 });
     }
     let mean = |sums: Vec<f64>| {
         let (count, images) = (sums.len().max(1) as f64, images.max(1) as f64);

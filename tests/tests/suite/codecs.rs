@@ -318,7 +318,7 @@ fn hostile_autoencoder_streams_never_panic() {
 #[test]
 #[ignore = "takes a minute; prints a report"]
 fn report_bytes_of_a_trained_model() {
-    let data = std::env::var_os("CC4DGS_DATA").map_or_else(|| std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), Into::into);
+    let data = std::env::var_os("CC4DGS_DATA").map_or_else(|| std::path::PathBuf::from("../../shared/data"), Into::into);
     let path = data.join("playbot_31k/lod3_decoded_3dgs.ply");
     let trained = path.exists().then(|| cc4dgs_core::ply::read(&path, &Limits::default()).unwrap());
     if trained.is_none() {

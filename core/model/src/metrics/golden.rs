@@ -3,11 +3,11 @@
 use super::Planes;
 use crate::Image8;
 use serde_json::Value;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Calls `check` with the name, the two images and the scores of every pair of `perceptual.json`.
 pub fn pairs(mut check: impl FnMut(&str, &Planes, &Planes, &Value)) {
-    let committed = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/fixtures/golden");
+    let committed = PathBuf::from("../../tests/fixtures/golden");
     let folder = std::env::var_os("CC4DGS_GOLDEN").map(PathBuf::from).filter(|f| f.join("perceptual.json").is_file()).unwrap_or(committed);
     let text = std::fs::read_to_string(folder.join("perceptual.json")).expect("perceptual.json in the golden folder");
     let file: Value = serde_json::from_str(&text).expect("JSON");

@@ -29,6 +29,7 @@ mod smoothness;
 mod stage;
 mod state;
 mod step;
+mod stored_weights;
 mod strain;
 mod targets;
 mod tune;

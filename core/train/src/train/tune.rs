@@ -6,6 +6,7 @@ use super::probe::mean;
 use super::pyramid::Pyramid;
 use super::rounded::{Rounded, WeightScale};
 use super::sampler::Sampler;
+use super::stored_weights::StoredWeights;
 use super::targets::{had_colours_per_camera, targets};
 use super::{Context, Parts, RateFactors, TrainJob, TrainState, training_cameras};
 use crate::config::RunConfig;
@@ -14,11 +15,9 @@ use crate::sample::spread_views;
 use crate::schedule::StageLengths;
 use burn::tensor::{Device, Tensor, TensorData};
 use cc4dgs_core::{
-    AppearanceContext, CodecContext, EncodedWeights, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage,
-    TuneModel, TunedModel, Tuning, WeightArray, WeightCodec, WeightSteps, config, psnr_of, weight_seed,
+    AppearanceContext, EncodedWeights, Error, Event, EventSink, HostGaussians, Limits, Registry, Result, Scene, Schedule, Seed, Split, Stage, TuneModel,
+    TunedModel, Tuning, WeightArray, WeightCodec, config, psnr_of,
 };
-use cc4dgs_play::codec_services::SceneViews;
-use cc4dgs_play::field_weights::FieldWeights;
 use cc4dgs_play::model::ModelDeformer;
 use cc4dgs_play::{Model, load_weights, weights_of};
 use std::cell::{OnceCell, RefCell};
@@ -52,7 +51,7 @@ pub struct TuneJob<'a> {
     pub model: &'a Model,
     /// The scene that it was trained on.
     pub scene: Arc<Scene>,
-    /// How the deformer's weights are stored: see [`FieldWeights::parse`]. The archive must name the same.
+    /// How the deformer's weights are stored: see [`cc4dgs_play::field_weights::FieldWeights::parse`]. The archive must name the same.
     pub field_weights: &'a str,
     /// Where plug-ins are found.
     pub registry: &'a Registry,
@@ -72,25 +71,16 @@ pub struct TuneJob<'a> {
 /// Nothing is looked at before a codec asks for it.
 pub struct Tuner<'a> {
     pub(super) job: TuneJob<'a>,
-    choices: OnceCell<Choices>,
+    config: OnceCell<RunConfig>,
+    weights: OnceCell<StoredWeights>,
     targets: OnceCell<Arc<Scene>>,
     adopted: RefCell<Option<(Vec<WeightArray>, f64)>>,
-}
-
-/// What follows from the model.
-struct Choices {
-    config: RunConfig,
-    field_weights: FieldWeights,
-    /// How much images depend on each weight, where the weight codec makes use of it.
-    importance: Option<Vec<Vec<f32>>>,
-    /// Settings of the weight codec without training.
-    weight_settings: toml::Table,
 }
 
 impl<'a> Tuner<'a> {
     /// A tuner of `job.model`.
     pub fn new(job: TuneJob<'a>) -> Self {
-        Self { job, choices: OnceCell::new(), targets: OnceCell::new(), adopted: RefCell::default() }
+        Self { job, config: OnceCell::new(), weights: OnceCell::new(), targets: OnceCell::new(), adopted: RefCell::default() }
     }
     /// The same tuner with the scene whose images it trains on.
     pub(super) fn with_targets(self, targets: Arc<Scene>) -> Self {
@@ -104,11 +94,12 @@ impl<'a> Tuner<'a> {
         let found = targets(&self.job)?;
         Ok(self.targets.get_or_init(|| found))
     }
-    fn choices(&self) -> Result<&Choices> {
-        if let Some(known) = self.choices.get() {
+    /// The configuration of the model's training, without what fine-tuning leaves out.
+    fn config(&self) -> Result<&RunConfig> {
+        if let Some(known) = self.config.get() {
             return Ok(known);
         }
-        let TuneJob { model, scene, field_weights, registry, device, limits, events, .. } = &self.job;
+        let TuneJob { model, scene, .. } = &self.job;
         if scene.split(Split::Train).is_empty() {
             return Err(Error::parameter("fine-tuning", format!("{} has no training views", scene.name), "Give the scene that the model was trained on"));
         }
@@ -119,14 +110,15 @@ impl<'a> Tuner<'a> {
         (config.density, config.appearance, config.train.image_growth, config.train.sh_every) = (none(), none(), 0.0, 1);
         (config.train.time_noise, config.train.dropout, config.train.lambda_r, config.train.lr.cooldown) = (0.0, 0.0, 0.0, 0.0);
         config.validate()?;
-        let field_weights = FieldWeights::parse(field_weights, registry)?;
-        let moves = self.moving_field().is_some();
-        let (mut importance, mut weight_settings) = (None, field_weights.settings.clone());
-        if moves {
-            importance = field_weights.importance(model, &SceneViews::new(scene), registry, device)?;
-            weight_settings = field_weights.settings_for(model, (scene, importance.as_deref()), registry, device, limits, *events)?;
+        Ok(self.config.get_or_init(|| config))
+    }
+    /// How the deformer's weights are stored.
+    fn weights(&self) -> Result<&StoredWeights> {
+        if let Some(known) = self.weights.get() {
+            return Ok(known);
         }
-        Ok(self.choices.get_or_init(|| Choices { config, field_weights, importance, weight_settings }))
+        let found = StoredWeights::choose(&self.job, self.moving_field().is_some())?;
+        Ok(self.weights.get_or_init(|| found))
     }
     /// The deformer, unless nothing moves: then it is not stored.
     fn moving_field(&self) -> Option<&ModelDeformer> {
@@ -137,7 +129,7 @@ impl<'a> Tuner<'a> {
     /// Calls `work` with the parts of a training and the state of `model`.
     pub(super) fn with_state<T>(&self, model: &TunedModel, seed: Seed, work: impl FnOnce(&Context, &mut TrainState) -> Result<T>) -> Result<T> {
         let TuneJob { registry, device, events, stop, .. } = &self.job;
-        let (config, scene) = (&self.choices()?.config, self.targets()?);
+        let (config, scene) = (self.config()?, self.targets()?);
         let training_camera = training_cameras(scene);
         let parts = Parts {
             appearance: registry.build_appearance(&config.appearance, &AppearanceContext { cameras: training_camera.len(), seed }, device)?,
@@ -170,49 +162,6 @@ impl<'a> Tuner<'a> {
         state.stage = Stage::Main;
         work(&context, &mut state)
     }
-    /// The weight codec in steps that are `weight_steps` times those chosen without training, and its settings.
-    fn weight_codec(&self, weight_steps: f64) -> Result<(Box<dyn WeightCodec>, toml::Table)> {
-        let Choices { field_weights, weight_settings, .. } = self.choices()?;
-        let settings = field_weights.coarser(weight_settings, weight_steps, self.job.registry)?;
-        Ok((self.job.registry.build_weight_codec(&field_weights.name, &settings)?, settings))
-    }
-    fn codec_context(&self) -> Result<CodecContext<'_>> {
-        let context = CodecContext::new(weight_seed(self.job.model.provenance.seed), *self.job.limits, self.job.events);
-        Ok(CodecContext { weight_importance: self.choices()?.importance.as_deref(), ..context })
-    }
-    /// `weights` as `codec` decodes them.
-    fn rounded_weights(&self, weights: &[WeightArray], codec: &dyn WeightCodec) -> Result<Vec<WeightArray>> {
-        if weights.is_empty() {
-            return Ok(Vec::new());
-        }
-        let context = self.codec_context()?;
-        codec.decode(&codec.encode(weights, &context)?, &context)
-    }
-    /// Steps of the deformer's weights, where their codec states them and they were searched, and derivatives of the size per step, each bit counted as `per_bit`.
-    fn weight_scales(&self, state: &TrainState, codec: &dyn WeightCodec, per_bit: f64) -> Result<Option<Vec<Option<WeightScale>>>> {
-        let Some(deformer) = &state.deformer else { return Ok(None) };
-        if self.choices()?.field_weights.max_drop_db.is_none() {
-            // Steps that nothing chose may be so small that no weight gets from one to the next.
-            return Ok(None);
-        }
-        let weights = weights_of(deformer.field.as_ref())?;
-        let Some(WeightSteps { steps, bit_slopes }) = codec.steps(&weights, &self.codec_context()?)? else { return Ok(None) };
-        let lengths = |arrays: &[Vec<f32>]| arrays.iter().map(Vec::len).collect::<Vec<_>>();
-        let expected: Vec<usize> = weights.iter().map(|array| array.values.len()).collect();
-        if lengths(&steps) != expected || lengths(&bit_slopes) != expected {
-            let object = format!("weight codec {}", self.choices()?.field_weights.name);
-            return Err(Error::parameter(object, "it states other numbers of steps than there are weights", "Return one step and one slope per weight"));
-        }
-        let upload = |values: Vec<f32>| {
-            let count = values.len();
-            Tensor::<1>::from_data(TensorData::new(values, [count]), self.job.device)
-        };
-        let scale = |(steps, slopes): (Vec<f32>, Vec<f32>)| {
-            let moves = steps.iter().any(|step| *step > 0.0);
-            moves.then(|| WeightScale { steps: upload(steps), size: upload(slopes).mul_scalar(per_bit) })
-        };
-        Ok(Some(steps.into_iter().zip(bit_slopes).map(scale).collect()))
-    }
     /// `like` with the values of `state`, which must be sound; `object` names them in errors.
     pub(super) fn columns_of(like: &HostGaussians, state: &TrainState, limits: &Limits, object: &str) -> Result<HostGaussians> {
         let (mut gaussians, found) = (like.clone(), state.set.host_gaussians()?);
@@ -232,7 +181,7 @@ impl<'a> Tuner<'a> {
         let scene = self.targets()?;
         let views = spread_views(scene, &scene.split(Split::Train), PROBES);
         let set = GaussianSet::new(gaussians, self.job.device).gaussians()?;
-        let (background, requests) = (self.choices()?.config.background()?, views.iter().map(|&v| (v, scene.views[v].time_norm)).collect::<Vec<_>>());
+        let (background, requests) = (self.config()?.background()?, views.iter().map(|&v| (v, scene.views[v].time_norm)).collect::<Vec<_>>());
         let mut sum = 0.0;
         context.draw(state, &set, &requests, gaussians.sh_degree, |index, image| {
             let target = context.rasterizer.upload(&scene.frame(views[index])?, background, self.job.device);
@@ -246,7 +195,7 @@ impl<'a> Tuner<'a> {
         let device = self.job.device;
         let host = state.set.host_gaussians()?;
         let exact = state.deformer.as_ref().map(|d| weights_of(d.field.as_ref())).transpose()?.unwrap_or_default();
-        let weights = self.rounded_weights(&exact, codec)?;
+        let weights = self.weights()?.rounded(&self.job, &exact, codec)?;
         let upload = |w: WeightArray| {
             let count = w.values.len();
             Tensor::<1>::from_data(TensorData::new(w.values, [count]), device)
@@ -298,7 +247,8 @@ impl TuneModel for Tuner<'_> {
     }
     fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel> {
         let device = self.job.device;
-        let (codec, _) = self.weight_codec(tuning.weight_steps)?;
+        let stored = self.weights()?;
+        let (codec, _) = stored.codec(&self.job, tuning.weight_steps)?;
         self.with_state(from, tuning.seed, |context, state| {
             let mut fixed = Fixed { steps: columns(&tuning.rounding.steps(&from.gaussians)?, device), size: BTreeMap::new(), weights: None, rate: 0.0 };
             let lost = self.mean_error(context, state, &tuning.rounding.round(&from.gaussians)?)? - self.mean_error(context, state, &from.gaussians)?;
@@ -318,7 +268,8 @@ impl TuneModel for Tuner<'_> {
                     fixed.size = slopes.into_iter().filter_map(in_steps).collect();
                 }
                 if (iteration - 1).is_multiple_of(SIZE_EVERY) {
-                    fixed.weights = self.weight_scales(state, codec.as_ref(), per_bit)?;
+                    let exact = state.deformer.as_ref().map(|d| weights_of(d.field.as_ref())).transpose()?;
+                    fixed.weights = exact.map_or(Ok(None), |exact| stored.scales(&self.job, &exact, codec.as_ref(), per_bit))?;
                 }
                 let share =
                     rate_at((iteration as f64 - 0.5) / tuning.iterations as f64) * (1.0 - FALL * (tuning.of.0 + iteration) as f64 / tuning.of.1.max(1) as f64);
@@ -341,7 +292,7 @@ impl TuneModel for Tuner<'_> {
     }
     fn psnr(&self, gaussians: &HostGaussians, weights: &[WeightArray], weight_steps: Option<f64>) -> Result<f64> {
         let weights = match weight_steps {
-            Some(factor) => self.rounded_weights(weights, self.weight_codec(factor)?.0.as_ref())?,
+            Some(factor) => self.weights()?.rounded(&self.job, weights, self.weights()?.codec(&self.job, factor)?.0.as_ref())?,
             None => weights.to_vec(),
         };
         // Images of cameras with colours of their own would hide what is lost.
@@ -351,7 +302,7 @@ impl TuneModel for Tuner<'_> {
         let mut sum = 0.0;
         self.with_state(&model, Seed::root(0), |context, state| {
             let requests: Vec<(usize, f32)> = views.iter().map(|&view| (view, scene.views[view].time_norm)).collect();
-            let (set, background) = (state.set.gaussians()?, self.choices()?.config.background()?);
+            let (set, background) = (state.set.gaussians()?, self.config()?.background()?);
             context.draw(state, &set, &requests, gaussians.sh_degree, |index, image| {
                 let target = context.rasterizer.upload(&scene.frame(views[index])?, background, self.job.device);
                 let difference = image.clamp(0.0, 1.0) - target;
@@ -365,8 +316,7 @@ impl TuneModel for Tuner<'_> {
         if self.moving_field().is_none() {
             return Ok(EncodedWeights::default());
         }
-        let (codec, settings) = self.weight_codec(weight_steps)?;
-        Ok((codec.encode(weights, &self.codec_context()?)?, settings))
+        self.weights()?.encode(&self.job, weights, weight_steps)
     }
     fn adopt(&self, weights: Vec<WeightArray>, weight_steps: f64) {
         *self.adopted.borrow_mut() = Some((weights, weight_steps));

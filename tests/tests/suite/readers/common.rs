@@ -223,7 +223,7 @@ pub fn write_technicolor(root: &Path, count: u8, frames: &[u32]) -> Vec<Camera> 
 
 /// A folder of real data, in `CC4DGS_DATA` or beside the repository; prints a note and returns `None` if absent.
 pub fn real(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("CC4DGS_DATA").map(PathBuf::from).unwrap_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data")));
+    let root = std::env::var_os("CC4DGS_DATA").map(PathBuf::from).unwrap_or_else(|| PathBuf::from("../../shared/data"));
     let path = root.join(name);
     if !path.is_dir() {
         eprintln!("skipped: {} is absent (set CC4DGS_DATA)", path.display());
