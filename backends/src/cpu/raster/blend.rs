@@ -4,13 +4,13 @@ use super::camera::{ALPHA_MIN, RuleConstants, TRANSMITTANCE_STOP};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
 use super::{RasterSettings, ScreenSplat, TILE, TILE_PIXELS};
-use crate::cpu::simd::{Lanes, dispatch, prefetch, vectorized};
+use crate::cpu::simd::{Lanes, dispatch, each, prefetch, vectorized};
 use pulp::{Simd, WithSimd};
 use std::mem::MaybeUninit;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Sigma up to which the exponential is evaluated; alpha is far below 1/255 beyond.
-pub const SIGMA_MAX: f32 = 87.0;
+const SIGMA_MAX: f32 = 87.0;
 /// Prefetch distance in list entries.
 pub const AHEAD: usize = 6;
 /// Planes of the output.
@@ -32,6 +32,44 @@ pub struct Gap {
 #[inline(always)]
 pub fn column_centers(origin_x: usize) -> [f32; TILE] {
     std::array::from_fn(|x| (origin_x + x) as f32 + 0.5)
+}
+
+/// Rows of a tile that [`alphas`] computes together.
+pub const TOGETHER: usize = 4;
+
+/// Numbers of the rows of a vector's columns, and of those beyond the tile that are computed with the last ones.
+pub type Rows<S> = [Lanes<S>; TILE + TOGETHER - 1];
+
+/// Pixel centres of the rows of a tile at `origin_y`, and of those beyond it.
+#[inline(always)]
+pub fn row_centers(origin_y: usize) -> [f32; TILE + TOGETHER - 1] {
+    std::array::from_fn(|y| (origin_y + y) as f32 + 0.5)
+}
+
+/// Writes alpha before it is capped to the rows of `out` that have a bit in `rows`, at the columns `dx` from the centre of `splat`; 0 where it is below 1/255.
+#[inline(always)]
+pub fn alphas<S: Simd>(simd: S, splat: &ScreenSplat, dx: Lanes<S>, centers: &[f32; TILE + TOGETHER - 1], rows: u32, out: &mut Rows<S>) {
+    let like = |v: f32| Lanes::<S>::splat(simd, v);
+    let [half_a, b, half_c] = splat.conic;
+    let (a, opacity, least, limit) = (like(half_a), like(splat.opacity), like(ALPHA_MIN), like(SIGMA_MAX));
+    let mut left = rows;
+    while left != 0 {
+        let first = left.trailing_zeros() as usize;
+        left &= u32::MAX << (first + TOGETHER);
+        let centers = &centers[first..first + TOGETHER];
+        let sigma: [Lanes<S>; TOGETHER] = each(
+            #[inline(always)]
+            |k| {
+                let dy = centers[k] - splat.center[1];
+                a.fma(dx, like(b * dy)).fma(dx, like(half_c * dy * dy))
+            },
+        );
+        let shown = Lanes::exp_negated(sigma);
+        for (k, out) in out[first..first + TOGETHER].iter_mut().enumerate() {
+            let alpha = opacity * shown[k];
+            *out = (sigma[k].bits_le(limit) & alpha.ge(least)).keep(alpha);
+        }
+    }
 }
 
 /// Blends every tile into `planes` `[5,H,W]`, of which every element is written, and saves what the backward pass needs. Returns the number of (Gaussian, pixel)
@@ -228,18 +266,15 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
         let Self { ranked, list, origin, rules, state, weights, ends_early } = self;
         let like = |v: f32| Lanes::<S>::splat(simd, v);
         let columns = column_centers(origin[0]);
-        let origin_y = origin[1] as f32 + 0.5;
-        let (cap, least, stop, limit) = (like(rules.alpha_max), like(ALPHA_MIN), like(TRANSMITTANCE_STOP), like(SIGMA_MAX));
-        let one = like(1.0);
+        let centers = row_centers(origin[1]);
+        let (cap, least, stop, one) = (like(rules.alpha_max), like(ALPHA_MIN), like(TRANSMITTANCE_STOP), like(1.0));
+        let mut full = [like(0.0); TILE + TOGETHER - 1];
         for (i, entry) in list.iter().enumerate() {
             if let Some(ahead) = list.get(i + AHEAD) {
                 prefetch(ranked, ahead.rank as usize);
             }
             let splat = &ranked[entry.rank as usize];
             let alive = if ends_early { state.alive } else { u32::MAX };
-            let [half_a, b, half_c] = splat.conic;
-            let a = like(half_a);
-            let opacity = like(splat.opacity);
             let shown = [like(splat.color[0]), like(splat.color[1]), like(splat.color[2]), like(splat.depth)];
             let mut largest = like(0.0);
             for block in 0..TILE / S::F32_LANES {
@@ -247,14 +282,13 @@ impl<const WEIGHTS: bool> WithSimd for BlendTile<'_, '_, WEIGHTS> {
                 let dx = Lanes::load(simd, &columns[first..]) - splat.center[0];
                 let mut left = entry.row_mask::<S>(first) & alive;
                 state.evaluations += u64::from(left.count_ones()) * S::F32_LANES as u64;
+                alphas(simd, splat, dx, &centers, left, &mut full);
                 while left != 0 {
                     let row = left.trailing_zeros() as usize;
                     left &= left - 1;
                     let at = row * TILE + first;
-                    let dy = origin_y + row as f32 - splat.center[1];
-                    let sigma = a.fma(dx, like(b * dy)).fma(dx, like(half_c * dy * dy));
-                    let alpha = (opacity * sigma.exp_negated()).min(cap);
-                    let hit = sigma.bits_le(limit) & alpha.ge(least);
+                    let alpha = full[row].min(cap);
+                    let hit = alpha.ge(least);
                     let before = Lanes::load(simd, &state.running[at..]);
                     let after = alpha.nfma(before, before);
                     let drawn = hit & after.gt(stop);

@@ -4,7 +4,7 @@
 //! d loss / d alpha_i = T_i q_i - S_i / (1 - alpha_i). All of a Gaussian's geometry gradients at a tile come from sums over v = d loss / d
 //! sigma times powers of dx and dy; dx is constant per column, so its powers are applied once after the rows.
 
-use super::blend::{AHEAD, Gap, SIGMA_MAX, TilePlane, column_centers};
+use super::blend::{AHEAD, Gap, TOGETHER, TilePlane, alphas, column_centers, row_centers};
 use super::camera::{ALPHA_MIN, RuleConstants};
 use super::parallel::{SharedMut, run_tasks};
 use super::scratch::{Entry, Workspace, set_len};
@@ -137,8 +137,9 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
         let stop_at: &[f32] = bytemuck::cast_slice(stop_at);
         let like = |v: f32| Lanes::<S>::splat(simd, v);
         let columns = column_centers(origin[0]);
-        let origin_y = origin[1] as f32 + 0.5;
-        let (cap, least, limit, one, zero) = (like(rules.alpha_max), like(ALPHA_MIN), like(SIGMA_MAX), like(1.0), like(0.0));
+        let centers = row_centers(origin[1]);
+        let (cap, least, one, zero) = (like(rules.alpha_max), like(ALPHA_MIN), like(1.0), like(0.0));
+        let mut uncapped = [zero; TILE + TOGETHER - 1];
         // Largest uncapped alpha whose gradient passes.
         let passing = like(if rules.pass_capped { f32::MAX } else { rules.alpha_max });
         for (i, entry) in list.iter().enumerate().rev() {
@@ -147,8 +148,6 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
             }
             let splat = &ranked[entry.rank as usize];
             let [half_a, b, half_c] = splat.conic;
-            let a = like(half_a);
-            let opacity = like(splat.opacity);
             let color: [Lanes<S>; 3] = each(
                 #[inline(always)]
                 |c| like(splat.color[c]),
@@ -170,14 +169,14 @@ impl<const STOPS: bool, const DEPTH: bool, const ABSOLUTE: bool> WithSimd for Fl
                 let mut v_dy2 = zero;
                 let mut shown = [zero; 4];
                 let (mut absolute_x, mut absolute_y) = (zero, zero);
+                alphas(simd, splat, dx, &centers, left, &mut uncapped);
                 while left != 0 {
                     let row = left.trailing_zeros() as usize;
                     left &= left - 1;
                     let at = row * TILE + first;
-                    let dy = origin_y + row as f32 - splat.center[1];
-                    let sigma = a.fma(dx, like(b * dy)).fma(dx, like(half_c * dy * dy));
-                    let full = opacity * sigma.exp_negated();
-                    let mut hit = sigma.bits_le(limit) & full.ge(least);
+                    let dy = centers[row] - splat.center[1];
+                    let full = uncapped[row];
+                    let mut hit = full.ge(least);
                     if STOPS {
                         // i < stop_at, on integers.
                         hit = hit & position.bits_le(Lanes::load(simd, &stop_at[at..]));

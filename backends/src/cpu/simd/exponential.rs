@@ -1,6 +1,6 @@
 //! Exponentials and logarithms of [`Lanes`].
 
-use super::Lanes;
+use super::{Lanes, each};
 use pulp::Simd;
 
 const LOG2_E: f32 = std::f32::consts::LOG2_E;
@@ -18,18 +18,31 @@ const EXP2_5: [f32; 5] = [0.693_147, 0.240_222_42, 0.055_507_337, 0.009_671_513,
 const EXP2_6: [f32; 6] = [std::f32::consts::LN_2, 0.240_226_48, 0.055_503_325, 0.009_618_437, 0.001_339_887_4, 0.000_153_533_6];
 
 impl<S: Simd> Lanes<S> {
-    /// exp(-self) for 0 <= self <= 87; relative error under 2e-7 where the result is over 1/255, exactly 1 at 0, garbage outside the range.
+    /// exp(-x) of each of `x` for 0 <= x <= 87; relative error under 2e-7 where the result is over 1/255, exactly 1 at 0, garbage outside the range. Every step is
+    /// taken for all of them before the next one: a processor does not look far enough ahead to find out that they do not depend on each other.
     #[inline(always)]
-    pub fn exp_negated(self) -> Self {
-        let scaled = self.like(-LOG2_E);
-        let rounded = self.fma(scaled, self.like(ROUND));
-        let n = rounded - ROUND;
-        let f = self.fma(scaled, -n);
-        let mut p = self.like(EXP2_5[4]);
-        for k in (0..4).rev() {
-            p = p.fma(f, self.like(EXP2_5[k]));
+    pub fn exp_negated<const N: usize>(x: [Self; N]) -> [Self; N] {
+        let like = |v: f32| x[0].like(v);
+        let scaled = like(-LOG2_E);
+        let rounded: [Self; N] = each(
+            #[inline(always)]
+            |k| x[k].fma(scaled, like(ROUND)),
+        );
+        let f: [Self; N] = each(
+            #[inline(always)]
+            |k| x[k].fma(scaled, -(rounded[k] - ROUND)),
+        );
+        let mut p = [like(EXP2_5[4]); N];
+        for coefficient in [EXP2_5[3], EXP2_5[2], EXP2_5[1], EXP2_5[0], 1.0] {
+            p = each(
+                #[inline(always)]
+                |k| p[k].fma(f[k], like(coefficient)),
+            );
         }
-        p.fma(f, self.like(1.0)).times_power_of_two(rounded)
+        each(
+            #[inline(always)]
+            |k| p[k].times_power_of_two(rounded[k]),
+        )
     }
     /// exp(self), the argument clamped to -87..88; relative error about 1e-7. A NaN gives a finite value: test the input.
     #[inline(always)]
@@ -99,7 +112,7 @@ mod tests {
                     let x = Lanes::load(simd, part);
                     let y = match self.1 {
                         0 => x.exp(),
-                        1 => x.exp_negated(),
+                        1 => Lanes::exp_negated([x])[0],
                         2 => x.ln(),
                         _ => x.ln_rough(),
                     };
