@@ -6,15 +6,16 @@ use rayon::prelude::*;
 /// Rows per task.
 const ROWS: usize = 4096;
 
-/// Adds the norm of `gradient` `[N,2]` times `scale`, and 1, to the `sums` `[N,2]` of every Gaussian with a radius.
+/// Adds the norm of `gradient` `[N,2]` times `scale`, and 1, to the `sums` `[N,2]` of every Gaussian with a radius. Norms that are not finite are left out.
 pub fn add_gradients(sums: &mut [f32], radii: &[i64], gradient: &[f32], scale: [f32; 2]) {
     let sums = sums.as_chunks_mut::<2>().0.par_chunks_mut(ROWS);
     let rows = sums.zip(radii.par_chunks(ROWS)).zip(gradient.as_chunks::<2>().0.par_chunks(ROWS));
     rows.for_each(|((sums, radii), gradient)| {
         for (([sum, seen], radius), [x, y]) in sums.iter_mut().zip(radii).zip(gradient) {
-            if *radius > 0 {
-                let (x, y) = (x * scale[0], y * scale[1]);
-                *sum += (x * x + y * y).sqrt();
+            let (x, y) = (x * scale[0], y * scale[1]);
+            let norm = (x * x + y * y).sqrt();
+            if *radius > 0 && norm.is_finite() {
+                *sum += norm;
                 *seen += 1.0;
             }
         }

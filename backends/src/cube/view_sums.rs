@@ -1,6 +1,6 @@
 //! Sums over views on a GPU: one thread per Gaussian.
 
-use super::tensor::{THREADS, floats, owned, workgroups_for};
+use super::tensor::{THREADS, floats, is_finite, owned, workgroups_for};
 use crate::ops::view_sums::{MOST_LOGIT, ViewSumOps};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn_cubecl::CubeBackend;
@@ -13,8 +13,11 @@ fn sum_gradients(sums: &mut [f32], radii: &[i32], gradient: &[f32], scale_x: f32
     if row < radii.len() && radii[row] > 0 {
         let x = gradient[2 * row] * scale_x;
         let y = gradient[2 * row + 1] * scale_y;
-        sums[2 * row] += (x * x + y * y).sqrt();
-        sums[2 * row + 1] += 1.0f32;
+        let norm = (x * x + y * y).sqrt();
+        if is_finite(norm) {
+            sums[2 * row] += norm;
+            sums[2 * row + 1] += 1.0f32;
+        }
     }
 }
 

@@ -13,7 +13,7 @@ pub(crate) const MOST_LOGIT: f32 = 30.0;
 /// The operations per device. A Gaussian whose radius is 0 is not shown.
 #[backend_extension(Flex, NdArray: cfg(feature = "ndarray"), Cube: cfg(feature = "cube"))]
 pub trait ViewSumOps: Backend {
-    /// Adds the norm of `gradient` `[N,2]` times `scale`, and 1, to the `sums` `[N,2]` of every Gaussian that is shown.
+    /// Adds the norm of `gradient` `[N,2]` times `scale`, and 1, to the `sums` `[N,2]` of every Gaussian that is shown. Norms that are not finite are left out.
     fn add_gradients(sums: FloatTensor<Self>, radii: IntTensor<Self>, gradient: FloatTensor<Self>, scale: [f32; 2]) -> FloatTensor<Self>;
     /// Adds `weights` `[N]`, their squares, and 1 where a Gaussian is shown, to `sums` `[N,3]`.
     fn add_weights(sums: FloatTensor<Self>, radii: IntTensor<Self>, weights: FloatTensor<Self>) -> FloatTensor<Self>;
@@ -45,7 +45,7 @@ fn check(object: &str, radii: &Tensor<1, Int>, found: &[&[usize]], expected: &[&
 }
 
 /// `sums` `[N,2]` of screen gradients and of views, after a view with these `radii` (0 where a Gaussian is not shown): the norm of `gradient` `[N,2]`, each axis times
-/// its `scale`, and 1 are added where a Gaussian is shown. In place if `sums` has no other owner.
+/// its `scale`, and 1 are added where a Gaussian is shown and the norm is finite. In place if `sums` has no other owner.
 ///
 /// # Errors
 /// [`Error::Parameter`] for other shapes.

@@ -77,39 +77,50 @@ impl Offsets {
     /// # Errors
     /// [`Error::Backend`] that names `deformer` and the head.
     pub fn check_finite(&self, deformer: &str) -> Result<()> {
-        let Some(head) = self.broken_head(deformer)? else { return Ok(()) };
+        let Some(head) = self.broken_head(deformer, 0.0)? else { return Ok(()) };
         Err(Error::backend(
             format!("deformer {deformer}, head {head}"),
             "its offsets are not finite",
             "Lower the deformer's learning rates, or limit what the head returns",
         ))
     }
-    /// The first head that is not finite. Reads one number per head back from the device.
+    /// The first head of which more than the share `tolerated` of the rows is not finite. Reads one number per head back from the device, and heads that are not finite.
     ///
     /// # Errors
     /// [`Error::Backend`] that names `deformer` and the head, if the device fails.
-    pub fn broken_head(&self, deformer: &str) -> Result<Option<&'static str>> {
-        fn sum<const D: usize>(tensor: &Option<Tensor<D>>) -> Option<Tensor<1>> {
-            tensor.as_ref().map(|t| t.clone().sum())
+    pub fn broken_head(&self, deformer: &str, tolerated: f64) -> Result<Option<&'static str>> {
+        fn finite(values: &[f32]) -> bool {
+            values.iter().all(|value| value.is_finite())
         }
-        let heads = [
-            ("means", sum(&self.means)),
-            ("log_scales", sum(&self.log_scales)),
-            ("scales", sum(&self.scales)),
-            ("quaternions", sum(&self.quaternions)),
-            ("rotation_vectors", sum(&self.rotation_vectors)),
-            ("opacity_logits", sum(&self.opacity_logits)),
-            ("opacity_log_factor", sum(&self.opacity_log_factor)),
-            ("sh", sum(&self.sh)),
-        ];
-        for (head, sum) in heads {
+        fn is_broken<const D: usize>(head: &Option<Tensor<D>>, object: &str, tolerated: f64) -> Result<bool> {
+            let Some(head) = head else { return Ok(false) };
             // A sum is finite only if every summand is; shader compilers do not optimise it away.
-            let Some(sum) = sum else { continue };
-            if to_vec(sum, &format!("deformer {deformer}, head {head}"))?.iter().any(|total| !total.is_finite()) {
+            if finite(&to_vec(head.clone().sum(), object)?) {
+                return Ok(false);
+            }
+            let (rows, values) = (head.dims()[0].max(1), to_vec(head.clone(), object)?);
+            let broken = values.chunks((values.len() / rows).max(1)).filter(|row| !finite(row)).count();
+            Ok(broken as f64 > tolerated * rows as f64)
+        }
+        let object = |head: &str| format!("deformer {deformer}, head {head}");
+        let wide = [
+            ("means", &self.means),
+            ("log_scales", &self.log_scales),
+            ("scales", &self.scales),
+            ("quaternions", &self.quaternions),
+            ("rotation_vectors", &self.rotation_vectors),
+        ];
+        for (head, offsets) in wide {
+            if is_broken(offsets, &object(head), tolerated)? {
                 return Ok(Some(head));
             }
         }
-        Ok(None)
+        for (head, offsets) in [("opacity_logits", &self.opacity_logits), ("opacity_log_factor", &self.opacity_log_factor)] {
+            if is_broken(offsets, &object(head), tolerated)? {
+                return Ok(Some(head));
+            }
+        }
+        Ok(is_broken(&self.sh, &object("sh"), tolerated)?.then_some("sh"))
     }
     /// Applies the offsets to the Gaussians with the indices `rows` `[M]`; `None` means the first M. All other Gaussians are returned unchanged.
     ///
@@ -320,10 +331,19 @@ mod tests {
     fn the_first_head_that_is_not_finite_is_named() {
         let filled = |value: f32| Some(Tensor::<2>::full([4, 3], value, &Device::flex()));
         let of = |means: f32, scales: f32| Offsets { means: filled(means), scales: filled(scales), ..Offsets::default() };
-        assert_eq!(of(0.5, 1.0).broken_head("d").unwrap(), None);
-        assert_eq!(Offsets::default().broken_head("d").unwrap(), None);
-        assert_eq!(of(0.5, f32::NAN).broken_head("d").unwrap(), Some("scales"));
-        assert_eq!(of(f32::INFINITY, f32::NAN).broken_head("d").unwrap(), Some("means"));
+        assert_eq!(of(0.5, 1.0).broken_head("d", 0.0).unwrap(), None);
+        assert_eq!(Offsets::default().broken_head("d", 0.0).unwrap(), None);
+        assert_eq!(of(0.5, f32::NAN).broken_head("d", 0.0).unwrap(), Some("scales"));
+        assert_eq!(of(f32::INFINITY, f32::NAN).broken_head("d", 0.0).unwrap(), Some("means"));
+        // One of four rows, and one of two.
+        let one_of = |rows: usize| {
+            let mut values = vec![0.5; 3 * rows];
+            values[4] = f32::NAN;
+            let means = Tensor::from_data(burn::tensor::TensorData::new(values, [rows, 3]), &Device::flex());
+            Offsets { means: Some(means), ..Offsets::default() }
+        };
+        assert_eq!([4, 2].map(|rows| one_of(rows).broken_head("d", 0.25).unwrap()), [None, Some("means")]);
+        assert_eq!(one_of(4).broken_head("d", 0.0).unwrap(), Some("means"));
         assert!(of(0.5, 1.0).check_finite("d").is_ok());
         let error = of(0.5, f32::NAN).check_finite("d").unwrap_err();
         assert!(error.to_string().starts_with("deformer d, head scales: its offsets are not finite"), "{error}");

@@ -174,7 +174,7 @@ impl RunConfig {
     }
     /// Whether the run is to settle the length of its main stage, by the time that its plan leaves.
     pub(crate) fn settles_length(&self) -> bool {
-        self.auto.ends.is_some() && self.train.stretch == 1.0
+        self.auto.time_left.is_some() && self.train.stretch == 1.0
     }
     pub(crate) fn validate(&self) -> Result<()> {
         self.scene.validate()?;

@@ -6,6 +6,7 @@ use cc4dgs_core::{Event, Recorder, Registry, Scene, Silent, Split};
 use cc4dgs_play::Model;
 use cc4dgs_train::auto;
 use cc4dgs_train::config::RunConfig;
+use cc4dgs_train::data::hold_out;
 use cc4dgs_train::eval::{Scored, evaluate};
 use cc4dgs_train::layers::Layers;
 use cc4dgs_train::train::{TrainJob, train};
@@ -90,4 +91,13 @@ fn plans_fit_the_capture() {
     let skips = |config: &RunConfig| config.auto.plan.iter().find(|line| line.starts_with("not computed")).cloned().unwrap();
     let named = |config: &RunConfig| ["train.batch", "deformer.vertex_reuse", "rasterizer.opacity_shortcut"].map(|key| skips(config).contains(key));
     assert_eq!((named(&handheld), named(&other), named(&photos)), ([false, true, true], [true, false, true], [false, false, true]));
+}
+
+#[test]
+fn a_plan_does_not_look_at_what_training_keeps_out() {
+    let registry = Registry::collect().unwrap();
+    let (config, scene) = planned("sparse", &["train.iterations=100", "train.validation=1"], &registry);
+    let trained_on = hold_out(&scene, 1).unwrap().split(Split::Train).len();
+    let seen = &config.auto.plan[0];
+    assert!(trained_on < scene.split(Split::Train).len() && seen.contains(&format!(": {trained_on} training images")), "{trained_on}, {seen}");
 }

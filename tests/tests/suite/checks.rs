@@ -12,7 +12,7 @@ use cc4dgs_train::train::{TrainJob, TrainReport, train};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Images of another scene, changed.
 struct Changed<F>(Arc<Scene>, F);
@@ -287,7 +287,7 @@ fn a_run_is_judged_by_the_length_that_it_gets() {
     // What comes of it where there is so much time, and when it was scored.
     let ended = |seconds: u64| {
         let mut config = configured(&sets);
-        config.auto.ends = Instant::now().checked_add(Duration::from_secs(seconds));
+        config.auto.time_left = Some(Duration::from_secs(seconds));
         let out = folder.path().join(seconds.to_string());
         let (trained, events) = run_as(&config, &scene, Some(&out), false, |_| false);
         let header: serde_json::Value = CheckpointFile::read(&out.join(CHECKPOINT), &Limits::default()).unwrap().header().unwrap();

@@ -197,8 +197,8 @@ fn importance_tells_how_much_images_change_with_weights() {
         };
         let of = built(&[0.05]);
         let compact = FieldWeights::parse("compact", &registry).unwrap();
-        assert!(FieldWeights::parse("fp16", &registry).unwrap().importance(&of, &views, &registry, &device).unwrap().is_none());
-        let importance = compact.importance(&of, &views, &registry, &device).unwrap().unwrap();
+        assert!(FieldWeights::parse("fp16", &registry).unwrap().importance(&of, &views, &registry, &device, &Silent).unwrap().is_none());
+        let importance = compact.importance(&of, &views, &registry, &device, &Silent).unwrap().unwrap();
         let counts: Vec<usize> = of.field.as_ref().unwrap().field.parameters().iter().map(|p| p.value.dims()[0]).collect();
         assert_eq!(importance.iter().map(Vec::len).collect::<Vec<_>>(), counts, "{kind}");
         assert!(importance.iter().flatten().all(|v| v.is_finite() && *v >= 0.0), "{kind}");

@@ -127,14 +127,14 @@ fn a_training_has_the_same_bytes_on_any_number_of_threads() {
 fn a_run_that_has_time_left_is_longer_and_its_settings_repeat_it() {
     let mut config = tiny(&["train.iterations=60"]);
     let planned = config.train.iterations;
-    config.auto.ends = std::time::Instant::now().checked_add(std::time::Duration::from_secs(36_000));
+    config.auto.time_left = Some(std::time::Duration::from_secs(36_000));
     let folder = tempfile::tempdir().unwrap();
     let [a, b, c] = ["a", "b", "c"].map(|name| folder.path().join(name));
     let never = AtomicBool::new(false);
     let report = run(&config, &a, false, &Silent, &never).unwrap();
     let settled = RunConfig::resolve(None, Some(&a.join(CONFIG)), &[]).unwrap();
     assert_eq!(settled.train.stretch, 4.0, "the largest factor");
-    assert!(report.iterations > 3 * planned && settled.train.iterations == planned && settled.auto.ends.is_none(), "{}", report.iterations);
+    assert!(report.iterations > 3 * planned && settled.train.iterations == planned && settled.auto.time_left.is_none(), "{}", report.iterations);
     run(&settled, &b, false, &Silent, &never).unwrap();
     let bytes = |out: &Path| std::fs::read(out.join(CHECKPOINT)).unwrap();
     assert!(bytes(&a) == bytes(&b), "the settings of a run that settled its length do not repeat it");

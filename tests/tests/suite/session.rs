@@ -1,9 +1,9 @@
 //! The library as used by a program.
 
-use cc4dgs::{Error, Event, Orbit, Session, Split};
+use cc4dgs::{Error, Event, Orbit, RunConfig, Session, Split};
 use cc4dgs_core::{Seed, Similarity, ply, resolved_device};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 
 fn flex() -> Session {
     Session::builder().device("flex").build().unwrap()
@@ -58,6 +58,47 @@ fn a_session_trains_saves_opens_and_plays() {
     assert_eq!(again.background, Some([0.0; 3]));
     let report = session.evaluate(&opened, &again, Split::Test).unwrap();
     assert_eq!(report.psnr_db, session.evaluate(&model, &scene, Split::Test).unwrap().psnr_db);
+}
+
+#[test]
+fn settings_out_of_range_are_refused_before_anything_is_written() {
+    let session = flex();
+    let config = session.config("demo", &["train.iterations=30"]).unwrap();
+    let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let changes: [(&str, fn(&mut RunConfig)); 3] = [
+        ("train.iterations", |config| config.train.iterations = 0),
+        ("train.batch", |config| config.train.batch = 0),
+        ("train.smooth_delta", |config| config.train.smooth_delta = -0.1),
+    ];
+    for (key, change) in changes {
+        let mut config = config.clone();
+        change(&mut config);
+        let error = session.train(&config, scene.clone(), Some(&run)).err().unwrap();
+        assert!(matches!(error, Error::Parameter { .. }) && error.to_string().contains(key), "{error}");
+        assert!(!run.exists(), "{key}");
+    }
+}
+
+#[test]
+fn key_frames_that_are_further_apart_than_the_scene_is_long_are_warned_of_with_both_numbers() {
+    let heard: Arc<Mutex<Vec<String>>> = Arc::default();
+    let listener = heard.clone();
+    let session = Session::builder().device("flex").on_event(move |event| {
+        if let Event::Warning { object, message } = event
+            && object == "train.key_frames"
+        {
+            listener.lock().unwrap().push(message.clone());
+        }
+    });
+    let session = session.build().unwrap();
+    let config = session.config("demo", &["train.iterations=30", "train.key_frames=4000"]).unwrap();
+    let scene = session.read_scene("procedural:tiny", &config.scene).unwrap();
+    let expected = format!("4000 is not below the {} frames", scene.frame_count);
+    session.train(&config, scene, None).unwrap();
+    let heard = heard.lock().unwrap();
+    assert!(heard.len() == 1 && heard[0].contains(&expected), "{heard:?}");
 }
 
 #[test]

@@ -3,10 +3,11 @@
 use burn::tensor::{Device, Tensor};
 use cc4dgs::{Error, Event, RunConfig, Session};
 use cc4dgs_core::{
-    DensityControl, DensityPlan, DensityPlugin, Gaussians, LossInput, LossPlugin, LossTerm, Plugin, Result, Schedule, Seed, Stage, Statistic, ViewStatistics,
-    config, inventory, toml,
+    DensityControl, DensityPlan, DensityPlugin, Gaussians, LossInput, LossPlugin, LossTerm, Plugin, Result, Schedule, Seed, Silent, Stage, Statistic,
+    ViewStatistics, config, inventory, toml,
 };
-use std::sync::atomic::{AtomicUsize, Ordering};
+use cc4dgs_train::train::{TrainJob, train};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// Calls of the term that breaks once.
@@ -47,11 +48,12 @@ inventory::submit! {
     }
 }
 
-/// No density control, but the first Gaussian is broken in the last iteration of the main stage if `breaks` says so.
+/// No density control, but in the last iteration of the main stage the first Gaussian is broken if `breaks` says so, and all get a large score if `moves_all` does.
 #[derive(Default, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct BreakOne {
     breaks: bool,
+    moves_all: bool,
 }
 
 impl DensityControl for BreakOne {
@@ -66,11 +68,18 @@ impl DensityControl for BreakOne {
         Ok(None)
     }
     fn after_step(&mut self, gaussians: &Gaussians, schedule: &Schedule, _seed: Seed) -> Result<Vec<(String, Tensor<2>)>> {
-        if !self.breaks || schedule.stage != Stage::Main || schedule.iteration < schedule.length {
-            return Ok(Vec::new());
+        let (mut changed, device) = (Vec::new(), gaussians.means.device());
+        if schedule.stage != Stage::Main || schedule.iteration < schedule.length {
+            return Ok(changed);
         }
-        let broken = Tensor::full([1, 3], f32::NAN, &gaussians.means.device());
-        Ok(vec![("means".into(), gaussians.means.clone().slice_assign([0..1, 0..3], broken))])
+        if self.breaks {
+            let broken = Tensor::full([1, 3], f32::NAN, &device);
+            changed.push(("means".into(), gaussians.means.clone().slice_assign([0..1, 0..3], broken)));
+        }
+        if self.moves_all {
+            changed.push(("dynamic_scores".into(), Tensor::full([gaussians.len(), 1], 100.0, &device)));
+        }
+        Ok(changed)
     }
 }
 
@@ -80,7 +89,7 @@ fn build_break_one(settings: &toml::Table) -> Result<Box<dyn DensityControl>> {
 
 inventory::submit! {
     DensityPlugin {
-        info: Plugin { name: "break-one", version: "1", summary: "NaN in one Gaussian", paper: "a test", schema: "breaks = false\n", capabilities: &[] },
+        info: Plugin { name: "break-one", version: "1", summary: "NaN in one Gaussian", paper: "a test", schema: "breaks = false\nmoves_all = false\n", capabilities: &[] },
         build: build_break_one,
     }
 }
@@ -138,6 +147,15 @@ fn the_part_that_runs_away_is_slowed_down() {
 }
 
 #[test]
+fn a_run_that_is_rarely_logged_recovers_as_well() {
+    let [often, rarely] = ["train.log_every=10", "train.log_every=1000"].map(|every| run("opaque", &["train.lr.opacity=3.0", every]));
+    let lowered = |run: &Run| run.warnings.iter().filter(|w| w.contains("learns")).cloned().collect::<Vec<_>>();
+    assert!(!lowered(&often).is_empty());
+    assert_eq!(lowered(&often), lowered(&rarely));
+    assert!(often.outcome.unwrap() == rarely.outcome.unwrap(), "other bytes where the loss is rarely logged");
+}
+
+#[test]
 fn checkpoints_on_the_way_change_nothing_where_there_is_trouble() {
     let [rare, often] = ["train.checkpoint_every=0", "train.checkpoint_every=7"]
         .map(|every| run("opaque", &["train.lr.opacity=3.0", "density={kind='none'}", "train.iterations=280", every]));
@@ -162,4 +180,20 @@ fn a_single_broken_gaussian_is_removed_before_the_model_is_stored() {
         model.gaussians.len()
     });
     assert_eq!(counts[1] + 1, counts[0]);
+}
+
+#[test]
+fn scores_that_a_density_control_sets_count_at_once() {
+    let session = Session::builder().device("flex").build().unwrap();
+    let [kept, set] = [false, true].map(|moves_all| {
+        let density = format!("density={{kind='break-one', moves_all={moves_all}}}");
+        let config = session.config("demo", &[density.as_str(), "deformer={kind='none'}", "train.iterations=60"]).unwrap();
+        let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
+        let (registry, stop) = (session.registry(), AtomicBool::new(false));
+        let job = TrainJob { config: &config, scene, out: None, resume: false, registry, events: &Silent, stop: &stop, observer: None };
+        let report = train(&job).unwrap().1;
+        [report.dynamic_gaussians, report.gaussians]
+    });
+    assert!(kept[0] < kept[1], "{kept:?}");
+    assert_eq!(set[0], set[1]);
 }

@@ -18,8 +18,9 @@ use crate::data;
 use crate::layers::Layers;
 use crate::train_config::LEAST_ITERATIONS;
 use calibrate::{Timing, calibrate};
-use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, auto_device, config, resolved_device};
+use cc4dgs_core::{Error, Event, EventSink, Registry, Result, Scene, Split, auto_device, config, resolved_device};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -64,9 +65,10 @@ pub struct AutoConfig {
     /// The plan, a line per choice. Where it is stated, the settings are those of the file and none is chosen anew.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub plan: Vec<String>,
-    /// When the iterations are to end, in a process that has planned them: `train` then settles `train.stretch`. Never in a file.
+    /// What the plan leaves of its time, first points and iterations of a training together, in a process that has made it: `train` counts it from its own
+    /// beginning, and settles `train.stretch`. Never in a file.
     #[serde(skip)]
-    pub ends: Option<Instant>,
+    pub time_left: Option<Duration>,
 }
 
 impl AutoConfig {
@@ -145,13 +147,15 @@ pub fn open_shared(
     let graphics = !matches!(device.as_str(), "flex" | "ndarray");
     let machine = Machine { threads: rayon::current_num_threads(), graphics, memory: memory::memory(processes) };
     let minutes = asked.auto.minutes.unwrap_or(MINUTES[usize::from(machine.graphics)]);
+    // Views that training keeps out are not looked at.
+    let seen = |scene: &Scene| data::hold_out(scene, asked.train.validation);
     let mut scene = read(&asked)?;
-    if let Some(choice) = choose::image_size(native_size(&scene), &asked.scene, machine, minutes) {
+    if let Some(choice) = choose::image_size(native_size(&seen(&scene)?), &asked.scene, machine, minutes) {
         plan.add(choice)?;
         scene = read(&layers.over(&plan.table).config()?)?;
     }
     step(1)?;
-    let facts = Facts::of(&scene)?;
+    let facts = Facts::of(&seen(&scene)?)?;
     if let Some(message) = facts.overlap.as_ref().and_then(Overlap::warning) {
         events.emit(&Event::Warning { object: scene.name.clone(), message });
     }
@@ -176,7 +180,7 @@ pub fn open_shared(
     let mut ends = None;
     if !layers.state("train.iterations") {
         let patience = Duration::from_secs_f64(DECODING_SHARE * 60.0 * minutes);
-        let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &scene, registry, patience, stop)?;
+        let timing = calibrate(&layers.over(&plan.table).config()?.settled_for(&scene)?, &Arc::new(seen(&scene)?), registry, patience, stop)?;
         let config = layers.over(&plan.table).config()?;
         let spent = began.elapsed().as_secs_f64() / 60.0;
         let left = (PLANNED_SHARE * minutes - spent - timing.start / 60_000.0).max(LEAST_SHARE * minutes);
@@ -197,7 +201,6 @@ pub fn open_shared(
         plan.add(Choice { settings: vec![("train.zeta", toml::Value::Float((100.0 * zeta).round() / 100.0))], reason })?;
     }
     let mut config = layers.over(&plan.table).config()?;
-    config.auto.ends = ends;
     // A stated `auto` becomes the device that it stands for here.
     config.device = device;
     let [width, height] = facts.size;
@@ -212,6 +215,7 @@ pub fn open_shared(
             .plan
             .push(format!("{} iterations are few: more minutes or smaller images (--minutes, scene.width) give a better model", config.train.iterations));
     }
+    config.auto.time_left = ends.map(|ends| ends.saturating_duration_since(Instant::now()));
     Ok((config, scene))
 }
 
@@ -268,7 +272,8 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
 
 /// Width and height in pixels of the median training camera.
 fn native_size(scene: &Scene) -> [u32; 2] {
-    let mut sizes: Vec<[u32; 2]> = scene.cameras.iter().map(|c| [c.width, c.height]).collect();
+    let cameras: BTreeSet<usize> = scene.split(Split::Train).into_iter().map(|view| scene.views[view].camera).collect();
+    let mut sizes: Vec<[u32; 2]> = cameras.into_iter().map(|camera| [scene.cameras[camera].width, scene.cameras[camera].height]).collect();
     sizes.sort_unstable_by_key(|size| u64::from(size[0]) * u64::from(size[1]));
     sizes.get(sizes.len() / 2).copied().unwrap_or([1, 1])
 }

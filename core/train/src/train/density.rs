@@ -8,6 +8,13 @@ use cc4dgs_core::{DensityPlan, Error, Event, Result, Schedule};
 use cc4dgs_play::Moving;
 
 const SCORES: &str = "dynamic_scores";
+/// Gaussians that key frames and recovery may add in any case, as a share of those there are.
+const LEAST_SHARE: f64 = 0.25;
+
+/// How many Gaussians key frames or recovery may add in any case, where there are `now`.
+pub(super) fn least_places(now: usize) -> usize {
+    (LEAST_SHARE * now as f64) as usize
+}
 
 /// Puts the rows of `plan` that move first, in their order, and the others behind them. What moves is then one piece of every array, and an iteration gathers
 /// nothing.
@@ -29,6 +36,13 @@ pub(super) fn moving_first(plan: &mut DensityPlan, state: &TrainState) -> Result
 }
 
 impl Context<'_> {
+    /// How many Gaussians key frames or recovery may add where there are `now`: as many as `density.max_gaussians` leaves, or [`least_places`] if that is more. `None`
+    /// for density controls without such a bound.
+    pub(super) fn places(&self, now: usize) -> Option<usize> {
+        let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer)?;
+        Some((most.max(0) as usize).saturating_sub(now).max(least_places(now)))
+    }
+
     /// What the density control wants after an optimizer step: new values of all rows, then a plan for the rows themselves.
     pub(crate) fn control_density(&self, schedule: &Schedule, state: &mut TrainState) -> Result<()> {
         let kind = self.job.config.density.get("kind").and_then(|k| k.as_str()).unwrap_or_default();
@@ -41,6 +55,9 @@ impl Context<'_> {
                 return Err(Error::backend(format!("density control {kind}"), problem, "Correct the control, or choose another"));
             }
             state.set.set(&name, values)?;
+            if name == SCORES {
+                state.invalidate_rows();
+            }
         }
         // The values may have changed.
         let gaussians = state.set.gaussians()?;
@@ -95,10 +112,12 @@ impl Context<'_> {
         for attribute in plan.restarted() {
             state.optimizer.restart(&format!("gaussians/{attribute}"));
         }
+        if !keeps_all || plan.values().iter().any(|set| set.attribute == SCORES) {
+            state.invalidate_rows();
+        }
         if keeps_all {
             return Ok(());
         }
-        state.invalidate_rows();
         let report = plan.report;
         let gaussians = state.set.len();
         self.job.events.emit(&Event::Densified {

@@ -1,5 +1,6 @@
 //! Gaussians of key frames: what moves starts with a life at each of them, so that nothing has to be followed from the first frame to the last.
 
+use super::density::least_places;
 use super::parents::Parents;
 use super::recover::own_lives;
 use super::{Context, TrainState};
@@ -17,8 +18,6 @@ const FALLOFF: f64 = 0.25;
 /// Gates: of what is there for a while, and of what stays.
 const TEMPORARY: f32 = 0.01;
 const LASTING: f32 = 0.95;
-/// Points that may be added in any case, as a share of the Gaussians there are.
-const LEAST_SHARE: f64 = 0.25;
 /// Largest standard deviation of a new Gaussian, as a share of the width of the image: a point far from all others would cover much of each image.
 const WIDTH_SHARE: f64 = 0.01;
 /// Opacity of new Gaussians.
@@ -27,11 +26,15 @@ const OPACITY: f32 = 0.6;
 impl Context<'_> {
     /// Adds the Gaussians of key frames at the start of the main stage, where `train.key_frames` asks for them, and gives what moved at the first frame a life there.
     pub(super) fn add_key_frames(&self, state: &mut TrainState) -> Result<()> {
-        let every = self.job.config.train.key_frames;
-        if every == 0 || self.job.scene.frame_count <= 1 {
+        let (every, frames) = (self.job.config.train.key_frames, self.job.scene.frame_count);
+        if every == 0 || frames <= 1 {
             return Ok(());
         }
         let warn = |message: String| self.job.events.emit(&Event::Warning { object: "train.key_frames".into(), message });
+        if every >= frames {
+            warn(format!("no key frame is used: {every} is not below the {frames} frames of the scene. Choose at most {}, or 0", frames - 1));
+            return Ok(());
+        }
         let (Moving::Scored { zeta }, false) = (state.moving, self.masks.is_empty()) else {
             warn("key frames need cameras that stand still and dynamic scores (train.dynamic = \"auto\" or \"score\"): none is used".into());
             return Ok(());
@@ -47,12 +50,15 @@ impl Context<'_> {
         let mask_of = |camera: usize| self.masks.iter().find(|mask| scene.views[mask.view].camera == camera);
         let masks: Vec<Option<&DynamicMask>> = (0..scene.cameras.len()).map(mask_of).collect();
         let moves = |camera: usize, x: f32, y: f32| masks[camera].is_some_and(|mask| covers(mask, &scene.cameras[camera], x, y));
-        let Some(frames) = KeyFrames::load(scene, every, moves, self.job.config.train.mask_threshold, seed)? else {
-            warn("none is used: fewer than two have images of all cameras, the first frame lacks one, or it is not the earliest".into());
-            return Ok(());
+        let frames = match KeyFrames::load(scene, every, moves, self.job.config.train.mask_threshold, seed)? {
+            Ok(frames) => frames,
+            Err(reason) => {
+                warn(format!("no key frame is used: {reason}"));
+                return Ok(());
+            }
         };
-        let most = self.job.config.density.get("max_gaussians").and_then(toml::Value::as_integer).map_or(0, |most| most.max(0) as usize);
-        let count = most.saturating_sub(state.set.len()).max((LEAST_SHARE * state.set.len() as f64) as usize);
+        let now = state.set.len();
+        let count = self.places(now).unwrap_or_else(|| least_places(now));
         let points = frames.points(count, seed.child("motion"));
         let end = self.job.scene.views.iter().fold(0.0f32, |end, view| end.max(view.time_norm));
         let times = Times { keys: &frames.times, end: f64::from(end) };

@@ -25,6 +25,7 @@ impl Log {
         (self.loss, self.psnr_db) = (f32::from_bits(record.loss_bits), f32::from_bits(record.psnr_db_bits));
         self.psnr_sum = (f32::from_bits(record.psnr_sum_bits), record.psnr_views);
         self.since.1 = iteration;
+        self.work = record.work;
         self
     }
     /// The stage is to have `length` iterations.
@@ -38,6 +39,7 @@ impl Log {
             psnr_db_bits: self.psnr_db.to_bits(),
             psnr_sum_bits: self.psnr_sum.0.to_bits(),
             psnr_views: self.psnr_sum.1,
+            work: self.work,
         }
     }
     /// Whether this iteration's numbers are read back.
@@ -85,5 +87,26 @@ impl Log {
                 events.emit(&Event::Work { stage: self.stage.name().into(), counter: name.into(), done, skipped });
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::Recorder;
+
+    #[test]
+    fn a_resumed_stage_counts_its_work_from_the_beginning() {
+        let mut log = Log::new(Stage::Main, 10, 1);
+        log.count_deformer(5, 7, 20, 30);
+        log.count_optimizer(1, 2);
+        let stored = serde_json::to_string(&log.record()).unwrap();
+        let mut log = Log::new(Stage::Main, 10, 1).resumed(serde_json::from_str(&stored).unwrap(), 1);
+        log.count_deformer(1, 1, 1, 1);
+        let events = Recorder::default();
+        log.finish(&events);
+        let told = events.events().into_iter().filter_map(|event| if let Event::Work { done, skipped, .. } = event { Some((done, skipped)) } else { None });
+        assert_eq!(told.collect::<Vec<_>>(), [(6, 8), (21, 31), (1, 2)]);
+        assert!(!serde_json::to_string(&LogRecord::default()).unwrap().contains("work"));
     }
 }

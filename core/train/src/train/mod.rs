@@ -151,10 +151,12 @@ pub(crate) struct Context<'a> {
 /// Trains. With a folder, `config.toml` and `checkpoint` are written into it.
 ///
 /// # Errors
-/// [`Error::Interrupted`] after `stop` was set (a checkpoint is written first), [`Error::Backend`] when loss or parameters do not stay finite even with lower rates,
-/// [`Error::Data`] for a scene that cannot be reconstructed, [`Error::Failed`] for a model that is no better than simple baselines, or ends far below its own
-/// earlier scores (the checkpoint is kept), and whatever the scene, the plug-ins or the disk report.
+/// [`Error::Parameter`] for settings out of range, before anything is written, [`Error::Interrupted`] after `stop` was set (a checkpoint is written first),
+/// [`Error::Backend`] when loss or parameters do not stay finite even with lower rates, [`Error::Data`] for a scene that cannot be reconstructed,
+/// [`Error::Failed`] for a model that is no better than simple baselines, or ends far below its own earlier scores (the checkpoint is kept), and whatever the
+/// scene, the plug-ins or the disk report.
 ///
+/// [`Error::Parameter`]: cc4dgs_core::Error::Parameter
 /// [`Error::Interrupted`]: cc4dgs_core::Error::Interrupted
 /// [`Error::Backend`]: cc4dgs_core::Error::Backend
 /// [`Error::Data`]: cc4dgs_core::Error::Data
@@ -166,6 +168,7 @@ pub fn train(job: &TrainJob) -> Result<(Model, TrainReport)> {
 
 fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
     let began = Instant::now();
+    job.config.validate()?;
     let config = &job.config.settled_for(&job.scene)?.completed(job.registry)?;
     let scene = hold_out(&job.scene, config.train.validation)?;
     let job = &TrainJob { config, scene: Arc::new(scene), out: job.out.clone(), ..*job };
@@ -239,6 +242,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         context.lengths.set_pass(stage, cameras.len().div_ceil(config.train.views_per_iteration(stage)));
     }
     let mut watch = Watch::new(&context, doubts, &state)?;
+    let ends = config.auto.time_left.and_then(|left| began.checked_add(left));
     let mut stage_seconds = BTreeMap::new();
     for stage in Stage::ALL {
         if stage < state.stage {
@@ -249,7 +253,7 @@ fn train_here(job: &TrainJob) -> Result<(Model, TrainReport)> {
         if stage == Stage::Score && matches!(moving, Moving::Scored { .. }) && context.masks.is_empty() && context.lengths.length(stage) > 0 {
             context.masks = context.residual_masks(&mut state)?;
         }
-        context.run_stage(stage, &mut state, &mut watch)?;
+        context.run_stage(stage, &mut state, &mut watch, ends)?;
         stage_seconds.insert(stage.name().to_string(), stage_began.elapsed().as_secs_f64());
         if stage != Stage::Main {
             state.stage = Stage::ALL[stage as usize + 1];

@@ -33,7 +33,7 @@ impl Attempts {
     }
 }
 
-/// What the log of a stage smooths. Floats are stored as their bits, because JSON has no infinity.
+/// What the log of a stage smooths and counts. Floats are stored as their bits, because JSON has no infinity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub(crate) struct LogRecord {
@@ -42,6 +42,15 @@ pub(crate) struct LogRecord {
     /// Sum of the PSNR since the last event, and of how many views.
     pub psnr_sum_bits: u32,
     pub psnr_views: u32,
+    /// What [`super::log::Log::finish`] tells: done and skipped. Absent where nothing was counted, and from older checkpoints.
+    #[serde(skip_serializing_if = "LogRecord::is_nothing")]
+    pub work: [(u64, u64); 3],
+}
+
+impl LogRecord {
+    fn is_nothing(work: &[(u64, u64); 3]) -> bool {
+        *work == [(0, 0); 3]
+    }
 }
 
 /// A model's scores at one moment of the main stage.

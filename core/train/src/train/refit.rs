@@ -25,7 +25,7 @@ const DEFORMER_RATE: f64 = 0.3;
 
 /// Removes Gaussians of `job.model` in rounds, each followed by `iterations` of training, as long as the PSNR stays within `max_drop_db` of what it was, on
 /// validation views where the scene has some, else on training views. Returns the Gaussians and weights of the last round that did, and what it came to; what
-/// one re-fit gives by itself, with nothing removed, is measured too.
+/// one re-fit gives by itself, with nothing removed, is measured too. A round that fails is the last, and the ones before are kept where they removed some.
 ///
 /// # Errors
 /// [`Error::Parameter`] for a drop that is not positive or a scene without training views, [`Error::Interrupted`], and what scene and rasterizer report.
@@ -63,9 +63,17 @@ pub fn prune_and_refit(model: &mut Model, scene: &Arc<Scene>, max_drop_db: f64, 
         };
         let rest = at_rows(&model.gaussians, &order[..n - removed]);
         let tuner = job.tuner(model, scene).with_targets(targets.clone());
-        let found = refit(&tuner, &rest, iterations, seed.index(round as u64))?;
-        let psnr = tuner.psnr(&found.gaussians, &found.weights, None)?;
+        let trained = refit(&tuner, &rest, iterations, seed.index(round as u64));
+        let trained = trained.and_then(|found| Ok((tuner.psnr(&found.gaussians, &found.weights, None)?, found)));
         drop(tuner);
+        let (psnr, found) = match trained {
+            Err(e) if n < before && !matches!(e, Error::Interrupted(_)) => {
+                let message = format!("round {} failed, and those before are kept: {e}", round + 1);
+                job.events.emit(&Event::Warning { object: "prune".into(), message });
+                break;
+            }
+            done => done?,
+        };
         let kept = psnr_before_db - psnr <= max_drop_db;
         let what = if kept { "kept" } else { "too many, the round is undone" };
         let message = format!("round {}: {} of {n} Gaussians, {psnr:.3} dB after re-fit ({what})", round + 1, rest.len());

@@ -1,7 +1,7 @@
 //! One step of the score stage: dynamic scores are blended like colours and fitted to the temporal-deviation masks (Swift4D).
 
 use super::log::Log;
-use super::watchdog::Trouble;
+use super::watchdog::{Trouble, broken_rows_of};
 use super::{Context, TrainState};
 use crate::gaussian_set::log_linear;
 use burn::tensor::{Tensor, TensorData};
@@ -48,6 +48,9 @@ impl Context<'_> {
             }
         }
         let gradients = leaves.gradients(&loss.backward());
+        if check && let Some(trouble) = broken_rows_of(&gradients)? {
+            return Ok(Some(trouble));
+        }
         drop((leaves, gaussians, splats, loss));
         // 0.05 -> 0.005 over 30,000 steps of which 3,000 run; shorter stages take larger steps so that scores can still reach zeta.
         let rate = self.job.config.train.lr.score;

@@ -16,8 +16,8 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 impl Context<'_> {
-    /// Runs `stage` from where `state` stands to its end.
-    pub(super) fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch) -> Result<()> {
+    /// Runs `stage` from where `state` stands to its end. `ends` is when the run is to end, where that was planned.
+    pub(super) fn run_stage(&mut self, stage: Stage, state: &mut TrainState, watch: &mut Watch, ends: Option<Instant>) -> Result<()> {
         let events = self.job.events;
         if self.lengths.length(stage) == 0 || (stage == Stage::Score && self.masks.is_empty()) {
             if stage == Stage::Main {
@@ -42,7 +42,7 @@ impl Context<'_> {
         events.emit(&Event::StageStarted { stage: stage.name().into(), iterations: length, gaussians: state.set.len() });
         let began = Instant::now();
         let mut sampler = self.sampler(&first);
-        let mut pace = Pace::new(self, stage, state);
+        let mut pace = Pace::new(self, stage, state, ends);
         let prefetcher = Prefetcher::new();
         let resumed_at = state.iteration;
         let mut watchdog = Watchdog::new(state);
@@ -69,7 +69,9 @@ impl Context<'_> {
             if stage != Stage::Score {
                 prefetcher.want(self.pyramid.at(schedule.image_scale), sampler.batch(state.iteration + 1));
             }
-            let check = watchdog.checks(schedule.iteration);
+            let every = self.job.config.train.checkpoint_every;
+            let saves = every > 0 && schedule.iteration.is_multiple_of(every) && schedule.iteration < self.lengths.length(stage);
+            let check = watchdog.checks(schedule.iteration, length, saves);
             let trouble = match stage {
                 Stage::Score => self.score_step(state, &schedule, check, &mut log)?,
                 _ => self.photometric_step(&schedule, state, &batch, check, &mut log)?,
@@ -82,8 +84,6 @@ impl Context<'_> {
                 self.recover(state, &schedule)?;
             }
             state.iteration = schedule.iteration;
-            let every = self.job.config.train.checkpoint_every;
-            let saves = every > 0 && state.iteration.is_multiple_of(every) && state.iteration < self.lengths.length(stage);
             watchdog.after_iteration(self, state, trouble, length, saves)?;
             if state.iteration < schedule.iteration {
                 // Back at an earlier state.

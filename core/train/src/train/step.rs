@@ -6,7 +6,7 @@ use super::log::Log;
 use super::probe::psnr_db;
 use super::rounded::{ExactWeights, Rounded};
 use super::smoothness::{flicker, smoothness};
-use super::watchdog::{Trouble, is_finite};
+use super::watchdog::{TOLERATED, Trouble, broken_rows_of, is_finite};
 use super::{Context, TrainState, parameters};
 use crate::gaussian_set::{Leaves, gaussian_rate};
 use burn::tensor::{Gradients, Int, Tensor};
@@ -114,7 +114,7 @@ impl Context<'_> {
                 (Some(offsets), Some(deformer)) => {
                     offsets.check(deformer.name(), rows.count())?;
                     if (read || check)
-                        && let Some(head) = offsets.broken_head(deformer.name())?
+                        && let Some(head) = offsets.broken_head(deformer.name(), TOLERATED)?
                     {
                         return Ok(Outcome::Trouble(Trouble::of("deformer", format!("the offsets of deformer {}, head {head}", deformer.name()))));
                     }
@@ -315,12 +315,10 @@ fn spatial_pass(deformer: &ModelDeformer, leaves: &Leaves, rows: &MovingRows) ->
     Ok(Spatial { input, features: spatial.values, work: spatial.work })
 }
 
-/// The first gradient that is not finite.
+/// The first gradient that is not finite; of Gaussians, the first of which more rows are not than is tolerated.
 fn broken_gradient(state: &TrainState, of_gaussians: &[(String, Tensor<2>)], gradients: &Gradients) -> Result<Option<Trouble>> {
-    for (name, gradient) in of_gaussians {
-        if !is_finite(gradient, name)? {
-            return Ok(Some(Trouble::of(format!("gaussians/{name}"), format!("the gradient of {name}"))));
-        }
+    if let Some(trouble) = broken_rows_of(of_gaussians)? {
+        return Ok(Some(trouble));
     }
     let deformer = state.deformer.iter().flat_map(|d| d.field.parameters()).map(|p| ("deformer", p));
     let weights = deformer.chain(state.appearance.parameters().into_iter().map(|p| ("appearance", p)));

@@ -1,7 +1,8 @@
 //! Finds values that are not finite at their source, goes back to the last good state, and lowers the learning rate of what caused them.
 //!
-//! - Every 100 iterations, and before a checkpoint is written, all parameters are looked at; the loss is looked at whenever it is logged. What is sound every 100
-//!   iterations is remembered, and nothing else: where the run goes back to does not depend on when it writes checkpoints and logs.
+//! - Every 100 iterations, in the last one of a stage, and before a checkpoint is written, loss, offsets, gradients and all parameters are looked at; loss and
+//!   offsets also whenever the loss is logged. What is sound every 100 iterations is remembered, and nothing else: where the run goes back to does not depend on
+//!   when it writes checkpoints and logs.
 //! - Where something is not finite, the run goes back and repeats the iterations with a check of every loss, gradient and parameter, so that the first broken value
 //!   is found. Iterations depend on seeds alone, so they repeat exactly, and it is the same value whenever the trouble was noticed.
 //! - The part that it belongs to, or else the part that grew most since the good state, learns a quarter as fast from then on.
@@ -25,8 +26,8 @@ const EVERY: usize = 100;
 const ATTEMPTS: usize = 5;
 /// Factor of a learning rate after trouble.
 const LOWERED: f64 = 0.25;
-/// Share of Gaussians that may be broken; density control removes them.
-const TOLERATED: f64 = 0.01;
+/// Share of Gaussians that may be broken, or have such gradients or offsets; density control removes them, and optimizers skip such gradients.
+pub(crate) const TOLERATED: f64 = 0.01;
 /// Names of the parts beside `gaussians/ATTRIBUTE`.
 const DEFORMER: &str = "deformer";
 const APPEARANCE: &str = "appearance";
@@ -55,6 +56,33 @@ impl Trouble {
 /// [`Error::Backend`] if the device fails.
 pub(crate) fn is_finite<const D: usize>(tensor: &Tensor<D>, object: &str) -> Result<bool> {
     Ok(to_vec(tensor.clone().sum(), object)?.iter().all(|sum| sum.is_finite()))
+}
+
+/// How many rows of the `values` `[N,W]` of Gaussians are not finite, where they are more than is tolerated. `object` names them in errors.
+///
+/// # Errors
+/// [`Error::Backend`] if the device fails.
+fn too_many_broken(values: &Tensor<2>, object: &str) -> Result<Option<usize>> {
+    if is_finite(values, object)? {
+        return Ok(None);
+    }
+    let (rows, width) = (values.dims()[0], values.dims()[1].max(1));
+    let broken = to_vec(values.clone(), object)?.chunks_exact(width).filter(|row| row.iter().any(|v| !v.is_finite())).count();
+    Ok((broken as f64 > TOLERATED * rows as f64).then_some(broken))
+}
+
+/// The first of the `gradients` of Gaussians of which more rows are not finite than is tolerated.
+///
+/// # Errors
+/// [`Error::Backend`] if the device fails.
+pub(crate) fn broken_rows_of(gradients: &[(String, Tensor<2>)]) -> Result<Option<Trouble>> {
+    for (name, gradient) in gradients {
+        if let Some(broken) = too_many_broken(gradient, name)? {
+            let what = format!("the gradient of {name} of {broken} of {} Gaussians", gradient.dims()[0]);
+            return Ok(Some(Trouble::of(format!("gaussians/{name}"), what)));
+        }
+    }
+    Ok(None)
 }
 
 /// Factors of learning rates by part; 1 where a part is not named.
@@ -137,6 +165,11 @@ impl Good {
     }
 }
 
+/// Whether a state after `iteration` of a stage of `length` is remembered, if it is sound.
+fn due(iteration: usize, length: usize) -> bool {
+    iteration.is_multiple_of(EVERY) || iteration == length
+}
+
 /// The watchdog of one stage.
 pub(crate) struct Watchdog {
     good: Good,
@@ -148,8 +181,12 @@ impl Watchdog {
     pub fn new(state: &TrainState) -> Self {
         Self { good: Good::of(state), attempts: state.record.attempts }
     }
-    /// Whether every value of this iteration is to be checked.
-    pub fn checks(&self, iteration: usize) -> bool {
+    /// Whether every value of an iteration of a stage of `length` is to be checked: where a source is looked for, and where the state may be gone back to or is about
+    /// to be written, which `saves` says. A loss that is not finite leaves parameters finite, because optimizers skip such gradients.
+    pub fn checks(&self, iteration: usize, length: usize, saves: bool) -> bool {
+        self.looks_for_source(iteration) || due(iteration, length) || saves
+    }
+    fn looks_for_source(&self, iteration: usize) -> bool {
         iteration <= self.attempts.checked_until
     }
     /// After an iteration of `length`: looks at the parameters where it is time for it or where the state is about to be written, which `saves` says, and goes back
@@ -159,9 +196,8 @@ impl Watchdog {
     /// [`Error::Backend`] that names the source, after too many attempts.
     pub fn after_iteration(&mut self, context: &Context, state: &mut TrainState, trouble: Option<Trouble>, length: usize, saves: bool) -> Result<()> {
         let iteration = state.iteration;
-        let due = iteration.is_multiple_of(EVERY) || iteration == length;
         let trouble = match trouble {
-            None if due || saves || self.checks(iteration) => unsound(state)?,
+            None if self.checks(iteration, length, saves) => unsound(state)?,
             trouble => trouble,
         };
         match trouble {
@@ -171,7 +207,7 @@ impl Watchdog {
                 Ok(())
             }
             None => {
-                if due {
+                if due(iteration, length) {
                     self.good = Good::of(state);
                 }
                 Ok(())
@@ -197,7 +233,7 @@ impl Watchdog {
         self.good.restore(state, context)?;
         let back = self.good.iteration;
         // The first broken value is known only where every value before it was checked, those of this iteration too.
-        if !self.checks(iteration) {
+        if !self.looks_for_source(iteration) {
             self.attempts.repeated += 1;
             self.attempts.checked_until = iteration;
             warn(format!("{what}: it is not finite; back to iteration {back}, to find its source"));
@@ -214,13 +250,7 @@ impl Watchdog {
 /// The first parameter that is not finite.
 fn unsound(state: &TrainState) -> Result<Option<Trouble>> {
     for (name, values) in state.set.iter() {
-        if is_finite(values, name)? {
-            continue;
-        }
-        let width = values.dims()[1].max(1);
-        let host = to_vec(values.clone(), name)?;
-        let broken = host.chunks_exact(width).filter(|row| row.iter().any(|v| !v.is_finite())).count();
-        if broken as f64 > TOLERATED * state.set.len() as f64 {
+        if let Some(broken) = too_many_broken(values, name)? {
             return Ok(Some(Trouble::of(format!("gaussians/{name}"), format!("{name} of {broken} of {} Gaussians", state.set.len()))));
         }
     }
@@ -263,4 +293,22 @@ fn fastest(state: &TrainState, good: &Good) -> Result<String> {
         }
     }
     Ok(best.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::{Device, TensorData};
+
+    #[test]
+    fn gradients_of_a_hundredth_of_the_gaussians_may_be_broken() {
+        let of = |broken: usize| {
+            let mut values = vec![0.5f32; 200];
+            values.iter_mut().step_by(2).take(broken).for_each(|value| *value = f32::NAN);
+            let gradient = Tensor::<2>::from_data(TensorData::new(values, [100, 2]), &Device::default());
+            broken_rows_of(&[("means".to_string(), gradient)]).unwrap().map(|trouble| trouble.what)
+        };
+        assert_eq!((of(0), of(1)), (None, None));
+        assert_eq!(of(2).as_deref(), Some("the gradient of means of 2 of 100 Gaussians"));
+    }
 }

@@ -184,9 +184,17 @@ fn reset_logit() -> f32 {
 
 fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
     let settings: Settings = config::parse_section("density clone-split", section)?;
-    let numbers = [settings.gradient, settings.dense_share, settings.min_opacity, settings.max_scale_share, settings.min_weight];
-    if let Some(odd) = numbers.iter().find(|v| !v.is_finite() || **v < 0.0) {
-        return Err(Error::parameter("density clone-split", format!("a threshold is {odd}"), "Give finite numbers of 0 or more"));
+    for (key, value, usual) in [
+        ("gradient", settings.gradient, "1e-4 to 1e-3 are usual"),
+        ("dense_share", settings.dense_share, "0.01 is usual"),
+        ("min_opacity", settings.min_opacity, "0.005 to 0.05 are usual"),
+        ("max_scale_share", settings.max_scale_share, "0 is off, 0.1 is usual"),
+        ("min_weight", settings.min_weight, "0.01 to 0.05 are usual"),
+    ] {
+        if !(value >= 0.0 && value.is_finite()) {
+            let remedy = format!("Give a finite number of 0 or more; {usual}");
+            return Err(Error::parameter(format!("density clone-split: {key}"), format!("{value} is no threshold"), remedy));
+        }
     }
     if settings.every == 0 {
         return Err(Error::parameter("density clone-split: every", "0 iterations", "Give at least 1, or use density.kind = \"none\""));
@@ -205,5 +213,18 @@ inventory::submit! {
             capabilities: &[],
         },
         build,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thresholds_out_of_range_are_named() {
+        for (section, key) in [("gradient = -1.0", "gradient"), ("min_weight = inf", "min_weight")] {
+            let error = build(&toml::from_str(section).unwrap()).err().unwrap().to_string();
+            assert!(error.contains(&format!("clone-split: {key}")) && error.contains("usual"), "{error}");
+        }
     }
 }

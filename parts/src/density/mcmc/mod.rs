@@ -234,21 +234,20 @@ impl DensityControl for Mcmc {
 
 fn build(section: &toml::Table) -> Result<Box<dyn DensityControl>> {
     let settings: Settings = config::parse_section("density mcmc", section)?;
-    let out_of_range =
-        |key: &str, value: f64, limits: &str| Err(Error::parameter(format!("density mcmc: {key}"), format!("{value} is not in {limits}"), "Change it"));
     if settings.every == 0 {
         return Err(Error::parameter("density mcmc: every", "0 iterations", "Give at least 1, or use density.kind = \"none\""));
     }
-    for (key, value, most) in [
-        ("min_opacity", f64::from(settings.min_opacity), 0.999),
-        ("growth", settings.growth, 1.0),
-        ("relocate", settings.relocate, 100.0),
-        ("coarse_share", settings.coarse_share, 1.0),
-        ("noise", f64::from(settings.noise), 100.0),
-        ("decay", f64::from(settings.decay), 0.5),
+    for (key, value, most, usual) in [
+        ("min_opacity", f64::from(settings.min_opacity), 0.999, "0.005 is usual"),
+        ("growth", settings.growth, 1.0, "0.05 to 0.2 are usual"),
+        ("relocate", settings.relocate, 100.0, "0 is off, 0.8 is usual"),
+        ("coarse_share", settings.coarse_share, 1.0, "0.6 is usual"),
+        ("noise", f64::from(settings.noise), 100.0, "0 is off and usual"),
+        ("decay", f64::from(settings.decay), 0.5, "0 is off, 0.01 is usual"),
     ] {
         if !(0.0..=most).contains(&value) {
-            return out_of_range(key, value, &format!("0..{most}"));
+            let (object, problem) = (format!("density mcmc: {key}"), format!("{value} is not in 0..{most}"));
+            return Err(Error::parameter(object, problem, format!("Give a number in that range; {usual}")));
         }
     }
     let (statistics, weights) = (Statistics::zeros(0, &Device::flex()), Weights::zeros(0, &Device::flex()));
@@ -286,6 +285,14 @@ mod tests {
         control.executed(&plan, &device).unwrap();
         let start = control.state().into_iter().find(|(name, _)| name == "start").unwrap().1;
         assert_eq!(start.into_scalar::<f32>(), 5.0);
+    }
+
+    #[test]
+    fn settings_out_of_range_are_named_with_what_is_usual() {
+        for (section, key) in [("decay = 0.6", "decay"), ("growth = nan", "growth")] {
+            let error = build(&toml::from_str(section).unwrap()).err().unwrap().to_string();
+            assert!(error.contains(&format!("mcmc: {key}")) && error.contains("usual"), "{error}");
+        }
     }
 
     #[test]

@@ -85,6 +85,13 @@ impl Context<'_> {
         if tracks.is_empty() || too_few {
             return Ok(());
         }
+        let places = self.places(state.set.len()).map_or(usize::MAX, |places| (places / seeds::PER_TRACK).max(1));
+        let found = tracks.len();
+        let tracks = most_seen(&tracks, places);
+        if tracks.len() < found {
+            let message = format!("tracks with fewer regions are left out, {} of {found}: density.max_gaussians leaves no more places", found - tracks.len());
+            self.job.events.emit(&Event::Note { object: "recover".into(), message });
+        }
         self.give_lives(state)?;
         let half_width = 0.5 * stride as f64 * interval;
         let mut plan = seeds::plan(self, state, &lost, &sightings, &tracks, half_width)?;
@@ -156,7 +163,29 @@ impl Context<'_> {
     }
 }
 
+/// The `most` of `tracks` that go through most regions, in their order.
+fn most_seen(tracks: &[Track], most: usize) -> Vec<Track> {
+    let mut kept: Vec<usize> = (0..tracks.len()).collect();
+    kept.sort_by_key(|&track| std::cmp::Reverse(tracks[track].sightings.len()));
+    kept.truncate(most);
+    kept.sort_unstable();
+    kept.into_iter().map(|track| tracks[track].clone()).collect()
+}
+
 /// How many of the attributes of lives a deformer has itself.
 pub(super) fn own_lives(deformer: &ModelDeformer) -> usize {
     LIFE_ATTRIBUTES.iter().filter(|(name, _)| deformer.field.attributes().iter().any(|a| a.name == *name)).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tracks_with_most_regions_are_kept_in_their_order() {
+        let track = |regions: usize| Track { time: 0.5, position: DVec3::ZERO, velocity: DVec3::ZERO, radius: 1.0, sightings: vec![0; regions] };
+        let tracks = [4, 9, 5, 9].map(track);
+        let kept = |most: usize| most_seen(&tracks, most).iter().map(|track| track.sightings.len()).collect::<Vec<_>>();
+        assert_eq!((kept(3), kept(1), kept(usize::MAX)), (vec![9, 5, 9], vec![9], vec![4, 9, 5, 9]));
+    }
 }

@@ -12,7 +12,7 @@ use glam::DVec3;
 use std::collections::BTreeMap;
 
 /// Gaussians of one track.
-const PER_TRACK: usize = 64;
+pub(super) const PER_TRACK: usize = 64;
 /// Where their centres lie, as a share of the radius, and their standard deviation as a share of their distance.
 const DEPTH: f64 = 0.85;
 const SIZE: f64 = 0.5;

@@ -35,6 +35,9 @@ const MOST_FOUND: usize = 8 << 20;
 /// Least time from one key frame to the next, as a share of the sequence: frames may claim to be simultaneous.
 pub(crate) const LEAST_INTERVAL: f64 = 1e-4;
 
+/// What was looked for, or the reason why there is none and what to do, in sentences.
+pub(crate) type Found<T> = std::result::Result<T, String>;
+
 /// What a point is and when it is there.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct KeyPoint {
@@ -62,20 +65,23 @@ pub(crate) struct KeyFrames {
 }
 
 impl KeyFrames {
-    /// Every `every`-th frame of `scene`, with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height) says so;
-    /// `None` where cameras move, or fewer than two of these frames, the first among them, have images of all cameras;
-    /// others are left out. Key frames are in the order of their times; `None` where frame 0 is not the earliest.
+    /// Every `every`-th frame of `scene` (at least 1), with points of the pixels for which `moves` (camera of the scene, share of the width, share of the height)
+    /// says so. Frames that lack an image of a camera are left out. Key frames are in the order of their times. Where the scene has none, the reason and what to do:
+    /// cameras do not share times, or fewer than two of these frames, the first among them, have images of all cameras, or frame 0 is not the earliest.
     /// Differences up to `noise`, 0..1, are none. Each thread holds one whole image at a time; those that are kept are small.
     ///
     /// # Errors
     /// Whatever decoding the images meets.
-    pub(crate) fn load(scene: &Scene, every: usize, moves: impl Fn(usize, f32, f32) -> bool, noise: f32, seed: Seed) -> Result<Option<Self>> {
+    pub(crate) fn load(scene: &Scene, every: usize, moves: impl Fn(usize, f32, f32) -> bool, noise: f32, seed: Seed) -> Result<Found<Self>> {
         let choice = Choice::new(scene);
-        if choice.arrangement != Arrangement::OneTime || every == 0 || scene.frame_count <= every {
-            return Ok(None);
+        if choice.arrangement != Arrangement::OneTime {
+            return Ok(Err("points need several cameras at each time. Set train.key_frames = 0".into()));
         }
         let cameras: Vec<usize> = choice.views.iter().map(|&v| scene.views[v].camera).collect();
-        let Some(complete) = complete_frames(&scene.views, &cameras, scene.frame_count, every) else { return Ok(None) };
+        let complete = match complete_frames(&scene.views, &cameras, scene.frame_count, every) {
+            Ok(complete) => complete,
+            Err(reason) => return Ok(Err(reason)),
+        };
         // The medians are as many images as one key frame has.
         let pixels = most_pixels((complete.len() + 1) * cameras.len());
         let most_found = MOST_FOUND / complete.len();
@@ -100,7 +106,7 @@ impl KeyFrames {
             loaded.times.push(time);
         }
         loaded.still = medians(&loaded.sets);
-        Ok(Some(loaded))
+        Ok(Ok(loaded))
     }
 
     /// Up to `count` points that are not there at all key frames, or are hidden at the first.
@@ -166,8 +172,8 @@ impl KeyFrames {
 }
 
 /// The frames with an image of each of `cameras` for training, of every `every`-th of `count` frames, and these images in the order of `cameras`. Ordered by
-/// time: a dataset may number its frames otherwise. `None` for fewer than two, or if frame 0 is not the first: nothing says what moves on from there.
-fn complete_frames(views: &[View], cameras: &[usize], count: usize, every: usize) -> Option<Vec<(usize, Vec<usize>)>> {
+/// time: a dataset may number its frames otherwise. A reason for fewer than two, or if frame 0 is not the first: nothing says what moves on from there.
+fn complete_frames(views: &[View], cameras: &[usize], count: usize, every: usize) -> Found<Vec<(usize, Vec<usize>)>> {
     let mut at: HashMap<(usize, usize), usize> = HashMap::new();
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
         at.entry((view.frame, view.camera)).or_insert(index);
@@ -175,7 +181,15 @@ fn complete_frames(views: &[View], cameras: &[usize], count: usize, every: usize
     let views_of = |frame: usize| cameras.iter().map(|&camera| at.get(&(frame, camera)).copied()).collect::<Option<Vec<usize>>>();
     let mut complete: Vec<(usize, Vec<usize>)> = (0..count).step_by(every).filter_map(|frame| Some((frame, views_of(frame)?))).collect();
     complete.sort_by(|(_, a), (_, b)| time_of(views, a).total_cmp(&time_of(views, b)));
-    (complete.len() > 1 && complete[0].0 == 0).then_some(complete)
+    match complete.iter().position(|(frame, _)| *frame == 0) {
+        None => Err("frame 0 lacks an image of a camera for training. Complete it, or begin with another frame (scene.frames)".into()),
+        Some(_) if complete.len() < 2 => {
+            let asked = count.div_ceil(every);
+            Err(format!("of {asked} key frames, only frame 0 has images of all cameras for training. Choose another train.key_frames than {every}"))
+        }
+        Some(0) => Ok(complete),
+        Some(_) => Err("frame 0 is not the earliest. Number the frames of the dataset by their times".into()),
+    }
 }
 
 /// The time of a key frame: that of the first of its images, whose indices in `views` are `own`.

@@ -83,16 +83,19 @@ fn key_frames_are_complete_and_in_the_order_of_their_times() {
     };
     let of = |views: &[View], count, every| complete_frames(views, &[3, 7], count, every);
     let mut views = scene(&[0.0, 0.5, 1.0]);
-    assert_eq!(of(&views, 3, 1), Some(vec![(0, vec![2, 1]), (1, vec![4, 3]), (2, vec![6, 5])]));
-    assert_eq!(of(&views, 3, 2), Some(vec![(0, vec![2, 1]), (2, vec![6, 5])]));
+    assert_eq!(of(&views, 3, 1), Ok(vec![(0, vec![2, 1]), (1, vec![4, 3]), (2, vec![6, 5])]));
+    assert_eq!(of(&views, 3, 2), Ok(vec![(0, vec![2, 1]), (2, vec![6, 5])]));
     views[3].split = Split::Validation;
-    assert_eq!(of(&views, 3, 1), Some(vec![(0, vec![2, 1]), (2, vec![6, 5])]), "frame 1 lacks an image");
+    assert_eq!(of(&views, 3, 1), Ok(vec![(0, vec![2, 1]), (2, vec![6, 5])]), "frame 1 lacks an image");
+    let reason = |found: Found<Vec<(usize, Vec<usize>)>>| found.unwrap_err();
+    views[5].split = Split::Validation;
+    assert!(reason(of(&views, 3, 1)).starts_with("of 3 key frames, only frame 0 has images"));
     views[1].split = Split::Validation;
-    assert_eq!(of(&views, 3, 1), None, "frame 0 lacks an image");
+    assert!(reason(of(&views, 3, 1)).starts_with("frame 0 lacks an image"));
     let frames = |times: &[f32]| of(&scene(times), times.len(), 1).map(|found| found.into_iter().map(|(frame, _)| frame).collect::<Vec<_>>());
-    assert_eq!(frames(&[0.0, 1.0, 0.5, 0.5]), Some(vec![0, 2, 3, 1]), "times that run backwards");
-    assert_eq!(frames(&[0.0; 3]), Some(vec![0, 1, 2]), "frames that claim to be simultaneous");
-    assert_eq!(frames(&[1.0, 0.5, 0.0]), None, "the first frame is the last one");
+    assert_eq!(frames(&[0.0, 1.0, 0.5, 0.5]), Ok(vec![0, 2, 3, 1]), "times that run backwards");
+    assert_eq!(frames(&[0.0; 3]), Ok(vec![0, 1, 2]), "frames that claim to be simultaneous");
+    assert!(frames(&[1.0, 0.5, 0.0]).unwrap_err().starts_with("frame 0 is not the earliest"));
 }
 
 #[test]
