@@ -194,7 +194,7 @@ pub struct Eval {
     /// Also write every render as a PNG file into this folder, 00000.png and on. It must be new or empty.
     #[arg(long, value_name = "DIR")]
     pub renders: Option<PathBuf>,
-    /// Replace the renders of an earlier command in DIR, and a contact sheet that lies in the folder of the scene.
+    /// Replace the renders of an earlier command in DIR, if it marked DIR (.cc4dgs-images), and a contact sheet that lies in the folder of the scene.
     #[arg(long)]
     pub overwrite: bool,
     /// Device to compute on.

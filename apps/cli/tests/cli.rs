@@ -147,7 +147,7 @@ fn a_scene_goes_through_the_whole_chain() {
     succeed(&draw);
     assert!(fail(&draw, 2).contains("--overwrite"));
     succeed(&[&draw[..], &["--overwrite", "--max-views", "1"]].concat());
-    assert_eq!(std::fs::read_dir(&renders).unwrap().count(), 1);
+    assert_eq!(std::fs::read_dir(&renders).unwrap().count(), 2, "a render and the mark of the folder");
     assert!(fail(&[&measure[..], &["--renders", text(&dir), "--overwrite"]].concat(), 2).contains("is not a render"));
     assert!(std::fs::read(&archive).unwrap() == packed && dir.join("checkpoint").is_file());
 
@@ -192,9 +192,9 @@ fn a_scene_goes_through_the_whole_chain() {
     let shorter = ["render", text(&archive), "--out", text(&frames), "--frames", "2", "--size", "48x36", "-q"];
     assert!(fail(&shorter, 2).contains("--overwrite"));
     succeed(&[&shorter[..], &["--overwrite"]].concat());
-    assert_eq!(std::fs::read_dir(&frames).unwrap().count(), 2);
+    assert_eq!(std::fs::read_dir(&frames).unwrap().count(), 3, "two frames and the mark of the folder");
     succeed(&["render", text(&archive), "--out", text(&at("views")), "--scene", "procedural:tiny", "--frames", "2", "-q"]);
-    assert_eq!(std::fs::read_dir(at("views")).unwrap().count(), 2);
+    assert_eq!(std::fs::read_dir(at("views")).unwrap().count(), 3);
     let output = cc4dgs().args(["render", text(&archive), "--out", text(&at("v")), "--mp4", text(&at("v.mp4"))]).env("PATH", "").output().unwrap();
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("ffmpeg") && !at("v").exists());

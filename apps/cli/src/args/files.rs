@@ -34,7 +34,7 @@ pub struct Render {
     /// Folder for the frames, frame_00000.png and on.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Replace the frames of an earlier command in DIR, and the video.
+    /// Replace the frames of an earlier command in DIR, if it marked DIR (.cc4dgs-images), and the video.
     #[arg(long)]
     pub overwrite: bool,
     #[command(flatten)]

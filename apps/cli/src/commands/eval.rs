@@ -1,6 +1,6 @@
 //! `cc4dgs eval`.
 
-use super::{Context, lies_in};
+use super::{Context, image_folder, lies_in};
 use crate::args::Eval;
 use crate::interrupt;
 use crate::models::{Loaded, load_model};
@@ -75,13 +75,13 @@ pub fn run(context: &Context, args: &Eval) -> Result<()> {
         check_sheet(sheet, &args.views.scene, args.overwrite)?;
     }
     let earlier = match &images.renders {
-        Some(folder) => earlier_renders(folder, &args.views.scene, args.overwrite)?,
+        Some(folder) => earlier_renders(folder, args.overwrite)?,
         None => Vec::new(),
     };
     let events = context.listeners(None)?;
     let loaded = load_model(&args.views.model, &args.device, &context.registry, &context.limits, &events)?;
     let subject = Subject::open(context, &args.views.model, &loaded, &args.views.scene, &args.views.sets)?;
-    earlier.iter().try_for_each(|render| std::fs::remove_file(render).map_err(|e| Error::io(render, e)))?;
+    images.renders.as_ref().map_or(Ok(()), |folder| image_folder::begin(folder, &earlier))?;
     let scored = Scored { split, max_views: args.max_views, perceptual: args.perceptual };
     let report = measure(context, &subject, scored, &images, &events)?;
     context.output.result(&report, || text(&report))?;
@@ -113,28 +113,21 @@ fn check_sheet(sheet: &Path, scene: &Path, overwrite: bool) -> Result<()> {
 }
 
 /// The renders that an earlier command left in `folder`. A folder that holds anything is refused without `overwrite`; with it, one that holds anything else, and
-/// one in the folder of the scene, whose images may have such names, too.
-fn earlier_renders(folder: &Path, scene: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
+/// one that no command marked, whose images may be those of a dataset.
+fn earlier_renders(folder: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
     let refuse = |problem: String, remedy: &str| Err(Error::parameter("--renders", problem, remedy));
-    if folder.symlink_metadata().is_err() {
-        return Ok(Vec::new());
-    }
-    let entries = std::fs::read_dir(folder).and_then(|entries| entries.map(|entry| entry.map(|e| e.path())).collect::<std::io::Result<Vec<_>>>());
-    let mut entries = entries.map_err(|e| Error::io(folder, e))?;
-    entries.sort();
+    let entries = image_folder::entries(folder)?;
     let Some(first) = entries.first() else { return Ok(entries) };
     if !overwrite {
         let problem = format!("{} is there already, and renders of two commands would mix", first.display());
         return refuse(problem, "Name another folder, or add --overwrite to replace the renders of an earlier command");
-    }
-    if lies_in(folder, scene) {
-        return refuse(format!("{} holds files and lies in the folder of the scene", folder.display()), "Name another folder: its images are never replaced");
     }
     let is_digits = |name: &str| name.len() >= 5 && name.bytes().all(|b| b.is_ascii_digit());
     let is_render = |path: &Path| path.is_file() && path.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_suffix(".png")).is_some_and(is_digits);
     if let Some(other) = entries.iter().find(|path| !is_render(path)) {
         return refuse(format!("{} is not a render", other.display()), "Name another folder: only renders are replaced");
     }
+    image_folder::refuse_unmarked("--renders", folder)?;
     Ok(entries)
 }
 
@@ -302,10 +295,10 @@ mod tests {
     #[test]
     fn renders_replace_renders_only() {
         let (_folder, at) = scratch();
-        let earlier = |folder: &str, overwrite| earlier_renders(&at(folder), &at("scene"), overwrite).map_err(|e| e.to_string());
+        let earlier = |folder: &str, overwrite| earlier_renders(&at(folder), overwrite).map_err(|e| e.to_string());
         let nothing: Vec<PathBuf> = Vec::new();
         assert_eq!(earlier("renders", false), Ok(nothing.clone()));
-        std::fs::create_dir(at("renders")).unwrap();
+        image_folder::begin(&at("renders"), &[]).unwrap();
         assert_eq!(earlier("renders", false), Ok(nothing));
         std::fs::write(at("renders/00000.png"), PNG).unwrap();
         std::fs::write(at("renders/100000.png"), PNG).unwrap();
@@ -313,11 +306,9 @@ mod tests {
         assert_eq!(earlier("renders", true), Ok(vec![at("renders/00000.png"), at("renders/100000.png")]));
         std::fs::write(at("renders/frame_00001.png"), PNG).unwrap();
         assert!(earlier("renders", true).unwrap_err().contains("frame_00001.png is not a render"));
-        // The folder of the scene, and that of its images, whose names are those of renders.
-        for folder in ["scene", "scene/images"] {
-            assert!(earlier(folder, false).unwrap_err().contains("--overwrite"));
-            assert!(earlier(folder, true).unwrap_err().contains("lies in the folder of the scene"));
-        }
-        assert!(earlier("scene/transforms.json", true).is_err());
+        // Images of a scene have the names of renders, wherever the file that names them lies.
+        assert!(earlier("scene/images", false).unwrap_err().contains("--overwrite"));
+        assert!(earlier("scene/images", true).unwrap_err().contains("may be those of a dataset"));
+        assert!(earlier("scene", true).is_err() && earlier("scene/transforms.json", true).is_err());
     }
 }

@@ -6,7 +6,7 @@ use super::{Context, megabytes};
 use crate::args::Info;
 use cc4dgs_core::archive::{Archive, DeformerEntry, StreamKind};
 use cc4dgs_core::gaussians::sh_rest_len;
-use cc4dgs_core::{Error, HostGaussians, Result, SceneOptions, Silent, Split, parse_device};
+use cc4dgs_core::{Error, HostGaussians, Result, Scene, SceneOptions, Silent, Split, parse_device};
 use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_play::{Model, attribute_width};
 use cc4dgs_train::data;
@@ -16,12 +16,19 @@ use std::path::Path;
 
 /// Nothing is drawn here, so no graphics driver is asked.
 const DEVICE: &str = "flex";
+/// The most cameras of a scene that people are shown.
+const MOST_CAMERAS: usize = 12;
+/// The key of the cameras of a scene.
+const CAMERAS: &str = "camera_list";
 
 pub fn run(context: &Context, args: &Info) -> Result<()> {
     let (mut value, storage) = describe(context, &args.path)?;
     let rows = storage.map_or(Vec::new(), |s| s.rows());
     let mut lines = Vec::new();
-    flatten("", &value, &mut lines);
+    let mut shown = value.clone();
+    let cameras = shown.as_object_mut().and_then(|map| map.remove(CAMERAS));
+    flatten("", &shown, &mut lines);
+    lines.extend(cameras.iter().flat_map(camera_lines));
     if let (false, Value::Object(map)) = (rows.is_empty(), &mut value) {
         map.insert("storage".into(), plain(&rows)?);
         lines.extend(table(&rows));
@@ -144,6 +151,7 @@ fn scene(context: &Context, path: &Path) -> Result<Value> {
         "path": path.to_string_lossy(),
         "name": scene.name,
         "cameras": scene.cameras.len(),
+        CAMERAS: cameras(&scene),
         "frames": scene.frame_count,
         "train_views": scene.split(Split::Train).len(),
         "test_views": scene.split(Split::Test).len(),
@@ -155,6 +163,35 @@ fn scene(context: &Context, path: &Path) -> Result<Value> {
         "background": plain(&scene.background)?,
         "warnings": scene.warnings,
     }))
+}
+
+/// Name, image size and views of every camera of `scene`.
+fn cameras(scene: &Scene) -> Vec<Value> {
+    let mut views = vec![[0usize; 3]; scene.cameras.len()];
+    for view in &scene.views {
+        views[view.camera][view.split as usize] += 1;
+    }
+    let described = scene.cameras.iter().zip(views);
+    described
+        .map(|(camera, [train, validation, test])| {
+            json!({ "name": camera.name, "size": format!("{}x{}", camera.width, camera.height), "train": train, "validation": validation, "test": test })
+        })
+        .collect()
+}
+
+/// The first of the cameras that [`cameras`] listed, a line each.
+fn camera_lines(cameras: &Value) -> Vec<String> {
+    let all = cameras.as_array().map_or(&[][..], Vec::as_slice);
+    let text = |camera: &Value, key: &str| camera[key].as_str().unwrap_or_default().to_string();
+    let line = |camera: &Value| {
+        let (name, size) = (text(camera, "name"), text(camera, "size"));
+        format!("camera {name}: {size}, {} training, {} validation and {} test views", camera["train"], camera["validation"], camera["test"])
+    };
+    let mut lines: Vec<String> = all.iter().take(MOST_CAMERAS).map(line).collect();
+    if all.len() > MOST_CAMERAS {
+        lines.push(format!("and {} more cameras, which --json lists", all.len() - MOST_CAMERAS));
+    }
+    lines
 }
 
 /// The JSON form through text, so that a float32 of 0.1 reads 0.1 and not its nearest float64.
@@ -181,5 +218,26 @@ fn flatten(prefix: &str, value: &Value, lines: &mut Vec<String>) {
         Value::String(text) => lines.push(format!("{prefix}: {text}")),
         Value::Null => {}
         other => lines.push(format!("{prefix}: {other}")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cc4dgs_core::{Camera, NoImages, View};
+    use std::sync::Arc;
+
+    #[test]
+    fn cameras_are_listed_with_their_views() {
+        let camera = |k: usize| Camera::look_at(&format!("cam{k:02}"), (8 + k as u32, 6), 1.0, [k as f64, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+        let split = |camera: usize| if camera == 0 { Split::Test } else { Split::Train };
+        let views = (0..30).map(|i| View { camera: i % 15, frame: i / 15, time_norm: 0.0, split: split(i % 15) }).collect();
+        let scene = Scene::new("s", (0..15).map(camera).collect(), views, Arc::new(NoImages), 0).unwrap();
+        let all = Value::from(cameras(&scene));
+        assert_eq!(all.as_array().unwrap().len(), 15);
+        let lines = camera_lines(&all);
+        assert_eq!((lines.len(), lines[0].as_str()), (MOST_CAMERAS + 1, "camera cam00: 8x6, 0 training, 0 validation and 2 test views"));
+        assert_eq!(lines[1], "camera cam01: 9x6, 2 training, 0 validation and 0 test views");
+        assert_eq!(lines[MOST_CAMERAS], "and 3 more cameras, which --json lists");
     }
 }

@@ -10,6 +10,7 @@ mod eval;
 #[cfg(feature = "view")]
 mod exact;
 mod export;
+mod image_folder;
 mod info;
 mod plugins;
 mod prune;

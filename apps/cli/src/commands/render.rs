@@ -1,6 +1,6 @@
 //! `cc4dgs render`.
 
-use super::{Context, create_parent, lies_in};
+use super::{Context, create_parent, image_folder};
 use crate::args::Render;
 use crate::models::load_model;
 use crate::{interrupt, shots};
@@ -37,14 +37,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     } else if args.shots.fps.is_some() {
         return Err(Error::parameter("--fps", "it is the rate of a video, and none is asked for", "Leave it out, or add --mp4 F.mp4"));
     }
-    let earlier = frames_in(&args.out)?;
-    if let Some(frame) = earlier.first().filter(|_| !args.overwrite) {
-        let problem = format!("{} is there already, and frames of two commands would mix", frame.display());
-        return Err(Error::parameter("--out", problem, "Name another folder, or add --overwrite"));
-    }
-    if !earlier.is_empty() {
-        refuse_images(&args.out, args.shots.scene.as_deref(), |folder| context.registry.readers().iter().any(|reader| (reader.probe)(folder)))?;
-    }
+    let earlier = earlier_frames(&args.out, args.overwrite)?;
     let stop = interrupt::stop_flag()?;
     let events = context.listeners(None)?;
     let loaded = load_model(&args.model, &args.device, &context.registry, &context.limits, &events)?;
@@ -52,8 +45,7 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     if let Some(path) = &args.mp4 {
         create_parent(path)?;
     }
-    std::fs::create_dir_all(&args.out).map_err(|e| Error::io(&args.out, e))?;
-    earlier.iter().try_for_each(|frame| std::fs::remove_file(frame).map_err(|e| Error::io(frame, e)))?;
+    image_folder::begin(&args.out, &earlier)?;
     let mut player = Player::new(&loaded.model, &context.registry, &loaded.device)?.on(background);
     let mut video = args.mp4.as_ref().map(|path| VideoWriter::new(path, args.shots.rate()));
     let mut times = Vec::with_capacity(shots.len());
@@ -93,31 +85,19 @@ pub fn run(context: &Context, args: &Render) -> Result<()> {
     })
 }
 
-/// The frames that an earlier command left in `folder`, by their names; none where there is no such folder.
-fn frames_in(folder: &Path) -> Result<Vec<PathBuf>> {
-    if !folder.exists() {
-        return Ok(Vec::new());
-    }
+/// The frames that an earlier command left in `folder`, by their names. They are refused without `overwrite`; with it, where no command marked the folder: they
+/// may be images of a dataset.
+fn earlier_frames(folder: &Path, overwrite: bool) -> Result<Vec<PathBuf>> {
     let is_frame = |name: &str| name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".png")).is_some_and(|n| n.parse::<u32>().is_ok());
-    let mut found = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(|e| Error::io(folder, e))? {
-        let entry = entry.map_err(|e| Error::io(folder, e))?;
-        if entry.file_name().to_str().is_some_and(is_frame) {
-            found.push(entry.path());
-        }
+    let mut found = image_folder::entries(folder)?;
+    found.retain(|path| path.file_name().and_then(|name| name.to_str()).is_some_and(is_frame));
+    let Some(frame) = found.first() else { return Ok(found) };
+    if !overwrite {
+        let problem = format!("{} is there already, and frames of two commands would mix", frame.display());
+        return Err(Error::parameter("--out", problem, "Name another folder, or add --overwrite"));
     }
-    found.sort();
+    image_folder::refuse_unmarked("--out", folder)?;
     Ok(found)
-}
-
-/// Refuses to replace frames in the folder of the scene at `scene`, and in that of a dataset (`is_dataset`) or directly below: images have such names, too.
-fn refuse_images(folder: &Path, scene: Option<&Path>, is_dataset: impl Fn(&Path) -> bool) -> Result<()> {
-    let whole = folder.canonicalize().map_err(|e| Error::io(folder, e))?;
-    if scene.is_some_and(|scene| lies_in(folder, scene)) || whole.ancestors().take(2).any(is_dataset) {
-        let problem = format!("{} holds frame_NNNNN.png files and lies in the folder of a scene", folder.display());
-        return Err(Error::parameter("--out", problem, "Name another folder: images of a scene are never replaced"));
-    }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -125,23 +105,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn images_of_a_scene_are_not_replaced() {
+    fn frames_replace_frames_only() {
         let root = tempfile::tempdir().unwrap();
         let at = |name: &str| root.path().join(name);
-        for folder in ["scene/images/left", "frames"] {
+        let earlier = |folder: &str, overwrite| earlier_frames(&at(folder), overwrite).map_err(|e| e.to_string());
+        let nothing: Vec<PathBuf> = Vec::new();
+        // A dataset three folders up, and one whose file lies beside the folder: neither has to be found.
+        for folder in ["cap/images/cam0", "cap/images"] {
             std::fs::create_dir_all(at(folder)).unwrap();
+            assert_eq!(earlier(folder, false), Ok(nothing.clone()));
+            std::fs::write(at(folder).join("frame_00001.png"), "").unwrap();
+            assert!(earlier(folder, false).unwrap_err().contains("--overwrite"));
+            let message = earlier(folder, true).unwrap_err();
+            assert!(message.contains(folder) && message.contains("may be those of a dataset") && message.contains("Name another folder"), "{message}");
         }
-        std::fs::write(at("scene/transforms.json"), "{}").unwrap();
-        std::fs::write(at("frames/frame_00001.png"), "").unwrap();
-        assert_eq!(frames_in(&at("frames")).unwrap(), [at("frames/frame_00001.png")]);
-        let is_dataset = |folder: &Path| folder.join("transforms.json").is_file();
-        let check = |folder: &str, scene: Option<&str>| refuse_images(&at(folder), scene.map(at).as_deref(), is_dataset).map_err(|e| e.to_string());
-        check("frames", None).unwrap();
-        check("frames", Some("scene")).unwrap();
-        for scene in ["scene", "scene/transforms.json"] {
-            assert!(check("scene/images/left", Some(scene)).unwrap_err().contains("lies in the folder of a scene"));
-        }
-        // An orbit names no scene.
-        assert!(check("scene/images", None).is_err() && check("scene", None).is_err());
+        // A folder of an earlier command.
+        assert_eq!(earlier("frames", true), Ok(nothing));
+        image_folder::begin(&at("frames"), &[]).unwrap();
+        ["frame_00001.png", "frame_00000.png", "frame_x.png", "00001.png"].iter().for_each(|name| std::fs::write(at("frames").join(name), "").unwrap());
+        assert!(earlier("frames", false).unwrap_err().contains("--overwrite"));
+        assert_eq!(earlier("frames", true), Ok(vec![at("frames/frame_00000.png"), at("frames/frame_00001.png")]));
     }
 }

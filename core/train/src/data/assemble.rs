@@ -41,6 +41,7 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
     raw.validate()?;
     let mut plans = Vec::with_capacity(raw.cameras.len());
     let mut cameras = Vec::with_capacity(raw.cameras.len());
+    let mut enlarged = Vec::new();
     let mut first_images: Vec<Option<&ImageSource>> = vec![None; raw.cameras.len()];
     raw.views.iter().rev().for_each(|view| first_images[view.camera] = Some(&view.image));
     for (camera, image) in raw.cameras.iter_mut().zip(first_images) {
@@ -48,10 +49,22 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
             Some(ImageSource::File { path, .. }) => fit_to_image(camera, image_size(path, limits)?, &mut raw.warnings)?,
             _ => camera.size,
         };
+        let wanted = options.target_size((native[0], native[1]));
+        if !raw.resized && (wanted.0 > native[0] || wanted.1 > native[1]) {
+            enlarged.push((native, wanted));
+        }
         let is_video = matches!(image, Some(ImageSource::Video { .. }));
         let (plan, pinhole) = plan_camera(camera, native, is_video, (!raw.resized).then_some(options), limits)?;
         plans.push(plan);
         cameras.push(frame.apply_camera(&pinhole));
+    }
+    if let Some(([w, h], (width, height))) = enlarged.first() {
+        raw.warnings.push(format!(
+            "the images of {} of {} cameras are smaller than scene.width and scene.height ask for and are enlarged ({w}x{h} to {width}x{height}), also where \
+             renders are scored against them; scene.downscale divides the size of each camera instead",
+            enlarged.len(),
+            plans.len()
+        ));
     }
     let videos = VideoFrames::new(&raw.views, &plans, options)?;
     let jobs = raw.views.iter().map(|v| Job { image: Some(v.image.clone()), plan: v.camera }).collect();
@@ -106,11 +119,13 @@ pub(super) fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: 
         return Ok(camera.size);
     }
     if !sx.is_finite() || !sy.is_finite() || (sx / sy - 1.0).abs() > 0.01 {
-        return Err(Error::data(
-            format!("camera {}", camera.name),
-            format!("calibrated for {w}x{h} pixels, its image has {}x{}", found.0, found.1),
-            "Use the images the calibration was made for",
-        ));
+        let is_turned = (f64::from(found.0) / h / (f64::from(found.1) / w) - 1.0).abs() < 0.01;
+        let remedy = match is_turned {
+            true => "The sides are swapped: if the photo has an EXIF rotation, which readers ignore, write it into the pixels (mogrify -auto-orient FILES)",
+            false => "Use the images the calibration was made for",
+        };
+        let problem = format!("calibrated for {w}x{h} pixels, its image has {}x{}", found.0, found.1);
+        return Err(Error::data(format!("camera {}", camera.name), problem, remedy));
     }
     warnings.push(format!("the images are {}x{}, the calibration is for {w}x{h}; it was scaled", found.0, found.1));
     camera.focal = [camera.focal[0] * sx, camera.focal[1] * sy];

@@ -1,6 +1,7 @@
-//! D-NeRF and Blender scenes: `transforms_train.json` and friends, RGBA images, times in 0..1.
+//! D-NeRF and Blender scenes: `transforms_train.json` and friends, RGBA images, times in 0..1. The images of a camera that stands still are its frames.
 
-use super::nerfstudio::{Intrinsics, camera, image_path, warn_of_missing_times};
+use super::fixed_cameras::{merge_fixed_cameras, warn_of_missing_times};
+use super::nerfstudio::{Intrinsics, camera, image_path};
 use cc4dgs_core::reader::files::{file_name, image_size, read_json};
 use cc4dgs_core::{Error, ImageSource, InitBox, Limits, Plugin, RawScene, RawView, ReaderPlugin, Result, SceneOptions, Split, inventory};
 use serde::Deserialize;
@@ -58,6 +59,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     }
     warn_of_missing_times(&times, &mut scene.warnings);
     scene.rank_times(&times, &path.display().to_string())?;
+    merge_fixed_cameras(&mut scene, &times, true);
     scene.init_box = Some(InitBox::Cube { half_share: INIT_HALF_SHARE });
     // The published tables composite over white (4DGS, Swift4D); images without alpha stay as they are.
     scene.background = Some([1.0; 3]);
@@ -73,13 +75,14 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
         let first = paths.first().map(|p| p.display().to_string()).unwrap_or_else(|| "any".into());
         return Err(Error::data(object, format!("none of its {} images exist ({first})", paths.len()), "Check that the images lie beside the JSON"));
     };
-    let (w, h) = image_size(present, limits)?;
-    for (frame, path) in transforms.frames.iter().zip(paths) {
+    for (frame, path) in transforms.frames.iter().zip(&paths) {
         let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");
         // Files that other programs have split name the lens, too.
         let intrinsics = frame.own.over(&transforms.shared);
-        scene.cameras.push(camera(&frame.file_path, &frame.transform_matrix, &intrinsics, &|| Ok((w, h)), &bad)?);
-        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, image: ImageSource::File { path, mask: None } });
+        // Missing images are left out later.
+        let size = || image_size(if path.is_file() { path } else { present }, limits);
+        scene.cameras.push(camera(&frame.file_path, &frame.transform_matrix, &intrinsics, &size, &bad)?);
+        scene.views.push(RawView { camera: scene.cameras.len() - 1, frame: 0, time: None, split, image: ImageSource::File { path: path.clone(), mask: None } });
         times.push(frame.time);
     }
     Ok(())

@@ -10,6 +10,7 @@ mod camera_box;
 mod colmap;
 mod colmap_binary;
 mod colmap_text;
+mod fixed_cameras;
 mod focus;
 mod frames;
 mod hold_out;

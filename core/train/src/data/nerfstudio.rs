@@ -3,6 +3,7 @@
 //! points of `ply_file_path` are those of the scene.
 
 use super::assemble::fit_to_image;
+use super::fixed_cameras::{merge_fixed_cameras, warn_of_missing_times};
 use super::ply_points;
 use super::video::{self, Footage};
 use cc4dgs_core::reader::files::{file_name, has_extension, image_size, read_bytes, read_json};
@@ -193,9 +194,10 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     if !missing.is_empty() {
         let shown = missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
         scene.warnings.push(format!(
-            "{} of {} images are missing and were skipped: {shown}{}",
+            "{} of {} {} are missing and were skipped: {shown}{}",
             missing.len(),
             transforms.frames.len(),
+            if has_times { "images" } else { "videos" },
             if missing.len() > 3 { ", …" } else { "" }
         ));
     }
@@ -211,8 +213,15 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     }
     if has_times {
         warn_of_missing_times(&times, &mut scene.warnings);
+        if times.len() > 1 && times.iter().all(Option::is_none) {
+            scene.warnings.push(format!(
+                "none of the {} images states a time, so nothing moves; for a scene that does, write \"time\" (0 at the first instant, 1 at the last) into every \
+                 entry of \"frames\"",
+                times.len()
+            ));
+        }
         scene.rank_times(&times, &object)?;
-        if merge_fixed_cameras(&mut scene, &times) && !named_split && scene.cameras.len() >= LEAST_HELD_OUT {
+        if merge_fixed_cameras(&mut scene, &times, false) && !named_split && scene.cameras.len() >= LEAST_HELD_OUT {
             // Another instant of a camera that is trained on says nothing of new views.
             scene.views.iter_mut().for_each(|view| view.split = if view.camera.is_multiple_of(HOLD_OUT_EVERY) { Split::Test } else { Split::Train });
         }
@@ -234,38 +243,9 @@ fn points(object: &str, folder: &Path, named: &str, limits: &Limits) -> Result<R
     ply_points::points(&name, &read_bytes(&file, limits)?, limits)
 }
 
-/// Says so where some images state a time and others none: these count as images of time 0.
-pub(crate) fn warn_of_missing_times(times: &[Option<f64>], warnings: &mut Vec<String>) {
-    let missing = times.iter().filter(|time| time.is_none()).count();
-    if (1..times.len()).contains(&missing) {
-        warnings.push(format!("{missing} of {} images state no time and are taken as images of time 0", times.len()));
-    }
-}
-
 /// The name of a file without a leading `./`.
 fn plain(name: &str) -> &str {
     name.trim_start_matches("./")
-}
-
-/// Where most entries are further instants of a camera that stands still, `scene` gets one camera for each; `times` are those of its views. Returns whether it did.
-fn merge_fixed_cameras(scene: &mut RawScene, times: &[Option<f64>]) -> bool {
-    let mut groups: BTreeMap<String, Vec<usize>> = BTreeMap::new();
-    for (index, c) in scene.cameras.iter().enumerate() {
-        groups.entry(format!("{:?}", (c.size, c.focal, c.principal, &c.distortion, c.world_to_camera))).or_default().push(index);
-    }
-    let instants = |of: &[usize]| of.iter().filter_map(|&view| times[view].map(f64::to_bits)).collect::<BTreeSet<_>>().len();
-    // A moving camera may rest for a moment.
-    if 2 * groups.len() > scene.views.len() || groups.values().any(|of| instants(of) < of.len()) {
-        return false;
-    }
-    let mut groups: Vec<Vec<usize>> = groups.into_values().collect();
-    groups.sort();
-    let cameras = groups.iter().map(|of| scene.cameras[of[0]].clone()).collect();
-    for (camera, views) in groups.iter().enumerate() {
-        views.iter().for_each(|&view| scene.views[view].camera = camera);
-    }
-    scene.cameras = cameras;
-    true
 }
 
 /// The videos that the frames name, if they do, by path.
@@ -371,16 +351,5 @@ mod tests {
         std::fs::remove_file(&file).unwrap();
         let missing = told();
         assert!(missing.contains("sparse_pc.ply: there is no such file") && missing.contains("Copy it there"), "{missing}");
-    }
-
-    #[test]
-    fn images_without_a_time_among_others_are_told() {
-        let told = |times: &[Option<f64>]| {
-            let mut warnings = Vec::new();
-            warn_of_missing_times(times, &mut warnings);
-            warnings.join("")
-        };
-        assert!(told(&[Some(0.0), None, Some(1.0)]).starts_with("1 of 3 images state no time"));
-        assert_eq!(told(&[None, None]) + &told(&[Some(0.5)]) + &told(&[]), "");
     }
 }

@@ -37,9 +37,8 @@ pub fn facts(results: &[CellResult]) -> String {
         let adapter = d.adapter.as_ref().map_or_else(String::new, |name| format!(" on {name}, driver {}", d.driver.as_deref().unwrap_or("unknown")));
         format!("{}{adapter}; {}, {} threads, {}", d.name, if d.processor.is_empty() { "unknown processor" } else { &d.processor }, d.threads, d.system)
     };
-    let data = |r: &CellResult| {
-        format!("{}: {} (xxh3 {}), {}x{}, {} frames", r.axes.scene, r.provenance.data.path, r.provenance.data.hash, r.image_size[0], r.image_size[1], r.frames)
-    };
+    let data =
+        |r: &CellResult| format!("{}: {} (xxh3 {}), {}, {} frames", r.axes.scene, r.provenance.data.path, r.provenance.data.hash, r.image_sizes(), r.frames);
     let mut rows = vec![
         ("sweep", set(&|r| r.sweep.clone())),
         (

@@ -86,7 +86,7 @@ impl<'a> Trained<'a> {
         let kept = spread_views(&self.scene, &views, plan.images);
         let (mut images, mut frame_ms_each) = (Vec::with_capacity(views.len()), Vec::with_capacity(views.len()));
         let began = Instant::now();
-        let mut image_size = [0, 0];
+        let (mut image_size, mut sizes_differ) = ([0, 0], false);
         let report = evaluate(&decoded, &self.scene, scored, worker.registry, &self.device, worker.events, &mut |view, truth, render, score| {
             if worker.stop.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted(format!("scoring of cell {}; the next run scores it again", cell.id)));
@@ -97,9 +97,11 @@ impl<'a> Trained<'a> {
                 write_png(folder.root().join(&name), image).map(|()| name)
             };
             let keeps = kept.contains(&view);
+            let size = [truth.width, truth.height];
             if index == 0 {
-                image_size = [truth.width, truth.height];
+                image_size = size;
             }
+            sizes_differ |= size != image_size;
             frame_ms_each.push(((score.field_ms + score.raster_ms) * 1e3).round() / 1e3);
             images.push(ImageResult {
                 camera: score.camera.clone(),
@@ -147,6 +149,7 @@ impl<'a> Trained<'a> {
             },
             split,
             image_size,
+            sizes_differ,
             frames: self.scene.frame_count,
             iterations: finished.iterations,
             gaussians: report.gaussians,

@@ -69,15 +69,24 @@ fn list(root: &Path) -> Result<Vec<DataFile>> {
     Ok(files)
 }
 
-/// The folder of everything that readers take from the dataset at `path`: of a file the one it lies in, since images are named relative to it; of a COLMAP model that
-/// of its project, where its images are.
+/// The folder of everything that readers take from the dataset at `path`: of a file the one it lies in, since images are named relative to it; of a COLMAP model in
+/// a folder `sparse`, or in a folder of it, that of its project, where its images are; of any other model its own.
 fn root_of(path: &Path) -> PathBuf {
     if path.is_file() {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
         return folder.unwrap_or(Path::new(".")).to_path_buf();
     }
     let is_model = ["cameras.bin", "cameras.txt"].iter().any(|name| path.join(name).is_file());
-    if is_model { path.join("../..") } else { path.to_path_buf() }
+    // A path such as `.` has no name.
+    let whole = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    let is_sparse = |folder: Option<&Path>| folder.and_then(Path::file_name).is_some_and(|name| name == "sparse");
+    if is_model && is_sparse(Some(whole.as_path())) {
+        path.join("..")
+    } else if is_model && is_sparse(whole.parent()) {
+        path.join("../..")
+    } else {
+        path.to_path_buf()
+    }
 }
 
 /// Names and sizes of a dataset's files as one name: what is compared before a training begins, because it costs little.
@@ -243,6 +252,18 @@ mod tests {
         let second = of();
         assert!(first[0] != second[0] && first[1] != second[1], "{first:?} {second:?}");
         assert_eq!(list(&root_of(&at("transforms.json"))).unwrap().len(), 3);
+        // A model beside its images, and one directly in `sparse`: what lies around the project belongs to something else.
+        for (project, model) in [("flat/project", "flat/project"), ("direct/project", "direct/project/sparse")] {
+            std::fs::create_dir_all(at(model)).unwrap();
+            std::fs::write(at(model).join("cameras.txt"), "model").unwrap();
+            std::fs::write(at(project).join("a.png"), "image").unwrap();
+            let of = || listing(&at(model)).unwrap();
+            let first = of();
+            std::fs::write(at(project).join("../other"), "other").unwrap();
+            assert_eq!(of(), first, "{model}");
+            std::fs::write(at(project).join("a.png"), "another image").unwrap();
+            assert_ne!(of(), first, "{model}");
+        }
     }
 
     #[cfg(target_os = "linux")]

@@ -142,6 +142,7 @@ impl Plan {
                 }
             }
         }
+        refuse_image_sizes(&plan.trainings, registry)?;
         Ok(plan)
     }
     /// A name of the trainings in their order: an index means the same training as long as it is the same.
@@ -297,6 +298,25 @@ fn stated(grid: &Grid, training: &PlannedTraining, registry: &Registry, check: &
     }
     check(&known)?;
     config::parse_table("configuration", &known.completed(registry)?.to_toml()?)
+}
+
+/// Refuses trainings of one scene whose images would have different sizes, of which no table is made: where no size is stated, `auto` chooses it by the minutes.
+fn refuse_image_sizes(trainings: &[PlannedTraining], registry: &Registry) -> Result<()> {
+    let mut chosen: BTreeMap<&str, &PlannedTraining> = BTreeMap::new();
+    for training in trainings.iter().filter(|training| training.minutes.is_some()) {
+        let scene = training.layers(registry)?.config()?.scene;
+        if scene.width > 0 || scene.height > 0 || scene.downscale != 1.0 {
+            continue;
+        }
+        let first = *chosen.entry(&training.scene).or_insert(training);
+        if first.minutes != training.minutes {
+            let of = |training: &PlannedTraining| format!("'{}' has {} minutes", training.label(), training.minutes.unwrap_or_default());
+            let problem = format!("{} and {}: `auto` may choose another image size for each, and no table compares these", of(first), of(training));
+            let remedy = "State scene.width, scene.height or scene.downscale in `set` of the grid or of the scene, or leave `size` out";
+            return Err(Error::parameter("size", problem, remedy));
+        }
+    }
+    Ok(())
 }
 
 /// `error` with the training it is about.

@@ -40,6 +40,9 @@ pub struct CellResult {
     pub split: Split,
     /// Width and height in pixels of the first scored image.
     pub image_size: [u32; 2],
+    /// Whether other scored images have another size; absent where they have not.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub sizes_differ: bool,
     /// Frames of the sequence.
     pub frames: usize,
     /// Training iterations of all stages.
@@ -348,6 +351,10 @@ impl CellResult {
             return Err(damaged("the columns of its training curve differ in length".into()));
         }
         Ok(result)
+    }
+    /// The size of its images for people.
+    pub fn image_sizes(&self) -> String {
+        if self.sizes_differ { "various sizes".into() } else { format!("{}x{} pixels", self.image_size[0], self.image_size[1]) }
     }
     /// Megabytes (10^6 bytes) of the archive.
     pub fn size_mb(&self) -> f64 {

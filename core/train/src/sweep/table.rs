@@ -112,9 +112,8 @@ pub fn markdown(results: &[CellResult]) -> Result<String> {
     let scenes: BTreeSet<&str> = rows.iter().map(|row| row.axes[0]).collect();
     for scene in scenes {
         let of_scene: Vec<&Row> = rows.iter().filter(|row| row.axes[0] == scene).collect();
-        let size = of_scene[0].results[0].image_size;
-        let images = of_scene[0].results[0].images.len();
-        let _ = writeln!(text, "\n## {scene}\n\n{images} images of {}x{} pixels.\n", size[0], size[1]);
+        let one = of_scene[0].results[0];
+        let _ = writeln!(text, "\n## {scene}\n\n{} images of {}.\n", one.images.len(), one.image_sizes());
         let mut headings = vec!["method", "setting", "codec", "seeds"];
         headings.extend(metrics.iter().map(|m| m.1));
         headings.extend(["MB", "Gaussians", "training s", "encode s", "decode s", "frame ms", ""]);
@@ -224,6 +223,8 @@ mod tests {
         assert!(table.contains("| cdf | base | cca | 2 | 31.00 ± 1.41 |") && table.contains("| cdf | base | raw | 1 | 31.25 |"), "{table}");
         assert!(table.contains("1 hopeless") && table.contains("flex") && table.contains("1 images of 400x400"), "{table}");
         assert!(!table.contains("LPIPS"), "no result has it: {table}");
+        let various: Vec<CellResult> = results.iter().cloned().map(|r| CellResult { sizes_differ: true, ..r }).collect();
+        assert!(markdown(&various).unwrap().contains("1 images of various sizes."));
         let csv = csv(&results).unwrap();
         let lines: Vec<Vec<&str>> = csv.lines().map(|line| line.split(',').collect()).collect();
         assert!(lines.len() == 3 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");

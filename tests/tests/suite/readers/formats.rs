@@ -183,7 +183,8 @@ fn videos_without_ffmpeg_say_what_to_do() {
     std::fs::write(dir.path().join("cam00.mp4"), "x").unwrap();
     let options = SceneOptions { ffmpeg: "/nonexistent/ffmpeg".into(), ..Default::default() };
     let message = open(dir.path(), &options, &Limits::default()).err().unwrap().to_string();
-    assert!(message.contains("/nonexistent/ffprobe") && message.contains("Install ffmpeg"), "{message}");
+    let parts = ["/nonexistent/ffprobe", "Install ffmpeg", "beside poses_bounds.npy", "transforms.json"];
+    assert!(parts.iter().all(|part| message.contains(part)), "{message}");
 }
 
 #[test]
@@ -336,28 +337,6 @@ fn a_lens_beside_the_angle_of_view_counts_in_split_files_too() {
     let (train, test) = (of(Split::Train), of(Split::Test));
     assert_eq!((train.fx, train.fy, train.cx, train.cy), (21.0, 22.0, 7.0, 9.0));
     assert!((test.fx - 8.0 / 0.4f64.tan()).abs() < 1e-9 && test.cx == 8.0);
-}
-
-#[test]
-fn images_of_a_camera_that_stands_still_are_its_frames() {
-    let dir = tempfile::tempdir().unwrap();
-    let cameras = ring(9, 16, 12);
-    let mut frames = Vec::new();
-    for (c, camera) in cameras.iter().enumerate() {
-        for t in 0..4 {
-            let name = format!("images/{c}_{t}.png");
-            write_image(&dir.path().join(&name), 16, 12, (10 * c + t) as u8);
-            frames.push(serde_json::json!({"file_path": name, "time": t as f64 / 3.0, "transform_matrix": opengl_camera_to_world(camera)}));
-        }
-    }
-    let document = serde_json::json!({"fl_x": 20.0, "w": 16, "h": 12, "frames": frames});
-    std::fs::write(dir.path().join("transforms.json"), document.to_string()).unwrap();
-    let scene = load(dir.path()).unwrap();
-    assert_eq!((scene.cameras.len(), scene.frame_count, train_count(&scene)), (9, 4, (28, 8)));
-    for (view, v) in scene.views.iter().enumerate() {
-        assert_eq!(scene.frame(view).unwrap().data[2], (10 * v.camera + v.frame) as u8);
-        assert_eq!(v.split == Split::Test, v.camera % 8 == 0, "whole cameras are held out");
-    }
 }
 
 #[test]

@@ -10,5 +10,6 @@ mod hostile;
 mod invariance;
 mod procedural;
 mod real;
+mod rigs;
 mod selection;
 mod videos;

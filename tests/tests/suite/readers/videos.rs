@@ -389,4 +389,12 @@ fn absurd_facts_are_errors() {
     assert_eq!(say(&times(&["nan", "1", "2"])), Ok(3));
     assert_eq!(say(&times(&["1e308", "-1e308"])), Ok(1));
     assert!(say(&times(&["0", "0.000001", "0.000002", "1e18"])).is_ok_and(|count| count <= 17));
+    // Where a disk is full, the folder of the cache is to blame.
+    let ffmpeg = dir.path().join("ffmpeg");
+    std::fs::write(&ffmpeg, "#!/bin/sh\necho No space left on device >&2\nexit 1\n").unwrap();
+    std::fs::set_permissions(&ffmpeg, std::fs::Permissions::from_mode(0o755)).unwrap();
+    assert_eq!(say(&times(&["0", "1", "2"])), Ok(3));
+    let (cache, full) = (dir.path().join("full"), SceneOptions { video_cache: Some(dir.path().join("full")), ..options.clone() });
+    let error = open(dir.path(), &full, &Limits::default()).unwrap().frame(0).err().unwrap().to_string();
+    assert!(["No space left", cache.to_str().unwrap(), "scene.video_cache"].iter().all(|part| error.contains(part)), "{error}");
 }

@@ -51,11 +51,16 @@ pub fn plan(context: &Context, args: &SweepPlan) -> Result<()> {
     context.output.result(&report, || {
         let time = report.minutes.map_or_else(String::new, |minutes| format!(", about {:.1} hours of training", minutes / 60.0));
         let next = match &report.folder {
-            Some(folder) => format!("run it: cc4dgs sweep run {folder}"),
+            Some(folder) => format!("run it: {} sweep run {folder}", program()),
             None => "nothing was written; --out DIR writes the plan".into(),
         };
         format!("{}: {} trainings, {} cells ({} of them finished){time}\n{next}", report.name, report.trainings, report.cells, report.finished)
     })
+}
+
+/// The running program as it was called: one that links other plug-ins has another name than `cc4dgs`.
+fn program() -> String {
+    std::env::args_os().next().map_or_else(|| "cc4dgs".into(), |name| name.to_string_lossy().into_owned())
 }
 
 /// The grid with the options in place of its values, which are held to the same rules.
@@ -143,7 +148,7 @@ pub fn collect(context: &Context, args: &SweepCollect) -> Result<()> {
         collection.check_complete(&folder)?;
     }
     if collection.results.is_empty() {
-        return Err(Error::data(format!("sweep {}", args.dir.display()), "there is no result", "Run it first: cc4dgs sweep run DIR"));
+        return Err(Error::data(format!("sweep {}", args.dir.display()), "there is no result", format!("Run it first: {} sweep run DIR", program())));
     }
     let results = select(std::mem::take(&mut collection.results), &args.conditions)?;
     let tables = write_tables(&folder, &results, collection.gap().as_deref())?;

@@ -79,9 +79,9 @@ pub fn run(context: &Context, plan: &Plan, folder: &SweepFolder, jobs: Option<us
         return Err(pool.error());
     }
     let report = PoolReport { finished: pool.finished(), planned: plan.cells.len(), seconds: began.elapsed().as_secs_f64() };
-    context
-        .output
-        .result(&report, || format!("{} of {} cells are finished; tables: cc4dgs sweep collect {}", report.finished, report.planned, folder.root().display()))
+    context.output.result(&report, || {
+        format!("{} of {} cells are finished; tables: {} sweep collect {}", report.finished, report.planned, super::program(), folder.root().display())
+    })
 }
 
 impl Pool<'_> {

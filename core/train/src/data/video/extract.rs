@@ -162,7 +162,7 @@ impl VideoFrames {
         arguments.push(&video_input);
         arguments.extend(after.map(OsStr::new));
         arguments.push(pattern.as_os_str());
-        run(&self.options.ffmpeg, &arguments, video, 1 << 20)?;
+        run(&self.options.ffmpeg, &arguments, video, 1 << 20, Some(&cache))?;
         let decoded = std::fs::read_dir(work.path()).map_err(|e| Error::io(work.path(), e))?.count();
         let counted = work.path().join(COUNT);
         std::fs::write(&counted, decoded.to_string()).map_err(|e| Error::io(&counted, e))?;

@@ -22,6 +22,9 @@ use std::process::{Command, Stdio};
 const STREAM: &str = "V:0";
 /// Brings selected frames to consecutive times, whatever their own: with an output rate of 25, no version of ffmpeg repeats or drops any.
 const CONSECUTIVE: &str = "settb=1/25,setpts=N";
+/// What helps where videos cannot be read.
+const EXTRACT: &str = "extract the frames yourself: into a folder per camera (cam00/0000.png …) beside poses_bounds.npy, else as images that a transforms.json names, \
+                       each with its \"time\"";
 /// The most bytes of messages that are read from a command.
 const MESSAGES: u64 = 1 << 16;
 
@@ -99,8 +102,8 @@ fn cache_name(video: &Path, what: &str) -> Result<String> {
     Ok(format!("{stem}-{:016x}", key.value()))
 }
 
-/// Runs a command to its end and returns what it prints, at most `most` bytes.
-fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64) -> Result<Vec<u8>> {
+/// Runs a command to its end and returns what it prints, at most `most` bytes. `writes` is the folder of the cache that it writes files into, if it does.
+fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64, writes: Option<&Path>) -> Result<Vec<u8>> {
     let object = || format!("video {}", video.display());
     let failed = |e: std::io::Error| Error::io(video, e);
     // A file, because a pipe that nobody reads would stop the command.
@@ -115,7 +118,7 @@ fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64) -> Result<V
         Error::unsupported(
             object(),
             format!("the command {program} could not be started ({e})"),
-            "Install ffmpeg, set scene.ffmpeg to its path, or extract the frames to one folder per camera (cam00/0000.png …)",
+            format!("Install ffmpeg, set scene.ffmpeg to its path, or {EXTRACT}"),
         )
     })?;
     let mut printed = Vec::new();
@@ -134,7 +137,13 @@ fn run(program: &str, arguments: &[&OsStr], video: &Path, most: u64) -> Result<V
         messages.take(MESSAGES).read_to_end(&mut said).map_err(failed)?;
         let said = String::from_utf8_lossy(&said);
         let last = said.lines().rev().find(|l| !l.trim().is_empty()).unwrap_or("no message").chars().take(300).collect::<String>();
-        return Err(Error::data(object(), format!("{program} failed: {last}"), "Check the video, or extract its frames yourself"));
+        let remedy = match writes {
+            Some(cache) => {
+                format!("Check that {} can be written and has space (scene.video_cache names another folder), and the video; or {EXTRACT}", cache.display())
+            }
+            None => format!("Check the video, or {EXTRACT}"),
+        };
+        return Err(Error::data(object(), format!("{program} failed: {last}"), remedy));
     }
     Ok(printed)
 }

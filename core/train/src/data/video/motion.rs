@@ -67,7 +67,7 @@ fn small_images(video: &Path, count: usize, options: &SceneOptions) -> Result<Ve
     arguments.push(&video_input);
     let after = ["-map", &map, "-vf", &filter, "-r", "25", "-frames:v", &frames, "-f", "rawvideo", "-pix_fmt", "gray", "pipe:1"];
     arguments.extend(after.map(OsStr::new));
-    let bytes = run(&options.ffmpeg, &arguments, video, most)?;
+    let bytes = run(&options.ffmpeg, &arguments, video, most, None)?;
     std::fs::create_dir_all(&cache).map_err(|e| Error::io(&cache, e))?;
     let mut work = tempfile::NamedTempFile::new_in(&cache).map_err(|e| Error::io(&cache, e))?;
     work.write_all(&bytes).map_err(|e| Error::io(&file, e))?;

@@ -141,7 +141,7 @@ fn ask(video: &Path, options: &SceneOptions, what: &[&str]) -> Result<Printed> {
     let video_input = input(video);
     let mut arguments: Vec<&OsStr> = arguments.iter().chain(what).map(OsStr::new).collect();
     arguments.push(&video_input);
-    let printed = run(&ffprobe, &arguments, video, MOST_PRINTED)?;
+    let printed = run(&ffprobe, &arguments, video, MOST_PRINTED, None)?;
     serde_json::from_slice(&printed).map_err(|e| {
         let said: String = String::from_utf8_lossy(&printed).trim().chars().take(200).collect();
         Error::data(format!("video {}", video.display()), format!("{ffprobe} said {said:?} ({e})"), "Check the video, and that ffprobe is the one of ffmpeg")

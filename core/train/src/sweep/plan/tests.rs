@@ -62,6 +62,23 @@ fn hours_are_those_of_every_size() {
 }
 
 #[test]
+fn images_of_a_scene_have_one_size_in_any_time() {
+    let axes = "[[method]]\nname = 'm'\npreset = 'auto'\n[[setting]]\nname = 'small'\n[[setting]]\nname = 'large'\nsize = 3.0\n";
+    let refused = |set: &str| {
+        let all: Vec<PlannedTraining> = trainings(&format!("minutes = 2.0\nset = [{set}]\n---{axes}{CODEC}")).unwrap().into_iter().map(|(t, _)| t).collect();
+        refuse_image_sizes(&all, &Registry::collect().unwrap()).map_err(|error| error.to_string())
+    };
+    for open in ["", "'scene.downscale=1.0'"] {
+        let message = refused(open).unwrap_err();
+        let parts = ["tiny m small seed 0' has 2 minutes", "tiny m large seed 0' has 6 minutes", "scene.width"];
+        assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    }
+    for stated in ["'scene.width=320'", "'scene.height=200'", "'scene.downscale=2.0'"] {
+        assert_eq!(refused(stated), Ok(()));
+    }
+}
+
+#[test]
 fn mistakes_name_their_place() {
     let wrong = format!("{METHODS}[[setting]]\nname = 'typo'\nset = ['train.iteratons=5']\n{CODEC}");
     let message = trainings(&wrong).unwrap_err().to_string();
