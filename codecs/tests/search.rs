@@ -198,3 +198,18 @@ fn attributes_of_plug_ins_are_rounded_by_what_is_seen() {
         assert_eq!(&codec.decode_stage(&base, &plain).unwrap().extra["velocity"].values, values);
     }
 }
+
+#[test]
+fn attributes_that_no_row_needs_are_stored_where_it_is_not_known_what_moves() {
+    cc4dgs_codecs::link();
+    let codec = (Entries::<CodecPlugin>::collect().unwrap().get("compact").unwrap().build)("psnr=50dB", &toml::Table::new()).unwrap();
+    let count = 60;
+    let mut g = scene(count);
+    let velocity = ExtraAttribute::exact(2, (0..2 * count).map(|i| 0.2 * draw(i, 90)).collect());
+    g.extra.insert("velocity".into(), velocity.needed_in(vec![false; count], 0.0));
+    let views = recorded(&g);
+    let plain = CodecContext::new(Seed::root(1), Limits::default(), &Silent);
+    let streams = codec.encode(&g, &CodecContext { views: Some(&views), renderer: Some(&Blots), deformer: Some(&Blots), ..plain }).unwrap();
+    let found = codec.decode(&streams, &CodecContext::new(Seed::root(1), Limits::default(), &Silent)).unwrap();
+    assert_eq!(found.extra["velocity"].values, vec![0.0; 2 * count]);
+}

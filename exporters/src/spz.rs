@@ -26,16 +26,24 @@ impl Default for Spz {
     }
 }
 
+impl Spz {
+    fn options(&self) -> SpzOptions {
+        SpzOptions { version: self.version, sh1_bits: self.sh1_bits, sh_rest_bits: self.sh_rest_bits, antialiased: false, usual_fraction: true }
+    }
+}
+
 impl Exporter for Spz {
     fn loses(&self, facts: &ExportFacts) -> String {
-        let parts = [(true, "background"), (true, "dynamic scores"), (true, "all but 8 bits of colours, opacities and scales"), still::highest_degree(facts)];
-        still::sentence(facts, &parts)
+        let (has_four, lost) = still::highest_degree(facts);
+        let refused = format!("{lost} (some refuse files of version 3 that have them)");
+        let four = (has_four, if self.version == 3 { refused.as_str() } else { lost });
+        still::sentence(facts, &[(true, "background"), (true, "dynamic scores"), (true, "all but 8 bits of colours, opacities and scales"), four])
     }
     fn write(&self, source: &mut dyn ExportSource, path: &Path) -> Result<Exported> {
         let gaussians = still::instant(source, "SPZ")?;
-        let options = SpzOptions { version: self.version, sh1_bits: self.sh1_bits, sh_rest_bits: self.sh_rest_bits, antialiased: source.facts().antialiased };
+        let options = SpzOptions { antialiased: source.facts().antialiased, ..self.options() };
         still::write(path, &to_spz(&gaussians, &options)?)?;
-        let notes = [vec![format!("SPZ version {}", self.version)], remarks(&gaussians)].concat();
+        let notes = [vec![format!("SPZ version {}", self.version)], remarks(&gaussians, &options)].concat();
         Ok(Exported { gaussians: gaussians.len(), sh_degree: gaussians.sh_degree, frames: 1, notes })
     }
 }
@@ -43,7 +51,7 @@ impl Exporter for Spz {
 pub(crate) fn build(settings: &toml::Table) -> Result<Box<dyn Exporter>> {
     let spz: Spz = config::parse_section("exporter spz", settings)?;
     // What cannot be written is refused before a model is loaded.
-    to_spz(&Default::default(), &SpzOptions { version: spz.version, sh1_bits: spz.sh1_bits, sh_rest_bits: spz.sh_rest_bits, antialiased: false })?;
+    to_spz(&Default::default(), &spz.options())?;
     Ok(Box::new(spz))
 }
 

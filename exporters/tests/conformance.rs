@@ -34,6 +34,12 @@ fn formats_that_hold_degree_4_say_that_most_viewers_do_not() {
         let says = |degree| exporter.loses(&conformance::export_facts(3, degree)).contains("most viewers harmonics over degree 3");
         assert!(says(4) && !says(3), "{name}");
     }
+    for (version, refused) in [(3, true), (4, false)] {
+        let settings = config::parse_table("test", &format!("version = {version}")).unwrap();
+        let exporter = (exporters.get("spz").unwrap().build)(&settings).unwrap();
+        let says = |degree| exporter.loses(&conformance::export_facts(3, degree)).contains("refuse files of version 3");
+        assert!(says(4) == refused && !says(3), "version {version}");
+    }
 }
 
 #[test]
@@ -48,7 +54,9 @@ fn spz_says_what_its_ranges_and_steps_lose() {
     assert_eq!(notes(|_| {}), ["SPZ version 4"]);
     let told = notes(|g| (g.log_scales[4], g.means[7]) = (-12.0, 1e6));
     assert_eq!(told[1], "limited to the range of the format: 1 scales (e^-10 to e^5.94)");
-    assert!(told.len() == 3 && told[2].starts_with("centres are in steps of 0.125, "), "{told:?}");
+    assert!(told.len() == 4 && told[2].starts_with("centres are in steps of 0.125, ") && told[3].starts_with("centres have 3 fractional bits, "), "{told:?}");
+    let told = notes(|g| g.log_scales.fill(-9.0));
+    assert!(told.len() == 2 && told[1].contains("readers that want 12 refuse the file"), "{told:?}");
 }
 
 #[test]

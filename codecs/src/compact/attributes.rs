@@ -173,8 +173,8 @@ fn known(color: u8, shape: u8, shift: u8, column: usize, before: impl Fn(usize) 
     out
 }
 
-/// The streams of all attributes of `sorted`, whose rows are those of `order`; `moving` is 0 or 1 per sorted row.
-pub fn write(sorted: &HostGaussians, of: &Integers, order: &[usize], moving: &[u8]) -> Result<Vec<Stream>> {
+/// The streams of all attributes of `sorted`, whose rows are those of `order`; `moving` is 0 or 1 per sorted row, where the file has it.
+pub fn write(sorted: &HostGaussians, of: &Integers, order: &[usize], moving: Option<&[u8]>) -> Result<Vec<Stream>> {
     let (mut plain, mut plans, mut columns) = (HostGaussians::default(), Vec::new(), Vec::new());
     for (name, attribute) in &sorted.extra {
         let Some(coded) = of.attributes.iter().find(|coded| coded.coding.name == *name) else {
@@ -185,7 +185,7 @@ pub fn write(sorted: &HostGaussians, of: &Integers, order: &[usize], moving: &[u
         let flags: Vec<u8> = order.iter().map(|&i| u8::from(coded.rows[i])).collect();
         let kind = if !flags.contains(&0) {
             ALL
-        } else if flags == moving {
+        } else if moving == Some(flags.as_slice()) {
             MOVING
         } else {
             MASK

@@ -42,12 +42,16 @@ enum Allowance<'a> {
 }
 
 impl Allowance<'_> {
-    /// What an attempt uses, as a share of what is allowed. It is coded only where bytes are allowed.
-    fn share(&self, job: &Job, attempt: &Attempt) -> Result<f64> {
-        match self {
-            Self::Bytes { limit, context } => Ok(file_bytes(context, &job.streams(job.planner.gaussians, &attempt.plan)?, None)? / limit),
-            Self::Drop { before, limit, views, renderer, chosen } => Ok((before - psnr_on_views(&attempt.rounded, *views, *renderer, *chosen)?) / limit),
-        }
+    /// The attempt with what it uses, as a share of what is allowed. It is coded only where bytes are allowed.
+    fn tried(&self, job: &Job, attempt: Attempt) -> Result<Tried> {
+        let (share, streams) = match self {
+            Self::Bytes { limit, context } => {
+                let streams = job.streams(job.planner.gaussians, &attempt.plan)?;
+                (file_bytes(context, &streams, None)? / limit, Some(streams))
+            }
+            Self::Drop { before, limit, views, renderer, chosen } => ((before - psnr_on_views(&attempt.rounded, *views, *renderer, *chosen)?) / limit, None),
+        };
+        Ok(Tried { attempt, share, streams })
     }
     /// Octaves from the step factor of an attempt to the one that is expected to use [`AIM`].
     fn octaves(&self, attempt: &Attempt, share: f64) -> f64 {
@@ -68,11 +72,16 @@ impl Allowance<'_> {
 struct Tried {
     attempt: Attempt,
     share: f64,
+    /// Where it was coded.
+    streams: Option<Vec<Stream>>,
 }
 
 impl Tried {
     fn allowed(&self) -> bool {
         self.share <= 1.0
+    }
+    fn coded(&mut self, job: &Job) -> Result<Vec<Stream>> {
+        self.streams.take().map_or_else(|| job.streams(job.planner.gaussians, &self.attempt.plan), Ok)
     }
 }
 
@@ -85,11 +94,10 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
     let mut least = None;
     for _ in 0..ATTEMPTS {
         let attempt = job.attempt(start * libm::exp2(direction * at))?;
-        let share = allowance.share(job, &attempt)?;
-        let step = direction * allowance.octaves(&attempt, share);
-        let tried = Tried { attempt, share };
+        let tried = allowance.tried(job, attempt)?;
+        let step = direction * allowance.octaves(&tried.attempt, tried.share);
         if tried.allowed() {
-            if share >= good {
+            if tried.share >= good {
                 return Ok(tried);
             }
             if best.as_ref().is_none_or(|(known, _)| at > *known) {
@@ -148,13 +156,14 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         context.events.emit(&Event::Warning { object: object.into(), message });
     }
     let tuner = tuner.filter(|_| caution.is_none());
+    let directions = job.directions;
     if tuner.is_some() {
         // Training learns which coefficients matter, and starts from steps of coefficients by themselves.
         job.directions = None;
     }
     let corrected = services.filter(|_| settings.allocate);
     let mut found = seek(job, start, &allowance, if corrected.is_some() { ROUGH } else { GOOD })?;
-    let mut streams = job.streams(gaussians, &found.attempt.plan)?;
+    let mut streams = found.coded(job)?;
     if let Some((views, renderer)) = corrected {
         let plain = job.factors;
         // Where a size is allowed, more is lost before fine-tuning than after it.
@@ -162,12 +171,17 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         let quality = found.attempt.quality * if fewer { fine(job, &found.attempt, views, renderer)? } else { 1.0 };
         job.factors = allocate::allocate(job, quality, views, renderer)?;
         note(context, format!("steps of means, log-scales, quaternions, opacities, degree 0 and higher degrees times {:.2?}", job.factors));
-        let second = seek(job, found.attempt.quality, &allowance, GOOD)?;
-        let coded = job.streams(gaussians, &second.attempt.plan)?;
+        let mut second = seek(job, found.attempt.quality, &allowance, GOOD)?;
+        let coded = second.coded(job)?;
         // The corrections may be worth nothing in small models.
         let worse = matches!(allowance, Allowance::Drop { .. }) && bytes_of(&coded) >= bytes_of(&streams);
         if found.allowed() && (worse || !second.allowed()) {
             job.factors = plain;
+            // It was good enough to be corrected.
+            if found.share < GOOD {
+                found = seek(job, found.attempt.quality, &allowance, GOOD)?;
+                streams = found.coded(job)?;
+            }
         } else {
             (found, streams) = (second, coded);
         }
@@ -180,9 +194,31 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
         let untuned = Untuned { attempt: &found.attempt, streams: &streams, allowed: found.allowed() };
         match tune::tune(job, &untuned, &goal, settings, tuner, context)? {
             Tuned::Better(streams) => return Ok(streams),
-            // It was measured on more views, and with the deformer's weights as they are stored.
-            Tuned::Nothing { lost } if let Allowance::Drop { limit, .. } = &allowance => found.share = found.share.max(lost / limit),
-            Tuned::Nothing { .. } => {}
+            Tuned::Nearest { streams: tuned, used } => (found.share, streams) = (used / goal.limit(), tuned),
+            Tuned::Nothing { lost } => {
+                // It was measured on more views, and with the deformer's weights as they are stored.
+                if let Goal::Drop(limit) = goal {
+                    found.share = found.share.max(lost / limit);
+                }
+                // Training was what colours were rounded apart for.
+                if directions.is_some() {
+                    job.directions = directions;
+                    let mut joint = seek(job, found.attempt.quality, &allowance, GOOD)?;
+                    let coded = joint.coded(job)?;
+                    if let Goal::Drop(limit) = goal {
+                        joint.share = joint.share.max(tune::loss(tuner, gaussians, &joint.attempt.rounded)? / limit);
+                    }
+                    let better = match (joint.allowed(), found.allowed()) {
+                        // In the same bytes, colours that are rounded together are nearer.
+                        (true, true) => matches!(goal, Goal::Bytes(_)) || bytes_of(&coded) < bytes_of(&streams),
+                        (false, false) => joint.share < found.share,
+                        (fits, _) => fits,
+                    };
+                    if better {
+                        (found, streams) = (joint, coded);
+                    }
+                }
+            }
         }
     }
     report(&found, bytes_of(&streams), &allowance, start, settings, context)?;

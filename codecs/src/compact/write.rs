@@ -124,7 +124,7 @@ pub fn write(gaussians: &HostGaussians, of: &Integers, motion: &Motion, order: &
     columns.push(predicted(&color_name(0), 3, &color_plan, &colors[0], &for_colors)?);
     let mut columns: Vec<_> = columns.into_iter().map(Vec::into_iter).collect();
     ranges.iter().for_each(|_| streams.extend(columns.iter_mut().filter_map(Iterator::next)));
-    streams.extend(attributes::write(&sorted, of, order, &moving)?);
+    streams.extend(attributes::write(&sorted, of, order, motion.moving.is_some().then_some(moving.as_slice()))?);
     let (all, mut sizes) = (0..n, vec![0; n]);
     for (degree, (plan, codes)) in of.plan.degrees.iter().zip(&colors).enumerate().skip(1) {
         streams.extend(blocks::encode(&color_name(degree), colors::CONTEXTS, slice::from_ref(&all), |coder, range| {

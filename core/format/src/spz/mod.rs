@@ -41,12 +41,15 @@ pub struct SpzOptions {
     pub sh_rest_bits: u8,
     /// Whether the model wants Mip-Splatting's 2D filter.
     pub antialiased: bool,
+    /// Whether centres have 12 fractional bits, as in Niantic's own writer, where all fit and steps of 2^-12 are not coarse: some readers refuse others. Else they have
+    /// as many as fit.
+    pub usual_fraction: bool,
 }
 
 impl SpzOptions {
     /// The written version with the best quality it has: 8 bits per coefficient.
     pub const fn version(version: u32) -> Self {
-        Self { version, sh1_bits: 8, sh_rest_bits: 8, antialiased: false }
+        Self { version, sh1_bits: 8, sh_rest_bits: 8, antialiased: false, usual_fraction: false }
     }
 }
 
@@ -86,9 +89,10 @@ pub fn to_spz(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Vec<u8>
     if options.version == 3 { gzip::write(&packed) } else { frames::write(&packed) }
 }
 
-/// What [`to_spz`] limits or rounds coarsely, in words: values outside of the ranges of the format, and centres in steps that are large beside the Gaussians.
-pub fn remarks(gaussians: &HostGaussians) -> Vec<String> {
-    values::remarks(gaussians)
+/// What [`to_spz`] limits or rounds coarsely, in words: values outside of the ranges of the format, and centres in steps that are large beside the Gaussians; and
+/// whether centres have other than the usual fractional bits that are asked for.
+pub fn remarks(gaussians: &HostGaussians, options: &SpzOptions) -> Vec<String> {
+    values::remarks(gaussians, options)
 }
 
 /// What an SPZ file of version 2, 3 or 4 holds; dynamic scores are zero. `object` names the file in errors.

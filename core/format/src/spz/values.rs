@@ -7,6 +7,8 @@ use std::f32::consts::FRAC_1_SQRT_2;
 
 /// Largest number of fractional bits of fixed-point coordinates.
 const MOST_FRACTION: u8 = 20;
+/// The fractional bits of Niantic's own writer.
+const USUAL_FRACTION: u8 = 12;
 /// Largest absolute coordinate, world units: 24 bits without fractional bits.
 pub const LARGEST: f32 = 8_388_607.0;
 /// Scale of the degree-0 coefficient in the stored colour range 0..1.
@@ -37,13 +39,33 @@ fn farthest(gaussians: &HostGaussians) -> f32 {
     gaussians.means.iter().fold(0.0, |a, v| a.max(v.abs()))
 }
 
-/// Fractional bits of coordinates up to `farthest`.
-fn fraction_of(farthest: f32) -> u8 {
+/// The most fractional bits of coordinates up to `farthest`.
+fn most_fraction(farthest: f32) -> u8 {
     (0..=MOST_FRACTION).rev().find(|&bits| farthest * power_of_two(i32::from(bits)) <= LARGEST).unwrap_or(0)
 }
 
-/// What a file does not hold of `gaussians`, in words: values outside of its ranges, and centres in steps that are coarse for such Gaussians.
-pub(super) fn remarks(gaussians: &HostGaussians) -> Vec<String> {
+/// The step of centres with so many fractional bits.
+fn step_of(fraction: u8) -> f32 {
+    power_of_two(-i32::from(fraction))
+}
+
+/// Median standard deviation; infinity where there are no Gaussians.
+fn median_size(gaussians: &HostGaussians) -> f32 {
+    let mut log_scales = gaussians.log_scales.clone();
+    let middle = log_scales.len().checked_sub(1).map(|last| last / 2);
+    middle.map_or(f32::INFINITY, |middle| libm::expf(*log_scales.select_nth_unstable_by(middle, f32::total_cmp).1))
+}
+
+/// The fractional bits of centres.
+fn fraction_of(gaussians: &HostGaussians, options: &SpzOptions) -> u8 {
+    let most = most_fraction(farthest(gaussians));
+    let usual = options.usual_fraction && most > USUAL_FRACTION && step_of(USUAL_FRACTION) <= COARSE * median_size(gaussians);
+    if usual { USUAL_FRACTION } else { most }
+}
+
+/// What a file does not hold of `gaussians`, in words: values outside of its ranges, and centres in steps that are coarse for such Gaussians; and other fractional bits
+/// of centres than readers may want.
+pub(super) fn remarks(gaussians: &HostGaussians, options: &SpzOptions) -> Vec<String> {
     let outside = |values: &[f32], code: fn(f32) -> f32| values.iter().filter(|v| !(0.0..=255.0).contains(&code(**v).round())).count();
     let counts = [
         (outside(&gaussians.log_scales, scale_code), "scales (e^-10 to e^5.94)"),
@@ -55,13 +77,18 @@ pub(super) fn remarks(gaussians: &HostGaussians) -> Vec<String> {
     if !limited.is_empty() {
         out.push(format!("limited to the range of the format: {}", limited.join(", ")));
     }
-    let mut log_scales = gaussians.log_scales.clone();
-    if let Some(middle) = log_scales.len().checked_sub(1).map(|last| last / 2) {
-        let size = libm::expf(*log_scales.select_nth_unstable_by(middle, f32::total_cmp).1);
-        let step = power_of_two(-i32::from(fraction_of(farthest(gaussians))));
-        if step > COARSE * size {
-            out.push(format!("centres are in steps of {step}, coarse beside the median standard deviation of {size:.2e}"));
-        }
+    let (size, fraction) = (median_size(gaussians), fraction_of(gaussians, options));
+    let step = step_of(fraction);
+    if step > COARSE * size {
+        out.push(format!("centres are in steps of {step}, coarse beside the median standard deviation of {size:.2e}"));
+    }
+    if options.usual_fraction && fraction != USUAL_FRACTION && !gaussians.is_empty() {
+        let why = if fraction < USUAL_FRACTION {
+            format!("the farthest coordinate is {:.1}", farthest(gaussians))
+        } else {
+            format!("the median standard deviation is {size:.2e}")
+        };
+        out.push(format!("centres have {fraction} fractional bits, since {why}; readers that want {USUAL_FRACTION} refuse the file"));
     }
     out
 }
@@ -92,7 +119,7 @@ pub(super) fn pack(gaussians: &HostGaussians, options: &SpzOptions) -> Result<Pa
             "Remove far outliers, or use another codec",
         ));
     }
-    let fraction = fraction_of(farthest);
+    let fraction = fraction_of(gaussians, options);
     let scale = power_of_two(i32::from(fraction));
     let fixed = |value: f32| ((value * scale).round() as i32).to_le_bytes();
     let positions = gaussians.means.as_chunks::<3>().0.iter().flat_map(|point| turned(*point)).flat_map(|v| fixed(v).into_iter().take(3)).collect();
@@ -198,6 +225,7 @@ mod tests {
         // The last values that are held, and the first that are not.
         let mut gaussians = HostGaussians { log_scales: vec![-10.0, 5.9375, -5.0], sh_dc: vec![-3.33, 3.33, 0.0], ..Default::default() };
         (gaussians.means, gaussians.sh_rest) = (vec![10.0, 0.0, 0.0], vec![-1.0, 127.0 / 128.0, 0.0]);
+        let remarks = |gaussians: &HostGaussians| remarks(gaussians, &SpzOptions::version(4));
         assert!(remarks(&gaussians).is_empty() && remarks(&HostGaussians::default()).is_empty());
         (gaussians.log_scales, gaussians.sh_dc, gaussians.sh_rest) = (vec![-10.1, 6.0, -5.0], vec![-3.4, 0.0, 0.0], vec![1.1, -1.1, 0.0]);
         let counts = "2 scales (e^-10 to e^5.94), 1 coefficients of degree 0 (±3.33), 2 coefficients of higher degrees (±1)";
@@ -206,6 +234,20 @@ mod tests {
         gaussians.means[1] = -1e5;
         let told = remarks(&gaussians);
         assert!(told.len() == 2 && told[1].starts_with("centres are in steps of 0.015625, "), "{told:?}");
+    }
+
+    #[test]
+    fn the_usual_fractional_bits_are_taken_where_they_are_enough() {
+        let options = |usual_fraction| SpzOptions { usual_fraction, ..SpzOptions::version(4) };
+        for (farthest, log_scale, fraction) in [(7.0, -5.0, 12), (2040.0, -5.0, 12), (3000.0, -5.0, 11), (7.0, -7.0, 20), (0.0, -5.0, 12)] {
+            let gaussians = HostGaussians { log_scales: vec![log_scale; 3], means: vec![farthest, 0.0, 0.0], opacity_logits: vec![0.0], ..Default::default() };
+            assert_eq!(fraction_of(&gaussians, &options(true)), fraction, "{farthest} and {log_scale}");
+            assert_eq!(fraction_of(&gaussians, &options(false)), most_fraction(farthest));
+            let told = remarks(&gaussians, &options(true));
+            let says = told.iter().any(|told| told.contains(&format!("{fraction} fractional bits")));
+            assert_eq!(says, fraction != 12, "{told:?}");
+        }
+        assert!(remarks(&HostGaussians::default(), &options(true)).is_empty());
     }
 
     #[test]

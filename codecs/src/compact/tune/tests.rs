@@ -1,0 +1,203 @@
+//! Fine-tuning with a trainer whose losses are known.
+
+use super::super::encode::classify;
+use super::super::joint::Directions;
+use super::super::search::search;
+use super::super::{Choices, Motion, importance, layers};
+use super::*;
+use cc4dgs_format::{Camera, EncodedWeights, Image8, Recorder, RenderModel, RenderedPlanes, Seed, TrainingViews};
+use std::cell::{Cell, RefCell};
+use std::collections::BTreeMap;
+
+/// A trainer whose PSNR falls with the mean squared error of the colours of degree 0 and rises with each iteration; its weight counts these.
+struct Trainer {
+    colors: Vec<f32>,
+    cost: f64,
+    gain: f64,
+    /// Training fails after so many iterations.
+    fails: Option<(f32, fn() -> Error)>,
+    /// What was measured after so many iterations, and after how many those were that were adopted.
+    measured: RefCell<BTreeMap<u32, f64>>,
+    adopted: Cell<u32>,
+}
+
+impl Trainer {
+    /// One by whose measure `attempt` loses so many dB before it trains.
+    fn of(attempt: &Attempt, gaussians: &HostGaussians, lost: f64, gain: f64) -> Self {
+        let colors = gaussians.sh_dc.clone();
+        let mut out = Self { colors, cost: 1.0, gain, fails: None, measured: RefCell::default(), adopted: Cell::new(0) };
+        out.cost = lost / (40.0 - out.psnr(&attempt.rounded, &out.start(gaussians).unwrap().weights, None).unwrap());
+        out
+    }
+}
+
+impl TuneModel for Trainer {
+    fn caution(&self) -> Result<Option<String>> {
+        Ok(None)
+    }
+    fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
+        Ok(TunedModel { gaussians: gaussians.clone(), weights: vec![WeightArray { name: "iterations".into(), shape: vec![1], values: vec![0.0] }] })
+    }
+    fn tune(&self, from: &TunedModel, tuning: &Tuning) -> Result<TunedModel> {
+        if let Some((_, error)) = self.fails.filter(|(after, _)| from.weights[0].values[0] >= *after) {
+            return Err(error());
+        }
+        let mut out = from.clone();
+        out.weights[0].values[0] += tuning.iterations as f32;
+        Ok(out)
+    }
+    fn psnr(&self, gaussians: &HostGaussians, weights: &[WeightArray], _: Option<f64>) -> Result<f64> {
+        // Scores are the indices of the rows, whose order may change.
+        let rows = gaussians.dynamic_scores.iter().zip(gaussians.sh_dc.chunks_exact(3));
+        let squares = rows.flat_map(|(&row, found)| found.iter().zip(&self.colors[3 * row as usize..])).map(|(a, b)| f64::from(a - b).powi(2));
+        // Training makes up for most of what rounding costs.
+        let cost = self.cost * if weights[0].values[0] > 0.0 { 0.3 } else { 1.0 };
+        let psnr = 40.0 - cost * squares.sum::<f64>() / self.colors.len() as f64 + self.gain * f64::from(weights[0].values[0]);
+        self.measured.borrow_mut().insert(weights[0].values[0] as u32, psnr);
+        Ok(psnr)
+    }
+    fn encoded_weights(&self, _: &[WeightArray], _: f64) -> Result<EncodedWeights> {
+        Ok(EncodedWeights::default())
+    }
+    fn adopt(&self, weights: Vec<WeightArray>, _: f64) {
+        self.adopted.set(weights[0].values[0] as u32);
+    }
+    fn adopted(&self) -> Result<Option<EncodedWeights>> {
+        Ok(None)
+    }
+}
+
+/// Calls `run` with a job of random Gaussians, the directions from which they are seen, and a context that notes events.
+fn with_job(sh_degree: usize, run: impl for<'a> FnOnce(&mut Job<'a>, &'a Directions, &CodecContext, &Recorder)) {
+    let n = 500;
+    let draw = |k: usize, column: u64| (Seed::root(column).index(k as u64).value() >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+    let mut g = HostGaussians { sh_degree, opacity_logits: vec![0.0; n], ..Default::default() };
+    for (column, (_, width, values)) in g.columns_mut().into_iter().enumerate() {
+        *values = (0..n * width).map(|k| draw(k, column as u64)).collect();
+    }
+    g.dynamic_scores = (0..n).map(|row| row as f32).collect();
+    let events = Recorder::default();
+    let context = CodecContext::new(Seed::root(1), Default::default(), &events);
+    let importance = importance::estimate(&g, &context);
+    let classes = classify(&importance.weights, &importance.shapes, false);
+    let planner = Planner::new(&g, &importance, &classes, Choices { transform: true, rate_weight: 0.0 });
+    let mut directions = Directions::new(n, sh_degree);
+    for k in 0..20 {
+        let eye = [4.0, (k as f64 * 0.7).sin(), (k as f64 * 1.3).cos()];
+        directions.add(&Camera::look_at("t", (8, 8), 1.0, eye, [0.0; 3], [0.0, 0.0, 1.0]), &g.means, &vec![1.0; n]);
+    }
+    let (directions, layers) = (directions.factored(), layers::assign(&importance.weights, 1));
+    let motion = Motion { free: 0, moving: None, levels: [0.0; 2] };
+    let mut job = Job { planner, free: vec![false; n], directions: None, layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
+    run(&mut job, &directions, &context, &events);
+}
+
+#[test]
+fn what_is_allowed_is_used_whatever_training_gains() {
+    with_job(0, |job, _, context, _| {
+        let attempt = job.attempt(0.01).unwrap();
+        let g = job.planner.gaussians;
+        let streams = job.streams(g, &attempt.plan).unwrap();
+        for (limit, gain) in [(0.05, 0.0), (0.05, 3e-4), (0.05, 1.5e-3), (0.3, 5e-4), (0.05, -1e-5)] {
+            // What needs no training loses almost what is allowed.
+            let trainer = Trainer::of(&attempt, g, 0.99 * limit, gain);
+            let found = Untuned { attempt: &attempt, streams: &streams, allowed: true };
+            let tuned = tune(job, &found, &Goal::Drop(limit), &Settings::default(), &trainer, context).unwrap();
+            let Tuned::Better(better) = tuned else { panic!("nothing better for {limit} dB and a gain of {gain}") };
+            assert!(bytes_of(&better) < bytes_of(&streams));
+            let lost = 40.0 - trainer.measured.borrow()[&trainer.adopted.get()];
+            assert!((0.2 * limit..=limit).contains(&lost), "{limit} dB, a gain of {gain}: {:?}", trainer.measured);
+        }
+    });
+}
+
+fn not_finite() -> Error {
+    Error::backend("fine-tuning", "a gradient is not finite", "Compress with finetune=0")
+}
+
+#[test]
+fn a_round_that_fails_leaves_those_before() {
+    with_job(0, |job, _, context, events| {
+        let attempt = job.attempt(0.01).unwrap();
+        let streams = job.streams(job.planner.gaussians, &attempt.plan).unwrap();
+        let found = Untuned { attempt: &attempt, streams: &streams, allowed: true };
+        let tuned = |after: f32, error: fn() -> Error| {
+            // A round gains so much that each keeps what is allowed.
+            let trainer = Trainer { fails: Some((after, error)), ..Trainer::of(&attempt, job.planner.gaussians, 0.29, 2e-2) };
+            let tuned = tune(job, &found, &Goal::Drop(0.3), &Settings::default(), &trainer, context);
+            (tuned, trainer.adopted.get())
+        };
+        let (first, adopted) = tuned(100.0, not_finite);
+        assert!(matches!(first, Ok(Tuned::Better(better)) if bytes_of(&better) < bytes_of(&streams)) && adopted == 100, "{adopted} iterations");
+        let warned = |event: &Event| matches!(event, Event::Warning { message, .. } if message.contains("round 2 of 5") && message.contains("not finite"));
+        assert_eq!(events.events().iter().filter(|event| warned(event)).count(), 1);
+        let (none, adopted) = tuned(0.0, not_finite);
+        assert!(matches!(none, Ok(Tuned::Nothing { lost }) if (lost - 0.29).abs() < 1e-6) && adopted == 0);
+        let (stopped, _) = tuned(100.0, || Error::Interrupted("in a test".into()));
+        assert!(matches!(stopped, Err(Error::Interrupted(_))));
+    });
+}
+
+#[test]
+fn where_nothing_is_allowed_the_nearest_is_kept() {
+    with_job(0, |job, _, context, _| {
+        let attempt = job.attempt(0.01).unwrap();
+        let streams = job.streams(job.planner.gaussians, &attempt.plan).unwrap();
+        let found = Untuned { attempt: &attempt, streams: &streams, allowed: false };
+        // Rounding costs 2 dB, 0.6 after training, and each round 1 dB more.
+        let trainer = Trainer::of(&attempt, job.planner.gaussians, 2.0, -1e-2);
+        let tuned = |goal: Goal| tune(job, &found, &goal, &Settings::default(), &trainer, context).unwrap();
+        let Tuned::Nearest { streams: nearest, used } = tuned(Goal::Drop(0.05)) else { panic!("the first round loses less") };
+        assert!((1.5..1.7).contains(&used) && trainer.adopted.get() == 100 && !nearest.is_empty(), "{used} dB");
+        let Tuned::Nearest { streams: nearest, used } = tuned(Goal::Bytes(10.0)) else { panic!("larger steps have fewer bytes") };
+        assert!(used == bytes_of(&nearest) as f64 && used < bytes_of(&streams) as f64, "{used} bytes");
+    });
+}
+
+/// Views that are there and never asked for.
+struct Unseen;
+
+impl TrainingViews for Unseen {
+    fn len(&self) -> usize {
+        1
+    }
+    fn view(&self, _: usize) -> (&Camera, f32) {
+        unreachable!("a size needs no views")
+    }
+    fn image(&self, _: usize) -> Result<Image8> {
+        Err(not_finite())
+    }
+}
+
+impl RenderModel for Unseen {
+    fn render(&self, _: &HostGaussians, _: &Camera, _: f32) -> Result<RenderedPlanes> {
+        Err(not_finite())
+    }
+    fn background(&self) -> [f32; 3] {
+        [0.0; 3]
+    }
+}
+
+#[test]
+fn where_training_is_worth_nothing_colours_are_rounded_together() {
+    with_job(2, |job, directions, context, _| {
+        let attempt = job.attempt(0.01).unwrap();
+        let limit = bytes_of(&job.streams(job.planner.gaussians, &attempt.plan).unwrap());
+        let trainer = Trainer { fails: Some((0.0, not_finite)), ..Trainer::of(&attempt, job.planner.gaussians, 0.1, 0.0) };
+        let context = CodecContext { views: Some(&Unseen), renderer: Some(&Unseen), tuner: Some(&trainer), ..*context };
+        let settings = |finetune: usize| Settings { max_size_mb: limit as f64 / 1e6, allocate: false, finetune, ..Default::default() };
+        let apart = search(job, &settings(0), &context).unwrap();
+        job.directions = Some(directions);
+        let together = search(job, &settings(100), &context).unwrap();
+        assert!(job.directions.is_some() && together != apart && bytes_of(&together) <= limit, "{} of {limit} bytes", bytes_of(&together));
+    });
+}
+
+#[test]
+fn rounds_add_up() {
+    for iterations in [0, 1, 4, 5, 999, 1000] {
+        let rounds = rounds(iterations);
+        assert_eq!(rounds.iter().sum::<usize>(), iterations);
+        assert!(rounds.iter().all(|r| *r > 0) && rounds.len() <= ROUNDS, "{rounds:?}");
+    }
+}
