@@ -6,8 +6,8 @@ opened from disk, without a network. Chromium renders with SwiftShader, so no gr
 the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
-from browser_faults import broken_module, few_degrees, hopeless, opened_meanwhile, refused, second_player, small_textures, told_once
-from browser_input import drop, embedded, reduced_motion, touch, wheel
+from browser_faults import broken_module, few_degrees, half_arrived, hopeless, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
+from browser_input import command_key, drop, embedded, reduced_motion, touch, wheel
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
 from playwright.sync_api import sync_playwright
@@ -114,6 +114,7 @@ def main():
         playing(page)
         navigation(pages, page)
         wheel(page)
+        command_key(page)
         webgl(pages, facts)
         lost(pages, page, facts)
         arriving(pages, page, facts, len(archive), args.layers)
@@ -122,6 +123,8 @@ def main():
         told_once(pages)
         refused(pages)
         small_textures(pages)
+        half_arrived(pages)
+        no_room(pages)
         few_degrees(pages)
         opened_meanwhile(pages)
         second_player(pages)

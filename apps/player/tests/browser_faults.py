@@ -11,6 +11,33 @@ TOLD = """async source => { const { createPlayer } = await import("./player.js")
 # Textures of `side` texels, and no more.
 TEXTURES = """side => { const own = WebGL2RenderingContext.prototype, { getParameter } = own;
     own.getParameter = function (name) { return name === this.MAX_TEXTURE_SIZE ? side : getParameter.call(this, name); }; }"""
+# Shows Gaussians and motion of `source` while the harmonics arrive, sets time, pose and playback, and then breaks the connection, or opens what is no model. The rest
+# arrives with the second connection. Returns what is left of what was set.
+HALF = """async ([source, breaks]) => { const { fetch } = window, bytes = new Uint8Array(await (await fetch(source)).arrayBuffer());
+    const wasm = await import("./cc4dgs_player.js"), download = new wasm.Download("half", bytes.length);
+    download.put(0, bytes);
+    const streams = JSON.parse(download.streams()), end = Math.max(...streams.filter(s => ["canonical", "playback"].includes(s.kind)).map(s => s.offset + s.bytes));
+    download.free();
+    let sink, connections = 0;
+    const until = async holds => { while (!holds()) await new Promise(done => setTimeout(done, 50)); };
+    const half = new ReadableStream({ start: controller => { sink = controller; } });
+    window.fetch = async () => new Response(connections++ ? bytes : half, { headers: { "Content-Length": String(bytes.length) } });
+    const finished = new Promise(done => cc4dgs.on("loaded", done));
+    cc4dgs.load("/half.cc4d");
+    sink.enqueue(bytes.slice(0, end));
+    await until(() => cc4dgs.facts?.frames > 1);
+    cc4dgs.set("speed", 0), cc4dgs.seek(0.375), cc4dgs.gpu.orbit(0.3, 0.1), cc4dgs.play();
+    const pose = Array.from(cc4dgs.gpu.pose);
+    let told = "";
+    if (breaks) sink.error(new TypeError("on purpose"));
+    else told = await cc4dgs.load(new TextEncoder().encode("no model at all. ".repeat(9)), "broken.ply").then(() => "it loaded", e => e.message);
+    await finished;
+    window.fetch = fetch;
+    const far = Math.max(...Array.from(cc4dgs.gpu.pose, (v, k) => Math.abs(v - pose[k])));
+    return { connections, far, time: cc4dgs.time, playing: cc4dgs.playing, source: cc4dgs.source, whole: cc4dgs.shown.ended, told }; }"""
+# A WebGL2 without memory, and one that cannot draw images.
+NO_ROOM = "() => { WebGL2RenderingContext.prototype.getError = function () { return this.OUT_OF_MEMORY; }; }"
+NO_IMAGE = "() => { WebGL2RenderingContext.prototype.checkFramebufferStatus = function () { return this.FRAMEBUFFER_UNSUPPORTED; }; }"
 ALERT = "document.querySelector('[role=alert]')?.innerText ?? ''"
 
 
@@ -50,6 +77,46 @@ def small_textures(pages):
     page.close()
     pages.quiet("small textures")
     say(f"images fit into small textures; models that do not: {message}")
+
+
+def half_arrived(pages):
+    """Time, pose and playback outlive a connection that breaks, and a file that is no model, while a model arrives."""
+    for backend in ("", "?backend=webgl"):
+        for breaks in (True, False):
+            page = pages.open(backend)
+            found = page.evaluate(HALF, [MODEL, breaks])
+            assert found["connections"] == 2 and found["source"] == "/half.cc4d" and found["whole"], found
+            assert found["far"] < 1e-9 and abs(found["time"] - 0.375) < 1e-6 and found["playing"], found
+            alert = page.evaluate(ALERT)
+            assert breaks and not found["told"] or len(found["told"]) > 20 and found["told"][:20] in alert, [found, alert]
+            page.close()
+    pages.quiet("a model of which half has arrived")
+    say("time, pose and playback stay where a connection breaks; a model that arrives goes on after a broken file")
+
+
+def no_room(pages):
+    """What the memory of the graphics card has no room for is a sentence, told once."""
+    page = pages.open("?backend=webgl")
+    page.evaluate(NO_ROOM)
+    message = page.evaluate(f"cc4dgs.load('{MODEL}').then(() => 'it loaded', e => e.message)")
+    assert "no room for the model" in message and page.evaluate("cc4dgs.facts") is None and message[:20] in page.evaluate(ALERT), message
+    page.close()
+    page = pages.open("?backend=webgl")
+    page.evaluate(NO_IMAGE)
+    page.evaluate("cc4dgs.set('resolution', 0.5)")
+    page.wait_for_function(f"({ALERT}).includes('cannot draw an image of')")
+    page.close()
+    # The page writes what stops it to the console.
+    pages.complaints[:] = [c for c in pages.complaints if "cannot draw" not in c]
+    page = pages.open(f"?src={MODEL}")
+    page.evaluate("""() => { window.told = []; cc4dgs.on("error", e => told.push(e.message)); cc4dgs.gpu.takeFailure = () => "Out of Memory"; }""")
+    page.wait_for_function("told.length > 0")
+    page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done))).then(() => 0)")
+    told = page.evaluate("told")
+    assert len(told) == 1 and "Out of Memory" in told[0] and told[0] in page.evaluate(ALERT), told
+    page.close()
+    pages.quiet("memory that ran out")
+    say(f"a full graphics card is a sentence: {told[0]}")
 
 
 def few_degrees(pages):

@@ -19,6 +19,7 @@ def drop(page, facts):
     assert page.locator(".cc.dropping").count() == 0
     assert opened["gaussians"] == facts["gaussians"] and opened["frames"] == facts["frames"], opened
     assert page.evaluate("cc4dgs.source.name") == "dropped.cc4d" and page.title().startswith("dropped.cc4d")
+    assert "src=" not in page.evaluate("cc4dgs.link()"), "the link of a file without an address names another one"
     say("a file that is dropped on the page is opened")
 
 
@@ -32,6 +33,18 @@ def wheel(page):
     page.evaluate("cc4dgs.reset()")
     assert max(arms) / min(arms) < 1 + 1e-6 and arms[0] > 1.1 * length(arm(page.evaluate(POSE))), arms
     say("a notch of the wheel zooms as far in pixels, lines and pages")
+
+
+def command_key(page):
+    """A key that is released while Cmd is held, of which macOS does not tell, is not held for ever."""
+    key = "([name, key, metaKey]) => document.body.dispatchEvent(new KeyboardEvent(name, { key, metaKey, bubbles: true, cancelable: true }))"
+    holds = "cc4dgs.flyKeys(0)"
+    for name, pressed, meta in (("keydown", "Meta", True), ("keydown", "c", True), ("keyup", "Meta", False)):
+        page.evaluate(key, ["keydown", "w", False])
+        assert page.evaluate(holds), "W does not fly"
+        page.evaluate(key, [name, pressed, meta])
+        assert not page.evaluate(holds), f"W flies on after {name} of {pressed}"
+    say("keys are not held any more once Cmd is")
 
 
 def reduced_motion(pages):

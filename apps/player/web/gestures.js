@@ -53,12 +53,25 @@ export function addGestures(canvas, act, signal) {
 const SLIDE = /^(Arrow(Left|Right|Up|Down)|Home|End|PageUp|PageDown)$/;
 const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
 
+/// What `player` does at a key; `act` moves its camera.
+export function commandsOf(player, act) {
+    return {
+        " ": () => player.toggle(), "k": () => player.toggle(), ",": () => player.step(-1), ".": () => player.step(1),
+        ArrowLeft: () => act.orbit(-0.08, 0), ArrowRight: () => act.orbit(0.08, 0), ArrowUp: () => act.orbit(0, 0.08), ArrowDown: () => act.orbit(0, -0.08),
+        "+": () => act.zoom(1.1), "=": () => act.zoom(1.1), "-": () => act.zoom(1 / 1.1), Home: () => player.seek(0), End: () => player.seek(1),
+        "r": () => player.reset(), "f": () => player.set("flying", !player.flying), "t": () => player.set("tint", !player.settings.tint),
+        "z": () => player.set("depth", !player.settings.depth), "p": () => player.savePng(), "Escape": () => player.ui.closePanel(),
+    };
+}
+
 /// Keys, until `signal` aborts: held ones fly, others are commands by name. Returns a function that moves by the keys that are held for so many seconds; whether any
 /// were.
 export function addKeys(element, act, commands, signal) {
     const held = new Set();
     const listen = (target, name, run) => target.addEventListener(name, run, { signal });
     listen(element, "keydown", e => {
+        // macOS tells of no key that is released while Cmd is held.
+        if (e.metaKey) held.clear();
         // Another player, inside of this one's page, has acted on it.
         if (e.defaultPrevented || e.ctrlKey || e.metaKey || e.altKey || e.target.closest("select, input:not([type=range]):not([type=checkbox]):not([type=file])")) return;
         const key = e.key.length === 1 ? e.key.toLowerCase() : e.key;
@@ -67,7 +80,7 @@ export function addKeys(element, act, commands, signal) {
         const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input") && (key === " " || key === "Enter");
         if (commands[key] && !own) { commands[key](); e.preventDefault(); }
     });
-    listen(element, "keyup", e => held.delete(e.key.toLowerCase()));
+    listen(element, "keyup", e => { if (e.key === "Meta") held.clear(); else held.delete(e.key.toLowerCase()); });
     listen(element, "focusout", () => held.clear());
     // Where nothing has the focus, nothing loses it with the window.
     listen(window, "blur", () => held.clear());

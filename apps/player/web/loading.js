@@ -45,9 +45,11 @@ async function drain(name, response, offset, sink) {
     for (;;) {
         const { done, value } = await received(name, () => reader.read());
         if (done) return offset;
-        const go = sink(offset, value);
+        let go = false;
+        // Where showing it fails, too, the rest is not fetched.
+        try { go = sink(offset, value); } finally { if (go === false) await reader.cancel(); }
         offset += value.length;
-        if (go === false) { await reader.cancel(); return offset; }
+        if (go === false) return offset;
     }
 }
 

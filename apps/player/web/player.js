@@ -9,7 +9,7 @@
 
 import init, * as wasm from "./cc4dgs_player.js";
 import { checkSize, loadUrl, nameOf } from "./loading.js";
-import { addGestures, addKeys } from "./gestures.js";
+import { addGestures, addKeys, commandsOf } from "./gestures.js";
 import { WebGl } from "./webgl.js";
 import { build, savePng } from "./controls.js";
 
@@ -19,8 +19,6 @@ export const PAGE_VERSION = 3;
 // A lost device is replaced at most so often in a row; it is none of the row once it has been kept for so many milliseconds.
 const MOST_RECOVERIES = 3;
 const KEPT_MS = 60000;
-// How long a lost WebGL2 context is waited for before the page says so, in milliseconds.
-const PATIENCE_MS = 5000;
 
 const gone = () => new Error("This player was destroyed. Make another one with createPlayer.");
 
@@ -36,7 +34,7 @@ export async function createPlayer(container, options = {}) {
         await ready;
         await player.start();
         const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-        if (src) await player.load(src, options.name, { autoplay: autoplay && !still });
+        if (src) await player.load(src, options.name, { playing: autoplay && !still });
         else player.followLink();
     } catch (e) {
         player.fail(e);
@@ -81,7 +79,7 @@ class Page {
         }
         if (!this.flyKeys) {
             // On a page of its own the player has the keys before anything was clicked.
-            this.flyKeys = addKeys(embedded ? root : document, act, this.commands(act), signal);
+            this.flyKeys = addKeys(embedded ? root : document, act, commandsOf(this, act), signal);
             // Where the page is open already, a link to it changes the hash alone. "Copy link" replaces the address, of which nobody is told.
             if (!embedded) window.addEventListener("hashchange", () => this.followLink(), { signal });
             this.request = requestAnimationFrame(now => this.loop(now));
@@ -106,33 +104,13 @@ class Page {
             this.ui.replaceCanvas();
         }
         // A lost context stays that of its canvas until the browser restores it.
-        if (this.gl?.gl.isContextLost()) await this.contextRestored();
+        if (this.gl?.gl.isContextLost()) {
+            const late = () => this.fail(new Error("The graphics device was lost, and the browser has not given WebGL2 back yet. Wait, or reload the page."));
+            if (await this.gl.restored(late, this.life.signal)) this.ui.error(null);
+        }
         this.gl?.free();
         this.gl = new WebGl(this.ui.canvas, () => { this.dirty = true; });
         this.gpu = wasm.Player.plain(this.ui.canvas.width, this.ui.canvas.height, this.gl.mostWords, this.gl.mostSide);
-    }
-    async contextRestored() {
-        const { signal } = this.life;
-        const restored = new Promise((done, stop) => {
-            this.ui.canvas.addEventListener("webglcontextrestored", done, { once: true, signal });
-            signal.addEventListener("abort", () => stop(gone()), { once: true });
-        });
-        let told = false;
-        const late = setTimeout(() => {
-            told = true;
-            this.fail(new Error("The graphics device was lost, and the browser has not given WebGL2 back yet. Wait, or reload the page."));
-        }, PATIENCE_MS);
-        try { await restored; } finally { clearTimeout(late); }
-        if (told) this.ui.error(null);
-    }
-    commands(act) {
-        return {
-            " ": () => this.toggle(), "k": () => this.toggle(), ",": () => this.step(-1), ".": () => this.step(1),
-            ArrowLeft: () => act.orbit(-0.08, 0), ArrowRight: () => act.orbit(0.08, 0), ArrowUp: () => act.orbit(0, 0.08), ArrowDown: () => act.orbit(0, -0.08),
-            "+": () => act.zoom(1.1), "=": () => act.zoom(1.1), "-": () => act.zoom(1 / 1.1), Home: () => this.seek(0), End: () => this.seek(1),
-            "r": () => this.reset(), "f": () => this.set("flying", !this.flying), "t": () => this.set("tint", !this.settings.tint),
-            "z": () => this.set("depth", !this.settings.depth), "p": () => this.savePng(), "Escape": () => this.ui.closePanel(),
-        };
     }
     // Events
     on(name, listener) { (this.listeners[name] ??= new Set()).add(listener); return () => this.listeners[name].delete(listener); }
@@ -151,23 +129,35 @@ class Page {
         this.emit("error", { message });
     }
     // Loading
-    /// `first` is for the model that a page opens with: it takes time and pose of the link when it is seen, and plays when it can (`autoplay`).
+    /// `first` says how a model starts: with `pose` and `time`, else those of the link; `playing` when it can. `back` is why another one failed, which stays said.
     async load(source, name, first = null) {
         if (this.destroyed) throw gone();
         this.abort?.abort();
         this.abort = new AbortController();
         const { signal } = this.abort;
         const again = this.gpu && source === this.source && this.facts;
-        const kept = again ? { pose: this.gpu.pose, time: this.gpu.time } : null;
+        // How things stood when the first of this model was opened. A model that is loaded again goes on from there.
+        let before = null;
+        const begin = () => {
+            if (before || again && !first) this.first = this.now;
+            before ??= this.now;
+            this.failure = null;
+        };
         [this.source, this.name, this.first] = [source, name, first];
         this.ui.loading(true);
         const show = {
             poster: bytes => { if (bytes && !this.facts) this.ui.poster(bytes); },
-            part: (download, ...what) => this.loaded(JSON.parse(this.gpu.openPart(download, ...what))),
+            part: (download, layer, motion, degree, starts) => {
+                // A download that begins anew goes on with pose and time.
+                const anew = starts && !before;
+                if (anew) begin();
+                this.loaded(JSON.parse(this.gpu.openPart(download, layer, motion, degree, anew)));
+            },
             harmonics: (download, degree) => { this.gpu.openHarmonics(download, degree); this.gl?.loadHarmonics(this.gpu); this.draw(); },
             whole: (name, bytes) => {
                 // A later load has the page; reading bytes is not interrupted.
                 if (signal.aborted) throw signal.reason;
+                begin();
                 this.loaded(JSON.parse(this.gpu.open(name, bytes)));
             },
             progress: (share, bytes) => { this.ui.progress(share); this.received = bytes; this.emit("progress", { share, bytes }); },
@@ -190,8 +180,8 @@ class Page {
                 this.received = bytes.length;
                 show.whole(label, bytes);
             }
-            if (kept) { this.gpu.pose = kept.pose; this.gpu.seek(kept.time); }
-            this.ui.error(null);
+            this.shown.ended = true;
+            this.ui.error(this.problem);
             this.warn();
             this.emit("loaded", this.facts);
             return this.facts;
@@ -203,20 +193,23 @@ class Page {
                 this.gpu = null;
                 e = new Error(`The player stopped while it opened ${this.title()} (${e.message}), most likely because its memory ran out. Reload the page, or open the file with \`cc4dgs view\`.`);
             } else if (signal.aborted) return null;
-            // The model before is still there.
-            Object.assign(this, this.shown ?? { source: null });
+            // What is shown of it stays as it is. A model before is still there, if only in part where it was arriving or has made room.
+            if (this.shown?.source === source) this.shown.ended = true;
+            const { ended, ...shown } = this.shown ?? { source: null, facts: null, first: null };
+            Object.assign(this, shown);
             this.ui.poster(null);
-            if (this.facts && this.gpu) {
-                this.ui.facts(this.facts);
-                this.ui.title(this.title());
-            } else this.ui.empty();
+            if (this.facts && this.gpu) { this.ui.facts(this.facts); this.ui.title(this.title()); } else this.ui.empty();
             this.fail(e);
+            const torn = this.gpu && this.source && !ended && this.abort.signal === signal;
+            if (torn) this.load(this.source, this.name, { ...(before ?? this.now), back: e.message }).catch(() => {});
             throw e;
         } finally {
             // A later load has a bar of its own.
             if (this.abort.signal === signal) this.ui.loading(false);
         }
     }
+    /// What stays said while the model is shown.
+    get problem() { return this.failure ?? this.first?.back ?? null; }
     /// Says what is not shown of the model.
     warn() {
         const { lacksMotion, shDegree, storedDegree } = this.facts, lines = [];
@@ -228,20 +221,27 @@ class Page {
     title() { return this.name ?? (typeof this.source === "string" ? nameOf(this.source) : this.source?.name ?? "model"); }
     loaded(facts) {
         this.facts = facts;
-        this.shown = { source: this.source, name: this.name, facts };
+        if (this.shown) this.shown.ended = false;
         this.gl?.load(this.gpu, facts.moving);
         this.ui.facts(facts);
+        this.ui.error(this.problem);
         this.ui.playing(this.gpu.playing);
         this.apply();
         const { first } = this;
-        if (first && !first.followed) { first.followed = true; this.followLink(); }
-        if (first?.autoplay && facts.frames > 1) { this.first = null; this.play(); }
+        this.shown = { source: this.source, name: this.name, facts, first };
+        if (first && !first.seen) {
+            first.seen = true;
+            if (first.pose) { this.gpu.pose = first.pose; this.seek(first.time); } else this.followLink();
+        }
+        if (first?.playing && facts.frames > 1) { first.playing = false; this.play(); }
         this.draw();
         this.ui.poster(null);
     }
     // Time
     get time() { return this.gpu?.time ?? 0; }
     get playing() { return this.gpu?.playing ?? false; }
+    /// Where the model that is shown stands, and whether it plays as soon as it can.
+    get now() { return { pose: this.gpu.pose, time: this.time, playing: this.playing || !!this.shown?.first?.playing }; }
     play() { this.setPlaying(true); }
     pause() { this.setPlaying(false); }
     toggle() { this.setPlaying(!this.playing); }
@@ -277,6 +277,7 @@ class Page {
         const [width, height] = [Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio))];
         if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
         this.gpu?.resize(width, height);
+        this.dirty = true;
         this.draw();
     }
     draw() { if (this.gl) { if (this.gpu && !this.gl.lost) this.gl.draw(this.gpu); } else this.gpu?.draw(); this.dirty = false; this.drawn = (this.drawn ?? 0) + 1; }
@@ -304,6 +305,9 @@ class Page {
             if (this.flyKeys(elapsed)) this.dirty = true;
             if (this.dirty) this.draw();
             this.statistics(now);
+            const failure = this.gpu?.takeFailure();
+            // Others follow from the first.
+            if (failure && !this.failure) this.fail(new Error(this.failure = `The graphics device failed (${failure}), most likely because its memory has no room for this model. Open a smaller one, or this one with \`cc4dgs view\`.`));
         }
     }
     statistics(now) {
@@ -317,9 +321,9 @@ class Page {
     }
     // A lost device: a new one, and the same model at the same time and pose.
     async recover() {
-        const [old, source, name, first] = [this.gpu, this.source, this.name, this.first];
-        // A model that nobody has seen yet has its own pose, and starts as it would have.
-        const kept = this.shown?.source === source ? { pose: old.pose, time: old.time, playing: old.playing } : null;
+        const [old, source, name] = [this.gpu, this.source, this.name];
+        // A model that nobody has seen yet starts as it would have.
+        const first = this.shown?.source === source ? this.now : this.first;
         this.gpu = null;
         // What is still being loaded has nothing to go to; it begins anew.
         this.abort?.abort();
@@ -332,11 +336,7 @@ class Page {
             if (losses > MOST_RECOVERIES) throw new Error(`The graphics device was lost ${losses} times in a row, most likely because the model is too large for it. Reload the page with another model, or open this one with \`cc4dgs view\`.`);
             await this.start();
             // Unless another model was opened meanwhile.
-            if (source && this.abort === abort && await this.load(source, name, first) && kept) {
-                this.gpu.pose = kept.pose;
-                this.seek(kept.time);
-                this.setPlaying(kept.playing || this.playing);
-            }
+            if (source && this.abort === abort) await this.load(source, name, first);
             this.emit("recovered", {});
         } catch (e) {
             if (!this.gpu) this.ui.empty();
@@ -357,7 +357,7 @@ class Page {
     /// Ends the player and empties its element. `load` and `capture` reject from then on, other calls do nothing.
     destroy() {
         if (this.destroyed) return;
-        this.life.abort();
+        this.life.abort(gone());
         this.abort?.abort();
         cancelAnimationFrame(this.request);
         this.sizes?.disconnect();
@@ -383,7 +383,8 @@ class Page {
     }
     link() {
         const url = new URL(location.href);
-        if (typeof this.source === "string") url.searchParams.set("src", this.source);
+        // A file that was dropped has no address.
+        if (typeof this.source === "string") url.searchParams.set("src", this.source); else if (this.source) url.searchParams.delete("src");
         const digits = v => Number(v.toPrecision(6));
         if (this.gpu) url.hash = `t=${digits(this.time)}&pose=${Array.from(this.gpu.pose, digits).join(",")}`;
         return url.href;

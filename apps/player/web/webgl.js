@@ -4,6 +4,8 @@
 import { Sorter, sortable } from "./sort.js";
 
 const WIDTH = 2048;
+// How long a lost context is waited for before the page says so, in milliseconds.
+const PATIENCE_MS = 5000;
 
 const COMMON = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
@@ -196,6 +198,26 @@ export class WebGl {
         return `WebGL2 ${info ? this.gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""}`;
     }
     get lost() { return !!this.wasLost || this.gl.isContextLost(); }
+    /// Waits until the browser restores a lost context. Calls `late` where that takes long, and resolves to whether it did; rejects where `signal` aborts.
+    async restored(late, signal) {
+        let told = false;
+        const timer = setTimeout(() => { told = true; late(); }, PATIENCE_MS);
+        try {
+            await new Promise((done, stop) => {
+                this.canvas.addEventListener("webglcontextrestored", done, { once: true, signal });
+                signal.addEventListener("abort", () => stop(signal.reason), { once: true });
+            });
+        } finally { clearTimeout(timer); }
+        return told;
+    }
+    /// Refuses `what` where the memory of the graphics card has no room for it. Waits for the driver.
+    check(what) {
+        const { gl } = this;
+        // A lost context has an error of its own.
+        for (let error; (error = gl.getError()) !== gl.NO_ERROR;) {
+            if (error === gl.OUT_OF_MEMORY) throw new Error(`The memory of the graphics card has no room for ${what}. Close other pages, or open the file with \`cc4dgs view\`.`);
+        }
+    }
     program(vertex, fragment) {
         const { gl } = this, program = gl.createProgram();
         for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -236,8 +258,8 @@ export class WebGl {
         const gaussians = player.plainFloats(0), coefficients = player.plainFloats(1), starts = player.plainWords(1);
         this.texture("gaussians", gaussians, floats, 4);
         this.texture("coefficients", coefficients, floats, 4);
-        this.loadHarmonics(player);
         this.texture("starts", starts, words, 4);
+        this.loadHarmonics(player);
         const { model, tracks } = sortable(gaussians, starts, coefficients, player.plainWords(2), moving);
         this.tracks = tracks;
         this.sorter = new Sorter(model, this.changed);
@@ -246,11 +268,13 @@ export class WebGl {
     loadHarmonics(player) {
         const { gl } = this;
         this.texture("harmonics", player.plainWords(0), [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT], 4);
+        this.check("the model");
     }
     target(width, height) {
         const { gl } = this;
         if (this.size?.[0] === width && this.size[1] === height) return;
         if (this.image) { gl.deleteTexture(this.image); gl.deleteFramebuffer(this.buffer); }
+        this.size = null;
         this.image = gl.createTexture();
         gl.bindTexture(gl.TEXTURE_2D, this.image);
         gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
@@ -258,6 +282,11 @@ export class WebGl {
         this.buffer = gl.createFramebuffer();
         gl.bindFramebuffer(gl.FRAMEBUFFER, this.buffer);
         gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.image, 0);
+        const what = `an image of ${width}x${height} pixels`;
+        this.check(what);
+        if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE && !gl.isContextLost()) {
+            throw new Error(`This graphics driver cannot draw ${what}. Use another browser, or open the file with \`cc4dgs view\`.`);
+        }
         this.size = [width, height];
     }
     uniforms({ at }, bytes) {

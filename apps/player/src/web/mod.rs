@@ -9,8 +9,8 @@ use capture::Capture;
 use cc4dgs_format::playback::Head;
 use cc4dgs_format::{Camera, Error, Limits, StreamStage};
 use download::Download;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use wasm_bindgen::prelude::*;
 // Asynchronous methods expand to calls of it.
 use wasm_bindgen_futures as _;
@@ -39,7 +39,14 @@ fn start() {
 #[allow(clippy::large_enum_variant, reason = "there is one player")]
 enum Output {
     /// A canvas with WebGPU.
-    WebGpu { surface: wgpu::Surface<'static>, configuration: wgpu::SurfaceConfiguration, renderer: Renderer, adapter: String, lost: Arc<AtomicBool> },
+    WebGpu {
+        surface: wgpu::Surface<'static>,
+        configuration: wgpu::SurfaceConfiguration,
+        renderer: Renderer,
+        adapter: String,
+        lost: Arc<AtomicBool>,
+        failure: Arc<Mutex<Option<String>>>,
+    },
     /// The page draws with WebGL2 from the arrays of `scene`, none of which may have more than `most_words` numbers.
     Plain { scene: Option<Scene>, most_words: u64 },
 }
@@ -74,14 +81,17 @@ impl Player {
         let mut configuration = surface.get_default_config(&adapter, width, height).ok_or_else(|| JsError::new("the canvas cannot be drawn on"))?;
         configuration.format = configuration.format.remove_srgb_suffix();
         surface.configure(&device, &configuration);
-        let lost = Arc::new(AtomicBool::new(false));
-        let flag = lost.clone();
+        let (lost, failure) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(None::<String>)));
+        let (flag, first) = (lost.clone(), failure.clone());
         device.set_device_lost_callback(move |_, _| flag.store(true, Ordering::Relaxed));
-        device.on_uncaptured_error(Arc::new(|e: wgpu::Error| web_sys::console::error_1(&e.to_string().into())));
+        device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
+            web_sys::console::error_1(&e.to_string().into());
+            first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(e.to_string());
+        }));
         let most_side = device.limits().max_texture_dimension_2d;
         let renderer = Renderer::new(device, queue, configuration.format);
         let adapter = format!("{} {}", adapter.get_info().name, adapter.get_info().driver).trim().to_string();
-        Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost }, (width, height), most_side))
+        Ok(Self::on(Output::WebGpu { surface, configuration, renderer, adapter, lost, failure }, (width, height), most_side))
     }
     /// A player that decodes, keeps time and navigates, for a page that draws by itself: at most `most_words` numbers per array, `most_side` pixels each way.
     pub fn plain(width: u32, height: u32, most_words: f64, most_side: u32) -> Player {
@@ -237,6 +247,12 @@ impl Player {
     #[wasm_bindgen(getter)]
     pub fn lost(&self) -> bool {
         matches!(&self.output, Output::WebGpu { lost, .. } if lost.load(Ordering::Relaxed))
+    }
+    /// The first of what the device failed to do since this was asked last, such as to find memory for a buffer.
+    #[wasm_bindgen(js_name = takeFailure)]
+    pub fn take_failure(&self) -> Option<String> {
+        let Output::WebGpu { failure, .. } = &self.output else { return None };
+        failure.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
     /// Loses the device on purpose: when a player is destroyed, and in tests.
     #[wasm_bindgen(js_name = loseDevice)]
