@@ -67,7 +67,8 @@ fn settings_out_of_range_are_refused_before_anything_is_written() {
     let scene = Arc::new(session.read_scene("procedural:tiny", &config.scene).unwrap());
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path().join("run");
-    let changes: [(&str, fn(&mut RunConfig)); 3] = [
+    type Change = fn(&mut RunConfig);
+    let changes: [(&str, Change); 3] = [
         ("train.iterations", |config| config.train.iterations = 0),
         ("train.batch", |config| config.train.batch = 0),
         ("train.smooth_delta", |config| config.train.smooth_delta = -0.1),

@@ -238,7 +238,7 @@ fn cut_into_tiles<S: Simd>(
             let mut packed = 0;
             for (strip, rows) in reached.iter().enumerate().take(strips) {
                 let (from, to) = (rows[0].max(top), rows[1].min(top + TILE - 1));
-                let bits = if from > to { EMPTY_STRIP } else { (from - top | (to - top) << 4) as u32 };
+                let bits = if from > to { EMPTY_STRIP } else { ((from - top) | ((to - top) << 4)) as u32 };
                 packed |= bits << (STRIP_BITS * strip as u32);
             }
             found(tile_y * tiles_x + tile_x, packed);

@@ -158,7 +158,7 @@ fn hostile_documents_are_refused() {
 fn the_corpus_is_refused() {
     let corpus = Path::new("bad/scenes");
     let mut seen = 0;
-    for entry in std::fs::read_dir(&corpus).unwrap() {
+    for entry in std::fs::read_dir(corpus).unwrap() {
         let path = entry.unwrap().path();
         if path.is_dir() {
             let error = open(&path).err().unwrap_or_else(|| panic!("{} was opened", path.display()));
