@@ -101,7 +101,7 @@ impl WithSimd for Bin<'_> {
             cut_into_tiles::<S>(
                 &splat,
                 &footprints[slot],
-                settings,
+                [settings.width, settings.height],
                 limits,
                 #[inline(always)]
                 |tile, rows| {
@@ -174,7 +174,7 @@ fn half_column(splat: &ScreenSplat, foot: &Footprint, dx: f32) -> f32 {
 
 /// First and last row of the image with pixel centres inside the footprint in the columns `from` to `to`; none where the first is over the last.
 #[inline(always)]
-fn rows_between(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettings, from: usize, to: usize) -> [usize; 2] {
+fn rows_between(splat: &ScreenSplat, foot: &Footprint, height: usize, from: usize, to: usize) -> [usize; 2] {
     const NONE: [usize; 2] = [1, 0];
     let [x, y] = splat.center;
     // The strip between the outermost pixel centres, relative to the centre of the Gaussian.
@@ -191,22 +191,16 @@ fn rows_between(splat: &ScreenSplat, foot: &Footprint, settings: &RasterSettings
     if last < 0.0 || last.is_nan() {
         return NONE;
     }
-    [(y + top - 0.5).ceil().max(0.0) as usize, (last as usize).min(settings.height - 1)]
+    [(y + top - 0.5).ceil().max(0.0) as usize, (last as usize).min(height - 1)]
 }
 
-/// Calls `found(tile, rows)` for every tile with a pixel centre inside the footprint; `rows` are those of [`Entry`].
+/// Calls `found(tile, rows)` for every tile of an image of `size` (width, height) with a pixel centre inside the footprint; `rows` are those of [`Entry`].
 #[inline(always)]
-fn cut_into_tiles<S: Simd>(
-    splat: &ScreenSplat,
-    foot: &Footprint,
-    settings: &RasterSettings,
-    limits: Option<[[usize; 2]; 2]>,
-    mut found: impl FnMut(usize, u32),
-) {
+fn cut_into_tiles<S: Simd>(splat: &ScreenSplat, foot: &Footprint, size: [usize; 2], limits: Option<[[usize; 2]; 2]>, mut found: impl FnMut(usize, u32)) {
     let x = splat.center[0];
-    let tiles_x = settings.width.div_ceil(TILE);
+    let tiles_x = size[0].div_ceil(TILE);
     let first_column = (x - splat.half_width - 0.5).ceil().max(0.0) as usize;
-    let last_column = ((x + splat.half_width - 0.5).floor().max(0.0) as usize).min(settings.width - 1);
+    let last_column = ((x + splat.half_width - 0.5).floor().max(0.0) as usize).min(size[0] - 1);
     if first_column > last_column {
         return;
     }
@@ -221,7 +215,7 @@ fn cut_into_tiles<S: Simd>(
         let (mut first_row, mut last_row) = (usize::MAX, 0);
         for (strip, rows) in reached.iter_mut().enumerate().take(strips) {
             let from = tile_x * TILE + strip * width;
-            *rows = rows_between(splat, foot, settings, from, from + width - 1);
+            *rows = rows_between(splat, foot, size[1], from, from + width - 1);
             if rows[0] <= rows[1] {
                 (first_row, last_row) = (first_row.min(rows[0]), last_row.max(rows[1]));
             }
@@ -297,4 +291,45 @@ fn fill_lists(buffers: &mut Buffers, tiles: usize, per_task: usize) {
     let starts = &buffers.tile_start;
     let length = |&tile: &u32| starts[tile as usize + 1] - starts[tile as usize];
     buffers.tile_order.sort_by_key(|tile| (std::cmp::Reverse(length(tile)), *tile));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Asserts that lists with strips for `S` have every pixel centre of a turned ellipse, and returns how many pixels they have.
+    fn listed<S: Simd>() -> usize {
+        let size = [50, 45];
+        let ([xx, xy, yy], reach) = ([30.0f32, 17.0, 14.0], 9.0f32);
+        let determinant = xx * yy - xy * xy;
+        let conic = [0.5 * yy / determinant, -xy / determinant, 0.5 * xx / determinant];
+        let half_height = (reach * yy).sqrt();
+        let splat = ScreenSplat { center: [21.3, 18.9], conic, half_width: (reach * xx).sqrt(), ..Default::default() };
+        let foot = Footprint { half_height, x_of_bottom: xy / yy * half_height, slope: xy / xx, aspect: determinant.sqrt() / xx };
+        let mut tiles = std::collections::BTreeMap::new();
+        cut_into_tiles::<S>(&splat, &foot, size, None, |tile, rows| assert!(tiles.insert(tile, Entry { rank: 0, rows }).is_none()));
+        for (x, y) in (0..size[0]).flat_map(|x| (0..size[1]).map(move |y| (x, y))) {
+            let [dx, dy] = [x as f32 + 0.5 - splat.center[0], y as f32 + 0.5 - splat.center[1]];
+            let sigma = conic[0] * dx * dx + conic[1] * dx * dy + conic[2] * dy * dy;
+            let rows = tiles.get(&(y / TILE * size[0].div_ceil(TILE) + x / TILE)).map_or(0, |entry| entry.row_mask::<S>(x % TILE));
+            assert!(2.0 * sigma > 0.999 * reach || rows >> (y % TILE) & 1 == 1, "pixel {x}, {y} is not listed");
+        }
+        let width = TILE / strips::<S>();
+        tiles.values().flat_map(|entry| (0..TILE).step_by(width).map(|column| entry.row_mask::<S>(column).count_ones() as usize * width)).sum()
+    }
+
+    #[test]
+    fn lists_have_all_pixels_of_an_ellipse_and_fewer_others_in_narrower_strips() {
+        struct Listed;
+        impl WithSimd for Listed {
+            type Output = [usize; 2];
+            #[inline(always)]
+            fn with_simd<S: Simd>(self, _: S) -> [usize; 2] {
+                [listed::<S>(), S::F32_LANES]
+            }
+        }
+        // Four strips, as NEON has, and those of this machine.
+        let ([here, lanes], narrow) = (dispatch(Listed), listed::<pulp::Scalar>());
+        assert!(if lanes > 4 { narrow < here } else { narrow == here }, "{narrow} pixels in four strips, {here} in strips of {lanes}");
+    }
 }
