@@ -22,7 +22,7 @@ hidden_below = 0.01      # a Gaussian whose opacity factor is below this is hidd
 center_lr = 1.6e-4       # Adam on T, as a share of the sequence
 width_lr = 5e-3          # Adam on the logarithms of r and s
 gate_lr = 0.0            # Adam on the gate's logit over 20
-velocity_lr = 1.6e-3     # Adam on the velocity in world units per sequence, times the extent of the cameras
+velocity_lr = 1.6e-3     # Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame
 ";
 
 /// A deformer whose Gaussians have lives too.
@@ -117,7 +117,8 @@ impl Deformer for WithLife {
     }
     fn regularizer(&self, input: &SpatialInput, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         let gates = input.attributes.get(input.attributes.len().saturating_sub(2)).cloned();
-        let (own, _) = self.divide(input)?;
+        let mut own = input.clone();
+        own.attributes.truncate(self.inner.attributes().len());
         let inner = self.inner.regularizer(&own, time_norm, progress)?;
         Ok(match (inner, gates.and_then(|gates| self.life.regularizer(gates))) {
             (Some(a), Some(b)) => Some(a + b),

@@ -10,6 +10,7 @@ use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Backend, Dispatch, ExtensionType, backend_extension};
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, Result};
+use rayon::prelude::*;
 
 /// The box and resolution of a level's grid.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -57,7 +58,7 @@ pub trait CornerOps: Backend {
 }
 
 fn signed(values: &[u32]) -> Vec<i64> {
-    values.iter().map(|&v| i64::from(v)).collect()
+    values.par_iter().map(|&v| i64::from(v)).collect()
 }
 
 /// A CPU needs no second half: the first does everything.

@@ -6,7 +6,7 @@ use crate::cpu::tensor::CpuBackend;
 use crate::cpu::vertex::hash::signatures;
 use crate::cpu::vertex::interpolate;
 use crate::ops::autodiff::{differentiate, record};
-use crate::ops::split::split;
+use crate::ops::split::{self, PieceLayout};
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops};
@@ -14,6 +14,7 @@ use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{Autodiff, Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::{Device, Tensor};
 use cc4dgs_core::{Error, Result};
+use rayon::prelude::*;
 use std::sync::Arc;
 
 pub use crate::cpu::vertex::index::MAX_RESOLUTION;
@@ -64,11 +65,11 @@ pub trait FieldOps: Backend {
 }
 
 fn unsigned<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<u32> {
-    B::ints(tensor).iter().map(|&v| v as u32).collect()
+    B::ints(tensor).par_iter().map(|&v| v as u32).collect()
 }
 
 fn triples<B: CpuBackend>(tensor: &IntTensor<B>) -> Vec<[u32; 3]> {
-    B::ints(tensor).chunks_exact(3).map(|v| [v[0] as u32, v[1] as u32, v[2] as u32]).collect()
+    B::ints(tensor).par_chunks_exact(3).map(|v| [v[0] as u32, v[1] as u32, v[2] as u32]).collect()
 }
 
 impl<B: CpuBackend> FieldKernels for B {
@@ -230,12 +231,23 @@ pub fn mlp_relu_flat(x: Tensor<2>, weights: Tensor<1>, shape: &Arc<ReluShape>) -
     Ok(Tensor::from_dispatch(<Dispatch as FieldOps>::network(x.into_dispatch(), weights.into_dispatch(), shape.clone())))
 }
 
+/// The outputs of [`mlp_relu_flat`] where each head `[M, times x width]` has per row its outputs at one time after those at another: time after time, one
+/// `[M,width]` per head.
+pub fn split_times(flat: Tensor<1>, rows: usize, widths: &[usize], times: usize) -> Vec<Vec<Tensor<2>>> {
+    if times == 1 {
+        return vec![split_heads(&flat, rows, widths)];
+    }
+    let pieces = split::split_heads(flat, PieceLayout { rows, widths: widths.to_vec(), times });
+    let of_time = |heads: &[Tensor<1>]| heads.iter().zip(widths).map(|(head, &width)| head.clone().reshape([rows, width])).collect();
+    pieces.chunks(widths.len().max(1)).map(of_time).collect()
+}
+
 /// The heads `[rows, width]` of a flat array that holds one after the other.
 pub(super) fn split_heads(flat: &Tensor<1>, rows: usize, widths: &[usize]) -> Vec<Tensor<2>> {
     if let [only] = widths {
         return vec![flat.clone().reshape([rows, *only])];
     }
-    let heads = split(flat.clone(), widths.iter().map(|width| rows * width).collect());
+    let heads = split::split_heads(flat.clone(), PieceLayout { rows, widths: widths.to_vec(), times: 1 });
     heads.into_iter().zip(widths).map(|(head, &width)| head.reshape([rows, width])).collect()
 }
 

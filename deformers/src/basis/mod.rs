@@ -7,6 +7,9 @@
 //! Trajectories as combinations of few shared functions are the idea of DynMF (Kratimenos et al. 2024) and Gaussian-Flow (Lin et al. 2024), which store the
 //! coefficients per Gaussian.
 //!
+//! Training needs no coefficients: it asks for the offsets at the times of an iteration, and there the network's last layers are combined with φ before it runs
+//! (`training`).
+//!
 //! Two plug-ins differ in their features of space: those of `cdf-basis` ([`computed`]) are the CDF's, hashed and decoded without stored tables (paper Section
 //! IV-B); those of `hash-basis` ([`stored`]) are stored in a hash grid, which takes more bytes, less time, and follows finer motion.
 //!
@@ -39,6 +42,7 @@ mod simplify;
 mod space;
 mod sparsity;
 pub mod stored;
+mod training;
 
 use crate::parts::centres::check_time;
 use crate::parts::heads::{self, Head};
@@ -128,6 +132,17 @@ impl Basis {
         }
         Ok(Tensor::cat(parts, 1))
     }
+    /// Whether the weights are in training. The features of Gaussians are then those of space `[M,S]`, otherwise coefficients `[M,C]`.
+    fn trains(&self) -> bool {
+        self.parameters.iter().any(|p| p.value.is_require_grad())
+    }
+    /// The coefficients `[M,C]` for features of space `[M,S]`, M > 0.
+    fn coefficients_of(&self, features: Tensor<2>) -> Result<Tensor<2>> {
+        let [m, _] = features.dims();
+        let weights = self.weights_after(usize::from(self.functions.network.is_some()));
+        let flat = mlp_relu_flat(features, weights, &self.coefficients)?;
+        Ok(flat.reshape([m, self.shape.coefficients()]))
+    }
     /// φ(t) at each of `times_norm` for each head (its own functions only), concatenated head after head.
     fn functions_by_head(&self, times_norm: &[f32], like: &Device) -> Result<Vec<Tensor<1>>> {
         let all = self.functions_at(times_norm, like)?;
@@ -147,9 +162,8 @@ impl Deformer for Basis {
             return Ok(SpatialFeatures { values: empty, work: DeformerWork::default() });
         }
         let (features, work) = self.space.features(&self.parameters, means_world)?;
-        let weights = self.weights_after(usize::from(self.functions.network.is_some()));
-        let flat = mlp_relu_flat(features, weights, &self.coefficients)?;
-        Ok(SpatialFeatures { values: flat.reshape([m, self.shape.coefficients()]), work })
+        let values = if self.trains() { features } else { self.coefficients_of(features)? };
+        Ok(SpatialFeatures { values, work })
     }
     fn deform(&self, features: Tensor<2>, time_norm: f32) -> Result<Offsets> {
         Ok(self.deform_all(features, &[time_norm])?.pop().unwrap_or_default())
@@ -163,6 +177,8 @@ impl Deformer for Basis {
         let outputs = if m == 0 {
             let empty = || self.shape.widths().into_iter().map(|width| Tensor::zeros([0, width], &device)).collect();
             times_norm.iter().map(|_| empty()).collect()
+        } else if self.trains() {
+            self.outputs_at(features, times_norm)?
         } else {
             combine_all(features, self.functions_by_head(times_norm, &device)?, &self.shape)?
         };
@@ -176,7 +192,7 @@ impl Deformer for Basis {
         Ok(outputs.into_iter().map(at).collect())
     }
     fn packed(&self, features: Tensor<2>) -> Tensor<2> {
-        by_columns(features, &self.shape)
+        if self.trains() { features } else { by_columns(features, &self.shape) }
     }
     fn parameters(&self) -> Vec<&Parameter> {
         self.parameters.iter().collect()

@@ -32,7 +32,8 @@ pub(super) fn simplified(field: &Basis, features: Tensor<2>, times: &[f32]) -> R
         return Ok(None);
     }
     let device = features.device();
-    let values = to_vec(features.inner(), "coefficients")?;
+    let coefficients = if field.trains() { field.coefficients_of(features)? } else { features };
+    let values = to_vec(coefficients.inner(), "coefficients")?;
     let mut functions = Vec::with_capacity(times.len());
     for at_time in field.functions_by_head(times, &device)? {
         functions.push(to_vec(at_time.inner(), "functions")?);

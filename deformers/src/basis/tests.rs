@@ -141,3 +141,38 @@ fn what_is_not_linear_is_left_to_baking() {
     let large = "learned = 0\nlevels = 4\nbase = 256\nlog2_rows = 24\nfeatures = 64";
     assert!(by(SpaceKind::Stored, large, &[]).unwrap().is_none(), "baking says what is wrong");
 }
+
+/// In training the last layers are combined with the functions of time first, which must change nothing but rounding.
+#[test]
+fn offsets_in_training_are_those_of_the_coefficients() {
+    let times = [0.0, 0.3, 1.0];
+    let tables = "levels = 2\nbase = 4\nlog2_rows = 7\nfeatures = 3\nwidth = 16\nlearned = 3\n";
+    for section in
+        [tables.to_string(), format!("{tables}head_layers = 0"), format!("{tables}head_layers = 2\nheads = ['quaternions', 'means']\n[kept]\nmeans = [0, 4]")]
+    {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(5) };
+        let settings: toml::Table = section.parse().unwrap();
+        let of = |device: &Device| {
+            let mut field = Basis::new(SpaceKind::Stored, &settings, &context, device).unwrap();
+            for (column, parameter) in field.parameters.iter_mut().enumerate() {
+                let count = parameter.shape.iter().product::<usize>();
+                let values: Vec<f32> = (0..count).map(|i| 0.4 * draw(column, i)).collect();
+                let value = Tensor::<1>::from_data(TensorData::new(values, [count]), device);
+                parameter.value = if value.is_autodiff() { value.require_grad() } else { value };
+            }
+            let means = Tensor::<2>::from_data(TensorData::new((0..3 * COUNT).map(|i| draw(50, i)).collect::<Vec<f32>>(), [COUNT, 3]), device);
+            let features = field.spatial(&SpatialInput::new(means)).unwrap().values;
+            assert_eq!(features.dims()[1] == field.shape.coefficients(), !field.trains(), "{section}");
+            let of_time = |offsets: Offsets| to_vec(offsets.concatenated().unwrap().inner(), "offsets").unwrap();
+            let all = field.deform_all(features.clone(), &times).unwrap().into_iter().map(of_time).collect::<Vec<_>>();
+            let alone = of_time(field.deform(features.clone(), times[1]).unwrap());
+            let simpler = field.simplified(features, &times).unwrap().map(|simple| simple.message);
+            (all, alone, simpler)
+        };
+        let (playback, training) = (of(&Device::flex()), of(&Device::flex().autodiff()));
+        assert_eq!(playback.2, training.2, "{section}: what is left out");
+        let close = |a: &[f32], b: &[f32]| a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() < 2e-5) && a.iter().any(|v| v.abs() > 0.1);
+        assert!(playback.0.iter().zip(&training.0).all(|(a, b)| close(a, b)), "{section}: {:?} {:?}", playback.0, training.0);
+        assert!(close(&training.0[1], &training.1) && playback.0[1] == playback.1, "{section}: one time alone");
+    }
+}

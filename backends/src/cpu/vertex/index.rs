@@ -1,5 +1,6 @@
 //! Which grid vertices surround each point, and which of them are the same (CC-4DGS, Sections IV-B and IV-C).
 
+use crate::cpu::raster::parallel::SharedMut;
 use crate::cpu::sort::stable_order;
 use rayon::prelude::*;
 
@@ -57,19 +58,18 @@ pub fn corners(points: &[f32], box_min: [f32; 3], box_max: [f32; 3], resolution:
         return Corners { vertices: keys.into_par_iter().map(vertex).collect(), corners: identity.clone(), weights, slots: identity, starts };
     }
     let slots = stable_order(&keys, side * side * side);
-    let mut corners = vec![0u32; 8 * m];
-    let (mut vertices, mut starts) = (Vec::new(), Vec::new());
-    let mut previous = None;
-    for (i, &slot) in slots.iter().enumerate() {
-        let key = keys[slot as usize];
-        if previous != Some(key) {
-            previous = Some(key);
-            starts.push(i as u32);
-            vertices.push(vertex(key));
-        }
-        corners[slot as usize] = vertices.len() as u32 - 1;
-    }
+    let key = |i: usize| keys[slots[i] as usize];
+    let mut starts: Vec<u32> = (0..slots.len()).into_par_iter().filter(|&i| i == 0 || key(i) != key(i - 1)).map(|i| i as u32).collect();
+    let vertices = starts.par_iter().map(|&start| vertex(key(start as usize))).collect();
     starts.push(slots.len() as u32);
+    let mut corners = vec![0u32; 8 * m];
+    let of_slots = SharedMut::new(&mut corners);
+    starts.par_windows(2).enumerate().for_each(|(index, ends)| {
+        for &slot in &slots[ends[0] as usize..ends[1] as usize] {
+            // SAFETY: a slot occurs once in the order.
+            unsafe { of_slots.slice(slot as usize, 1)[0] = index as u32 };
+        }
+    });
     Corners { vertices, corners, weights, slots, starts }
 }
 
@@ -98,14 +98,23 @@ mod tests {
 
     #[test]
     fn reuse_keeps_each_vertex_once_and_lists_its_slots() {
-        let c = corners(&points(500), [0.0; 3], [1.0; 3], 16, true);
-        let mut seen = c.vertices.clone();
-        seen.sort_unstable_by_key(|v| (v[2], v[1], v[0]));
-        seen.dedup();
-        assert_eq!(seen, c.vertices);
-        for u in 0..c.vertices.len() {
-            let slots = &c.slots[c.starts[u] as usize..c.starts[u + 1] as usize];
-            assert!(!slots.is_empty() && slots.is_sorted() && slots.iter().all(|&s| c.corners[s as usize] == u as u32));
+        // In one part, and in several.
+        for (count, resolution) in [(500, 16), (9_000, 200)] {
+            let found = |threads: usize| {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                pool.install(|| corners(&points(count), [0.0; 3], [1.0; 3], resolution, true))
+            };
+            let c = found(3);
+            assert!(c == found(1), "threads change the corners");
+            let mut seen = c.vertices.clone();
+            seen.sort_unstable_by_key(|v| (v[2], v[1], v[0]));
+            seen.dedup();
+            assert_eq!(seen, c.vertices);
+            assert_eq!((c.starts[0], c.starts[c.vertices.len()] as usize), (0, 8 * count));
+            for u in 0..c.vertices.len() {
+                let slots = &c.slots[c.starts[u] as usize..c.starts[u + 1] as usize];
+                assert!(!slots.is_empty() && slots.is_sorted() && slots.iter().all(|&s| c.corners[s as usize] == u as u32));
+            }
         }
     }
 
