@@ -9,7 +9,7 @@ use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::{BLUR, Camera, Error, Gaussians, HostGaussians, ParameterSpace, Rasterizer, Registry, RenderSettings, Rules, Seed, SplatColors, Splats};
 use cc4dgs_tests::larger;
 
-const EVERYTHING: GradientRequest = GradientRequest {
+pub const EVERYTHING: GradientRequest = GradientRequest {
     means: true,
     scales: true,
     quaternions: true,
@@ -22,7 +22,7 @@ const EVERYTHING: GradientRequest = GradientRequest {
     camera: true,
 };
 
-fn arrays<'a>(g: &'a HostGaussians, background: [f32; 3]) -> SplatArrays<'a> {
+pub fn arrays<'a>(g: &'a HostGaussians, background: [f32; 3]) -> SplatArrays<'a> {
     SplatArrays {
         means: &g.means,
         scales: &g.log_scales,
@@ -34,7 +34,7 @@ fn arrays<'a>(g: &'a HostGaussians, background: [f32; 3]) -> SplatArrays<'a> {
     }
 }
 
-fn settings(camera: &Camera, rules: Rules, antialiased: bool, blur: f64, degree: usize) -> RasterSettings {
+pub fn settings(camera: &Camera, rules: Rules, antialiased: bool, blur: f64, degree: usize) -> RasterSettings {
     RasterSettings {
         width: camera.width as usize,
         height: camera.height as usize,
@@ -79,9 +79,9 @@ pub fn relative(a: &[f32], b: &[f64]) -> f64 {
 }
 
 /// The names of [`columns`].
-const NAMES: [&str; 10] = ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "background", "screen", "absolute screen", "camera"];
+pub const NAMES: [&str; 10] = ["means", "scales", "quaternions", "opacities", "colors", "sh_rest", "background", "screen", "absolute screen", "camera"];
 
-fn columns(g: &Gradients) -> [&Vec<f32>; 10] {
+pub fn columns(g: &Gradients) -> [&Vec<f32>; 10] {
     [&g.means, &g.scales, &g.quaternions, &g.opacities, &g.colors, &g.sh_rest, &g.background, &g.screen, &g.absolute_screen, &g.camera]
 }
 

@@ -1,9 +1,12 @@
-//! Where rasterizers decide: colours of exactly zero, and images too long for them.
+//! Where rasterizers decide: colours of exactly zero, depths that are not positive once rounded, and images too long for them.
 
+use super::raster::{arrays, settings};
 use burn::tensor::{Tensor, TensorData};
+use cc4dgs_backends::cpu::raster;
+use cc4dgs_backends::ops::rasterize::RasterSettings;
 use cc4dgs_backends::rasterizers::tile::TileRasterizer;
 use cc4dgs_core::gaussians::to_vec;
-use cc4dgs_core::{Camera, Error, Gaussians, HostGaussians, Rasterizer, RenderSettings, SplatColors, Splats};
+use cc4dgs_core::{BLUR, Camera, Error, Gaussians, HostGaussians, Rasterizer, RenderSettings, Rules, SplatColors, Splats};
 use cc4dgs_tests::{devices, poison};
 
 /// A Gaussian straight ahead at distance 4, where harmonics of degree 1 along z are exactly their constant.
@@ -77,5 +80,31 @@ fn colours_without_harmonics_have_gradients_whatever_their_sign() {
         let out = TileRasterizer.render(&splats, &camera, &RenderSettings::default()).unwrap();
         let found = to_vec(colors.grad(&out.planes.sum().backward()).unwrap(), "gradient").unwrap();
         assert!(found[0] > 0.0 && found.iter().all(|g| *g == found[0]), "{name}: {found:?}");
+    }
+}
+
+#[test]
+fn gaussians_whose_sorted_depth_is_not_positive_are_culled() {
+    let tiny = 2.0f32.powi(-26);
+    let (one, camera) = ahead([1.0; 3], [0.0; 3]);
+    // The depth is x + z - 2 - error, and float32 rounds the error away: 2^-26 for the first Gaussian, 1 for the second.
+    let host = HostGaussians {
+        means: vec![tiny, 0.0, 2.0, 1.0, 0.0, 2.0],
+        log_scales: [[-20.7f32; 3], [-2.0; 3]].concat(),
+        quaternions: one.quaternions.repeat(2),
+        opacity_logits: vec![0.0; 2],
+        sh_dc: vec![1.0; 6],
+        sh_rest: Vec::new(),
+        dynamic_scores: vec![0.0; 2],
+        sh_degree: 0,
+        ..Default::default()
+    };
+    for (error, drawn) in [(0.0, 2), (2.0f64.powi(-24), 1)] {
+        let mut settings = RasterSettings { near: Some(0.0), ..settings(&camera, Rules::Gsplat099, false, BLUR, 0) };
+        settings.world_to_camera = [[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -2.0], [1.0, 0.0, 1.0, -2.0 - error], [0.0, 0.0, 0.0, 1.0]];
+        let out = raster::forward(&arrays(&host, [0.0; 3]), &settings).unwrap();
+        assert_eq!(out.work.visible, drawn);
+        assert_eq!(out.radii[0] > 0, drawn == 2, "{:?}", out.radii);
+        assert!(out.radii[1] > 0 && out.planes.iter().all(|v| *v >= 0.0), "a negative depth was drawn");
     }
 }

@@ -50,9 +50,10 @@ pub fn blend_backward_all(background: [f32; 3], settings: &RasterSettings, works
             (false, true, false) => dispatch(Flags::<false, true, false>(kernel)),
             (true, false, false) => dispatch(Flags::<true, false, false>(kernel)),
             (true, true, false) => dispatch(Flags::<true, true, false>(kernel)),
-            // Depth without gradient adds zeros: two more kernels suffice.
-            (false, _, true) => dispatch(Flags::<false, true, true>(kernel)),
-            (true, _, true) => dispatch(Flags::<true, true, true>(kernel)),
+            (false, false, true) => dispatch(Flags::<false, false, true>(kernel)),
+            (false, true, true) => dispatch(Flags::<false, true, true>(kernel)),
+            (true, false, true) => dispatch(Flags::<true, false, true>(kernel)),
+            (true, true, true) => dispatch(Flags::<true, true, true>(kernel)),
         }
     });
 }

@@ -227,7 +227,7 @@ impl WithSimd for GradientChunk<'_> {
 }
 
 impl GradientChunk<'_> {
-    /// The Gaussians `indices`, staged in columns.
+    /// The Gaussians `indices`, staged in columns. The projection is skipped where nothing that depends on it was requested.
     #[inline(always)]
     fn group<S: Simd>(&mut self, simd: S, indices: &[usize], stage: &Stage<11>, screen: &Stage<SCREEN_ROWS>, camera_sums: &mut [Lanes<S>; CAMERA_ROWS]) {
         let inputs: [Lanes<S>; 11] = each(
@@ -239,48 +239,62 @@ impl GradientChunk<'_> {
             |i| Lanes::load(simd, &screen[i]),
         );
         let mean: Vec3<S> = [inputs[0], inputs[1], inputs[2]];
-        let space = self.settings.space;
-        let (scales, opacity) = activate(space, [inputs[3], inputs[4], inputs[5]], inputs[10]);
-        let p = project(self.camera, mean, [inputs[6], inputs[7], inputs[8], inputs[9]], scales);
-        let zero = Lanes::splat(simd, 0.0);
-        let one = Lanes::splat(simd, 1.0);
-        let (mut d_opacity, d_compensation) =
-            if self.settings.antialiased { (g[AT_OPACITY] * p.compensation, g[AT_OPACITY] * opacity) } else { (g[AT_OPACITY], zero) };
-        let upstream = ProjectionGradient { center: [g[AT_X], g[AT_Y]], conic: [g[AT_A], g[AT_B], g[AT_C]], depth: g[AT_DEPTH], compensation: d_compensation };
-        let mut d = project_backward(self.camera, mean, &p, &upstream);
-        if space == ParameterSpace::Raw {
-            d_opacity = d_opacity * opacity * (one - opacity);
-            for k in 0..3 {
-                d.scales[k] = d.scales[k] * scales[k];
-            }
-        }
         let color: Vec3<S> = each(
             #[inline(always)]
             |c| g[AT_COLOR + c] * Lanes::load(simd, &screen[RECORD + c]),
         );
-        let mut d_colors = color;
-        if let Some(degree) = self.settings.sh_degree {
-            let (d_dc, d_offset) = self.harmonics(simd, degree, indices, mean, color);
-            d_colors = d_dc;
-            for k in 0..3 {
-                d.mean[k] += d_offset[k];
-                camera_sums[12 + k] += -d_offset[k];
+        let (d_colors, d_offset) = match self.settings.sh_degree {
+            Some(degree) => {
+                let (d_dc, d_offset) = self.harmonics(simd, degree, indices, mean, color);
+                (d_dc, Some(d_offset))
             }
-        }
-        if self.request.camera {
-            for k in 0..9 {
-                camera_sums[k] += d.camera_rotation[k / 3][k % 3];
-            }
-            for k in 0..3 {
-                camera_sums[9 + k] += d.camera_translation[k];
-            }
-        }
-        self.scatter(MEANS, indices, &d.mean);
-        self.scatter(SCALES, indices, &d.scales);
-        self.scatter(QUATERNIONS, indices, &d.quaternion);
-        self.scatter(OPACITIES, indices, &[d_opacity]);
+            None => (color, None),
+        };
         self.scatter(COLORS, indices, &d_colors);
         self.scatter(SCREEN, indices, &[g[AT_X], g[AT_Y]]);
+        let request = self.request;
+        let geometry = request.means || request.scales || request.quaternions || request.camera;
+        if !geometry && !request.opacities {
+            return;
+        }
+        let (space, antialiased) = (self.settings.space, self.settings.antialiased);
+        let (scales, opacity) = activate(space, [inputs[3], inputs[4], inputs[5]], inputs[10]);
+        let mut d_opacity = g[AT_OPACITY];
+        if geometry || antialiased {
+            let p = project(self.camera, mean, [inputs[6], inputs[7], inputs[8], inputs[9]], scales);
+            let compensation = if antialiased { d_opacity * opacity } else { Lanes::splat(simd, 0.0) };
+            if antialiased {
+                d_opacity = d_opacity * p.compensation;
+            }
+            let upstream = ProjectionGradient { center: [g[AT_X], g[AT_Y]], conic: [g[AT_A], g[AT_B], g[AT_C]], depth: g[AT_DEPTH], compensation };
+            let mut d = project_backward(self.camera, mean, &p, &upstream);
+            if space == ParameterSpace::Raw {
+                for k in 0..3 {
+                    d.scales[k] = d.scales[k] * scales[k];
+                }
+            }
+            if let Some(d_offset) = d_offset {
+                for k in 0..3 {
+                    d.mean[k] += d_offset[k];
+                    camera_sums[12 + k] += -d_offset[k];
+                }
+            }
+            if request.camera {
+                for k in 0..9 {
+                    camera_sums[k] += d.camera_rotation[k / 3][k % 3];
+                }
+                for k in 0..3 {
+                    camera_sums[9 + k] += d.camera_translation[k];
+                }
+            }
+            self.scatter(MEANS, indices, &d.mean);
+            self.scatter(SCALES, indices, &d.scales);
+            self.scatter(QUATERNIONS, indices, &d.quaternion);
+        }
+        if space == ParameterSpace::Raw {
+            d_opacity = d_opacity * opacity * (Lanes::splat(simd, 1.0) - opacity);
+        }
+        self.scatter(OPACITIES, indices, &[d_opacity]);
     }
     /// Gradient of the degree-0 coefficients and of the offset from the camera; writes those of the higher coefficients.
     #[inline(always)]

@@ -210,12 +210,18 @@ impl WithSimd for Project<'_, '_> {
 }
 
 impl ProjectChunk<'_> {
-    /// Adds one visible Gaussian.
+    /// Adds one visible Gaussian, unless it misses Inria's square or its depth for sorting is not positive.
     #[inline(always)]
     fn emit(&mut self, offset: usize, v: &[f32; 12]) {
         // Integer radii stay below 2^31, as in Inria's code.
         let radius = v[11].ceil().min(1e9) as i64;
         if self.rules.square_tiles && tiles::square([v[0], v[1]], radius, self.settings).iter().any(|axis| axis[0] >= axis[1]) {
+            return;
+        }
+        let index = self.first + offset;
+        // The float32 depth was over the near plane. At a near plane of 0, this one may be 0 or less all the same.
+        let depth = self.camera.depth(&self.splats.means[3 * index..3 * index + 3]);
+        if depth <= 0.0 {
             return;
         }
         let span = |center: f32, half: f32, size: usize| {
@@ -224,7 +230,6 @@ impl ProjectChunk<'_> {
             (last + 1 - first.min(last)) as u64
         };
         self.tiles += span(v[0], v[6], self.settings.width) * span(v[1], v[7], self.settings.height);
-        let index = self.first + offset;
         self.radii[offset] = radius;
         self.slots[self.count] = ScreenSplat {
             center: [v[0], v[1]],
@@ -232,7 +237,7 @@ impl ProjectChunk<'_> {
             opacity: v[5],
             color: [0.0; 3],
             clamped: [false; 3],
-            depth: self.camera.depth(&self.splats.means[3 * index..3 * index + 3]),
+            depth,
             half_width: v[6],
             index: index as u32,
         };

@@ -6,10 +6,10 @@ use crate::cpu::simd::prefetch;
 use pulp::Simd;
 use std::sync::Mutex;
 
-/// Workspaces in the pool.
-const POOLED: usize = 4;
-/// Upper bound on the bytes of a workspace in the pool.
-const POOLED_BYTES: usize = 512 << 20;
+/// Upper bound on the workspaces in the pool: every view of an iteration holds one until its backward pass.
+const POOLED: usize = 8;
+/// Upper bound on the bytes of all workspaces in the pool.
+const POOLED_BYTES: usize = 2 << 30;
 
 static POOL: Mutex<Vec<Buffers>> = Mutex::new(Vec::new());
 
@@ -121,6 +121,7 @@ impl Buffers {
             + 12 * self.list.capacity()
             + 4 * RECORD * self.records.capacity()
             + 8 * self.absolute.capacity()
+            + 4 * self.pair_weights.capacity()
             + 8 * self.final_transmittance.capacity()
             + pairs
     }
@@ -190,16 +191,39 @@ impl std::fmt::Debug for Workspace {
 
 impl Drop for Workspace {
     fn drop(&mut self) {
-        if self.buffers.bytes() <= POOLED_BYTES
-            && let Ok(mut pool) = POOL.lock()
-            && pool.len() < POOLED
-        {
-            pool.push(std::mem::take(&mut self.buffers));
+        if let Ok(mut pool) = POOL.lock() {
+            keep(&mut pool, &mut self.buffers, POOLED_BYTES);
         }
+    }
+}
+
+/// Moves `buffers` to `pool`, if that then has at most [`POOLED`] workspaces of `most_bytes` in all.
+fn keep(pool: &mut Vec<Buffers>, buffers: &mut Buffers, most_bytes: usize) {
+    let bytes = buffers.bytes() + pool.iter().map(Buffers::bytes).sum::<usize>();
+    if pool.len() < POOLED && bytes <= most_bytes {
+        pool.push(std::mem::take(buffers));
     }
 }
 
 /// Makes `buffer` `len` long without touching what is there; new elements are `T::default()`.
 pub fn set_len<T: Clone + Default>(buffer: &mut Vec<T>, len: usize) {
     buffer.resize(len, T::default());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_pool_keeps_eight_workspaces_within_its_bytes() {
+        let kept = |most_bytes: usize| {
+            let mut pool = Vec::new();
+            for _ in 0..9 {
+                // 400 bytes.
+                keep(&mut pool, &mut Buffers { pair_weights: Vec::with_capacity(100), ..Default::default() }, most_bytes);
+            }
+            pool.len()
+        };
+        assert_eq!([kept(POOLED_BYTES), kept(1000), kept(399)], [8, 2, 0]);
+    }
 }

@@ -118,7 +118,7 @@ fn sort_by_depth(buffers: &mut Buffers) {
     buffers.order.clear();
     for (chunk, &(count, _)) in buffers.chunk_counts.iter().enumerate() {
         let slots = chunk * CHUNK..chunk * CHUNK + count as usize;
-        // Depths are positive, so their bits order like the numbers. Slots come in order of index.
+        // Slots have positive depths, whose bits order like the numbers, and come in order of index.
         buffers.order.extend(slots.map(|slot| u64::from(buffers.slots[slot].depth.to_bits()) << 32 | slot as u64));
     }
     let keys = buffers.order.iter().map(|v| (v >> 32) as u32);

@@ -160,11 +160,12 @@ pub fn project_gaussians(
             && p.center_x - half_width <= width - 0.5
             && p.center_y + half_height >= 0.5
             && p.center_y - half_height <= height - 0.5;
-        let mut drawn = seen;
+        let depth = sorting_depth(cam, mean);
+        let mut drawn = seen && depth > 0.0;
         if comptime!(square) {
             let square_columns = tiles_of_square(p.center_x, radius, width);
             let square_rows = tiles_of_square(p.center_y, radius, height);
-            drawn = seen && length_of(square_columns) > 0 && length_of(square_rows) > 0;
+            drawn = drawn && length_of(square_columns) > 0 && length_of(square_rows) > 0;
             columns = overlap(columns, square_columns);
             rows = overlap(rows, square_rows);
         }
@@ -175,7 +176,6 @@ pub fn project_gaussians(
         splats[at + AT_B] = p.conic.y;
         splats[at + AT_C] = p.conic.z * 0.5;
         splats[at + AT_OPACITY] = opacity;
-        let depth = sorting_depth(cam, mean);
         splats[at + AT_DEPTH] = depth;
         let key = KEYS * i;
         // Depths are positive, so their bits order like the numbers.
