@@ -2,7 +2,7 @@
 
 use crate::cpu::scratch::scratch;
 use crate::cpu::simd::{Lanes, dispatch};
-use crate::ops::adam::AdamScalars;
+use crate::ops::adam::{AdamScalars, GRADIENT_LIMIT};
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
 
@@ -12,7 +12,7 @@ const CHUNK: usize = 8 << 10;
 const WIDE_ROW: usize = 16;
 
 /// One step in place over rows of `width` elements. Rows whose entry in `rows` is 0 are unchanged, moments included; so are
-/// rows with a gradient that is not finite.
+/// rows with a gradient that is not finite, or of [`GRADIENT_LIMIT`] or more.
 pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width: usize, rows: Option<&[i64]>, scalars: &AdamScalars) {
     if param.is_empty() || width == 0 {
         return;
@@ -22,8 +22,8 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
     let chunks = param.par_chunks_mut(chunk).zip(m.par_chunks_mut(chunk)).zip(v.par_chunks_mut(chunk)).zip(grad.par_chunks(chunk));
     chunks.enumerate().for_each(|(i, (((p, m), v), g))| {
         let visible = rows.map(|rows| &rows[i * rows_per_chunk..][..p.len() / width]);
-        let finite = dispatch(AllFinite(g));
-        if finite && visible.is_none_or(|rows| rows.iter().all(|&r| r != 0)) {
+        let sound = dispatch(AllSound(g));
+        if sound && visible.is_none_or(|rows| rows.iter().all(|&r| r != 0)) {
             return dispatch(Update { p, m, v, g, keep: None, scalars });
         }
         // 1 for rows that move, 0 for others.
@@ -32,9 +32,9 @@ pub fn adam(param: &mut [f32], m: &mut [f32], v: &mut [f32], grad: &[f32], width
             Some(visible) => moves.iter_mut().zip(visible).for_each(|(moves, &visible)| *moves = if visible != 0 { 1.0 } else { 0.0 }),
             None => moves.fill(1.0),
         }
-        if !finite {
+        if !sound {
             for (moves, g) in moves.iter_mut().zip(g.chunks_exact(width)) {
-                if g.iter().any(|v| !v.is_finite()) {
+                if !g.iter().all(is_sound) {
                     *moves = 0.0;
                 }
             }
@@ -70,20 +70,28 @@ fn repeat<const W: usize>(out: &mut [f32], values: &[f32]) {
     }
 }
 
-/// x * 0 is 0 for finite numbers and NaN for all others.
-struct AllFinite<'a>(&'a [f32]);
+/// Whether a gradient is a number of less than [`GRADIENT_LIMIT`].
+fn is_sound(gradient: &f32) -> bool {
+    gradient.abs() < GRADIENT_LIMIT
+}
 
-impl WithSimd for AllFinite<'_> {
+/// Whether [`is_sound`] holds for all.
+struct AllSound<'a>(&'a [f32]);
+
+impl WithSimd for AllSound<'_> {
     type Output = bool;
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> bool {
         let chunks = self.0.chunks_exact(Lanes::<S>::COUNT);
-        let rest = chunks.remainder().iter().all(|v| v.is_finite());
-        let mut zeros = Lanes::splat(simd, 0.0);
+        let rest = chunks.remainder().iter().all(is_sound);
+        let (limit, one) = (Lanes::splat(simd, GRADIENT_LIMIT), Lanes::splat(simd, 1.0));
+        // 1 in lanes with a gradient that is not sound.
+        let mut found = Lanes::splat(simd, 0.0);
         for chunk in chunks {
-            zeros = Lanes::load(simd, chunk).fma(zeros.like(0.0), zeros);
+            let gradient = Lanes::load(simd, chunk);
+            found = gradient.max(-gradient).lt(limit).select(found, one);
         }
-        rest && zeros.sum() == 0.0
+        rest && found.sum() == 0.0
     }
 }
 

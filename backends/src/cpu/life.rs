@@ -2,7 +2,7 @@
 
 use super::heads::row_blocks;
 use crate::cpu::simd::{Lanes, Mask, dispatch, each};
-use crate::ops::life::{HIDDEN, LEAST_FALLOFF, LifeRules, MOST_LOG, OUTPUTS, WIDTH};
+use crate::ops::life::{HIDDEN, LASTING, LEAST_FALLOFF, LifeRules, MOST_LOG, OUTPUTS, WIDTH};
 use cc4dgs_core::LIFE_GATE_STEEPNESS;
 use pulp::{Simd, WithSimd};
 use rayon::prelude::*;
@@ -36,6 +36,8 @@ struct Life<S: Simd> {
     falloff: Lanes<S>,
     gate: Lanes<S>,
     /// 1 - gate, which does not cancel.
+    rest: Lanes<S>,
+    /// The same, but 0 up to [`LASTING`].
     temporary: Lanes<S>,
     velocity: [Lanes<S>; 3],
 }
@@ -74,13 +76,15 @@ impl<S: Simd> Life<S> {
         let inverse = one / (small + 1.0);
         let (larger, smaller) = (inverse, small * inverse);
         let below = logit.lt(center.like(0.0));
+        // A gate that is not a number stays one.
+        let rest = unless_nan(below.select(larger, smaller), logit);
         Self {
             center,
             half_width: half_width.min(most).exp(),
             falloff: falloff.min(most).exp().max(center.like(LEAST_FALLOFF)),
-            // A gate that is not a number stays one.
             gate: unless_nan(below.select(smaller, larger), logit),
-            temporary: unless_nan(below.select(larger, smaller), logit),
+            rest,
+            temporary: rest.le(center.like(LASTING)).select(center.like(0.0), rest),
             velocity: [x, y, z],
         }
     }
@@ -235,7 +239,7 @@ fn add_gradient<S: Simd>(
         -since,
         -(outside * life.half_width),
         -life.falloff.gt(like(LEAST_FALLOFF)).keep(in_falloffs * now.in_falloffs),
-        gate * life.gate * life.temporary * LIFE_GATE_STEEPNESS,
+        gate * life.gate * life.rest * LIFE_GATE_STEEPNESS,
         x * reach,
         y * reach,
         z * reach,

@@ -1,7 +1,7 @@
 //! The fused Adam step on the device: one sweep. Wide rows have a sweep before it that decides which of them move.
 
-use super::tensor::{THREADS, constant, is_finite, owned, workgroups_for};
-use crate::ops::adam::{AdamOps, AdamScalars};
+use super::tensor::{THREADS, constant, owned, workgroups_for};
+use crate::ops::adam::{AdamOps, AdamScalars, GRADIENT_LIMIT};
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -11,19 +11,27 @@ use cubecl::prelude::*;
 
 /// Upper bound on the values of a row for which every value checks the whole row; wider rows are checked once, by a launch before.
 const NARROW: usize = 4;
+/// The bits of [`GRADIENT_LIMIT`].
+const LIMIT_BITS: u32 = GRADIENT_LIMIT.to_bits();
 
-/// Whether the row is wanted and its gradient is finite.
+/// Whether a gradient is a number of less than [`GRADIENT_LIMIT`], by its bits: shader compilers may assume that arithmetic never meets infinities and NaN.
+#[cube]
+fn is_sound(gradient: f32) -> bool {
+    (u32::reinterpret(gradient) & 0x7fff_ffffu32) < LIMIT_BITS
+}
+
+/// Whether the row is wanted and its gradient is sound.
 #[cube]
 fn moves_row(grad: &[f32], visible: &[i32], row: usize, width: u32, #[comptime] masked: bool) -> bool {
     let mut wanted = true;
     if comptime!(masked) {
         wanted = visible[row] != 0;
     }
-    let mut finite = true;
+    let mut sound = true;
     for k in 0..width as usize {
-        finite = finite && is_finite(grad[row * width as usize + k]);
+        sound = sound && is_sound(grad[row * width as usize + k]);
     }
-    wanted && finite
+    wanted && sound
 }
 
 /// moves`[row]` is 1 where the row moves.

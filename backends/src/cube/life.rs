@@ -1,7 +1,7 @@
 //! Lives on the device: a thread per Gaussian, for all times.
 
 use super::tensor::{THREADS, constant, floats, workgroups_for};
-use crate::ops::life::{HIDDEN, LEAST_FALLOFF, LifeBackward, LifeOps, LifeRules, MOST_LOG, OUTPUTS, WIDTH};
+use crate::ops::life::{HIDDEN, LASTING, LEAST_FALLOFF, LifeBackward, LifeOps, LifeRules, MOST_LOG, OUTPUTS, WIDTH};
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
 use burn_cubecl::CubeBackend;
@@ -43,6 +43,8 @@ fn bounded(factor: f32) -> f32 {
 struct Life {
     /// Share of the opacity that does not depend on time, and the rest.
     gate: f32,
+    rest: f32,
+    /// The rest, but 0 up to [`LASTING`].
     temporary: f32,
     half_width: f32,
     falloff: f32,
@@ -58,10 +60,12 @@ impl Life {
     fn of(attributes: &[f32], at: usize, #[comptime] gated: bool) -> Life {
         let logit = LIFE_GATE_STEEPNESS * attributes[at + 3];
         let smaller = smaller_share(logit);
-        let temporary = select(logit < 0.0, 1.0 - smaller, smaller);
+        let rest = select(logit < 0.0, 1.0 - smaller, smaller);
+        let temporary = select(rest <= LASTING, 0.0f32, rest);
         let wanted = width(attributes[at + 2]);
         Life {
             gate: select(logit < 0.0, smaller, 1.0 - smaller),
+            rest,
             temporary,
             half_width: width(attributes[at + 1]),
             falloff: select(wanted > LEAST_FALLOFF, wanted, LEAST_FALLOFF),
@@ -139,7 +143,7 @@ fn backward(attributes: &[f32], times: &[f32], grad: &[f32], out: &mut [f32], ro
         out[at] = of_center;
         out[at + 1] = of_width;
         out[at + 2] = of_falloff;
-        out[at + 3] = of_gate * life.gate * life.temporary * LIFE_GATE_STEEPNESS;
+        out[at + 3] = of_gate * life.gate * life.rest * LIFE_GATE_STEEPNESS;
         out[at + 4] = of_x;
         out[at + 5] = of_y;
         out[at + 6] = of_z;

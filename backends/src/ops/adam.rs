@@ -7,6 +7,9 @@ use burn::backend::{Backend, Dispatch, TensorMetadata, backend_extension};
 use burn::tensor::{Int, Tensor};
 use cc4dgs_core::{Error, Result};
 
+/// Gradients have to be smaller than this. The square of one from 1.8e19 on is infinite in float32, and so would its second moment be for ever.
+pub const GRADIENT_LIMIT: f32 = 1e18;
+
 /// The settings of one step.
 #[derive(Clone, Debug)]
 pub struct AdamSettings {
@@ -126,7 +129,7 @@ impl<B: CpuBackend> AdamOps for B {
 }
 
 /// One Adam step, p -= lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps), in place when the tensors have no other owner.
-/// Results carry no autodiff association; rows (dimension 0) with a gradient that is not finite are skipped.
+/// Results carry no autodiff association; rows (dimension 0) with a gradient that is not finite, or of [`GRADIENT_LIMIT`] or more, are skipped.
 pub fn adam_step<const D: usize>(param: Tensor<D>, m: Tensor<D>, v: Tensor<D>, grad: Tensor<D>, settings: &AdamSettings) -> Result<AdamStep<D>> {
     let shape = param.dims();
     for (name, other) in [("first moment", m.dims()), ("second moment", v.dims()), ("gradient", grad.dims())] {

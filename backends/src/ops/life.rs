@@ -2,7 +2,8 @@
 //!
 //! A life has a centre T, a half-width r during which the Gaussian is fully there, a falloff s, a gate g and a velocity v (FreeTimeGS, with the gate of
 //! FreeTimeGS++ and the flat-topped life of SharpTimeGS). At the time t the Gaussian is shifted by v (t - T) and its opacity is multiplied by
-//! g + (1 - g) exp(-(max(|t - T| - r, 0) / s)^2).
+//! g + (1 - g) exp(-(max(|t - T| - r, 0) / s)^2). Where g is 1 in float32, 1 - g is 0: such a life has no gradient but that of its gate, and a velocity that is
+//! multiplied by 1 - g none either.
 
 use super::limits::check_binding;
 use super::split::split;
@@ -26,6 +27,9 @@ pub const OUTPUTS: usize = 4;
 pub const LEAST_FALLOFF: f32 = 1e-3;
 /// Logarithm of the opacity factor of a hidden Gaussian.
 pub const HIDDEN: f32 = -30.0;
+/// Up to here, 1 - g is 0 beside a gate that is 1 in float32: what lasts has neither a life nor, where it is gated, a velocity. Adam moves any attribute with
+/// a gradient at its full rate, however small the gradient is.
+pub(crate) const LASTING: f32 = f32::EPSILON / 4.0;
 /// Largest logarithm of r and s: further ones last for ever too.
 pub(crate) const MOST_LOG: f32 = 60.0;
 
@@ -36,7 +40,7 @@ pub struct LifeRules {
     pub times_norm: Vec<f32>,
     /// A Gaussian whose opacity factor is below this is hidden: [`HIDDEN`], without a gradient.
     pub hidden_below: f32,
-    /// Whether velocities are multiplied by 1 - g, so that what lasts is not moved by its velocity.
+    /// Whether velocities are multiplied by 1 - g, so that what lasts is not moved by its velocity, which then has no gradient.
     pub gated_velocity: bool,
 }
 

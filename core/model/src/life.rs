@@ -6,7 +6,8 @@ pub const LIFE_ATTRIBUTES: [(&str, usize); 5] = [("life_center", 1), ("life_log_
 /// How steep the gate is in its attribute (FreeTimeGS++).
 pub const LIFE_GATE_STEEPNESS: f32 = 20.0;
 
-/// The value of the attribute `life_gate` for a gate `gate` in 0..1. That of 0 and 1 is finite; float32 rounds their gates to 0 and 1.
+/// The value of the attribute `life_gate` for a gate `gate` in 0..1. It is finite for 0, of which a gate of 2e-9 is left, and for 1, which is 1 again in float32:
+/// such a Gaussian lasts, and its life has no gradient.
 pub fn gate_value(gate: f32) -> f32 {
     ((gate / (1.0 - gate)).ln() / LIFE_GATE_STEEPNESS).clamp(-1.0, 1.0)
 }

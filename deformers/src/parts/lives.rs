@@ -32,7 +32,7 @@ pub struct LifeSettings {
     pub width_lr: f64,
     /// Adam on the gate's logit over 20.
     pub gate_lr: f64,
-    /// Adam on the velocity in world units per sequence, times the extent of the cameras.
+    /// Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame.
     pub velocity_lr: f64,
 }
 

@@ -25,7 +25,7 @@ impl Default for Settings {
 }
 
 /// The second moment of a new row over that of its parent: two copies share the gradient of one.
-const SHARED: f64 = 0.25;
+const SHARED: f32 = 0.25;
 
 /// State of one array: first and second moment `[N,W]`, and the number of steps.
 struct Moments {
@@ -63,18 +63,20 @@ impl Optimizer for Adam {
         let count = parents.len();
         let rows: Vec<i64> = parents.iter().map(|&row| row as i64).collect();
         for (name, moments) in self.moments.iter_mut().filter(|(name, _)| name.starts_with(prefix)) {
-            let [have, width] = moments.first.dims();
+            let [have, _] = moments.first.dims();
             if fresh.len() != count || parents.iter().any(|&row| row >= have) {
                 return Err(Error::backend(format!("optimizer adam: {name}"), format!("{count} rows are selected of {have}"), "Report this as a defect"));
             }
             let device = moments.first.device();
             let rows = Tensor::<1, Int>::from_data(TensorData::new(rows.clone(), [count]), &device);
-            let zero = Tensor::<1, Int>::from_data(TensorData::new(fresh.iter().map(|&f| i64::from(f)).collect::<Vec<_>>(), [count]), &device);
-            let zero = zero.reshape([count, 1]).repeat_dim(1, width).equal_elem(1);
-            moments.first = moments.first.clone().select(0, rows.clone()).mask_fill(zero.clone(), 0.0);
+            // Columns, which are read once per row instead of stored once per value.
+            let zero = Tensor::<2, Int>::from_data(TensorData::new(fresh.iter().map(|&f| i64::from(f)).collect::<Vec<_>>(), [count, 1]), &device);
+            let share = fresh.iter().map(|&f| if f { SHARED } else { 1.0 }).collect::<Vec<_>>();
+            let share = Tensor::<2>::from_data(TensorData::new(share, [count, 1]), &device);
+            // A mask and no factor: a moment that is not finite becomes 0, too.
+            moments.first = moments.first.clone().select(0, rows.clone()).mask_fill(zero.equal_elem(1), 0.0);
             // Without a second moment, steps would be up to six times too large for a hundred iterations: the bias correction counts the steps of the array.
-            let second = moments.second.clone().select(0, rows.clone());
-            moments.second = second.clone().mask_where(zero, second.mul_scalar(SHARED));
+            moments.second = moments.second.clone().select(0, rows) * share;
         }
         Ok(())
     }

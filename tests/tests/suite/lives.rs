@@ -184,6 +184,30 @@ fn values_and_gradients_are_those_of_the_formula() {
 }
 
 #[test]
+fn what_lasts_has_a_gradient_of_its_gate_alone() {
+    // Outside of the half-width and not hidden at both times. The second gate, of the logit 16, is 1e-7 below 1.
+    let row = |gate: f32| [0.5, 0.1f32.ln(), 0.2f32.ln(), gate, 0.3, -0.2, 0.1];
+    let attributes = [row(gate_value(1.0)), row(0.8)].concat();
+    for (name, device) in devices() {
+        for gated_velocity in [false, true] {
+            poison(&device);
+            let device = device.clone().autodiff();
+            let rules = LifeRules { times_norm: vec![0.1, 0.8], hidden_below: 0.01, gated_velocity };
+            let input = Tensor::<2>::from_data(TensorData::new(attributes.clone(), [2, WIDTH]), &device).require_grad();
+            let found = lives(input.clone(), rules).unwrap();
+            let sum = found.into_iter().map(|at| at.shift.sum() + at.log_factor.sum()).reduce(|a, b| a + b).unwrap();
+            let gradient = to_vec(input.grad(&sum.backward()).unwrap(), "gradient").unwrap();
+            let (lasting, other) = gradient.split_at(WIDTH);
+            assert!(lasting[3] != 0.0 && other.iter().all(|g| g.is_finite() && *g != 0.0), "{name}: {gradient:?}");
+            assert!(lasting[1..3].iter().all(|g| *g == 0.0), "{name}: {gradient:?}");
+            // A velocity that no gate multiplies moves what lasts, too.
+            let of_motion = [lasting[0], lasting[4], lasting[5], lasting[6]];
+            assert!(of_motion.iter().all(|g| (*g == 0.0) == gated_velocity), "{name}: {gradient:?}");
+        }
+    }
+}
+
+#[test]
 fn lives_of_another_shape_are_refused() {
     let device = Device::flex();
     let rules = |time| LifeRules { times_norm: vec![time], hidden_below: 0.01, gated_velocity: false };
