@@ -3,6 +3,7 @@
 use crate::{Camera, Error, Image8, Result, Similarity};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// The part of the split that a view belongs to.
@@ -59,7 +60,7 @@ impl FrameSource for NoImages {
     }
 }
 
-/// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes; clones share the cache.
+/// A dynamic scene. Frames are decoded on demand and cached up to a number of bytes; clones share the cache, derived scenes its bound.
 #[derive(Clone)]
 pub struct Scene {
     /// Display name.
@@ -91,7 +92,18 @@ impl Scene {
     /// # Errors
     /// [`Error::Data`] for a scene without training views, views of cameras that do not exist or with times outside 0..1, and invalid cameras.
     pub fn new(name: impl Into<String>, cameras: Vec<Camera>, views: Vec<View>, source: Arc<dyn FrameSource>, cache_bytes: u64) -> Result<Self> {
-        let name = name.into();
+        let kept = KeptFrames { cap: cache_bytes, caches: AtomicUsize::new(0), state: Mutex::default() };
+        Self::over(name.into(), cameras, views, FrameCache::new(source, Arc::new(kept)))
+    }
+    /// The views of this scene with other `cameras` and the images of `source`, of another size, say. The frames of both scenes together are cached up to
+    /// [`Scene::cache_bytes`].
+    ///
+    /// # Errors
+    /// As [`Scene::new`].
+    pub fn derived(&self, cameras: Vec<Camera>, source: Arc<dyn FrameSource>) -> Result<Self> {
+        Self::over(self.name.clone(), cameras, self.views.clone(), FrameCache::new(source, self.frames.kept.clone()))
+    }
+    fn over(name: String, cameras: Vec<Camera>, views: Vec<View>, frames: FrameCache) -> Result<Self> {
         for camera in &cameras {
             camera.validate()?;
         }
@@ -106,7 +118,6 @@ impl Scene {
             return Err(Error::data(name, "there is no training view", "Check the path, and that the images exist"));
         }
         let frame_count = views.iter().map(|v| v.frame + 1).max().unwrap_or(1);
-        let frames = Arc::new(FrameCache { source, cap: cache_bytes, state: Mutex::default() });
         Ok(Self {
             name,
             cameras,
@@ -118,12 +129,12 @@ impl Scene {
             warnings: Vec::new(),
             background: None,
             foreground_masks: None,
-            frames,
+            frames: Arc::new(frames),
         })
     }
-    /// The most bytes of decoded frames that are kept.
+    /// The most bytes of decoded frames that are kept, of this scene and those derived from it together.
     pub fn cache_bytes(&self) -> u64 {
-        self.frames.cap
+        self.frames.kept.cap
     }
     /// Indices of the views of `split`, in order.
     pub fn split(&self, split: Split) -> Vec<usize> {
@@ -146,7 +157,8 @@ impl Scene {
         let white = |mask: Image8| mask.data.chunks_exact(mask.channels as usize).map(|pixel| pixel[0] > 127).collect();
         Ok(self.frames.source.motion_mask(view)?.map(white))
     }
-    /// 1.1 x the largest distance of a training camera from their mean, the scale of position learning rates (Inria's `cameras_extent`).
+    /// 1.1 x the largest distance of a training camera from their mean, the scale of position learning rates (Inria's `cameras_extent`). In units of the scene:
+    /// those of the normalised frame, not of the dataset.
     pub fn extent(&self) -> f32 {
         let centers: Vec<[f64; 3]> = self.split(Split::Train).iter().map(|&v| self.camera(v).center_world()).collect();
         let n = centers.len().max(1) as f64;
@@ -157,45 +169,132 @@ impl Scene {
     }
 }
 
+/// The frames of a source, those of them that are kept among others in [`KeptFrames`].
 struct FrameCache {
     source: Arc<dyn FrameSource>,
+    /// Its number among those that share `kept`.
+    number: usize,
+    kept: Arc<KeptFrames>,
+}
+
+/// What is kept of the frames of a scene and of those derived from it.
+struct KeptFrames {
     cap: u64,
+    caches: AtomicUsize,
     state: Mutex<CacheState>,
 }
 
 #[derive(Default)]
 struct CacheState {
-    frames: HashMap<usize, (Arc<Image8>, u64)>,
+    /// By cache and view: an image, and when it was last used.
+    frames: HashMap<(usize, usize), (Arc<Image8>, u64)>,
     bytes: u64,
     clock: u64,
 }
 
 impl FrameCache {
+    fn new(source: Arc<dyn FrameSource>, kept: Arc<KeptFrames>) -> Self {
+        Self { source, number: kept.caches.fetch_add(1, Ordering::Relaxed), kept }
+    }
     fn get(&self, view: usize) -> Result<Arc<Image8>> {
-        if let Ok(mut state) = self.state.lock() {
+        let key = (self.number, view);
+        if let Ok(mut state) = self.kept.state.lock() {
             state.clock += 1;
             let now = state.clock;
-            if let Some((image, used)) = state.frames.get_mut(&view) {
+            if let Some((image, used)) = state.frames.get_mut(&key) {
                 *used = now;
                 return Ok(image.clone());
             }
         }
         // Decoded outside the lock, so that prefetching threads work in parallel.
         let image = Arc::new(self.source.load(view)?);
-        if let Ok(mut state) = self.state.lock() {
-            let size = image.data.len() as u64;
-            while state.bytes + size > self.cap {
-                let Some(oldest) = state.frames.iter().min_by_key(|(_, (_, used))| *used).map(|(&v, _)| v) else { break };
-                if let Some((old, _)) = state.frames.remove(&oldest) {
-                    state.bytes -= old.data.len() as u64;
-                }
-            }
-            if size <= self.cap && !state.frames.contains_key(&view) {
-                state.bytes += size;
-                let now = state.clock;
-                state.frames.insert(view, (image.clone(), now));
-            }
+        if let Ok(mut state) = self.kept.state.lock() {
+            state.keep(key, &image, self.kept.cap);
         }
         Ok(image)
+    }
+}
+
+impl Drop for FrameCache {
+    /// Nobody can ask for its frames any more, and others may use their bytes.
+    fn drop(&mut self) {
+        if let Ok(mut state) = self.kept.state.lock() {
+            let CacheState { frames, bytes, .. } = &mut *state;
+            frames.retain(|(cache, _), _| *cache != self.number);
+            *bytes = frames.values().map(|(image, _)| image.data.len() as u64).sum();
+        }
+    }
+}
+
+impl CacheState {
+    /// Keeps `image` in place of the frames that were not used for longest.
+    fn keep(&mut self, key: (usize, usize), image: &Arc<Image8>, cap: u64) {
+        let size = image.data.len() as u64;
+        // What another thread has decoded, too, or what never fits, is no reason to drop others.
+        if size > cap || self.frames.contains_key(&key) {
+            return;
+        }
+        while self.bytes + size > cap {
+            let Some(oldest) = self.frames.iter().min_by_key(|(_, (_, used))| *used).map(|(&key, _)| key) else { break };
+            if let Some((old, _)) = self.frames.remove(&oldest) {
+                self.bytes -= old.data.len() as u64;
+            }
+        }
+        self.bytes += size;
+        self.frames.insert(key, (image.clone(), self.clock));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Images of so many bytes, and how many were loaded.
+    struct Counted {
+        bytes: usize,
+        loads: AtomicUsize,
+    }
+
+    impl FrameSource for Counted {
+        fn load(&self, _: usize) -> Result<Image8> {
+            self.loads.fetch_add(1, Ordering::Relaxed);
+            Ok(Image8 { width: (self.bytes / 3) as u32, height: 1, channels: 3, data: vec![0; self.bytes] })
+        }
+    }
+
+    #[test]
+    fn derived_scenes_share_one_bound() {
+        let source = |bytes| Arc::new(Counted { bytes, loads: AtomicUsize::new(0) });
+        let loads = |source: &Arc<Counted>| source.loads.load(Ordering::Relaxed);
+        let (large, small, huge) = (source(300), source(90), source(3000));
+        let camera = || vec![Camera::look_at("a", (100, 1), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0])];
+        let views = (0..6).map(|frame| View { camera: 0, frame, time_norm: 0.0, split: Split::Train }).collect();
+        let scene = Scene::new("s", camera(), views, large.clone(), 1000).unwrap();
+        let kept = || {
+            let state = scene.frames.kept.state.lock().unwrap();
+            assert_eq!(state.bytes, state.frames.values().map(|(image, _)| image.data.len() as u64).sum::<u64>());
+            state.bytes
+        };
+        let derived = scene.derived(camera(), small.clone()).unwrap();
+        assert_eq!((derived.views.len(), derived.cache_bytes()), (6, 1000));
+        for view in 0..6 {
+            scene.frame(view).unwrap();
+            derived.frame(view).unwrap();
+            assert!(kept() <= 1000, "{} bytes after view {view}", kept());
+        }
+        // Of one view both images are kept apart, and the last ones are there.
+        assert_eq!((scene.frame(5).unwrap().data.len(), derived.frame(5).unwrap().data.len()), (300, 90));
+        assert_eq!((loads(&large), loads(&small)), (6, 6));
+        // What is larger than the bound drives nothing out.
+        let before = kept();
+        let other = scene.derived(camera(), huge.clone()).unwrap();
+        other.frame(0).unwrap();
+        assert_eq!((kept(), loads(&huge)), (before, 1));
+        // The frames of a scene that is gone make room.
+        let copy = derived.clone();
+        drop(derived);
+        assert_eq!(kept(), before, "a clone still has them");
+        drop(copy);
+        assert!(kept() < before && kept().is_multiple_of(300), "{} of {before} bytes", kept());
     }
 }

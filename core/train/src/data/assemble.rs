@@ -4,6 +4,7 @@ use super::Trained;
 use super::align::align;
 use super::camera_box::camera_box;
 use super::frames::{Job, Plan, SceneFrames};
+use super::instants::join_instants;
 use super::normalise::{CAMERA_DISTANCE, normalisation};
 use super::select::select;
 use super::undistort::Undistort;
@@ -33,6 +34,7 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
     // Before views are chosen: the frame must not depend on the options.
     let frame = trained.map_or_else(|| normalisation(&raw), |t| t.normalisation);
     align(&mut raw, options, limits)?;
+    join_instants(&mut raw.views, &mut raw.warnings);
     let views = select(&mut raw, options, trained)?;
     if !views.iter().any(|v| v.split == Split::Train) {
         let hint = raw.warnings.last().cloned().unwrap_or_default();

@@ -112,17 +112,39 @@ fn read_model(folder: &Path, limits: &Limits) -> Result<ColmapModel> {
     let named = |path: &Path| path.display().to_string();
     let (cameras, images, points);
     if is_complete(folder, "bin") {
-        let (c, i, p) = (file("cameras", "bin"), file("images", "bin"), file("points3D", "bin"));
+        let (c, p) = (file("cameras", "bin"), file("points3D", "bin"));
         cameras = colmap_binary::cameras(&named(&c), &read_bytes(&c, limits)?)?;
-        images = colmap_binary::images(&named(&i), &read_bytes(&i, limits)?)?;
+        images = read_images(folder, limits)?;
         points = if p.is_file() { colmap_binary::points(&named(&p), &read_bytes(&p, limits)?, limits)? } else { RawPoints::default() };
     } else {
-        let (c, i, p) = (file("cameras", "txt"), file("images", "txt"), file("points3D", "txt"));
+        let (c, p) = (file("cameras", "txt"), file("points3D", "txt"));
         cameras = colmap_text::cameras(&named(&c), &read_text(&c, limits)?)?;
-        images = colmap_text::images(&named(&i), &read_text(&i, limits)?)?;
+        images = read_images(folder, limits)?;
         points = if p.is_file() { colmap_text::points(&named(&p), &read_text(&p, limits)?, limits)? } else { RawPoints::default() };
     }
     Ok(ColmapModel { cameras, images, points })
+}
+
+/// The images of the model in `folder`, of its binary form where it has both.
+fn read_images(folder: &Path, limits: &Limits) -> Result<Vec<ColmapImage>> {
+    let binary = is_complete(folder, "bin");
+    let file = folder.join(if binary { "images.bin" } else { "images.txt" });
+    let name = file.display().to_string();
+    if binary { colmap_binary::images(&name, &read_bytes(&file, limits)?) } else { colmap_text::images(&name, &read_text(&file, limits)?) }
+}
+
+/// The folder with the images of a model at `path`.
+fn image_folder(path: &Path, images: &[ColmapImage]) -> PathBuf {
+    let folders = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()];
+    let has_images = |f: &&PathBuf| images.iter().any(|image| f.join(&image.name).is_file());
+    folders.iter().find(has_images).or_else(|| folders.iter().find(|f| f.is_dir())).unwrap_or(&folders[0]).clone()
+}
+
+/// The files of the images of the model at `path`, some of which may be missing; none where there is no sound model.
+pub(super) fn image_files(path: &Path, limits: &Limits) -> Vec<PathBuf> {
+    let images = model_folder(path).and_then(|folder| read_images(&folder, limits).ok()).unwrap_or_default();
+    let folder = image_folder(path, &images);
+    images.iter().map(|image| folder.join(&image.name)).collect()
 }
 
 inventory::submit! {
@@ -157,9 +179,7 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
         let read = format!("there are several models; that of {object} is read, with {} images", images.len());
         scene.warnings.push(format!("{read} (to read another, give its folder as the path)"));
     }
-    let folders = [path.join("images"), path.join("../images"), path.join("../../images"), path.to_path_buf()];
-    let has_images = |f: &&PathBuf| images.iter().any(|image| f.join(&image.name).is_file());
-    let image_folder = folders.iter().find(has_images).or_else(|| folders.iter().find(|f| f.is_dir())).unwrap_or(&folders[0]);
+    let image_folder = image_folder(path, &images);
     let hold_out = images.len() >= LEAST_HELD_OUT;
     if !hold_out && options.test_cameras.is_none() {
         scene.warnings.push(NOTHING_HELD_OUT.into());

@@ -15,7 +15,9 @@ mod focus;
 mod frames;
 mod hold_out;
 pub mod init;
+mod instants;
 mod llff;
+mod named_files;
 mod nerfstudio;
 mod normalise;
 pub mod npy;
@@ -32,6 +34,7 @@ mod video;
 pub use assemble::assemble;
 pub use camera_box::camera_box;
 pub use hold_out::hold_out;
+pub(crate) use named_files::named_files;
 pub use resample::resize;
 pub use undistort::Undistort;
 

@@ -99,7 +99,13 @@ impl Intrinsics {
     }
 }
 
-/// The file a JSON names, with the usual extensions tried where it names none. Backslashes of Windows separate folders, unless a file has them in its name.
+/// The file a JSON names. Backslashes of Windows separate folders, unless a file has them in its name.
+pub(super) fn file_named(folder: &Path, named: &str) -> PathBuf {
+    let file = folder.join(named);
+    if named.contains('\\') && !file.is_file() { folder.join(named.replace('\\', "/")) } else { file }
+}
+
+/// The image a JSON names, as [`file_named`], with the usual extensions tried where it names none.
 pub(crate) fn image_path(folder: &Path, named: &str) -> PathBuf {
     if named.contains('\\') && !folder.join(named).is_file() {
         return image_path(folder, &named.replace('\\', "/"));
@@ -229,12 +235,9 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     Ok(scene)
 }
 
-/// The points of the PLY that the document `object` names. Backslashes of Windows separate folders, unless a file has them in its name.
+/// The points of the PLY that the document `object` names.
 fn points(object: &str, folder: &Path, named: &str, limits: &Limits) -> Result<RawPoints> {
-    let mut file = folder.join(named);
-    if named.contains('\\') && !file.is_file() {
-        file = folder.join(named.replace('\\', "/"));
-    }
+    let file = file_named(folder, named);
     let name = file.display().to_string();
     if !file.exists() {
         let problem = format!("there is no such file, and {object} names it as ply_file_path");

@@ -2,9 +2,11 @@
 
 use super::hash::ContentHash;
 use super::result::{DataFingerprint, DeviceFacts, TrainingDevice};
+use crate::data::named_files;
 use cc4dgs_core::{Error, Registry, Result, adapters, resolved_device};
 use rayon::prelude::*;
-use std::path::{Path, PathBuf};
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 /// Deepest folder of a dataset, and most files and folders: a link that leads in a circle ends here.
@@ -28,7 +30,7 @@ pub fn locate(text: &str) -> Result<PathBuf> {
     }
 }
 
-/// A file of a dataset: name relative to the dataset, and bytes.
+/// A file of a dataset: name relative to the dataset, or the whole path where the dataset names it so, and bytes.
 struct DataFile {
     name: String,
     path: PathBuf,
@@ -89,6 +91,26 @@ fn root_of(path: &Path) -> PathBuf {
     }
 }
 
+/// All files of the dataset at `path`: those in its folder, then those elsewhere that its index names, each in the order of their names.
+fn files_of(path: &Path) -> Result<Vec<DataFile>> {
+    let root = root_of(path);
+    let mut files = list(&root)?;
+    let whole = root.canonicalize().map_err(|e| Error::io(&root, e))?;
+    let is_listed = |inner: &Path| inner.components().all(|part| matches!(part, Component::Normal(name) if !name.to_string_lossy().starts_with('.')));
+    let mut elsewhere = BTreeMap::new();
+    for path in named_files(path) {
+        let inner = path.strip_prefix(&root).unwrap_or(&path);
+        // It may be named by another way into the folder.
+        if is_listed(inner) || path.canonicalize().is_ok_and(|real| real.strip_prefix(&whole).is_ok_and(is_listed)) {
+            continue;
+        }
+        let (name, bytes) = (inner.to_string_lossy().into_owned(), std::fs::metadata(&path).map_err(|e| Error::io(&path, e))?.len());
+        elsewhere.insert(name.clone(), DataFile { name, path, bytes });
+    }
+    files.extend(elsewhere.into_values());
+    Ok(files)
+}
+
 /// Names and sizes of a dataset's files as one name: what is compared before a training begins, because it costs little.
 ///
 /// # Errors
@@ -96,7 +118,7 @@ fn root_of(path: &Path) -> PathBuf {
 pub fn listing(path: &Path) -> Result<String> {
     let mut hash = ContentHash::default();
     if path.exists() {
-        for file in list(&root_of(path))? {
+        for file in files_of(path)? {
             hash.part(file.name.as_bytes());
             hash.part(&file.bytes.to_le_bytes());
         }
@@ -104,7 +126,8 @@ pub fn listing(path: &Path) -> Result<String> {
     Ok(hash.name())
 }
 
-/// The fingerprint of the dataset that `text` names: names and contents of all files, or the name of a built-in scene.
+/// The fingerprint of the dataset that `text` names: names and contents of all files, those in other folders that its index names included, or the
+/// name of a built-in scene.
 ///
 /// # Errors
 /// [`Error::Parameter`] for a path that no reader recognises, [`Error::Io`].
@@ -124,7 +147,7 @@ pub fn fingerprint(text: &str, registry: &Registry) -> Result<DataFingerprint> {
         hash.part(text.as_bytes());
         return Ok(DataFingerprint { path: text.into(), hash: hash.name(), files: 0, bytes: 0 });
     }
-    let files = list(&root_of(&path))?;
+    let files = files_of(&path)?;
     let contents: Vec<u64> = files.par_iter().map(|file| content(&file.path)).collect::<Result<_>>()?;
     for (file, content) in files.iter().zip(&contents) {
         hash.part(file.name.as_bytes());
@@ -264,6 +287,54 @@ mod tests {
             std::fs::write(at(project).join("a.png"), "another image").unwrap();
             assert_ne!(of(), first, "{model}");
         }
+    }
+
+    #[test]
+    fn files_that_an_index_names_elsewhere_count() {
+        let registry = Registry::collect().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        for name in ["scene/images", "scene/.cache", "shared"] {
+            std::fs::create_dir_all(at(name)).unwrap();
+        }
+        let whole = at("shared/b.png").display().to_string();
+        let named = ["images/a.png", "../scene/images/a.png", "../shared/a", "../shared/a.png", ".cache/c.png", "../shared/missing.png", whole.as_str()];
+        let named: Vec<_> = named.iter().map(|name| serde_json::json!({"file_path": name})).collect();
+        let document = serde_json::json!({"frames": named, "ply_file_path": "../shared/points.ply"}).to_string();
+        let read = ["scene/images/a.png", "scene/.cache/c.png", "shared/a.png", "shared/b.png", "shared/points.ply"];
+        for name in read.iter().chain(&["shared/other.png"]) {
+            std::fs::write(at(name), "file").unwrap();
+        }
+        for document_name in ["transforms.json", "transforms_train.json"] {
+            let file = at("scene").join(document_name);
+            std::fs::write(&file, &document).unwrap();
+            let of = || (fingerprint(at("scene").to_str().unwrap(), &registry).unwrap(), listing(&at("scene")).unwrap());
+            let first = of();
+            assert_eq!(first.0.files, 6, "each once, and the document");
+            for name in read {
+                std::fs::write(at(name), "FILE").unwrap();
+                let changed = of();
+                assert!(changed.0.hash != first.0.hash && changed.1 == first.1, "{name}");
+                std::fs::write(at(name), "longer").unwrap();
+                assert_ne!(of().1, first.1, "{name}");
+                std::fs::write(at(name), "file").unwrap();
+            }
+            std::fs::write(at("shared/other.png"), "FILE, longer").unwrap();
+            assert_eq!(of(), first, "nothing names it");
+            assert_eq!(listing(&file).unwrap(), first.1, "the path of the document");
+            std::fs::remove_file(file).unwrap();
+        }
+        std::fs::create_dir(at("model")).unwrap();
+        std::fs::create_dir(at("images")).unwrap();
+        for (name, text) in [("model/cameras.txt", ""), ("model/images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n"), ("images/a.png", "image"), ("images/b.png", "")] {
+            std::fs::write(at(name), text).unwrap();
+        }
+        let of = || fingerprint(at("model").to_str().unwrap(), &registry).unwrap();
+        let first = of();
+        std::fs::write(at("images/b.png"), "nothing names it").unwrap();
+        assert_eq!((of(), first.files), (first.clone(), 3));
+        std::fs::write(at("images/a.png"), "other").unwrap();
+        assert_ne!(of().hash, first.hash);
     }
 
     #[cfg(target_os = "linux")]

@@ -31,12 +31,11 @@ impl Pyramid {
     }
 }
 
-/// `scene` with images of `scale` per axis, and a cache for as many of them.
+/// `scene` with images of `scale` per axis. They are cached within the bound of `scene`.
 fn shrunk(scene: &Arc<Scene>, scale: f32) -> Result<Scene> {
     let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
     let cameras = scene.cameras.iter().map(|camera| camera.resized(side(camera.width), side(camera.height))).collect();
-    let cache_bytes = (scene.cache_bytes() as f32 * scale * scale) as u64;
-    Scene::new(scene.name.clone(), cameras, scene.views.clone(), Arc::new(Shrunk { scene: scene.clone(), scale }), cache_bytes)
+    scene.derived(cameras, Arc::new(Shrunk { scene: scene.clone(), scale }))
 }
 
 /// The images of a scene, smaller.
@@ -57,21 +56,50 @@ impl FrameSource for Shrunk {
 mod tests {
     use super::*;
     use cc4dgs_core::{Camera, Split, View};
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
-    struct Flat;
+    /// How many images were loaded.
+    #[derive(Default)]
+    struct Flat(AtomicUsize);
     impl FrameSource for Flat {
         fn load(&self, _: usize) -> Result<Image8> {
+            self.0.fetch_add(1, Ordering::Relaxed);
             Ok(Image8 { width: 40, height: 20, channels: 3, data: vec![9; 2400] })
         }
     }
 
-    #[test]
-    fn images_and_cameras_shrink_alike() {
+    /// A view of 2,400 bytes, and its source.
+    fn flat(cache_bytes: u64) -> (Arc<Scene>, Arc<Flat>) {
         let camera = Camera::look_at("a", (40, 20), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
         let views = vec![View { camera: 0, frame: 0, time_norm: 0.0, split: Split::Train }];
-        let scene = Arc::new(Scene::new("flat", vec![camera], views, Arc::new(Flat), 1 << 20).unwrap());
+        let source = Arc::new(Flat::default());
+        (Arc::new(Scene::new("flat", vec![camera], views, source.clone(), cache_bytes).unwrap()), source)
+    }
+
+    fn growing() -> RunConfig {
         let mut config = RunConfig::resolve(Some("demo"), None, &[]).unwrap();
         config.train.image_growth = 0.5;
+        config
+    }
+
+    #[test]
+    fn images_of_all_sizes_share_the_cache() {
+        // Loads for a full image, a small one of it and the full one again.
+        let loads = |cache_bytes: u64| {
+            let (scene, source) = flat(cache_bytes);
+            let pyramid = Pyramid::new(&scene, &growing()).unwrap();
+            for scale in [1.0, IMAGE_SCALES[0], 1.0] {
+                pyramid.at(scale).frame(0).unwrap();
+            }
+            source.0.load(Ordering::Relaxed)
+        };
+        assert_eq!((loads(2549), loads(2550)), (2, 1), "2,400 and 150 bytes");
+    }
+
+    #[test]
+    fn images_and_cameras_shrink_alike() {
+        let (scene, _) = flat(1 << 20);
+        let mut config = growing();
         let pyramid = Pyramid::new(&scene, &config).unwrap();
         for scale in IMAGE_SCALES.into_iter().chain([1.0]) {
             let level = pyramid.at(scale);

@@ -2,6 +2,7 @@
 
 use super::common::*;
 use cc4dgs_core::{Camera, Limits, SceneOptions, Split};
+use cc4dgs_train::auto::{Arrangement, Facts};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -60,6 +61,35 @@ fn a_rig_in_split_files_is_one_camera_for_each_pose() {
     assert_eq!(scene.cameras.len(), 24);
     let said = |part: &str| scene.warnings.iter().any(|w| w.contains(part));
     assert!(said("24 images have 6 poses, but 1 of them state no time and 1 the same time"), "{:?}", scene.warnings);
+}
+
+#[test]
+fn cameras_whose_clocks_jitter_are_a_rig() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("transforms.json");
+    let mut images = frames(dir.path(), &ring(9, 16, 12), 0);
+    // Up to a fifth of the interval late; then each camera a ninth of it after the one before.
+    let mut delayed = |share: &dyn Fn(usize) -> f64| {
+        for (index, image) in images.iter_mut().enumerate() {
+            let (camera, instant) = (index / 4, index % 4);
+            image["time"] = json!((instant as f64 + share(camera + 3 * instant)) / 4.0);
+        }
+        write(&file, &images);
+        load(dir.path()).unwrap()
+    };
+    let scene = delayed(&|number| 0.05 * (number % 5) as f64);
+    assert_eq!((scene.cameras.len(), scene.frame_count, scene.views.len()), (9, 4, 36));
+    assert_eq!(Facts::of(&scene).unwrap().arrangement, Arrangement::Dome);
+    let mut times: Vec<u32> = scene.views.iter().map(|view| view.time_norm.to_bits()).collect();
+    times.sort_unstable();
+    times.dedup();
+    assert!(times.len() > 16, "each image keeps its own time: {times:?}");
+    assert!(scene.warnings.iter().any(|w| w.contains("36 images are 4 frames, each image at its own time")), "{:?}", scene.warnings);
+    let options = SceneOptions { frames: Some([1, 2, 1]), ..options() };
+    assert_eq!(open(dir.path(), &options, &Limits::default()).unwrap().views.len(), 18);
+    let scene = delayed(&|number| (number % 9) as f64 / 9.0);
+    assert_eq!((scene.cameras.len(), scene.views.len()), (9, 36));
+    assert!(scene.frame_count > 30 && !Facts::of(&scene).unwrap().arrangement.has_several_cameras(), "{} frames", scene.frame_count);
 }
 
 #[test]
