@@ -5,11 +5,11 @@
 //! names a folder, the archives are written there; where `DECODED` does, what was decoded too, as PLY files.
 //!
 //! `codec_speed FILE.cc4d CODEC[:PROFILE][;SETTINGS] [--json FILE]` decodes such an archive once in a process that has done nothing else, and says how much
-//! memory it had. `benches/codec_speed.py` does both with every codec.
+//! memory it had. `codec_speed FILE.cc4d [--json FILE]` decodes the weights of its deformer instead, `DECODES` times. `benches/codec_speed.py` does all of it.
 #![allow(clippy::print_stdout, reason = "its output is what it is for")]
 
 use cc4dgs_format::archive::{Archive, ArchiveWriter, Manifest, StreamKind};
-use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, Entries, Error, HostGaussians, Limits, Result, Seed, Silent, ply, toml};
+use cc4dgs_format::{AttributeCodec, CodecContext, CodecPlugin, Entries, Error, HostGaussians, Limits, Result, Seed, Silent, ply, read_weights, toml};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -19,7 +19,8 @@ const ENOUGH_S: f64 = 60.0;
 
 fn main() -> Result<()> {
     cc4dgs_codecs::link();
-    let usage = || Error::parameter("codec_speed", "wrong arguments", "Write codec_speed FILE.ply REPEAT CODEC[:PROFILE][;SETTINGS]... [--json FILE]");
+    let usage =
+        || Error::parameter("codec_speed", "wrong arguments", "Write FILE.ply REPEAT CODEC[:PROFILE][;SETTINGS]..., or FILE.cc4d [CODEC]; [--json FILE]");
     let mut arguments: Vec<String> = std::env::args().skip(1).collect();
     let mut json = None;
     if let Some(at) = arguments.iter().position(|a| a == "--json") {
@@ -29,6 +30,7 @@ fn main() -> Result<()> {
         json = arguments.drain(at..at + 2).nth(1);
     }
     let rows = match arguments.as_slice() {
+        [path] if path.ends_with(".cc4d") => vec![decode_weights(path)?],
         [path, codec] if path.ends_with(".cc4d") => vec![decode_alone(path, codec)?],
         [path, repeat, specs @ ..] if !specs.is_empty() => measure(path, repeat, specs)?,
         _ => return Err(usage()),
@@ -138,6 +140,37 @@ fn decode_alone(path: &str, spec: &str) -> Result<Value> {
     let seconds = rounded(began.elapsed().as_secs_f64(), 4);
     let row = json!({
         "codec": spec, "plugin": facts, "gaussians": found.len(), "decode_s": seconds, "decoded_bytes": array_bytes(&found), "peak_mb": peak_mb(),
+    });
+    println!("{row}");
+    Ok(row)
+}
+
+/// Decodes the weights of the deformer of the archive at `path`, which is in memory; Zstandard is included.
+fn decode_weights(path: &str) -> Result<Value> {
+    let limits = Limits::default();
+    let archive = Archive::from_bytes(path, limits.read_file(Path::new(path))?, &limits)?;
+    let Some(deformer) = &archive.manifest().deformer else {
+        return Err(Error::parameter(path, "the archive has no deformer", "Name one that `cc4dgs compress` made of a model with a deformer"));
+    };
+    let (mut values, mut decode, mut decode_cpu) = (0, Vec::new(), Vec::new());
+    for _ in 0..times("DECODES", 3).max(1) {
+        let (began, cpu) = (Instant::now(), cpu_seconds());
+        let found = read_weights(path, &archive, &deformer.weights, None, &limits, &Silent)?;
+        decode.push(began.elapsed().as_secs_f64());
+        decode_cpu.push(cpu_seconds() - cpu);
+        values = found.iter().map(|array| array.values.len()).sum::<usize>();
+    }
+    let weights = &deformer.weights;
+    let row = json!({
+        "deformer": deformer.name,
+        "plugin": { "name": weights.name, "version": weights.version, "settings": weights.settings },
+        "values": values,
+        "bytes": archive.stream_sizes().iter().filter(|s| s.kind == StreamKind::Field).map(|s| s.stored_bytes).sum::<u64>(),
+        "decodes": decode.len(),
+        "decode_median_s": rounded(median(&decode), 5),
+        "decode_least_s": rounded(least(&decode), 5),
+        "decode_cpu_least_s": rounded(least(&decode_cpu), 5),
+        "peak_mb": peak_mb(),
     });
     println!("{row}");
     Ok(row)

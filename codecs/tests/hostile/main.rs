@@ -96,7 +96,7 @@ fn happened<T>(found: &Result<T>, sound: &[Stream]) -> String {
 
 /// Repeats the damages of the corpus, then tries others until time is up, half of them on top of those. How many, and what is new in the corpus.
 fn attack(name: &str, sound: &[Stream], time: Duration, decode: &dyn Fn(&[Stream]) -> Outcome) -> (u64, String) {
-    let corpus = Corpus::read(name);
+    let corpus = Corpus::read(name, sound);
     let limits = |name: &str| {
         let largest = LARGEST.load(Ordering::Relaxed) as u64;
         assert!(largest <= LIMITS.max_bytes, "{name}: {largest} bytes at once, {} are allowed", LIMITS.max_bytes);

@@ -1,6 +1,7 @@
 //! A model as a `.cc4d` archive.
 
 use crate::codec_services::{ModelServices, SceneViews};
+use crate::encoded_once::EncodedOnce;
 use crate::field_weights::StoredField;
 use crate::layer_deformer::{PLAYBACK_LAYER, of_layer};
 use crate::model::{Model, ModelDeformer, ModelSize};
@@ -112,12 +113,15 @@ impl Model {
     /// The bytes of the model's `.cc4d` archive.
     ///
     /// # Errors
-    /// What codecs and the deformer report, and unknown names.
+    /// What codecs and the deformer report, unknown names, and [`Error::Limit`] for Gaussians that no reader with these limits accepts.
     pub fn to_archive(&self, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<Vec<u8>> {
         self.archive_writer(options, registry, limits, events)?.to_bytes()
     }
     fn archive_writer(&self, options: &ArchiveOptions, registry: &Registry, limits: &Limits, events: &dyn EventSink) -> Result<ArchiveWriter> {
         let ArchiveOptions { codec: spec, settings, field_weights, scene, tuner } = *options;
+        self.check_size(limits)?;
+        let tuner = tuner.map(EncodedOnce::new);
+        let tuner = tuner.as_ref().map(|tuner| tuner as &dyn TuneModel);
         let codec = registry.build_codec(spec, settings)?;
         let (name, profile) = spec.split_once(':').unwrap_or((spec, ""));
         let views = scene.map(|(scene, _)| SceneViews::new(scene));
@@ -212,6 +216,16 @@ impl Model {
             None => untuned.into_inner().map_or_else(encode_weights, Ok)?,
         };
         Ok(assembled(streams, &found))
+    }
+    /// Refuses Gaussians that no reader with these limits accepts, before they are encoded.
+    fn check_size(&self, limits: &Limits) -> Result<()> {
+        let (bytes, limit) = (self.float32_size().point_cloud, limits.max_bytes);
+        if bytes <= limit {
+            return Ok(());
+        }
+        let object = format!("decoded bytes of {} Gaussians", self.gaussians.len());
+        let remedy = "Remove Gaussians with `cc4dgs prune`, or raise limits.max_bytes (--limit max_bytes=…), which readers of the file need, too";
+        Err(Error::limit(object, bytes, limit, remedy))
     }
     /// The Gaussians, with what a codec may lose of the field's attributes: nobody reads those of Gaussians that do not move.
     fn for_codec(&self, codec: &dyn AttributeCodec) -> HostGaussians {

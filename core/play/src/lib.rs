@@ -8,6 +8,7 @@ mod archive;
 pub mod bake;
 pub mod checkpoint;
 pub mod codec_services;
+mod encoded_once;
 pub mod field_weights;
 mod layer_deformer;
 pub mod model;

@@ -4,8 +4,8 @@ use burn::tensor::{Device, Tensor};
 use cc4dgs_core::SceneOptions;
 use cc4dgs_core::archive::Archive;
 use cc4dgs_core::{
-    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Deformer, DeformerContext, Event, ExtraAttribute, HostGaussians, Limits, Plugin, Recorder,
-    Registry, Result, Seed, Silent, Stream, inventory,
+    AttributeCodec, CodecContext, CodecPlugin, DeclaredLoss, Deformer, DeformerContext, EncodedWeights, Error, Event, ExtraAttribute, HostGaussians, Limits,
+    Plugin, Recorder, Registry, Result, Seed, Silent, Stream, TuneModel, TunedModel, Tuning, WeightArray, inventory,
 };
 use cc4dgs_core::{EvaluateDeformer, RenderModel, TrainingViews};
 use cc4dgs_play::Moving;
@@ -17,9 +17,10 @@ use cc4dgs_play::player::Player;
 use cc4dgs_play::{ArchiveOptions, Model};
 use cc4dgs_tests::larger;
 use cc4dgs_train::data;
+use std::cell::RefCell;
 use std::path::Path;
 
-/// The codec `raw`, which also records the parts of its context.
+/// The codec `raw`, which also records the parts of its context, and asks for the sizes of weights and files as a codec does whose size is bounded.
 struct Witness(Box<dyn AttributeCodec>);
 
 impl AttributeCodec for Witness {
@@ -30,6 +31,16 @@ impl AttributeCodec for Witness {
             let moved = deformer.deform(gaussians, time_norm)?;
             let same_size = (image.width, image.height) == (drawn.width, drawn.height) && moved.len() == gaussians.len();
             context.events.emit(&Event::Note { object: "codec witness".into(), message: format!("{} views, sizes agree: {same_size}", views.len()) });
+        }
+        if let (Some(tuner), Some(file_bytes)) = (context.tuner, context.file_bytes) {
+            let weights = tuner.start(gaussians)?.weights;
+            for steps in [2.0, 4.0] {
+                tuner.encoded_weights(&weights, steps)?;
+                file_bytes(&[], Some((weights.as_slice(), steps)))?;
+            }
+            file_bytes(&[], None)?;
+            file_bytes(&[], None)?;
+            tuner.adopt(weights, 2.0);
         }
         self.0.encode(gaussians, context)
     }
@@ -105,6 +116,65 @@ fn a_codec_gets_views_renderer_and_field_only_with_a_scene() {
     };
     assert!(notes(None).is_empty());
     assert_eq!(notes(Some(&scene)), [format!("{} views, sizes agree: true", SceneViews::new(&scene).len())]);
+}
+
+/// A tuner that notes in which steps it encodes weights.
+#[derive(Default)]
+struct Counting {
+    encoded: RefCell<Vec<f64>>,
+    adopted: RefCell<Option<(Vec<WeightArray>, f64)>>,
+}
+
+impl TuneModel for Counting {
+    fn caution(&self) -> Result<Option<String>> {
+        Ok(None)
+    }
+    fn start(&self, gaussians: &HostGaussians) -> Result<TunedModel> {
+        Ok(TunedModel { gaussians: gaussians.clone(), weights: vec![WeightArray { name: "tuned".into(), shape: vec![2], values: vec![1.0, 2.0] }] })
+    }
+    fn tune(&self, from: &TunedModel, _: &Tuning) -> Result<TunedModel> {
+        Ok(from.clone())
+    }
+    fn psnr(&self, _: &HostGaussians, _: &[WeightArray], _: Option<f64>) -> Result<f64> {
+        Ok(0.0)
+    }
+    fn encoded_weights(&self, _: &[WeightArray], weight_steps: f64) -> Result<EncodedWeights> {
+        self.encoded.borrow_mut().push(weight_steps);
+        Ok((Vec::new(), toml::Table::from_iter([("steps".into(), weight_steps.into())])))
+    }
+    fn adopt(&self, weights: Vec<WeightArray>, weight_steps: f64) {
+        *self.adopted.borrow_mut() = Some((weights, weight_steps));
+    }
+    fn adopted(&self) -> Result<Option<EncodedWeights>> {
+        self.adopted.borrow().as_ref().map(|(weights, steps)| self.encoded_weights(weights, *steps)).transpose()
+    }
+}
+
+#[test]
+fn weights_are_encoded_once_for_each_of_their_steps() {
+    let registry = Registry::collect().unwrap();
+    let (model, scene, device, tuner) = (model(&registry), scene(), Device::flex(), Counting::default());
+    let (settings, limits) = (toml::Table::new(), Limits::default());
+    let options = ArchiveOptions { codec: "witness", settings: &settings, field_weights: "fp32", scene: Some((&scene, &device)), tuner: Some(&tuner) };
+    let bytes = model.to_archive(&options, &registry, &limits, &Silent).unwrap();
+    // Those of the codec twice, and once those of the model itself.
+    assert_eq!(*tuner.encoded.borrow(), [2.0, 4.0, 1.0]);
+    assert!(tuner.adopted.borrow().is_some(), "the tuner is told what was adopted");
+    let stored = Archive::from_bytes("t", bytes, &limits).unwrap().manifest().deformer.clone().unwrap().weights;
+    assert_eq!(stored.settings["steps"].as_float(), Some(2.0), "what was adopted is stored");
+}
+
+#[test]
+fn gaussians_that_no_reader_accepts_are_not_encoded() {
+    let registry = Registry::collect().unwrap();
+    let (model, settings) = (model(&registry), toml::Table::new());
+    let options = ArchiveOptions { codec: "raw", settings: &settings, field_weights: "fp32", scene: None, tuner: None };
+    let write = |max_bytes: u64| model.to_archive(&options, &registry, &Limits { max_bytes, ..Limits::default() }, &Silent);
+    let bytes = model.float32_size().point_cloud;
+    assert!(write(bytes).is_ok());
+    let refused = write(bytes - 1).unwrap_err();
+    assert!(matches!(&refused, Error::Limit { value, limit, .. } if (*value, *limit) == (bytes, bytes - 1)), "{refused}");
+    assert!(refused.to_string().contains("decoded bytes of 90 Gaussians") && refused.to_string().contains("limits.max_bytes"), "{refused}");
 }
 
 #[test]

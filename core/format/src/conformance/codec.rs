@@ -1,8 +1,8 @@
 //! The conformance suite of attribute codecs.
 
-use super::uniform;
+use super::{on_threads, uniform};
 use crate::gaussians::sh_rest_len;
-use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, NeededRows, Result, Seed, Silent, Stream, StreamStage};
+use crate::{AttributeCodec, CodecContext, CodecPlugin, ExtraAttribute, HostGaussians, Limits, NeededRows, Result, Seed, Silent, Stream, StreamStage, config};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Name of the extra attribute that identifies the Gaussians after a codec has reordered them.
@@ -12,13 +12,15 @@ const DAMAGES: usize = 24;
 
 /// Tests a codec. Each finding is a line; an empty list means that it passed.
 ///
-/// - Unknown settings are refused.
+/// - Its schema is TOML that it accepts; unknown settings and profiles are refused by name.
 /// - Decoding gives the same Gaussians in any order, with extra attributes bit for bit or as [`ExtraAttribute`] allows.
-/// - The error of each column is at most the declared one.
-/// - Equal inputs give equal bytes.
-/// - Sets of no Gaussians and of one Gaussian can be stored; Gaussians that are not finite are refused.
+/// - The error of each column is at most the declared one, also where all Gaussians are alike.
+/// - Equal inputs give equal bytes, whatever the number of threads. Streams have names that an archive can hold, and are decoded in any order.
+/// - Where [`AttributeCodec::keeps_motion`] says so, scores stay on their side of the threshold.
+/// - Sets of no Gaussians and of one Gaussian can be stored; values that are not finite, in any column or attribute, and columns of a wrong length are refused.
 /// - The streams of the first stages hold the first rows of the whole; coefficients of degrees that have streams of their own are 0 until their stage.
-/// - Truncated, damaged and missing streams give an error or valid Gaussians within the limits, never a panic.
+/// - Sound streams of more Gaussians or bytes than the limits allow are refused, and so are streams that end early or have bytes behind their end.
+/// - Damaged and missing streams give an error or valid Gaussians within the limits, never a panic.
 ///
 /// `profile` is the part after the colon of `name:profile`; `settings` can make an expensive codec fast.
 pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec<String> {
@@ -34,15 +36,18 @@ pub fn codec(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Vec
         Ok(Some(finding)) => findings.push(format!("{name}, {check}: {finding}")),
         Err(e) => findings.push(format!("{name}, {check}: {e}")),
     };
-    note("settings", refuses_unknown_settings(plugin, profile, settings));
+    note("settings", reads_settings(plugin, profile, settings));
     for (count, degree) in [(0, 3), (1, 2), (2, 0), (700, 3), (400, 1)] {
         note(&format!("{count} Gaussians of degree {degree}"), comes_back(codec, &scene(count, degree)));
     }
+    note("90 Gaussians that are alike", comes_back(codec, &alike(90, 1)));
     note("repeats", repeats(codec));
+    note("motion", keeps_motion(codec));
     for (count, degree) in [(0, 1), (1, 2), (300, 3)] {
         note(&format!("stages of {count} Gaussians"), arrives_in_stages(codec, &scene(count, degree)));
     }
-    note("values that are not finite", refuses_what_is_not_finite(codec));
+    note("invalid Gaussians", refuses_what_is_not_sound(codec));
+    note("limits", keeps_limits(codec));
     note("damaged streams", survives_damage(codec));
     findings
 }
@@ -78,14 +83,36 @@ fn scene(count: usize, sh_degree: usize) -> HostGaussians {
     g
 }
 
-fn refuses_unknown_settings(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Result<Option<String>> {
-    let mut settings = settings.clone();
-    settings.insert("no_such_setting".into(), 1.into());
-    Ok(match (plugin.build)(profile, &settings) {
-        Ok(_) => Some("an unknown setting was accepted".into()),
-        Err(e) if !e.to_string().contains("no_such_setting") => Some(format!("the error does not name the unknown setting: {e}")),
-        Err(_) => (plugin.build)("no-such-profile", &toml::Table::new()).is_ok().then(|| "an unknown profile was accepted".into()),
-    })
+/// The same with the columns of the first Gaussian in all rows. Attributes stay different.
+fn alike(count: usize, sh_degree: usize) -> HostGaussians {
+    let (mut g, first) = (scene(count, sh_degree), scene(1, sh_degree));
+    for ((_, _, values), (_, _, row)) in g.columns_mut().into_iter().zip(first.columns()) {
+        *values = row.repeat(count);
+    }
+    g
+}
+
+/// The streams of `given`, and what they are decoded to.
+fn stored(codec: &dyn AttributeCodec, given: &HostGaussians, context: &CodecContext) -> Result<(Vec<Stream>, HostGaussians)> {
+    let streams = codec.encode(given, context)?;
+    let found = codec.decode(&streams, &self::context())?;
+    Ok((streams, found))
+}
+
+fn reads_settings(plugin: &CodecPlugin, profile: &str, settings: &toml::Table) -> Result<Option<String>> {
+    let mut odd = settings.clone();
+    odd.insert("no_such_setting".into(), 1.into());
+    let of_setting = (plugin.build)(profile, &odd);
+    let of_profile = (plugin.build)("no-such-profile", &toml::Table::new());
+    for (built, what, name) in [(of_setting, "setting", "no_such_setting"), (of_profile, "profile", "no-such-profile")] {
+        match built {
+            Ok(_) => return Ok(Some(format!("an unknown {what} was accepted"))),
+            Err(e) if !e.to_string().contains(name) => return Ok(Some(format!("the error does not name the unknown {what}: {e}"))),
+            Err(_) => {}
+        }
+    }
+    let stated = config::parse_table(&format!("schema of codec {}", plugin.info.name), plugin.info.schema)?;
+    Ok((plugin.build)("", &stated).err().map(|e| format!("it refuses the settings that its schema states: {e}")))
 }
 
 fn relative_rms(before: &[f32], after: &[f32]) -> f64 {
@@ -99,20 +126,11 @@ fn relative_rms(before: &[f32], after: &[f32]) -> f64 {
 }
 
 fn comes_back(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Option<String>> {
-    let found = codec.decode(&codec.encode(given, &context())?, &context())?;
-    if (found.len(), found.sh_degree) != (given.len(), given.sh_degree) {
-        return Ok(Some(format!("{} Gaussians of degree {} came back", found.len(), found.sh_degree)));
-    }
-    let Some(marks) = found.extra.get(MARK).filter(|a| a.width == 1 && a.values.len() == given.len()) else {
-        return Ok(Some("extra attributes were lost".into()));
+    let (_, found) = stored(codec, given, &context())?;
+    let expected = match in_order_of(&found, given) {
+        Ok(expected) => expected,
+        Err(finding) => return Ok(Some(finding)),
     };
-    let order: Vec<usize> = marks.values.iter().map(|&v| v as usize).collect();
-    let mut all = order.clone();
-    all.sort_unstable();
-    if all != (0..given.len()).collect::<Vec<_>>() {
-        return Ok(Some("extra attributes were changed".into()));
-    }
-    let expected = given.select(&order);
     if !expected.extra.keys().eq(found.extra.keys()) {
         return Ok(Some("extra attributes are missing, or there are more of them".into()));
     }
@@ -136,6 +154,21 @@ fn comes_back(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Optio
     Ok(None)
 }
 
+/// The Gaussians `given` in the order in which they were `found`; else what is wrong with these.
+fn in_order_of(found: &HostGaussians, given: &HostGaussians) -> Result<HostGaussians, String> {
+    if (found.len(), found.sh_degree) != (given.len(), given.sh_degree) {
+        return Err(format!("{} Gaussians of degree {} came back", found.len(), found.sh_degree));
+    }
+    let marks = found.extra.get(MARK).filter(|a| a.width == 1 && a.values.len() == given.len()).ok_or("extra attributes were lost")?;
+    let order: Vec<usize> = marks.values.iter().map(|&v| v as usize).collect();
+    let mut all = order.clone();
+    all.sort_unstable();
+    if all != (0..given.len()).collect::<Vec<_>>() {
+        return Err("extra attributes were changed".into());
+    }
+    Ok(given.select(&order))
+}
+
 /// How `after` violates what `before` allows; `None` if it does not.
 fn attribute_changed(before: &ExtraAttribute, after: &ExtraAttribute) -> Option<String> {
     if after.width != before.width || after.values.len() != before.values.len() {
@@ -157,17 +190,50 @@ fn attribute_changed(before: &ExtraAttribute, after: &ExtraAttribute) -> Option<
 
 fn repeats(codec: &dyn AttributeCodec) -> Result<Option<String>> {
     let given = scene(300, 2);
-    let (first, second) = (codec.encode(&given, &context())?, codec.encode(&given, &context())?);
-    if first != second {
+    let run = |threads: usize| on_threads(threads, || stored(codec, &given, &context()));
+    let (first, again, parallel) = (run(1)??, run(1)??, run(3)??);
+    if first.0 != again.0 {
         return Ok(Some("two encodings of the same Gaussians differ".into()));
     }
-    let mut names: Vec<&str> = first.iter().map(|s| s.name.as_str()).collect();
+    if first.1 != again.1 {
+        return Ok(Some("two decodings of the same streams differ".into()));
+    }
+    if first != parallel {
+        return Ok(Some("streams or decoded Gaussians of one thread and of three differ".into()));
+    }
+    let (mut streams, found) = first;
+    let mut names: Vec<&str> = streams.iter().map(|s| s.name.as_str()).collect();
     names.sort_unstable();
     if let Some(twice) = names.windows(2).find(|w| w[0] == w[1]) {
         return Ok(Some(format!("two streams are called {}", twice[0])));
     }
-    let (a, b) = (codec.decode(&first, &context())?, codec.decode(&second, &context())?);
-    Ok((a != b).then(|| "two decodings of the same streams differ".into()))
+    if let Some(name) = names.iter().find(|n| n.is_empty() || n.len() > 255 || n.chars().any(char::is_control)) {
+        return Ok(Some(format!("an archive cannot hold a stream that is called {name:?}")));
+    }
+    // Archives sort streams by their stages.
+    streams.reverse();
+    let same = codec.decode(&streams, &context()).is_ok_and(|turned| turned == found);
+    Ok((!same).then(|| "streams in another order are not decoded to the same Gaussians".into()))
+}
+
+fn keeps_motion(codec: &dyn AttributeCodec) -> Result<Option<String>> {
+    if !codec.keeps_motion() {
+        return Ok(None);
+    }
+    let given = scene(300, 1);
+    // All may move, those above the score of one that does not, a few, none.
+    for threshold in [f32::NEG_INFINITY, given.dynamic_scores[1], 4.0, f32::INFINITY] {
+        let (_, found) = stored(codec, &given, &CodecContext { dynamic_threshold: Some(threshold), ..context() })?;
+        let expected = match in_order_of(&found, &given) {
+            Ok(expected) => expected,
+            Err(finding) => return Ok(Some(format!("with a threshold of {threshold}, {finding}"))),
+        };
+        let mut scores = expected.dynamic_scores.iter().zip(&found.dynamic_scores);
+        if let Some((before, after)) = scores.find(|(before, after)| (**before > threshold) != (**after > threshold)) {
+            return Ok(Some(format!("a score of {before} became {after}, across the threshold of {threshold}")));
+        }
+    }
+    Ok(None)
 }
 
 fn arrives_in_stages(codec: &dyn AttributeCodec, given: &HostGaussians) -> Result<Option<String>> {
@@ -206,12 +272,45 @@ fn arrives_in_stages(codec: &dyn AttributeCodec, given: &HostGaussians) -> Resul
     Ok(None)
 }
 
-fn refuses_what_is_not_finite(codec: &dyn AttributeCodec) -> Result<Option<String>> {
-    for value in [f32::NAN, f32::INFINITY] {
-        let mut given = scene(20, 1);
-        given.opacity_logits[3] = value;
-        if codec.encode(&given, &context()).is_ok() {
-            return Ok(Some(format!("an opacity of {value} was encoded")));
+fn refuses_what_is_not_sound(codec: &dyn AttributeCodec) -> Result<Option<String>> {
+    let sound = scene(20, 1);
+    let mut short = sound.clone();
+    short.sh_dc.pop();
+    let mut cases = vec![("a column of a wrong length".to_string(), short)];
+    for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        for (column, (name, _, _)) in sound.columns().into_iter().enumerate() {
+            let mut given = sound.clone();
+            given.columns_mut()[column].2[7] = value;
+            cases.push((format!("a value of {value} in {name}"), given));
+        }
+        for (name, attribute) in &sound.extra {
+            let (mut given, mut odd) = (sound.clone(), attribute.clone());
+            odd.values[7] = value;
+            given.extra.insert(name.clone(), odd);
+            cases.push((format!("a value of {value} in the attribute '{name}'"), given));
+        }
+    }
+    for (what, given) in cases {
+        match catch_unwind(AssertUnwindSafe(|| codec.encode(&given, &context()))) {
+            Err(_) => return Ok(Some(format!("it panics at {what}"))),
+            Ok(Ok(_)) => return Ok(Some(format!("{what} was encoded"))),
+            Ok(Err(_)) => {}
+        }
+    }
+    Ok(None)
+}
+
+fn keeps_limits(codec: &dyn AttributeCodec) -> Result<Option<String>> {
+    let given = scene(60, 1);
+    let streams = codec.encode(&given, &context())?;
+    let floats = given.columns().iter().map(|(_, _, values)| values.len()).chain(given.extra.values().map(|a| a.values.len())).sum::<usize>();
+    let few = Limits { max_gaussians: 59, ..Limits::default() };
+    let small = Limits { max_bytes: 4 * floats as u64 - 1, ..Limits::default() };
+    for (what, limits) in [("max_gaussians", few), ("max_bytes", small)] {
+        for decode in [AttributeCodec::decode, AttributeCodec::decode_stage] {
+            if decode(codec, &streams, &CodecContext { limits, ..context() }).is_ok() {
+                return Ok(Some(format!("more than the limit {what} allows was decoded")));
+            }
         }
     }
     Ok(None)
@@ -221,36 +320,40 @@ fn survives_damage(codec: &dyn AttributeCodec) -> Result<Option<String>> {
     let sound = codec.encode(&scene(60, 1), &context())?;
     let limits = Limits { max_gaussians: 1000, ..Limits::default() };
     let context = CodecContext { limits, ..context() };
-    let mut tries: Vec<(String, Vec<Stream>)> = vec![("no streams".into(), Vec::new())];
+    // What is damaged, whether that must be an error, and the streams.
+    let mut tries: Vec<(String, bool, Vec<Stream>)> = vec![("there are no streams".into(), true, Vec::new())];
     for index in 0..sound.len() {
         let name = &sound[index].name;
         let mut without = sound.clone();
         without.remove(index);
         // A stream may be optional, so both an error and a result are allowed without it.
-        tries.push((format!("'{name}' is missing"), without));
+        tries.push((format!("'{name}' is missing"), false, without));
         let length = sound[index].bytes.len();
         for k in 0..DAMAGES.min(2 * length) {
             let mut damaged = sound.clone();
             let bytes = &mut damaged[index].bytes;
             let at = (Seed::root(3).index((index * DAMAGES + k) as u64).value() % length as u64) as usize;
-            let what = if k % 3 == 0 {
+            let cut = k % 3 == 0;
+            let what = if cut {
                 bytes.truncate(at);
                 "is truncated"
             } else {
                 bytes[at] ^= 1 << (k % 8);
                 "has a flipped bit"
             };
-            tries.push((format!("'{name}' {what} at {at}"), damaged));
+            tries.push((format!("'{name}' {what} at {at}"), cut, damaged));
         }
         let mut longer = sound.clone();
         longer[index].bytes.extend([255; 9]);
-        tries.push((format!("'{name}' has trailing bytes"), longer));
+        tries.push((format!("'{name}' has trailing bytes"), true, longer));
     }
-    for (what, streams) in tries {
-        for decode in [AttributeCodec::decode, AttributeCodec::decode_stage] {
+    for (what, refused, streams) in tries {
+        // The first stages do not read all streams.
+        for (decode, refused) in [AttributeCodec::decode, AttributeCodec::decode_stage].into_iter().zip([refused, false]) {
             match catch_unwind(AssertUnwindSafe(|| decode(codec, &streams, &context))) {
                 Err(_) => return Ok(Some(format!("it panics where {what}"))),
                 Ok(Err(_)) => {}
+                Ok(Ok(_)) if refused => return Ok(Some(format!("it decodes Gaussians where {what}"))),
                 Ok(Ok(found)) => {
                     if found.validate("decoded", &limits).is_err() {
                         return Ok(Some(format!("invalid Gaussians were returned where {what}")));
@@ -261,3 +364,6 @@ fn survives_damage(codec: &dyn AttributeCodec) -> Result<Option<String>> {
     }
     Ok(None)
 }
+
+#[cfg(test)]
+mod tests;

@@ -98,8 +98,11 @@ impl Shape {
     pub fn of(gaussians: &HostGaussians) -> Self {
         Self { count: gaussians.len(), sh_degree: gaussians.sh_degree, extra: gaussians.extra.iter().map(|(n, a)| (n.clone(), a.width)).collect() }
     }
-    /// Appends the shape to a meta stream. Refuses names and widths that cannot be stored.
+    /// Appends the shape to a meta stream. Refuses names and widths that cannot be stored, and more Gaussians than streams can number.
     pub fn write(&self, out: &mut Vec<u8>) -> Result<()> {
+        if self.count as u64 > MAX_COUNT {
+            return Err(Error::limit("number of Gaussians to encode", self.count as u64, MAX_COUNT, "Remove Gaussians, or split the model into several"));
+        }
         out.extend((self.count as u64).to_le_bytes());
         out.push(self.sh_degree as u8);
         out.extend((self.extra.len() as u16).to_le_bytes());
@@ -164,6 +167,8 @@ impl Shape {
     }
 }
 
+/// Streams number rows with 32 bits.
+const MAX_COUNT: u64 = u32::MAX as u64;
 const MAX_EXTRA: usize = 256;
 const MAX_EXTRA_WIDTH: usize = 4096;
 
@@ -181,4 +186,17 @@ pub fn from_planes(mut reader: ByteReader, count: usize, width: usize) -> Result
         plane.iter().enumerate().for_each(|(i, &v)| rows[i * width + c] = v);
     }
     Ok(rows)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_gaussians_than_streams_can_number_are_refused() {
+        let write = |count: usize| Shape { count, sh_degree: 0, extra: Vec::new() }.write(&mut Vec::new());
+        assert!(write(u32::MAX as usize).is_ok());
+        let error = write(u32::MAX as usize + 1).unwrap_err();
+        assert!(matches!(error, Error::Limit { value: 4_294_967_296, limit: 4_294_967_295, .. }), "{error}");
+    }
 }
