@@ -2,12 +2,15 @@
 """Bytes, seconds and memory of every codec on a PLY file, repeated to a larger model. Each codec is encoded and decoded alone, each in a process of its own.
 
     benches/codec_speed.py OUT.json --ply FILE.ply [--copies 11] [--example target/release/examples/codec_speed] [--codecs raw,quantize,...] [--threads N]
-                           [--limit SECONDS] [--limits sorted-image=SECONDS,vq=SECONDS]
+                           [--limit SECONDS] [--limits sorted-image=SECONDS,vq=SECONDS] [--weights ARCHIVE.cc4d ...]
 
 Needs the built example: cargo build --release -p cc4dgs-codecs --example codec_speed. There is no scene, so that `compact` aims at 50 dB. Seconds are of encoding
 without Zstandard, median and least of --encodes (fewer where a minute is over before), and of decoding, of --decodes. Memory is the most that a process had, in
 MB, the program and what it had read included: before and after encoding, and where it decodes once and has done nothing else. A codec that takes longer than its
-limit has a row that says so. Run it while nothing else does. Writes OUT.json and prints a table.
+limit has a row that says so.
+
+--weights names archives whose deformer's weights are decoded, --decodes times each, Zstandard included: one model that `cc4dgs compress` stored with one
+--field-weights after another. Run it while nothing else does. Writes OUT.json and prints tables.
 """
 import argparse, hashlib, json, os, pathlib, subprocess, sys, tempfile
 
@@ -60,6 +63,17 @@ def table(rows):
         yield f"| `{r['codec']}` | {r['bytes_per_gaussian']:.2f} | {' | '.join(mb)} | {encode} | {decode} | {r['decode_cpu_least_s']:.3f} | {' | '.join(peaks)} |"
 
 
+def weights_table(rows):
+    yield "| archive | deformer | weights | values | MB | decode ms, median (least) | of processor ms | peak MB |"
+    yield "| --- | --- | --- |" + " ---: |" * 5
+    for r in rows:
+        if "bytes" not in r:
+            yield f"| {r['archive']} | over the limit of {r['over_the_limit_s']:g} s |" + " |" * 6
+            continue
+        decode = f"{1e3 * r['decode_median_s']:.2f} ({1e3 * r['decode_least_s']:.2f})"
+        yield f"| {r['archive']} | `{r['deformer']}` | `{r['plugin']['name']}` | {r['values']} | {r['bytes'] / 1e6:.4f} | {decode} | {1e3 * r['decode_cpu_least_s']:.2f} | {r['peak_mb']} |"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=pathlib.Path, metavar="OUT.json")
@@ -72,6 +86,7 @@ def main():
     parser.add_argument("--threads", type=int, help="threads of the example; all processors by default")
     parser.add_argument("--limit", type=float, default=600, help="seconds that a process may take")
     parser.add_argument("--limits", default="", help="the same for some codecs: sorted-image=1800,vq=1800")
+    parser.add_argument("--weights", nargs="+", default=[], type=pathlib.Path, metavar="ARCHIVE.cc4d", help="archives whose deformer's weights are decoded, too")
     args = parser.parse_args()
     if not args.example.exists():
         parser.error(f"{args.example} is not there; build it, or name it with --example")
@@ -80,14 +95,20 @@ def main():
     commit = subprocess.run(["git", "-C", str(pathlib.Path(__file__).parent), "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip()
     # The commit is that of the repository; the example may be older.
     digest = hashlib.sha256(args.example.read_bytes()).hexdigest()
-    found = {"ply": args.ply.name, "copies": args.copies, "commit": commit, "example_sha256": digest, "rows": []}
+    found = {"ply": args.ply.name, "copies": args.copies, "commit": commit, "example_sha256": digest, "rows": [], "weights": []}
     for codec in args.codecs.split(","):
         row, machine = measure(args, codec, limits.get(codec, args.limit))
         found = {**machine, **found, "rows": [*found["rows"], row]}
         # Whoever stops it keeps what is finished.
         args.out.write_text(json.dumps(found, indent=1) + "\n")
         print(json.dumps(row), file=sys.stderr)
-    print("\n".join(table(found["rows"])))
+    for archive in args.weights:
+        with tempfile.TemporaryDirectory() as name:
+            decoded = run(args, args.limit, pathlib.Path(name), archive)
+        row = decoded["rows"][0] if decoded else {"over_the_limit_s": args.limit}
+        found["weights"].append({"archive": archive.name} | row)
+        args.out.write_text(json.dumps(found, indent=1) + "\n")
+    print("\n".join([*table(found["rows"]), *(["", *weights_table(found["weights"])] if found["weights"] else [])]))
 
 
 if __name__ == "__main__":

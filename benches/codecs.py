@@ -1,18 +1,24 @@
 #!/usr/bin/env python3
 """Sizes, losses and times of codecs: a table of every codec on given models.
 
-    benches/codecs.py --cc4dgs target/release/cc4dgs --out benches/results/NAME [--codecs raw,quantize,...] MODEL=NAME[:SCENE]...
+    benches/codecs.py --cc4dgs target/release/cc4dgs --out benches/results/NAME [--codecs raw,quantize,...] [--ablation] MODEL=NAME[:SCENE]...
 
 With SCENE, PSNR and SSIM are those of `cc4dgs eval` on the test views, and codecs are given the scene. Without, a model is rendered from an orbit before and
 after by the example `compare`, which lies beside the program, and PSNR is between the two. Writes NAME.json and NAME.md, which hold numbers only.
 
-With a scene, `compact` has two rows: `finetune=0` and as it comes. Seconds are those that `compress` reports: of encoding, with the scene where there is one,
-and of decoding the file; memory is the most that its process had. Run it while nothing else does.
+With a scene, `compact` has two rows: `finetune=0` and as it comes. `--ablation` adds rows of `compact`, each with an idea switched off that has an effect on the
+model, and a table of them by stream. Without a scene, all of them aim at the same estimated PSNR: compare sizes beside the PSNR.
+
+Seconds are those that `compress` reports: of encoding, with the scene where there is one, and of decoding the file; memory is the most that its process had.
+Run it while nothing else does.
 """
 import argparse, json, os, pathlib, re, subprocess, sys, tempfile
 
 CODECS = "raw,quantize,sorted-image,spz,vq,cca:low,cca:mid,cca:default,compact"
 FRAMES = 12
+# The ideas of `compact`, each switched off, and those that have no effect without a scene.
+SWITCHES = ["adaptive=false", "measured=false", "transform=false", "shapes=false", "allocate=false", "joint=false", "canonical=false", "rate_weight=1.0"]
+NEED_SCENE = {"measured=false", "shapes=false", "allocate=false", "joint=false"}
 
 
 def run(program, *arguments):
@@ -31,8 +37,13 @@ def measured(program, *arguments):
         return out.read().decode(), usage.ru_maxrss * 1024 / 1e6
 
 
+def compare(program):
+    """The example that renders two models."""
+    return pathlib.Path(program).parent / "examples/compare"
+
+
 def between(program, model, other):
-    return json.loads(run(pathlib.Path(program).parent / "examples/compare", model, other, FRAMES))["psnr_db"]
+    return json.loads(run(compare(program), model, other, FRAMES))["psnr_db"]
 
 
 def measure(program, model, scene, codec, weights, settings, before, folder):
@@ -72,20 +83,45 @@ def table(rows, scene):
     return lines
 
 
+def column(stream):
+    """Where a stream of `compact` counts: layers after the first have numbers, and attributes of plug-ins have a stream per value."""
+    stream = re.sub(r"^(classes|shapes|moving|log_scales|means|quaternions|opacity_logits|sh\.0)\.\d+$", r"\1", stream)
+    return re.sub(r"^(coded|extra)\..*", r"\1", stream)
+
+
+def by_stream(rows, scene):
+    """Bytes per Gaussian of `compact` by stream, a row per idea that is switched off."""
+    whole = "compact finetune=0" if scene else "compact"
+    names = {"compact": "fine-tuning on", whole: "none"}
+    rows = [r for r in rows if r["codec"].split()[0] == "compact"]
+    sums = []
+    for r in rows:
+        sums.append({})
+        for stream, size in r["streams"].items():
+            sums[-1][column(stream)] = sums[-1].get(column(stream), 0.0) + size
+    columns = list(dict.fromkeys(c for of in sums for c in of))
+    yield "| without | " + "".join(f"`{c}` | " for c in columns) + "all | encode s | decode s |"
+    yield "| --- |" + " ---: |" * (len(columns) + 3)
+    for r, of in zip(rows, sums):
+        name = names.get(r["codec"], f"`{r['codec'].removeprefix(whole).strip()}`")
+        yield f"| {name} | " + "".join(f"{of.get(c, 0.0):.3f} | " for c in columns) + f"{r['bytes_per_gaussian']:.3f} | {r['encode_s']} | {r['decode_s']} |"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cc4dgs", default="target/release/cc4dgs")
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("--codecs", default=CODECS)
     parser.add_argument("--weights", default="fp16")
-    parser.add_argument("--ablation", action="store_true", help="compact with each of its ideas switched off")
+    parser.add_argument("--ablation", action="store_true", help="compact with each of its ideas switched off, and a table by stream")
     parser.add_argument("models", nargs="+", metavar="MODEL=NAME[:SCENE]")
     args = parser.parse_args()
-    switches = ["adaptive=false", "measured=false", "transform=false", "shapes=false", "allocate=false", "joint=false", "canonical=false", "rate_weight=1.0"] if args.ablation else []
     results, lines = [], []
     for spec in args.models:
         model, name = spec.split("=", 1)
         name, _, scene = name.partition(":")
+        if not scene and not compare(args.cc4dgs).exists():
+            parser.error(f"{compare(args.cc4dgs)} is not there, which compares renders of a model without SCENE: cargo build --release --workspace --examples")
         with tempfile.TemporaryDirectory() as folder:
             before = None
             if scene:
@@ -94,11 +130,18 @@ def main():
             untuned = ["finetune=0"] if scene else []
             todo = [(codec, untuned if codec.startswith("compact") else []) for codec in args.codecs.split(",")]
             todo += [(codec, []) for codec in args.codecs.split(",") if scene and codec.startswith("compact")]
-            todo += [("compact", [*untuned, s]) for s in switches]
+            if args.ablation:
+                todo += [("compact", untuned)] if ("compact", untuned) not in todo else []
+                todo += [("compact", [*untuned, s]) for s in SWITCHES if scene or s not in NEED_SCENE]
             rows = [measure(args.cc4dgs, model, scene, codec, args.weights, settings, before, folder) for codec, settings in todo]
+            # Large models have several layers.
+            if args.ablation and any("means.1" in row["streams"] for row in rows):
+                rows.append(measure(args.cc4dgs, model, scene, "compact", args.weights, [*untuned, "layers=1"], before, folder))
         about = f"{name}: {rows[0]['gaussians']} Gaussians" + (f", {before['psnr_db']:.3f} dB, SSIM {before['ssim']:.4f} on test views" if scene else ", no scene: PSNR between renders")
         results.append({"model": name, "scene": bool(scene), "psnr_db": before["psnr_db"] if scene else None, "rows": rows})
         lines += [f"## {about}", "", *table(rows, scene), ""]
+        if args.ablation:
+            lines += ["Bytes per Gaussian of `compact` by stream, without one of its ideas:", "", *by_stream(rows, scene), ""]
     args.out.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
     args.out.with_suffix(".md").write_text("\n".join(lines))
     print("\n".join(lines))

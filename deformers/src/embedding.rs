@@ -33,7 +33,7 @@ smooth_weight = 1.0      # weight of the differences between vectors of neighbou
 smooth_neighbours = 20   # the nearest Gaussians that count as neighbours
 smooth_falloff = 2000.0  # differences count exp(-smooth_falloff d^2 / 2) at distance d (published: 2000, d in units of the dataset; here in world units)
 gaussian_lr = 2.5e-3     # Adam on the vectors of Gaussians
-lr_start = 1.6e-4        # Adam on everything else, times the extent of the cameras, log-linear to lr_end
+lr_start = 1.6e-4        # Adam on everything else, times the extent of the cameras in the normalised frame, log-linear to lr_end
 lr_end = 1.6e-5
 "#;
 

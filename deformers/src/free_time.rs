@@ -21,7 +21,7 @@ hidden_below = 0.01      # a Gaussian whose opacity factor is below this is hidd
 center_lr = 1.6e-4       # Adam on T, as a share of the sequence
 width_lr = 5e-3          # Adam on the logarithms of r and s
 gate_lr = 1e-3           # Adam on the gate's logit over 20
-velocity_lr = 1.6e-3     # Adam on the velocity in world units per sequence, times the extent of the cameras
+velocity_lr = 1.6e-3     # Adam on the velocity in world units per sequence, times the extent of the cameras in the normalised frame
 ";
 
 /// Centres of life are spread over the sequence, and a tenth beyond either end.

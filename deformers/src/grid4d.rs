@@ -245,7 +245,8 @@ impl Deformer for Grid4d {
         let s = &self.settings;
         vec![ParameterGroup::plain("grid4d net", s.lr_start, s.lr_end), ParameterGroup::plain("grid4d tables", s.lr_grid_start, s.lr_grid_end)]
     }
-    /// Smoothness: squared differences of features at centres and at slightly perturbed centres, summed over channels and averaged over centres.
+    /// Smoothness: squared differences of features at centres and at slightly perturbed centres, both at `time_norm`, summed over channels and averaged over
+    /// centres.
     fn regularizer(&self, input: &SpatialInput, time_norm: f32, progress: f32) -> Result<Option<Tensor<1>>> {
         let s = &self.settings;
         let m = input.len();
@@ -296,5 +297,20 @@ mod tests {
             assert!(build(smooth_delta, smooth_weight).is_err(), "{smooth_delta}, {smooth_weight}");
         }
         assert!(build(0.0, 0.0).is_ok() && build(5e-3, 0.5).is_ok());
+    }
+
+    #[test]
+    fn smoothness_compares_features_of_one_time() {
+        let context = DeformerContext { box_min: [-1.0; 3], box_max: [1.0; 3], frame_count: 20, sh_degree: 0, seed: Seed::root(2) };
+        let of = |smooth_delta: f32, time_norm: f32| {
+            let small = Settings { log2_rows: 4, space_levels: 1, time_levels: 1, width: 4, smooth_delta, ..Settings::default() };
+            let deformer = Grid4d::new(small, &context, &Device::flex()).unwrap();
+            let input = SpatialInput::new(Tensor::from_floats([[0.3, -0.2, 0.1]], &Device::flex()));
+            deformer.regularizer(&input, time_norm, 0.5).unwrap().unwrap().into_scalar::<f32>()
+        };
+        for time_norm in [0.0, 0.5, 1.0] {
+            assert_eq!(of(0.0, time_norm), 0.0, "without perturbed centres there is no difference at {time_norm}");
+            assert!(of(0.01, time_norm) > 0.0, "{time_norm}");
+        }
     }
 }

@@ -28,7 +28,7 @@ half_time = false        # read only the upper half of the time axis, as the pub
 tv_space = 2e-4          # weight of the squared second differences of spatial planes
 tv_time = 1e-3           # the same for planes with time, along time
 time_one = 1e-4          # weight of the distance from 1 of planes with time
-lr_start = 1.6e-4        # Adam on the network, times the extent of the cameras, log-linear to lr_end
+lr_start = 1.6e-4        # Adam on the network, times the extent of the cameras in the normalised frame, log-linear to lr_end
 lr_end = 1.6e-5
 grid_rate = 10.0         # learning rate of the planes, as a multiple
 "#;

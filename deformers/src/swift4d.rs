@@ -24,7 +24,7 @@ features = 4             # features per level
 base = 16                # vertices per axis of the first level; each level doubles them
 width = 128              # width of encoder and heads
 heads = ["means", "log_scales", "quaternions", "opacity", "sh"]
-lr_start = 2e-4          # Adam, times the extent of the cameras, log-linear to lr_end
+lr_start = 2e-4          # Adam, times the extent of the cameras in the normalised frame, log-linear to lr_end
 lr_end = 2e-6
 "#;
 

@@ -18,14 +18,15 @@ pub fn json(name: &str) -> Value {
     serde_json::from_str(&text).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The fixtures called `kind`, or `kind_` and more: cases of one kind in different sizes.
-pub fn cases(kind: &str) -> Vec<Fixture> {
+/// The fixtures called `kind`, or `kind_` and more: cases of one kind in different sizes. The committed folder has those called `committed`, and no others.
+pub fn cases(kind: &str, committed: &[&str]) -> Vec<Fixture> {
     let files = std::fs::read_dir(folder()).unwrap_or_else(|e| panic!("{}: {e}", folder().display()));
     let names = files.filter_map(|entry| entry.expect("an entry").file_name().into_string().ok());
     let mut stems: Vec<String> = names.filter_map(|name| name.strip_suffix(".f64.safetensors").map(str::to_string)).collect();
     stems.retain(|stem| stem.strip_prefix(kind).is_some_and(|rest| rest.is_empty() || rest.starts_with('_')));
     stems.sort();
     assert!(!stems.is_empty(), "no fixture {kind} in {}", folder().display());
+    assert!(std::env::var_os("CC4DGS_GOLDEN").is_some() || stems == committed, "fixtures {stems:?} in tests/{}, not {committed:?}", folder().display());
     stems.iter().map(|stem| Fixture::open(stem)).collect()
 }
 

@@ -127,11 +127,15 @@ impl Stored {
         let found = presented(&self.model, cameras, up)?;
         Ok(Presentation { frames_per_second: stored.frames_per_second, seconds: stored.seconds, ..found })
     }
-    /// Whether the archive has no layer and needs none: players compute the motion from the deformer's weights.
-    fn computes_motion(&self, around: Surroundings) -> Result<bool> {
-        let archive = &self.archive;
-        Ok(PlaybackLayer::may_be_computed(archive)?
-            && PlaybackLayer::computed("the stored model", archive, &self.model.gaussians, self.model.moving, around.limits)?.is_some())
+    /// The motion as players compute it from the deformer's weights; `None` where the archive has a layer, or needs one.
+    ///
+    /// # Errors
+    /// As [`PlaybackLayer::computed`].
+    pub fn computed_motion(&self, around: Surroundings) -> Result<Option<PlaybackLayer>> {
+        if !PlaybackLayer::may_be_computed(&self.archive)? {
+            return Ok(None);
+        }
+        PlaybackLayer::computed("the stored model", &self.archive, &self.model.gaussians, self.model.moving, around.limits)
     }
     /// The archive with a playback layer, cameras and a poster.
     ///
@@ -141,7 +145,7 @@ impl Stored {
         options.presentation.validate("presentation")?;
         let stored = &self.archive.manifest().presentation.cameras;
         let cameras = if options.cameras.is_empty() { stored.as_slice() } else { options.cameras };
-        let computed = !options.baked && self.computes_motion(around)?;
+        let computed = !options.baked && self.computed_motion(around)?.is_some();
         let kept = computed || options.max_error.is_none() && self.bytes_of(StreamKind::Playback) > 0;
         let baked = if kept {
             None

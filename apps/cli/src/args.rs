@@ -9,7 +9,7 @@ mod sweep;
 pub use bench::{Bench, BenchAgree, BenchField, BenchFrame, BenchLookup, BenchLoss, BenchPlay, BenchSkip, BenchSort, BenchStep, BenchWhat};
 pub use files::{Decompress, Export, Render, Shots};
 pub use play::{Bake, View};
-#[cfg(feature = "view")]
+#[cfg(any(feature = "view", test))]
 pub use play::{VIEW_DEVICE, VIEW_MAX_ERROR};
 pub use prune::Prune;
 pub use sweep::{SchedulerArg, Sweep, SweepCollect, SweepEmit, SweepPlan, SweepRun, SweepWhat};
@@ -32,7 +32,7 @@ pub struct Cli {
     /// Threads to compute with; 0 uses all cores. Plans of the preset auto depend on it, other results do not.
     #[arg(long, global = true, value_name = "N", default_value_t = 0)]
     pub threads: usize,
-    /// Raise or lower what readers accept of a file, such as max_gaussians=50000000; may be given several times.
+    /// Raise or lower what readers accept of a file: max_bytes, max_gaussians, max_pixels or max_depth, such as max_gaussians=50000000; may be given several times.
     #[arg(long = "limit", global = true, value_name = "NAME=VALUE")]
     pub limits: Vec<String>,
     #[command(subcommand)]
@@ -68,7 +68,7 @@ pub enum Command {
     Info(Info),
     /// List the plug-ins, or show one with its settings.
     Plugins(Plugins),
-    /// Check this machine: processor, threads, devices, ffmpeg, and an image drawn by two rasterizers.
+    /// Check this machine: processor, threads, devices, adapters, ffmpeg, the page of the player, the weights of LPIPS, and an image drawn on each device.
     Doctor(Doctor),
     /// Try float32 against float64 under conditions that break floating point. Ends with 5 where a result is neither finite nor an error, and where an ordinary
     /// condition ends with an error.
@@ -90,17 +90,17 @@ pub struct Demo {
     /// Override a setting, such as train.iterations=500; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// Device to compute on.
+    /// Device to compute on [default: flex].
     #[arg(long, value_name = "NAME")]
     pub device: Option<String>,
 }
 
 #[derive(Debug, Args)]
 pub struct Train {
-    /// A dataset, or `procedural` for the built-in scene. The format is recognised.
+    /// The folder of a dataset, whose format is recognised; `procedural` is the built-in scene, `procedural:captures/NAME` a built-in capture.
     #[arg(long, value_name = "PATH")]
     pub scene: PathBuf,
-    /// Settings to start from; see `cc4dgs plugins`. Without one and without --config, `auto` chooses them by looking at the scene.
+    /// Settings to start from: a family, such as dnerf, or a family with another deformer, such as auto+hexplane; `cc4dgs plugins` lists both. Without one and without --config, `auto` chooses them by looking at the scene.
     #[arg(long, value_name = "NAME")]
     pub preset: Option<String>,
     /// Wall time that the preset `auto` plans for; ten on processors, five on a graphics card by default.
@@ -112,7 +112,7 @@ pub struct Train {
     /// Override a setting, such as train.iterations=5000; may be given several times. Plug-ins (deformer.kind=…) are chosen first, whatever the order.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// Device to compute on: auto, flex, ndarray, wgpu, cuda.
+    /// Device to compute on: auto, flex, ndarray, wgpu, wgpu:N, cuda. By default a graphics card with the preset auto, if there is one, else flex.
     #[arg(long, value_name = "NAME")]
     pub device: Option<String>,
     /// The run's folder.
@@ -153,7 +153,7 @@ pub struct Compress {
     /// Replace F.cc4d where it exists.
     #[arg(long)]
     pub overwrite: bool,
-    /// Device the deformer is loaded on.
+    /// Device the deformer is loaded on; with --scene, the model is also drawn and trained further on it.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }

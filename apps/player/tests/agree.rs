@@ -1,8 +1,8 @@
 //! Images of the player against those of the tile renderer, of a small model trained here and baked.
 #![allow(clippy::unwrap_used)]
 
-use cc4dgs::core::Limits;
 use cc4dgs::core::metrics::{Metric, Rounding};
+use cc4dgs::core::{Limits, Silent, StoredModel};
 use cc4dgs::play::bake::MaxError;
 use cc4dgs::play::player::FrameOptions;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings};
@@ -49,6 +49,10 @@ fn archive(session: &Session, folder: &Path, overrides: &[&str], baked: bool) ->
     let options = PlayableOptions { max_error: Some(MaxError::Pixels(0.1)), cameras: &[], presentation, poster: false, without_field: false, baked };
     let playable = stored.playable(options, around).unwrap();
     std::fs::write(&out, playable.bytes).unwrap();
+    if !baked {
+        let played = StoredModel::open(&out, &Limits::default(), &Silent).unwrap().playback;
+        assert!(played.is_some() && stored.computed_motion(around).unwrap() == played, "players compute another motion from the file");
+    }
     (out, playable.report.map(|report| report.at_samples))
 }
 

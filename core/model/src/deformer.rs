@@ -41,7 +41,7 @@ pub struct ParameterGroup {
     pub lr_end: f64,
     /// Linear warm-up from zero over this share of the stage.
     pub warmup: f64,
-    /// Whether the rates are multiplied by the extent of the cameras (as the Gaussians' positions are).
+    /// Whether the rates are multiplied by the extent of the cameras in the normalised frame, [`crate::Scene::extent`] (as those of the Gaussians' positions are).
     pub times_extent: bool,
     /// Adam's epsilon.
     pub epsilon: f64,
@@ -145,7 +145,7 @@ pub struct AttributeSpec {
     pub spread: f32,
     /// Learning rate of the optimizer.
     pub lr: f64,
-    /// Whether the rate is multiplied by the extent of the cameras (as that of the positions is).
+    /// Whether the rate is multiplied by the extent of the cameras in the normalised frame, [`crate::Scene::extent`] (as that of the positions is).
     pub times_extent: bool,
     /// Largest absolute error of a float after lossy compression. `None`: codecs that measure what errors change in images round by that, others store it
     /// bit for bit.

@@ -119,7 +119,7 @@ impl Leaves {
     }
 }
 
-/// The learning rate of a core attribute at `schedule`; positions move with the extent of the cameras.
+/// The learning rate of a core attribute at `schedule`; that of positions is multiplied by the extent of the cameras in the normalised frame.
 pub fn gaussian_rate(rates: &GaussianRates, name: &str, schedule: &Schedule) -> f64 {
     match name {
         "means" => {

@@ -29,7 +29,8 @@ pub struct StageLengths {
 }
 
 impl StageLengths {
-    /// The lengths of `config`; `score` says whether the score stage is needed at all (its share goes to the others). `extent` is that of the cameras.
+    /// The lengths of `config`; `score` says whether the score stage is needed at all (its share goes to the others). `extent` is that of the cameras in the
+    /// normalised frame.
     pub fn new(config: &TrainConfig, score: bool, extent: f32) -> Self {
         let mut shares = config.shares;
         if !score {

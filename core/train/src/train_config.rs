@@ -152,9 +152,9 @@ pub struct GaussianRates {
     pub batch_power: f64,
     /// Share of the main stage, at its end, over which every rate falls to 0 as a cosine; 0 is off.
     pub cooldown: f64,
-    /// Positions at the first iteration of a stage, times the camera extent.
+    /// Positions at the first iteration of a stage, times the extent of the cameras in the normalised frame ([`cc4dgs_core::Scene::extent`]).
     pub means: f64,
-    /// Positions at the last iteration of a stage, times the camera extent.
+    /// Positions at the last iteration of a stage, times the same extent.
     pub means_end: f64,
     /// Share of the way from the first rate of positions to the last one that the coarse stage goes: 1 is all of it, 0.25 that of the published 5,000 of 20,000 iterations.
     pub coarse_decay: f64,

@@ -2,7 +2,7 @@
 
 use crate::data::procedural::{Body, ProceduralScene, Viewpoint};
 use burn::tensor::Device;
-use cc4dgs_core::metrics::PSNR_CEILING_DB;
+use cc4dgs_core::metrics::psnr_of_mean_squared_error;
 use cc4dgs_core::{Event, EventSink, HostGaussians, Registry, Result, Split};
 use cc4dgs_play::{Model, Player};
 use glam::DVec3;
@@ -97,8 +97,7 @@ pub fn motion_scores(model: &Model, scene: &ProceduralScene, registry: &Registry
 
 /// PSNR in dB of `count` values of 8 bits whose squared errors add up to `error`; `None` of no values.
 fn psnr_of_sums(error: f64, count: u64) -> Option<f64> {
-    let mean = error / (255.0f64.powi(2) * count as f64);
-    (count > 0).then(|| if mean > 0.0 { (-10.0 * mean.log10()).min(PSNR_CEILING_DB) } else { PSNR_CEILING_DB })
+    (count > 0).then(|| psnr_of_mean_squared_error(error / (255.0f64.powi(2) * count as f64)))
 }
 
 /// The trajectory error from sums of squares over Gaussians and frames: of differences, of true displacements, and of the coordinates at the start.
@@ -179,6 +178,17 @@ mod tests {
     fn what_stands_still_has_no_trajectory() {
         assert_eq!(trajectory_error([4.0, 16.0, 100.0]), Some(0.5));
         assert_eq!((trajectory_error([1e-3, 1e-30, 100.0]), trajectory_error([0.0; 3])), (None, None));
+    }
+
+    #[test]
+    fn sums_have_the_psnr_of_the_metric() {
+        use cc4dgs_core::metrics::{Metric, PSNR_CEILING_DB, Rounding};
+        let (a, b) = ([0.0f32, 51.0, 255.0], [5.0f32, 51.0, 251.0]);
+        let unit = |values: [f32; 3]| values.map(|v| v / 255.0);
+        let whole = Metric::psnr(Rounding::EightBit).score(&unit(a), &unit(b), [3, 1, 1], None).unwrap();
+        let sums = [psnr_of_sums(25.0 + 16.0, 3), psnr_of_sums(0.0, 3), psnr_of_sums(0.0, 0)];
+        assert!((sums[0].unwrap() - whole).abs() < 1e-9, "{sums:?}, {whole}");
+        assert_eq!((sums[1], sums[2]), (Some(PSNR_CEILING_DB), None));
     }
 
     #[test]

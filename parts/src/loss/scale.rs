@@ -1,4 +1,4 @@
-//! Loss term: mean standard deviation of the Gaussians, divided by the extent of the cameras. It favours few and small Gaussians (3DGS-MCMC).
+//! Loss term: mean standard deviation of the Gaussians, divided by the extent of the cameras in the normalised frame. It favours few and small Gaussians (3DGS-MCMC).
 
 use burn::tensor::Tensor;
 
@@ -32,7 +32,7 @@ inventory::submit! {
         info: Plugin {
             name: "scale",
             version: "1",
-            summary: "mean standard deviation of the Gaussians, divided by the extent of the cameras",
+            summary: "mean standard deviation of the Gaussians, divided by the extent of the cameras in the normalised frame",
             paper: "Kheradmand et al. 2024 (3DGS-MCMC)",
             schema: "# no settings\n",
             capabilities: &["differentiable"],

@@ -58,7 +58,9 @@ fn join_coefficients(dc: &[f64], rest: &[f64], n: usize) -> Vec<f64> {
 #[test]
 fn golden_scenes_are_all_there() {
     let names: Vec<String> = scenes().into_iter().map(|scene| scene.name).collect();
-    assert!(names.len() >= 20, "{names:?}");
+    // Another folder may have other scenes.
+    let committed = std::env::var_os("CC4DGS_GOLDEN").is_none();
+    assert!(names.len() >= 20 && (!committed || names.len() == 21), "{} scenes: {names:?}", names.len());
     for needed in ["raster_a.inria", "raster_b2.gsplat099", "raster_b4.gsplat099", "raster_c.gsplat099", "raster_d_clamp_tie.gsplat0999"] {
         assert!(names.iter().any(|name| name == needed), "{needed} is missing");
     }

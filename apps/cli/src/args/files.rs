@@ -59,7 +59,7 @@ pub struct Shots {
     /// Which side of the dataset's split; with --scene only.
     #[arg(long, value_enum, default_value_t = SplitArg::Test, requires = "scene")]
     pub split: SplitArg,
-    /// Frames: of the orbit (default 60), at most so many of the dataset, spread over cameras and frames, or of ply-sequence (default: those of training).
+    /// Number of frames: of the orbit (60 by default); at most so many of the dataset, spread over cameras and frames (all by default); of ply-sequence (those of training by default).
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: Option<u32>,
     /// Image size in pixels; by default 800x600 for an orbit, for datasets their own.

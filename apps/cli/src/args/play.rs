@@ -50,9 +50,9 @@ pub struct Bake {
 }
 
 /// What `view` takes without `--device` and `--max-error`.
-#[cfg(feature = "view")]
+#[cfg(any(feature = "view", test))]
 pub const VIEW_DEVICE: &str = "flex";
-#[cfg(feature = "view")]
+#[cfg(any(feature = "view", test))]
 pub const VIEW_MAX_ERROR: &str = "0.1px";
 
 #[cfg(feature = "view")]

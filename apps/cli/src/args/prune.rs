@@ -26,7 +26,7 @@ pub struct Prune {
     /// Scene options over those the model was trained with, such as scene.ffmpeg=/opt/ffmpeg/bin/ffmpeg; may be given several times.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub sets: Vec<String>,
-    /// Device to render on.
+    /// Device to render and to train on.
     #[arg(long, value_name = "NAME", default_value = "flex")]
     pub device: String,
 }

@@ -17,7 +17,7 @@ pub enum SweepWhat {
     Run(SweepRun),
     /// Check that every cell is there, and write the tables.
     Collect(SweepCollect),
-    /// Print a job file for a scheduler: each index runs one training with its cells.
+    /// Print a job file for a scheduler: each index runs one training with its cells, on --threads threads (one by default).
     Emit(SweepEmit),
 }
 
@@ -48,7 +48,7 @@ pub struct SweepRun {
     /// The sweep's folder.
     #[arg(value_name = "DIR")]
     pub dir: PathBuf,
-    /// Processes at a time, each with --threads threads; by default as many as the processor has cores for.
+    /// Processes at a time, each with --threads threads; by default as many as there are cores for, and without --threads one, which uses all cores.
     #[arg(long, value_name = "P", conflicts_with_all = ["cell", "index"], value_parser = clap::value_parser!(u64).range(1..=1024))]
     pub jobs: Option<u64>,
     /// Run one cell, and its training if that is missing.

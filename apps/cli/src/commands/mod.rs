@@ -7,7 +7,8 @@ mod decompress;
 mod demo;
 mod doctor;
 mod eval;
-#[cfg(feature = "view")]
+// Needs no window, so it is tested without one.
+#[cfg(any(feature = "view", test))]
 mod exact;
 mod export;
 mod image_folder;
@@ -22,6 +23,8 @@ mod sweep;
 mod train;
 #[cfg(feature = "view")]
 mod view;
+#[cfg(any(feature = "view", test))]
+mod view_command;
 #[cfg(feature = "view")]
 mod watch;
 

@@ -1,10 +1,11 @@
 //! `cc4dgs view`.
 
+use super::view_command::view_command;
 use super::{Context, exact};
-use crate::args::{VIEW_DEVICE, VIEW_MAX_ERROR, View};
+use crate::args::View;
 use cc4dgs::playable::{PlayableOptions, Storage, Stored, Surroundings};
-use cc4dgs_core::archive::Archive;
-use cc4dgs_core::{Error, EventSink, Limits, Registry, Result, Silent, StoredModel, parse_device};
+use cc4dgs_core::archive::{Archive, Manifest};
+use cc4dgs_core::{EventSink, Limits, Registry, Result, Silent, StoredModel, parse_device};
 use cc4dgs_play::bake::MaxError;
 use cc4dgs_play::source::{Source, SourceKind};
 use cc4dgs_player::Content;
@@ -43,20 +44,6 @@ fn start(args: &View) -> Result<Start> {
     Ok(Start { time: args.time.as_deref().map(Start::parse_time).transpose()?, pose: args.pose.as_deref().map(Start::parse_pose).transpose()? })
 }
 
-/// The command with the options that say how models are opened, where they are not the usual ones. What they may be needs no quotes.
-fn command(args: &View, limits: &Limits) -> Result<String> {
-    let mut out = "cc4dgs view".to_string();
-    for (name, value, usual) in [("device", &args.device, VIEW_DEVICE), ("max-error", &args.max_error, VIEW_MAX_ERROR)] {
-        if value != usual {
-            out += &format!(" --{name} {value}");
-        }
-    }
-    let table = |limits: &Limits| toml::Table::try_from(limits).map_err(|e| Error::backend("limits", e.to_string(), "Report this as a defect"));
-    let (limits, usual) = (table(limits)?, table(&Limits::default())?);
-    let changed = limits.iter().filter(|(name, value)| usual.get(*name) != Some(value));
-    Ok(changed.fold(out, |out, (name, value)| format!("{out} --limit {name}={value}")))
-}
-
 fn content(path: &Path, options: &Options, registry: &Registry, events: &dyn EventSink) -> Result<Content> {
     let Options { device, max_error, limits } = options;
     let source = Source::expect(path)?;
@@ -77,7 +64,13 @@ fn content(path: &Path, options: &Options, registry: &Registry, events: &dyn Eve
     let around = Surroundings { registry, device: &device, limits, events, stop: &AtomicBool::new(false) };
     let stored = Stored::open(path, Storage { codec: "raw", field_weights: "fp32" }, around)?;
     let presentation = stored.presentation(&[], None)?;
-    let options = PlayableOptions { max_error: Some(*max_error), cameras: &[], presentation, poster: false, without_field: true, baked: false };
+    if let Some(motion) = stored.computed_motion(around)? {
+        let Stored { archive, model } = stored;
+        let manifest = Manifest { presentation, ..archive.manifest().clone() };
+        let stored = StoredModel { manifest, gaussians: model.gaussians, moving: model.moving, playback: Some(motion) };
+        return Content::of_model(stored, archive.total_bytes()?);
+    }
+    let options = PlayableOptions { max_error: Some(*max_error), cameras: &[], presentation, poster: false, without_field: true, baked: true };
     let playable = stored.playable(options, around)?;
     Content::read(&object, playable.bytes, limits)
 }
@@ -92,20 +85,7 @@ pub fn show(args: &View, limits: Limits, opened: Opened) -> Result<()> {
     let options = Options::of(args, limits)?;
     // On a thread of the pool, as all commands: baking computes in parallel.
     let open = move |path: &Path| rayon::scope(|_| options.open(path, &Registry::collect()?, &Silent));
-    let source = window::Source { path: args.model.clone(), open: Arc::new(open), start: start(args)?, command: command(args, &limits)? };
+    let command = view_command(&args.device, &args.max_error, &limits)?;
+    let source = window::Source { path: args.model.clone(), open: Arc::new(open), start: start(args)?, command };
     window::show(&title, Shown::Model(Box::new(opened), source))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_command_has_the_options_that_are_not_usual() {
-        let mut args = View { model: "a.cc4d".into(), max_error: VIEW_MAX_ERROR.into(), time: None, pose: None, device: VIEW_DEVICE.into() };
-        assert_eq!(command(&args, &Limits::default()).unwrap(), "cc4dgs view");
-        (args.device, args.max_error) = ("wgpu:1".into(), "0.5px".into());
-        let limits = Limits { max_gaussians: 7, ..Limits::default() };
-        assert_eq!(command(&args, &limits).unwrap(), "cc4dgs view --device wgpu:1 --max-error 0.5px --limit max_gaussians=7");
-    }
 }

@@ -19,5 +19,5 @@ pub use lpips::{InstalledLpips, LPIPS_FILE, LPIPS_SMALLEST_SIDE, LPIPS_VARIABLE,
 pub use ms_ssim::{MS_SSIM_WEIGHTS, ms_ssim};
 pub use planes::Planes;
 pub use protocol::{FrameSet, MaskRule, Metric, MetricKind, Padding, Protocol, Rounding, Window};
-pub use psnr::{PSNR_CEILING_DB, mean_absolute_error, mean_squared_error, psnr};
+pub use psnr::{PSNR_CEILING_DB, mean_absolute_error, mean_squared_error, psnr, psnr_of_mean_squared_error};
 pub use ssim::{SsimConvention, ssim};

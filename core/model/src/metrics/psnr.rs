@@ -40,8 +40,12 @@ pub fn mean_absolute_error(a: &Planes, b: &Planes, mask: Option<&[bool]>) -> Res
     mean(a, b, mask, |x, y| (x - y).abs())
 }
 
+/// 10 log10(1 / MSE) in dB for data range 1; at most [`PSNR_CEILING_DB`], which is that of an MSE of 0.
+pub fn psnr_of_mean_squared_error(mse: f64) -> f64 {
+    if mse > 0.0 { (-10.0 * mse.log10()).min(PSNR_CEILING_DB) } else { PSNR_CEILING_DB }
+}
+
 /// 10 log10(1 / MSE) in dB for data range 1, the MSE taken over all channels and pixels at once; at most [`PSNR_CEILING_DB`].
 pub fn psnr(a: &Planes, b: &Planes, mask: Option<&[bool]>) -> Result<f64> {
-    let mse = mean_squared_error(a, b, mask)?;
-    Ok(if mse > 0.0 { (-10.0 * mse.log10()).min(PSNR_CEILING_DB) } else { PSNR_CEILING_DB })
+    Ok(psnr_of_mean_squared_error(mean_squared_error(a, b, mask)?))
 }

@@ -5,7 +5,7 @@ use crate::gaussian_set::log_linear;
 use burn::tensor::{Gradients, Tensor};
 use cc4dgs_core::{Optimizer, Parameter, ParameterGroup, Result, StepSettings, ordered_sum};
 
-/// The learning rate of `group` at `progress` in 0..1 of the stage; `extent` is that of the cameras.
+/// The learning rate of `group` at `progress` in 0..1 of the stage; `extent` is that of the cameras in the normalised frame.
 pub(crate) fn rate(group: &ParameterGroup, progress: f64, extent: f64) -> f64 {
     let warm = if group.warmup > 0.0 { (progress / group.warmup).min(1.0) } else { 1.0 };
     log_linear(group.lr_start, group.lr_end, progress) * warm * if group.times_extent { extent } else { 1.0 }

@@ -76,7 +76,7 @@ inventory::submit! {
             version: "1",
             summary: "swings by an amount linear in the position",
             paper: "an example",
-            schema: "cycles = 1.0             # per sequence\nlr = 1e-3                # Adam, times the extent of the cameras\n",
+            schema: "cycles = 1.0             # per sequence\nlr = 1e-3                # Adam, times the extent of the cameras in the normalised frame\n",
             capabilities: &["differentiable", "starts-as-identity"],
         },
         build,

@@ -79,7 +79,7 @@ inventory::submit! {
             version: "1",
             summary: "an amplitude and a phase per Gaussian, and one wind",
             paper: "an example",
-            schema: "cycles = 1.0             # per sequence\nlr = 1e-3                # Adam on the amplitudes, times the extent of the cameras; phases ten times as fast\n",
+            schema: "cycles = 1.0             # per sequence\nlr = 1e-3                # Adam on the amplitudes, times the extent of the cameras in the normalised frame; phases ten times as fast\n",
             capabilities: &["differentiable", "starts-as-identity", "per-gaussian-attributes"],
         },
         build,

@@ -153,20 +153,32 @@ fn hostile_documents_are_refused() {
     }
 }
 
-/// Contributed files: each must be refused by the reader of its folder.
+/// Contributed scenes with all of their files: without one, a scene would be refused for another reason than its own.
+const CORPUS: [(&str, &[&str]); 9] = [
+    ("blender_nan_pose", &["a.png", "transforms_train.json"]),
+    ("blender_no_pictures", &["transforms_train.json"]),
+    ("colmap_binary_huge_count", &["cameras.bin", "images.bin"]),
+    ("colmap_text_unknown_model", &["cameras.txt", "images.txt", "images/a.png"]),
+    ("llff_huge_shape", &["poses_bounds.npy", "images/0.png"]),
+    ("llff_nested_header", &["poses_bounds.npy", "images/0.png"]),
+    ("nerfstudio_sheared_pose", &["a.png", "transforms.json"]),
+    ("panoptic_ragged", &["train_meta.json"]),
+    ("technicolor_short_row", &["Painter_undist_00100_00.png", "cameras_parameters.txt"]),
+];
+
+/// Each must be refused by the reader of its folder.
 #[test]
 fn the_corpus_is_refused() {
     let corpus = Path::new("bad/scenes");
-    let mut seen = 0;
-    for entry in std::fs::read_dir(corpus).unwrap() {
-        let path = entry.unwrap().path();
-        if path.is_dir() {
-            let error = open(&path).err().unwrap_or_else(|| panic!("{} was opened", path.display()));
-            assert!(matches!(error.exit_code(), 2..=4), "{}: {error}", path.display());
-            seen += 1;
-        }
+    for (name, files) in CORPUS {
+        let path = corpus.join(name);
+        let missing: Vec<&str> = files.iter().copied().filter(|file| !path.join(file).is_file()).collect();
+        assert!(missing.is_empty(), "tests/{} lacks {missing:?}", path.display());
+        let error = open(&path).err().unwrap_or_else(|| panic!("{} was opened", path.display()));
+        assert!(matches!(error.exit_code(), 2..=4), "{}: {error}", path.display());
     }
-    assert!(seen >= 6, "{seen} scenes in {}", corpus.display());
+    let listed = std::fs::read_dir(corpus).unwrap().filter(|entry| entry.as_ref().unwrap().path().is_dir()).count();
+    assert_eq!(listed, CORPUS.len(), "a scene in tests/bad/scenes is not in the list of this test");
 }
 
 proptest! {

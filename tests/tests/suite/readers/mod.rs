@@ -3,6 +3,7 @@
 mod captures;
 pub mod common;
 mod conformance;
+mod course;
 mod first_points;
 mod formats;
 mod golden;

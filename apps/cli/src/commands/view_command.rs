@@ -1,0 +1,31 @@
+//! The command that opens a window, as the window prints it.
+
+use crate::args::{VIEW_DEVICE, VIEW_MAX_ERROR};
+use cc4dgs_core::{Error, Limits, Result};
+
+/// `cc4dgs view` with the options that say how models are opened, where they are not the usual ones. What they may be needs no quotes.
+pub fn view_command(device: &str, max_error: &str, limits: &Limits) -> Result<String> {
+    let mut out = "cc4dgs view".to_string();
+    for (name, value, usual) in [("device", device, VIEW_DEVICE), ("max-error", max_error, VIEW_MAX_ERROR)] {
+        if value != usual {
+            out += &format!(" --{name} {value}");
+        }
+    }
+    let table = |limits: &Limits| toml::Table::try_from(limits).map_err(|e| Error::backend("limits", e.to_string(), "Report this as a defect"));
+    let (limits, usual) = (table(limits)?, table(&Limits::default())?);
+    let changed = limits.iter().filter(|(name, value)| usual.get(*name) != Some(value));
+    Ok(changed.fold(out, |out, (name, value)| format!("{out} --limit {name}={value}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_has_the_options_that_are_not_usual() {
+        assert_eq!(view_command(VIEW_DEVICE, VIEW_MAX_ERROR, &Limits::default()).unwrap(), "cc4dgs view");
+        let limits = Limits { max_gaussians: 7, ..Limits::default() };
+        let command = view_command("wgpu:1", "0.5px", &limits).unwrap();
+        assert_eq!(command, "cc4dgs view --device wgpu:1 --max-error 0.5px --limit max_gaussians=7");
+    }
+}
