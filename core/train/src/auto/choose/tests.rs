@@ -71,6 +71,7 @@ fn scenes_get_what_they_need_and_no_more() {
     let decoded = chosen(&facts(Arrangement::OneCameraAnywhere), MACHINE, 5.0, Some(CDF_BASIS));
     assert_eq!((value(&decoded, "deformer.capacity"), value(&decoded, "deformer.cycles")), (Some("small".into()), Some(0.5.into())));
     assert_eq!(value(&decoded, "deformer.sparsity"), Some(0.0.into()));
+    assert_eq!((stored(90.0, "deformer.head_layers"), value(&decoded, "deformer.head_layers")), (Some(0.into()), None));
     let tables = chosen(&facts(Arrangement::Rig), MACHINE, 5.0, Some(HASH_BASIS));
     assert_eq!((value(&tables, "deformer.kind"), value(&tables, "deformer.log2_rows")), (Some("hash-basis".into()), Some(13.into())));
     let other = chosen(&facts(Arrangement::Dome), MACHINE, 5.0, Some("hexplane"));
