@@ -49,29 +49,31 @@ def measure(args, codec, limit):
         return row | {new: alone[old] for old, new in names.items() if old in alone}, encoded
 
 
-def table(rows):
-    yield "| codec | bytes per Gaussian | MB | decoded MB | encode s, median (least) | decode s, median (least) | of processor s | peak MB: loaded | encoding | decoding alone |"
-    yield "| --- |" + " ---: |" * 9
-    for r in rows:
-        if "bytes" not in r:
-            yield f"| `{r['codec']}` | over the limit of {r['over_the_limit_s']:g} s |" + " |" * 8
-            continue
-        mb = [f"{r[key] / 1e6:.3f}" for key in ("bytes", "decoded_bytes")]
-        peaks = [str(r.get(key, "over the limit")) for key in ("loaded_peak_mb", "encode_peak_mb", "decode_alone_peak_mb")]
-        encode = f"{r['encode_median_s']:.2f} ({r['encode_least_s']:.2f})"
-        decode = f"{r['decode_median_s']:.3f} ({r['decode_least_s']:.3f})"
-        yield f"| `{r['codec']}` | {r['bytes_per_gaussian']:.2f} | {' | '.join(mb)} | {encode} | {decode} | {r['decode_cpu_least_s']:.3f} | {' | '.join(peaks)} |"
+def table(heading, left_aligned, rows, cells):
+    """Lines of a table whose first cell is a name; `cells` gives those of a row that kept to its limit."""
+    columns = heading.count("|") - 1
+    yield heading
+    yield "|" + " --- |" * left_aligned + " ---: |" * (columns - left_aligned)
+    for name, r in rows:
+        own = cells(r) if "bytes" in r else [f"over the limit of {r['over_the_limit_s']:g} s"] + [""] * (columns - 2)
+        yield "| " + " | ".join([name, *own]) + " |"
 
 
-def weights_table(rows):
-    yield "| archive | deformer | weights | values | MB | decode ms, median (least) | of processor ms | peak MB |"
-    yield "| --- | --- | --- |" + " ---: |" * 5
-    for r in rows:
-        if "bytes" not in r:
-            yield f"| {r['archive']} | over the limit of {r['over_the_limit_s']:g} s |" + " |" * 6
-            continue
-        decode = f"{1e3 * r['decode_median_s']:.2f} ({1e3 * r['decode_least_s']:.2f})"
-        yield f"| {r['archive']} | `{r['deformer']}` | `{r['plugin']['name']}` | {r['values']} | {r['bytes'] / 1e6:.4f} | {decode} | {1e3 * r['decode_cpu_least_s']:.2f} | {r['peak_mb']} |"
+def codec_cells(r):
+    peaks = [str(r.get(key, "over the limit")) for key in ("loaded_peak_mb", "encode_peak_mb", "decode_alone_peak_mb")]
+    encode = f"{r['encode_median_s']:.2f} ({r['encode_least_s']:.2f})"
+    decode = f"{r['decode_median_s']:.3f} ({r['decode_least_s']:.3f})"
+    mb = [f"{r[key] / 1e6:.3f}" for key in ("bytes", "decoded_bytes")]
+    return [f"{r['bytes_per_gaussian']:.2f}", *mb, encode, decode, f"{r['decode_cpu_least_s']:.3f}", *peaks]
+
+
+def weight_cells(r):
+    decode = f"{1e3 * r['decode_median_s']:.2f} ({1e3 * r['decode_least_s']:.2f})"
+    return [f"`{r['deformer']}`", f"`{r['plugin']['name']}`", str(r["values"]), f"{r['bytes'] / 1e6:.4f}", decode, f"{1e3 * r['decode_cpu_least_s']:.2f}", str(r["peak_mb"])]
+
+
+CODEC_HEADING = "| codec | bytes per Gaussian | MB | decoded MB | encode s, median (least) | decode s, median (least) | of processor s | peak MB: loaded | encoding | decoding alone |"
+WEIGHT_HEADING = "| archive | deformer | weights | values | MB | decode ms, median (least) | of processor ms | peak MB |"
 
 
 def main():
@@ -108,7 +110,9 @@ def main():
         row = decoded["rows"][0] if decoded else {"over_the_limit_s": args.limit}
         found["weights"].append({"archive": archive.name} | row)
         args.out.write_text(json.dumps(found, indent=1) + "\n")
-    print("\n".join([*table(found["rows"]), *(["", *weights_table(found["weights"])] if found["weights"] else [])]))
+    print("\n".join(table(CODEC_HEADING, 1, [(f"`{r['codec']}`", r) for r in found["rows"]], codec_cells)))
+    if found["weights"]:
+        print("\n".join(["", *table(WEIGHT_HEADING, 3, [(r["archive"], r) for r in found["weights"]], weight_cells)]))
 
 
 if __name__ == "__main__":
