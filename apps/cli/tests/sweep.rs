@@ -11,6 +11,7 @@ const GRID: &str = "name = 'small'
 iterations = 90
 images = 1
 max_views = 2
+validation = 2
 [[scene]]
 name = 'tiny'
 path = 'procedural:tiny'
@@ -110,6 +111,9 @@ fn a_grid_becomes_tables() {
     assert!(protocol["rounding"] == "eight-bit" && protocol["frames"]["count"] == 2, "{protocol}");
     assert!(result["absent"]["ms_ssim"].as_str().unwrap().contains("too small"), "{}", result["absent"]);
     assert!(result["curve"]["iteration"].as_array().unwrap().last() == Some(&Value::from(90)), "{}", result["curve"]);
+    let curve = &stored["validation_curve"];
+    assert!(curve["iteration"].as_array().unwrap().last() == Some(&Value::from(90)) && curve["psnr_db"][0].as_f64() > Some(1.0), "{curve}");
+    assert_eq!(curve["iteration"].as_array().unwrap().len(), stored["cost"]["validation_seconds"].as_array().unwrap().len());
     assert_eq!(result["provenance"]["configuration"]["train"]["iterations"], 90);
 
     let report = succeed(&["sweep", "collect", text(&pool)]);

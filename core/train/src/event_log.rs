@@ -95,6 +95,19 @@ pub struct History {
     pub resumed: usize,
     /// What it reached on the way. An iteration that was repeated after an interruption is there once.
     pub points: Vec<HistoryPoint>,
+    /// Scores of views that are kept out of training, likewise.
+    pub validation: Vec<ValidationPoint>,
+}
+
+/// A score of views that are kept out of training.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ValidationPoint {
+    /// Over all stages, from 1.
+    pub iteration: usize,
+    /// Seconds since the training began.
+    pub seconds: f64,
+    /// Mean PSNR in dB; images are not rounded to 8 bits.
+    pub psnr_db: f32,
 }
 
 /// A training at one iteration.
@@ -124,6 +137,7 @@ pub fn read_history(path: &Path) -> Result<History> {
     let text = std::fs::read(path).map_err(|e| Error::io(path, e))?;
     let mut history = History::default();
     let mut points: BTreeMap<usize, HistoryPoint> = BTreeMap::new();
+    let mut validation: BTreeMap<usize, ValidationPoint> = BTreeMap::new();
     // Iterations before each stage, and seconds of the processes before this one.
     let mut before: BTreeMap<String, usize> = BTreeMap::new();
     let (mut iterations, mut earlier, mut last, mut has_started) = (0, 0.0, 0.0, false);
@@ -154,12 +168,17 @@ pub fn read_history(path: &Path) -> Result<History> {
                 let iteration = before.get(&stage).copied().unwrap_or(0) + iteration;
                 points.insert(iteration, HistoryPoint { iteration, seconds: earlier + seconds, psnr_db, gaussians });
             }
+            Event::Validated { stage, iteration, psnr_db, .. } => {
+                let iteration = before.get(&stage).copied().unwrap_or(0) + iteration;
+                validation.insert(iteration, ValidationPoint { iteration, seconds: earlier + seconds, psnr_db });
+            }
             _ => {}
         }
     }
     history.seconds = earlier + last;
     history.resumed = history.resumed.saturating_sub(1);
     history.points = points.into_values().collect();
+    history.validation = validation.into_values().collect();
     Ok(history)
 }
 
@@ -175,24 +194,42 @@ mod tests {
         let run = || Event::RunStarted { command: "train".into(), device: "flex".into(), seed: 0 };
         let start = |stage: &str, iterations| Event::StageStarted { stage: stage.into(), iterations, gaussians: 5 };
         let step = |stage: &str, iteration, psnr_db| Event::Iteration { stage: stage.into(), iteration, of: 20, loss: 0.0, psnr_db, gaussians: 5, ms: 1.0 };
+        let score = |iteration, psnr_db| Event::Validated { stage: "main".into(), iteration, of: 20, views: 8, psnr_db };
         let end = |stage: &str| Event::StageFinished { stage: stage.into(), seconds: 1.0, gaussians: 5 };
         let mut text: String =
             [(0.5, run()), (1.0, start("coarse", 10)), (2.0, step("coarse", 10, 20.0)), (3.0, end("coarse"))].map(|(s, e)| line(s, e)).concat();
-        text += &[(4.0, start("score", 10)), (5.0, step("score", 10, 1.0)), (6.0, end("score")), (7.0, start("main", 20)), (8.0, step("main", 10, 25.0))]
-            .map(|(s, e)| line(s, e))
-            .concat();
+        text += &[
+            (4.0, start("score", 10)),
+            (5.0, step("score", 10, 1.0)),
+            (6.0, end("score")),
+            (7.0, start("main", 20)),
+            (8.0, step("main", 10, 25.0)),
+            (8.5, score(10, 24.0)),
+        ]
+        .map(|(s, e)| line(s, e))
+        .concat();
         // Killed in the middle of a line; the stage is resumed before that iteration.
         text += "{\"seconds\":8.5,\"eve";
         text += &("\n".to_string()
-            + &[(0.1, run()), (0.2, start("main", 20)), (1.2, step("main", 10, 26.0)), (2.2, step("main", 20, 30.0)), (2.7, end("main"))]
-                .map(|(s, e)| line(s, e))
-                .concat());
+            + &[
+                (0.1, run()),
+                (0.2, start("main", 20)),
+                (1.2, step("main", 10, 26.0)),
+                (1.2, score(10, 24.5)),
+                (2.2, step("main", 20, 30.0)),
+                (2.4, score(20, 27.0)),
+                (2.7, end("main")),
+            ]
+            .map(|(s, e)| line(s, e))
+            .concat());
         std::fs::write(&path, text).unwrap();
         let history = read_history(&path).unwrap();
         let points: Vec<(usize, f32)> = history.points.iter().map(|p| (p.iteration, p.psnr_db)).collect();
         assert_eq!(points, [(10, 20.0), (30, 26.0), (40, 30.0)]);
-        assert_eq!((history.resumed, history.points[1].seconds), (1, 9.2));
-        assert!((history.seconds - 10.7).abs() < 1e-9 && (history.stage_seconds["main"] - 3.5).abs() < 1e-9, "{history:?}");
+        assert_eq!((history.resumed, history.points[1].seconds), (1, 9.7));
+        let scores: Vec<(usize, f32)> = history.validation.iter().map(|p| (p.iteration, p.psnr_db)).collect();
+        assert_eq!((scores, history.validation[0].seconds), (vec![(30, 24.5), (40, 27.0)], 9.7));
+        assert!((history.seconds - 11.2).abs() < 1e-9 && (history.stage_seconds["main"] - 4.0).abs() < 1e-9, "{history:?}");
         assert_eq!(history.stage_seconds["coarse"], 2.0);
 
         // The process that goes on is later with its first line than the other was with its last.

@@ -71,7 +71,10 @@ impl Plots {
         Self {
             rate: shown(&mut [&PSNR, &SSIM, &LPIPS].into_iter().map(|metric| rate_distortion(rows, metric, key))),
             cost: shown(&mut [&PSNR, &LPIPS].into_iter().flat_map(costs)),
-            progress: shown(&mut [training_curves(rows, key, None), training_curves(rows, key, Some(trained)), per_frame(rows, key)].into_iter()),
+            progress: shown(
+                &mut [training_curves(rows, key, None), training_curves(rows, key, Some(trained)), validation_curves(rows, key, trained), per_frame(rows, key)]
+                    .into_iter(),
+            ),
         }
     }
 }
@@ -264,6 +267,23 @@ fn training_curves(rows: &[Row], key: &Key, times: Option<&TrainingDevices>) -> 
     };
     let note = times.map_or_else(String::new, |trained| device_note(rows, trained));
     Plot { title: title.into(), x: Axis::linear(x), y: Axis::linear("PSNR of training views (dB)"), series, front: Vec::new(), note }
+}
+
+/// By time: of views that were kept out of the trainings, where some were.
+fn validation_curves(rows: &[Row], key: &Key, trained: &TrainingDevices) -> Plot {
+    let line = |cell: &CellResult| -> Vec<Point> {
+        let columns = cell.cost.validation_seconds.iter().zip(&cell.validation_curve.psnr_db);
+        columns.map(|(seconds, psnr)| Point { x: seconds / 60.0, y: *psnr, y_range: None, hint: String::new() }).collect()
+    };
+    let of = |row: &&Row| row.cells.iter().map(|cell| Series { colour: key.colour(row), marker: None, line: true, points: line(cell) }).collect::<Vec<_>>();
+    Plot {
+        title: "Validation views by time, a line per seed".into(),
+        x: Axis::linear("wall time (min)"),
+        y: Axis::linear("PSNR of validation views (dB)"),
+        series: trainings(rows).iter().flat_map(of).collect(),
+        front: Vec::new(),
+        note: device_note(rows, trained),
+    }
 }
 
 fn per_frame(rows: &[Row], key: &Key) -> Plot {

@@ -158,8 +158,9 @@ fn check(cell: &CellResult) -> Result<()> {
     let others = [frame.field, frame.raster, frame.field_first, frame.raster_first].into_iter().map(|v| ("frame_ms", v));
     let stages = cell.cost.stage_seconds.values().map(|v| ("stage_seconds", *v));
     let curve = cell.curve.psnr_db.iter().chain(&cell.cost.curve_seconds).map(|v| ("curve", *v));
+    let validation = cell.validation_curve.psnr_db.iter().chain(&cell.cost.validation_seconds).map(|v| ("validation_curve", *v));
     let images = cell.images.iter().flat_map(|image| image.scores.values()).map(|v| ("images", *v));
-    let mut all = named.chain(others).chain(stages).chain(curve).chain(images);
+    let mut all = named.chain(others).chain(stages).chain(curve).chain(validation).chain(images);
     match all.find(|(_, v)| !v.is_finite() || v.abs() > MOST) {
         Some((key, value)) => Err(Error::data(format!("result {}", cell.id), format!("{key} is {value:e}"), "Remove the file and run the cell again")),
         None => Ok(()),

@@ -123,6 +123,29 @@ fn a_report_has_all_parts_and_equal_bytes_again() {
 }
 
 #[test]
+fn scores_of_validation_views_are_drawn_where_there_are_some() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cells = sweep(folder.path());
+    let options = ReportOptions { images: ImageChoice::None, ..Default::default() };
+    let plot = |cells: &[CellResult]| {
+        write(folder.path(), cells);
+        let figures = report(folder.path(), &options).unwrap().figures;
+        figures.into_iter().find(|(name, _)| name == "tiny-validation-views-by-time-a-line-per-seed.svg")
+    };
+    assert!(plot(&cells).is_none());
+    for cell in cells.iter_mut().filter(|c| c.axes.method == "cdf") {
+        (cell.validation_curve.iteration, cell.validation_curve.psnr_db) = (vec![130, 2600], vec![20.0, 30.0]);
+        cell.cost.validation_seconds = vec![60.0, 120.0];
+    }
+    let (_, svg) = plot(&cells).unwrap();
+    assert_eq!(svg.matches("class=\"line\"").count(), 2, "a line per seed, once for both codecs");
+    assert!(svg.contains("cdf</text>") && !svg.contains("hexplane</text>"), "{svg}");
+    cells[0].validation_curve.psnr_db[1] = 1e300;
+    write(folder.path(), &cells);
+    assert!(report(folder.path(), &options).unwrap_err().to_string().contains("validation_curve"));
+}
+
+#[test]
 fn times_of_trainings_on_other_devices_are_marked() {
     let folder = tempfile::tempdir().unwrap();
     let mut cells = sweep(folder.path());

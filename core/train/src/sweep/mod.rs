@@ -34,7 +34,7 @@ pub use plan::{PLAN, Plan, PlannedCell, PlannedTraining};
 pub use read::{RESULTS, check_comparable, read_results};
 pub use result::{
     Axes, Blocks, CellResult, CodecChoice, Cost, Curve, DataFingerprint, DeviceFacts, FrameMs, ImageResult, KIND, Outcome, ResultProvenance, SCHEMA, Score,
-    Storage, StreamBytes, TrainingDevice,
+    Storage, StreamBytes, TrainingDevice, ValidationCurve,
 };
 pub use run::{Busy, TrainingState, run_training, summary};
 pub(crate) use table::csv_field;

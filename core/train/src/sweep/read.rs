@@ -187,6 +187,9 @@ pub(super) mod tests {
         {
             assert!(matches!(CellResult::from_json("broken.json", broken), Err(Error::Data { .. })), "{broken}");
         }
+        let uneven = cell("uneven", |r| (r.validation_curve.iteration, r.validation_curve.psnr_db) = (vec![130], vec![20.0]));
+        let error = CellResult::from_json("uneven.json", &uneven.to_line().unwrap()).unwrap_err();
+        assert!(matches!(error, Error::Data { .. }) && error.to_string().contains("validation curve"), "{error}");
     }
 
     #[test]

@@ -69,6 +69,9 @@ pub struct CellResult {
     pub verdict: Option<Value>,
     /// Training PSNR on the way.
     pub curve: Curve,
+    /// Scores on the way of views that were kept out of the training, where some were; images are not rounded to 8 bits.
+    #[serde(default, skip_serializing_if = "ValidationCurve::is_empty")]
+    pub validation_curve: ValidationCurve,
     /// What it took: the only part that differs between equal runs.
     pub cost: Cost,
 }
@@ -258,6 +261,21 @@ impl Curve {
     pub const MOST_POINTS: usize = 100;
 }
 
+/// PSNR on the way of views that are kept out of a training: columns of equal length.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ValidationCurve {
+    /// Iteration over all stages, from 1.
+    pub iteration: Vec<usize>,
+    /// Mean PSNR of at most eight views, dB.
+    pub psnr_db: Vec<f64>,
+}
+
+impl ValidationCurve {
+    fn is_empty(&self) -> bool {
+        self.iteration.is_empty()
+    }
+}
+
 /// What a result took. Seconds of wall time.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
@@ -272,6 +290,9 @@ pub struct Cost {
     pub resumed: usize,
     /// Seconds since the training began, for each point of [`CellResult::curve`].
     pub curve_seconds: Vec<f64>,
+    /// The same for each point of [`CellResult::validation_curve`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub validation_seconds: Vec<f64>,
     /// Codec and writing of the archive.
     pub encode_seconds: f64,
     /// Reading the archive back into a model.
@@ -349,6 +370,10 @@ impl CellResult {
         let points = result.curve.iteration.len();
         if [result.curve.psnr_db.len(), result.curve.gaussians.len(), result.cost.curve_seconds.len()].iter().any(|len| *len != points) {
             return Err(damaged("the columns of its training curve differ in length".into()));
+        }
+        let points = result.validation_curve.iteration.len();
+        if [result.validation_curve.psnr_db.len(), result.cost.validation_seconds.len()].iter().any(|len| *len != points) {
+            return Err(damaged("the columns of its validation curve differ in length".into()));
         }
         Ok(result)
     }

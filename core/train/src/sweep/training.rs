@@ -3,7 +3,7 @@
 use super::facts::{PeakMemory, listing, locate, training_device};
 use super::folder::SweepFolder;
 use super::plan::PlannedTraining;
-use super::result::{Curve, Outcome, TrainingDevice};
+use super::result::{Curve, Outcome, TrainingDevice, ValidationCurve};
 use crate::auto;
 use crate::checkpoint::read_config;
 use crate::checks::Verdict;
@@ -36,6 +36,10 @@ pub(super) struct FinishedTraining {
     pub verdict: Option<Verdict>,
     pub curve: Curve,
     pub curve_seconds: Vec<f64>,
+    #[serde(default)]
+    pub validation_curve: ValidationCurve,
+    #[serde(default)]
+    pub validation_seconds: Vec<f64>,
     pub seconds: f64,
     pub stage_seconds: BTreeMap<String, f64>,
     pub resumed: usize,
@@ -125,6 +129,7 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
     };
     let history = read_history(&run.join(EVENTS))?;
     let (curve, curve_seconds) = curve(&history);
+    let (validation_curve, validation_seconds) = validation_curve(&history);
     let finished = FinishedTraining {
         outcome,
         message,
@@ -133,6 +138,8 @@ pub(super) fn finish_training(worker: &Worker, folder: &SweepFolder, training: &
         verdict,
         curve,
         curve_seconds,
+        validation_curve,
+        validation_seconds,
         seconds: history.seconds,
         stage_seconds: history.stage_seconds,
         resumed: history.resumed,
@@ -173,13 +180,26 @@ fn curve(history: &History) -> (Curve, Vec<f64>) {
     let n = history.points.len();
     let wanted = n.min(Curve::MOST_POINTS);
     let picked: Vec<_> = (1..=wanted).map(|i| history.points[i * n / wanted - 1]).collect();
-    let decimals = |value: f64, digits: i32| (value * 10f64.powi(digits)).round() / 10f64.powi(digits);
     let curve = Curve {
         iteration: picked.iter().map(|p| p.iteration).collect(),
         psnr_db: picked.iter().map(|p| decimals(f64::from(p.psnr_db), 4)).collect(),
         gaussians: picked.iter().map(|p| p.gaussians).collect(),
     };
     (curve, picked.iter().map(|p| decimals(p.seconds, 3)).collect())
+}
+
+/// All scores of validation views, and their seconds.
+fn validation_curve(history: &History) -> (ValidationCurve, Vec<f64>) {
+    let points = &history.validation;
+    let curve = ValidationCurve {
+        iteration: points.iter().map(|p| p.iteration).collect(),
+        psnr_db: points.iter().map(|p| decimals(f64::from(p.psnr_db), 4)).collect(),
+    };
+    (curve, points.iter().map(|p| decimals(p.seconds, 3)).collect())
+}
+
+fn decimals(value: f64, digits: i32) -> f64 {
+    (value * 10f64.powi(digits)).round() / 10f64.powi(digits)
 }
 
 #[cfg(test)]
