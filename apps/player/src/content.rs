@@ -31,6 +31,10 @@ pub struct Content {
 
 /// Share of the centres along each axis that a first view shows: a few far away would make the model a dot.
 const SHOWN: f64 = 0.95;
+/// Standard deviations of a Gaussian of middle size that a first view shows at least: a single one is no point.
+const SHOWN_SIGMAS: f32 = 3.0;
+/// Largest standard deviation that counts for it: beyond, sums of squares leave float32.
+const MOST_SHOWN: f32 = 1e18;
 
 /// Gaussians in the layout of the shaders, moving ones first.
 pub struct Scene {
@@ -42,7 +46,7 @@ pub struct Scene {
     pub sh_degree: usize,
     /// Largest degree that `harmonics` holds: `sh_degree`, unless that was too much for the device.
     pub(crate) drawn_degree: usize,
-    /// Lower and upper corner of the box that holds most canonical centres; cameras without a presentation look at it.
+    /// Lower and upper corner of the box that holds most canonical centres, and a Gaussian of middle size; cameras without a presentation look at it.
     pub bounds: [[f32; 3]; 2],
     /// Lower and upper corner of a box that holds all centres at all times.
     pub(crate) reach: [[f32; 3]; 2],
@@ -154,7 +158,7 @@ impl Scene {
             moving: layer.as_ref().map_or(0, |l| l.rows.len()),
             sh_degree: gaussians.sh_degree,
             drawn_degree: gaussians.sh_degree,
-            bounds: gaussians.central_box(SHOWN),
+            bounds: shown(gaussians),
             reach: gaussians.central_box(1.0),
             background: [0.0; 3],
             near: Rules::default().near(),
@@ -243,6 +247,23 @@ fn order(n: usize, layer: Option<&PlaybackLayer>) -> Vec<usize> {
     rows.into_iter().chain((0..n).filter(|&i| still[i])).collect()
 }
 
+/// The box of most centres, along each axis no smaller than a Gaussian of middle size.
+fn shown(gaussians: &HostGaussians) -> [[f32; 3]; 2] {
+    let [lower, upper] = gaussians.central_box(SHOWN);
+    let mut sizes: Vec<f32> = gaussians.log_scales.as_chunks::<3>().0.iter().map(|s| s[0].max(s[1]).max(s[2])).collect();
+    if sizes.is_empty() {
+        return [lower, upper];
+    }
+    let middle = sizes.len() / 2;
+    let size = SHOWN_SIGMAS * sizes.select_nth_unstable_by(middle, f32::total_cmp).1.exp().min(MOST_SHOWN);
+    let axis = |k: usize| {
+        let center = 0.5 * lower[k] + 0.5 * upper[k];
+        [lower[k].min(center - size), upper[k].max(center + size)]
+    };
+    let [x, y, z] = [0, 1, 2].map(axis);
+    [0, 1].map(|end| [x[end], y[end], z[end]])
+}
+
 /// The coefficients of degree 1 to `degree`.
 fn harmonics(gaussians: &HostGaussians, order: &[usize], degree: usize) -> Vec<u32> {
     let (rest, kept) = (3 * sh_rest_len(gaussians.sh_degree), 3 * sh_rest_len(degree));
@@ -281,6 +302,7 @@ fn reach(means: &[f32], still: [[f32; 3]; 2], layer: &PlaybackLayer) -> [[f32; 3
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Navigator;
     use cc4dgs_format::playback::{Segment, Track};
 
     #[test]
@@ -310,12 +332,24 @@ mod tests {
     #[test]
     fn small_files_are_drawn_from_nearer() {
         let near = |size: f32| {
-            let gaussians = HostGaussians { means: vec![0.0, 0.0, 0.0, size, 0.0, 0.0, 0.0, size, 0.0], ..three(0) };
+            let means = vec![0.0, 0.0, 0.0, size, 0.0, 0.0, 0.0, size, 0.0];
+            let gaussians = HostGaussians { means, log_scales: vec![(0.1 * size).ln(); 9], ..three(0) };
             Content::read("t", ply::to_bytes(&gaussians, false).unwrap(), &Limits::default()).unwrap().scene.near
         };
         let usual = Rules::default().near();
         assert_eq!(near(100.0), usual);
         assert!((1e-6..0.01 * usual).contains(&near(1e-3)), "{}", near(1e-3));
+    }
+
+    #[test]
+    fn a_single_gaussian_is_seen_whole() {
+        let one = HostGaussians { log_scales: vec![-9.0, -4.0, -6.0], ..three(0).select(&[0]) };
+        let scene = Content::read("t", ply::to_bytes(&one, false).unwrap(), &Limits::default()).unwrap().scene;
+        let [lower, upper] = scene.bounds;
+        let navigator = Navigator::new(&Presentation::default(), lower, upper);
+        let (distance, sigma) = ((navigator.eye - navigator.target).length(), f64::from(-4f32).exp());
+        assert!(distance > f64::from(scene.near) && (5.0..20.0).contains(&(distance / sigma)), "{distance} from {sigma}, drawn from {}", scene.near);
+        assert_eq!(Scene::new(&HostGaussians::default(), None).unwrap().bounds, [[0.0; 3]; 2]);
     }
 
     /// Three Gaussians whose harmonics count from 0.

@@ -8,6 +8,8 @@
 
 mod clock;
 mod content;
+#[cfg(all(any(feature = "window", test), not(target_arch = "wasm32")))]
+mod desktop;
 #[cfg(not(target_arch = "wasm32"))]
 pub mod exact;
 mod memory;

@@ -73,6 +73,12 @@ impl Navigator {
         let right = forward.cross(self.up).try_normalize().unwrap_or_else(|| forward.any_orthonormal_vector());
         (right, forward.cross(right))
     }
+    /// Right and down of the image.
+    fn image_axes(&self) -> (DVec3, DVec3) {
+        let (right, down) = self.axes();
+        let (s, c) = self.roll.sin_cos();
+        (c * right + s * down, c * down - s * right)
+    }
     /// Orbits by angles in radians: to the right, and upwards.
     pub fn orbit(&mut self, right: f64, upwards: f64) {
         self.roll = 0.0;
@@ -92,10 +98,12 @@ impl Navigator {
         self.orbit(-right, upwards);
         (self.eye, self.target) = (eye, self.eye);
     }
-    /// Moves eye and target along the image: shares of its height.
-    pub fn pan(&mut self, right: f64, down: f64) {
-        let height = 2.0 * (0.5 * self.fov_y).tan() * (self.target - self.eye).length();
-        let (r, d) = self.axes();
+    /// Moves eye and target along the image: shares of its height, for an image of this size in pixels.
+    pub fn pan(&mut self, right: f64, down: f64, (width, height): (u32, u32)) {
+        // Narrow images show more above and below.
+        let taller = (self.aspect * f64::from(height.max(1)) / f64::from(width.max(1))).max(1.0);
+        let height = 2.0 * (0.5 * self.fov_y).tan() * taller * (self.target - self.eye).length();
+        let (r, d) = self.image_axes();
         let by = height * (right * r + down * d);
         self.eye += by;
         self.target += by;
@@ -110,7 +118,7 @@ impl Navigator {
     /// Flies: shares of the distance to the target, to the right, up and forward.
     pub fn fly(&mut self, right: f64, up: f64, forward: f64) {
         let distance = (self.target - self.eye).length();
-        let (r, d) = self.axes();
+        let (r, d) = self.image_axes();
         let by = distance * (right * r - up * d + forward * self.forward());
         self.eye += by;
         self.target += by;
@@ -118,9 +126,7 @@ impl Navigator {
     /// The camera for an image of this size in pixels.
     pub fn camera(&self, width: u32, height: u32) -> Camera {
         let (width, height) = (width.max(1), height.max(1));
-        let (flat_right, flat_down) = self.axes();
-        let (s, c) = self.roll.sin_cos();
-        let (right, down) = (c * flat_right + s * flat_down, c * flat_down - s * flat_right);
+        let (right, down) = self.image_axes();
         let row = |a: DVec3| [a.x, a.y, a.z, -a.dot(self.eye)];
         let focal = 0.5 * f64::from(height).min(f64::from(width) / self.aspect) / (0.5 * self.fov_y).tan();
         Camera {
@@ -153,6 +159,7 @@ impl Navigator {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DVec4;
 
     fn home() -> Camera {
         Camera::look_at("home", (640, 480), 0.8, [3.0, 1.0, 2.0], [0.2, 0.1, 0.3], [0.0, 0.0, 1.0])
@@ -183,12 +190,36 @@ mod tests {
     }
 
     #[test]
+    fn the_scene_moves_with_the_image_of_any_shape_and_roll() {
+        let rolled = Camera::look_at("rolled", (640, 480), 0.8, [3.0, 1.0, 2.0], [0.2, 0.1, 0.3], [0.3, 0.9, -0.4]);
+        let cases = [(home(), 640, 480), (home(), 1280, 320), (home(), 390, 844), (rolled.clone(), 640, 480), (rolled, 390, 844)];
+        for (camera, width, height) in cases {
+            let shown = Presentation { home: Some(camera), up: Some([0.0, 0.0, 1.0]), target: Some([0.2, 0.1, 0.3]), ..Default::default() };
+            let start = Navigator::new(&shown, [-1.0; 3], [1.0; 3]);
+            // Where the middle of the first image is, in pixels from the middle and in depth.
+            let seen = |navigator: &Navigator| {
+                let (camera, point) = (navigator.camera(width, height), start.target.extend(1.0));
+                let [x, y, z] = [0, 1, 2].map(|row| DVec4::from(camera.world_to_camera[row]).dot(point));
+                [camera.fx * x / z, camera.fy * y / z, z]
+            };
+            let (mut panned, mut flown, depth) = (start.clone(), start.clone(), seen(&start)[2]);
+            panned.pan(0.25, -0.125, (width, height));
+            flown.fly(0.5, 0.0, 0.0);
+            let [x, y, _] = seen(&panned);
+            let wanted = [-0.25, 0.125].map(|share| share * f64::from(height));
+            assert!((x - wanted[0]).abs() < 1e-6 && (y - wanted[1]).abs() < 1e-6, "{width}x{height}: {x}, {y} instead of {wanted:?}");
+            let [x, y, z] = seen(&flown);
+            assert!(x < 0.0 && y.abs() < 1e-6 && (z - depth).abs() < 1e-9, "flying to the right leads to {x}, {y}");
+        }
+    }
+
+    #[test]
     fn no_gesture_loses_the_scene() {
         let mut navigator = Navigator::new(&Presentation::default(), [-1.0; 3], [1.0; 3]);
         for _ in 0..50 {
             navigator.orbit(0.4, 0.7);
             navigator.look(0.1, -0.9);
-            navigator.pan(0.1, -0.2);
+            navigator.pan(0.1, -0.2, (10, 10));
             navigator.zoom(1.1);
             navigator.fly(0.0, 0.1, 0.1);
             navigator.camera(10, 10).validate().unwrap();

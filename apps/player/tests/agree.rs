@@ -148,6 +148,33 @@ fn options_change_what_is_drawn() {
 }
 
 #[test]
+fn footprints_along_the_axes_of_the_image_are_drawn_whole() {
+    let Some(mut renderer) = renderer() else { return };
+    // Columns of the image are along the world's y, rows along its z.
+    let camera = Camera::look_at("t", (200, 100), 0.8, [3.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]);
+    let log_scale = |sigma_px: f64| (sigma_px * 3.0 / camera.fx).ln() as f32;
+    for step in 0..60 {
+        // The square of the width is just below a power of two, and over it with that of the height: there sums are rounded most.
+        let width_px = 30.0 + 0.03 * f64::from(step);
+        let gaussians = cc4dgs::HostGaussians {
+            means: vec![0.0; 3],
+            log_scales: vec![-9.0, log_scale(width_px), log_scale(15.0)],
+            quaternions: vec![1.0, 0.0, 0.0, 0.0],
+            opacity_logits: vec![3.0],
+            sh_dc: vec![1.77; 3],
+            dynamic_scores: vec![0.0],
+            ..Default::default()
+        };
+        let bytes = cc4dgs::core::ply::to_bytes(&gaussians, true).unwrap();
+        renderer.load(Content::read("one.ply", bytes, &Limits::default()).unwrap().scene).unwrap();
+        let image = renderer.image(&View::new(camera.clone(), 0.0)).unwrap();
+        // Two standard deviations from the middle: exp(-2) of white.
+        let found = image.data[3 * (50 * 200 + 100 + (2.0 * width_px) as usize)];
+        assert!((25..45).contains(&found), "{width_px} pixels wide: {found}");
+    }
+}
+
+#[test]
 fn a_model_that_the_device_refuses_leaves_the_one_before() {
     if renderer().is_none() {
         return;

@@ -7,7 +7,8 @@ the path. Ends with a sentence per check; fails at the first that does not hold.
 """
 import argparse, pathlib, time
 from browser_faults import broken_module, few_degrees, half_arrived, hopeless, no_room, opened_meanwhile, refused, second_player, small_textures, told_once
-from browser_input import command_key, drop, embedded, reduced_motion, touch, wheel
+from browser_gaussian import one_gaussian
+from browser_input import command_key, drop, embedded, focus, held, reduced_motion, touch, wheel
 from browser_pages import Handler, MODEL, Pages, launch, say, serve
 from browser_sort import sorting
 from playwright.sync_api import sync_playwright
@@ -115,6 +116,7 @@ def main():
         navigation(pages, page)
         wheel(page)
         command_key(page)
+        held(page)
         webgl(pages, facts)
         lost(pages, page, facts)
         arriving(pages, page, facts, len(archive), args.layers)
@@ -126,6 +128,7 @@ def main():
         half_arrived(pages)
         no_room(pages)
         few_degrees(pages)
+        one_gaussian(pages)
         opened_meanwhile(pages)
         second_player(pages)
         destroyed(pages, facts)
@@ -136,6 +139,7 @@ def main():
         page.close()
         phone(pages, args.archive)
         embedded(pages)
+        focus(pages)
         reduced_motion(pages)
         for file, name in ((args.single, "single"), (args.weights, "weights")):
             if file:

@@ -57,6 +57,8 @@ def refused(pages):
     assert page.get_by_label("Play", exact=True).is_disabled()
     again = page.evaluate(f"cc4dgs.load('{MODEL}').then(() => 'it loaded', e => e.message)")
     assert "Reload the page" in again, again
+    captured = page.evaluate("cc4dgs.capture().then(() => 'it is drawn', e => e.message)")
+    assert "no graphics device" in captured, captured
     page.close()
     # The page writes the panic itself to the console.
     pages.complaints[:] = [c for c in pages.complaints if "unreachable" not in c]

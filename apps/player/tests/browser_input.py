@@ -47,6 +47,30 @@ def command_key(page):
     say("keys are not held any more once Cmd is")
 
 
+def held(page):
+    """A key that is held down switches once, and steps again and again."""
+    key = "([key, repeat]) => document.body.dispatchEvent(new KeyboardEvent('keydown', { key, repeat, bubbles: true, cancelable: true }))"
+    for repeat, flies in ((False, True), (True, True), (True, True), (False, False)):
+        page.evaluate(key, ["f", repeat])
+        assert page.evaluate("cc4dgs.flying") == flies, "F that is held down switches again and again"
+    page.evaluate("cc4dgs.seek(0)")
+    for repeat in (False, True):
+        page.evaluate(key, [".", repeat])
+    assert page.evaluate("cc4dgs.gpu.frame === Math.min(2, cc4dgs.facts.frames - 1)"), "a full stop that is held down does not step on"
+    say("a key that is held down switches once, or steps on")
+
+
+def focus(pages):
+    """The keyboard's focus on the view is seen."""
+    page = pages.open()
+    page.keyboard.press("Tab")
+    found = page.evaluate("[document.activeElement.tagName, getComputedStyle(document.activeElement).outlineStyle]")
+    assert found == ["CANVAS", "solid"], f"the focus is not seen: {found}"
+    page.close()
+    pages.quiet("the focus")
+    say("the focus on the view is seen")
+
+
 def reduced_motion(pages):
     """Where the system asks for less motion, nothing starts by itself."""
     page = pages.watch(pages.browser.new_page(reduced_motion="reduce"))

@@ -49,6 +49,8 @@ export function addGestures(canvas, act, signal) {
     }, { passive: false });
 }
 
+// Keys that switch something or save a file: held down, they do it once.
+const ONCE = new Set([" ", "k", "f", "t", "z", "p"]);
 // Keys that move a slider.
 const SLIDE = /^(Arrow(Left|Right|Up|Down)|Home|End|PageUp|PageDown)$/;
 const FLY = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
@@ -78,7 +80,9 @@ export function addKeys(element, act, commands, signal) {
         if (FLY[key]) { held.add(key); e.preventDefault(); return; }
         // Sliders keep the keys that move them, buttons and boxes those that press them.
         const own = e.target.matches("input[type=range]") ? SLIDE.test(key) : e.target.matches("button, input") && (key === " " || key === "Enter");
-        if (commands[key] && !own) { commands[key](); e.preventDefault(); }
+        if (!commands[key] || own) return;
+        if (!e.repeat || !ONCE.has(key)) commands[key]();
+        e.preventDefault();
     });
     listen(element, "keyup", e => { if (e.key === "Meta") held.clear(); else held.delete(e.key.toLowerCase()); });
     listen(element, "focusout", () => held.clear());

@@ -369,6 +369,7 @@ class Page {
     // Images and links
     async capture(camera, time) {
         if (this.destroyed) throw gone();
+        if (!this.gpu) throw new Error("There is no graphics device to draw an image with. Wait for \"recovered\", or reload the page.");
         const json = camera ? JSON.stringify(camera) : undefined;
         if (this.gl) return this.gl.capture(this.gpu, json, time);
         const image = await this.gpu.capture(json, time);

@@ -113,12 +113,13 @@ void main() {
     if (flags.z == 1u && i < counts.y) color = mix(color, vec3(1.0, 0.25, 0.1), 0.65);
     a = vec4(center, 0.5 * yy / determinant, -xy / determinant);
     b = vec4(0.5 * xx / determinant, opacity, point.z, radius);
-    float mid = 0.5 * (xx + yy), spread = sqrt(max(0.25 * (xx - yy) * (xx - yy) + xy * xy, 0.0));
-    vec2 axis = vec2(xy, mid + spread - xx);
-    if (dot(axis, axis) < 1e-12) axis = xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
+    // Eigenvalues and axis take no difference of nearly equal numbers: of a long, thin footprint rounding would leave little.
+    float difference = 0.5 * (xx - yy), spread = sqrt(difference * difference + xy * xy), largest = 0.5 * (xx + yy) + spread;
+    vec2 axis = difference >= 0.0 ? vec2(spread + difference, xy) : vec2(xy, spread - difference);
+    if (dot(axis, axis) < 1e-12) axis = vec2(1.0, 0.0);
     axis = normalize(axis);
     vec2 side = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
-    vec2 pixel = center + side.x * sqrt(reach * (mid + spread)) * axis + side.y * sqrt(reach * max(mid - spread, 1e-4)) * vec2(-axis.y, axis.x);
+    vec2 pixel = center + side.x * sqrt(reach * largest) * axis + side.y * sqrt(reach * determinant / largest) * vec2(-axis.y, axis.x);
     gl_Position = vec4(2.0 * pixel.x / frame[6].x - 1.0, 1.0 - 2.0 * pixel.y / frame[6].y, 0.0, 1.0);
 }`;
 

@@ -27,7 +27,7 @@ pub enum Mode {
     /// The colours of the model.
     #[default]
     Color,
-    /// Depth of each Gaussian: near ones blue, far ones red.
+    /// Depth of each Gaussian: near ones red, far ones blue.
     Depth,
 }
 

@@ -27,19 +27,17 @@ struct Vertex {
 fn vertex(@builtin(vertex_index) corner: u32, @builtin(instance_index) instance: u32) -> Vertex {
     // The list is nearest first.
     let splat = splats[pairs[work.visible - 1u - instance].y];
-    let half_xx = splat.a.z;
-    let xy = splat.a.w;
-    let half_yy = splat.b.x;
-    // The covariance is the inverse of the conic.
-    let scale = 1.0 / max(4.0 * half_xx * half_yy - xy * xy, 1e-30);
-    let cov = vec3<f32>(2.0 * half_yy, -xy, 2.0 * half_xx) * scale;
-    let mid = 0.5 * (cov.x + cov.z);
-    let spread = sqrt(max(0.25 * (cov.x - cov.z) * (cov.x - cov.z) + cov.y * cov.y, 0.0));
+    // The covariance is the inverse of the conic. Eigenvalues and axis take no difference of nearly equal numbers: of a long, thin footprint rounding would leave little.
+    let determinant = splat.c.w;
+    let cov = vec3<f32>(2.0 * splat.b.x, -splat.a.w, 2.0 * splat.a.z) * determinant;
+    let difference = 0.5 * (cov.x - cov.z);
+    let spread = sqrt(difference * difference + cov.y * cov.y);
+    let largest = 0.5 * (cov.x + cov.z) + spread;
     let reach = 2.0 * (log(max(splat.b.y * 255.0, 1.0)) + 0.005);
-    let major = sqrt(reach * (mid + spread));
-    let minor = sqrt(reach * max(mid - spread, 1e-4));
-    var axis = vec2<f32>(cov.y, mid + spread - cov.x);
-    if (dot(axis, axis) < 1e-12) { axis = select(vec2<f32>(0.0, 1.0), vec2<f32>(1.0, 0.0), cov.x >= cov.z); }
+    let major = sqrt(reach * largest);
+    let minor = sqrt(reach * determinant / largest);
+    var axis = select(vec2<f32>(cov.y, spread - difference), vec2<f32>(spread + difference, cov.y), difference >= 0.0);
+    if (dot(axis, axis) < 1e-12) { axis = vec2<f32>(1.0, 0.0); }
     axis = normalize(axis);
     let side = vec2<f32>(f32(corner & 1u) * 2.0 - 1.0, f32(corner >> 1u) * 2.0 - 1.0);
     let pixel = splat.a.xy + side.x * major * axis + side.y * minor * vec2<f32>(-axis.y, axis.x);

@@ -14,7 +14,7 @@ struct Splat {
     a: vec4<f32>,
     // Half its last entry, opacity, depth, radius of the square that limits it (0: none).
     b: vec4<f32>,
-    // Red, green, blue.
+    // Red, green, blue; determinant of the covariance.
     c: vec4<f32>,
 }
 
@@ -131,7 +131,7 @@ fn color_of(i: u32, dc: vec3<f32>, d: vec3<f32>) -> vec3<f32> {
     return max(color, vec3<f32>(0.0));
 }
 
-// Dark blue through green to yellow, for 0 to 1.
+// Dark blue through green to red, for 0 to 1.
 fn depth_color(v: f32) -> vec3<f32> {
     let t = clamp(v, 0.0, 1.0);
     return clamp(vec3<f32>(1.5 - abs(4.0 * t - 3.5), 1.5 - abs(4.0 * t - 2.2), 1.3 - abs(4.0 * t - 0.8)), vec3<f32>(0.0), vec3<f32>(1.0));
@@ -198,7 +198,7 @@ fn project(i: u32) -> bool {
         color = color_of(i, g.dc.xyz, normalize(mean - frame.center.xyz));
     }
     if (frame.flags.z == 1u && i < frame.counts.y) { color = mix(color, vec3<f32>(1.0, 0.25, 0.1), 0.65); }
-    splats[i] = Splat(vec4<f32>(center, 0.5 * yy * inverse, -xy * inverse), vec4<f32>(0.5 * xx * inverse, opacity, point.z, radius), vec4<f32>(color, 0.0));
+    splats[i] = Splat(vec4<f32>(center, 0.5 * yy * inverse, -xy * inverse), vec4<f32>(0.5 * xx * inverse, opacity, point.z, radius), vec4<f32>(color, determinant));
     keys[i] = u32(key);
     return true;
 }

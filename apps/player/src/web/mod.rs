@@ -314,7 +314,7 @@ impl Player {
     }
     /// Moves along the image, by shares of its height.
     pub fn pan(&mut self, right: f64, down: f64) {
-        self.navigator.pan(right, down);
+        self.navigator.pan(right, down, self.size);
     }
     /// Divides the distance to the orbited point.
     pub fn zoom(&mut self, factor: f64) {

@@ -198,7 +198,7 @@ impl Window {
         let pans = response.dragged_by(egui::PointerButton::Secondary) || response.dragged_by(egui::PointerButton::Middle) || ui.input(|i| i.modifiers.shift);
         if response.dragged() {
             match (pans, self.flying) {
-                (true, _) => self.navigator.pan(-dx, -dy),
+                (true, _) => self.navigator.pan(-dx, -dy, self.drawn),
                 (false, true) => self.navigator.look(-2.0 * dx, 2.0 * dy),
                 (false, false) => self.navigator.orbit(-4.0 * dx, 4.0 * dy),
             }

@@ -1,14 +1,13 @@
-//! The player in a desktop window (eframe), which shares the device with its controls.
+//! The player in a desktop window (eframe), which shares the device with its controls. What needs no window library, and tests of it, is in `desktop`.
 
 mod controls;
 mod image;
 mod keep;
-mod live;
-mod lost;
 mod opening;
-mod start;
 mod switch;
 
+use crate::desktop::lost::Lost;
+pub use crate::desktop::{live::Live, start::Start};
 use crate::exact::Exact;
 use crate::render::descriptor;
 use crate::{Clock, Content, Navigator, Renderer, View};
@@ -16,10 +15,7 @@ use cc4dgs_format::{Camera, Error, Result};
 use eframe::egui;
 use eframe::egui_wgpu::{WgpuConfiguration, WgpuSetup, WgpuSetupCreateNew};
 use image::{FORMAT, Image};
-pub use live::Live;
-use lost::Lost;
 use opening::Opening;
-pub use start::Start;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -146,7 +142,11 @@ impl Window {
         let told = trouble.clone();
         // Without a handler, wgpu ends the process.
         state.device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| *told.lock().unwrap_or_else(PoisonError::into_inner) = Some(e.to_string())));
-        lost.watch(&state.device, &cc.egui_ctx);
+        let (noted, ctx) = (lost.clone(), cc.egui_ctx.clone());
+        state.device.set_device_lost_callback(move |_, _| {
+            noted.lose();
+            ctx.request_repaint();
+        });
         let navigator = Navigator::new(&Default::default(), [-1.0; 3], [1.0; 3]);
         let mut window = Self {
             renderer: Renderer::new(state.device.clone(), state.queue.clone(), FORMAT),
@@ -187,7 +187,8 @@ impl Window {
                 window.source = Some(source);
             }
             Shown::Training(live) => {
-                live.open(cc.egui_ctx.clone());
+                let ctx = cc.egui_ctx.clone();
+                live.open(move |delay| ctx.request_repaint_after(delay));
                 window.live = Some(live);
             }
         }

@@ -1,6 +1,7 @@
 //! The switch from the player's images to exact ones.
 
 use super::image::Image;
+use crate::desktop::exact_view::{Choice, pixels, psnr_db, reduced};
 use crate::exact::{Exact, ExactImage, ExactImages, ExactWorker};
 use crate::{Mode, Renderer, View};
 use cc4dgs_format::{Error, Image8, Result};
@@ -11,20 +12,12 @@ use std::time::Duration;
 
 /// A view that has not changed for so long stands still: its image is drawn at full size.
 const STILL: Duration = Duration::from_millis(200);
-/// How long an image may take while something moves, in milliseconds; it is made smaller for that.
-const QUICK_MS: f64 = 150.0;
-/// Sides of the first quick image, when it is not known yet how long one takes, and of the smallest, as shares of full ones.
-const FIRST: f64 = 0.5;
-const LEAST: f64 = 0.25;
 /// How soon the window looks again for what it waits for.
 const SOON: Duration = Duration::from_millis(30);
 
 /// Exact images of the model in the window, where it has them.
 pub(super) struct Switch {
-    /// Whether they are shown.
-    on: bool,
-    /// Why there are none; empty where there are.
-    lacks: String,
+    choice: Choice,
     /// What draws them, until its thread is started.
     images: Option<Box<dyn ExactImages>>,
     worker: Option<ExactWorker>,
@@ -58,11 +51,11 @@ impl Switch {
             Ok(images) => (Some(images), String::new()),
             Err(lacks) => (None, lacks),
         };
-        Self { on: false, lacks, images, worker: None, last: None, asked: None, seen: None, since: 0.0, texture: None, shown: None, pace: None }
+        Self { choice: Choice::new(lacks), images, worker: None, last: None, asked: None, seen: None, since: 0.0, texture: None, shown: None, pace: None }
     }
     /// Takes the place of the switch of another model: stays on where it can.
     pub(super) fn replace(&mut self, exact: Exact) {
-        let (on, texture) = (self.on, self.texture.take());
+        let (on, texture) = (self.is_on(), self.texture.take());
         let last = self.worker.take().or_else(|| self.last.take());
         if let Some(worker) = &last {
             worker.close();
@@ -73,15 +66,15 @@ impl Switch {
     }
     /// Why there are no exact images.
     pub(super) fn lacks(&self) -> Option<&str> {
-        if self.lacks.is_empty() { None } else { Some(&self.lacks) }
+        self.choice.lacks()
     }
     pub(super) fn is_on(&self) -> bool {
-        self.on
+        self.choice.is_on()
     }
     pub(super) fn set(&mut self, on: bool) {
-        self.on = on && self.lacks.is_empty();
+        self.choice.set(on);
         (self.asked, self.seen) = (None, None);
-        if !self.on {
+        if !self.is_on() {
             self.shown = None;
         }
     }
@@ -90,7 +83,7 @@ impl Switch {
     /// # Errors
     /// Why an image could not be drawn; the switch is off then.
     pub(super) fn follow(&mut self, ctx: &egui::Context, state: &RenderState, renderer: &mut Renderer, view: &View) -> Result<Option<egui::TextureId>> {
-        if !self.on {
+        if !self.is_on() {
             return Ok(None);
         }
         // What exact images do not have is no other view.
@@ -200,67 +193,5 @@ impl Drop for Switch {
     fn drop(&mut self) {
         // Both are told before either is waited for.
         self.worker.iter().chain(&self.last).for_each(ExactWorker::close);
-    }
-}
-
-fn pixels(view: &View) -> f64 {
-    f64::from(view.camera.width) * f64::from(view.camera.height)
-}
-
-/// `view` with as many pixels as can be drawn quickly, by milliseconds and pixels of an image before.
-fn reduced(view: &View, pace: Option<(f64, f64)>) -> View {
-    let share = match pace {
-        Some((ms, of_pixels)) => (QUICK_MS * of_pixels / (ms.max(1e-3) * pixels(view))).sqrt().clamp(LEAST, 1.0),
-        None => FIRST,
-    };
-    let side = |pixels: u32| ((f64::from(pixels) * share).round() as u32).max(1);
-    let (width, height) = (side(view.camera.width), side(view.camera.height));
-    View { camera: view.camera.resized(width, height), ..view.clone() }
-}
-
-/// PSNR in dB of two RGB images, infinite if they are equal; `None` if their sizes differ.
-fn psnr_db(a: &Image8, b: &Image8) -> Option<f64> {
-    if (a.width, a.height, a.channels) != (b.width, b.height, b.channels) || a.data.is_empty() || a.data.len() != b.data.len() {
-        return None;
-    }
-    let squares: u64 = a.data.iter().zip(&b.data).map(|(x, y)| u64::from(x.abs_diff(*y)).pow(2)).sum();
-    Some(10.0 * (255.0f64.powi(2) * a.data.len() as f64 / squares as f64).log10())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use cc4dgs_format::Camera;
-
-    #[test]
-    fn quick_images_are_as_large_as_time_allows() {
-        let view = View::new(Camera::look_at("t", (1000, 500), 0.8, [3.0, 0.0, 0.0], [0.0; 3], [0.0, 0.0, 1.0]), 0.5);
-        let size = |pace| {
-            let camera = reduced(&view, pace).camera;
-            camera.validate().unwrap();
-            (camera.width, camera.height)
-        };
-        assert_eq!(size(None), (500, 250));
-        assert_eq!(size(Some((QUICK_MS, 500_000.0))), (1000, 500));
-        assert_eq!(size(Some((4.0 * QUICK_MS, 500_000.0))), (500, 250));
-        assert_eq!(size(Some((4.0 * QUICK_MS, 125_000.0))), (250, 125));
-        assert_eq!(size(Some((1e9, 1.0))), (250, 125));
-        assert_eq!(size(Some((0.0, 500_000.0))), (1000, 500));
-    }
-
-    #[test]
-    fn psnr_is_that_of_all_values() {
-        let image = |data: Vec<u8>| Image8 { width: 2, height: 1, channels: 3, data };
-        let (a, b) = (image(vec![10; 6]), image(vec![10, 10, 10, 10, 10, 13]));
-        assert!((psnr_db(&a, &b).unwrap() - 10.0 * (255.0f64.powi(2) / 1.5).log10()).abs() < 1e-9);
-        assert_eq!(psnr_db(&a, &a), Some(f64::INFINITY));
-        assert_eq!(psnr_db(&a, &Image8 { width: 1, ..b }), None);
-    }
-
-    #[test]
-    fn a_model_without_exact_images_cannot_be_switched() {
-        let mut switch = Switch::new(Err("no deformer".to_string()));
-        switch.set(true);
-        assert_eq!((switch.is_on(), switch.lacks()), (false, Some("no deformer")));
     }
 }

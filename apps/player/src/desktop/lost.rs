@@ -1,36 +1,31 @@
 //! A graphics device that is lost: the window closes, and the error names the command that goes on at the same time and pose.
 
 use cc4dgs_format::{Error, Result};
-use eframe::egui;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Whether the device is lost, and the command that shows what the window showed last.
 #[derive(Clone, Default)]
-pub(super) struct Lost {
+pub(crate) struct Lost {
     flag: Arc<AtomicBool>,
     command: Arc<Mutex<Option<String>>>,
 }
 
 impl Lost {
-    /// Notes when `device` is lost, and wakes the window.
-    pub(super) fn watch(&self, device: &wgpu::Device, ctx: &egui::Context) {
-        let (flag, ctx) = (self.flag.clone(), ctx.clone());
-        device.set_device_lost_callback(move |_, _| {
-            flag.store(true, Ordering::Relaxed);
-            ctx.request_repaint();
-        });
+    /// Notes that the device is lost.
+    pub(crate) fn lose(&self) {
+        self.flag.store(true, Ordering::Relaxed);
     }
-    pub(super) fn is_lost(&self) -> bool {
+    pub(crate) fn is_lost(&self) -> bool {
         self.flag.load(Ordering::Relaxed)
     }
     /// Notes what is shown now.
-    pub(super) fn note(&self, command: Option<String>) {
+    pub(crate) fn note(&self, command: Option<String>) {
         *self.command.lock().unwrap_or_else(PoisonError::into_inner) = command;
     }
     /// Runs the window. egui panics where the device is lost while it draws; that is an error like any other loss.
-    pub(super) fn guard(&self, run: impl FnOnce() -> Result<()>) -> Result<()> {
+    pub(crate) fn guard(&self, run: impl FnOnce() -> Result<()>) -> Result<()> {
         let ended = catch_unwind(AssertUnwindSafe(run));
         if self.is_lost() && !matches!(ended, Ok(Err(_))) {
             let command = self.command.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -51,7 +46,7 @@ mod tests {
         lost.note(Some("cc4dgs view a.cc4d --time 0.5".into()));
         assert!(lost.guard(|| Ok(())).is_ok());
         assert!(catch_unwind(AssertUnwindSafe(|| lost.guard(|| panic!("a fault of its own")))).is_err(), "other panics go on");
-        lost.flag.store(true, Ordering::Relaxed);
+        lost.lose();
         let message = lost.guard(|| panic!("no buffer")).unwrap_err().to_string();
         assert!(message.contains("lost") && message.contains("cc4dgs view a.cc4d --time 0.5"), "{message}");
     }

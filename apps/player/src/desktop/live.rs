@@ -1,7 +1,6 @@
 //! A model that changes while a window shows it: a training under way.
 
 use crate::Content;
-use eframe::egui;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Duration;
@@ -11,12 +10,15 @@ const POLL: Duration = Duration::from_millis(100);
 /// How soon a new line is shown.
 const SOON: Duration = Duration::from_millis(200);
 
+/// Asks a window to draw again after so long.
+type Repaint = Box<dyn Fn(Duration) + Send + Sync>;
+
 /// What training and window tell each other. The training offers models and says where it stands; the window takes them and pauses it.
 #[derive(Default)]
 pub struct Live {
     state: Mutex<State>,
     changed: Condvar,
-    window: OnceLock<egui::Context>,
+    window: OnceLock<Repaint>,
 }
 
 #[derive(Default)]
@@ -34,9 +36,9 @@ impl Live {
         // A panic elsewhere leaves nothing half written here.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
-    fn repaint(&self) {
-        if let Some(window) = self.window.get() {
-            window.request_repaint();
+    fn repaint_after(&self, delay: Duration) {
+        if let Some(repaint) = self.window.get() {
+            repaint(delay);
         }
     }
     /// Whether the window is open.
@@ -50,14 +52,12 @@ impl Live {
     /// Hands over a model.
     pub fn offer(&self, content: Content) {
         self.lock().content = Some(content);
-        self.repaint();
+        self.repaint_after(Duration::ZERO);
     }
     /// Says where the training stands, in a line.
     pub fn say(&self, status: String) {
         self.lock().status = status;
-        if let Some(window) = self.window.get() {
-            window.request_repaint_after(SOON);
-        }
+        self.repaint_after(SOON);
     }
     /// Says how the training ended; there is nothing left to pause.
     pub fn end(&self, status: String) {
@@ -65,12 +65,12 @@ impl Live {
             let mut state = self.lock();
             (state.status, state.ended) = (status, true);
         }
-        self.repaint();
+        self.repaint_after(Duration::ZERO);
     }
     /// Says what failed; it stays beside the line.
     pub fn fail(&self, failure: String) {
         self.lock().failure = failure;
-        self.repaint();
+        self.repaint_after(Duration::ZERO);
     }
     /// Returns once the window lets the training go on, was closed, or `stop` is set.
     pub fn wait_while_paused(&self, stop: &AtomicBool) {
@@ -79,28 +79,28 @@ impl Live {
             state = self.changed.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
-    /// The window is open.
-    pub(super) fn open(&self, window: egui::Context) {
+    /// The window is open; `repaint` asks it to draw again after so long.
+    pub(crate) fn open(&self, repaint: impl Fn(Duration) + Send + Sync + 'static) {
         // A second window of the same training repaints by itself.
-        self.window.set(window).ok();
+        self.window.set(Box::new(repaint)).ok();
         self.lock().closed = false;
     }
     /// The window is closed: nothing is shown any more, and a paused training goes on.
-    pub(super) fn close(&self) {
+    pub(crate) fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_all();
     }
     /// The model that was offered last and not taken yet.
-    pub(super) fn take(&self) -> Option<Content> {
+    pub(crate) fn take(&self) -> Option<Content> {
         self.lock().content.take()
     }
     /// The line, with what failed; whether the training is paused, and whether it has ended.
-    pub(super) fn status(&self) -> (String, bool, bool) {
+    pub(crate) fn status(&self) -> (String, bool, bool) {
         let state = self.lock();
         let line = [&state.status, &state.failure].into_iter().filter(|text| !text.is_empty()).cloned().collect::<Vec<_>>().join(" · ");
         (line, state.paused, state.ended)
     }
-    pub(super) fn pause(&self, on: bool) {
+    pub(crate) fn pause(&self, on: bool) {
         self.lock().paused = on;
         self.changed.notify_all();
     }
@@ -109,6 +109,27 @@ impl Live {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Scene;
+    use cc4dgs_format::HostGaussians;
+    use cc4dgs_format::archive::Presentation;
+    use std::sync::Arc;
+
+    #[test]
+    fn a_window_is_woken_by_what_is_offered_and_takes_it_once() {
+        let (live, woken) = (Live::default(), Arc::new(Mutex::new(Vec::new())));
+        let scene = Scene::new(&HostGaussians::default(), None).unwrap();
+        let content = Content { scene, presentation: Presentation::default(), frame_count: 1, lacks_motion: false, bytes: 0 };
+        let noted = woken.clone();
+        live.open(move |delay| noted.lock().unwrap().push(delay));
+        assert!(live.is_open() && live.wants() && live.take().is_none());
+        live.offer(content);
+        assert!(!live.wants(), "the last one has not been taken");
+        live.say("main 1 of 5".into());
+        assert_eq!(*woken.lock().unwrap(), [Duration::ZERO, SOON]);
+        assert!(live.take().is_some() && live.take().is_none() && live.wants());
+        live.close();
+        assert!(!live.is_open() && !live.wants());
+    }
 
     #[test]
     fn a_paused_training_waits_until_the_window_closes_or_it_is_stopped() {

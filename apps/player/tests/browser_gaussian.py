@@ -1,0 +1,34 @@
+"""Checks of browser.py: a model of one Gaussian."""
+import math
+from browser_pages import say
+
+# Opens one Gaussian at the origin with these standard deviations along x, y and z.
+OPEN = """async sigmas => { const names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split(" ");
+    const head = `ply\\nformat binary_little_endian 1.0\\nelement vertex 1\\n${names.map(name => `property float ${name}\\n`).join("")}end_header\\n`;
+    const values = new Float32Array([0, 0, 0, 1.77, 1.77, 1.77, 3, ...sigmas.map(v => Math.log(v)), 1, 0, 0, 0]);
+    await cc4dgs.load(new File([head, values], "one.ply")); }"""
+BRIGHTEST = "cc4dgs.capture().then(({ data }) => data.reduce((most, v, i) => (i % 4 < 3 ? Math.max(most, v) : most), 0))"
+PIXEL = "async ([camera, x, y]) => { const { width, data } = await cc4dgs.capture(camera, 0); return data[4 * (y * width + x)]; }"
+# From (3, 0, 0) to the origin; columns are along y, rows along z.
+FOCAL = 100 / math.tan(0.4)
+CAMERA = {"name": "t", "width": 200, "height": 100, "fx": FOCAL, "fy": FOCAL, "cx": 100, "cy": 50,
+          "world_to_camera": [[0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 3], [0, 0, 0, 1]]}
+
+
+def one_gaussian(pages):
+    """A single Gaussian is seen from where the page begins, and one along the axes of the image is drawn whole."""
+    pixel = 3 / FOCAL
+    for backend in ("", "?backend=webgl"):
+        page = pages.open(backend)
+        page.evaluate(OPEN, [0.05, 0.05, 0.05])
+        brightest = page.evaluate(BRIGHTEST)
+        assert brightest > 150, f"a single Gaussian is not seen: at most {brightest}"
+        for step in range(24):
+            # Its square is just below a power of two, and over it with that of the height: there sums are rounded most.
+            width = 30 + 0.07 * step
+            page.evaluate(OPEN, [1e-4, width * pixel, 15 * pixel])
+            found = page.evaluate(PIXEL, [CAMERA, 100 + int(2 * width), 50])
+            assert 25 < found < 45, f"a Gaussian {width} pixels wide is {found} two standard deviations from its middle"
+        page.close()
+    pages.quiet("one Gaussian")
+    say("a single Gaussian is seen, and drawn whole")
