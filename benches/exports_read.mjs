@@ -46,6 +46,8 @@ const arrays = (file) => {
 };
 const [ours, theirs] = [arrays('model.glb'), arrays('splat-transform.glb')];
 console.log('== splat-transform writes the same model as glTF');
+// Its colours of plain points, COLOR_0, are sRGB; glTF's are linear.
+const linear = (byte) => 255 * (byte <= 10 ? byte / 255 / 12.92 : ((byte / 255 + 0.055) / 1.055) ** 2.4);
 const odd = /SH_DEGREE_1_COEF_[02]|SH_DEGREE_2_COEF_[13]|SH_DEGREE_3_COEF_[0246]/;
 for (const [name, { count, type, componentType, values }] of Object.entries(theirs)) {
     const own = ours[name];
@@ -61,7 +63,8 @@ for (const [name, { count, type, componentType, values }] of Object.entries(thei
             most = Math.max(most, 1 - Math.abs(along));
         }
     } else if (alike) {
-        values.forEach((v, i) => {
+        values.forEach((stored, i) => {
+            const v = name === 'COLOR_0' && i % 4 < 3 ? linear(stored) : stored;
             const sign = odd.test(name) || (name === 'POSITION' && i % 3 < 2) ? -1 : 1;
             most = Math.max(most, Math.abs(sign * own.values[i] - v) / Math.max(1, Math.abs(v)));
         });

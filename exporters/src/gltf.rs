@@ -2,7 +2,7 @@
 //!
 //! Attributes keep the values and axes of the model; a rotation of the node brings its upward axis to glTF's +y.
 
-use crate::still::{self, byte, color_bytes, sigmoid, unit};
+use crate::still::{self, byte, color, sigmoid, unit};
 use cc4dgs_format::{Error, ExportFacts, ExportSource, ExportTarget, Exported, Exporter, ExporterPlugin, HostGaussians, Plugin, Result, config, inventory};
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -87,7 +87,7 @@ fn to_glb(gaussians: &HostGaussians, up: [f64; 3]) -> Result<Vec<u8>> {
     // A rotation of length zero is not drawn.
     let opacities: Vec<f32> = gaussians.opacity_logits.iter().zip(&rotations).map(|(o, q)| if q.is_some() { sigmoid(*o) } else { 0.0 }).collect();
     let colors = gaussians.sh_dc.as_chunks::<3>().0.iter().zip(&opacities).flat_map(|(dc, o)| {
-        let [r, g, b] = color_bytes(dc);
+        let [r, g, b] = color(dc).map(|v| byte(linear(v)));
         [r, g, b, byte(*o)]
     });
     buffer.add("COLOR_0", "VEC4", UNSIGNED_BYTE, count, colors.collect::<Vec<_>>(), json!({ "normalized": true }));
@@ -135,6 +135,11 @@ fn to_glb(gaussians: &HostGaussians, up: [f64; 3]) -> Result<Vec<u8>> {
     Ok(out)
 }
 
+/// Light of a value of sRGB: glTF's vertex colours, which programs without the extension show, are linear.
+fn linear(srgb: f32) -> f32 {
+    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
+}
+
 /// The rotation (x,y,z,w) that takes the axis `up` to +y.
 fn to_y_up([x, y, z]: [f64; 3]) -> [f64; 4] {
     if y <= -1.0 {
@@ -168,6 +173,26 @@ inventory::submit! {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn colours_of_plain_points_are_linear() {
+        let gaussians = HostGaussians {
+            means: vec![0.0; 3],
+            log_scales: vec![0.0; 3],
+            quaternions: vec![1.0, 0.0, 0.0, 0.0],
+            opacity_logits: vec![0.0],
+            sh_dc: [-0.1f32, 0.5, 0.8].map(|srgb| (srgb - 0.5) / 0.282_094_8).to_vec(),
+            dynamic_scores: vec![0.0],
+            ..Default::default()
+        };
+        let glb = to_glb(&gaussians, [0.0, 1.0, 0.0]).unwrap();
+        let length = u32::from_le_bytes([glb[12], glb[13], glb[14], glb[15]]) as usize;
+        let document: Value = serde_json::from_slice(&glb[20..20 + length]).unwrap();
+        let index = |value: &Value| value.as_u64().unwrap() as usize;
+        let accessor = &document["accessors"][index(&document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"])];
+        let at = 20 + length + 8 + index(&document["bufferViews"][index(&accessor["bufferView"])]["byteOffset"]);
+        assert_eq!(glb[at..at + 4], [0, 55, 154, 128]);
+    }
 
     #[test]
     fn every_axis_is_brought_up() {

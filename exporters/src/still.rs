@@ -60,11 +60,16 @@ pub fn sigmoid(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())
 }
 
-/// Colour of the degree-0 coefficients in bytes.
-pub fn color_bytes(dc: &[f32; 3]) -> [u8; 3] {
+/// Colour of the degree-0 coefficients as models are trained: sRGB, 0..1 unless it is out of range.
+pub fn color(dc: &[f32; 3]) -> [f32; 3] {
     /// 1 / (2 sqrt(pi)), the constant basis function.
     const SH_C0: f32 = 0.282_094_8;
-    dc.map(|c| byte(c * SH_C0 + 0.5))
+    dc.map(|c| c * SH_C0 + 0.5)
+}
+
+/// [`color`] in bytes.
+pub fn color_bytes(dc: &[f32; 3]) -> [u8; 3] {
+    color(dc).map(byte)
 }
 
 /// A number in 0..1 in a byte.
