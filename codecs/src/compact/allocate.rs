@@ -22,14 +22,14 @@ pub fn allocate(job: &Job, quality: f64, views: &dyn TrainingViews, renderer: &d
     let view = |k: usize| views.view(k * views.len() / chosen);
     let originals = (0..chosen).map(|k| Ok(renderer.render(gaussians, view(k).0, view(k).1)?.planes)).collect::<Result<Vec<Vec<f32>>>>()?;
     let measure = |factors: &Factors| -> Result<(f64, f64)> {
-        let attempt = job.attempt_with(&job.planner, quality, factors)?;
+        let (attempt, streams) = job.coded_attempt(&job.planner, quality, factors)?;
         let mut error = 0.0;
         for (k, original) in originals.iter().enumerate() {
             let drawn = renderer.render(&attempt.rounded, view(k).0, view(k).1)?;
             let colours = 3 * drawn.width as usize * drawn.height as usize;
             error += original.iter().zip(&drawn.planes).take(colours).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
         }
-        Ok((error, bytes_of(&job.streams(gaussians, &attempt.plan)?) as f64))
+        Ok((error, bytes_of(&streams) as f64))
     };
     let mut factors: Factors = [1.0; 6];
     let (error, bytes) = measure(&factors)?;

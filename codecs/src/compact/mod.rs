@@ -85,6 +85,12 @@ struct Job<'a> {
     joint: Cell<bool>,
 }
 
+#[cfg(test)]
+thread_local! {
+    /// How often this thread has quantised the Gaussians of a [`Job`].
+    static QUANTISED: Cell<usize> = const { Cell::new(0) };
+}
+
 /// Gaussians rounded in the steps of a quality.
 struct Attempt {
     quality: f64,
@@ -98,10 +104,20 @@ struct Attempt {
 impl Job<'_> {
     /// Rounds the Gaussians to encode.
     fn attempt(&self, quality: f64) -> Result<Attempt> {
-        self.attempt_with(&self.planner, quality, &self.factors)
+        Ok(self.attempt_with(&self.planner, quality, &self.factors, |_, _| Ok(()))?.0)
     }
-    /// Rounds the Gaussians of `planner` in steps that keep the declared loss.
-    fn attempt_with(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<Attempt> {
+    /// Rounds the Gaussians of `planner` and codes them.
+    fn coded_attempt(&self, planner: &Planner, quality: f64, factors: &Factors) -> Result<(Attempt, Vec<Stream>)> {
+        self.attempt_with(planner, quality, factors, |of, order| self.write(planner.gaussians, of, order))
+    }
+    /// Rounds the Gaussians of `planner` in steps that keep the declared loss. `encode` gets their integers and the order in which rows are stored.
+    fn attempt_with<T>(
+        &self,
+        planner: &Planner,
+        quality: f64,
+        factors: &Factors,
+        encode: impl FnOnce(&Integers, &[usize]) -> Result<T>,
+    ) -> Result<(Attempt, T)> {
         let mut bounds = Bounds { joint: self.joint.get(), ..Bounds::NONE };
         // Colours may be rounded apart, and each column be stored exactly in the end.
         for reductions in 0..REDUCTIONS + 2 + factors.len() {
@@ -125,24 +141,32 @@ impl Job<'_> {
                 }
             }
             if kept {
-                let rounded = rounded.select(&self.order(&of));
-                return Ok(Attempt { quality, plan, rounded });
+                let order = self.order(&of);
+                let (found, rounded) = (encode(&of, &order)?, rounded.select(&order));
+                return Ok((Attempt { quality, plan, rounded }, found));
             }
         }
         Err(Error::backend("codec compact", "no step keeps the declared loss", "Report this"))
     }
     fn quantise<'a>(&'a self, gaussians: &HostGaussians, plan: &'a Plan) -> Integers<'a> {
+        #[cfg(test)]
+        QUANTISED.set(QUANTISED.get() + 1);
         plan.quantise(gaussians, &self.free, self.planner.classes, self.directions)
     }
     /// The streams of canonical Gaussians as `plan` rounds them.
     fn streams(&self, gaussians: &HostGaussians, plan: &Plan) -> Result<Vec<Stream>> {
         let of = self.quantise(gaussians, plan);
-        write::write(gaussians, &of, &self.motion, &self.order(&of), &self.layers.1)
+        self.write(gaussians, &of, &self.order(&of))
     }
-    /// What these streams will be decoded to, as in [`Attempt::rounded`].
-    fn rounded(&self, gaussians: &HostGaussians, plan: &Plan) -> HostGaussians {
+    /// The same streams, and what they will be decoded to, as in [`Attempt::rounded`].
+    fn stored(&self, gaussians: &HostGaussians, plan: &Plan) -> Result<(Vec<Stream>, HostGaussians)> {
         let of = self.quantise(gaussians, plan);
-        rounding::restored(&of, gaussians).select(&self.order(&of))
+        let order = self.order(&of);
+        Ok((self.write(gaussians, &of, &order)?, rounding::restored(&of, gaussians).select(&order)))
+    }
+    /// The streams of `gaussians`, whose integers are `of`.
+    fn write(&self, gaussians: &HostGaussians, of: &Integers, order: &[usize]) -> Result<Vec<Stream>> {
+        write::write(gaussians, of, &self.motion, order, &self.layers.1)
     }
     /// The order in which rows are stored.
     fn order(&self, of: &Integers) -> Vec<usize> {
@@ -298,7 +322,9 @@ mod tests {
         let job = Job { planner, free: vec![false; n], directions: Some(&directions), layers, motion, factors: [1.0; 6], joint: Cell::new(true) };
         let wanted = job.planner.plan(0.05, &job.factors, &Bounds::NONE);
         let too_much = |plan: &Plan| {
-            let (sorted, rounded) = (g.select(&job.order(&job.quantise(&g, plan))), job.rounded(&g, plan));
+            let of = job.quantise(&g, plan);
+            let order = job.order(&of);
+            let (sorted, rounded) = (g.select(&order), rounding::restored(&of, &g).select(&order));
             let losses = sorted.columns().into_iter().zip(rounded.columns()).zip(LOSSES).map(|(((name, width, a), (_, _, b)), loss)| {
                 assert_eq!(name, loss.0);
                 column_loss(name, a, b, width) > loss.1

@@ -42,16 +42,19 @@ enum Allowance<'a> {
 }
 
 impl Allowance<'_> {
-    /// The attempt with what it uses, as a share of what is allowed. It is coded only where bytes are allowed.
-    fn tried(&self, job: &Job, attempt: Attempt) -> Result<Tried> {
-        let (share, streams) = match self {
+    /// An attempt with what it uses, as a share of what is allowed. It is coded only where bytes are allowed.
+    fn tried(&self, job: &Job, quality: f64) -> Result<Tried> {
+        match self {
             Self::Bytes { limit, context } => {
-                let streams = job.streams(job.planner.gaussians, &attempt.plan)?;
-                (file_bytes(context, &streams, None)? / limit, Some(streams))
+                let (attempt, streams) = job.coded_attempt(&job.planner, quality, &job.factors)?;
+                Ok(Tried { attempt, share: file_bytes(context, &streams, None)? / limit, streams: Some(streams) })
             }
-            Self::Drop { before, limit, views, renderer, chosen } => ((before - psnr_on_views(&attempt.rounded, *views, *renderer, *chosen)?) / limit, None),
-        };
-        Ok(Tried { attempt, share, streams })
+            Self::Drop { before, limit, views, renderer, chosen } => {
+                let attempt = job.attempt(quality)?;
+                let share = (before - psnr_on_views(&attempt.rounded, *views, *renderer, *chosen)?) / limit;
+                Ok(Tried { attempt, share, streams: None })
+            }
+        }
     }
     /// Octaves from the step factor of an attempt to the one that is expected to use [`AIM`].
     fn octaves(&self, attempt: &Attempt, share: f64) -> f64 {
@@ -93,8 +96,7 @@ fn seek(job: &Job, start: f64, allowance: &Allowance, good: f64) -> Result<Tried
     let mut best: Option<(f64, Tried)> = None;
     let mut least = None;
     for _ in 0..ATTEMPTS {
-        let attempt = job.attempt(start * libm::exp2(direction * at))?;
-        let tried = allowance.tried(job, attempt)?;
+        let tried = allowance.tried(job, start * libm::exp2(direction * at))?;
         let step = direction * allowance.octaves(&tried.attempt, tried.share);
         if tried.allowed() {
             if tried.share >= good {
@@ -147,7 +149,7 @@ pub fn search(job: &mut Job, settings: &Settings, context: &CodecContext) -> Res
             let problem = "fine-tuning belongs to the search for a loss or a size, and neither is bounded";
             return Err(Error::parameter("codec compact.finetune", problem, "Choose compact:max-drop=0.05dB or compact:max-size=5MB, or leave it out"));
         }
-        _ => return job.streams(gaussians, &job.attempt(start)?.plan),
+        _ => return Ok(job.coded_attempt(&job.planner, start, &job.factors)?.1),
     };
     let tuner = context.tuner.filter(|_| settings.finetune > 0 && services.is_some());
     let caution = tuner.filter(|_| !settings.finetune_wanted).map(|t| t.caution()).transpose()?.flatten();

@@ -127,16 +127,16 @@ pub fn tune(job: &Job, found: &Untuned, goal: &Goal, settings: &Settings, tuner:
         let quality = found.attempt.quality * libm::exp2(octaves);
         let weight_steps = libm::exp2(octaves + of_weights);
         let planner = job.planner.of(&model.gaussians);
-        let plan = job.attempt_with(&planner, quality, &job.factors)?.plan;
-        let per_octave = saved_by_doubling(job, &planner, quality, bytes_of(&job.streams(&model.gaussians, &plan)?))?;
+        let (Attempt { plan, .. }, untrained) = job.coded_attempt(&planner, quality, &job.factors)?;
+        let per_octave = saved_by_doubling(job, &planner, quality, bytes_of(&untrained))?;
         let bits_per_octave = 8.0 * per_octave;
         let rounding = &Rounder { plan: &plan, free: &job.free, classes: job.planner.classes };
         let (iterations, of) = (shares[round], (shares[..round].iter().sum(), settings.finetune));
         let seed = context.seed.child("fine-tuning").index(round as u64);
         let mut model = tuner.tune(model, &Tuning { rounding, weight_steps, iterations, of, seed, size_weight: settings.size_weight, bits_per_octave })?;
         model.gaussians = canonical(&model.gaussians, &job.free);
-        let streams = job.streams(&model.gaussians, &plan)?;
-        let drop = before - tuner.psnr(&job.rounded(&model.gaussians, &plan), &model.weights, Some(weight_steps))?;
+        let (streams, rounded) = job.stored(&model.gaussians, &plan)?;
+        let drop = before - tuner.psnr(&rounded, &model.weights, Some(weight_steps))?;
         let weights = weight_bytes(tuner, &model.weights, weight_steps)?;
         let bytes = bytes_of(&streams) + weights;
         let (number, steps, gaussians) = (round + 1, libm::exp2(octaves), megabytes(bytes_of(&streams)));
@@ -209,8 +209,8 @@ pub fn loss(tuner: &dyn TuneModel, gaussians: &HostGaussians, rounded: &HostGaus
 
 /// The bytes that steps twice as large save where those of `quality` give `bytes`.
 fn saved_by_doubling(job: &Job, planner: &Planner, quality: f64, bytes: usize) -> Result<f64> {
-    let coarser = job.attempt_with(planner, 2.0 * quality, &job.factors)?.plan;
-    Ok(bytes.saturating_sub(bytes_of(&job.streams(planner.gaussians, &coarser)?)).max(1) as f64)
+    let (_, coarser) = job.coded_attempt(planner, 2.0 * quality, &job.factors)?;
+    Ok(bytes.saturating_sub(bytes_of(&coarser)).max(1) as f64)
 }
 
 /// Bytes of weights in such steps.

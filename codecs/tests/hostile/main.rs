@@ -179,7 +179,7 @@ fn damaged_gaussians_give_errors() {
 
 #[test]
 fn damaged_playback_layers_give_errors() {
-    let (rows, samples, degree) = ([1u32, 4, 5, 9, 30], 6, 1);
+    let (rows, samples, degree) = ([1usize, 4, 5, 9, 30], 6, 1);
     let track = |head: Head, first: usize, last: usize| {
         let ranks = vec![2u8, 0, 1, 2, 1];
         let coefficients = ranks.iter().map(|r| usize::from(*r)).sum::<usize>() * head.width(degree);

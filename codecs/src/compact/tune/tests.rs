@@ -2,8 +2,8 @@
 
 use super::super::encode::classify;
 use super::super::joint::Directions;
-use super::super::search::search;
-use super::super::{Choices, Motion, importance, layers};
+use super::super::search::{estimate, search};
+use super::super::{Choices, Motion, QUANTISED, importance, layers};
 use super::*;
 use cc4dgs_format::{Camera, EncodedWeights, Image8, Recorder, RenderModel, RenderedPlanes, Seed, TrainingViews};
 use std::cell::{Cell, RefCell};
@@ -190,6 +190,28 @@ fn where_training_is_worth_nothing_colours_are_rounded_together() {
         job.directions = Some(directions);
         let together = search(job, &settings(100), &context).unwrap();
         assert!(job.directions.is_some() && together != apart && bytes_of(&together) <= limit, "{} of {limit} bytes", bytes_of(&together));
+    });
+}
+
+#[test]
+fn what_is_coded_is_quantised_once() {
+    with_job(2, |job, directions, context, _| {
+        job.directions = Some(directions);
+        let plain = Settings { max_drop_db: 0.0, finetune: 0, allocate: false, ..Default::default() };
+        let quality = estimate(plain.psnr_db, job.planner.importance);
+        // Colours that exceed the declared loss together are rounded apart from then on.
+        job.attempt(quality).unwrap();
+        QUANTISED.set(0);
+        let attempt = job.attempt(quality).unwrap();
+        let passes = QUANTISED.replace(0);
+        let (streams, rounded) = job.stored(job.planner.gaussians, &attempt.plan).unwrap();
+        assert!(QUANTISED.replace(0) == 1 && rounded == attempt.rounded);
+        // The first attempt uses almost all of this size.
+        let bounded = Settings { max_size_mb: (bytes_of(&streams) + 1) as f64 / 1e6, ..plain.clone() };
+        for settings in [plain, bounded] {
+            assert!(search(job, &settings, context).unwrap() == streams, "{settings:?}");
+            assert_eq!(QUANTISED.replace(0), passes, "{settings:?}");
+        }
     });
 }
 

@@ -13,6 +13,7 @@
 mod computed;
 mod layer;
 mod max_error;
+mod sizes;
 mod streams;
 
 pub use computed::{ComputedMotion, MotionPlugin, MotionSource};

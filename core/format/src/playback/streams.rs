@@ -6,7 +6,8 @@
 //! 0; `.coefficients`: zigzag u32, function by function, then number by number, then Gaussian by Gaussian of a sufficient rank. A coefficient is its integer
 //! times step times 2^-exponent. All little-endian.
 
-use super::layer::{Head, MAX_FUNCTIONS, MAX_SAMPLES, MAX_SEGMENTS, PlaybackLayer, Segment, Track};
+use super::layer::{Head, MAX_SAMPLES, MAX_SEGMENTS, PlaybackLayer, Segment, Track};
+use super::sizes::{check_counts, coefficient_count, gaps};
 use crate::archive::ByteReader;
 use crate::{Error, Limits, Result, Stream};
 
@@ -75,26 +76,17 @@ impl PlaybackLayer {
     /// The streams of a layer: `rows` (ascending) of Gaussians of degree `sh_degree`, `samples` times, and per segment its last sample and tracks.
     ///
     /// # Errors
-    /// [`Error::Parameter`] for counts over what the format holds.
-    pub fn encode(rows: &[u32], sh_degree: usize, samples: usize, segments: &[(usize, Vec<CodedTrack>)]) -> Result<Vec<Stream>> {
-        let functions = segments.iter().flat_map(|(_, tracks)| tracks).map(|t| t.peaks.len()).max().unwrap_or(0);
-        for (what, found, most) in [("samples", samples, MAX_SAMPLES), ("segments", segments.len(), MAX_SEGMENTS), ("functions", functions, MAX_FUNCTIONS)] {
-            if found > most {
-                return Err(Error::parameter("playback layer", format!("{found} {what} are over the limit of {most}"), "Bake with a larger --max-error"));
-            }
-        }
+    /// [`Error::Limit`] for counts over what the format holds, [`Error::Parameter`] for rows that do not ascend.
+    pub fn encode(rows: &[usize], sh_degree: usize, samples: usize, segments: &[(usize, Vec<CodedTrack>)]) -> Result<Vec<Stream>> {
+        check_counts(sh_degree, samples, segments)?;
+        let gaps = gaps(rows)?;
         let mut meta = vec![VERSION, sh_degree as u8];
         meta.extend((samples as u16).to_le_bytes());
         meta.extend((segments.len() as u16).to_le_bytes());
-        meta.extend((rows.len() as u32).to_le_bytes());
+        meta.extend((gaps.len() as u32).to_le_bytes());
         let mut out = Vec::new();
         let mut add = |name: String, bytes: Vec<u8>| out.push(Stream { name, bytes });
-        let gaps = rows.iter().scan(0u32, |next, &row| {
-            let gap = row - *next;
-            *next = row + 1;
-            Some(gap)
-        });
-        add(ROWS.into(), gaps.flat_map(u32::to_le_bytes).collect());
+        add(ROWS.into(), gaps.into_iter().flat_map(u32::to_le_bytes).collect());
         for (k, (last, tracks)) in segments.iter().enumerate() {
             meta.extend((*last as u16).to_le_bytes());
             meta.push(tracks.len() as u8);
@@ -104,6 +96,7 @@ impl PlaybackLayer {
                 meta.extend(track.peaks.iter().flat_map(|p| p.to_le_bytes()));
                 let name = |part: &str| format!("{PREFIX}{k}.{}.{part}", track.head.name());
                 let width = track.head.width(sh_degree);
+                coefficient_count(&track.ranks, width)?;
                 add(name("functions"), track.functions.iter().flat_map(|v| v.to_le_bytes()).collect());
                 add(name("ranks"), track.ranks.clone());
                 add(name("exponents"), track.ranks.iter().zip(&track.exponents).filter(|(rank, _)| **rank > 0).map(|(_, e)| *e).collect());
@@ -200,11 +193,8 @@ impl TrackShape {
             return Err(reader.error(format!("no Gaussian uses exactly the {} functions there are", self.functions)));
         }
         reader.finish()?;
-        let (users, total) = (ranks.iter().filter(|r| **r > 0).count(), ranks.iter().map(|r| u64::from(*r)).sum::<u64>() * self.width as u64);
-        limits.check_bytes("coefficients of the playback layer", 4 * total)?;
-        if total > u64::from(u32::MAX) {
-            return Err(Error::limit("coefficients of the playback layer", total, u64::from(u32::MAX), "Bake with a larger --max-error"));
-        }
+        let (users, total) = (ranks.iter().filter(|r| **r > 0).count(), coefficient_count(&ranks, self.width)?);
+        limits.check_bytes("coefficients of the playback layer", 4 * total as u64)?;
         let mut reader = part("exponents")?;
         let mut stored = reader.take(users)?.iter();
         if let Some(e) = stored.clone().find(|e| **e > MAX_EXPONENT) {
@@ -213,8 +203,8 @@ impl TrackShape {
         let exponents = ranks.iter().map(|r| if *r > 0 { stored.next().copied().unwrap_or(0) } else { 0 }).collect();
         reader.finish()?;
         let mut reader = part("coefficients")?;
-        let words = reader.take(4 * total as usize)?.as_chunks::<4>().0;
-        let mut coefficients = vec![0i32; total as usize];
+        let words = reader.take(4 * total)?.as_chunks::<4>().0;
+        let mut coefficients = vec![0i32; total];
         for (i, word) in CodedTrack::order(&ranks, self.width).zip(words) {
             coefficients[i] = unzigzag(u32::from_le_bytes(*word));
         }
@@ -240,7 +230,7 @@ fn unzigzag(v: u32) -> i32 {
 mod tests {
     use super::*;
 
-    fn coded() -> (Vec<u32>, Vec<(usize, Vec<CodedTrack>)>) {
+    fn coded() -> (Vec<usize>, Vec<(usize, Vec<CodedTrack>)>) {
         let track = |head: Head, width: usize| CodedTrack {
             head,
             peaks: vec![1.0, 0.5],
@@ -258,7 +248,7 @@ mod tests {
         let (rows, segments) = coded();
         let streams = PlaybackLayer::encode(&rows, 1, 5, &segments).unwrap();
         let layer = PlaybackLayer::decode(&streams, 10, 1, &Limits::default()).unwrap();
-        assert_eq!((&layer.rows, layer.samples, layer.segments.len()), (&rows, 5, 2));
+        assert_eq!((layer.rows.as_slice(), layer.samples, layer.segments.len()), ([1, 2, 9].as_slice(), 5, 2));
         for (segment, (_, tracks)) in layer.segments.iter().zip(&segments) {
             for (found, coded) in segment.tracks.iter().zip(tracks) {
                 assert_eq!(*found, coded.decoded(coded.head.width(1)));

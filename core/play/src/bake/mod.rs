@@ -130,7 +130,8 @@ pub struct HeadReport {
 /// The motion of `model` as a playback layer; `None` if nothing moves. `device` is that of the model's deformer.
 ///
 /// # Errors
-/// [`Error::Parameter`] for a bound that is not positive; [`Error::Interrupted`] where something moves and `options.stop` is set; what the deformer reports.
+/// [`Error::Parameter`] for a bound that is not positive; [`Error::Interrupted`] where something moves and `options.stop` is set; [`Error::Limit`] for a layer with
+/// larger numbers than its format holds; what the deformer reports.
 pub fn bake(model: &Model, options: &BakeOptions, device: &Device, events: &dyn EventSink) -> Result<Option<Baked>> {
     options.max_error.check()?;
     let Some(motion) = Motion::of(model, device, options.stop)? else { return Ok(None) };
@@ -182,10 +183,9 @@ pub fn bake(model: &Model, options: &BakeOptions, device: &Device, events: &dyn 
         .zip(functions.iter().zip(&ends[1..]))
         .map(|(tracks, (heads, &end))| (end, tracks.into_iter().zip(heads).filter_map(|(t, functions)| t.finish(functions)).collect()))
         .collect();
-    let indices: Vec<u32> = motion.rows.iter().map(|&row| row as u32).collect();
-    let streams = PlaybackLayer::encode(&indices, model.gaussians.sh_degree, samples, &segments)?;
+    let streams = PlaybackLayer::encode(&motion.rows, model.gaussians.sh_degree, samples, &segments)?;
     let report = BakeReport {
-        moving: indices.len(),
+        moving: motion.rows.len(),
         samples,
         samples_limited,
         segments: segments.len(),

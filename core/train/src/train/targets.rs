@@ -59,8 +59,12 @@ pub(super) fn targets(job: &TuneJob) -> Result<Arc<Scene>> {
     }
     let message = format!("trained with colours per camera, which models do not keep: the images of {} cameras are brought to its own colours", maps.len());
     job.events.emit(&Event::Note { object: "model".into(), message });
-    let source = Recoloured { scene: scene.clone(), background, maps };
-    Ok(Arc::new(Scene::new(scene.name.clone(), scene.cameras.clone(), scene.views.clone(), Arc::new(source), scene.cache_bytes())?))
+    Ok(Arc::new(recoloured(scene, background, maps)?))
+}
+
+/// `scene` with the colours of each camera of `maps` mapped, over `background`. Its images are cached within the bound of `scene`.
+fn recoloured(scene: &Arc<Scene>, background: [f32; 3], maps: BTreeMap<usize, [DVec4; 3]>) -> Result<Scene> {
+    scene.derived(scene.cameras.clone(), Arc::new(Recoloured { scene: scene.clone(), background, maps }))
 }
 
 /// The affine transform of colours that is best in the sense of least squares.
@@ -132,6 +136,36 @@ impl FrameSource for Recoloured {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cc4dgs_core::{Camera, View};
+    use std::sync::atomic::AtomicUsize;
+
+    /// White images of 2,400 bytes, and how many were loaded.
+    #[derive(Default)]
+    struct White(AtomicUsize);
+
+    impl FrameSource for White {
+        fn load(&self, _: usize) -> Result<Image8> {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            Ok(Image8 { width: 40, height: 20, channels: 3, data: vec![255; 2400] })
+        }
+    }
+
+    #[test]
+    fn images_in_other_colours_share_the_cache() {
+        // Loads for an image, the same in other colours, and the image again.
+        let loads = |cache_bytes: u64| {
+            let camera = Camera::look_at("a", (40, 20), 1.0, [0.0, 0.0, -4.0], [0.0; 3], [0.0, 1.0, 0.0]);
+            let views = vec![View { camera: 0, frame: 0, time_norm: 0.0, split: Split::Train }];
+            let source = Arc::new(White::default());
+            let scene = Arc::new(Scene::new("white", vec![camera], views, source.clone(), cache_bytes).unwrap());
+            let darker = [DVec4::X, DVec4::Y, DVec4::Z].map(|row| row * 0.2);
+            let other = recoloured(&scene, [0.0; 3], BTreeMap::from([(0, darker)])).unwrap();
+            let images = [scene.frame(0), other.frame(0), scene.frame(0)].map(|image| image.unwrap().data[0]);
+            assert_eq!(images, [255, 51, 255]);
+            source.0.load(Ordering::Relaxed)
+        };
+        assert_eq!((loads(4799), loads(4800)), (2, 1), "two images of 2,400 bytes");
+    }
 
     #[test]
     fn a_transform_of_colours_is_found_and_the_identity_where_colours_say_nothing() {
