@@ -64,11 +64,11 @@ const MOST_OFFSET: i32 = 1_000_000;
 pub struct SceneOptions {
     /// Reader name, or `auto` to probe.
     pub reader: String,
-    /// Target width in pixels; 0 keeps the native one, or the aspect if only the height is given.
+    /// Target width in pixels; 0 keeps the native one, or the aspect if only the height is given. Images that are smaller keep their size.
     pub width: u32,
-    /// Target height in pixels; 0 keeps the native one, or the aspect if only the width is given.
+    /// Target height in pixels; 0 keeps the native one, or the aspect if only the width is given. Images that are smaller keep their size.
     pub height: u32,
-    /// Divides the native size; not together with `width` and `height`.
+    /// Divides the native size; not together with `width` and `height`. Below 1 it enlarges images that readers compute, and no others.
     pub downscale: f64,
     /// First frame, number of frames (0: all that follow) and stride, by frame index of the dataset.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -83,7 +83,8 @@ pub struct SceneOptions {
     pub test_cameras: Option<Vec<CameraRef>>,
     /// At most this many training views, evenly spread; 0 for all.
     pub max_views: usize,
-    /// Which `transforms_*.json` is the held-out one of Blender-style scenes (`val` is the usual choice for D-NeRF lego).
+    /// Which `transforms_*.json` is the held-out one of Blender-style scenes (`val` is the usual choice for D-NeRF lego). Otherwise views of `transforms_val.json` are
+    /// validation views.
     pub test_split: String,
     /// The `ffmpeg` command for video input; `ffprobe` is expected in the same folder.
     pub ffmpeg: String,
@@ -142,7 +143,8 @@ impl SceneOptions {
         }
         Ok(())
     }
-    /// The size, width and height in pixels, to which images of the size `native` are scaled.
+    /// The size, width and height in pixels, that is asked for where images have the size `native`. Readers that compute images compute them at this size;
+    /// images of files and videos get [`Self::image_size`].
     pub fn target_size(&self, native: (u32, u32)) -> (u32, u32) {
         let (w, h) = (f64::from(native.0), f64::from(native.1));
         let pixels = |v: f64| v.round().clamp(1.0, f64::from(u32::MAX)) as u32;
@@ -152,6 +154,12 @@ impl SceneOptions {
             (0, height) => (pixels(w * f64::from(height) / h), height),
             both => both,
         }
+    }
+    /// The size, width and height in pixels, to which images of the size `native` are scaled: [`Self::target_size`], but at most `native` along each axis.
+    /// Enlarged images would show no more; they would cost time and blur what renders are compared with.
+    pub fn image_size(&self, native: (u32, u32)) -> (u32, u32) {
+        let asked = self.target_size(native);
+        (asked.0.min(native.0), asked.1.min(native.1))
     }
 }
 
@@ -168,6 +176,14 @@ mod tests {
         assert_eq!(with(0, 150, 1.0), (200, 150));
         assert_eq!(with(100, 100, 1.0), (100, 100));
         assert_eq!(with(0, 0, 2.0), (400, 300));
+    }
+
+    #[test]
+    fn images_are_not_enlarged() {
+        let with = |width, height, downscale| SceneOptions { width, height, downscale, ..Default::default() }.image_size((800, 600));
+        assert_eq!([with(400, 0, 1.0), with(0, 150, 1.0), with(0, 0, 2.0), with(100, 90, 1.0)], [(400, 300), (200, 150), (400, 300), (100, 90)]);
+        assert_eq!([with(801, 0, 1.0), with(0, 1200, 1.0), with(0, 0, 0.5), with(1000, 1000, 1.0)], [(800, 600); 4]);
+        assert_eq!(with(1000, 150, 1.0), (800, 150), "each axis on its own where both are stated");
     }
 
     #[test]

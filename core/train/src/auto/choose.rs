@@ -124,18 +124,22 @@ fn integer(value: f64) -> Value {
     Value::Integer(value.round() as i64)
 }
 
-/// The width images are trained at, where their `native` size is too much for the time. Sizes that the user stated count instead.
-pub(super) fn image_size(native: [u32; 2], options: &SceneOptions, machine: Machine, minutes: f64) -> Option<Choice> {
+/// The width images are trained at, where the median of the `native` sizes of the cameras, which are sorted, is too much for the time. Sizes that the user
+/// stated count instead.
+pub(super) fn image_size(native: &[[u32; 2]], options: &SceneOptions, machine: Machine, minutes: f64) -> Option<Choice> {
     if options.width > 0 || options.height > 0 || options.downscale != 1.0 {
         return None;
     }
-    let pixels = f64::from(native[0]) * f64::from(native[1]);
+    let median = native.get(native.len() / 2)?;
+    let pixels = f64::from(median[0]) * f64::from(median[1]);
     let affordable = (PIXELS_PER_THREAD_MINUTE * machine.speed() * minutes).max(LEAST_PIXELS);
     if pixels <= SPARE * affordable {
         return None;
     }
-    let width = (f64::from(native[0]) * (affordable / pixels).sqrt()).round().max(1.0);
-    let reason = format!("images of {}x{} pixels are too many for {minutes:.0} minutes on this machine", native[0], native[1]);
+    let width = (f64::from(median[0]) * (affordable / pixels).sqrt()).round().max(1.0);
+    let narrower = native.iter().filter(|size| f64::from(size[0]) < width).count();
+    let kept = if narrower > 0 { format!("; {narrower} of {} cameras have smaller ones, which are not enlarged", native.len()) } else { String::new() };
+    let reason = format!("images of {}x{} pixels are too many for {minutes:.0} minutes on this machine{kept}", median[0], median[1]);
     Some(choice([("scene.width", integer(width))], reason))
 }
 

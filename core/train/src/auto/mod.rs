@@ -154,7 +154,7 @@ pub fn open_shared(
     // Views that training keeps out are not looked at.
     let seen = |scene: &Scene| data::hold_out(scene, asked.train.validation);
     let mut scene = read(&asked)?;
-    if let Some(choice) = choose::image_size(native_size(&seen(&scene)?), &asked.scene, machine, minutes) {
+    if let Some(choice) = choose::image_size(&native_sizes(&seen(&scene)?), &asked.scene, machine, minutes) {
         plan.add(choice)?;
         scene = read(&layers.over(&plan.table).config()?)?;
     }
@@ -281,12 +281,12 @@ fn lengths(facts: &Facts, config: &RunConfig, timing: Timing, minutes: f64, left
     choices
 }
 
-/// Width and height in pixels of the median training camera.
-fn native_size(scene: &Scene) -> [u32; 2] {
+/// Width and height in pixels of every training camera, sorted by the number of pixels.
+fn native_sizes(scene: &Scene) -> Vec<[u32; 2]> {
     let cameras: BTreeSet<usize> = scene.split(Split::Train).into_iter().map(|view| scene.views[view].camera).collect();
     let mut sizes: Vec<[u32; 2]> = cameras.into_iter().map(|camera| [scene.cameras[camera].width, scene.cameras[camera].height]).collect();
     sizes.sort_unstable_by_key(|size| u64::from(size[0]) * u64::from(size[1]));
-    sizes.get(sizes.len() / 2).copied().unwrap_or([1, 1])
+    sizes
 }
 
 #[cfg(test)]

@@ -22,7 +22,10 @@ const FARTHEST: f64 = 1e9;
 /// Size per axis of stored frames of a video whose lens has to be undone, over their final one.
 const LENS_SHARE: f64 = 1.5;
 
-/// The scene a reader parsed, with frames and cameras chosen, lenses undone and images brought to the size the options ask for.
+/// Width and height in pixels of images, and of the larger ones that the options ask for.
+type Smaller = [(u32, u32); 2];
+
+/// The scene a reader parsed, with frames and cameras chosen, lenses undone and images brought to the size the options ask for, if it is not larger.
 ///
 /// The scene is in the normalised frame of its cameras and on a clock of its own, or in those of a model.
 ///
@@ -43,7 +46,7 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
     raw.validate()?;
     let mut plans = Vec::with_capacity(raw.cameras.len());
     let mut cameras = Vec::with_capacity(raw.cameras.len());
-    let mut enlarged = Vec::new();
+    let mut smaller = Vec::new();
     let mut first_images: Vec<Option<&ImageSource>> = vec![None; raw.cameras.len()];
     raw.views.iter().rev().for_each(|view| first_images[view.camera] = Some(&view.image));
     for (camera, image) in raw.cameras.iter_mut().zip(first_images) {
@@ -51,20 +54,17 @@ pub fn assemble(mut raw: RawScene, options: &SceneOptions, trained: Option<&Trai
             Some(ImageSource::File { path, .. }) => fit_to_image(camera, image_size(path, limits)?, &mut raw.warnings)?,
             _ => camera.size,
         };
-        let wanted = options.target_size((native[0], native[1]));
-        if !raw.resized && (wanted.0 > native[0] || wanted.1 > native[1]) {
-            enlarged.push((native, wanted));
-        }
         let is_video = matches!(image, Some(ImageSource::Video { .. }));
-        let (plan, pinhole) = plan_camera(camera, native, is_video, (!raw.resized).then_some(options), limits)?;
+        let (plan, pinhole, is_smaller) = plan_camera(camera, native, is_video, (!raw.resized).then_some(options), limits)?;
+        smaller.extend(is_smaller);
         plans.push(plan);
         cameras.push(frame.apply_camera(&pinhole));
     }
-    if let Some(([w, h], (width, height))) = enlarged.first() {
+    if let Some([(w, h), (width, height)]) = smaller.first() {
         raw.warnings.push(format!(
-            "the images of {} of {} cameras are smaller than scene.width and scene.height ask for and are enlarged ({w}x{h} to {width}x{height}), also where \
-             renders are scored against them; scene.downscale divides the size of each camera instead",
-            enlarged.len(),
+            "the images of {} of {} cameras are smaller than scene.width, scene.height or scene.downscale ask for and are not enlarged ({w}x{h}, where \
+             {width}x{height} is asked for)",
+            smaller.len(),
             plans.len()
         ));
     }
@@ -136,24 +136,31 @@ pub(super) fn fit_to_image(camera: &mut RawCamera, found: (u32, u32), warnings: 
     Ok(camera.size)
 }
 
-/// What happens to the images of a camera, and the pinhole camera they have then. Without options the images keep their size.
-fn plan_camera(camera: &RawCamera, native: [u32; 2], is_video: bool, options: Option<&SceneOptions>, limits: &Limits) -> Result<(Plan, Camera)> {
+/// What happens to the images of a camera, the pinhole camera they have then, and their size where a larger one is asked for. Without options they keep it.
+fn plan_camera(
+    camera: &RawCamera,
+    native: [u32; 2],
+    is_video: bool,
+    options: Option<&SceneOptions>,
+    limits: &Limits,
+) -> Result<(Plan, Camera, Option<Smaller>)> {
     let object = format!("camera {}", camera.name);
     let (undistort, pinhole) = without_lens(&object, camera, native)?;
     let size = (pinhole.width, pinhole.height);
-    let output = options.map_or(size, |o| o.target_size(size));
+    let (asked, output) = options.map_or((size, size), |o| (o.target_size(size), o.image_size(size)));
+    let smaller = (asked.0 > size.0 || asked.1 > size.1).then_some([size, asked]);
     limits.check_pixels(&object, u64::from(output.0), u64::from(output.1))?;
     let plan = Plan { native, undistort, output };
     let share = LENS_SHARE * f64::max(f64::from(output.0) / f64::from(size.0), f64::from(output.1) / f64::from(size.1));
     if !is_video || plan.undistort.is_none() || share >= 1.0 {
-        return Ok((plan, pinhole.resized(output.0, output.1)));
+        return Ok((plan, pinhole.resized(output.0, output.1), smaller));
     }
     // Every frame is stored before its lens is undone, so it should not be larger than needed.
     let small = native.map(|n| (f64::from(n) * share).ceil() as u32);
     let scaled = |values: [f64; 2]| [0, 1].map(|axis| values[axis] * f64::from(small[axis]) / f64::from(native[axis]));
     let camera = RawCamera { size: small, focal: scaled(camera.focal), principal: scaled(camera.principal), ..camera.clone() };
     let (undistort, pinhole) = without_lens(&object, &camera, small)?;
-    Ok((Plan { native: small, undistort, output }, pinhole.resized(output.0, output.1)))
+    Ok((Plan { native: small, undistort, output }, pinhole.resized(output.0, output.1), smaller))
 }
 
 /// How the lens of a camera whose images have `native` pixels is undone, if it has one, and the pinhole camera that is left.

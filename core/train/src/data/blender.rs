@@ -23,6 +23,8 @@ struct Frame {
     transform_matrix: Vec<Vec<f64>>,
 }
 
+/// The name of the split to choose settings by.
+const VALIDATION: &str = "val";
 /// Half the side of the cube D-NeRF scenes are initialised in (Deformable 3D Gaussians, 4DGS: 1.3 units) over the distance of their cameras.
 const INIT_HALF_SHARE: f64 = 1.3 / 4.0311;
 
@@ -57,6 +59,9 @@ fn open(path: &Path, options: &SceneOptions, limits: &Limits) -> Result<RawScene
     } else {
         scene.warnings.push(format!("there is no {test}; nothing is held out"));
     }
+    if options.test_split != VALIDATION && path.join(format!("transforms_{VALIDATION}.json")).is_file() {
+        read_split(path, VALIDATION, Split::Validation, limits, &mut scene, &mut times)?;
+    }
     warn_of_missing_times(&times, &mut scene.warnings);
     scene.rank_times(&times, &path.display().to_string())?;
     merge_fixed_cameras(&mut scene, &times, true);
@@ -73,7 +78,13 @@ fn read_split(folder: &Path, name: &str, split: Split, limits: &Limits, scene: &
     let paths: Vec<_> = transforms.frames.iter().map(|f| image_path(folder, &f.file_path)).collect();
     let Some(present) = paths.iter().find(|p| p.is_file()) else {
         let first = paths.first().map(|p| p.display().to_string()).unwrap_or_else(|| "any".into());
-        return Err(Error::data(object, format!("none of its {} images exist ({first})", paths.len()), "Check that the images lie beside the JSON"));
+        let problem = format!("none of its {} images exist ({first})", paths.len());
+        if split == Split::Validation {
+            // Nothing depends on them, and copies of the dataset leave them out.
+            scene.warnings.push(format!("{object}: {problem}; there are no validation views"));
+            return Ok(());
+        }
+        return Err(Error::data(object, problem, "Check that the images lie beside the JSON"));
     };
     for (frame, path) in transforms.frames.iter().zip(&paths) {
         let bad = |problem: String| Error::data(format!("{object}: frame {}", frame.file_path), problem, "Correct the JSON");

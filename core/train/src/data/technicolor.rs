@@ -1,4 +1,4 @@
-//! Technicolor light-field videos as E-D3DGS uses them: a 4x4 rig, undistorted images, `cameras_parameters.txt`.
+//! Technicolor light-field videos as E-D3DGS uses them: a 4x4 rig, undistorted images or smaller copies of them, `cameras_parameters.txt`.
 
 use cc4dgs_core::reader::files::{file_name, image_size, is_image, list, read_text};
 use cc4dgs_core::reader::pose::from_quaternion;
@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 /// First frame of the 50 each of the five scenes is evaluated on.
 const FIRST_FRAMES: [(&str, u32); 5] = [("Birthday", 151), ("Fabien", 51), ("Painter", 100), ("Theater", 51), ("Train", 151)];
 const FRAMES: u32 = 50;
+/// Width and height in pixels of the dataset's images. Its `cameras_parameters.txt` is calibrated for them without saying so.
+const FULL_SIZE: [u32; 2] = [2048, 1088];
 /// The held-out view.
 const TEST_CAMERA: u32 = 10;
 
@@ -62,7 +64,7 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
         };
         return Err(Error::data(path.display().to_string(), problem, remedy));
     };
-    let (w, h) = image_size(first, limits)?;
+    let size = calibrated_size(&rows, image_size(first, limits)?.into());
     let mut scene = RawScene { name: file_name(path), ..Default::default() };
     if let Some(range) = range.filter(|_| images.len() < found) {
         let (more, last) = (found - images.len(), range.end - 1);
@@ -72,7 +74,7 @@ fn open(path: &Path, _: &SceneOptions, limits: &Limits) -> Result<RawScene> {
         let bad = |problem: String| Error::data(format!("{}: camera {index}", file.display()), problem, "Fetch the file again");
         scene.cameras.push(RawCamera {
             name: format!("cam{index:02}"),
-            size: [w, h],
+            size,
             focal: [row[0]; 2],
             principal: [row[1], row[2]],
             distortion: Distortion::None,
@@ -103,6 +105,14 @@ fn parse_name(path: &Path) -> Option<(String, u32, u32)> {
     let (name, rest) = stem.split_once("_undist_")?;
     let (frame, camera) = rest.split_once('_')?;
     Some((name.to_string(), frame.parse().ok()?, camera.parse().ok()?))
+}
+
+/// The size that `rows` are calibrated for: that of the dataset's images, or for a rig of its own that of the first image, whichever has its centre nearer
+/// to the mean principal point.
+fn calibrated_size(rows: &[Vec<f64>], first: [u32; 2]) -> [u32; 2] {
+    let mean = [1, 2].map(|column| rows.iter().map(|row| row[column]).sum::<f64>() / rows.len() as f64);
+    let distance = |size: [u32; 2]| (f64::from(size[0]) / 2.0 - mean[0]).hypot(f64::from(size[1]) / 2.0 - mean[1]);
+    if distance(FULL_SIZE) < distance(first) { FULL_SIZE } else { first }
 }
 
 /// A header line, then 12 numbers a row: focal, cx, cy, two ignored, quaternion (w,x,y,z), translation; world to camera.

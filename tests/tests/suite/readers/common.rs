@@ -206,17 +206,18 @@ pub fn write_nerfstudio(root: &Path, count: usize) -> Vec<Camera> {
     cameras
 }
 
-/// A Technicolor scene called Painter with the given frames.
+/// A Technicolor scene called Painter with the given frames. Its images have a 64th of the size that its cameras are calibrated for; the returned ones have the
+/// size of the images.
 pub fn write_technicolor(root: &Path, count: u8, frames: &[u32]) -> Vec<Camera> {
-    let cameras = ring(usize::from(count), 16, 12);
+    let cameras = ring(usize::from(count), 32, 17);
     let mut text = "header line\n".to_string();
     for camera in &cameras {
         let (q, t) = quaternion(camera);
-        text += &format!("{} 8.5 5.25 0 0 {} {} {} {} {} {} {}\n", camera.fx, q[0], q[1], q[2], q[3], t[0], t[1], t[2]);
+        text += &format!("{} 1088 480 0 0 {} {} {} {} {} {} {}\n", 64.0 * camera.fx, q[0], q[1], q[2], q[3], t[0], t[1], t[2]);
     }
     std::fs::write(root.join("cameras_parameters.txt"), text).unwrap();
     for frame in frames {
-        (0..count).for_each(|c| write_image(&root.join(format!("Painter_undist_{frame:05}_{c:02}.png")), 16, 12, c));
+        (0..count).for_each(|c| write_image(&root.join(format!("Painter_undist_{frame:05}_{c:02}.png")), 32, 17, c));
     }
     cameras
 }

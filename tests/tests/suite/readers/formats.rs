@@ -28,6 +28,30 @@ fn dnerf() {
 }
 
 #[test]
+fn dnerf_has_validation_views_of_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    write_dnerf(dir.path(), 5, 2, 16);
+    let without = load(dir.path()).unwrap();
+    let document = std::fs::read_to_string(dir.path().join("transforms_test.json")).unwrap();
+    std::fs::write(dir.path().join("transforms_val.json"), document.replace("./test/", "./val/")).unwrap();
+    let told = |scene: &cc4dgs_core::Scene| scene.warnings.join("\n").contains("there are no validation views");
+    assert!(told(&load(dir.path()).unwrap()), "copies without these images are read");
+    std::fs::create_dir(dir.path().join("val")).unwrap();
+    for name in ["r_000.png", "r_001.png"] {
+        std::fs::copy(dir.path().join("test").join(name), dir.path().join("val").join(name)).unwrap();
+    }
+    let scene = load(dir.path()).unwrap();
+    assert!(!told(&scene));
+    assert_eq!((train_count(&scene), scene.split(Split::Validation).len()), ((5, 2), 2));
+    let others: Vec<_> = scene.views.iter().filter(|view| view.split != Split::Validation).cloned().collect();
+    assert_eq!((others, scene.frame_count), (without.views, without.frame_count), "as without them");
+    // They are taken in place of training views.
+    assert_eq!(train_count(&cc4dgs_train::data::hold_out(&scene, 1).unwrap()), (5, 2));
+    let held_out = open(dir.path(), &SceneOptions { test_split: "val".into(), ..Default::default() }, &Limits::default()).unwrap();
+    assert_eq!((train_count(&held_out), held_out.split(Split::Validation).len()), ((5, 2), 0));
+}
+
+#[test]
 fn panoptic() {
     let dir = tempfile::tempdir().unwrap();
     let cameras = write_panoptic(dir.path(), 4, 3);
@@ -197,7 +221,8 @@ fn technicolor() {
     for (view, v) in scene.views.iter().enumerate() {
         let camera = scene.camera(view);
         same_pose(&dataset_camera(&scene, view), &cameras[v.camera]);
-        assert_eq!((camera.cx, camera.cy), (8.5, 5.25), "the principal point is honoured");
+        assert_eq!((camera.cx, camera.cy), (17.0, 7.5), "the principal point is honoured");
+        assert_eq!((camera.fx, camera.fy), (cameras[v.camera].fx, cameras[v.camera].fx));
         assert_eq!(v.split == Split::Test, camera.name == "cam10");
         assert_eq!(scene.frame(view).unwrap().data[2] as usize, v.camera);
     }

@@ -8,7 +8,8 @@ use cc4dgs_train::data::init::photo_points;
 fn dnerf_mutant() {
     let Some(path) = real("dnerf_mutant") else { return };
     let scene = open(&path, &SceneOptions { width: 400, ..Default::default() }, &Limits::default()).unwrap();
-    assert_eq!((scene.split(Split::Train).len(), scene.split(Split::Test).len(), scene.frame_count), (150, 20, 150));
+    assert_eq!([Split::Train, Split::Test, Split::Validation].map(|split| scene.split(split).len()), [150, 20, 20]);
+    assert_eq!(scene.frame_count, 150);
     assert!((scene.normalisation.scale - 1.0).abs() < 0.02, "{:?}", scene.normalisation);
     for camera in scene.cameras.iter().map(|c| scene.normalisation.inverse().apply_camera(c)) {
         let (u, v, z) = project(&camera, [0.0; 3]);

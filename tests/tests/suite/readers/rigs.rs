@@ -117,23 +117,41 @@ fn images_without_any_time_are_told() {
 }
 
 #[test]
-fn images_of_different_sizes_keep_their_lens_and_are_not_enlarged_in_silence() {
+fn images_of_different_sizes_keep_their_lens_and_are_not_enlarged() {
     let dir = tempfile::tempdir().unwrap();
     write_dnerf(dir.path(), 3, 1, 16);
     write_rgba_image(&dir.path().join("train/r_001.png"), 8, 6, [10, 20, 30, 255]);
+    let native = load(dir.path()).unwrap();
     let sizes = |options: &SceneOptions| {
         let scene = open(dir.path(), options, &Limits::default()).unwrap();
-        let sizes: Vec<(u32, u32)> = scene.split(Split::Train).into_iter().map(|v| (scene.camera(v).width, scene.camera(v).height)).collect();
-        (sizes, scene.warnings.join("\n"))
+        let size = |view: usize| {
+            let (camera, image) = (scene.camera(view), scene.frame(view).unwrap());
+            assert_eq!((camera.width, camera.height), (image.width, image.height));
+            // The angles that an image spans do not depend on its size.
+            let whole = native.cameras.iter().find(|c| c.name == camera.name).unwrap();
+            let [sx, sy] = [f64::from(camera.width) / f64::from(whole.width), f64::from(camera.height) / f64::from(whole.height)];
+            let scaled = [whole.fx * sx, whole.fy * sy, whole.cx * sx, whole.cy * sy];
+            let found = [camera.fx, camera.fy, camera.cx, camera.cy];
+            assert!(found.iter().zip(scaled).all(|(a, b)| (a - b).abs() < 1e-9), "{}: {found:?}, not {scaled:?}", camera.name);
+            (camera.width, camera.height)
+        };
+        (scene.split(Split::Train).into_iter().map(size).collect::<Vec<_>>(), scene.warnings.join("\n"))
     };
-    let native = load(dir.path()).unwrap();
     let small = native.cameras.iter().find(|c| c.name == "train/r_001").unwrap();
     assert!((small.fx - 4.0 / 0.4f64.tan()).abs() < 1e-9 && (small.cx, small.cy) == (4.0, 3.0), "{small:?}");
     assert_eq!(sizes(&SceneOptions::default()), (vec![(16, 16), (8, 6), (16, 16)], String::new()));
     assert_eq!(sizes(&SceneOptions { downscale: 2.0, ..options() }), (vec![(8, 8), (4, 3), (8, 8)], String::new()));
-    let (enlarged, said) = sizes(&SceneOptions { width: 16, ..options() });
-    assert_eq!(enlarged, [(16, 16), (16, 12), (16, 16)]);
-    assert!(["1 of 4 cameras", "8x6 to 16x12", "scene.downscale"].iter().all(|part| said.contains(part)), "{said}");
+    let said = |options: SceneOptions, expected: [(u32, u32); 3], parts: &[&str]| {
+        let (found, said) = sizes(&options);
+        assert_eq!(found, expected);
+        assert!(parts.iter().all(|part| said.contains(part)), "{said}");
+    };
+    let one = ["1 of 4 cameras are smaller", "8x6, where 12x9 is asked for"];
+    said(SceneOptions { width: 12, ..options() }, [(12, 12), (8, 6), (12, 12)], &one);
+    said(SceneOptions { width: 12, height: 5, ..options() }, [(12, 5), (8, 5), (12, 5)], &["8x6, where 12x5 is asked for"]);
+    for larger in [SceneOptions { width: 32, ..options() }, SceneOptions { height: 32, ..options() }, SceneOptions { downscale: 0.5, ..options() }] {
+        said(larger, [(16, 16), (8, 6), (16, 16)], &["4 of 4 cameras are smaller", "16x16, where 32x32 is asked for"]);
+    }
 }
 
 #[test]

@@ -64,6 +64,36 @@ fn sizes_follow_the_options() {
 }
 
 #[test]
+fn technicolor_cameras_follow_the_size_of_the_images() {
+    let dir = tempfile::tempdir().unwrap();
+    let focal = 64.0 * write_technicolor(dir.path(), 3, &[100])[0].fx;
+    let sized = |width: u32, height: u32| {
+        (0..3).for_each(|c| write_image(&dir.path().join(format!("Painter_undist_00100_{c:02}.png")), width, height, c));
+        load(dir.path())
+    };
+    // Sides of smaller copies are rounded to whole pixels.
+    for (width, height, is_scaled) in [(2048, 1088, false), (100, 53, true)] {
+        let scene = sized(width, height).unwrap();
+        let [sx, sy] = [f64::from(width) / 2048.0, f64::from(height) / 1088.0];
+        for camera in &scene.cameras {
+            let found = [camera.fx, camera.fy, camera.cx, camera.cy];
+            let expected = [focal * sx, focal * sy, 1088.0 * sx, 480.0 * sy];
+            assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{found:?}, not {expected:?}");
+        }
+        let said = scene.warnings.join("\n");
+        assert_eq!(said.contains(&format!("the images are {width}x{height}, the calibration is for 2048x1088")), is_scaled, "{said}");
+    }
+    let message = sized(32, 24).err().unwrap().to_string();
+    assert!(message.contains("calibrated for 2048x1088 pixels, its image has 32x24"), "{message}");
+    // The calibration of another rig, by its principal points.
+    let file = dir.path().join("cameras_parameters.txt");
+    std::fs::write(&file, std::fs::read_to_string(&file).unwrap().replace(" 1088 480 ", " 17 11.5 ")).unwrap();
+    let scene = sized(32, 24).unwrap();
+    assert!(scene.cameras.iter().all(|camera| (camera.fx, camera.cx, camera.cy) == (focal, 17.0, 11.5)), "{:?}", scene.cameras);
+    assert!(!scene.warnings.join("\n").contains("calibration"), "{:?}", scene.warnings);
+}
+
+#[test]
 fn other_frames_keep_the_clock_of_a_training() {
     let dir = tempfile::tempdir().unwrap();
     write_panoptic(dir.path(), 2, 9);

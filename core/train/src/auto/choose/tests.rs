@@ -88,10 +88,15 @@ fn scenes_get_what_they_need_and_no_more() {
 #[test]
 fn images_shrink_to_the_time() {
     let options = SceneOptions::default();
-    assert!(image_size([320, 180], &options, MACHINE, 10.0).is_none());
-    let width = image_size([1920, 1080], &options, MACHINE, 10.0).and_then(|c| c.settings[0].1.as_integer()).unwrap();
+    assert!(image_size(&[[320, 180]], &options, MACHINE, 10.0).is_none() && image_size(&[], &options, MACHINE, 10.0).is_none());
+    let large = image_size(&[[1920, 1080]], &options, MACHINE, 10.0).unwrap();
+    let width = large.settings[0].1.as_integer().unwrap();
     assert!((500..700).contains(&width), "{width}");
-    assert!(image_size([1920, 1080], &SceneOptions { width: 700, ..options }, MACHINE, 10.0).is_none());
+    assert_eq!(large.reason, "images of 1920x1080 pixels are too many for 10 minutes on this machine");
+    let mixed = image_size(&[[320, 180], [1920, 1080], [1920, 1080]], &options, MACHINE, 10.0).unwrap();
+    assert_eq!(mixed.settings, large.settings);
+    assert_eq!(mixed.reason, format!("{}; 1 of 3 cameras have smaller ones, which are not enlarged", large.reason));
+    assert!(image_size(&[[1920, 1080]], &SceneOptions { width: 700, ..options }, MACHINE, 10.0).is_none());
 }
 
 #[test]
